@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gfnn_jax.data.channels import args_of, channels_of, parameters_of
+from gfnn_jax.data.channels import args_of, channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.signals.local_cubics import Smooth, choose_half, smooth
@@ -119,15 +119,17 @@ class Arcs:
 def stretches(
     recording: Recording, channels: Sequence[str] | None = None,
     coordinates_of: Callable[[np.ndarray], np.ndarray] | None = None,
+    parameters: Sequence[str] = (),
 ) -> list[Stretch]:  # fmt: skip
     """The stretches of all runs.
 
     channels: columns that are seen, the positions unless given. coordinates_of: (n, k) channels ->
     (n, d) coordinates, NaN where they are not told; None: the channels are the coordinates.
+    parameters: in which the systems of the runs differ.
     Raises FitError where no stretch is long enough.
     """
     names = recording.positions if channels is None else channels
-    varied, found = parameters_of(recording), []
+    found = []
     for run in recording.runs:
         t, u = recording.times(run), recording.array("inputs", run)
         y, noise = channels_of(recording, names, run)
@@ -139,7 +141,7 @@ def stretches(
         if coordinates_of is not None and len(q):
             q = q.copy()
             q[:, turns] = np.unwrap(q[:, turns], axis=0)
-        found += pieces(run, t, y, u, q, noise, args_of(recording, run, varied))
+        found += pieces(run, t, y, u, q, noise, args_of(recording, run, parameters))
     found = [s for s in found if len(s.t) >= _SHORTEST]
     if not found:
         raise FitError(

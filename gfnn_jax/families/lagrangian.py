@@ -365,7 +365,10 @@ class Lagrangian:
 
 def pushed(gains: Any, u: Any) -> Any:
     """G u (..., d) of gains (d, k), or those of each lane (..., d, k), and u (..., k)."""
-    return matmul(u, gains.T) if gains.ndim == 2 else matmul(gains, u[..., None])[..., 0]
+    if gains.ndim == 2:
+        return matmul(u, gains.T)
+    column = u[..., None]
+    return matmul(as_row(gains, column) if column.ndim > gains.ndim else gains, column)[..., 0]
 
 
 def functions_of(powers: Powers, args: Any) -> Any:

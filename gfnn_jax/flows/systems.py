@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 
-from gfnn_jax.arrays import beside
+from gfnn_jax.arrays import as_row, beside
 from gfnn_jax.families.family import at_time, parameter_gradients
 from gfnn_jax.families.lagrangian import Powers, functions_of
 
@@ -71,7 +71,8 @@ class OfSystems:
             raise ValueError("expected the parameters of the system: the law depends on them")
         count = len(self.powers[0])
         rest = args[..., count:]
-        own = params * functions_of(self.powers, args[..., :count])
+        weights = functions_of(self.powers, args[..., :count])
+        own = as_row(params, weights) * weights
         return own, rest if rest.shape[-1] else None
 
     def at_time(self, args, after):

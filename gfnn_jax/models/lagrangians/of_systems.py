@@ -4,7 +4,7 @@ The runs of the value with most samples are searched for terms as any recording 
 then fitted to the runs of each value by themselves, and the coefficients tell on which functions of
 the parameters they depend (`dependence`). That law is fitted to all runs at once, and from there on
 terms are dropped and added, and friction is chosen, as ever. Where arcs that a fit has not seen do
-not gain by the dependence, there is none, and all runs are searched as those of one system.
+not gain by the dependence, there is none.
 """
 
 from __future__ import annotations
@@ -47,11 +47,13 @@ def search_of_systems(
     nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
     inputs: Mapping[str, ArcInputs], observation: Observation,
     on_progress: Callable[[str], object], options: SearchOptions, parameters: tuple[str, ...],
-) -> Found:  # fmt: skip
-    """The law of runs that differ in ``parameters``, with the result of `search.search`."""
-    together = (nodes, scales, angles, num_inputs, inputs, observation, on_progress, options)
+) -> Found | None:  # fmt: skip
+    """The law of runs that differ in ``parameters``, with the result of `search.search`; None where
+    no coefficient depends on them."""
     groups = _of_one_value(nodes)
-    rule = _first_law(groups, nodes, scales, angles, num_inputs, tuple(inputs), *together[5:])
+    rule = _first_law(
+        groups, nodes, scales, angles, num_inputs, tuple(inputs), observation, on_progress, options
+    )
     structure = rule.fit.structure
     gauge = np.concatenate([n.x[:, : observation.dim] for n in nodes])
 
@@ -70,12 +72,12 @@ def search_of_systems(
         for i, node in zip(places, some, strict=True):
             followed[i] = node
     if len(fits) < 2:
-        return search(*together)
+        return None
     inertia = _inertia(structure, gauge)
     found = dependence(structure, inertia, values)
     if found.structure == structure:
         on_progress(f"no coefficient depends on {', '.join(parameters)}")
-        return search(*together)
+        return None
     bench = bench_of(nodes, Systems.of(parameters, nodes))
     arcs = arcs_of(followed, max(6, round(options.periods[-1] * scales.per_period)))
     sigma = np.median([fit.sigma for fit in fits], axis=0)
@@ -89,7 +91,7 @@ def search_of_systems(
     alike = bench.cross_validate(followed, fit, structure, mean)
     on_progress(f"  cost of held-out arcs {np.sum(alike):.5g} → {np.sum(apart):.5g}")
     if not gains(alike, apart, options.gain):
-        return search(*together)
+        return None
     every = everything(scales, angles, num_inputs, observation, options)
     every = _depending(every, fit.structure, (0,) * len(parameters))
     return finished(bench, followed, fit, every, scales, on_progress, options)

@@ -71,12 +71,10 @@ def fit_recording(
         steps.append(line)
         on_progress(line)
 
-    samples = _samples(recording, loss, note)
-    asked = _asked(terms, samples, options)
-    nodes = nodes_of(samples.stretches, samples.scales)
-    gauge = np.concatenate([n.x[:, : samples.observation.dim] for n in nodes])
     holds = _holds(recording, input_hold)
-    acting, choice, nodes = _searched(samples, nodes, asked, holds, note, options)
+    parameters = parameters_of(recording)
+    samples, gauge, found = _found(recording, loss, parameters, terms, holds, note, options)
+    acting, choice, nodes = found
     bench, fit = _with_finer_steps(acting, gauge, samples, nodes, note)
     measured = velocities(recording, fit, nodes)
     for name, one in measured.items():
@@ -136,13 +134,15 @@ def _holds(recording: Recording, input_hold: str) -> tuple[str, ...]:
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Samples:
     """Samples of a recording as a fit sees them: how its columns show the coordinates, which of
-    these are angles, stretches without gaps, their scales, and what was left out."""
+    these are angles, stretches without gaps, their scales, the parameters in which the systems of
+    the runs differ, and what was left out."""
 
     recording: Recording
     observation: Observation
     angles: tuple[int, ...]
     stretches: list[Stretch]
     scales: Scales
+    parameters: tuple[str, ...] = ()
     messages: tuple[str, ...] = ()
 
     @property
@@ -158,25 +158,45 @@ class _Samples:
         )  # fmt: skip
 
 
-def _samples(recording: Recording, loss: Loss | None, on_progress: OnProgress) -> _Samples:
+def _found(
+    recording: Recording, loss: Loss | None, parameters: tuple[str, ...], terms: Sequence[Any],
+    holds: Sequence[str], on_progress: OnProgress, options: SearchOptions,
+) -> tuple[_Samples, np.ndarray, Found]:  # fmt: skip
+    """The samples, the positions (n, d) of the gauge, and the law of these parameters; where
+    nothing depends on them, all as of one system."""
+    samples = _samples(recording, loss, on_progress, parameters)
+    nodes = nodes_of(samples.stretches, samples.scales)
+    gauge = np.concatenate([n.x[:, : samples.observation.dim] for n in nodes])
+    asked = _asked(terms, samples, options)
+    found = _searched(samples, nodes, asked, holds, on_progress, options)
+    if found is None:
+        return _found(recording, loss, (), terms, holds, on_progress, options)
+    return samples, gauge, found
+
+
+def _samples(
+    recording: Recording, loss: Loss | None, on_progress: OnProgress, parameters: tuple[str, ...]
+) -> _Samples:
     """The samples of the positions, without rests, each σ as given where it is."""
     observation, angles = _observation(recording)
     observation = observation if loss is None else dataclasses.replace(observation, loss=loss)
-    found = _stretches(recording, observation, angles)
+    found = _stretches(recording, observation, angles, parameters)
     offset = [i for i in observation.shifts() if i not in angles]
     if offset and not recording.guess:  # an offset starts at the middle of its coordinate
         middle = np.mean(np.concatenate([s.q for s in found]), axis=0)
         observation = observation.shifted(
             np.where(np.isin(range(observation.dim), offset), middle, 0.0)
         )
-        found = _stretches(recording, observation, angles)
-    samples = _Samples(recording, observation, angles, found, measure(found))
+        found = _stretches(recording, observation, angles, parameters)
+    samples = _Samples(recording, observation, angles, found, measure(found), parameters)
     if observation.is_plain:
         found, resting = without_rests(found, samples.scales)
         if resting:
             line = f"{resting:.3g} s at rest left out: a body that stands still tells no law"
             on_progress(line)
-            samples = _Samples(recording, observation, angles, found, measure(found), (line,))
+            samples = dataclasses.replace(
+                samples, stretches=found, scales=measure(found), messages=(line,)
+            )
     sigma = np.where(samples.given > 0, samples.given, samples.scales.sigma)
     return dataclasses.replace(samples, scales=dataclasses.replace(samples.scales, sigma=sigma))
 
@@ -204,21 +224,23 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
 
 
 def _stretches(
-    recording: Recording, observation: Observation, angles: tuple[int, ...]
-) -> list[Stretch]:
+    recording: Recording, observation: Observation, angles: tuple[int, ...],
+    parameters: tuple[str, ...],
+) -> list[Stretch]:  # fmt: skip
     """The stretches of a recording, as the parameters of ``observation`` show its coordinates."""
     if observation.is_plain:
-        return stretches(recording)
+        return stretches(recording, parameters=parameters)
     return stretches(
-        recording, observation.channels, partial(observation.coordinates_of, angles=angles)
-    )
+        recording, observation.channels, partial(observation.coordinates_of, angles=angles),
+        parameters,
+    )  # fmt: skip
 
 
 def _asked(terms: Sequence[Any], samples: _Samples, options: SearchOptions) -> Given | None:
     """The terms that were given, by the names of formulas."""
     observation = samples.observation
-    d, varied = observation.dim, parameters_of(samples.recording)
-    names = symbols((*observation.coordinates, *observation.speeds, *varied))
+    d = observation.dim
+    names = symbols((*observation.coordinates, *observation.speeds, *samples.parameters))
     width = options.dry_width * float(np.mean(samples.scales.speed))
     return given_terms(terms, names[:d], names[d : 2 * d], width, names[2 * d :]) if terms else None
 
@@ -226,21 +248,23 @@ def _asked(terms: Sequence[Any], samples: _Samples, options: SearchOptions) -> G
 def _searched(
     samples: _Samples, nodes: Sequence[Nodes], asked: Given | None, holds: Sequence[str],
     on_progress: OnProgress, options: SearchOptions,
-) -> Found:  # fmt: skip
-    """The law that a search finds, or that of the terms which were asked for."""
+) -> Found | None:  # fmt: skip
+    """The law that a search finds, or that of the terms which were asked for; None where no
+    coefficient depends on the samples' parameters."""
     scales = samples.scales
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
     record = (
         nodes, scales, samples.angles, len(samples.recording.inputs), inputs, samples.observation,
         on_progress, options,
     )  # fmt: skip
-    parameters = parameters_of(samples.recording)
     if asked is not None:
-        found = fit_given(asked, *record, parameters)
-    elif parameters:
-        found = search_of_systems(*record, parameters)
+        found = fit_given(asked, *record, samples.parameters)
+    elif samples.parameters:
+        found = search_of_systems(*record, samples.parameters)
     else:
         found = search(*record)
+    if found is None:
+        return None
     fit = found.acting.fit
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError(NO_LAW)
@@ -284,7 +308,7 @@ def _with_velocities(
     bench = dataclasses.replace(bench, observation=observation)
     fit = bench.fit(fit.structure, fit.values, arcs, np.concatenate([fit.sigma, sigma]))
     scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, sigma]))
-    found = _stretches(recording, observation, samples.angles)
+    found = _stretches(recording, observation, samples.angles, samples.parameters)
     found = without_rests(found, scales)[0] if samples.messages else found
     samples = dataclasses.replace(samples, observation=observation, stretches=found, scales=scales)
     return samples, nodes, bench, fit
