@@ -159,7 +159,7 @@ def pieces(
     steps = np.diff(t)
     cuts = np.flatnonzero(steps > gap * np.median(steps)) + 1 if len(steps) else []
     parts = (np.split(a, cuts) for a in (t, y, u, q, noise))
-    return [Stretch(run, *part, args) for part in zip(*parts, strict=True)]
+    return [Stretch(run, *part, args=args) for part in zip(*parts, strict=True)]
 
 
 def measure(found: Sequence[Stretch]) -> Scales:

@@ -83,8 +83,10 @@ class Form:
         friction, uniform = self.friction.take(~even), losses[..., even].sum(axis=-1)
         powers = self.powers
         if powers is not None:  # γ has none
-            kept = np.concatenate([np.ones(self.terms.count, bool), ~even, np.ones(gains.size, bool)])
-            powers = tuple(row for row, keep in zip(powers, kept, strict=True) if keep)
+            first, last = self.terms.count, self.terms.count + len(even)
+            of_friction = zip(powers[first:last], even, strict=True)
+            of_friction = tuple(row for row, is_rate in of_friction if not is_rate)
+            powers = (*powers[:first], *of_friction, *powers[last:])
         return Lagrangian(self.terms, theta, friction, losses[..., ~even], uniform, gains, powers)
 
     def in_systems(self, p: np.ndarray, args: np.ndarray) -> tuple[Form, np.ndarray, np.ndarray]:

@@ -101,6 +101,6 @@ class OfSystems:
         """∂/∂params of the gradient (..., 2d, m). NumPy."""
         own, rest = self.of_one(params, args)
         columns = parameter_gradients(self.family, own, w, rest, along)
-        if along is not None:
+        if along is not None or args is None:
             return columns
         return columns * functions_of(self.powers, args[..., : len(self.powers[0])])[..., None, :]

@@ -93,14 +93,15 @@ def _read(
     sensors = map_.sensors
     assert sensors is not None
     observation = sensors.observation_model
-    varied = {} if map_.parameters is None else {"parameters": map_.parameters.names}
-    roles = _roles(sensors, job, observation.channels) | varied | columns
+    varied = () if map_.parameters is None else map_.parameters.names
+    columns = {"parameters": varied, **columns}
+    roles = _roles(sensors, job, observation.channels) | columns
     try:
         return read(path, **roles), roles
     except InputError:
         if observation.needed == observation.channels:
             raise
-    roles = _roles(sensors, job, observation.needed) | varied | columns
+    roles = _roles(sensors, job, observation.needed) | columns
     return read(path, **roles), roles
 
 

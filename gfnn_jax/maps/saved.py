@@ -61,9 +61,9 @@ _TYPES: dict[str, type] = {
     for kind in (
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
-        Windows, Groups, Ranges, OfTimeStep, Ensemble, Uniform, Forced, OfSystems, Legendre, Friction, Signals,
-        Sensors, Wander, Observation, SoftL1, Biweight, Damping, DampingOfArgs, FunctionsOfArgs,
-        OfDisplacement,
+        Windows, Groups, Ranges, OfTimeStep, Ensemble, Uniform, Forced, Legendre, Friction, Signals,
+        OfSystems, Sensors, Wander, Observation, SoftL1, Biweight, Damping, DampingOfArgs,
+        FunctionsOfArgs, OfDisplacement,
     )
 } | {"LagrangianTerms": lagrangian.Terms}  # fmt: skip
 _NAMES = {kind: name for name, kind in _TYPES.items()}

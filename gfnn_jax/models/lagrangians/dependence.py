@@ -1,8 +1,8 @@
 """The dependence of a law's coefficients on parameters of the system: which functions of these.
 
 Runs of one value v of the parameters are fitted by themselves, with the terms that one of them
-shows: coefficients p_v, and the triangle R_v of their information. Close to these fits the residuals
-of any law are R_v (p − p_v), so that sets of functions for all coefficients,
+shows: coefficients p_v, and the triangle R_v of their information. Close to these fits the
+residuals of any law are R_v (p − p_v), so that sets of functions for all coefficients,
 
     p_j(μ) = Σ_a x_ja ∏ μ^a / c(μ),      a whole powers from −2 to 2,
 
@@ -254,5 +254,3 @@ def functions_in(rows: Sequence[Any], none: Function) -> tuple[Function, ...]:
     """The functions of parameters that rows have, none first."""
     found = {row[-1] for row in rows if isinstance(row[-1], tuple)}
     return (none, *sorted(found - {none}))
-
-

@@ -21,9 +21,7 @@ def protected(structure: Structure) -> set[Key]:
     """Constant masses of each coordinate, without which there would be no motion; of several that
     depend on parameters of the system none alone."""
     masses = [
-        row
-        for row in structure.terms
-        if max(row[0]) == 2 and not any(row[1]) and not any(row[2])
+        row for row in structure.terms if max(row[0]) == 2 and not any(row[1]) and not any(row[2])
     ]
     alone = [row for row in masses if sum(other[0] == row[0] for other in masses) == 1]
     return {("term", row) for row in alone}
