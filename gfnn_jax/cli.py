@@ -349,6 +349,8 @@ def _forecast(arguments: argparse.Namespace) -> None:
     runs = "1 run" if len(found) == 1 else f"{len(found)} runs"
     unit = record(arguments.model).get("job", {}).get("time_unit", "s")
     print(f"{arguments.out}: forecasts of {runs}, up to t = {max(times):g} {unit}")
+    for line in (line for one in found.values() for line in one.outside):
+        print(f"note: {line}")
     if judged is not None:
         for name, (rms, median, within) in judged.columns.items():
             unit = f" {judged.units[name]}" if judged.units[name] else ""

@@ -488,7 +488,7 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     for k, one in enumerate(u):
         x[k + 1] = (step @ np.append(x[k], one))[:2]
     table = {"t": dt * np.arange(300), "x": x[:-1, 0] + 1e-4 * rng.normal(size=300), "u": u}
-    samples = _samples(gfnn.Recording(table), None, print)
+    samples = _samples(gfnn.Recording(table), None, print, ())
     nodes = nodes_of(samples.stretches, samples.scales)
     inputs = {hold: ArcInputs(nodes, samples.scales.substeps, hold) for hold in HOLDS}
     found = {

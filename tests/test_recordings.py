@@ -8,11 +8,12 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli_columns import add_column_options, column_options, masses, names_roles
+from gfnn_jax.data.channels import parameters_of
 from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.data.recording_summary import as_typed
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.errors import InputError
-from gfnn_jax.models.lagrangians.in_words import parameters_left_out
+from gfnn_jax.models.lagrangians.in_words import about_parameters
 
 T = np.array([0.0, 0.1, 0.25, 0.3, 1.0])
 THETA = np.array([0.5, 0.25, -0.125, 1e-3, 2.0])
@@ -178,9 +179,19 @@ def test_columns_that_differ_from_run_to_run_are_parameters():
     recording = gfnn.Recording({**table, "day": [7, 7, 7, 7]})
     assert recording.parameters == ("mass",)
     assert recording.ignored == ("day",)
-    (told,) = parameters_left_out(recording)
-    assert told.startswith("mass is 1 to 2 and the law is one for all runs")
-    assert parameters_left_out(recording.slice(run="0")) == []
+    assert parameters_of(recording) == ("mass",)
+    (told,) = about_parameters(recording, None)
+    assert told.startswith("mass is 1 to 2, and no coefficient of the law depends on it")
+    (told,) = about_parameters(recording, ((0,), (-1,)))
+    assert "two values" in told
+    assert about_parameters(recording.slice(run="0"), None) == []
+
+
+def test_a_parameter_is_one_number_of_each_run():
+    table = {"run": [0, 0, 1, 1], "t": [0, 1, 0, 1], "x": [0.0, 1, 2, 3], "m": [1.0, 1, 2, 3]}
+    recording = gfnn.Recording(table, positions=["x"], parameters=["m"])
+    with pytest.raises(InputError, match="parameter m is not one number in run 1"):
+        parameters_of(recording)
 
 
 def test_an_angle_is_lifted_and_a_lift_is_trusted():

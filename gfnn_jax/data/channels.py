@@ -1,4 +1,4 @@
-"""Columns of a recording side by side, with their noise."""
+"""Columns of a recording side by side, with their noise; parameters that its runs differ in."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.errors import InputError
 
 
 def channels_of(
@@ -24,3 +25,25 @@ def channels_of(
         if sigma is not None and usual:
             noise[:, k] = np.where(np.isfinite(sigma), sigma / usual, 1.0)
     return y, noise
+
+
+def parameters_of(recording: Recording) -> tuple[str, ...]:
+    """Parameters that differ between the runs. Raises InputError where one is no number of each
+    run."""
+    found = []
+    for name in recording.parameters:
+        columns = [recording.values(name, run) for run in recording.runs]
+        for run, column in zip(recording.runs, columns, strict=True):
+            if not (np.isfinite(column).all() and np.ptp(column) == 0):
+                raise InputError(
+                    f"{recording.source}: parameter {name} is not one number in run {run}. Name "
+                    "what changes within a run an input: --inputs (inputs=)"
+                )
+        if len({float(column[0]) for column in columns}) > 1:
+            found.append(name)
+    return tuple(found)
+
+
+def args_of(recording: Recording, run: str, names: Sequence[str]) -> np.ndarray:
+    """(k,) these parameters of a run."""
+    return np.array([recording.values(name, run)[0] for name in names])

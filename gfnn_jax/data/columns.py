@@ -48,7 +48,9 @@ def roles_of(
     if varied:
         roles["parameters"] = (*roles["parameters"], *varied)
         rest = [name for name in rest if name not in varied]
-        notes.append(f"{', '.join(varied)} differ from run to run, and are taken as parameters")
+        verbs = ("differs", "is taken as a parameter"), ("differ", "are taken as parameters")
+        differ, taken = verbs[len(varied) > 1]
+        notes.append(f"{', '.join(varied)} {differ} from run to run, and {taken}")
     if not any(roles[role] for role in ("positions", "velocities", "momenta")):
         found, velocities = positions_and_velocities(source, runs, rest)
         roles |= {"positions": found, "velocities": velocities}

@@ -13,10 +13,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from gfnn_jax.data.channels import channels_of
+from gfnn_jax.data.channels import args_of, channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.signals.local_cubics import choose_half, smooth
+from gfnn_jax.signals.local_cubics import Smooth, choose_half, smooth
 
 GAP = 3.5  # median steps: a longer one ends a stretch
 PER_PERIOD = 40  # nodes
@@ -29,13 +29,14 @@ _SHORTEST = (
     9  # samples of a stretch, nodes of an arc: shorter ones tell less than their state needs
 )
 _SHORTEST_ARC = 5
+_SLOW = 0.1  # of the rms speed: less of it, in one of several systems, tells no frequency
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Stretch:
     """Samples without a gap of ``run``: times t (n,), channels y (n, k), NaN where one was not
-    seen, inputs u (n, inputs), the coordinates q (n, d) that the channels show, and the ``noise``
-    (n, k) of each value in units of its channel's."""
+    seen, inputs u (n, inputs), the coordinates q (n, d) that the channels show, the ``noise``
+    (n, k) of each value in units of its channel's, and the parameters args (k,) of the system."""
 
     run: str
     t: np.ndarray
@@ -43,6 +44,7 @@ class Stretch:
     u: np.ndarray
     q: np.ndarray
     noise: np.ndarray
+    args: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -118,11 +120,13 @@ class Arcs:
 def stretches(
     recording: Recording, channels: Sequence[str] | None = None,
     coordinates_of: Callable[[np.ndarray], np.ndarray] | None = None,
+    parameters: Sequence[str] = (),
 ) -> list[Stretch]:  # fmt: skip
     """The stretches of all runs.
 
     channels: columns that are seen, the positions unless given. coordinates_of: (n, k) channels ->
     (n, d) coordinates, NaN where they are not told; None: the channels are the coordinates.
+    parameters: in which the systems of the runs differ.
     Raises FitError where no stretch is long enough.
     """
     names = recording.positions if channels is None else channels
@@ -138,7 +142,7 @@ def stretches(
         if coordinates_of is not None and len(q):
             q = q.copy()
             q[:, turns] = np.unwrap(q[:, turns], axis=0)
-        found += pieces(run, t, y, u, q, noise)
+        found += pieces(run, t, y, u, q, noise, args_of(recording, run, parameters))
     found = [s for s in found if len(s.t) >= _SHORTEST]
     if not found:
         raise FitError(
@@ -150,13 +154,13 @@ def stretches(
 
 def pieces(
     run: str, t: np.ndarray, y: np.ndarray, u: np.ndarray, q: np.ndarray, noise: np.ndarray,
-    gap: float = GAP,
+    args: np.ndarray, gap: float = GAP,
 ) -> list[Stretch]:  # fmt: skip
     """A run cut at its gaps."""
     steps = np.diff(t)
     cuts = np.flatnonzero(steps > gap * np.median(steps)) + 1 if len(steps) else []
     parts = (np.split(a, cuts) for a in (t, y, u, q, noise))
-    return [Stretch(run, *part) for part in zip(*parts, strict=True)]
+    return [Stretch(run, *part, args=args) for part in zip(*parts, strict=True)]
 
 
 def measure(found: Sequence[Stretch]) -> Scales:
@@ -165,7 +169,6 @@ def measure(found: Sequence[Stretch]) -> Scales:
     every = max(1, sum(len(s.t) for s in found) // 2_000)
     smooths = [smooth(s.t, s.q, half, np.arange(0, len(s.t), every))[0] for s in found]
     speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
-    acceleration = np.sqrt(np.mean(np.concatenate([s.a for s in smooths]) ** 2, axis=0))
     if not np.all(speed > 0):
         still = ", ".join(str(i + 1) for i in np.flatnonzero(~(speed > 0)))
         raise InputError(
@@ -179,7 +182,19 @@ def measure(found: Sequence[Stretch]) -> Scales:
     size = np.sqrt(np.nanmean(steps**2, axis=0))
     sigma = np.maximum(sigma, 1e-9 * np.maximum(resolution, size))  # clean data have none
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
-    return Scales(sigma, speed, float(np.max(acceleration / speed)), dt, half, spread)
+    systems: dict[tuple[float, ...], list[Smooth]] = {}
+    for stretch, own in zip(found, smooths, strict=True):
+        systems.setdefault(tuple(stretch.args.tolist()), []).append(own)
+    omega = max(_frequency(own, _SLOW * speed) for own in systems.values())
+    return Scales(sigma, speed, omega, dt, half, spread)
+
+
+def _frequency(smooths: Sequence[Smooth], slow: np.ndarray) -> float:
+    """The largest ratio of the rms acceleration of a coordinate to its rms speed, or to that which
+    is ``slow`` (d,): below it noise moves."""
+    speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
+    acceleration = np.sqrt(np.mean(np.concatenate([s.a for s in smooths]) ** 2, axis=0))
+    return float(np.max(acceleration / np.maximum(speed, slow)))
 
 
 def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:

@@ -67,6 +67,17 @@ def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
                 for name, forces in fit.gains.items()
             },
         },
+        "parameters": {}
+        if map_.parameters is None
+        else {
+            name: {"low": low, "high": high}
+            for name, low, high in zip(
+                map_.parameters.names,
+                np.asarray(map_.parameters.low).tolist(),
+                np.asarray(map_.parameters.high).tolist(),
+                strict=True,
+            )
+        },
         "zeros": {name: {"zero": z, "std": s} for name, (z, s) in fit.zeros.items()},
         "observe": fit.observe,
         "sensors": {name: {"value": c, "std": s} for name, (c, s) in fit.sensors.items()},

@@ -15,6 +15,7 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.families.traced import traced
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.legendre import Legendre
+from gfnn_jax.flows.systems import OfSystems
 from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform
 
 _NARROWEST = 1e-150  # width of dry friction that no speed is below, and whose square is a number
@@ -63,7 +64,7 @@ def on_symbols(family: Any) -> Any:
         widths = np.maximum(family.friction.widths, _NARROWEST)
         friction = dataclasses.replace(family.friction, widths=widths)
         family = dataclasses.replace(family, friction=friction)
-    if isinstance(family, (OfDisplacement, Forced, Uniform, CaldirolaKanai)):
+    if isinstance(family, (OfDisplacement, Forced, OfSystems, Uniform, CaldirolaKanai)):
         return dataclasses.replace(family, family=on_symbols(family.family))
     if not isinstance(family, Products) or family.inputs.features is None:
         return family

@@ -9,6 +9,10 @@ potential terms. With s = c·v, the speed of one coordinate or the relative spee
 linear, r = ½s²; quadratic, r = ⅓|s|³; or dry, r = √(s² + ε²) − ε. Everything is batch first, in
 closed form, and runs in NumPy or JAX. A term is a row of arrays, none of which is static, so that
 another library of as many terms (`Terms.padded`) compiles nothing.
+
+Of systems that differ in parameters μ, a length or a mass, each coefficient is multiplied by a
+product of whole powers of these: L = Σ θ_j ∏ μ_i^a_ji ℓ_j(q, v), and R and G alike. The law of one
+system, `Lagrangian.at`, has plain coefficients again.
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ import numpy as np
 from gfnn_jax.arrays import as_row, matmul, namespace
 
 MAX_POWER = 8  # of one coordinate in one term; powers come from a table of this length
+Powers = tuple[tuple[int, ...], ...]  # of the parameters, (m, k), for each coefficient
 LINEAR, QUADRATIC, DRY, UNIFORM = range(4)  # UNIFORM stands in a fit's `flows.motion.Form` alone
 
 
@@ -240,12 +245,16 @@ class Friction:
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=("terms", "coefficients", "friction", "losses", "uniform", "gains"),
-    meta_fields=(),
+    meta_fields=("powers",),
 )
 @dataclasses.dataclass(frozen=True, eq=False)
 class Lagrangian:
     """L = Σ θ_j ℓ_j with θ ``coefficients`` (P,), friction R = Σ ρ_k r_k with ρ ``losses`` (F,),
-    uniform friction −γ ∂L/∂v with γ ``uniform`` in 1/time, and gains G (d, inputs) of inputs u."""
+    uniform friction −γ ∂L/∂v with γ ``uniform`` in 1/time, and gains G (d, inputs) of inputs u.
+
+    powers: of the system's parameters, by which (θ, ρ, G row by row) are multiplied; None where the
+    law has no parameters. Values and forces are those of the law of one system, `at`.
+    """
 
     terms: Terms
     coefficients: Any
@@ -253,6 +262,7 @@ class Lagrangian:
     losses: Any
     uniform: Any
     gains: Any
+    powers: Powers | None = None
 
     @property
     def dim(self) -> int:
@@ -260,7 +270,19 @@ class Lagrangian:
 
     @property
     def num_inputs(self) -> int:
-        return self.gains.shape[1]
+        return self.gains.shape[-1]
+
+    def at(self, args: Any) -> Lagrangian:
+        """The law of the system with these parameters (k,), or of one for each lane (..., k)."""
+        if self.powers is None:
+            return self
+        weights, first = functions_of(self.powers, args), self.terms.count
+        last = first + self.friction.count
+        of_gains = weights[..., last:].reshape(*weights.shape[:-1], *self.gains.shape)
+        return dataclasses.replace(
+            self, coefficients=self.coefficients * weights[..., :first],
+            losses=self.losses * weights[..., first:last], gains=self.gains * of_gains, powers=None,
+        )  # fmt: skip
 
     def derivatives(self, q: Any, v: Any) -> Derivatives:
         """L and its first and second derivatives at q, v (..., d)."""
@@ -305,7 +327,7 @@ class Lagrangian:
         _, slope, _ = self.friction.tables(v)
         push = -matmul(as_row(self.losses, slope) * slope, self.friction.directions.astype(v.dtype))
         push = push - self.uniform * self.momentum(q, v)
-        return push if u is None else push + matmul(u, self.gains.T)
+        return push if u is None else push + pushed(self.gains, u)
 
     def losses_by_v(self, v: Any) -> Any:
         """∂²R/∂v∂v (..., d, d)."""
@@ -337,8 +359,28 @@ class Lagrangian:
         lost = lost * as_row(self.losses, lost)
         even = self.uniform * (self.momentum(q, v) * v).sum(-1)
         lost = xp.concatenate([lost, even[..., None]], axis=-1)
-        supplied = matmul(v, self.gains) * (0.0 if u is None else u)
+        supplied = pushed(xp.swapaxes(self.gains, -1, -2), v) * (0.0 if u is None else u)
         return lost, supplied
+
+
+def pushed(gains: Any, u: Any) -> Any:
+    """G u (..., d) of gains (d, k), or those of each lane (..., d, k), and u (..., k)."""
+    if gains.ndim == 2:
+        return matmul(u, gains.T)
+    column = u[..., None]
+    return matmul(as_row(gains, column) if column.ndim > gains.ndim else gains, column)[..., 0]
+
+
+def functions_of(powers: Powers, args: Any) -> Any:
+    """∏ args_i^n_i (..., m) of parameters args (..., k) and whole powers n (m, k). NumPy or JAX."""
+    columns = []
+    for row in powers:
+        column = namespace(args).ones_like(args[..., 0])
+        for i, n in enumerate(row):
+            for _ in range(abs(n)):
+                column = column * args[..., i] if n > 0 else column / args[..., i]
+        columns.append(column)
+    return namespace(args).stack(columns, axis=-1)
 
 
 def _friction_named(direction: tuple[int, ...], kind: int) -> str:

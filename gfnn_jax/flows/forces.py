@@ -21,7 +21,7 @@ import numpy as np
 
 from gfnn_jax.arrays import as_row, beside, matmul, namespace
 from gfnn_jax.families.family import at_time, parameter_gradients
-from gfnn_jax.families.lagrangian import LINEAR, Friction
+from gfnn_jax.families.lagrangian import LINEAR, Friction, pushed
 from gfnn_jax.phase_space import split
 
 
@@ -49,7 +49,7 @@ class WithForces:
 
     def value(self, params, w, args=None):
         """H, shape (...), the energy that friction loses and inputs supply."""
-        own = params[: self.family.num_parameters]
+        own = params[..., : self.family.num_parameters]
         return self.family.value(own, w, self._inner(args))
 
     def _inner(self, args):
@@ -191,13 +191,14 @@ class Forced(WithForces):
         _, slope, _ = self.friction.tables(v)
         speeds = matmul(v, self.friction.directions.astype(v.dtype).T)
         lost = as_row(losses, slope) * slope * speeds
-        return lost, matmul(v, gains) * self._inputs(args)
+        return lost, pushed(namespace(gains).swapaxes(gains, -1, -2), v) * self._inputs(args)
 
     def parts(self, params) -> tuple[Any, Any, Any]:
         """The params of H, ρ (F,) and G (d, k)."""
         own, count = self.family.num_parameters, self.friction.count
-        gains = params[own + count :].reshape(self.dim, self.num_inputs)
-        return params[:own], params[own : own + count], gains
+        gains = params[..., own + count :]
+        gains = gains.reshape(*gains.shape[:-1], self.dim, self.num_inputs)
+        return params[..., :own], params[..., own : own + count], gains
 
     def _inner(self, args):
         """Args of H."""
@@ -218,7 +219,7 @@ class Forced(WithForces):
         directions = self.friction.directions.astype(gradient.dtype)
         along_q = along_q + matmul(as_row(losses, slope) * slope, directions)
         if self.num_inputs:
-            along_q = along_q - matmul(self._inputs(args), gains.T)
+            along_q = along_q - pushed(gains, self._inputs(args))
         return namespace(gradient).concatenate([along_q, along_p], axis=-1)
 
     def _beside(self, columns, losses, curvature):

@@ -19,6 +19,7 @@ import numpy as np
 from gfnn_jax.arrays import namespace
 from gfnn_jax.families.lagrangian import Derivatives, Friction, Lagrangian, Terms
 from gfnn_jax.flows.forces import Forced
+from gfnn_jax.flows.systems import OfSystems
 from gfnn_jax.flows.uniform import Uniform
 from gfnn_jax.phase_space import split
 from gfnn_jax.solve.linear import small_solve
@@ -156,7 +157,7 @@ def _solved(matrix, rows):
 
 def family_of(law: Lagrangian, degree: int = 0) -> tuple[Any, np.ndarray]:
     """The family and the params of a law's flow: H by the Legendre transform, its friction and its
-    inputs as forces, and uniform friction where it has any.
+    inputs as forces, their dependence on parameters, and uniform friction where it has any.
 
     degree: of the inputs' polynomials in time over a step.
     """
@@ -165,6 +166,8 @@ def family_of(law: Lagrangian, degree: int = 0) -> tuple[Any, np.ndarray]:
     if law.friction.count or law.num_inputs:
         family = Forced(family, law.friction, law.num_inputs, degree)
         params += [np.asarray(law.losses), np.asarray(law.gains).ravel()]
+    if law.powers is not None:
+        family = OfSystems(family, law.powers)
     if law.uniform != 0:
         family = Uniform(family)
         params.append(np.atleast_1d(law.uniform))
@@ -176,10 +179,13 @@ def law_of(family: Any, params: Any) -> Lagrangian:
     uniform: Any = 0.0
     if isinstance(family, Uniform):
         family, params, uniform = family.family, params[:-1], params[-1]
+    powers = None
+    if isinstance(family, OfSystems):
+        family, powers = family.family, family.powers
     if isinstance(family, Forced):
         own, losses, gains = family.parts(params)
-        return Lagrangian(family.family.terms, own, family.friction, losses, uniform, gains)
+        return Lagrangian(family.family.terms, own, family.friction, losses, uniform, gains, powers)
     dim, none = family.dim, np.zeros(0)
     return Lagrangian(
-        family.terms, params, Friction.of([], dim), none, uniform, none.reshape(dim, 0)
+        family.terms, params, Friction.of([], dim), none, uniform, none.reshape(dim, 0), powers
     )

@@ -17,7 +17,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import DRY, UNIFORM, Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import (
+    DRY,
+    UNIFORM,
+    Friction,
+    Lagrangian,
+    Powers,
+    Terms,
+    functions_of,
+)
 from gfnn_jax.solve.linear import among
 
 # Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19: the solution of order 5.
@@ -56,13 +64,15 @@ class Form:
     """A law whose coefficients are free: terms with θ = ``fixed`` + ``basis`` c (the gauge),
     friction, and gains of the inputs. Its coefficients are (c, ρ, G row by row); that of a row of
     friction of the kind UNIFORM is γ, of the force −γ ∂L/∂v. They are p (count,), or (N, count) of
-    N states that follow laws of their own; phases of the terms are then (P,) or (N, P)."""
+    N states that follow laws of their own; phases of the terms are then (P,) or (N, P). powers: of
+    parameters that systems differ in, by which (θ, ρ, G) are multiplied (`in_systems`)."""
 
     terms: Terms
     fixed: np.ndarray
     basis: np.ndarray
     friction: Friction
     num_inputs: int = 0
+    powers: Powers | None = None
 
     @property
     def dim(self) -> int:
@@ -96,7 +106,26 @@ class Form:
         c, losses, gains = self.split(p)
         theta, even = self.fixed + c @ self.basis.T, self.friction.kinds == UNIFORM
         friction, uniform = self.friction.take(~even), losses[..., even].sum(axis=-1)
-        return Lagrangian(self.terms, theta, friction, losses[..., ~even], uniform, gains)
+        powers = self.powers
+        if powers is not None:  # γ has none
+            first, last = self.terms.count, self.terms.count + len(even)
+            of_friction = zip(powers[first:last], even, strict=True)
+            of_friction = tuple(row for row, is_rate in of_friction if not is_rate)
+            powers = (*powers[:first], *of_friction, *powers[last:])
+        return Lagrangian(self.terms, theta, friction, losses[..., ~even], uniform, gains, powers)
+
+    def in_systems(self, p: np.ndarray, args: np.ndarray) -> tuple[Form, np.ndarray, np.ndarray]:
+        """The form whose coefficients are (θ, ρ, G) of one system, their values (A, n) in systems
+        of parameters args (A, k), and the derivatives (A, n, count) of these in p (count,)."""
+        count, own = self.terms.count, self.basis.shape[1]
+        turn = np.zeros((count + self.count - own, self.count))
+        turn[:count, :own] = self.basis
+        turn[count:, own:] = np.eye(self.count - own)
+        whole = turn @ p
+        whole[:count] += self.fixed
+        weights = functions_of(self.powers or ((),) * len(whole), args)
+        form = dataclasses.replace(self, fixed=0 * self.fixed, basis=np.eye(count), powers=None)
+        return form, weights * whole, weights[..., None] * turn
 
     def accelerate(
         self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, order: int = 2,

@@ -21,6 +21,7 @@ import numpy as np
 from gfnn_jax.arrays import as_row, beside, namespace
 from gfnn_jax.families.family import at_time, parameter_gradients
 from gfnn_jax.flows.forces import Forced, WithForces
+from gfnn_jax.flows.systems import OfSystems
 from gfnn_jax.phase_space import split
 
 FRICTION = "friction"  # the name of γ among the terms
@@ -72,7 +73,8 @@ class Uniform(WithForces):
 
     def multiplier(self, params, dt):
         """e^(−γ dt); None beside other forces, which keep no multiple of the symplectic form."""
-        if isinstance(self.family, Forced):
+        own = self.family.family if isinstance(self.family, OfSystems) else self.family
+        if isinstance(own, Forced):
             return None
         return namespace(params, dt).exp(-params[-1] * dt)
 
@@ -127,7 +129,7 @@ class Uniform(WithForces):
 
 def without_forces(family) -> Any:
     """The family of H alone."""
-    while isinstance(family, (Uniform, Forced)):
+    while isinstance(family, (Uniform, Forced, OfSystems)):
         family = family.family
     return family
 
@@ -148,6 +150,9 @@ def power(family, params, w, args=None) -> Power:
         xp = namespace(w)
         even = params[-1] * xp.sum(split(w)[1] * v, axis=-1, keepdims=True)
         return Power(xp.concatenate([lost, even], axis=-1), supplied)
+    if isinstance(family, OfSystems):
+        own, rest = family.of_one(params, args)
+        return power(family.family, own, w, rest)
     if isinstance(family, Forced):
         return Power(*family.power(params, w, args))
     return Power(w[..., :0], w[..., :0])

@@ -19,6 +19,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.maps.estimates import Forecast
 from gfnn_jax.maps.saved import load, record
 from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
 
 
@@ -56,13 +57,13 @@ def forecast_recording(
     sensors = map_.sensors
     job = record(model).get("job", {})
     columns = columns or {}
-    recording, roles = _read(initial, sensors, job, columns)
+    recording, roles = _read(initial, map_, job, columns)
     if stop is not None:
         recording = recording.slice(stop=stop * SECONDS[recording.time_unit])
-    bare = ("positions", "velocities", "sensors", "coordinates", "angles", "degrees")
+    bare = ("positions", "velocities", "sensors", "coordinates", "angles", "degrees", "parameters")
     only_inputs = {**roles, **dict.fromkeys(bare)}
     ahead = None if inputs is None else read(inputs, **only_inputs)
-    measured = None if compare is None else _read(compare, sensors, job, columns)[0]
+    measured = None if compare is None else _read(compare, map_, job, columns)[0]
     if num_steps is None and measured is None:
         raise InputError("expected --num-steps, or --compare, whose times the forecast is for")
     if ahead is None and sensors.inputs and measured is not None:
@@ -93,11 +94,15 @@ def forecast_recording(
 
 
 def _read(
-    path: Path, sensors: Sensors, job: dict[str, Any], columns: dict[str, Any]
+    path: Path, map_: SymplecticMap, job: dict[str, Any], columns: dict[str, Any]
 ) -> tuple[Recording, dict[str, Any]]:
     """Read a recording with the columns that the law was learned from, but for velocities that it
     may lack, and return the keywords of `read` too."""
+    sensors = map_.sensors
+    assert sensors is not None
     observation = sensors.observation_model
+    varied = () if map_.parameters is None else map_.parameters.names
+    columns = {"parameters": varied, **columns}
     roles = _roles(sensors, job, observation.channels) | columns
     try:
         return read(path, **roles), roles
@@ -128,7 +133,7 @@ def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> For
         {name: array / factors.get(name, 1.0) for name, array in of.items()}
         for of in (one.values, one.std)
     )
-    return Forecast(one.times / second, values, std)
+    return Forecast(one.times / second, values, std, one.outside)
 
 
 def _last_samples(recording: Recording, run: str, count: int | None) -> Recording:

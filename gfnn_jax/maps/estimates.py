@@ -13,16 +13,18 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
-from gfnn_jax.data.channels import channels_of
+from gfnn_jax.data.channels import args_of, channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian
+from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian, functions_of
 from gfnn_jax.flows import coulomb
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import at_stages
 from gfnn_jax.maps.laws import law_of_map
+from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
 from gfnn_jax.solve.arc_models import Defects, Observed
@@ -37,32 +39,62 @@ _AT_ONCE = 4_096  # steps whose derivatives are taken together
 
 class Forecast(NamedTuple):
     """Forecast of what sensors will show, and of coordinates that no column is named for: name ->
-    (runs, n), and their standard deviations."""
+    (runs, n), and their standard deviations. outside: lines about runs whose parameters lie beyond
+    those that the law was learned from."""
 
     times: np.ndarray
     values: dict[str, np.ndarray]
     std: dict[str, np.ndarray]
+    outside: tuple[str, ...] = ()
 
 
 class Window(NamedTuple):
-    """Samples of one run before a time: t (n,), channels y (n, k), that run's inputs, and the noise
-    (n, k) of each value in units of its channel's, None where it is the same of all."""
+    """Samples of one run before a time: t (n,), channels y (n, k), that run's inputs, the noise
+    (n, k) of each value in units of its channel's, None where it is the same of all, and the
+    parameters (k,) of the run's system."""
 
     t: np.ndarray
     y: np.ndarray
     inputs_t: np.ndarray
     inputs: np.ndarray
     noise: np.ndarray | None = None
+    args: np.ndarray | None = None
 
 
 class Law(NamedTuple):
     """A law in use: its form with all coefficients given, a root of their covariance (rootᵀ root),
-    and its sensors."""
+    and its sensors. Where its coefficients depend on parameters, `at` is that of one system."""
 
     form: Form
     p: np.ndarray
     root: np.ndarray
     sensors: Sensors
+
+    def at(self, args: np.ndarray | None) -> Law:
+        """The law of the system with these parameters (k,)."""
+        if self.form.powers is None:
+            return self
+        if args is None:
+            raise ValueError("expected the parameters of the system: the law depends on them")
+        weights = functions_of(self.form.powers, args)
+        form = dataclasses.replace(self.form, powers=None)
+        return Law(form, weights * self.p, weights * self.root, self.sensors)
+
+
+def of_windows(
+    laws: Sequence[Law], which: np.ndarray, windows: Sequence[Window]
+) -> tuple[Sequence[Law], np.ndarray]:
+    """The laws of the windows' systems, and which of them (B,) each window follows, of laws that
+    may depend on parameters and ``which`` (B,) of these."""
+    if laws[0].form.powers is None:
+        return laws, which
+    keys = [
+        (int(k), *np.asarray(window.args).tolist())
+        for k, window in zip(which, windows, strict=True)
+    ]
+    unique = list(dict.fromkeys(keys))
+    found = [laws[k].at(np.array(args)) for k, *args in unique]
+    return found, np.array([unique.index(key) for key in keys])
 
 
 def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> Law:
@@ -75,7 +107,11 @@ def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> La
         rows, losses = [*rows, ((0,) * law.dim, UNIFORM, 0.0)], np.append(losses, law.uniform)
         order = np.insert(order, count + law.friction.count, len(order))
     friction = Friction.of(rows, law.dim)
-    form = Form(law.terms, np.zeros(count), np.eye(count), friction, law.num_inputs)
+    powers = law.powers
+    if powers is not None and law.uniform != 0:  # γ is one number for all systems
+        last = count + law.friction.count
+        powers = (*powers[:last], (0,) * len(powers[0]), *powers[last:])
+    form = Form(law.terms, np.zeros(count), np.eye(count), friction, law.num_inputs, powers)
     p = np.concatenate([law.coefficients, losses, np.ravel(law.gains)])
     known = np.zeros((0, len(p))) if root is None else np.asarray(root)[:, order]
     return Law(form, p, known, sensors)
@@ -87,25 +123,21 @@ def law_of(map_: Any) -> Law:
         raise InputError(
             "expected a map that was learned from a recording, which knows its sensors"
         )
-    law = law_of_map(map_)
-    law = Lagrangian(*(_numpy(getattr(law, f.name)) for f in dataclasses.fields(law)))
+    law = jax.tree.map(np.asarray, law_of_map(map_))
     root = None if map_.posterior is None else map_.posterior.root
     return law_in_use(law, root, map_.sensors)
-
-
-def _numpy(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        return type(value)(*(np.asarray(getattr(value, f.name)) for f in dataclasses.fields(value)))
-    return np.asarray(value)
 
 
 def estimate(map_: Any, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """`SymplecticMap.estimate`."""
     law = law_of(map_)
-    windows = windows_of(law.sensors, recording)
-    lagrangian, d = law.form.lagrangian(law.p), law.form.dim
-    x, covariance = estimate_states(law, windows)
+    windows = windows_of(law.sensors, recording, map_.parameters)
+    d = law.form.dim
+    x, covariance = estimates_of([law], np.zeros(len(windows), int), windows)
     x, covariance = x[:, : 2 * d], covariance[:, : 2 * d, : 2 * d]
+    lagrangian = law.form.lagrangian(law.p)
+    if lagrangian.powers is not None:
+        lagrangian = lagrangian.at(np.stack([np.asarray(window.args) for window in windows]))
     found = lagrangian.derivatives(x[:, :d], x[:, d:])
     z = np.concatenate([x[:, :d], found.by_v], axis=1)
     turn = np.zeros_like(covariance)
@@ -121,7 +153,7 @@ def forecast(
     law = law_of(map_)
     sensors = law.sensors
     times = np.atleast_1d(np.asarray(times, float))
-    windows = windows_of(sensors, recording)
+    windows = windows_of(sensors, recording, map_.parameters)
     last = np.array([np.max(w.t) for w in windows])
     if times.ndim != 1 or not np.all(np.diff(times) > 0) or not np.all(times[0] >= last):
         raise InputError(
@@ -138,9 +170,10 @@ def forecast(
             _with_inputs(window, inputs, sensors, run)
             for window, run in zip(windows, recording.runs, strict=True)
         ]
-    x, covariance = estimate_states(law, windows)
+    laws, which = of_windows([law], np.zeros(len(windows), int), windows)
+    x, covariance = estimates_of(laws, which, windows)
     ahead = np.broadcast_to(times, (len(windows), len(times)))
-    orbits = propagate(law, windows, x, covariance, last, ahead)
+    orbits = propagate_each(laws, which, windows, x, covariance, last, ahead)
     names = sensors.observation_model.channels
     values = {n: orbits.values[..., k] for k, n in enumerate(names)}
     std = {n: orbits.std[..., k] for k, n in enumerate(names)}
@@ -148,13 +181,35 @@ def forecast(
         if n not in values:
             values[n] = orbits.states[..., i]
             std[n] = np.sqrt(orbits.covariances[..., i, i])
-    return Forecast(times, values, std)
+    return Forecast(times, values, std, _outside(map_.parameters, recording, windows))
 
 
-def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
+def _outside(
+    parameters: Parameters | None, recording: Recording, windows: Sequence[Window]
+) -> tuple[str, ...]:
+    """A line for each parameter of a run that lies beyond those that the law was learned from."""
+    if parameters is None:
+        return ()
+    low, high = (np.asarray(end) for end in (parameters.low, parameters.high))
+    least, most = (np.asarray(bound) for bound in parameters.bounds)
+    return tuple(
+        f"run {run}: {name} = {value:g} is outside {low[k]:g} to {high[k]:g}, which the law was "
+        "learned from"
+        for run, window in zip(recording.runs, windows, strict=True)
+        for k, (name, value) in enumerate(
+            zip(parameters.names, np.asarray(window.args), strict=True)
+        )
+        if not least[k] <= value <= most[k]
+    )
+
+
+def windows_of(
+    sensors: Sensors, recording: Recording, parameters: Parameters | None = None
+) -> list[Window]:
     """The last samples of each run. Raises InputError where a column is missing or they are few."""
     channels = sensors.observation_model.channels
-    needed = (*sensors.observation_model.needed, *sensors.inputs)
+    varied = () if parameters is None else parameters.names
+    needed = (*sensors.observation_model.needed, *sensors.inputs, *varied)
     missing = [n for n in needed if n not in recording.columns]
     if missing:
         raise InputError(
@@ -177,7 +232,8 @@ def windows_of(sensors: Sensors, recording: Recording) -> list[Window]:
         times, places, noise = t[finite], y[finite], noise[finite]
         recent = times >= times[-FEWEST:].min()
         recent |= times >= times.max() - sensors.window
-        window = Window(times[recent], places[recent], t[known], u[known], noise[recent])
+        args = None if parameters is None else args_of(recording, run, varied)
+        window = Window(times[recent], places[recent], t[known], u[known], noise[recent], args)
         windows.append(thinned(window))
     return windows
 
@@ -285,6 +341,23 @@ def _with_zeros(
         [across.swapaxes(1, 2), sigma[:, None] * open_ * sigma],
     ])  # fmt: skip
     return np.concatenate([x, (c.swapaxes(1, 2) @ r)[..., 0] * sigma], axis=1), covariance
+
+
+def estimates_of(
+    laws: Sequence[Law], which: np.ndarray, windows: Sequence[Window]
+) -> tuple[np.ndarray, np.ndarray]:
+    """`estimate_states` of windows of which each follows its own law, ``laws[which]``, which
+    (B,)."""
+    laws, which = of_windows(laws, which, windows)
+    states: list[Any] = [None] * len(windows)
+    for number in np.unique(which).tolist():
+        own = np.flatnonzero(which == number).tolist()
+        for n, x, covariance in zip(
+            own, *estimate_states(laws[number], [windows[n] for n in own]), strict=True
+        ):
+            states[n] = x, covariance
+    x, covariance = (np.stack(part) for part in zip(*states, strict=True))
+    return x, covariance
 
 
 def _started(sensors: Sensors, window: Window) -> tuple[Window, np.ndarray]:

@@ -21,6 +21,7 @@ from gfnn_jax.flows.motion import coulomb_rows
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.inputs import Signals
+from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import sizes, split
@@ -40,13 +41,16 @@ def map_of_law(
     angles: Sequence[int] = (),
     signals: Signals | None = None,
     inputs: Any = None,
+    parameters: tuple[str, ...] = (),
+    args: Any = None,
     root: Any = None,
     tolerance: float = 1e-9,
 ) -> SymplecticMap:
     """The map over dt of a law that was learned from states z (N, 2d), NumPy.
 
     angles: indices of q that have period 2π. signals: the inputs, where the law has gains of any;
-    inputs: (N, k) at these states, by which the steps are chosen too. root: (m, m), rootᵀ root the
+    inputs: (N, k) at these states, by which the steps are chosen too. parameters: names of those
+    that the law depends on; args: (N, k) their values at these states. root: (m, m), rootᵀ root the
     covariance of the law's coefficients (θ, ρ, G row by row, and γ where there is uniform
     friction). tolerance: of the step's own error, ÷ sizes of the coordinates.
 
@@ -60,16 +64,18 @@ def map_of_law(
     z, _, centre, covered = lift(np.asarray(z, float), np.asarray(z, float), coordinates)
     whole = tuple(a for a, all_of_it in zip(angles, covered, strict=True) if all_of_it)
     scale, some = sizes(z), slice(None, None, -(-len(z) // _JUDGED))
-    args = None
+    own = args[some] if parameters else None
     if signals is not None:
         u = np.zeros((len(z), count)) if inputs is None else np.asarray(inputs, float)
-        args = signals.constant(None, u[some], z[some].shape, np.float64)
-    steps = _steps(law, family, params, z[some], dt, scale, args, tolerance)
+        own = signals.constant(own, u[some], z[some].shape, np.float64)
+    one = law.at(args[some]) if parameters else law
+    steps = _steps(one, family, params, z[some], dt, scale, own, tolerance)
     flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, steps.newton)
     posterior = None if root is None else Posterior(0, np.asarray(root))
     return SymplecticMap(
         (flow,), coordinates, covering(z, ignore=whole), scale, centre, float(dt),
-        posterior=posterior, signals=signals,
+        parameters=sampled(parameters, args) if parameters else None, posterior=posterior,
+        signals=signals,
     )  # fmt: skip
 
 
@@ -101,6 +107,9 @@ def conformal(law: Lagrangian, covariance: np.ndarray) -> tuple[Lagrangian, np.n
     moved = [(k, n, m) for k, n, m, _ in rows if any(k)]
     plain = all(sum(k) == 2 and not any(n) and not any(m) for k, n, m in moved)
     alone = [row[1] for row in law.friction.rows()] == [LINEAR] and law.uniform == 0
+    if law.powers is not None:  # γ is one number for all systems
+        of_rate = [p for p, row in zip(law.powers, rows, strict=False) if any(row[0])]
+        alone = alone and not any(map(any, (*of_rate, law.powers[law.terms.count])))
     if law.dim > 1 or law.num_inputs or not plain or not alone:
         return law, covariance
     mass = 2 * sum(c for c, row in zip(law.coefficients, rows, strict=True) if any(row[0]))
@@ -108,6 +117,7 @@ def conformal(law: Lagrangian, covariance: np.ndarray) -> tuple[Lagrangian, np.n
     even = dataclasses.replace(
         law, friction=law.friction.take([]), losses=law.losses[:0],
         uniform=float(law.losses[0]) / mass,
+        powers=None if law.powers is None else law.powers[: law.terms.count],
     )  # fmt: skip
     return even, by[:, None] * covariance * by
 
@@ -130,15 +140,16 @@ def law_of_map(map_: SymplecticMap) -> Lagrangian:
     return law_of(piece.family, np.asarray(piece.params))
 
 
-def states_of(map_: SymplecticMap, q, v):
-    """z = (q, p) (..., 2d) of positions and velocities (..., d)."""
-    law = law_of_map(map_)
+def states_of(map_: SymplecticMap, q, v, args=None):
+    """z = (q, p) (..., 2d) of positions and velocities (..., d); args (..., k): parameters of the
+    system, of a map that has such."""
+    law = law_of_map(map_).at(args)
     return np.concatenate([q, law.momentum(np.asarray(q), np.asarray(v))], axis=-1)
 
 
-def velocities_of(map_: SymplecticMap, z):
-    """v (..., d) of states z = (q, p) (..., 2d)."""
-    law = law_of_map(map_)
+def velocities_of(map_: SymplecticMap, z, args=None):
+    """v (..., d) of states z = (q, p) (..., 2d), as `states_of`."""
+    law = law_of_map(map_).at(args)
     return Legendre(law.terms).velocity(law.coefficients, np.asarray(z))
 
 

@@ -34,6 +34,7 @@ from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.legendre import Legendre
+from gfnn_jax.flows.systems import OfSystems
 from gfnn_jax.flows.uniform import Uniform
 from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
@@ -61,8 +62,8 @@ _TYPES: dict[str, type] = {
         SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
         Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
         Windows, Groups, Ranges, OfTimeStep, Ensemble, Uniform, Forced, Legendre, Friction, Signals,
-        Sensors, Wander, Observation, SoftL1, Biweight, Damping, DampingOfArgs, FunctionsOfArgs,
-        OfDisplacement,
+        OfSystems, Sensors, Wander, Observation, SoftL1, Biweight, Damping, DampingOfArgs,
+        FunctionsOfArgs, OfDisplacement,
     )
 } | {"LagrangianTerms": lagrangian.Terms}  # fmt: skip
 _NAMES = {kind: name for name, kind in _TYPES.items()}

@@ -116,7 +116,7 @@ def _constant(dim: int, parameters: tuple[str, ...]) -> Terms:
 
 def _powers(dim: int, parameters: tuple[str, ...], args) -> Terms:
     """Products of whole powers, negative ones where a parameter keeps away from 0."""
-    inverse = [_keeps_away(column) for column in args.T]
+    inverse = [keeps_away(column) for column in args.T]
     ranges = [range(-OPTIONS.powers if i else 0, OPTIONS.powers + 1) for i in inverse]
     exponents = [e for e in product(*ranges) if sum(map(abs, e)) <= OPTIONS.total]
     variables = (*parameters, *(f"1/{name}" for name in parameters))
@@ -124,7 +124,7 @@ def _powers(dim: int, parameters: tuple[str, ...], args) -> Terms:
     return Terms(dim, variables, rows, parameters)
 
 
-def _keeps_away(values) -> bool:
+def keeps_away(values) -> bool:
     size = np.abs(values)
     return bool(np.ptp(np.sign(values)) == 0 and size.min() > _FAR_FROM_ZERO * size.max())
 
@@ -135,7 +135,7 @@ def _chebyshev(dim: int, parameters: tuple[str, ...], args, degree: int) -> Term
     for name, values in zip(parameters, args.T, strict=True):
         if (
             values.min() > 0
-            and _keeps_away(values)
+            and keeps_away(values)
             and np.ptp(np.log(values)) > np.log(OPTIONS.apart)
         ):
             name, values = f"log({name})", np.log(values)

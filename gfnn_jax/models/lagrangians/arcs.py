@@ -17,7 +17,8 @@ class LawOnArcs:
     """Steps h (A, L − 1) of a law with inputs u (A, L − 1, substeps, 6, k). What is seen are the
     channels of ``observation`` plus the ``zeros`` of angles; their coefficients come last, first
     the zeros', then the parameters of ``observation``. Coefficients that are not ``free`` (indices)
-    stay as in ``given``."""
+    stay as in ``given``. args (A, k): parameters of the system that each arc is of, where the
+    coefficients depend on such."""
 
     form: Form
     observation: Observation
@@ -26,6 +27,7 @@ class LawOnArcs:
     u: np.ndarray
     given: np.ndarray
     free: np.ndarray
+    args: np.ndarray | None = None
 
     def full(self, p: np.ndarray) -> np.ndarray:
         """All coefficients, of the free ones."""
@@ -36,16 +38,23 @@ class LawOnArcs:
     def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         arcs, length, m = x.shape
         whole, num = self.full(p), arcs * (length - 1)
+        form, coefficients, turn = self.form, whole[: self.form.count], None
+        if self.args is not None:
+            form, coefficients, turn = form.in_systems(coefficients, self.args)
+            coefficients = np.repeat(coefficients, length - 1, axis=0)
         step, _ = coulomb.step(
-            self.form,
-            whole[: self.form.count],
+            form,
+            coefficients,
             x[:, :-1].reshape(num, m),
             self.h.reshape(num),
             self.u.reshape(num, *self.u.shape[2:]),
             order=2 if len(self.free) else 1,
         )
+        of_step = step.by_coefficients
+        if turn is not None and len(self.free):
+            of_step = (of_step.reshape(arcs, -1, turn.shape[1]) @ turn).reshape(num, m, -1)
         by = np.zeros((num, m, len(whole)))
-        by[..., : step.by_coefficients.shape[-1]] = step.by_coefficients
+        by[..., : of_step.shape[-1]] = of_step
         shape = (arcs, length - 1, m)
         return Defects(
             step.states.reshape(shape) - x[:, 1:],

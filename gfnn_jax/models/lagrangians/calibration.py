@@ -19,7 +19,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Scales, Stretch
-from gfnn_jax.maps.estimates import Law, Window, estimate_states, propagate_each, thinned
+from gfnn_jax.maps.estimates import (
+    Law,
+    Window,
+    estimate_states,
+    of_windows,
+    propagate_each,
+    thinned,
+)
 
 _WINDOWS, _TRIED = 96, 16  # starts of forecasts; of those that choose the window
 _CHOICES = (0.25, 0.5, 1.0, 2.0)  # periods from which a state may be estimated
@@ -126,7 +133,7 @@ def _passed(error: np.ndarray, leads: np.ndarray, fraction: float) -> float:
 
 
 def _window(s: Stretch, begin: int, end: int) -> Window:
-    return Window(s.t[begin:end], s.y[begin:end], s.t, s.u, s.noise[begin:end])
+    return Window(s.t[begin:end], s.y[begin:end], s.t, s.u, s.noise[begin:end], s.args)
 
 
 def _starts(found: Sequence[Stretch], scales: Scales) -> list[tuple[int, int]]:
@@ -154,13 +161,14 @@ def _forecasts(
         times.append(np.where(inside, s.t[at], s.t[at[inside][-1]] if inside.any() else s.t[k]))
         measured.append(np.where(inside[:, None], s.y[at], np.nan))
     third = np.array([thirds.of(i, found[i].t[k]) for i, k in starts])
+    laws, which = of_windows(thirds.laws, third, cut)
     last = np.array([w.t[-1] for w in cut])
     states: list[Any] = [None] * len(cut)
-    for number, window in sorted(set(zip(third.tolist(), windows.tolist(), strict=True))):
-        own = np.flatnonzero((third == number) & (windows == window)).tolist()
-        found_there = estimate_states(thirds.laws[number], [cut[n] for n in own])
+    for number, window in sorted(set(zip(which.tolist(), windows.tolist(), strict=True))):
+        own = np.flatnonzero((which == number) & (windows == window)).tolist()
+        found_there = estimate_states(laws[number], [cut[n] for n in own])
         for n, x, covariance in zip(own, *found_there, strict=True):
             states[n] = x, covariance
     x, covariance = (np.stack(part) for part in zip(*states, strict=True))
-    orbits = propagate_each(thirds.laws, third, cut, x, covariance, last, np.array(times))
+    orbits = propagate_each(laws, which, cut, x, covariance, last, np.array(times))
     return orbits.values - np.array(measured), orbits.std

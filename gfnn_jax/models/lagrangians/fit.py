@@ -78,8 +78,40 @@ class LawFit:
         return np.sqrt(np.nanmean(left**2, axis=(0, 1))) * self.sigma
 
 
+class Systems(NamedTuple):
+    """Parameters of the systems that a recording is of: their names, and values (n, k) of the
+    stretch of each of the nodes, and (m, k) of the positions of the gauge."""
+
+    names: tuple[str, ...]
+    of_nodes: np.ndarray
+    of_gauge: np.ndarray
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], nodes: Sequence[Nodes]) -> Systems | None:
+        """Make those of the runs that the nodes are of; None where there are no such ``names``."""
+        if not names:
+            return None
+        values = np.stack([n.stretch.args for n in nodes])
+        return cls(names, values, np.repeat(values, [len(n.t) for n in nodes], axis=0))
+
+    @property
+    def which(self) -> np.ndarray:
+        """The number (n,) of the system that each of the nodes is of."""
+        return np.unique(self.of_nodes, axis=0, return_inverse=True)[1].ravel()
+
+    @property
+    def few(self) -> bool:
+        """Return whether a third of the systems is needed to tell how they differ."""
+        return bool(self.which.max() < 2 * FOLDS)
+
+    def __call__(self, arcs: Arcs) -> np.ndarray:
+        """(A, k) of arcs."""
+        return self.of_nodes[[i for i, _, _ in arcs.home]]
+
+
 class Without(NamedTuple):
-    """A fit without a third of the record, and the run and the time at which that third begins."""
+    """A fit without a third of the record, and the run and the time at which a part of that third
+    begins."""
 
     fit: LawFit
     run: str
@@ -89,13 +121,15 @@ class Without(NamedTuple):
 @dataclasses.dataclass(frozen=True, eq=False)
 class Workbench:
     """Basis that all fits of one recording share: positions of the gauge, the inputs of arcs, the
-    fastest frequency ω, how states are seen, and how zeros of channels wander, if they do."""
+    fastest frequency ω, how states are seen, how zeros of channels wander, if they do, and the
+    parameters of the systems, if these differ."""
 
     gauge: np.ndarray
     inputs: Any  # of arcs: ArcInputs, or a function in its place
     omega: float
     observation: Observation
     wander: Wander | None = None
+    systems: Systems | None = None
 
     def whitening(self, arcs: Arcs) -> np.ndarray | None:
         """Whitening (A, k, L, L) of the residuals of arcs; None where they are white."""
@@ -104,10 +138,14 @@ class Workbench:
         return self.wander.whitening(arcs.t, np.where(np.isfinite(arcs.y), arcs.noise, np.inf))
 
     def model(self, structure: Structure, arcs: Arcs, given: np.ndarray, free: np.ndarray):
-        form = structure.form(self.gauge)
         u = self.inputs(arcs)
         h = np.diff(arcs.t, axis=1)
-        return LawOnArcs(form, self.observation, structure.zeros, h, u, given, free)
+        if self.systems is None:
+            form, args = structure.form(self.gauge), None
+        else:
+            form, args = structure.form(self.gauge, self.systems.of_gauge), self.systems(arcs)
+        args = None if form.powers is None else args
+        return LawOnArcs(form, self.observation, structure.zeros, h, u, given, free, args)
 
     def state_scale(self, sigma: np.ndarray) -> np.ndarray:
         """The defect (2d,) that counts as one standard deviation of the channels."""
@@ -163,7 +201,7 @@ class Workbench:
     ) -> np.ndarray:
         """Held-out cost (A,) of each arc: of three blocks of arcs, each left out of a fit. All in
         the noise scale of ``fit``; infinite where a fit fails."""
-        arcs, third = in_thirds(nodes, fit)
+        arcs, third = in_thirds(nodes, fit, self.systems)
         costs = np.full(len(arcs.home), np.inf)
         for k in range(FOLDS):
             some = self.fit(structure, known, arcs.take(third != k), fit.sigma, rescale=False)
@@ -172,8 +210,9 @@ class Workbench:
 
     def without_thirds(self, nodes: Sequence[Nodes], fit: LawFit) -> list[Without]:
         """The fit without each third of the record, by one Gauss–Newton step from that to all of
-        it: close to a fit its residuals are linear in the coefficients."""
-        arcs, third = in_thirds(nodes, fit)
+        it: close to a fit its residuals are linear in the coefficients; where the parts of each
+        third begin."""
+        arcs, third = in_thirds(nodes, fit, self.systems)
         noise, scale, loss = (
             fit.sigma * arcs.noise,
             self.state_scale(fit.sigma),
@@ -186,16 +225,16 @@ class Workbench:
         )
         model = self.model(fit.structure, arcs, fit.p, np.arange(len(fit.p)))
         rows = rows_of_arcs(model, fit.p, own.x, arcs.y, noise, loss, whitening)
-        found = []
-        for k in np.unique(third):
-            i, first, _ = arcs.home[int(np.argmax(third == k))]
+        fits = {}
+        for k in np.unique(third).tolist():
             others = rows[third != k].reshape(-1, rows.shape[-1])
             size = np.maximum(np.linalg.norm(others[:, :-1], axis=0), 1e-300)
             change = np.linalg.lstsq(others[:, :-1] / size, others[:, -1], rcond=1e-10)[0] / size
             fitted = dataclasses.replace(fit.fitted, p=fit.p + change)
-            moved = dataclasses.replace(fit, fitted=fitted)
-            found.append(Without(moved, nodes[i].stretch.run, float(nodes[i].t[first])))
-        return found
+            fits[k] = dataclasses.replace(fit, fitted=fitted)
+        begun = np.flatnonzero(np.diff(third, prepend=-1)).tolist()
+        homes = [(int(third[j]), *arcs.home[j][:2]) for j in begun]
+        return [Without(fits[k], nodes[i].stretch.run, float(nodes[i].t[a])) for k, i, a in homes]
 
     def scores(self, fit: LawFit, candidates: Structure) -> dict[Key, float]:
         """Distance from zero, in standard errors, of each coefficient of ``candidates`` that the
@@ -223,12 +262,35 @@ class Workbench:
         return scores
 
 
-def in_thirds(nodes: Sequence[Nodes], fit: LawFit) -> tuple[Arcs, np.ndarray]:
+def in_thirds(
+    nodes: Sequence[Nodes], fit: LawFit, systems: Systems | None = None
+) -> tuple[Arcs, np.ndarray]:
     """Arcs of the nodes, and the third of the record (A,) that each lies in. They are as long as
     those of the fit, or as long as three of them can be."""
-    length = min(fit.arcs.t.shape[1], sum(len(n.t) for n in nodes) // FOLDS)
+    length = min(fit.arcs.t.shape[1], a_third(nodes, systems))
     arcs = arcs_of(with_states(nodes, fit.arcs, fit.fitted.x), length)
-    return arcs, np.arange(len(arcs.home)) * FOLDS // len(arcs.home)
+    return arcs, thirds_of(arcs, systems)
+
+
+def a_third(nodes: Sequence[Nodes], systems: Systems | None) -> int:
+    """The length of which three arcs can be: of all nodes, of a few systems of those of each."""
+    lengths = np.array([len(n.t) for n in nodes])
+    if systems is None or not systems.few:
+        return int(lengths.sum()) // FOLDS
+    return int(np.bincount(systems.which, lengths).min()) // FOLDS
+
+
+def thirds_of(arcs: Arcs, systems: Systems | None) -> np.ndarray:
+    """The third of the record (A,) that each arc lies in: of a few systems a third of the runs of
+    each, for without one of them hardly anything tells how a law depends on their parameters."""
+    count = len(arcs.home)
+    place = np.arange(count)
+    if systems is not None and systems.few:
+        own = systems.which[[i for i, _, _ in arcs.home]]
+        earlier = np.array([np.sum(own[:k] == own[k]) for k in place])
+        share = (earlier + 0.5) / np.bincount(own)[own]
+        place = np.argsort(np.argsort(share, kind="stable"))
+    return place * FOLDS // count
 
 
 def correlation_time(residuals: np.ndarray) -> float:

@@ -30,7 +30,13 @@ import numpy as np
 from scipy.optimize import nnls
 
 from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
-from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench, correlation_time
+from gfnn_jax.models.lagrangians.fit import (
+    FOLDS,
+    LawFit,
+    Workbench,
+    correlation_time,
+    thirds_of,
+)
 from gfnn_jax.models.lagrangians.structure import Loss
 from gfnn_jax.solve.latent_arcs import rows_of_arcs
 
@@ -150,24 +156,28 @@ def _table_of(bench: Workbench, fit: LawFit, candidates: Sequence[Loss]) -> Tabl
     rest = [k for k in range(len(keys)) if k not in own]
     rows = rows[..., [*rest, *own, len(keys)]]
     rows[..., -1] += rows[..., len(rest) : -1] @ p[own]  # as if there were no friction
-    return Table(tuple(candidates), rows, fit.correlation)
+    thirds = thirds_of(fit.arcs, bench.systems)
+    return Table(tuple(candidates), rows, fit.correlation, thirds=thirds)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Table:
     """Rows (A, L, k, n + 1) of arcs, or of pairs, close to a fit: derivatives in the coefficients,
     the candidates' last, and the residuals, which are those without friction; the correlation of
-    residuals; and their rounding, below which no set is better than another."""
+    residuals; their rounding, below which no set is better than another; and the third (A,) that
+    each arc lies in, None where they lie in the order of the rows."""
 
     candidates: tuple[Loss, ...]
     rows: np.ndarray
     correlation: float
     rounding: float = 0.0
+    thirds: np.ndarray | None = None
 
     @functools.cached_property
     def folds(self) -> np.ndarray:
         """The arcs of each third (thirds, A)."""
         place = np.arange(len(self.rows)) * FOLDS // len(self.rows)
+        place = place if self.thirds is None else self.thirds
         return place == np.unique(place)[:, None]
 
     @property

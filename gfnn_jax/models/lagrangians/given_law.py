@@ -11,7 +11,7 @@ from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.fit import Workbench
+from gfnn_jax.models.lagrangians.fit import Systems, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import choose_rule, with_delay
@@ -30,12 +30,17 @@ from gfnn_jax.models.lagrangians.zeros_of_runs import with_zeros_of_runs
 def fit_given(
     given: Given, nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
     inputs: Mapping[str, ArcInputs], observation: Observation, on_progress: Callable[[str], object],
-    options: SearchOptions,
+    options: SearchOptions, parameters: tuple[str, ...] = (),
 ) -> Found:  # fmt: skip
-    """Fit exactly the terms that are given, with the result of `law_search.search`."""
+    """Fit exactly the terms that are given, with the result of `search.search`. parameters: in
+    which the systems of the runs differ, and by which terms may be multiplied."""
     d = observation.dim
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
-    benches = {hold: Workbench(gauge, u, scales.omega, observation) for hold, u in inputs.items()}
+    systems = Systems.of(parameters, nodes)
+    benches = {
+        hold: Workbench(gauge, u, scales.omega, observation, systems=systems)
+        for hold, u in inputs.items()
+    }
     sensors = tuple(zip(observation.parameters, map(float, observation.values), strict=True))
     linear = tuple(libraries.losses(d, (LINEAR,), 0.0)[:d])
     friction = linear if given.friction is None else given.friction

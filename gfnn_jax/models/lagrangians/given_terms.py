@@ -18,7 +18,7 @@ import numpy as np
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.expressions import plain
 from gfnn_jax.families.lagrangian import DRY, LINEAR, MAX_POWER, QUADRATIC
-from gfnn_jax.models.lagrangians.structure import Loss, Row
+from gfnn_jax.models.lagrangians.structure import Loss, Row, with_powers
 
 _SINE = -np.pi / 2
 Node = ast.expr
@@ -31,13 +31,17 @@ class Given(NamedTuple):
     friction: tuple[Loss, ...] | None
 
 
-def given_terms(texts: Sequence[Any], positions: Sequence[str], speeds: Sequence[str]) -> Given:
-    """The terms that these texts name.
+def given_terms(
+    texts: Sequence[Any], positions: Sequence[str], speeds: Sequence[str],
+    parameters: Sequence[str] = (),
+) -> Given:  # fmt: skip
+    """The terms that these texts name. ``parameters`` are those in which the systems of the
+    runs differ.
 
     Without a kinetic term each coordinate has its ½v². Raises InputError, a line with the text, for
     what is no term of such a law.
     """
-    reader = _Reader(tuple(positions), tuple(speeds))
+    reader = _Reader(tuple(positions), tuple(speeds), tuple(parameters))
     rows: list[Row] = []
     losses: list[Loss] = []
     kinds = set()
@@ -93,11 +97,23 @@ class _Reader(NamedTuple):
 
     positions: tuple[str, ...]
     speeds: tuple[str, ...]
+    parameters: tuple[str, ...]
+
+    def apart(self, node: Node) -> tuple[list[tuple[Node, int]], tuple[int, ...]]:
+        """The factors of a product that are no parameters, and the powers of these."""
+        powers, others = [0] * len(self.parameters), []
+        for factor, power in _factors(node):
+            if isinstance(factor, ast.Name) and factor.id in self.parameters:
+                powers[self.parameters.index(factor.id)] += power
+            else:
+                others.append((factor, power))
+        return others, tuple(powers)
 
     def row(self, node: Node, text: str) -> Row:
-        """(k, n, m, φ) of a product."""
+        """(k, n, m, φ) of a product, with its powers of parameters."""
         k, n, wave = [0] * len(self.positions), [0] * len(self.positions), None
-        for factor, power in _factors(node):
+        factors, of_system = self.apart(node)
+        for factor, power in factors:
             if isinstance(factor, ast.Constant):
                 continue
             if isinstance(factor, ast.Name) and factor.id in (*self.positions, *self.speeds):
@@ -116,11 +132,12 @@ class _Reader(NamedTuple):
         if sum(k) > 2 or max(n, default=0) > MAX_POWER or min([*k, *n]) < 0:
             raise self.refused(text)
         m, phase = wave if wave is not None else ((0,) * len(n), 0.0)
-        return tuple(k), tuple(n), m, phase
+        return with_powers((tuple(k), tuple(n), m, phase), of_system)
 
     def loss(self, node: Node, text: str) -> Loss:
-        """(c, kind, ε) of a friction."""
-        factors = [(f, p) for f, p in _factors(node) if not isinstance(f, ast.Constant)]
+        """(c, kind, ε) of a friction, with its powers of parameters."""
+        factors, of_system = self.apart(node)
+        factors = [(f, p) for f, p in factors if not isinstance(f, ast.Constant)]
         if len(factors) != 1:
             raise self.refused(text)
         (factor, power), kind, width = factors[0], LINEAR, 0.0
@@ -137,7 +154,8 @@ class _Reader(NamedTuple):
         multiples, rest = self.linear(inside, text)
         if rest or not multiples or set(multiples) - set(self.speeds):
             raise self.refused(text)
-        return tuple(multiples.get(name, 0) for name in self.speeds), kind, width
+        direction = tuple(multiples.get(name, 0) for name in self.speeds)
+        return with_powers((direction, kind, width), of_system)
 
     def smoothed(self, node: Node, text: str) -> tuple[Node, float]:
         """(v, ε) of v² + ε²."""
@@ -171,10 +189,11 @@ class _Reader(NamedTuple):
         raise self.refused(text)
 
     def refused(self, text: str) -> InputError:
+        of = f", times whole powers of {', '.join(self.parameters)}" if self.parameters else ""
         return InputError(
             f"terms: '{text}' is no term of a law. A term of L or V is a product of powers of "
             f"{', '.join(self.positions)}, one cos or sin of a sum of whole multiples of them, and "
-            f"in L up to two of {', '.join(self.speeds)}; one of R is v**2, abs(v)**3 or abs(v)"
+            f"in L up to two of {', '.join(self.speeds)}; one of R is v**2, abs(v)**3 or abs(v){of}"
         )
 
 
@@ -182,11 +201,12 @@ def _factors(node: Node) -> list[tuple[Node, int]]:
     """(factor, power) of a product; numbers below a fraction line are numbers."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
         return [*_factors(node.left), *_factors(node.right)]
-    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div) and _number(node.right):
-        return _factors(node.left)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):
+        below = [] if _number(node.right) else _factors(node.right)
+        return [*_factors(node.left), *((factor, -power) for factor, power in below)]
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
         power = _number(node.right)
-        if power is not None and power.is_integer() and power > 0:
+        if power is not None and power.is_integer() and power != 0:
             return [(factor, inner * int(power)) for factor, inner in _factors(node.left)]
     if isinstance(node, ast.UnaryOp):
         return _factors(node.operand)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.data.channels import parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.stretches import Nodes, Scales, Stretch
 from gfnn_jax.families.lagrangian import Lagrangian
@@ -59,6 +60,11 @@ class Record:
     hold: str
     delay: float
 
+    @property
+    def args(self) -> np.ndarray:
+        """Parameters (n, k) of the system of each of the nodes' states."""
+        return np.concatenate([np.tile(n.stretch.args, (len(n.t), 1)) for n in self.nodes])
+
     def in_use(self, bench: Workbench, fit: LawFit, choice: FrictionChoice) -> InUse:
         """The fit made ready for forecasts."""
         law, covariance = in_columns(fit)
@@ -69,10 +75,11 @@ class Record:
         )
         for name, value in self.mass.items():
             q = np.concatenate([n.x[:, : fit.form.dim] for n in self.nodes])
-            i = names.index(name)
-            scale = value / float(np.mean(law.masses(q)[:, i, i]))
+            i, of_systems = names.index(name), law.at(self.args)
+            scale = value / float(np.mean(of_systems.masses(q)[:, i, i]))
             law, covariance = scaled(law, covariance, scale)
             gauge = f"the mean inertia of {name} over the data is {value:g}, as given"
+        gauge += self._of_systems(law)
         moving, of_moving = conformal(law, covariance)
         root, sensors = covariance_root(of_moving), self.sensors(bench, fit)
         spread = np.nanstd(np.concatenate([s.y for s in self.found]), axis=0)
@@ -80,6 +87,23 @@ class Record:
         used = law_in_use(moving, root, sensors)
         calibration = calibrated(used, thirds, self.found, self.scales, spread)
         return InUse(bench, fit, choice, law, covariance, moving, root, scale, gauge, calibration)
+
+    def _of_systems(self, law: Lagrangian) -> str:
+        """What fixes the scale of L in each run, where these are of different systems."""
+        if law.powers is None:
+            return ""
+        names = ", ".join(parameters_of(self.recording))
+        inertia = [
+            row for row, term in zip(law.powers, law.terms.rows(), strict=False) if term[0][0] == 2
+        ]
+        if law.num_inputs:
+            return f"; gains of inputs are the same for all values of {names}"
+        if any(map(any, inertia)):
+            return (
+                f"; a run tells ratios of coefficients alone, and of laws with the same ratios for "
+                f"every {names} this has the fewest terms"
+            )
+        return f"; for every {names}, since a run tells ratios of coefficients alone"
 
     def sensors(self, bench: Workbench, fit: LawFit) -> Sensors:
         """The sensors, as yet without a misfit."""

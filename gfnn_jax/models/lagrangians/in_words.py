@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.data.channels import parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
+from gfnn_jax.families.lagrangian import Powers
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.in_use import InUse
@@ -20,6 +22,7 @@ from gfnn_jax.models.lagrangians.text import (
     Expression,
     Term,
     friction_of,
+    of_systems,
     speed_names,
     terms_of,
     which_friction_line,
@@ -58,7 +61,8 @@ def in_words(
         delay=(acting.delay, acting.error) if recording.inputs else None,
         input_rules=dict(acting.others),
         which_friction=which_friction_line(best.choice, best.scale, law.dim, names.speeds),
-        hamiltonian=hamiltonian_of(law.terms, lagrangian, names.coordinates), zeros=zeros,
+        hamiltonian=hamiltonian_of(law, lagrangian, names.coordinates, names.parameters),
+        zeros=zeros,
         noise=dict(zip(channels, map(float, sensors.sigma / factors), strict=True)),
         residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)),
         gauge=best.gauge,
@@ -75,16 +79,18 @@ def in_words(
 
 
 class _Names(NamedTuple):
-    """Symbols of coordinates and of their speeds, as formulas write them."""
+    """Symbols of coordinates, of their speeds, and of parameters, as formulas write them."""
 
     coordinates: tuple[str, ...]
     speeds: tuple[str, ...]
+    parameters: tuple[str, ...] = ()
 
 
 def _names(recording: Recording) -> _Names:
-    names = recording.coordinates
-    listed = symbols((*names, *speed_names(names, recording.velocities)))
-    return _Names(listed[: len(names)], listed[len(names) :])
+    names, d = recording.coordinates, len(recording.coordinates)
+    speeds = speed_names(names, recording.velocities)
+    listed = symbols((*names, *speeds, *parameters_of(recording)))
+    return _Names(listed[:d], listed[d : 2 * d], listed[2 * d :])
 
 
 def _standard_errors(best: InUse) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
@@ -100,8 +106,12 @@ def _expressions(best: InUse, names: _Names) -> tuple[Expression, Expression]:
     """L and Rayleigh's R; uniform friction enters R as γ T."""
     law = best.law
     of_terms, of_losses, _, of_rate = _standard_errors(best)
-    lagrangian = terms_of(law.terms, law.coefficients, of_terms, *names)
+    lagrangian = terms_of(law.terms, law.coefficients, of_terms, names.coordinates, names.speeds)
     friction = friction_of(law.friction, law.losses, of_losses, names.speeds)
+    if law.powers is not None:
+        lagrangian = of_systems(lagrangian, law.powers[: law.terms.count], names.parameters)
+        of_friction = law.powers[law.terms.count :][: law.friction.count]
+        friction = of_systems(friction, of_friction, names.parameters)
     if law.uniform == 0:
         return lagrangian, friction
     kinetic = tuple(
@@ -146,7 +156,7 @@ def _warnings(best: InUse, recording: Recording, gains: Gains) -> list[str]:
             "the record gains energy that no input explains. If the system is driven, name its "
             "drive: --inputs NAME (inputs=)"
         )
-    found += parameters_left_out(recording)
+    found += about_parameters(recording, best.law.powers)
     return found + [
         f"no force of the input {u} is seen: its gain is within {_SEEN:g} standard errors of 0. "
         f"Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
@@ -155,17 +165,22 @@ def _warnings(best: InUse, recording: Recording, gains: Gains) -> list[str]:
     ]
 
 
-def parameters_left_out(recording: Recording) -> list[str]:
-    """A warning for each parameter that differs from run to run: a law has none."""
+def about_parameters(recording: Recording, powers: Powers | None) -> list[str]:
+    """A warning for each parameter that differs from run to run: which the law, of these powers of
+    them, does not depend on, or of which there are too few values."""
     found = []
-    for name in recording.parameters:
-        values = np.concatenate([recording.values(name, run) for run in recording.runs])
-        least, most = np.nanmin(values), np.nanmax(values)
-        if least < most:
-            unit = f" {recording.unit(name)}" if recording.unit(name) else ""
+    for k, name in enumerate(parameters_of(recording)):
+        values = {float(recording.values(name, run)[0]) for run in recording.runs}
+        range_ = f"{name} is {min(values):g} to {max(values):g}"
+        if not any(row[k] for row in powers or ()):
             found.append(
-                f"{name} is {least:g} to {most:g}{unit} and the law is one for all runs. If {name} "
-                "moves anything, fit the runs of each value by themselves"
+                f"{range_}, and no coefficient of the law depends on it, as far as this recording "
+                "tells"
+            )
+        elif len(values) == 2:
+            found.append(
+                f"{range_}, two values: they do not tell functions of {name} apart that agree "
+                "there. Forecasts between them and beyond need a third"
             )
     return found
 

@@ -8,14 +8,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.exports import symbolic
-from gfnn_jax.families.lagrangian import DRY, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import DRY, Lagrangian
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.calibration import Horizon
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.input_rules import RULES
 from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness
-from gfnn_jax.models.lagrangians.text import Expression, Term, WhichFriction, measured, terms_of
+from gfnn_jax.models.lagrangians.text import (
+    Expression,
+    Term,
+    WhichFriction,
+    measured,
+    of_systems,
+    terms_of,
+)
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
 _SHOWN = 3  # pairs of coefficients that are not told apart
@@ -215,13 +222,18 @@ class Hamiltonian:
         return Expression(tuple(t for t in self.terms if not t.term.startswith("M")))
 
 
-def hamiltonian_of(terms: Terms, lagrangian: Expression, names: tuple[str, ...]) -> Hamiltonian:
+def hamiltonian_of(
+    law: Lagrangian, lagrangian: Expression, names: tuple[str, ...], parameters: tuple[str, ...]
+) -> Hamiltonian:
     """The entries of M as "M12: factor", and V = −(the terms of L without v)."""
+    terms = law.terms
     coefficients = np.array([t.coefficient for t in lagrangian.terms])
     std = np.array([t.std for t in lagrangian.terms])
     still = dataclasses.replace(terms, speeds=np.zeros_like(terms.speeds))
-    factors = terms_of(still, coefficients, std, names, names).terms
-    listed = []
+    found = terms_of(still, coefficients, std, names, names)
+    if law.powers is not None:
+        found = of_systems(found, law.powers[: terms.count], parameters)
+    factors, listed = found.terms, []
     for row, (factor, c, error) in zip(terms.rows(), factors, strict=True):
         axes = [i for i, k in enumerate(row[0]) for _ in range(k)]
         if len(axes) == 2:

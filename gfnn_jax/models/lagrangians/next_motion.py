@@ -97,12 +97,15 @@ def _followed(bench: Workbench, fit: LawFit, starts: Sequence[np.ndarray]) -> li
     steps = np.diff(fit.arcs.t, axis=1)
     h = np.full(len(starts), np.median(steps[steps > 0]))
     still = np.zeros((len(starts), *bench.inputs(fit.arcs).shape[2:]))
-    coefficients = fit.p[: fit.form.count]
+    form, coefficients = fit.form, fit.p[: fit.form.count]
+    if form.powers is not None and bench.systems is not None:  # of the first arc's system
+        form, each, _ = form.in_systems(coefficients, bench.systems(fit.arcs)[:1])
+        coefficients = each[0]
     first = np.array(starts)
     x = [np.concatenate([first, np.zeros((len(starts), d))], axis=1)]
     for _ in range(length - 1):
         with np.errstate(all="ignore"):
-            x.append(coulomb.step(fit.form, coefficients, x[-1], h, still, order=0)[0].states)
+            x.append(coulomb.step(form, coefficients, x[-1], h, still, order=0)[0].states)
     states = np.stack(x, axis=1)
     off = np.abs(states[..., :d] - first[:, None])
     far = 10 * (np.ptp(bench.gauge, axis=0) + np.abs(first))

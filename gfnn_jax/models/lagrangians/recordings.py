@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.data.channels import parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.dataset.rests import without_rests
@@ -33,6 +34,7 @@ from gfnn_jax.models.lagrangians.input_rules import RULES, Acting, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.next_motion import next_motions
+from gfnn_jax.models.lagrangians.of_systems import search_of_systems
 from gfnn_jax.models.lagrangians.search import NO_LAW, Found, SearchOptions, describe, search
 from gfnn_jax.models.lagrangians.text import speed_names
 from gfnn_jax.models.lagrangians.traces import traces_of
@@ -69,12 +71,10 @@ def fit_recording(
         steps.append(line)
         on_progress(line)
 
-    samples = _samples(recording, loss, note)
-    asked = _asked(terms, samples)
-    nodes = nodes_of(samples.stretches, samples.scales)
-    gauge = np.concatenate([n.x[:, : samples.observation.dim] for n in nodes])
     holds = _holds(recording, input_hold)
-    acting, choice, nodes = _searched(samples, nodes, asked, holds, note, options)
+    parameters = parameters_of(recording)
+    samples, gauge, found = _found(recording, loss, parameters, terms, holds, note, options)
+    acting, choice, nodes = found
     bench, fit = _with_finer_steps(acting, gauge, samples, nodes, note)
     measured = velocities(recording, fit, nodes)
     for name, one in measured.items():
@@ -133,13 +133,15 @@ def _holds(recording: Recording, input_hold: str) -> tuple[str, ...]:
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Samples:
     """Samples of a recording as a fit sees them: how its columns show the coordinates, which of
-    these are angles, stretches without gaps, their scales, and what was left out."""
+    these are angles, stretches without gaps, their scales, the parameters in which the systems of
+    the runs differ, and what was left out."""
 
     recording: Recording
     observation: Observation
     angles: tuple[int, ...]
     stretches: list[Stretch]
     scales: Scales
+    parameters: tuple[str, ...] = ()
     messages: tuple[str, ...] = ()
 
     @property
@@ -155,25 +157,45 @@ class _Samples:
         )  # fmt: skip
 
 
-def _samples(recording: Recording, loss: Loss | None, on_progress: OnProgress) -> _Samples:
+def _found(
+    recording: Recording, loss: Loss | None, parameters: tuple[str, ...], terms: Sequence[Any],
+    holds: Sequence[str], on_progress: OnProgress, options: SearchOptions,
+) -> tuple[_Samples, np.ndarray, Found]:  # fmt: skip
+    """The samples, the positions (n, d) of the gauge, and the law of these parameters; where
+    nothing depends on them, all as of one system."""
+    samples = _samples(recording, loss, on_progress, parameters)
+    nodes = nodes_of(samples.stretches, samples.scales)
+    gauge = np.concatenate([n.x[:, : samples.observation.dim] for n in nodes])
+    asked = _asked(terms, samples)
+    found = _searched(samples, nodes, asked, holds, on_progress, options)
+    if found is None:
+        return _found(recording, loss, (), terms, holds, on_progress, options)
+    return samples, gauge, found
+
+
+def _samples(
+    recording: Recording, loss: Loss | None, on_progress: OnProgress, parameters: tuple[str, ...]
+) -> _Samples:
     """The samples of the positions, without rests, each σ as given where it is."""
     observation, angles = _observation(recording)
     observation = observation if loss is None else dataclasses.replace(observation, loss=loss)
-    found = _stretches(recording, observation, angles)
+    found = _stretches(recording, observation, angles, parameters)
     offset = [i for i in observation.shifts() if i not in angles]
     if offset and not recording.guess:  # an offset starts at the middle of its coordinate
         middle = np.mean(np.concatenate([s.q for s in found]), axis=0)
         observation = observation.shifted(
             np.where(np.isin(range(observation.dim), offset), middle, 0.0)
         )
-        found = _stretches(recording, observation, angles)
-    samples = _Samples(recording, observation, angles, found, measure(found))
+        found = _stretches(recording, observation, angles, parameters)
+    samples = _Samples(recording, observation, angles, found, measure(found), parameters)
     if observation.is_plain:
         found, resting = without_rests(found, samples.scales)
         if resting:
             line = f"{resting:.3g} s at rest left out: a body that stands still tells no law"
             on_progress(line)
-            samples = _Samples(recording, observation, angles, found, measure(found), (line,))
+            samples = dataclasses.replace(
+                samples, stretches=found, scales=measure(found), messages=(line,)
+            )
     sigma = np.where(samples.given > 0, samples.given, samples.scales.sigma)
     return dataclasses.replace(samples, scales=dataclasses.replace(samples.scales, sigma=sigma))
 
@@ -201,45 +223,54 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
 
 
 def _stretches(
-    recording: Recording, observation: Observation, angles: tuple[int, ...]
-) -> list[Stretch]:
+    recording: Recording, observation: Observation, angles: tuple[int, ...],
+    parameters: tuple[str, ...],
+) -> list[Stretch]:  # fmt: skip
     """The stretches of a recording, as the parameters of ``observation`` show its coordinates."""
     if observation.is_plain:
-        return stretches(recording)
+        return stretches(recording, parameters=parameters)
     return stretches(
-        recording, observation.channels, partial(observation.coordinates_of, angles=angles)
-    )
+        recording, observation.channels, partial(observation.coordinates_of, angles=angles),
+        parameters,
+    )  # fmt: skip
 
 
 def _asked(terms: Sequence[Any], samples: _Samples) -> Given | None:
     """The terms that were given, by the names of formulas."""
     observation = samples.observation
-    names = symbols((*observation.coordinates, *observation.speeds))
     d = observation.dim
-    return given_terms(terms, names[:d], names[d:]) if terms else None
+    names = symbols((*observation.coordinates, *observation.speeds, *samples.parameters))
+    return given_terms(terms, names[:d], names[d : 2 * d], names[2 * d :]) if terms else None
 
 
 def _searched(
     samples: _Samples, nodes: Sequence[Nodes], asked: Given | None, holds: Sequence[str],
     on_progress: OnProgress, options: SearchOptions,
-) -> Found:  # fmt: skip
-    """The law that a search finds, or that of the terms which were asked for."""
+) -> Found | None:  # fmt: skip
+    """The law that a search finds, or that of the terms which were asked for; None where no
+    coefficient depends on the samples' parameters."""
     scales = samples.scales
     inputs = {hold: ArcInputs(nodes, scales.substeps, hold) for hold in holds}
-    find = search if asked is None else partial(fit_given, asked)
+    find: Callable[..., Found | None] = search
+    if asked is not None:
+        find = partial(fit_given, asked, parameters=samples.parameters)
+    elif samples.parameters:
+        find = partial(search_of_systems, parameters=samples.parameters)
 
-    def with_rules(inputs: Mapping[str, ArcInputs]) -> Found:
+    def with_rules(inputs: Mapping[str, ArcInputs]) -> Found | None:
         return find(
             nodes, scales, samples.angles, len(samples.recording.inputs), inputs,
             samples.observation, on_progress, options,
         )  # fmt: skip
 
     found = with_rules(inputs)
+    if found is None:
+        return None
     period = max(6, round(scales.per_period))
     acting = choose_again(found.acting, inputs, found.nodes, period, scales.dt)
     if acting.hold != found.acting.hold:
         on_progress(f"inputs {RULES[acting.hold]}: held-out arcs choose it with the law found")
-        found = with_rules({acting.hold: inputs[acting.hold]})
+        found = with_rules({acting.hold: inputs[acting.hold]}) or found
     found = found._replace(acting=found.acting._replace(others=acting.others))
     fit = found.acting.fit
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
@@ -257,7 +288,7 @@ def _with_finer_steps(
     """The fit with the steps between nodes that its noise asks for: local cubics may have seen more
     noise than there is."""
     fit, scales = acting.fit, samples.scales
-    bench = Workbench(gauge, acting.bench.inputs, scales.omega, samples.observation)
+    bench = dataclasses.replace(acting.bench, gauge=gauge)
     finer = scales.substeps_for(fit.sigma)
     if finer > scales.substeps:
         inputs = ArcInputs(nodes, finer, acting.hold, acting.delay)
@@ -284,7 +315,7 @@ def _with_velocities(
     bench = dataclasses.replace(bench, observation=observation)
     fit = bench.fit(fit.structure, fit.values, arcs, np.concatenate([fit.sigma, sigma]))
     scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, sigma]))
-    found = _stretches(recording, observation, samples.angles)
+    found = _stretches(recording, observation, samples.angles, samples.parameters)
     found = without_rests(found, scales)[0] if samples.messages else found
     samples = dataclasses.replace(samples, observation=observation, stretches=found, scales=scales)
     return samples, nodes, bench, fit
@@ -311,12 +342,13 @@ def _map(record: Record, best: InUse, angles: tuple[int, ...]) -> SymplecticMap:
     x = np.concatenate([n.x for n in record.nodes])
     d = fit.form.dim
     q, v = x[:, :d] + fit.zeros, x[:, d:]
-    z = np.concatenate([q, law.momentum(q, v)], axis=1)
+    parameters = () if law.powers is None else parameters_of(record.recording)
+    z = np.concatenate([q, law.at(record.args).momentum(q, v)], axis=1)
     signals = Signals(names, record.hold, record.delay) if names else None
     inputs = np.concatenate([n.stretch.u[n.at] for n in record.nodes]) if names else None
     sensors = best.calibration.law.sensors
     map_ = map_of_law(
         smoothed(best.moving, sensors.creep), z, record.scales.dt, angles=angles, signals=signals,
-        inputs=inputs, root=best.root,
+        inputs=inputs, parameters=parameters, args=record.args, root=best.root,
     )  # fmt: skip
     return dataclasses.replace(map_, sensors=sensors)

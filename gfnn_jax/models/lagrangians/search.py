@@ -20,7 +20,7 @@ from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
+from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, a_third
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, which_friction
 from gfnn_jax.models.lagrangians.input_rules import Acting, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
@@ -123,12 +123,7 @@ def search(
     simple = [k for k, start in enumerate(starts) if start.structure.terms in plain_terms]
     simple = [k for k in simple if misfit[k] <= options.plain_is_enough * misfit[best]]
     fit = starts[min(simple, key=lambda k: misfit[k]) if simple else best]
-    every = Structure(
-        d, libraries.without_forces(
-            (*libraries.first(d, angles), *libraries.more(d, angles)), shifted
-        ),
-        frictions_tried(d, options), turned, num_inputs, sensors,
-    )  # fmt: skip
+    every = everything(angles, num_inputs, observation, options)
     frictions = dataclasses.replace(every, terms=every.terms[:1])
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     for periods in options.periods[1:]:
@@ -143,6 +138,29 @@ def search(
             fit = grow(bench, nodes, fit, every, on_progress, options)
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
         on_progress(f"{periods:g} periods: {describe(fit)}")
+    return finished(bench, nodes, fit, every, scales, on_progress, options)
+
+
+def everything(
+    angles: tuple[int, ...], num_inputs: int, observation: Observation, options: SearchOptions
+) -> Structure:  # fmt: skip
+    """All terms and frictions that a search may come to."""
+    d, shifted = observation.dim, observation.shifts()
+    rows = (*libraries.first(d, angles), *libraries.more(d, angles))
+    turned = tuple(i for i in angles if i in observation.direct and i not in shifted)
+    sensors = tuple(zip(observation.parameters, map(float, observation.values), strict=True))
+    return Structure(
+        d, libraries.without_forces(rows, shifted), frictions_tried(d, options), turned,
+        num_inputs, sensors,
+    )  # fmt: skip
+
+
+def finished(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, every: Structure, scales: Scales,
+    on_progress: Callable, options: SearchOptions,
+) -> Found:  # fmt: skip
+    """The law that a fit to the longest arcs comes to: its friction chosen, terms dropped and
+    added."""
     fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
     terms = dataclasses.replace(every, friction=())
     before = fit.structure
@@ -153,6 +171,22 @@ def search(
         fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     return Found(with_delay(bench, nodes, fit, scales.dt), choice, nodes)
+
+
+def arcs_by_length(
+    bench: Workbench, nodes: Sequence[Nodes], structure: Structure, known: Mapping[Key, float],
+    scales: Scales, options: SearchOptions,
+) -> tuple[LawFit, list[Nodes]]:  # fmt: skip
+    """A structure fitted to arcs of growing length, and the nodes with its states."""
+    fit, sigma, nodes = None, scales.sigma, list(nodes)
+    for periods in options.periods:
+        arcs = arcs_of(nodes, max(6, round(periods * scales.per_period)))
+        if fit is not None and arcs.t.shape == fit.arcs.t.shape:
+            break  # no run is longer
+        fit = bench.fit(structure, known, arcs, sigma)
+        known, sigma, nodes = fit.values, fit.sigma, with_states(nodes, arcs, fit.fitted.x)
+    assert fit is not None  # there is a length
+    return fit, nodes
 
 
 def describe(fit: LawFit) -> str:
@@ -167,7 +201,8 @@ def describe(fit: LawFit) -> str:
 
 
 def _word(bench: Workbench, key: Key) -> str:
-    return word_of(key, bench.observation.coordinates, bench.observation.speeds)
+    names = () if bench.systems is None else bench.systems.names
+    return word_of(key, bench.observation.coordinates, bench.observation.speeds, names)
 
 
 def prune(
@@ -293,7 +328,7 @@ def choose_friction(
     as those of the fit, or as long as three of them can be. A choice holds close to its fit, so
     that it is made again until it stands."""
     whole, sigma = dataclasses.replace(fit.arcs, x=fit.fitted.x), fit.sigma
-    length = max(6, min(whole.t.shape[1], sum(len(n.t) for n in nodes) // FOLDS))
+    length = max(6, min(whole.t.shape[1], a_third(nodes, bench.systems)))
     arcs = arcs_of(with_states(nodes, whole, whole.x), length)
     if arcs.t.shape != whole.t.shape:
         fit = bench.fit(fit.structure, fit.values, arcs, sigma)

@@ -5,6 +5,11 @@ L → c L + const moves nothing, so one coefficient has to be given: the mean of
 1. (To set the coefficient of ½v₁² alone would admit M₁₁ = 1 − 1.3 cos q + 0.3 cos 2q, which is
 nearly zero where the data are, and fits any record with nothing.) In a law whose M₁₁ is constant
 that is ½ of v₁².
+
+Where runs differ in parameters of the system, a row has one more entry, the whole powers of these
+that its coefficient is multiplied by; a row without it does not depend on them. Within a run
+L → c(μ) L moves nothing either: the first term has the power that is given to it, and what is told
+of the others is their ratio to it.
 """
 
 from __future__ import annotations
@@ -15,12 +20,23 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import UNIFORM, Friction, Terms
+from gfnn_jax.families.lagrangian import UNIFORM, Friction, Powers, Terms, functions_of
 from gfnn_jax.flows.motion import Form
 
-Row = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...], float]
-Loss = tuple[tuple[int, ...], int, float]
+Row = tuple[Any, ...]  # (k, n, m, φ), or (k, n, m, φ, powers of parameters)
+Loss = tuple[Any, ...]  # (c, kind, ε), or (c, kind, ε, powers of parameters)
 Key = tuple[Any, ...]
+
+
+def with_powers(row: Row | Loss, powers: tuple[int, ...]) -> Row | Loss:
+    """A row whose coefficient is multiplied by these powers of the parameters."""
+    plain = row[:-1] if isinstance(row[-1], tuple) else row
+    return (*plain, powers) if any(powers) else plain
+
+
+def powers_of(row: Row | Loss, count: int) -> tuple[int, ...]:
+    """The powers of ``count`` parameters that a row's coefficient is multiplied by."""
+    return row[-1] if isinstance(row[-1], tuple) else (0,) * count
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,15 +68,30 @@ class Structure:
         known = {**{("sensor", name): value for name, value in self.sensors}, **known}
         return np.array([known.get(key, 0.0) for key in self.keys()])
 
-    def form(self, q: np.ndarray) -> Form:
-        """The law with free coefficients, in the gauge of the positions q (n, d)."""
-        terms = Terms.of(self.terms, self.dim)
-        own = terms.quadratic()[0][:, 0, 0] * terms.potentials(q, order=0).value.mean(axis=0)
+    @property
+    def powers(self) -> Powers | None:
+        """The powers of parameters in each coefficient (θ, ρ, G); None where there are none."""
+        rows = (*self.terms, *self.friction)
+        count = max((len(row[-1]) for row in rows if isinstance(row[-1], tuple)), default=0)
+        if not count:
+            return None
+        gains = ((0,) * count,) * (self.dim * self.num_inputs)
+        return (*(powers_of(row, count) for row in rows), *gains)
+
+    def form(self, q: np.ndarray, args: np.ndarray | None = None) -> Form:
+        """The law with free coefficients, in the gauge of the positions q (n, d), where systems
+        have the parameters args (n, k)."""
+        terms, powers = Terms.of(self.terms, self.dim), self.powers
+        values = terms.potentials(q, order=0).value
+        if powers is not None:
+            values = values * functions_of(powers[: terms.count], args)
+        own = terms.quadratic()[0][:, 0, 0] * values.mean(axis=0)
         fixed = np.zeros(terms.count)
         fixed[0] = 1 / own[0]
         basis = np.eye(terms.count)[:, 1:]
         basis[0] = -own[1:] / own[0]
-        return Form(terms, fixed, basis, Friction.of(self.friction, self.dim), self.num_inputs)
+        friction = Friction.of(self.friction, self.dim)
+        return Form(terms, fixed, basis, friction, self.num_inputs, powers)
 
     def without(self, keys: set[Key]) -> Structure:
         return dataclasses.replace(

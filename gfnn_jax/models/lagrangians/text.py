@@ -10,9 +10,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.exports.symbolic import as_sympy
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction, Terms
+from gfnn_jax.families.lagrangian import (
+    DRY,
+    LINEAR,
+    QUADRATIC,
+    UNIFORM,
+    Friction,
+    Powers,
+    Terms,
+)
 from gfnn_jax.models.lagrangians.friction_choice import DECIDED, FrictionChoice
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, losses
+from gfnn_jax.models.lagrangians.structure import powers_of
 
 _GREEK = {
     "theta": "θ", "phi": "φ", "psi": "ψ", "alpha": "α", "beta": "β", "gamma": "γ", "omega": "ω",
@@ -92,14 +101,41 @@ def friction_of(
     return Expression(tuple(listed))
 
 
-def word_of(key: tuple[Any, ...], names: Sequence[str], speeds: Sequence[str]) -> str:
+def of_systems(found: Expression, powers: Powers, parameters: Sequence[str]) -> Expression:
+    """The expression with each term multiplied by its powers (m, k) of the parameters: cos(q)/l."""
+    return Expression(
+        tuple(
+            term._replace(term=_with_powers(term.term, row, parameters))
+            for term, row in zip(found.terms, powers, strict=True)
+        )
+    )
+
+
+def _with_powers(term: str, powers: Sequence[int], parameters: Sequence[str]) -> str:
+    for name, n in zip(parameters, powers, strict=True):
+        if n:
+            term = ("" if term == "1" and n > 0 else f"{term}{'*' if n > 0 else '/'}") + _power(
+                name, abs(n)
+            )
+    return term
+
+
+def word_of(
+    key: tuple[Any, ...], names: Sequence[str], speeds: Sequence[str],
+    parameters: Sequence[str] = (),
+) -> str:  # fmt: skip
     """A coefficient of a structure, by its term."""
     kind, *rest = key
     one, none = np.ones(1), np.zeros(1)
-    if kind == "term":
-        return terms_of(Terms.of(rest, len(names)), one, none, names, speeds).terms[0].term
-    if kind == "loss":
-        return "R: " + friction_of(Friction.of(rest, len(names)), one, none, speeds).terms[0].term
+    if kind in ("term", "loss"):
+        found = (
+            terms_of(Terms.of(rest, len(names)), one, none, names, speeds)
+            if kind == "term"
+            else friction_of(Friction.of(rest, len(names)), one, none, speeds)
+        )
+        powers = (powers_of(rest[0], len(parameters)),)
+        (term,) = of_systems(found, powers, parameters).terms
+        return term.term if kind == "term" else f"R: {term.term}"
     return f"{'gain' if kind == 'gain' else 'zero'} of {names[rest[0]]}"
 
 
@@ -133,7 +169,7 @@ def which_friction_line(
         return "+".join(FRICTIONS[KINDS.index(k)] for k in kinds) or "none"
 
     plain = {direction for direction, _, _ in losses(dim, KINDS, 0.0)}
-    rows = [r for r in choice.limits if r[1] not in choice.kinds and r[0] in plain]
+    rows = [r for r in choice.limits if r[1] not in choice.kinds and r[0] in plain and len(r) == 3]
     largest = scale * np.array([choice.limits[row] for row in rows])
     terms = friction_of(Friction.of(rows, dim), largest, 0 * largest, speeds).terms
     return WhichFriction(

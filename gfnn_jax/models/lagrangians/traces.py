@@ -29,13 +29,14 @@ def traces_of(
         n, stretch = b - a, nodes[i].stretch
         t, y, x = arcs.t[k, :n], arcs.y[k, :n] + nodes[i].zero, fit.fitted.x[k, :n]
         q, v = x[:, :d] + fit.zeros, x[:, d:]
-        rate = law.power(q, v)[0][:, : law.friction.count + (law.uniform != 0)]
+        own = law.at(stretch.args)
+        rate = own.power(q, v)[0][:, : law.friction.count + (law.uniform != 0)]
         lost = 0.5 * np.diff(t)[:, None] * (rate[1:] + rate[:-1])
         supplied = acting[k, : n - 1] * (np.diff(q, axis=0) @ law.gains)
         found.append(
             Trace(
                 stretch.run, t, y / factors, (y - left[k, :n]) / factors,
-                fit.fitted.residuals[k, :n], stretch.u[nodes[i].at[a:b]], law.energy(q, v),
+                fit.fitted.residuals[k, :n], stretch.u[nodes[i].at[a:b]], own.energy(q, v),
                 _summed(lost), _summed(supplied),
             )
         )  # fmt: skip

@@ -67,6 +67,9 @@ def velocities(recording: Recording, fit: LawFit, nodes: Sequence[Nodes]) -> dic
     if recording.coordinates != recording.positions:
         return {}
     law = fit.form.lagrangian(fit.p[: fit.form.count])
+    if law.powers is not None:
+        args = np.stack([nodes[i].stretch.args for i, _, _ in arcs.home])
+        law = law.at(np.repeat(args, x.shape[1], axis=0))
     u = _at_nodes(arcs, nodes, [node.stretch.u for node in nodes])
     flat = x.reshape(-1, 2 * d)
     a = law.acceleration(flat[:, :d], flat[:, d:], u.reshape(len(flat), -1))

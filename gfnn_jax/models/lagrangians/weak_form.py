@@ -11,18 +11,24 @@ from __future__ import annotations
 
 import numpy as np
 
+from gfnn_jax.families.lagrangian import functions_of
 from gfnn_jax.flows.motion import Form
 
 _SPACING = 0.25  # of a window's length, from one window to the next
 
 
 def weak_rows(
-    form: Form, t: np.ndarray, q: np.ndarray, v: np.ndarray, u: np.ndarray, length: float
-) -> tuple[np.ndarray, np.ndarray]:
+    form: Form, t: np.ndarray, q: np.ndarray, v: np.ndarray, u: np.ndarray, length: float,
+    args: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Rows (windows, d, count) of the coefficients, and what the fixed part of the law gives
     (windows, d); their sum with the coefficients is zero for the law. Along one stretch: t (n,),
-    q and v (n, d), u (n, inputs); ``length`` of the windows in units of t."""
+    q and v (n, d), u (n, inputs); ``length`` of the windows in units of t; args (k,) the parameters
+    of the system, where the law has such."""
     terms, d = form.terms, form.dim
+    weights = np.ones(terms.count + form.friction.count)
+    if form.powers is not None:
+        weights = functions_of(form.powers, args)[: len(weights)]
     f, df, _ = terms.potentials(q, order=1)
     g, dg = terms.motion(v)
     momentum = (dg * f[..., None]).swapaxes(1, 2)  # (n, d, P)
@@ -41,7 +47,8 @@ def weak_rows(
         norm = np.sqrt(np.sum(slope**2))  # of the noise that v brings
         phi, slope = phi / norm, slope / norm
         of_terms = -np.tensordot(slope, momentum[i:j], 1) - np.tensordot(phi, force[i:j], 1)
-        row = [of_terms @ form.basis, np.tensordot(phi, lost[i:j], 1)]
+        of_terms = of_terms * weights[: terms.count]
+        row = [of_terms @ form.basis, np.tensordot(phi, lost[i:j], 1) * weights[terms.count :]]
         if form.num_inputs:
             push = -np.tensordot(phi, u[i:j], 1)
             row.append((push[None, None, :] * np.eye(d)[:, :, None]).reshape(d, -1))

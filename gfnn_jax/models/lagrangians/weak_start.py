@@ -18,12 +18,13 @@ _SIGNIFICANT = 4.0  # standard errors
 
 
 def protected(structure: Structure) -> set[Key]:
-    """Constant masses of each coordinate, without which there would be no motion."""
-    return {
-        ("term", row)
-        for row in structure.terms
-        if max(row[0]) == 2 and not any(row[1]) and not any(row[2])
-    }
+    """Constant masses of each coordinate, without which there would be no motion; of several that
+    depend on parameters of the system none alone."""
+    masses = [
+        row for row in structure.terms if max(row[0]) == 2 and not any(row[1]) and not any(row[2])
+    ]
+    alone = [row for row in masses if sum(other[0] == row[0] for other in masses) == 1]
+    return {("term", row) for row in alone}
 
 
 def weak_start(
@@ -35,13 +36,16 @@ def weak_start(
     Raises FitError where a coordinate without mass and force solves the equations.
     """
     d = structure.dim
-    form = structure.form(np.concatenate([n.x[:, :d] for n in nodes]))
+    args = np.repeat([n.stretch.args for n in nodes], [len(n.t) for n in nodes], axis=0)
+    form = structure.form(np.concatenate([n.x[:, :d] for n in nodes]), args)
     rows, targets = [], []
     for node in nodes:
         u = node.stretch.u[node.at]
         for length in _LENGTHS:
             q, v = node.x[:, :d], node.x[:, d:]
-            row, target = weak_rows(form, node.t, q, v, u, length * scales.period)
+            row, target = weak_rows(
+                form, node.t, q, v, u, length * scales.period, node.stretch.args
+            )
             rows.append(row)
             targets.append(target)
     X, Y = np.concatenate(rows), -np.concatenate(targets)
