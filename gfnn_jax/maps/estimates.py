@@ -386,8 +386,8 @@ def _followed(
         some = slice(first, first + most)
         begun = np.stack(orbit[:-1][some], axis=1)
         form, p, _ = _side_by_side(laws, np.repeat(which, begun.shape[1]))
-        flat = (a.reshape(p.shape[0], *a.shape[2:]) for a in (begun, h[:, some], u[:, some]))
-        step = form.step(p, *flat)
+        flat = [a.reshape(len(p), *a.shape[2:]) for a in (begun, h[:, some], u[:, some])]
+        step = form.step(p, flat[0], flat[1], flat[2])
         by_state = step.by_state.reshape(*begun.shape, begun.shape[-1])
         further = step.by_coefficients[..., :count].reshape(*begun.shape, count)
         further = further @ roots[:, None].swapaxes(2, 3)

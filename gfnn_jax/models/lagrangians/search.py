@@ -145,6 +145,7 @@ def search(
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
         on_progress(f"{periods:g} periods: {describe(fit)}")
     fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
+    nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
     terms = dataclasses.replace(every, friction=())
     before = fit.structure
     fit = prune(bench, nodes, fit, on_progress, options, friction=False)
