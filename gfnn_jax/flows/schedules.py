@@ -42,13 +42,12 @@ def at_stages(
     parts: np.ndarray = np.diff(np.concatenate(cuts, axis=-1))[..., None]
     at = np.concatenate(cuts[:2], axis=-1)[..., None] + parts * _GAUSS
     passed = np.broadcast_to(whole > 0, a.shape)[..., None, None]
-    share = np.where(passed, _SHARES * parts / np.where(passed, whole[..., None, None], 1.0), 0.0)
+    size = np.where(passed, whole[..., None, None], 1.0)
     values = interpolate(t, u, at, hold)
-    moved = _legendre((at - a[..., None, None]) / np.where(passed, whole[..., None, None], 1.0))
-    moments = np.einsum("...pg,...pgn,...pgk->...nk", share, moved, values)
-    found = _legendre(NODES) * np.array([1, 3, 5]) @ moments
-    still = ~passed[..., 0]
-    return np.where(still[..., None], values[..., 0, :1, :], found) if still.any() else found
+    moved = _legendre((at - a[..., None, None]) / size)
+    moments = np.einsum("...pg,...pgn,...pgk->...nk", parts / size * _SHARES, moved, values)
+    found = (_legendre(NODES) * np.array([1.0, 3.0, 5.0])) @ moments
+    return np.where(passed, found, values[..., 0, :1, :])  # no time: the value there
 
 
 def _legendre(s: np.ndarray) -> np.ndarray:

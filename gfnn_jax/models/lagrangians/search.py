@@ -162,6 +162,7 @@ def finished(
     """The law that a fit to the longest arcs comes to: its friction chosen, terms dropped and
     added."""
     fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
+    nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
     terms = dataclasses.replace(every, friction=())
     before = fit.structure
     fit = prune(bench, nodes, fit, on_progress, options, friction=False)

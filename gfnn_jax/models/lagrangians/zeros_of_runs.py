@@ -4,8 +4,9 @@
 
 An encoder is often set to zero where a run begins; where friction holds an arm it does not begin at
 the same place. Residuals are linear in b_r, as they are in the coefficients of the law, so that one
-evaluation of the arcs tells both. The zeros are taken where arcs that neither was found from are
-followed better with a b_r for each run than with one for all. Their mean is left to the law.
+evaluation of the arcs tells both. The zeros are taken off where arcs that neither was found from
+are followed better with a b_r for each run than with one for all. Of a run that is yet to come the
+zero is known as well as they scatter: the law keeps their mean only where that is significant.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from gfnn_jax.solve.latent_arcs import rows_of_arcs
 from gfnn_jax.solve.wander import Wander
 
 _GAIN = 0.05  # of the held-out cost, that zeros of runs have to bring, as terms have
+_SIGNIFICANT = 4.0  # standard errors of the mean of the runs' zeros, as of a term
 _RCOND = 1e-6  # a zero that moves residuals less than this, the motion follows
 
 
@@ -32,36 +34,43 @@ def with_zeros_of_runs(
     """The nodes with the states of a fit, and the fit: with zeros of their runs taken off, and
     fitted anew, where they have some."""
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
-    found = _found(bench, nodes, fit)
+    names = sorted({n.stretch.run for n in nodes})
+    if len(names) < 2 or not bench.observation.is_plain or not np.isfinite(fit.fitted.cost):
+        return nodes, fit
+    found = _found(bench, nodes, fit, names)
     if found is None:
         return nodes, fit
-    nodes = shifted(nodes, found)
+    before = {n.stretch.run: n.zero for n in nodes}
+    zeros = found + np.array([before[name] for name in names]) + fit.zeros
+    mean, size = zeros.mean(axis=0), np.std(zeros, axis=0, ddof=1)
+    of_law = np.isin(range(len(mean)), fit.structure.zeros)
+    of_law &= np.abs(mean) > _SIGNIFICANT * size / np.sqrt(len(names))
+    mean = np.where(of_law, mean, 0.0)
+    known = fit.values | {("zero", i): float(mean[i]) for i in fit.structure.zeros}
+    further = {n: z - mean - before[n] for n, z in zip(names, zeros, strict=True)}
+    nodes = shifted(nodes, further)
     arcs = arcs_of(nodes, fit.arcs.t.shape[1])
-    fit = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
-    size = np.std(_of_runs(nodes), axis=0, ddof=1)
-    on_progress(f"zeros that differ from run to run by {' '.join(f'{s:.3g}' for s in size)}")
+    fit = bench.fit(fit.structure, known, arcs, fit.sigma)
+    told = ", ".join(f"{s:.3g}" for s in size)
+    on_progress(f"zeros that differ from run to run by {told}")
     return with_states(nodes, fit.arcs, fit.fitted.x), fit
 
 
 def wander_of_runs(nodes: Sequence[Nodes], noise: np.ndarray) -> Wander | None:
-    """The scatter of the zeros of runs that were found, in units of the ``noise`` (k,) of their
-    channels; None where they are the same."""
-    zeros = _of_runs(nodes)
+    """The scatter of the zeros of runs about that of the law, in units of the ``noise`` (k,) of
+    their channels; None where they are the same."""
+    zeros = np.array(list({n.stretch.run: n.zero for n in nodes}.values()))
     if not zeros.any():
         return None
-    return Wander(float(np.sqrt(np.mean(np.var(zeros, axis=0, ddof=1) / noise**2))), np.inf)
+    scatter = np.sum(zeros**2, axis=0) / (len(zeros) - 1)
+    return Wander(float(np.sqrt(np.mean(scatter / noise**2))), np.inf)
 
 
-def _of_runs(nodes: Sequence[Nodes]) -> np.ndarray:
-    """(runs, k)."""
-    return np.array(list({n.stretch.run: n.zero for n in nodes}.values()))
-
-
-def _found(bench: Workbench, nodes: Sequence[Nodes], fit: LawFit) -> dict[str, np.ndarray] | None:
-    """Zeros (k,) by run, of mean zero; None where held-out arcs do not gain by them."""
-    names = sorted({n.stretch.run for n in nodes})
-    if len(names) < 2 or not bench.observation.is_plain or not np.isfinite(fit.fitted.cost):
-        return None
+def _found(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, names: Sequence[str]
+) -> np.ndarray | None:
+    """Zeros (runs, k) beside those of the nodes and of the law; None where held-out arcs do not
+    gain by them."""
     arcs, p = fit.arcs, fit.p
     runs = np.array([names.index(nodes[i].stretch.run) for i, _, _ in arcs.home])
     k = arcs.y.shape[-1]
@@ -71,15 +80,15 @@ def _found(bench: Workbench, nodes: Sequence[Nodes], fit: LawFit) -> dict[str, n
     rows = rows_of_arcs(model, start, fit.fitted.x, arcs.y, noise, bench.observation.loss)
     rows = rows.reshape(len(rows), -1, rows.shape[-1])
     own, of_runs, left = np.split(rows, [len(p), len(start)], axis=-1)
+    own = own[..., [key[0] != "zero" for key in fit.values]]
     own = own / np.maximum(np.linalg.norm(own, axis=(0, 1)), 1e-300)
-    of_runs = of_runs / np.linalg.norm(rows[..., -1])
+    unit = np.linalg.norm(left)
+    of_runs = of_runs / unit
     common = of_runs.reshape(*of_runs.shape[:2], len(names), k).sum(axis=2)
     together, apart = (np.concatenate([own, z], axis=-1) for z in (common, of_runs))
     if not _held_out(apart, left) < (1 - _GAIN) * _held_out(together, left):
         return None
-    zeros = _solved(apart, left)[len(p) :, 0].reshape(len(names), k)
-    zeros = (zeros - zeros.mean(axis=0)) / np.linalg.norm(rows[..., -1])
-    return dict(zip(names, zeros, strict=True))
+    return _solved(apart, left)[own.shape[-1] :].reshape(len(names), k) / unit
 
 
 def _held_out(columns: np.ndarray, left: np.ndarray) -> float:
