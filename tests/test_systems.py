@@ -128,6 +128,8 @@ def test_the_family_of_systems_is_each_system_s_own():
         np.testing.assert_allclose(columns[..., k], (ahead - behind) / 2e-6, atol=1e-7)
     with pytest.raises(ValueError, match="parameters of the system"):
         family.gradient(params, w)
+    assert inner.multiplier(c, 0.1) is None  # friction and an input
+    assert OfSystems(inner.family.family, LAW.powers[:5]).multiplier(c[:5], 0.1) == 1.0
 
 
 def test_coefficients_of_a_run_are_linear_in_those_of_the_law():
