@@ -1,7 +1,7 @@
 """One law of recordings whose runs differ in a parameter: whether it is the one that was put in.
 
-    python benchmarks/parameters.py            every system (some two minutes)
-    python benchmarks/parameters.py --quick    two of them, one size of the noise
+    python benchmarks/parameters.py            every system (some six minutes)
+    python benchmarks/parameters.py --quick    two of them, one draw of one size of the noise
 
 Each system is integrated by SciPy from its own equations of motion, a run for each value of a
 length or of an added mass, and noise is added to its positions, of 1e-4 to 1e-2 of their spread.
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from twins import WITHIN, plain
 import gfnn_jax as gfnn
 
 NOISES = (1e-4, 1e-3, 1e-2)  # of the spread
+DRAWS = 3  # of the noise
 G = 9.81
 
 
@@ -122,21 +123,31 @@ FAMILIES = {
 }  # fmt: skip
 
 
-def recording(family: Family, values: Sequence[float], noise: float, seed: int) -> gfnn.Recording:
-    """Positions of a run of each value, with noise that is a share of their spread."""
-    rng, t, d = np.random.default_rng(seed), np.arange(0, family.end, family.dt), len(family.names)
+@cache
+def orbits(name: str, values: tuple[float, ...]) -> tuple[np.ndarray, ...]:
+    """Positions (d, n) of a run of each value."""
+    family, d = FAMILIES[name], len(FAMILIES[name].names)
+    t = np.arange(0, family.end, family.dt)
 
     def rate(s, x, value):
         u = force(s) if family.gain else 0.0
         return [*x[d:], *np.ravel(family.accelerate(x[:d], x[d:], u, value))]
 
-    orbits = [
-        solve_ivp(rate, (0, t[-1]), [*family.start(k), *np.zeros(d)], t_eval=t, args=(value,),
-                  method="DOP853", rtol=1e-11, atol=1e-11, max_step=0.05).y[:d]
+    return tuple(
+        solve_ivp(
+            rate, (0, t[-1]), [*family.start(k), *np.zeros(d)], t_eval=t, args=(value,),
+            method="DOP853", rtol=1e-11, atol=1e-11, max_step=0.05,
+        ).y[:d]
         for k, value in enumerate(values)
-    ]  # fmt: skip
-    spread, tables = np.concatenate(orbits, axis=1).std(axis=1), []
-    for k, (q, value) in enumerate(zip(orbits, values, strict=True)):
+    )  # fmt: skip
+
+
+def recording(name: str, values: tuple[float, ...], noise: float, seed: int) -> gfnn.Recording:
+    """Positions of a run of each value, with noise that is a share of their spread."""
+    family, rng, tables = FAMILIES[name], np.random.default_rng(seed), []
+    t, found = np.arange(0, family.end, family.dt), orbits(name, values)
+    spread = np.concatenate(found, axis=1).std(axis=1)
+    for k, (q, value) in enumerate(zip(found, values, strict=True)):
         seen = q + noise * spread[:, None] * rng.normal(size=q.shape)
         columns = dict(zip(family.names, seen, strict=True))
         columns |= {family.parameter: np.full(len(t), value)}
@@ -148,10 +159,11 @@ def recording(family: Family, values: Sequence[float], noise: float, seed: int) 
     )  # fmt: skip
 
 
-def case(family: Family, noise: float) -> Numbers:
+def case(name: str, noise: float, draw: int) -> Numbers:
     """One fit: whether its terms are those put in, its errors in standard errors, and forecasts of
     values that it has not seen."""
-    record = recording(family, family.values, noise, 0)
+    family = FAMILIES[name]
+    record = recording(name, family.values, noise, draw)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
         done = once(lambda: gfnn.fit(record))
@@ -169,27 +181,30 @@ def case(family: Family, noise: float) -> Numbers:
         off["gain"] = abs(gain - family.gain) / std
     low, *_, last, high = family.values
     ahead = {
-        name: forecast(family, fit, value, noise)
-        for name, value in (("between", 0.5 * (last + high)), ("beyond", high + 0.1 * (high - low)))
+        place: forecast(name, fit, value, noise, DRAWS + draw)
+        for place, value in (
+            ("between", 0.5 * (last + high)),
+            ("beyond", high + 0.1 * (high - low)),
+        )
     }
     return {
-        "noise": noise, "same": same, "standard_errors": off, "formula": fit.formula,
+        "noise": noise, "draw": draw, "same": same, "standard_errors": off, "formula": fit.formula,
         "friction": fit.friction.formula, "forecasts": ahead,
         "processor_seconds": done.processor_seconds,
     }  # fmt: skip
 
 
-def forecast(family: Family, fit: Any, value: float, noise: float) -> Numbers:
+def forecast(name: str, fit: Any, value: float, noise: float, seed: int) -> Numbers:
     """The last two thirds of a run of this value from its first third: RMS error in units of the
     noise, and the share of samples within two standard deviations."""
-    new = recording(family, (value,), noise, 1)
+    family, new = FAMILIES[name], recording(name, (value,), noise, seed)
     t = new.times("0")
     cut = family.end / 3
     found = fit.map.forecast(new.slice(stop=cut), t[t > cut], new if family.gain else None)
     error, sigma, inside = [], [], []
-    for k, name in enumerate(family.names):
-        error.append(found.values[name][0] - new.values(name, "0")[t > cut])
-        inside.append(np.abs(error[-1]) <= 2 * found.std[name][0])
+    for k, column in enumerate(family.names):
+        error.append(found.values[column][0] - new.values(column, "0")[t > cut])
+        inside.append(np.abs(error[-1]) <= 2 * found.std[column][0])
         sigma.append(np.asarray(fit.map.sensors.sigma)[k])
     size = np.sqrt(np.mean((np.array(error) / np.array(sigma)[:, None]) ** 2))
     return {"error": float(size), "within": float(np.mean(inside))}
@@ -198,31 +213,44 @@ def forecast(family: Family, fit: Any, value: float, noise: float) -> Numbers:
 def measured(name: str, quick: bool) -> Numbers:
     cases = []
     for noise in NOISES[1:2] if quick else NOISES:
-        cases.append(case(FAMILIES[name], noise))
-        c = cases[-1]
-        worst = max(c["standard_errors"].items(), key=lambda item: item[1], default=("", 0))
-        print(f"  {noise:g}: {c['same']}, {worst[0]} off by {worst[1]:.1f}; {c['formula']} | "
-              f"{c['friction']}; {c['forecasts']}; {c['processor_seconds']:.1f} s",
-              flush=True)  # fmt: skip
+        for draw in range(1 if quick else DRAWS):
+            cases.append(case(name, noise, draw))
+            c = cases[-1]
+            worst = max(c["standard_errors"].items(), key=lambda item: item[1], default=("", 0))
+            print(f"  {noise:g}: {c['same']}, {worst[0]} off by {worst[1]:.1f}; {c['formula']} | "
+                  f"{c['friction']}; {c['forecasts']}; {c['processor_seconds']:.1f} s",
+                  flush=True)  # fmt: skip
     return {"cases": cases}
 
 
-PIECES = {name.replace(",", "").replace(" ", "-"): partial(measured, name) for name in FAMILIES}
+NAMES = {name.replace(",", "").replace(" ", "-"): name for name in FAMILIES}
+PIECES = {key: partial(measured, name) for key, name in NAMES.items()}
 
 
 def tables() -> None:
     """The table of RESULTS.md."""
     rows = []
-    for (name, result), title in zip(results(PIECES, "parameters").items(), FAMILIES, strict=True):
-        for c in result["measured"]["cases"]:
-            off, ahead = c["standard_errors"].values(), c["forecasts"]
+    for name, result in results(PIECES, "parameters").items():
+        for noise in NOISES:
+            cases = [c for c in result["measured"]["cases"] if c["noise"] == noise]
+            if not cases:
+                continue
+            off = [z for c in cases for z in c["standard_errors"].values()]
+            ahead = {
+                place: (
+                    np.sqrt(np.mean([c["forecasts"][place]["error"] ** 2 for c in cases])),
+                    np.mean([c["forecasts"][place]["within"] for c in cases]),
+                )
+                for place in ("between", "beyond")
+            }
             rows.append([
-                title, f"{c['noise']:g}", *("yes" if c["same"][k] else "no" for k in c["same"]),
+                NAMES[name], f"{noise:g}",
+                *(f"{sum(c['same'][k] for c in cases)} of {len(cases)}"
+                  for k in ("lagrangian", "friction")),
                 f"{sum(z <= WITHIN for z in off)} of {len(off)}", number(max(off)),
-                *(f"{ahead[k]['error']:.2f}, {ahead[k]['within']:.0%}" for k in ahead),
-                number(c["processor_seconds"]),
+                *(f"{error:.2f}, {within:.0%}" for error, within in ahead.values()),
+                number(np.mean([c["processor_seconds"] for c in cases])),
             ])  # fmt: skip
-            assert name in PIECES
     heads = ("systems", "noise ÷ spread", "terms of L exact", "friction exact",
              f"within {WITHIN:g} standard errors", "largest", "forecast between", "and beyond",
              "CPU s")  # fmt: skip

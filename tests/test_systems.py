@@ -1,7 +1,6 @@
 """One law of runs that differ in a parameter: its functions, flow, search and forecasts."""
 
 import dataclasses
-import warnings
 
 import jax
 import numpy as np
@@ -128,6 +127,8 @@ def test_the_family_of_systems_is_each_system_s_own():
         np.testing.assert_allclose(columns[..., k], (ahead - behind) / 2e-6, atol=1e-7)
     with pytest.raises(ValueError, match="parameters of the system"):
         family.gradient(params, w)
+    assert inner.multiplier(c, 0.1) is None  # friction and an input
+    assert OfSystems(inner.family.family, LAW.powers[:5]).multiplier(c[:5], 0.1) == 1.0
 
 
 def test_coefficients_of_a_run_are_linear_in_those_of_the_law():
@@ -314,10 +315,56 @@ def test_a_gain_tells_the_scale_for_every_mass():
     np.testing.assert_allclose(states[0, -1, 0], found.y[0, -1], atol=2e-3)
 
 
+def added(masses, **options):
+    """A cart on a spring, with masses on it."""
+    starts = [(0.8, 0.0)] * len(masses)
+    options = {"end": 20.0, "dt": 0.05, **options}
+    return recorded(
+        lambda _, x, m: [x[1], (-3 * x[0] - 0.05 * x[1]) / (0.5 + m)], starts, masses, "m", ("x",),
+        **options,
+    )  # fmt: skip
+
+
 @pytest.mark.slow
-def test_two_values_do_not_tell_functions_apart_and_that_is_said():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", gfnn.FitWarning)
-        fit = gfnn.fit(swings((0.6, 1.7)))
-    within(fit.lagrangian.terms, {"omega**2": 0.5, "cos(theta)/l": G})
-    assert "two values" in fit.messages[0]
+def test_two_values_do_not_tell_two_functions_and_that_is_said():
+    with pytest.warns(gfnn.FitWarning, match="2 functions of m, and the runs are of 2 values"):
+        fit = gfnn.fit(added((0.05, 0.4)))
+    within(fit.lagrangian.terms, {k: v / 0.725 for k, v in
+                                  {"v**2": 0.25, "v**2*m": 0.5, "x**2": -1.5}.items()})  # fmt: skip
+    one = gfnn.fit(swings((0.6, 1.7)))  # of one function a second value is a test
+    within(one.lagrangian.terms, {"omega**2": 0.5, "cos(theta)/l": G})
+    assert one.messages == ()
+
+
+@pytest.mark.slow
+def test_a_dependence_that_no_power_is_is_told_to_be_an_interpolation():
+    """g/(l + l³/10)."""
+
+    def rate(_, x, length):
+        return [x[1], -G / (length + 0.1 * length**3) * np.sin(x[0]) - 0.05 * x[1]]
+
+    starts = [(1.2 - 0.1 * k, 0.0) for k in range(5)]
+    with pytest.warns(gfnn.FitWarning, match="functions of l, and the runs are of 5 values"):
+        fit = gfnn.fit(recorded(rate, starts, LENGTHS, "l", ("theta",), ("theta",)))
+    new = recorded(rate, [(1.0, 0.0)], (1.2,), "l", ("theta",), ("theta",))
+    t = new.times("0")[new.times("0") > 4.0]
+    found = fit.map.forecast(new.slice(stop=4.0), t)
+    error = found.values["theta"][0] - new.values("theta", "0")[-len(t) :]
+    assert np.sqrt(np.mean(error**2)) < 2e-3
+
+
+@pytest.mark.slow
+def test_an_inertia_and_a_lever_that_are_no_powers_come_out():
+    """A rod and a bob: an inertia of 0.3 + l², a lever of 0.2 + l, uniform friction."""
+
+    def rate(_, x, length):
+        torque = -G * (0.2 + length) * np.sin(x[0])
+        return [x[1], torque / (0.3 + length**2) - 0.05 * x[1]]
+
+    starts = [(1.2 - 0.1 * k, 0.0) for k in range(5)]
+    fit = gfnn.fit(recorded(rate, starts, LENGTHS, "l", ("theta",), ("theta",)))
+    c = {t.term: t.coefficient for t in fit.lagrangian.terms}
+    assert c["omega**2"] / c["omega**2*l**2"] == pytest.approx(0.3, rel=0.01)
+    assert c["cos(theta)"] / c["cos(theta)*l"] == pytest.approx(0.2, rel=0.02)
+    assert c["cos(theta)*l"] / c["omega**2*l**2"] == pytest.approx(2 * G, rel=2e-3)
+    assert [t.term for t in fit.friction.terms] == ["omega**2", "omega**2*l**2"]

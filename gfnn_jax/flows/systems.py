@@ -75,6 +75,11 @@ class OfSystems:
         own = as_row(params, weights) * weights
         return own, rest if rest.shape[-1] else None
 
+    def multiplier(self, params, dt):
+        """1.0, or None where the family's forces keep no multiple of the symplectic form."""
+        own = getattr(self.family, "multiplier", None)
+        return 1.0 if own is None else own(params, dt)
+
     def at_time(self, args, after):
         """args a time ``after`` later: the system stays the same."""
         count = len(self.powers[0])

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.data.channels import parameters_of
+from gfnn_jax.data.channels import args_of, parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.families.lagrangian import Powers
@@ -31,6 +31,7 @@ from gfnn_jax.models.lagrangians.text import (
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
 _SEEN = 3.0  # standard errors of a gain, below which its input is not seen to act
+_MANY = 3  # functions of parameters in a term, of which laws of physics have fewer
 _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
 
 Gains = dict[str, dict[str, tuple[float, float]]]
@@ -156,7 +157,8 @@ def _warnings(best: InUse, recording: Recording, gains: Gains) -> list[str]:
             "the record gains energy that no input explains. If the system is driven, name its "
             "drive: --inputs NAME (inputs=)"
         )
-    found += about_parameters(recording, best.law.powers)
+    most = best.fit.structure.most_functions
+    found += about_parameters(recording, best.law.powers, most)
     return found + [
         f"no force of the input {u} is seen: its gain is within {_SEEN:g} standard errors of 0. "
         f"Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
@@ -165,23 +167,27 @@ def _warnings(best: InUse, recording: Recording, gains: Gains) -> list[str]:
     ]
 
 
-def about_parameters(recording: Recording, powers: Powers | None) -> list[str]:
-    """A warning for each parameter that differs from run to run: which the law, of these powers of
-    them, does not depend on, or of which there are too few values."""
-    found = []
-    for k, name in enumerate(parameters_of(recording)):
-        values = {float(recording.values(name, run)[0]) for run in recording.runs}
-        range_ = f"{name} is {min(values):g} to {max(values):g}"
+def about_parameters(
+    recording: Recording, powers: Powers | None, most_functions: int = 1
+) -> list[str]:
+    """Warnings about parameters that differ from run to run: which the law, of these powers of
+    them, does not depend on; and where a term has so many functions of them that it may be no more
+    than an interpolation."""
+    found, names = [], parameters_of(recording)
+    for k, name in enumerate(names):
+        values = [recording.values(name, run)[0] for run in recording.runs]
         if not any(row[k] for row in powers or ()):
             found.append(
-                f"{range_}, and no coefficient of the law depends on it, as far as this recording "
-                "tells"
+                f"{name} is {min(values):g} to {max(values):g}, and no coefficient of the law "
+                "depends on it, as far as this recording tells"
             )
-        elif len(values) == 2:
-            found.append(
-                f"{range_}, two values: they do not tell functions of {name} apart that agree "
-                "there. Forecasts between them and beyond need a third"
-            )
+    count = len({tuple(args_of(recording, run, names).tolist()) for run in recording.runs})
+    if powers is not None and most_functions >= min(count, _MANY):
+        found.append(
+            f"a term has {most_functions} functions of {', '.join(names)}, and the runs are of "
+            f"{count} values: other functions agree there, and forecasts between and beyond may "
+            "err by more than their bands. Record further values"
+        )
     return found
 
 

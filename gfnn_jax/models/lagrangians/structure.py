@@ -78,6 +78,12 @@ class Structure:
         gains = ((0,) * count,) * (self.dim * self.num_inputs)
         return (*(powers_of(row, count) for row in rows), *gains)
 
+    @property
+    def most_functions(self) -> int:
+        """The largest number of functions of the parameters that one term or friction has."""
+        plain = [with_powers(row, ()) for row in (*self.terms, *self.friction)]
+        return max(map(plain.count, plain))
+
     def form(self, q: np.ndarray, args: np.ndarray | None = None) -> Form:
         """The law with free coefficients, in the gauge of the positions q (n, d), where systems
         have the parameters args (n, k)."""
