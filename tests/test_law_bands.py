@@ -10,6 +10,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.lagrangians.calibration import Thirds
 from gfnn_jax.models.lagrangians.fit import Workbench, in_thirds
 from gfnn_jax.models.lagrangians.search import SearchOptions, search
@@ -86,6 +87,16 @@ def swing():
     t, theta = pendulum(end=40.0)
     recording = recorded(t, theta)
     return recording, gfnn.fit(recording.slice(stop=28.0))
+
+
+def test_misfit_beyond_the_last_lead_grows_as_it_did():
+    """As √t, not at all where it has settled (a driven, damped motion), and no faster than t."""
+    leads = np.geomspace(0.1, 10, 24)
+    misfit = np.stack([np.sqrt(leads), np.minimum(leads, 3.0), leads**2], axis=1)
+    sensors = Sensors(("x",), (), (), np.ones(1), 1.0, 1.0, "hold", 0.0, leads, misfit)
+    far = sensors.misfit_at(np.array([1.0, 40.0]))
+    np.testing.assert_allclose(far[0], [1.0, 1.0, 1.0], rtol=0.02)
+    np.testing.assert_allclose(far[1], [np.sqrt(40), 3.0, 400.0], rtol=1e-6)
 
 
 def test_thirds_begin_where_they_say():
