@@ -345,7 +345,7 @@ def propagate_each(
     law, (form, p, roots) = laws[0], _side_by_side(laws, which)
     d, sensors, count = form.dim, law.sensors, form.count
     ends, (x, zeros) = np.concatenate([last[:, None], times], axis=1), np.split(x, [2 * d], axis=1)
-    steps = np.diff(ends, axis=1)
+    steps, large = np.diff(ends, axis=1), sensors.size_of(x)[:, None, None]
     root, size = covariance_root(covariance).swapaxes(1, 2), covariance.shape[-1]
     root = np.concatenate([root, np.zeros((len(x), size, roots.shape[1]))], axis=2)
     spread, of_zeros = root[:, : 2 * d], root[:, 2 * d :]
@@ -369,7 +369,8 @@ def propagate_each(
         values = values + left * zeros[:, None]
         shown = shown + left[..., None] * of_zeros[:, None]
         further = sensors.wander.size**2 * (1 - left**2) * sensors.sigma**2
-    own = np.sum(shown**2, axis=-1) + further + sensors.sigma**2 + sensors.misfit_at(ahead) ** 2
+    misfit = sensors.misfit_at(ahead) * large
+    own = np.sum(shown**2, axis=-1) + further + sensors.sigma**2 + misfit**2
     return Orbits(values, np.sqrt(own), orbit, spread @ spread.swapaxes(2, 3))
 
 
