@@ -217,10 +217,10 @@ def orbits(name: str, draw: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     options = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-11, "max_step": 0.05}
     if twin.push is None:
 
-        def rate(_, x):
+        def free(_, x):
             return [*x[d:], *np.ravel(twin.accelerate(x[:d], x[d:], None))]
 
-        q = [solve_ivp(rate, (0, t[-1]), one, t_eval=t, **options).y[:d] for one in x]
+        q = [solve_ivp(free, (0, t[-1]), one, t_eval=t, **options).y[:d] for one in x]
         return t, np.array(q), np.zeros((len(x), len(t), 0))
     u, q = np.array([twin.push(rng, t) for _ in x]), [x[:, :d]]
     for k, (begin, end) in enumerate(pairwise(t)):

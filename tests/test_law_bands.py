@@ -9,8 +9,9 @@ from test_law_fits import chain, pendulum
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
 from gfnn_jax.maps.observation import Observation
+from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.calibration import Thirds
+from gfnn_jax.models.lagrangians.calibration import Thirds, _with_size
 from gfnn_jax.models.lagrangians.fit import Workbench, in_thirds
 from gfnn_jax.models.lagrangians.search import SearchOptions, search
 
@@ -86,6 +87,35 @@ def swing():
     t, theta = pendulum(end=40.0)
     recording = recorded(t, theta)
     return recording, gfnn.fit(recording.slice(stop=28.0))
+
+
+def test_misfit_beyond_the_last_lead_grows_as_it_did():
+    """As √t, not at all where it has settled (a driven, damped motion), and no faster than t."""
+    leads = np.geomspace(0.1, 10, 24)
+    misfit = np.stack([np.sqrt(leads), np.minimum(leads, 3.0), leads**2], axis=1)
+    sensors = Sensors(("x",), (), (), np.ones(1), 1.0, 1.0, "hold", 0.0, leads, misfit)
+    far = sensors.misfit_at(np.array([1.0, 40.0]))
+    np.testing.assert_allclose(far[0], [1.0, 1.0, 1.0], rtol=0.02)
+    np.testing.assert_allclose(far[1], [np.sqrt(40), 3.0, 400.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_the_misfit_is_in_proportion_to_the_motion_where_its_errors_are(relative):
+    """Of swings that die down, an angle that has turned among them."""
+    rng, phase = np.random.default_rng(0), np.linspace(0, 40, 400)
+    amplitude = np.exp(-phase / 20)
+    x = np.stack([amplitude * np.cos(phase) + 2 * np.pi, -amplitude * np.sin(phase)], axis=1)
+    sensors = Sensors(
+        ("theta",), (), ("theta",), 1e-3 * np.ones(1), 1.0, 1.0, "hold", 0.0, np.ones(1),
+        np.ones((1, 1)), middle=np.zeros(1),
+    )  # fmt: skip
+    reach = np.sqrt(np.mean(sensors.distances(x) ** 2, axis=0))
+    sensors = dataclasses.replace(sensors, reach=reach)
+    errors = 0.01 * rng.normal(size=(400, 3, 1)) * (amplitude[:, None, None] if relative else 0.5)
+    chosen, large = _with_size(sensors, x, errors, 1e-3 * np.ones(errors.shape))
+    assert chosen.relative == relative
+    expected = amplitude / np.sqrt(np.mean(amplitude**2)) if relative else np.ones(400)
+    np.testing.assert_allclose(large[:, 0, 0], expected, rtol=0.15)
 
 
 def test_thirds_begin_where_they_say():

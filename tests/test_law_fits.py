@@ -306,10 +306,20 @@ def test_the_friction_that_a_record_shows(swing):
     assert max(without.which_friction.limits.values()) < 1e-3
 
 
-@pytest.mark.slow
-def test_friction_that_is_asked_for_dissipates():
-    fit = gfnn.fit(undamped(), friction="dry+linear")
-    assert all(term.coefficient > 0 for term in fit.friction.terms)
+@pytest.mark.parametrize("asked", ["dry+linear", "linear+uniform", "quadratic"])
+def test_friction_that_is_asked_for_dissipates_or_is_said_to_be_none(asked):
+    """Of a record without any: ρ ≥ 0 at its bound, with a limit."""
+    with pytest.warns(gfnn.FitWarning, match="friction was asked for, and the record shows none"):
+        fit = gfnn.fit(undamped(), friction=asked)
+    assert fit.friction.terms == ()
+    assert 0 < max(fit.which_friction.limits.values()) < 1e-3
+
+
+def test_friction_that_is_asked_for_and_is_there_needs_no_word(swing, recwarn):
+    recording, _ = swing
+    fit = gfnn.fit(recording, friction="linear")
+    assert len(fit.friction.terms) == 1
+    assert not [w for w in recwarn if "asked for" in str(w.message)]
 
 
 def test_linear_friction_of_one_mass_is_uniform(swing):

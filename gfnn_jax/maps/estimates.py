@@ -418,6 +418,7 @@ def propagate_each(
     """
     law, d, sensors = laws[0], laws[0].form.dim, laws[0].sensors
     x, zeros = np.split(x, [2 * d], axis=1)
+    large = sensors.size_of(x)[:, None, None]
     root = covariance_root(covariance).swapaxes(1, 2)
     ends, asked = _in_steps(sensors, np.concatenate([last[:, None], times], axis=1))
     u = _inputs(law, windows, ends, 1)
@@ -432,7 +433,8 @@ def propagate_each(
         values = values + left * zeros[:, None]
         shown = shown + left[..., None] * of_zeros[:, None]
         further = sensors.wander.size**2 * (1 - left**2) * sensors.sigma**2
-    own = np.sum(shown**2, axis=-1) + further + sensors.sigma**2 + sensors.misfit_at(ahead) ** 2
+    misfit = sensors.misfit_at(ahead) * large
+    own = np.sum(shown**2, axis=-1) + further + sensors.sigma**2 + misfit**2
     return Orbits(values, np.sqrt(own), orbit, spread @ spread.swapaxes(2, 3))
 
 

@@ -24,6 +24,9 @@ class Sensors:
     their noise; None where they are the positions, and it is the usual one. wander: how zeros of
     channels move, each in units of its σ; None where they stay. creep: the speed of what moves by a
     σ in a period: of dry friction that is smoothed over no more, forecasts slide or stick.
+    middle, reach: (d,) and (2d,) the mean of the coordinates over the data, and the rms of their
+    distances from it and of the speeds. relative: whether the misfit is in proportion to how large
+    the motion is, in these units.
     """
 
     positions: tuple[str, ...]
@@ -39,6 +42,9 @@ class Sensors:
     observation: Observation | None = None
     wander: Wander | None = None
     creep: float = 0.0
+    middle: Any = None
+    reach: Any = None
+    relative: bool = False
 
     @property
     def observation_model(self) -> Observation:
@@ -60,6 +66,20 @@ class Sensors:
             if self.positions[i] not in self.observation_model.channels:
                 q[known, i] = np.unwrap(q[known, i])
         return q
+
+    def distances(self, x: np.ndarray) -> np.ndarray:
+        """Distances (..., 2d) of states (q, v) from rest in the middle; of angles by chords."""
+        q, v = np.split(np.asarray(x), 2, axis=-1)
+        off, turning = q - self.middle, list(self.turning)
+        off[..., turning] = 2 * np.sin(off[..., turning] / 2)
+        return np.concatenate([off, v], axis=-1)
+
+    def size_of(self, x: np.ndarray) -> np.ndarray:
+        """Size (...) of the motion from states x (..., 2d), 1 on the mean of the data (rms), and
+        1 where the misfit does not depend on it."""
+        if not self.relative:
+            return np.ones(x.shape[:-1])
+        return np.sqrt(np.mean((self.distances(x) / self.reach) ** 2, axis=-1))
 
     def misfit_at(self, ahead: np.ndarray) -> np.ndarray:
         """The law's own error (..., k) at times ``ahead`` (...); beyond the last lead it grows on

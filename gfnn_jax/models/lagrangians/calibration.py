@@ -5,13 +5,15 @@ the state is estimated, now from the window that does so best and now from a sho
 orbit followed. What has to be added to the variance that noise, state and coefficients explain so
 that two standard deviations hold 95 % of the errors is the misfit, by the time ahead (conformal
 prediction: Lei et al., J. Am. Stat. Assoc. 113 (2018) 1094). The colour of the noise is in it, and
-what is wrong with the law. The time until which 95 % of the errors are below 1 %, 5 % and 20 % of
-the spread is the horizon.
+what is wrong with the law. Either is the same everywhere, or in proportion to how large the motion
+is (ibid., §5.2), as of friction of a wrong kind where motion dies down: the errors say which. The
+time until which 95 % of the errors are below 1 %, 5 % and 20 % of the spread is the horizon.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from bisect import bisect
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -27,6 +29,7 @@ from gfnn_jax.maps.estimates import (
     propagate_each,
     thinned,
 )
+from gfnn_jax.maps.sensors import Sensors
 
 _WINDOWS, _TRIED = 96, 16  # starts of forecasts; of those that choose the window
 _CHOICES = (0.25, 0.5, 1.0, 2.0)  # periods from which a state may be estimated
@@ -89,7 +92,7 @@ def calibrated(
     some = starts[:: -(-len(starts) // _TRIED)]
     leads = np.array([0.5, 1.0]) * scales.period
     windows = np.repeat(tried, len(some))
-    errors, _ = _forecasts(thirds, found, some * len(tried), windows, leads)
+    errors, _, _ = _forecasts(thirds, found, some * len(tried), windows, leads)
     with np.errstate(all="ignore"):
         sizes = (np.abs(errors) / spread).reshape(len(tried), -1)
         middle = np.nan_to_num(np.nanmedian(sizes, axis=1), nan=np.inf)
@@ -98,16 +101,17 @@ def calibrated(
     leads = np.geomspace(max(_FIRST * scales.period, scales.dt), _LAST * scales.period, _LEADS)
     leads = leads[leads <= 0.9 * longest]
     windows = np.where(np.arange(len(starts)) % 2, short, best)
-    errors, deviations = _forecasts(thirds, found, starts, windows, leads)
+    errors, deviations, x = _forecasts(thirds, found, starts, windows, leads)
     errors, deviations = _shared(errors), _shared(deviations)
+    sensors, large = _with_size(law.sensors, x, errors, deviations)
     told = np.isfinite(errors).all(axis=-1).sum(axis=0) >= _FEWEST
     leads, errors, deviations = leads[told], errors[:, told], deviations[:, told]
     if not len(leads):
         return Calibration(law, [], np.zeros((0, len(spread))))
-    missed = np.nanquantile(errors**2 / 4 - deviations**2, _INSIDE, axis=0)
+    missed = np.nanquantile((errors**2 / 4 - deviations**2) / large**2, _INSIDE, axis=0)
     misfit = np.sqrt(np.maximum(missed, 0.0))
-    sensors = dataclasses.replace(law.sensors, window=best, leads=leads, misfit=misfit)
-    bands = np.where(np.isfinite(errors), 2 * np.hypot(deviations, misfit), np.nan)
+    sensors = dataclasses.replace(sensors, window=best, leads=leads, misfit=misfit)
+    bands = np.where(np.isfinite(errors), 2 * np.hypot(deviations, misfit * large), np.nan)
     measured = np.max(np.nanquantile(np.abs(errors), _INSIDE, axis=0) / spread, axis=1)
     predicted = np.max(np.nanmedian(bands, axis=0) / spread, axis=1)
     horizons = [
@@ -115,6 +119,26 @@ def calibrated(
     ]
     median = np.nanmedian(np.abs(errors), axis=0) / spread
     return Calibration(law._replace(sensors=sensors), horizons, median)
+
+
+def _with_size(
+    sensors: Sensors, x: np.ndarray, errors: np.ndarray, deviations: np.ndarray
+) -> tuple[Sensors, np.ndarray]:
+    """The sensors with a misfit that is in proportion to the motion's size or does not depend on
+    it, whichever makes these errors (N, n, k) likelier, of deviations in a law that is right; and
+    the sizes (N, 1, 1), of N forecasts from states x (B, 2d) that N repeats (`_shared`)."""
+    best, chosen = np.inf, (sensors, np.ones((len(errors), 1, 1)))
+    for relative in (False, True):
+        one = dataclasses.replace(sensors, relative=relative)
+        large = np.tile(one.size_of(x), len(errors) // len(x))[:, None, None]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # leads without errors
+            left = np.nanmean((errors**2 - deviations**2) / large**2, axis=0)
+        variance = deviations**2 + np.maximum(left, 0.0) * large**2
+        unlikely = float(np.nansum(np.log(variance) + errors**2 / variance))
+        if unlikely < best:
+            best, chosen = unlikely, (one, large)
+    return chosen
 
 
 def _shared(values: np.ndarray) -> np.ndarray:
@@ -147,10 +171,11 @@ def _starts(found: Sequence[Stretch], scales: Scales) -> list[tuple[int, int]]:
 def _forecasts(
     thirds: Thirds, found: Sequence[Stretch], starts: Sequence[tuple[int, int]],
     windows: np.ndarray, leads: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Errors (B, n, k) of forecasts by the law without the third in which they start, NaN where the
-    record ends before, and their standard deviations; times are those of the samples nearest to the
-    leads. windows: (B,) seconds from which each state is estimated."""
+    record ends before, their standard deviations, and the states (B, 2d) they start from; times are
+    those of the samples nearest to the leads. windows: (B,) seconds from which each state is
+    estimated."""
     cut, times, measured = [], [], []
     for (i, k), window in zip(starts, windows.tolist(), strict=True):
         s = found[i]
@@ -171,4 +196,5 @@ def _forecasts(
             states[n] = x, covariance
     x, covariance = (np.stack(part) for part in zip(*states, strict=True))
     orbits = propagate_each(laws, which, cut, x, covariance, last, np.array(times))
-    return orbits.values - np.array(measured), orbits.std
+    d = thirds.laws[0].form.dim
+    return orbits.values - np.array(measured), orbits.std, x[:, : 2 * d]

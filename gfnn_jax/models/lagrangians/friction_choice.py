@@ -15,7 +15,8 @@ found from them as well, so that the odds of B, residuals being normal, are
 where of N residuals those that are correlated, over τ samples, count once. Of the sets against
 which the best has odds of less than 20 the one with the fewest kinds is taken: uniform friction,
 which has one coefficient and keeps a multiple of the symplectic form, before linear friction, and
-that before quadratic and dry friction. Uniform friction is not tried beside linear friction.
+that before quadratic and dry friction. Uniform friction is tried beside linear friction only where
+both are asked for.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def chosen(
     ``before`` stay."""
     kinds = sorted({row[1] for row in table.candidates})
     every = (chosen for n in range(len(kinds) + 1) for chosen in combinations(kinds, n))
-    every = (chosen for chosen in every if not {LINEAR, UNIFORM} <= set(chosen))
+    every = (chosen for chosen in every if not (choose and {LINEAR, UNIFORM} <= set(chosen)))
     sets = [judged for judged in map(table.leanest, every) if judged is not None]
     if not choose:
         sets = sets[-1:]

@@ -113,13 +113,18 @@ class Record:
         if bench.wander is not None:  # sizes of wanders are in units of the white part
             noise, wander = fit.sigma, bench.wander
         plain = observation.is_plain and observation.loss == SOFT_L1
-        return Sensors(
+        x = np.concatenate([n.x for n in self.nodes])
+        x[:, : observation.dim] += fit.zeros
+        own = Sensors(
             recording.coordinates, recording.inputs, recording.angles, noise, scales.omega,
             scales.period, self.hold, self.delay, np.array([scales.period]),
             np.zeros((1, len(noise))),
             None if plain else dataclasses.replace(observation, values=fit.sensors), wander,
             float(np.min(bench.state_scale(noise)[: observation.dim]) / scales.period),
+            x[:, : observation.dim].mean(axis=0),
         )  # fmt: skip
+        reach = np.sqrt(np.mean(own.distances(x) ** 2, axis=0))
+        return dataclasses.replace(own, reach=np.maximum(reach, 1e-300))
 
     def thirds(self, bench: Workbench, fit: LawFit, sensors: Sensors) -> Thirds:
         """The laws of the record without each third, of which less data tell less."""

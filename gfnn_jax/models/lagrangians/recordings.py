@@ -26,13 +26,14 @@ from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
+from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_law import fit_given
 from gfnn_jax.models.lagrangians.given_terms import Given, given_terms
 from gfnn_jax.models.lagrangians.in_use import InUse, Record, best_in_use
 from gfnn_jax.models.lagrangians.in_words import in_words
 from gfnn_jax.models.lagrangians.input_rules import RULES, Acting, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
-from gfnn_jax.models.lagrangians.libraries import FRICTIONS
+from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS
 from gfnn_jax.models.lagrangians.next_motion import next_motions
 from gfnn_jax.models.lagrangians.of_systems import search_of_systems
 from gfnn_jax.models.lagrangians.search import NO_LAW, Found, SearchOptions, describe, search
@@ -89,11 +90,11 @@ def fit_recording(
         recording, samples.observation.channels, best.fit, best.law, nodes, bench.inputs
     )
     note("finding the motion to record next")
+    messages = (*samples.messages, *_at_bound(options, best.choice, best.law.dim))
     motions = next_motions(best.bench, best.fit, samples.angles)
     seconds = time.process_time() - started
     return in_words(
-        recording, best, map_, traces, motions, measured, acting, samples.messages, tuple(steps),
-        seconds,
+        recording, best, map_, traces, motions, measured, acting, messages, tuple(steps), seconds,
     )  # fmt: skip
 
 
@@ -107,6 +108,22 @@ def _options(friction: str) -> SearchOptions:
             f"{friction!r}"
         )
     return SearchOptions(frictions=kinds, choose_friction=False)
+
+
+def _at_bound(options: SearchOptions, choice: FrictionChoice, dim: int) -> list[str]:
+    """A message where kinds of friction were asked for that the record does not show."""
+    if options.choose_friction:
+        return []
+    taken = {FRICTIONS[KINDS.index(kind)] for kind in choice.kinds}
+    taken |= {"uniform"} if dim == 1 and "linear" in taken else set()  # which is the same there
+    unseen = [kind for kind in options.frictions if kind not in taken]
+    if not unseen:
+        return []
+    return [
+        f"{' and '.join(unseen)} friction was asked for, and the record shows none: its "
+        "coefficient is 0, the least that friction can have. fit.which_friction tells the largest "
+        "that the record allows"
+    ]
 
 
 def _check(recording: Recording, input_hold: str, mass: Mapping[str, float] | None) -> None:
