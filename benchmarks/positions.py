@@ -165,10 +165,11 @@ def noisy(quick: bool, *, sets: int = 5, triples: int = 3_000, noise: float = NO
 
 
 def cell(quick: bool, *, noise: float, tolerance: float) -> Numbers:
-    """One cell of a storage ring (`storage_ring`) from x and y at one place, turn by turn, of 20
+    """One cell of a storage ring (`rings.lattice`) from x and y at one place, turn by turn, of 20
     particles within 2 mm: the next reading, tunes and amplitude detuning, which no gauge touches.
     Needs PyAT."""
-    from storage_ring import AMPLITUDE, ellipsoid, ring, tune
+    from rings.lattice import AMPLITUDE, ellipsoid, ring
+    from rings.tunes import tune
 
     machine, turns, ahead = ring("hmba.mat"), 500 if quick else 5_000, 1_024
 
