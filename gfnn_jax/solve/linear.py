@@ -127,3 +127,10 @@ def covariance_root(covariance: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(correlations)
     root = np.sqrt(values.clip(0.0))[..., :, None] * np.swapaxes(vectors, -1, -2)
     return root * deviations[..., None, :]
+
+
+def non_negative(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """The x ≥ 0 (n,) of the least ‖A x − b‖, A (N, n)."""
+    from scipy.optimize import nnls  # takes a quarter of a second: loaded when first used
+
+    return nnls(matrix, target)[0]
