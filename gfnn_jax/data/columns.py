@@ -122,7 +122,7 @@ def time_unit_of(source: str, names: list[str], units: Mapping[str, str], given:
                     return unit
             if _unit(units, name) and _unit(units, name) not in ("seconds", "second"):
                 raise InputError(
-                    f"{source}: {name}: unit {units[name]!r} is not known: say --time-unit "
+                    f"{source}: {name}: unit {units[name]!r} is not known: give --time-unit "
                     f"{'|'.join(SECONDS)}"
                 )
     return "s"
