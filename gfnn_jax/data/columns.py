@@ -53,7 +53,7 @@ def roles_of(
         found, velocities = positions_and_velocities(source, runs, rest)
         roles |= {"positions": found, "velocities": velocities}
         notes.append(
-            f"the data tell that {', '.join(velocities)} are derivatives of {', '.join(found)}"
+            f"the data show that {', '.join(velocities)} are derivatives of {', '.join(found)}"
         )
     for role in ("velocities", "momenta"):
         if len(roles[role]) > len(roles["positions"]) > 0:

@@ -259,7 +259,7 @@ def _promised(
         return ""
     order = found.order_for(bound)
     if order is None:
-        return "; its error falls too slowly to tell which size would meet the tolerance"
+        return "; its error falls too slowly to predict which size would meet the tolerance"
     return f"; extrapolated, {sweeps[i].at(order)} would meet the tolerance"
 
 

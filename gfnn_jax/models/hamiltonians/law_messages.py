@@ -52,7 +52,7 @@ def messages(
         if found.whole.misfit:
             yield (
                 "H misses whole sequences by more than their noise: it lacks terms that single "
-                "steps do not tell; bands count what it misses"
+                "steps do not show; bands count what it misses"
             )
     if found.undetermined:
         names = found.undetermined

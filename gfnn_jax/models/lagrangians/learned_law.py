@@ -21,7 +21,7 @@ _RULES = {
     "linear": "linear between samples",
     "band": "band-limited between samples",
 }
-_SHOWN = 3  # pairs of coefficients that are not told apart
+_SHOWN = 3  # pairs of nearly collinear coefficients that are listed
 
 
 def _time(seconds: float) -> str:
@@ -101,7 +101,7 @@ class LearnedLaw:
         """The law, its errors and its horizon, a line each."""
         lines = [f"L = {self.lagrangian}", f"R = {self.friction}"]
         lines += [f"friction: {self.which_friction}", f"scale of L: {self.gauge}"]
-        lines += [f"not told apart: {pair}" for pair in self.alike[:_SHOWN]]
+        lines += [f"nearly collinear: {pair}" for pair in self.alike[:_SHOWN]]
         lines += [
             f"{name}: zero at {measured(zero, std)} rad" for name, (zero, std) in self.zeros.items()
         ]

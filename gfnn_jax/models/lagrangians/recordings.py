@@ -172,7 +172,7 @@ def _samples(recording: Recording, loss: Loss | None, on_progress: OnProgress) -
     if observation.is_plain:
         found, resting = without_rests(found, samples.scales)
         if resting:
-            line = f"{resting:.3g} s at rest left out: a body that stands still tells no law"
+            line = f"{resting:.3g} s at rest left out: a body at rest shows no dynamics"
             on_progress(line)
             samples = _Samples(recording, observation, angles, found, measure(found), (line,))
     sigma = np.where(samples.given > 0, samples.given, samples.scales.sigma)
