@@ -32,6 +32,10 @@ _BLOCK_BYTES, _FEWEST_ROWS = 2 * 2**20, 256
 # operations as rows as there are terms. An accelerator wants larger ones, and was not at hand to
 # tell how large.
 _PART_ON_CPU, _PART_ON_ACCELERATORS = 4, 16
+# Rows per term, the fewest that the terms of S are fitted to: half as many gain a digit where pairs
+# are few and clean, of a map nearly twice as dear, and noise is learned with them; twice as many
+# lose that digit (benchmarks/constants.py).
+ROWS_PER_TERM = 3
 # Ridge parameters tried, relative to the largest singular value; the first is plain least squares.
 _RIDGES = (0.0, *(10.0**k for k in range(-13, 0)))
 # Standard deviations of chance by which a ridge must lower the held-out squares. Of Hénon–Heiles
