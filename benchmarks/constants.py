@@ -159,38 +159,48 @@ CASES: dict[str, Callable[[], Outcome]] = {
 }  # fmt: skip
 
 S, H, L = "models.generating_functions", "models.hamiltonians", "models.lagrangians"
-# (module, constant, cases that it decides in); a name with a point is a field of frozen options.
-CONSTANTS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    (f"{S}.sweeps", "_ROWS_PER_TERM", ("few", "two")),
-    (f"{S}.sweeps", "_ROWS_THAT_TELL", ("noisy", "two")),
-    (f"{S}.sweeps", "_SCARCE", ("few", "two")),
-    ("search.search", "_WORTHWHILE", ("clean", "noisy")),
-    ("search.search", "_STALLED", ("noisy",)),
-    ("search.search", "_NO_WORSE", ("noisy",)),
-    ("search.search", "COMPARABLE", ("noisy",)),
-    ("search.search", "_FAR", ("clean", "few")),
-    ("search.extrapolate", "_GAINED", ("clean", "noisy")),
-    ("search.extrapolate", "_FARTHEST", ("clean", "two")),
-    ("learn.choose", "_CONFIRMED", ("clean", "long")),
-    ("learn.noisy_sweeps", "_NO_WORSE", ("noisy",)),
-    ("dataset.split", "_FRACTION", ("few", "noisy")),
-    ("diagnosis.charts", "_FAR", ("long",)),
-    ("diagnosis.local_jacobians", "_NEIGHBOURS_PER_TERM", ("damped", "outliers")),
-    ("diagnosis.clean", "_MOST_OUTLIERS", ("outliers",)),
-    ("learn.gross_errors", "_BEYOND", ("outliers",)),
-    ("diagnosis.damping", "_CERTAIN", ("damped",)),
-    ("diagnosis.damping", "_ROWS_PER_TERM", ("damped",)),
-    (f"{H}.choose_law", "MAX_COST_RATIO", ("law",)),
-    (f"{H}.options", "OPTIONS.rise", ("law", "sequences")),
-    (f"{H}.options", "OPTIONS.certain", ("law", "sequences")),
-    (f"{H}.options", "OPTIONS.flat", ("sequences",)),
-    ("solve.latent_arcs", "OUTLYING", ("sequences",)),
-    ("solve.latent_arcs", "_DEFECT", ("record",)),
-    ("solve.latent_arcs", "SOFT_L1.k", ("record",)),
-    (f"{L}.search", "SearchOptions.significant", ("record",)),
-    (f"{L}.search", "SearchOptions.asked_for", ("record",)),
-    (f"{L}.search", "SearchOptions.gain", ("record",)),
-)
+
+
+class Constant(NamedTuple):
+    """module, name: where it stands; a name with a point is a field of frozen options. cases: that
+    it decides in. unit: what it is measured in."""
+
+    module: str
+    name: str
+    cases: tuple[str, ...]
+    unit: str
+
+
+CONSTANTS = tuple(Constant(*row) for row in (
+    ("fitting.least_squares", "ROWS_PER_TERM", ("few", "two", "damped"), "rows ÷ terms of S"),
+    (f"{S}.sweeps", "_ROWS_THAT_TELL", ("noisy", "two"), "rows ÷ terms that show misfit"),
+    (f"{S}.sweeps", "_SCARCE", ("few", "two"), "rows ÷ terms, test rows train below"),
+    ("search.extrapolate", "GAINED", ("clean", "noisy"), "error ÷ least before, no gain above"),
+    ("search.extrapolate", "_FARTHEST", ("clean", "two"), "orders ÷ range of orders"),
+    ("search.search", "_STALLED", ("noisy",), "sizes in a row without a gain"),
+    ("search.search", "_NO_WORSE", ("noisy",), "error ÷ error, as good below"),
+    ("search.search", "COMPARABLE", ("noisy",), "error ÷ best sweep's"),
+    ("search.search", "_FAR", ("clean", "few"), "foretold error ÷ tolerance"),
+    ("learn.choose", "_CONFIRMED", ("clean", "long"), "bound of own steps ÷ of the search"),
+    ("learn.noisy_sweeps", "_NO_WORSE", ("noisy",), "squared error ÷ least, as good below"),
+    ("dataset.split", "_FRACTION", ("few", "noisy"), "part of the pairs that validates"),
+    ("diagnosis.charts", "_FAR", ("long",), "determinant of ∂w/∂z"),
+    ("diagnosis.local_jacobians", "_NEIGHBOURS_PER_TERM", ("damped", "outliers"),
+     "neighbours ÷ unknowns"),
+    ("diagnosis.clean", "_MOST_OUTLIERS", ("outliers",), "part of the pairs"),
+    ("learn.gross_errors", "_BEYOND", ("outliers",), "residual ÷ neighbours'"),
+    ("diagnosis.damping", "_CERTAIN", ("damped",), "standard errors"),
+    (f"{H}.choose_law", "MAX_COST_RATIO", ("law",), "operations ÷ the map's"),
+    (f"{H}.options", "OPTIONS.rise", ("law", "sequences"), "held-out error ÷ before"),
+    (f"{H}.options", "OPTIONS.certain", ("law", "sequences"), "standard errors"),
+    (f"{H}.options", "OPTIONS.flat", ("sequences",), "error ÷ error"),
+    ("solve.latent_arcs", "OUTLYING", ("sequences",), "standard deviations"),
+    ("solve.latent_arcs", "_DEFECT", ("record",), "standard deviations"),
+    ("solve.latent_arcs", "SOFT_L1.k", ("record",), "standard deviations"),
+    (f"{L}.search", "SearchOptions.significant", ("record",), "standard errors"),
+    (f"{L}.search", "SearchOptions.asked_for", ("record",), "standard errors"),
+    (f"{L}.search", "SearchOptions.gain", ("record",), "part of the held-out cost"),
+))  # fmt: skip
 
 
 def value_of(module: str, name: str) -> Any:
@@ -255,7 +265,7 @@ def halved_and_doubled(quick: bool) -> harness.Numbers:
     """(constant, factor) -> what becomes of error and cost."""
     known: dict[str, Outcome] = {}
     found: dict[str, Any] = {}
-    for module, name, cases in CONSTANTS[:: 6 if quick else 1]:
+    for module, name, cases, _ in CONSTANTS[:: 6 if quick else 1]:
         value = value_of(module, name)
         row: dict[str, Any] = {"value": value}
         for factor in (0.5, 2.0):
@@ -318,8 +328,12 @@ def tables() -> None:
     text = []
     if "halved-and-doubled" in found:
         rows = found["halved-and-doubled"]["measured"]["constants"]
-        heads = ("constant", "value", "halved and doubled")
-        cells = [[f"`{name}`", f"{row['value']:g}", shown(row)] for name, row in rows.items()]
+        units = {f"{c.module}.{c.name}": c.unit for c in CONSTANTS}
+        heads = ("constant", "value", "unit", "halved and doubled")
+        cells = [
+            [f"`{name}`", f"{row['value']:g}", units[name], shown(row)]
+            for name, row in rows.items()
+        ]
         text.append(harness.markdown(heads, cells))
     if "parity" in found:
         rows = found["parity"]["measured"]

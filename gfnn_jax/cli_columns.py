@@ -17,7 +17,7 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
     """
     group = command.add_argument_group(
         "columns of a recording",
-        "names separated by commas; without these options the file's names and data tell the roles",
+        "names separated by commas; without these options the file's names and data decide",
     )
     for role in ROLES:
         group.add_argument(f"--{role}", type=_names, metavar="A,B", help=f"columns of {role}")

@@ -94,7 +94,7 @@ def parser() -> argparse.ArgumentParser:
 
     command = commands.add_parser(
         "look", help="what a recording holds, before anything is learned",
-        description="Runs, rates, gaps, noise, friction and mistakes of a recording, told by the "
+        description="Runs, rates, gaps, noise, friction and mistakes of a recording, found in the "
         "file itself: .csv and other text, .npz, .npy.", **others,
     )  # fmt: skip
     command.set_defaults(command="look")
@@ -113,7 +113,7 @@ def parser() -> argparse.ArgumentParser:
     command = commands.add_parser(
         "fit", help="learn from your own recording, or from states q, p",
         description="Learn from a recording (positions over time: a law with friction and inputs) "
-        "or from states q, p (a symplectic map, or H). The columns tell which of them a file is.",
+        "or from states q, p (a symplectic map, or H). The columns decide which of them a file is.",
         **_with_status(fitting),
     )  # fmt: skip
     command.set_defaults(command="fit")

@@ -25,7 +25,7 @@ def law_line(report: dict[str, Any]) -> str:
             f"best partial law: H of {len(law['terms'])} terms, one-step error "
             f"{fit['validation_relative']:.1e} of the spread (report.json)"
         )
-    return f"{'' if chosen else 'found, and dearer per step than the map: '}H = {law['formula']}"
+    return f"{'' if chosen else 'found, and costlier per step than the map: '}H = {law['formula']}"
 
 
 def error_line(fit: dict[str, Any]) -> str:

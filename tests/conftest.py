@@ -58,6 +58,11 @@ def pytest_configure(config):
     for name, value in shared.items():
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
+    # Each operation that is traced keeps where it was called from: a twentieth of the time.
+    with contextlib.suppress(ImportError, AttributeError):  # no part of JAX's interface
+        from jax._src.lib import _jax
+
+        _jax.set_tracebacks_enabled(False)
     # Tracing makes millions of small objects that live on: looking through them so often as Python
     # does by itself takes a twentieth of the suite's time.
     gc.set_threshold(50_000, 20, 20)

@@ -17,7 +17,7 @@ from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.models.generating_functions import sweeps
 from gfnn_jax.models.generating_functions.parity import is_even
 from gfnn_jax.phase_space import Pairs
-from gfnn_jax.search.search import search
+from gfnn_jax.search.search import Search
 from gfnn_jax.storage.factors import KeptFactors
 
 
@@ -77,7 +77,7 @@ def test_a_size_too_large_to_count_is_never_looked_at():
         return Products(inputs, degree)
 
     groups = (map(family, group) for group in sweeps._DEGREES)
-    kept = list(itertools.chain(*sweeps._determined(groups, 10**6, sweeps._ROWS_PER_TERM)))
+    kept = list(itertools.chain(*sweeps._determined(groups, 10**6, sweeps.ROWS_PER_TERM)))
     assert [f.degree for f in kept] == [2, 3, 4]
     assert looked_at == [2, 3, 4, 5]
 
@@ -104,7 +104,7 @@ def quiet(_):
 def test_the_right_degree_is_found_without_compiling(compilations):
     with compilations() as found:
         sweep = of_kicks()
-        result = search([sweep], 1e-11, Budget(), quiet, quiet)
+        result = Search([sweep], 1e-11, Budget(), quiet, quiet).to_its_end()
     assert found.count == 0
     best = result.ranking[0]
     assert best.candidate.label == "polynomial 4"
@@ -128,7 +128,7 @@ def test_the_estimate_is_of_the_size_of_the_error():
 def test_more_pairs_never_take_a_candidate_away(monkeypatch):
     """Where a factorisation of all rows would take too long, it is of a sample of them."""
     monkeypatch.setattr(sweeps, "_MOST_OPERATIONS", 300 * 27**2)
-    found = search([of_kicks()], 1e-11, Budget(), quiet, quiet)
+    found = Search([of_kicks()], 1e-11, Budget(), quiet, quiet).to_its_end()
     assert found.ranking[0].candidate.label == "polynomial 4"
     assert found.ranking[0].candidate.validation_bound < 1e-11
 
@@ -141,11 +141,12 @@ def test_a_factorisation_stops_when_the_time_is_spent():
 
 def test_a_fit_that_goes_on_takes_the_factors_that_were_kept(monkeypatch, tmp_path):
     monkeypatch.setattr(sweeps, "_WORTH_KEEPING", 0.0)
-    first = search([of_kicks(factors=KeptFactors(tmp_path))], 1e-11, Budget(), quiet, quiet)
 
     def again():
-        return search([of_kicks(factors=KeptFactors(tmp_path))], 1e-11, Budget(), quiet, quiet)
+        swept = [of_kicks(factors=KeptFactors(tmp_path))]
+        return Search(swept, 1e-11, Budget(), quiet, quiet).to_its_end()
 
+    first = again()
     with monkeypatch.context() as without:
         without.setattr(sweeps.least_squares, "reduce", None)
         second = again()

@@ -157,6 +157,7 @@ def test_a_factor_that_no_parameter_changes_is_one_number():
     assert learned.map.multiplier({"strength": 0.5}) == learned.damping.factor
 
 
+@pytest.mark.slow
 def test_two_factors_that_depend_on_a_parameter():
     """Two oscillators whose frictions are of a parameter: none of them has a multiple of J."""
     rng = np.random.default_rng(0)

@@ -33,7 +33,7 @@ from gfnn_jax.learn.refit import refit
 from test_fit_on_devices import kicked, quartic
 
 warnings.simplefilter("ignore")
-assert len(jax.devices()) == 4
+assert len(jax.devices()) == 3
 pairs = {"map": kicked(3_000), "law": quartic(3_000), "networks": kicked(120)}
 options = {
     "map": dict(learn="map", chart="midpoint", tolerance=1e-8),
@@ -42,9 +42,9 @@ options = {
                      max_seconds=None),
 }
 for name, own in ((kind, pairs[kind]) for kind in sys.argv[1:]):
-    found = {n: gfnn.fit(own, devices=n, **options[name]) for n in (None, 1, 3, 4)}
+    found = {n: gfnn.fit(own, devices=n, **options[name]) for n in (None, 1, 3)}
     bits = {n: [np.asarray(a).tobytes() for a in jax.tree.leaves(f.map)] for n, f in found.items()}
-    assert all(bits[n] == bits[1] for n in (3, 4)), f"{name}: bits depend on the devices"
+    assert bits[3] == bits[1], f"{name}: bits depend on the devices"
     assert len({f.chosen.label for f in found.values()}) == 1
     z = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 2))
     plain, shared = (np.asarray(found[n].map.step(z)[0]) for n in (None, 1))
@@ -89,7 +89,7 @@ def quartic(number):
     ["map", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("law", "networks"))],
 )
 def test_the_same_bits_on_any_number_of_devices(kind):
-    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=3"
     path = os.pathsep.join([os.path.dirname(__file__), *sys.path])
     ran = subprocess.run(
         [sys.executable, "-c", FITS, kind], capture_output=True, text=True, check=False,

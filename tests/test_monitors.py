@@ -143,7 +143,7 @@ def test_what_does_not_fit_is_refused():
         (PLACES, [LENGTH], "expected 2 stretches"),
         (PLACES, [None, None], "stretches that are known, and some None"),
         (PLACES, [np.diag([2.0, 2.0, 1.0, 1.0]), None], "expected symplectic matrices"),
-        (PLACES, [0.0, None], "two readings tell no momenta"),
+        (PLACES, [0.0, None], "two readings determine no momenta"),
         ([("x1", "y1"), ("x3", "y2")], [LENGTH, None], "expected columns x3"),
         (
             [*PLACES, ("x1", "y1"), ("x2", "y2")],

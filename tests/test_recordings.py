@@ -263,7 +263,7 @@ def test_names_as_they_can_stand_in_a_formula():
 REFUSED = {
     "Time (s) Run #1,x Run #1,Time (s) Run #2,x Run #2\n0,1,0,1\n1,2,1,2\n": "Run #1, Run #2",
     "a,x\n1,2\n2,3\n": "expected a column t or time",
-    "t,a,b\n1,2,3\n2,3,4\n": "do not tell what was measured",
+    "t,a,b\n1,2,3\n2,3,4\n": "do not show what was measured",
     "t,x\n0,1\n0,2\n": "line 3: t = 0 is the same as 0",
     "run,t,x\n0,0,1\n# gap\n0,2,2\n0,1,2\n": "line 5: t = 1 runs back from 2",
     "t,x\n0,1\n1,two\n2,3\n": "line 3, x: 'two' is not a number",

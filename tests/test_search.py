@@ -9,7 +9,7 @@ import pytest
 
 from gfnn_jax.budget import Budget
 from gfnn_jax.candidates.candidate import Candidate
-from gfnn_jax.search.search import Search, search
+from gfnn_jax.search.search import Search
 
 WORK = 1_000  # operations that a made-up size takes, and its steps
 
@@ -59,7 +59,8 @@ class Sweep:
 
 def found_in(*sweeps, bound=1e-6, budget=None, told=None, on_validated=None):
     tell = (lambda c: None) if told is None else told.append
-    return search(sweeps, bound, budget or Budget(), lambda message: None, tell, on_validated)
+    given = bound, budget or Budget(), lambda message: None, tell, on_validated
+    return Search(sweeps, *given).to_its_end()
 
 
 def order(found):

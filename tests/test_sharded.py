@@ -31,7 +31,7 @@ from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.processes import Share
 
-DT, LANES, STEPS = 0.3, 700, 60
+DT, LANES, STEPS = 0.3, 700, 30
 
 
 @pytest.fixture(scope="module")
@@ -63,28 +63,28 @@ from gfnn_jax.maps.sharded import Sharded, local_devices
 
 folder = Path(sys.argv[1])
 map_, z0 = saved.load(folder / "m"), np.load(folder / "z0.npy")
-assert len(jax.devices()) == 4
+assert len(jax.devices()) == 3
 found = []
-for count in (1, 2, 4):
-    states, info = map_.sharded(count).rollout(z0, 60, save_every=20)
+for count in (1, 2, 3):
+    states, info = map_.sharded(count).rollout(z0, 30, save_every=10)
     found.append((states.tobytes(), *(a.tobytes() for a in jax.tree.leaves(info))))
 assert len(set(found)) == 1, "bits depend on the number of devices"
-block, _ = map_.rollout(z0[:256], 60, save_every=20)
+block, _ = map_.rollout(z0[:256], 30, save_every=10)
 np.testing.assert_array_equal(block, states[:256], "a block is what the map itself makes of it")
-few, _ = map_.sharded(1).rollout(z0[:3], 60, save_every=20)
+few, _ = map_.sharded(1).rollout(z0[:3], 30, save_every=10)
 np.testing.assert_array_equal(few, states[:3], "bits depend on the number of lanes")
 
 params = np.asarray(map_.pieces[0].params)
 samples = Samples(map_, jax.device_put(np.stack([params, 1.1 * params])), 0)
-of = [Sharded(samples, local_devices(n)).rollout(z0, 20, save_every=10)[0] for n in (1, 4)]
+of = [Sharded(samples, local_devices(n)).rollout(z0, 10, save_every=5)[0] for n in (1, 3)]
 assert of[0].tobytes() == of[1].tobytes(), "bits of samples depend on the number of devices"
 
 def predicted(name, devices, **more):
-    job.predict(folder / "m", folder / "z0.npy", num_steps=60, out=folder / name, devices=devices,
+    job.predict(folder / "m", folder / "z0.npy", num_steps=30, out=folder / name, devices=devices,
                 **more)
     return (folder / name).read_bytes()
 
-job._CHUNK_LANE_STEPS = 7_000
+job._CHUNK_LANE_STEPS = 3_500
 whole = predicted("one.npz", 1)
 append = PredictionWriter.append
 
@@ -95,7 +95,7 @@ def stopping(self, states, carry):
 
 PredictionWriter.append = stopping
 try:
-    predicted("stopped.npz", 4)
+    predicted("stopped.npz", 3)
 except KeyboardInterrupt:
     PredictionWriter.append = append
 assert predicted("stopped.npz", 2, resume=True) == whole, "resumed on other devices"
@@ -109,7 +109,7 @@ def environment(**more):
 
 
 def test_the_same_bits_on_any_number_of_devices(folder):
-    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=3"
     ran = subprocess.run(
         [sys.executable, "-c", ON_DEVICES, str(folder)], capture_output=True, text=True,
         check=False, env=environment(XLA_FLAGS=flags),
@@ -232,7 +232,7 @@ def test_a_killed_job_resumes_to_the_same_bits(folder, alone, monkeypatch):
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(job, "_CHUNK_LANE_STEPS", 7_000)
+        patch.setattr(job, "_CHUNK_LANE_STEPS", 3_500)
         patch.setattr(PredictionWriter, "append", stopping)
         with pytest.raises(KeyboardInterrupt):
             job.predict(folder / "m", folder / "z0.npy", num_steps=STEPS,

@@ -321,6 +321,7 @@ def test_a_heavy_top_in_eulers_angles_is_found_told_nothing():
     assert found == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_good_approximation_is_no_formula():
     """cos(q) e^(−q²/10) is of no dictionary; five atoms of others come to 1e-11 of it."""
     z0 = np.random.default_rng(0).uniform(-1.3, 1.3, (160, 2))

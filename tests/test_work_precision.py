@@ -110,6 +110,6 @@ def test_a_name_looks_alike_in_all_panels():
         {str(ln.get_label()): (ln.get_color(), ln.get_marker()) for ln in ax.get_lines()}
         for ax in figure.axes
     ]
-    for name in ("b", "heyoka (told H)"):
+    for name in ("b", "heyoka (given H)"):
         assert looks[0][name] == looks[1][name]
     assert looks[0]["a"] != looks[0]["b"]

@@ -55,7 +55,7 @@ def roles_of(
         found, velocities = positions_and_velocities(source, runs, rest)
         roles |= {"positions": found, "velocities": velocities}
         notes.append(
-            f"the data tell that {', '.join(velocities)} are derivatives of {', '.join(found)}"
+            f"the data show that {', '.join(velocities)} are derivatives of {', '.join(found)}"
         )
     for role in ("velocities", "momenta"):
         if len(roles[role]) > len(roles["positions"]) > 0:
@@ -124,7 +124,7 @@ def time_unit_of(source: str, names: list[str], units: Mapping[str, str], given:
                     return unit
             if _unit(units, name) and _unit(units, name) not in ("seconds", "second"):
                 raise InputError(
-                    f"{source}: {name}: unit {units[name]!r} is not known: say --time-unit "
+                    f"{source}: {name}: unit {units[name]!r} is not known: give --time-unit "
                     f"{'|'.join(SECONDS)}"
                 )
     return "s"

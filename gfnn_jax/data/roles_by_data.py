@@ -47,7 +47,7 @@ def positions_and_velocities(
         if not moving:
             raise InputError(f"{source}: none of the columns {', '.join(names)} varies")
         raise InputError(
-            f"{source}: the names {', '.join(names)} do not tell what was measured, and {shown} "
+            f"{source}: the names {', '.join(names)} do not show what was measured, and {shown} "
             f"may be motion or what drives it. Name them: --positions {','.join(moving)}, or some "
             "of them and --inputs"
         )

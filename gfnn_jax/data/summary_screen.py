@@ -85,7 +85,7 @@ def _loss(summary: RecordingSummary) -> str:
     if not loss.significant and loss.error > _TOLD:
         return f"friction{beside} not determined ({size})"
     if not loss.significant:
-        return f"no friction seen{beside} ({size})"
+        return f"no friction found{beside} ({size})"
     if loss.per_period < 0:
         return f"a gain of {size}{beside}: a drive is missing (--inputs)"
     kind = f"; {loss.kind} friction fits best" if loss.kind else ""

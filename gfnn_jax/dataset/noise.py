@@ -16,7 +16,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import nnls
+
+from gfnn_jax.solve.linear import non_negative
 
 # Where the residuals cannot tell two coordinates' noise apart, each is given half of its own
 # residual's variance, by this weight beside the moments' own.
@@ -60,7 +61,7 @@ def of_pairs(residual: np.ndarray, jacobian: np.ndarray, shared: np.ndarray) -> 
     moments = r.T @ r / count, r[shared].T @ r[shared + 1] / count
     parts = one.reshape(-1, width), between.reshape(-1, width), _PRIOR * np.eye(width)
     target = *(moment.ravel() for moment in moments), np.full(width, 0.5 * _PRIOR)
-    variance, _ = nnls(np.concatenate(parts), np.concatenate(target))
+    variance = non_negative(np.concatenate(parts), np.concatenate(target))
     # So many residuals tell no less.
     return deviation * np.sqrt(np.maximum(variance, 1.0 / count))
 
@@ -79,5 +80,5 @@ def of_halves(residual: np.ndarray, grown: np.ndarray) -> np.ndarray:
     # In units of each half's own residual, as q and p may differ by orders of magnitude.
     relative = factors * mean / mean[:, None]
     rows = np.concatenate([relative, _PRIOR * np.eye(2)])
-    found, _ = nnls(rows, np.concatenate([np.ones(2), np.full(2, 0.5 * _PRIOR)]))
+    found = non_negative(rows, np.concatenate([np.ones(2), np.full(2, 0.5 * _PRIOR)]))
     return np.sqrt(mean * found)[halves]

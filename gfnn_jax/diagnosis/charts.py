@@ -72,7 +72,7 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
         return Charts([TYPE1], None, judgements, [])
     beyond = [n for n in near_identity if judgements[n].valid]
     if request == "auto" and beyond:
-        message = _about(beyond[0], judgements[beyond[0]], "lies beyond a fold throughout", ())
+        message = _about(beyond[0], judgements[beyond[0]], "is valid only beyond a fold of w", ())
         return Charts([CHARTS[beyond[0]]], None, judgements, [message])
     lows = ", ".join(f"{n} {j.sign * j.low:.2g}" for n, j in judgements.items())
     raise FitError(

@@ -26,6 +26,7 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
+from gfnn_jax.fitting.least_squares import ROWS_PER_TERM
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping, DampingOfArgs, FunctionsOfArgs
@@ -38,7 +39,6 @@ _CERTAIN = 5.0  # standard errors that make a factor other than 1 certain
 # change of areas certain.
 _SAMPLE, _PLENTY = 1_000, 20
 _DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20, 24, 28)  # of S, that are tried in turn
-_ROWS_PER_TERM = 3
 # Rows × terms² of one solve: a quarter of a second on one core, and of a sample a fortieth.
 _MOST_OPERATIONS, _OF_SAMPLE = 1e9, 1e8
 _UPDATES = 10  # of Gauss–Newton, which converges in four or five
@@ -279,7 +279,7 @@ class _Problem:
             family = Products(inputs, degree)
             terms = family.num_parameters
             if degree > _DEGREES[0] and (
-                _ROWS_PER_TERM * terms > w.size or w.size * terms**2 > self.most_operations
+                ROWS_PER_TERM * terms > w.size or w.size * terms**2 > self.most_operations
             ):
                 return
             yield family

@@ -161,7 +161,7 @@ def work_precision_panels(panels: Mapping, ylabel) -> Figure:
             ax.plot([], [], "o", mfc="white", color="#777777", label="hollow: in float32")
         for name, points in groups["known"].items():
             look = look_of(place[name]) | {"color": "#777777", "linewidth": 0.8, "ms": 3.5}
-            ax.plot(*points[:2], label=f"{name} (told H)", **look)
+            ax.plot(*points[:2], label=f"{name} (given H)", **look)
         costs, errors = (
             np.array([np.ravel(v[i])[0] for v in groups["others"].values()]) for i in (0, 1)
         )

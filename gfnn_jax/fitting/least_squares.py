@@ -32,6 +32,10 @@ _BLOCK_BYTES, _FEWEST_ROWS = 2 * 2**20, 256
 # operations as rows as there are terms. An accelerator wants larger ones, and was not at hand to
 # tell how large.
 _PART_ON_CPU, _PART_ON_ACCELERATORS = 4, 16
+# Rows per term, the fewest that the terms of S are fitted to. Of 70 clean pairs of a pendulum half
+# as many gain two digits by a map that is 1.7 times as dear, and twice as many lose one and a half
+# (benchmarks/constants.py).
+ROWS_PER_TERM = 3
 # Ridge parameters tried, relative to the largest singular value; the first is plain least squares.
 _RIDGES = (0.0, *(10.0**k for k in range(-13, 0)))
 # Standard deviations of chance by which a ridge must lower the held-out squares. Of Hénon–Heiles

@@ -279,8 +279,8 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     if known is not None:
         return known
     if data.noise_of_channels is None and _told_by_neighbours(sample) is None:
-        return _LeftOver(None, [], "the pairs lie too far apart to tell noise from what these "
-                         "functions lack")  # fmt: skip
+        return _LeftOver(None, [], "the pairs lie too far apart to distinguish noise from what "
+                         "these functions lack")  # fmt: skip
     rows, sequence = sample.rows, sample.sequence
     taken = candidate.num_parameters / (data.training.size * 2 * data.dim)
     noise = state_noise(candidate.map, data.pairs.take(rows[:_NOISE_PAIRS]), taken)
@@ -304,14 +304,14 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     hidden, reason = "", "the residuals are noise"
     if len(np.unique(sequence)) == len(sequence):
         hidden = (
-            ". Single pairs cannot tell noise from something that the states do not hold (a "
+            ". Single pairs cannot distinguish noise from something that the states do not hold (a "
             "parameter, a drive)"
         )
         reason += ", or something that the states do not hold"
     of_law = law if candidate.learns == "hamiltonian" and not hidden else None
     if of_law is not None and leaves_white(of_law, searched.data):
         message = (
-            "the residuals of H are white: these pairs say nothing against H. They are noise of "
+            "the residuals of H are white: these pairs do not contradict H. They are noise of "
             f"about {sizes_of_noise}"
         )
         return _LeftOver(noise, [message], _WHITE)

@@ -194,7 +194,7 @@ def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
     if not values[-1] > _SEEN * max(values[0], 1e-300):
         raise InputError(
             "between: the block ∂Q/∂p of a matrix is singular (a phase advance near a multiple of "
-            "π), so that two readings tell no momenta. Give another stretch as the known one"
+            "π), so that two readings determine no momenta. Give another stretch as the known one"
         )
     return matrix
 

@@ -73,7 +73,7 @@ class OfPositions:
         listed = "" if self.noise is None else ", ".join(f"{s:.3g}" for s in self.noise)
         return (
             f"S(q, Q) of {self.num_triples:,} triples of successive positions, {kind}. Positions "
-            "do not tell its scale: momenta, energies and areas have a unit of their own"
+            "do not determine its scale: momenta, energies and areas have a unit of their own"
             + (f". {left} undetermined combinations of terms are 0" if left else "")
             + (f". The noise of the readings is {listed}" if listed else "")
         )

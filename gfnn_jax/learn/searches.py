@@ -126,7 +126,7 @@ def searched(
         law is not None and not met_by_law and data.args is None
         and law_explains_most(law, found, tolerance, budget)
     ):  # fmt: skip
-        on_progress(f"learning what the flow of {law.candidate.label} leaves over")
+        on_progress(f"learning the residual of the flow of {law.candidate.label}")
         around = search_around(
             law, data, tolerance, scene, budget, on_progress, on_candidate, better, options.seed
         )

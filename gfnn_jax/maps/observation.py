@@ -140,8 +140,8 @@ class Observation:
             q[better], best[better] = x[better, :d], left[better]
         if not np.isfinite(best).all():
             raise InputError(
-                f"observe: {', '.join(self.channels)} do not tell {', '.join(self.coordinates)}: "
-                "each needs a channel that shows it"
+                f"observe: {', '.join(self.channels)} do not determine "
+                f"{', '.join(self.coordinates)}: each needs a channel that shows it"
             )
         for i in angles:
             if own[i] is None:

@@ -10,7 +10,6 @@ import dataclasses
 from collections.abc import Callable
 from functools import partial
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +36,8 @@ def _solve(field, start, end, z, until=None):
     With ``until`` the solver stops at the end of the first step after which ``until(z)`` holds. It
     never interpolates. The result is NaN where the solver fails.
     """
+    import diffrax  # takes half a second: loaded when first used
+
     event = None if until is None else diffrax.Event(lambda t, y, args, **_: until(y))
     # A dead lane gets an interval of length zero, so that the others do not wait for it.
     end = jnp.where(jnp.all(jnp.isfinite(z)), end, start)
@@ -266,6 +267,8 @@ def flow_step(field: Callable, dt: float, tolerance: float) -> Callable:
     ``tolerance``, the allowed local error, absolute and relative. Where the solver fails the state
     becomes NaN. The step can be differentiated forwards, through the solver's steps that ran.
     """
+    import diffrax
+
     term = diffrax.ODETerm(lambda t, z, _: field(z))
     controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
 

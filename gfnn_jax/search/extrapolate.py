@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 # Sizes of a smaller range foretell nothing: an even S gains nothing from every other degree.
 _RANGE = 2.0
-# A size whose error is not this much smaller than all before it has gained nothing.
-_GAINED = 0.8
+# A size whose error ÷ the least before it is more than this has gained nothing.
+GAINED = 0.8
 # Extrapolated over more than so many times the orders that were seen, a decay means nothing.
 _FARTHEST = 3.0
 
@@ -51,7 +51,7 @@ def decay_of(sizes: Sequence[tuple[float, float]]) -> Decay | None:
         return None
     gains = finite[:1]
     for order, error in finite[1:]:
-        if error < _GAINED * gains[-1][1]:
+        if error < GAINED * gains[-1][1]:
             gains.append((order, error))
     (first, _), (order, error) = gains[0], gains[-1]
     if len(gains) == 1:

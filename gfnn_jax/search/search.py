@@ -17,12 +17,12 @@ import numpy as np
 
 from gfnn_jax.budget import ROWS, SOLVE, Budget, OutOfTime
 from gfnn_jax.candidates.candidate import Candidate
-from gfnn_jax.search.extrapolate import Decay, decay_of
+from gfnn_jax.search.extrapolate import GAINED, Decay, decay_of
 from gfnn_jax.search.sweep import Sweep
 
 # A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
 # the odd degrees), and larger families only fit noise.
-_WORTHWHILE, _STALLED = 0.8, 3
+_STALLED = 3
 # So often another sweep may be better before this one is left.
 _BEATEN = 3
 _FINALISTS = 3  # that are validated where none meets the tolerance
@@ -57,21 +57,6 @@ class Found(NamedTuple):
     ended: str
 
 
-def search(
-    sweeps: Sequence[Sweep],
-    bound: float,
-    budget: Budget,
-    on_progress: Callable[[str], Any],
-    on_candidate: Callable[[Candidate], Any],
-    on_validated: Callable[[Entry], Any] | None = None,
-    dearest: float = np.inf,
-) -> Found:
-    """Climb the sweeps to their end: a `Search` in one go, its arguments those of ``climb``."""
-    started = Search(sweeps, bound, budget, on_progress, on_candidate, on_validated)
-    started.climb(dearest)
-    return started.found()
-
-
 class Search:
     """A climb of sweeps (`search.sweep.Sweep`), which may be made in parts.
 
@@ -89,11 +74,8 @@ class Search:
         on_validated: Callable[[Entry], Any] | None = None,
     ):
         self.sweeps, self._bound, self._budget = sweeps, bound, budget
-        self._on_progress, self._on_candidate, self._on_validated = (
-            on_progress,
-            on_candidate,
-            on_validated,
-        )
+        self._on_progress, self._on_candidate = on_progress, on_candidate
+        self._on_validated = on_validated
         self._queue = sorted(
             (size.operations, i, n) for i, s in enumerate(sweeps) for n, size in enumerate(s.sizes)
         )
@@ -123,6 +105,11 @@ class Search:
         except OutOfTime:
             self._unfinished = True
 
+    def to_its_end(self, dearest: float = np.inf) -> Found:
+        """Climb as far as the budget goes; what was found."""
+        self.climb(dearest)
+        return self.found()
+
     def _look_at(self, i: int, n: int) -> None:
         """One size: estimated, and validated by steps where it may be accurate enough."""
         sweep, size = self.sweeps[i], self.sweeps[i].sizes[n]
@@ -148,7 +135,7 @@ class Search:
         if candidate.validated and candidate.validation_bound <= self._bound:
             self._cheapest = min(self._cheapest, size.operations)
             self._left.add(i)
-        self._stalled[i] = self._stalled[i] + 1 if relative > _WORTHWHILE * self._best[i] else 0
+        self._stalled[i] = self._stalled[i] + 1 if relative > GAINED * self._best[i] else 0
         self._best[i] = min(self._best[i], relative)
         self._beaten[i] += any(_beats(e.candidate, estimated) for e in self._entries)
         if self._stalled[i] == _STALLED or self._beaten[i] == _BEATEN:
@@ -259,7 +246,7 @@ def _promised(
         return ""
     order = found.order_for(bound)
     if order is None:
-        return "; its error falls too slowly to tell which size would meet the tolerance"
+        return "; its error falls too slowly to predict which size would meet the tolerance"
     return f"; extrapolated, {sweeps[i].at(order)} would meet the tolerance"
 
 
@@ -333,7 +320,7 @@ def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
             e.candidate.validation_relative
         )
     for sweep, errors in of_sweep.items():
-        if len(errors) > 2 and min(errors[-2:]) > _WORTHWHILE * min(errors[:-2]):
+        if len(errors) > 2 and min(errors[-2:]) > GAINED * min(errors[:-2]):
             found.add(sweep)
     return found
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.polynomial import legendre
-from scipy import ndimage
 
 _GAP = 1.5  # of the 95th percentile of the steps; a longer step is a gap
 _FEWEST = 100  # samples of a run whose drift is told
@@ -51,6 +50,8 @@ def drift(times: np.ndarray) -> float:
     """
     if len(times) < _FEWEST:
         return 0.0
+    from scipy import ndimage  # loaded when first used
+
     steps = np.diff(times)
     usual = ndimage.median_filter(steps, _NEARBY, mode="nearest")
     number = np.concatenate([[0], np.cumsum(np.maximum(np.round(steps / usual), 1))])

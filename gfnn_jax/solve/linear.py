@@ -142,3 +142,10 @@ def among(some, matrix, rhs):
     rhs = np.where(some[..., None], rhs, 0.0)
     found = np.linalg.solve(matrix + own, rhs)
     return found + np.linalg.solve(matrix + own, rhs - matrix @ found)
+
+
+def non_negative(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """The x ≥ 0 (n,) of the least ‖A x − b‖, A (N, n)."""
+    from scipy.optimize import nnls  # takes a quarter of a second: loaded when first used
+
+    return nnls(matrix, target)[0]

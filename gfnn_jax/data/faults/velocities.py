@@ -134,7 +134,7 @@ def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fau
     without = f"To ignore {v}: --positions {','.join(traits.recording.positions)}"
     kind = difference(traits.times, traits.columns[x], traits.columns[v])
     if kind is not None:
-        yield Fault("difference", f"{v} is the {kind} difference of {x} and tells nothing more",
+        yield Fault("difference", f"{v} is the {kind} difference of {x} and adds no information",
                     without, alone, wrong=False)  # fmt: skip
         return
     error = max(5 * relation.factor_error, _FILTERED)

@@ -28,6 +28,7 @@ from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms, joined, multiplied
 from gfnn_jax.fitting import least_squares, uncertainty
+from gfnn_jax.fitting.least_squares import ROWS_PER_TERM
 from gfnn_jax.fitting.linear_starts import fitted_gradients
 from gfnn_jax.fitting.significance import null_terms, significant, terms_above_noise
 from gfnn_jax.fitting.triangle import Triangle
@@ -36,7 +37,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
 
 _CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
-_MOST_TERMS, _ROWS_PER_TERM = 500, 3
+_MOST_TERMS = 500
 _THRESHOLDS = (1e4, 1e3, 100.0, 30.0, 10.0)  # standard errors below which terms go, tried in turn
 _CERTAIN = 4.0  # where noise is left over: those that are larger it does not explain
 _RISE, _ROUNDING = 1.1, 1e-15  # of the held-out error that this may cost
@@ -208,7 +209,7 @@ def _of_chart(attempt: _Attempts, scene) -> Iterator[_Tried]:
     yield from walked(
         states, functions, attempt, lambda tried: tried.error.bound,
         bound=tolerance.bound,
-        most=min(len(data.training) * 2 * dim / _ROWS_PER_TERM, _MOST_TERMS),
+        most=min(len(data.training) * 2 * dim / ROWS_PER_TERM, _MOST_TERMS),
     )  # fmt: skip
 
 
@@ -223,7 +224,7 @@ def _of_sites(data: Dataset, tolerance: Tolerance, attempt) -> Iterator[_Tried]:
     assert data.structure is not None
     width = data.y0.shape[1]
     rows = data.training[: max(1, _NULL_ROWS // width)]
-    most = min(len(data.training) * width / _ROWS_PER_TERM, _MOST_TERMS)
+    most = min(len(data.training) * width / ROWS_PER_TERM, _MOST_TERMS)
     for library in data.structure.libraries(data.dim):
         family = library.take(null_terms(library, data.y0[rows])[0])
         if family.num_parameters <= most:
@@ -280,7 +281,7 @@ def _covariance_root(piece: Generated, data: Dataset) -> np.ndarray:
     slopes = (family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
     residual, noise = slopes @ np.asarray(piece.params) - aim, None
     found = _larger(family, data)
-    if found is not None and _ROWS_PER_TERM * found.num_parameters <= target.size:
+    if found is not None and ROWS_PER_TERM * found.num_parameters <= target.size:
         some = slice(max(1, _NULL_ROWS // w.shape[1]))
         given = () if args is None else (args,)
         few = null_terms(found, w[some], args=None if args is None else args[some])[0]

@@ -23,6 +23,7 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import least_squares
+from gfnn_jax.fitting.least_squares import ROWS_PER_TERM
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.models.generating_functions.coefficient_noise import CoefficientNoise, Factors
@@ -37,7 +38,6 @@ _EVEN_DEGREES = tuple((degree,) for degree in (2, 4, 6, 8, 10, 12, 14, 16, 18, 2
 _SINES = (100, 200, 400, 800, 1_600)
 # Products of degree 14 in four variables: benchmarks/storage_ring.py.
 _MOST_TERMS = 3_100
-_ROWS_PER_TERM = 3
 # Enough to tell misfit from noise by a size, though not to choose it.
 _ROWS_THAT_TELL = 1.5
 # Rows per term up to which the test rows, an eighth as many, make the coefficients much better.
@@ -71,7 +71,7 @@ def sweeps_for(
     polynomials = request in ("auto", "polynomial")
     free = polynomials and (scene is None or scene.reversor is None)
     degrees = [degree for (degree,) in _EVEN_DEGREES]
-    even = free and is_even(data, degrees, _MOST_TERMS, _ROWS_PER_TERM)
+    even = free and is_even(data, degrees, _MOST_TERMS, ROWS_PER_TERM)
     for chart in charts:
         # Only the midpoint S inherits the parity.
         reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
@@ -139,10 +139,10 @@ class LinearSweep(CoefficientNoise):
         self._groups, self._determining = groups, rows
         self.sizes = [
             Size(family, group[-1], _extent(family))
-            for group in _determined(groups(), rows, _ROWS_PER_TERM) for family in group
+            for group in _determined(groups(), rows, ROWS_PER_TERM) for family in group
         ]  # fmt: skip
         # Else the last size is the largest there is, or the most terms are reached.
-        self.short_of_pairs = len(self.sizes) < known and rows < _ROWS_PER_TERM * _MOST_TERMS
+        self.short_of_pairs = len(self.sizes) < known and rows < ROWS_PER_TERM * _MOST_TERMS
         self._factors: dict[Any, Factors] = {}
         self._solved: dict[int, least_squares.LeastSquaresFit] = {}  # by the number of terms
 
@@ -210,7 +210,7 @@ class LinearSweep(CoefficientNoise):
             terms = family.terms_of(degree)
         fitted = len(self._train[0]) + len(self.data.test)
         share = fitted / (fitted + len(self.data.validation))
-        pairs = int(np.ceil(_ROWS_PER_TERM * terms / self._width / share))
+        pairs = int(np.ceil(ROWS_PER_TERM * terms / self._width / share))
         most = f", more than the {_MOST_TERMS:,} that are tried" if terms > _MOST_TERMS else ""
         return f"{label} ({terms:,} terms{most}; about {pairs:,} pairs)"
 
@@ -290,7 +290,7 @@ class LinearSweep(CoefficientNoise):
         if len(further) < 2:
             rows = self._determining
             families = (f for g in _determined(self._groups(), rows, _ROWS_THAT_TELL) for f in g)
-            beyond = (f for f in families if f.num_parameters > rows // _ROWS_PER_TERM)
+            beyond = (f for f in families if f.num_parameters > rows // ROWS_PER_TERM)
             further += [Size(f, f, _extent(f)) for f in itertools.islice(beyond, 2 - len(further))]
         return further[-1] if further else None
 
@@ -364,7 +364,7 @@ def trial_residual(data: Dataset) -> float:
         cyclic=coordinates.cyclic,
     )  # fmt: skip
     trials = ([Products(inputs, degree)] for degree in _TRIAL)
-    groups = list(_determined(trials, w.size // 2, _ROWS_PER_TERM))
+    groups = list(_determined(trials, w.size // 2, ROWS_PER_TERM))
     family = groups[-1][0] if groups else Products(inputs, 1)
     train, held = (
         least_squares.reduce(family, [(w[rows], target[rows])], weight)

@@ -43,8 +43,8 @@ def messages(
     if error.bound <= tolerance.bound and omega_h > FAST:
         yield (
             f"the motion turns by ωh = {omega_h:.2g} radians in a step (median over the states"
-            f"{', beyond π' if omega_h > np.pi else ''}). Pairs of one dt tell frequencies only "
-            "modulo 2π/dt (aliasing): of the H that fit, this is the "
+            f"{', beyond π' if omega_h > np.pi else ''}). Pairs of one dt determine "
+            "frequencies only modulo 2π/dt (aliasing): of the H that fit, this is the "
             + ("simplest. A smaller dt, or several, would decide" if omega_h > np.pi else "slowest")
         )
     if found.whole is not None:
@@ -52,7 +52,7 @@ def messages(
         if found.whole.misfit:
             yield (
                 "H misses whole sequences by more than their noise: it lacks terms that single "
-                "steps do not tell; bands count what it misses"
+                "steps do not show; bands count what it misses"
             )
     if found.undetermined:
         names = found.undetermined

@@ -138,7 +138,7 @@ def _searched(
         for i, family in enumerate(libraries):
             if tried and too_dear(problem, family, tried[-1], data, tolerance, work.dearest):
                 on_progress(
-                    f"H: {family.num_parameters} terms skipped, dearer per step than the map found"
+                    f"H: {family.num_parameters} terms skipped, costlier per step than the map"
                 )
                 continue
             if i < len(early):

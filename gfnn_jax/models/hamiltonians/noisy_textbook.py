@@ -232,7 +232,7 @@ def _significant(sequences: Sequences, arcs: Measured, formula: Formula) -> _Law
     count = np.isfinite(found.residuals).sum(axis=(0, 1))
     length = float(
         np.sum(count * np.log(noise_of(found)))
-        + 0.5 * np.log(count.sum()) * len(found.p) + OPTIONS.said * formula.said
+        + 0.5 * np.log(count.sum()) * len(found.p) + OPTIONS.penalty * formula.complexity
     )  # fmt: skip
     return _LawOfSequences(formula, found, length)
 

@@ -28,7 +28,6 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
 
 from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.models.lagrangians.fit import (
@@ -40,6 +39,7 @@ from gfnn_jax.models.lagrangians.fit import (
 )
 from gfnn_jax.models.lagrangians.structure import Loss
 from gfnn_jax.solve.latent_arcs import rows_of_arcs
+from gfnn_jax.solve.linear import non_negative
 
 DECIDED = 20.0  # odds, below which two sets are as good
 _NEEDED = 3.0  # odds, below which a direction is left out
@@ -199,7 +199,7 @@ class Table:
         losses, columns = np.zeros(len(self.candidates)), list(subset)
         if columns and len(own):  # a single arc leaves nothing to find them from
             scale = np.maximum(np.linalg.norm(own[:, columns], axis=0), 1e-300)
-            losses[columns] = nnls(own[:, columns] / scale, own[:, -1])[0] / scale
+            losses[columns] = non_negative(own[:, columns] / scale, own[:, -1]) / scale
         return losses
 
     def judged(self, subset: Sequence[int]) -> _Judged:

@@ -25,7 +25,7 @@ from gfnn_jax.models.lagrangians.text import (
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
-_SHOWN = 3  # pairs of coefficients that are not told apart
+_SHOWN = 3  # pairs of nearly collinear coefficients that are listed
 
 
 def _time(seconds: float) -> str:
@@ -122,7 +122,7 @@ class LearnedLaw:
                 f"dry friction: bodies slide or stick in fits and forecasts; rollouts of the map "
                 f"smooth it over speeds of {sensors.creep:.2g}"
             )
-        lines += [f"not told apart: {pair}" for pair in self.alike[:_SHOWN]]
+        lines += [f"nearly collinear: {pair}" for pair in self.alike[:_SHOWN]]
         lines += [
             f"{name}: zero at {measured(zero, std)} rad" for name, (zero, std) in self.zeros.items()
         ]

@@ -208,7 +208,7 @@ def _samples(
     if observation.is_plain:
         found, resting = without_rests(found, samples.scales)
         if resting:
-            line = f"{resting:.3g} s at rest left out: a body that stands still tells no law"
+            line = f"{resting:.3g} s at rest left out: a body at rest shows no dynamics"
             on_progress(line)
             samples = dataclasses.replace(
                 samples, stretches=found, scales=measure(found), messages=(line,)

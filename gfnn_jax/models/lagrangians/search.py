@@ -270,7 +270,7 @@ def without_degeneracies(bench: Workbench, fit: LawFit, on_progress: Callable) -
             fixed = fixed | {gone}
             continue
         others = ", ".join(_word(bench, key) for key in open_[1:])
-        on_progress(f"  dropped {_word(bench, gone)}: told only together with {others}")
+        on_progress(f"  dropped {_word(bench, gone)}: determined only together with {others}")
         fit = without
 
 

@@ -23,7 +23,7 @@ from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS, drawn
 from gfnn_jax.models.maps_of_laws.factor_out import TRIAL_PAIRS, factored_out, flow_of
 from gfnn_jax.scenes.scene import Scene
-from gfnn_jax.search.search import Entry, Found, search
+from gfnn_jax.search.search import Entry, Found, Search
 
 _FITTED, _MOST_STRONG = 200, 4  # pairs and terms of the simplest laws
 _THERE_AND_BACK = 8.0  # steps of a law's flow, at each of the states
@@ -62,7 +62,8 @@ def search_of_law(
     except FitError:  # drawn ones go further than the user's; the law itself is left
         return None
     sweeps = list(sweeps_for("auto", diagnosis.charts.charts, diagnosis.data, tolerance, scene))
-    found = search(sweeps, tolerance.bound, budget, on_progress, on_candidate, None, dearest)
+    climb = Search(sweeps, tolerance.bound, budget, on_progress, on_candidate)
+    found = climb.to_its_end(dearest)
     if not found.ranking:
         return None
     if found.ranking[0].candidate.validation_bound > tolerance.bound:
@@ -129,7 +130,8 @@ def _around(
     """The search for S around one flow, whose operations are added to every candidate's."""
     more = flow_operations(flow, data)
     sweeps = list(sweeps_for("auto", diagnosis.charts.charts, diagnosis.data, tolerance, scene))
-    found = search(sweeps, tolerance.bound, budget, on_progress, on_candidate, better)
+    climb = Search(sweeps, tolerance.bound, budget, on_progress, on_candidate, better)
+    found = climb.to_its_end()
 
     def dearer(entry: Entry) -> Entry:
         candidate = dataclasses.replace(

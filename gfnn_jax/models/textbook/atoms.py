@@ -126,8 +126,8 @@ def powers_of(atom: Atom, arguments: Sequence[Argument], width: int) -> tuple[in
     return tuple(row)
 
 
-def weight_of(atoms: Sequence[Atom]) -> float:
-    """Amount that there is to say of atoms: of their shapes, and of centres that are not 0."""
+def complexity_of(atoms: Sequence[Atom]) -> float:
+    """Complexity of atoms: of their shapes, and of centres that are not 0."""
     factors = [factor for atom in atoms for factor in atom]
     return sum(complexity(f.kind) + sum(c != 0 for c in f.centre) for f in factors)
 

@@ -21,9 +21,9 @@ from gfnn_jax.models.textbook.atoms import (
     Atom,
     Average,
     Dictionary,
+    complexity_of,
     constants_of,
     gradient_of,
-    weight_of,
     with_constants,
 )
 from gfnn_jax.solve.levenberg_marquardt import Factors, Tried, descended
@@ -38,7 +38,7 @@ _DAMPING = Factors(first=1e-2, shrunk_by=0.1, least=5e-4, trials=4)  # of them, 
 _GAINED = 1e-3  # of what is left over: a step that gains less is the last
 _FARTHEST = 0.2  # of the distances: by which a centre moves in a step
 _FLOOR = 1e-13  # of what is left over: below it is roundoff
-SAID = 0.5  # halvings of what is left over that a unit of complexity must bring, of clean pairs
+PENALTY = 0.5  # halvings of what is left over that a unit of complexity must bring, of clean pairs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,16 +63,21 @@ class Matching:
     """The search for atoms that, beside a base, have the gradient ``target`` (rows,).
 
     base: (rows, n) orthonormal columns that are always there. weight: (2d,), or of each row, by
-    which gradients are multiplied. arguments: at the states. said: halvings of what is left over
+    which gradients are multiplied. arguments: at the states. penalty: halvings of what is left over
     that a unit of complexity must bring. average: makes the rows of gradients at the states, where
     they are not these themselves.
     """
 
     def __init__(
         self, base: np.ndarray, target: np.ndarray, weight: np.ndarray, arguments: list[Argument],
-        said: float = SAID, average: Average = np.asarray,
+        penalty: float = PENALTY, average: Average = np.asarray,
     ):  # fmt: skip
-        self.weight, self.arguments, self._said, self._average = weight, arguments, said, average
+        self.weight, self.arguments, self._penalty, self._average = (
+            weight,
+            arguments,
+            penalty,
+            average,
+        )
         self.base, self.target = base, target
         self.size = float(np.linalg.norm(target))
         self._beside_base = target - base @ (base.T @ target)
@@ -108,15 +113,15 @@ class Matching:
         return sorted(found.values(), key=self.cost)
 
     def cost(self, match: Match) -> float:
-        """The logarithm of what is left over, and what there is to say of the atoms."""
-        return float(np.log2(max(match.left, _FLOOR)) + self._said * weight_of(match.atoms))
+        """The logarithm of what is left over, and the penalty on the complexity of the atoms."""
+        return float(np.log2(max(match.left, _FLOOR)) + self._penalty * complexity_of(match.atoms))
 
     def plainer(self, match: Match, dictionary: Dictionary) -> Match:
         """The match with each atom, in turn, in a plainer shape of the same argument, where that
         leaves hardly more: what is left over is not yet that of the pairs."""
         for i in range(len(match.atoms)):
-            said = weight_of(match.atoms[i : i + 1])
-            tried = self._exchanged(match, i, dictionary, lambda a, s=said: weight_of((a,)) < s)
+            own = complexity_of(match.atoms[i : i + 1])
+            tried = self._exchanged(match, i, dictionary, lambda a, s=own: complexity_of((a,)) < s)
             if tried:
                 best = min(tried, key=self.cost)
                 match = best if best.left < _HARDLY * match.left else match
@@ -127,11 +132,11 @@ class Matching:
         no longer to say: what is next to a law that is as likely."""
         found = []
         for i in range(len(match.atoms)):
-            said = weight_of(match.atoms[i : i + 1])
+            most = complexity_of(match.atoms[i : i + 1])
             own = tuple(f.kind for f in match.atoms[i])
 
-            def allowed(atom: Atom, own=own, said=said) -> bool:
-                return tuple(f.kind for f in atom) != own and weight_of((atom,)) <= said
+            def allowed(atom: Atom, own=own, most=most) -> bool:
+                return tuple(f.kind for f in atom) != own and complexity_of((atom,)) <= most
 
             found += self._exchanged(match, i, dictionary, allowed)
         return found

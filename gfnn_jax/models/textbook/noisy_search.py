@@ -22,10 +22,10 @@ from gfnn_jax.models.textbook.atoms import (
     Atom,
     atom_text,
     blocks_of,
+    complexity_of,
     constants_of,
     dictionary_of,
     powers_of,
-    weight_of,
     with_constants,
 )
 from gfnn_jax.models.textbook.matching import Match, Matching, orthonormal
@@ -37,7 +37,7 @@ class NoisyTextbookOptions:
     """Tuned on the laws of benchmarks/textbook.py with noise of 1e-3 of the spread.
 
     degrees: of products of coordinates, by degrees of freedom from 1. atoms: of a law, beside the
-    coordinates and products of two. said: natural logarithms of likelihood that a unit of
+    coordinates and products of two. penalty: natural logarithms of likelihood that a unit of
     complexity must bring. finalists: laws that are handed on. explained: RMS of what a match leaves
     over, in units of the noise, from which on products of shapes are looked at too. kept: standard
     errors of a coordinate, or a product of two, that a law is handed on with. exchanged:
@@ -46,7 +46,7 @@ class NoisyTextbookOptions:
 
     degrees: tuple[int, ...] = (6, 4, 4)
     atoms: int = 5
-    said: float = 5.0
+    penalty: float = 5.0
     finalists: int = 6
     explained: float = 1.5
     kept: float = 2.0
@@ -62,7 +62,7 @@ class Formula(NamedTuple):
     """H = Σ c_j φ_j: terms without constants inside, and atoms with them.
 
     left: RMS of what it leaves over of the weak gradients, in units of their noise; rows: so many
-    numbers. said: what there is to say of its atoms.
+    numbers. complexity: of its atoms.
     """
 
     plain: Terms
@@ -71,7 +71,7 @@ class Formula(NamedTuple):
     coefficients: np.ndarray
     left: float
     rows: int
-    said: float
+    complexity: float
 
     @property
     def constants(self) -> np.ndarray:
@@ -111,7 +111,10 @@ class Formula(NamedTuple):
         atoms = tuple(self.atoms[j - count] for j in kept if j >= count)
         plain = self.plain.take([j for j in kept if j < count])
         return self._replace(
-            plain=plain, atoms=atoms, coefficients=coefficients, said=said_of(plain, atoms)
+            plain=plain,
+            atoms=atoms,
+            coefficients=coefficients,
+            complexity=complexity_of_law(plain, atoms),
         )
 
 
@@ -121,11 +124,11 @@ def _with(atoms: Sequence[Atom], constants: np.ndarray) -> tuple[Atom, ...]:
     return tuple(with_constants(atom, given) for atom in atoms)
 
 
-def said_of(plain: Terms, atoms: Sequence[Atom]) -> float:
+def complexity_of_law(plain: Terms, atoms: Sequence[Atom]) -> float:
     """Complexity of a law, in units of `shapes.complexity`: its atoms, and products of coordinates
     beyond those of two."""
     beyond = [row for row in plain.powers if sum(row) > 2]
-    return weight_of(atoms) + sum(1.0 + 0.1 * n for row in beyond for n in row if n)
+    return complexity_of(atoms) + sum(1.0 + 0.1 * n for row in beyond for n in row if n)
 
 
 class NoisyTextbook:
@@ -146,7 +149,7 @@ class NoisyTextbook:
         self._degree = degrees[dim - 1] if dim <= len(degrees) else 3
 
     def formulas(self) -> list[Formula]:
-        """The laws that are worth a fit, the likeliest for what there is to say of them first."""
+        """The laws that are worth a fit, the likeliest for their complexity first."""
         with np.errstate(all="ignore"):
             found: list[Formula] = []
             for products in (False, True):
@@ -188,9 +191,14 @@ class NoisyTextbook:
             average=self._weak.average,
         )  # fmt: skip
         self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
-        said = OPTIONS.said / (len(self._target) * np.log(2))
+        penalty = OPTIONS.penalty / (len(self._target) * np.log(2))
         matching = Matching(
-            self._spanned, self._target, self._weight, self._arguments, said, self._weak.average
+            self._spanned,
+            self._target,
+            self._weight,
+            self._arguments,
+            penalty,
+            self._weak.average,
         )
         found = matching.best(dictionary, OPTIONS.atoms)
         if not products:
@@ -201,15 +209,15 @@ class NoisyTextbook:
         return found + [m for best in likeliest for m in matching.exchanged(best, dictionary)]
 
     def _length_of_match(self, match: Match) -> float:
-        said = OPTIONS.said * weight_of(match.atoms)
-        return len(self._target) * np.log(match.left) + said
+        penalty = OPTIONS.penalty * complexity_of(match.atoms)
+        return len(self._target) * np.log(match.left) + penalty
 
     def _length(self, formula: Formula) -> float:
         """Description length: natural logarithms."""
-        told = np.log(len(self._target))
+        rows = len(self._target)
         numbers = len(formula.coefficients) + len(formula.constants)
-        said = OPTIONS.said * formula.said + 0.5 * told * numbers
-        return len(self._target) * np.log(formula.left) + said
+        penalty = OPTIONS.penalty * formula.complexity + 0.5 * np.log(rows) * numbers
+        return rows * np.log(formula.left) + penalty
 
     def _formula(self, match: Match) -> Formula:
         """The law of a match, without the coordinates and products that it does not ask for."""
@@ -224,7 +232,7 @@ class NoisyTextbook:
         atoms = tuple(others)
         whole = Formula(
             plain, atoms, self._arguments, np.zeros(0), np.inf, len(self._target),
-            said_of(plain, atoms),
+            complexity_of_law(plain, atoms),
         )  # fmt: skip
         columns = self._columns(whole.family(whole.constants))
         kept = np.arange(columns.shape[1])

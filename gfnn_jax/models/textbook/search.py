@@ -28,11 +28,11 @@ from gfnn_jax.models.textbook.atoms import (
     Dictionary,
     atom_text,
     blocks_of,
+    complexity_of,
     constants_of,
     dictionary_of,
     powers_of,
     tops_of,
-    weight_of,
     with_constants,
 )
 from gfnn_jax.models.textbook.invariance import Invariance
@@ -213,7 +213,7 @@ class Textbook:
             states = [s for m in tried for s in [self._converged(m, target)] if s is not None]
             exact = [s for s in states if self._is_exact(s)]
             if exact:
-                return min(exact, key=lambda s: weight_of(s.match.atoms))
+                return min(exact, key=lambda s: complexity_of(s.match.atoms))
             if not states:
                 return None
             self._partial += states
@@ -315,8 +315,8 @@ class Textbook:
             m for m in matching.best(dictionary, min(3, len(state.match.atoms)))
             if m.left <= _AS_WELL * max(state.match.left, _MATCHED)
         ]  # fmt: skip
-        for match in sorted(simpler, key=lambda m: weight_of(m.atoms)):
-            if weight_of(match.atoms) >= weight_of(state.match.atoms):
+        for match in sorted(simpler, key=lambda m: complexity_of(m.atoms)):
+            if complexity_of(match.atoms) >= complexity_of(state.match.atoms):
                 break
             found = self._converged(match, state.target)
             if found is not None and found.law.left <= bound:
@@ -329,7 +329,7 @@ class Textbook:
         """Drop the atoms, and their factors, that are not needed."""
         matching = self._matching(state.target)
         for atoms in _shorter(state.match.atoms):
-            if weight_of(atoms) >= weight_of(state.match.atoms):
+            if complexity_of(atoms) >= complexity_of(state.match.atoms):
                 continue
             if matching.residual_of(atoms) > _AS_WELL * max(state.match.left, _MATCHED):
                 continue

@@ -53,7 +53,7 @@ def has_constant(kind: Kind) -> bool:
 
 
 def complexity(kind: Kind) -> float:
-    """Amount that there is to say of a shape: its name 1, a constant, an unusual exponent more."""
+    """Complexity of a shape: its name 1, a constant, an unusual exponent more."""
     name, n = kind
     if name != "power":
         return 1.0 + has_constant(kind) + 0.5 * (name == "exp" and n != 0)
