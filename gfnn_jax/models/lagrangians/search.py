@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -52,17 +53,20 @@ class SearchOptions:
     )
     gain: float = 0.05  # of the held-out cost, that a term has to bring
     choices: int = 3  # of the friction, each close to the fit with the one before
+    tells_more: float = 1.5  # times smaller standard errors, at which shorter arcs are tried
     frictions: tuple[str, ...] = FRICTIONS
     choose_friction: bool = True  # by held-out arcs; else all of these
 
 
 class Found(NamedTuple):
     """Findings of a search: the fit to the longest arcs with the inputs as they act, which friction
-    and how sure that is, and the nodes with their states."""
+    and how sure that is, and the nodes with their states; and the same of shorter arcs, where
+    these tell the coefficients better."""
 
     acting: Acting
     choice: FrictionChoice
     nodes: list[Nodes]
+    shorter: Found | None = None
 
 
 def search(
@@ -163,6 +167,25 @@ def finished(
     added."""
     fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
     nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
+    settled = partial(_settled, bench, every, scales.dt, on_progress, options)
+    lengths = [max(6, round(p * scales.per_period)) for p in options.periods]
+    shorter = telling_more(bench, nodes, fit, lengths, options)
+    found = settled(nodes, fit, choice)
+    if shorter is None:
+        return found
+    periods = shorter.arcs.t.shape[1] / scales.per_period
+    on_progress(f"arcs of {periods:.2g} periods tell more than longer ones: {describe(shorter)}")
+    nodes = with_states(nodes, shorter.arcs, shorter.fitted.x)
+    fit, choice = choose_friction(bench, nodes, shorter, every.friction, on_progress, options)
+    return found._replace(shorter=settled(nodes, fit, choice))
+
+
+def _settled(
+    bench: Workbench, every: Structure, dt: float, on_progress: Callable[[str], object],
+    options: SearchOptions, nodes: Sequence[Nodes], fit: LawFit, choice: FrictionChoice,
+) -> Found:  # fmt: skip
+    """The law by arcs as long as those of the fit: terms that they do not tell are dropped, and
+    others of ``every`` tried."""
     terms = dataclasses.replace(every, friction=())
     before = fit.structure
     fit = prune(bench, nodes, fit, on_progress, options, friction=False)
@@ -171,7 +194,33 @@ def finished(
     if fit.structure != before:
         fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
-    return Found(with_delay(bench, nodes, fit, scales.dt), choice, nodes)
+    return Found(with_delay(bench, nodes, fit, dt), choice, nodes)
+
+
+def telling_more(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, lengths: Sequence[int],
+    options: SearchOptions,
+) -> LawFit | None:  # fmt: skip
+    """The fit to arcs of the one of these ``lengths`` (nodes) that tells the coefficients best,
+    longer ones first as long as shorter ones tell more. None where the standard errors, in the
+    geometric mean, are not much smaller than those of ``fit``: longer arcs are a longer lever, but
+    where motion is chaotic, or forces unknown, their residuals grow faster."""
+    best = fit
+    for size in sorted(lengths, reverse=True):
+        arcs = arcs_of(with_states(nodes, best.arcs, best.fitted.x), size)
+        if arcs.t.shape[1] >= best.arcs.t.shape[1]:
+            continue
+        other = bench.fit(fit.structure, best.values, arcs, best.sigma)
+        if not _errors(other) < _errors(best):
+            break
+        best = other
+    return best if options.tells_more * _errors(best) < _errors(fit) else None
+
+
+def _errors(fit: LawFit) -> float:
+    """Geometric mean of the standard errors."""
+    variance = np.diag(fit.covariance())
+    return float(np.exp(0.5 * np.mean(np.log(np.maximum(variance, 1e-300)))))
 
 
 def arcs_by_length(

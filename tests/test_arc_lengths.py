@@ -1,0 +1,77 @@
+"""Lengths of arcs: those that tell a law's coefficients best, where unknown forces act."""
+
+import numpy as np
+
+import gfnn_jax as gfnn
+from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
+from gfnn_jax.maps.observation import Observation
+from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.models.lagrangians.search import SearchOptions, search
+
+MASS, COUPLED, PULLS, DT, NOISE = 0.5, 0.4, (20.0, 8.0), 0.02, 1e-3
+
+
+def swung(torque, seed=0, runs=4, end=12.0):
+    """Runs of a double pendulum, mostly chaotic, whose joints unknown torques push: white ones of
+    this size, as shares of gravity, another one every sample. By Runge and Kutta."""
+    rng = np.random.default_rng(seed)
+
+    def rate(x, push):
+        q, v = x[..., :2], x[..., 2:]
+        turn = q[..., 0] - q[..., 1]
+        c, s = COUPLED * np.cos(turn), COUPLED * np.sin(turn)
+        f = push - np.array(PULLS) * np.sin(q) - 0.02 * v
+        f1, f2 = f[..., 0] - s * v[..., 1] ** 2, f[..., 1] + s * v[..., 0] ** 2
+        det = MASS - c**2
+        return np.stack([*v.T, (MASS * f1 - c * f2) / det, (f2 - c * f1) / det], axis=-1)
+
+    x = np.concatenate([rng.uniform(1.5, 2.5, (runs, 2)), np.zeros((runs, 2))], axis=1)
+    shown = []
+    for _ in range(round(end / DT)):
+        shown.append(x[:, :2])
+        push, h = torque * np.array(PULLS) * rng.normal(size=(runs, 2)), DT / 4
+        for _ in range(4):
+            k1 = rate(x, push)
+            k2 = rate(x + h / 2 * k1, push)
+            k3 = rate(x + h / 2 * k2, push)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3, push))
+    q = np.array(shown) + NOISE * rng.normal(size=(len(shown), runs, 2))
+    tables = [
+        {"run": np.full(len(q), str(k)), "t": DT * np.arange(len(q)), "theta1": q[:, k, 0],
+         "theta2": q[:, k, 1]}
+        for k in range(runs)
+    ]  # fmt: skip
+    names = ["theta1", "theta2"]
+    return gfnn.Recording(tables, positions=names, angles=names)
+
+
+def searched(recording):
+    found = stretches(recording)
+    scales = measure(found)
+    nodes = nodes_of(found, scales)
+    inputs = {"hold": ArcInputs(nodes, scales.substeps, "hold")}
+    options = SearchOptions(frictions=("linear",), choose_friction=False)
+    seen = Observation.plain(recording.positions)
+    return search(nodes, scales, (0, 1), 0, inputs, seen, options=options)
+
+
+def pulls_of(found):
+    """The coefficients of cos θ₁ and cos θ₂."""
+    waves = ((0, 0), (0, 0), (1, 0), 0.0), ((0, 0), (0, 0), (0, 1), 0.0)
+    return np.array([found.acting.fit.values["term", wave] for wave in waves])
+
+
+def test_longer_arcs_tell_more_where_the_law_is_all_that_acts():
+    found = searched(swung(0.0))
+    assert found.shorter is None
+    np.testing.assert_allclose(pulls_of(found), PULLS, rtol=2e-3)
+
+
+def test_shorter_arcs_tell_more_where_unknown_torques_act():
+    """The oracle are the pulls that made the data: the law of shorter arcs is nearer to them."""
+    found = searched(swung(0.03))
+    assert found.shorter is not None
+    fit, other = found.acting.fit, found.shorter.acting.fit
+    assert other.arcs.t.shape[1] < fit.arcs.t.shape[1]
+    far, near = (np.abs(pulls_of(f) / PULLS - 1).max() for f in (found, found.shorter))
+    assert near < 0.5 * far
