@@ -235,6 +235,14 @@ def with_length(kind):
     """A map whose S or H depends on a length l, its states and their lengths (N, 1)."""
     z, lengths = 0.5 * states(1), np.random.default_rng(2).uniform(0.5, 2, (300, 1))
     unit, names = np.ones(2), ("l",)
+    if kind == "Lagrangian":
+        none = (0,)
+        law = lagrangian.Lagrangian(
+            lagrangian.Terms.of([((2,), none, none, 0.0), (none, none, (1,), 0.0)], 1),
+            np.array([0.5, 1.0]), lagrangian.Friction.of([((1,), lagrangian.LINEAR, 0.0)], 1),
+            np.array([0.1]), 0.0, np.zeros((1, 0)), ((0,), (-1,), (1,)),
+        )  # fmt: skip
+        return map_of_law(law, z, DT, parameters=names, args=lengths), z, lengths
     if kind == "law":
         family = given_terms(1, ["p1**2/l**2", "l*cos(q1)", "T3(q1)*l"], names)
         piece = Flow(family, np.array([0.5, -1.0, 0.1]), DT, unit, 4, 2)
@@ -260,7 +268,8 @@ def with_length(kind):
 
 @needs_cc
 @pytest.mark.parametrize(
-    "kind", ["law", pytest.param("midpoint", marks=pytest.mark.slow), "type 2", "damped"]
+    "kind",
+    ["law", "Lagrangian", pytest.param("midpoint", marks=pytest.mark.slow), "type 2", "damped"],
 )
 def test_c_of_a_map_with_parameters(kind, tmp_path):
     map_, z, args = with_length(kind)

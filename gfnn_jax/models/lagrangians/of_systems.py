@@ -104,8 +104,9 @@ def _depending(every: Structure, found: Structure, none: tuple[int, ...]) -> Str
     sums = {libraries.opposite(row) for row in every.friction} - shown
     directed = [row for row in every.friction if row[1] != UNIFORM and row not in sums]
     uniform = [row for row in every.friction if row[1] == UNIFORM]
+    terms = with_functions(every.terms, functions_in(found.terms, none))
     return dataclasses.replace(
-        every, terms=with_functions(every.terms, functions_in(found.terms, none)),
+        every, terms=tuple(dict.fromkeys((found.terms[0], *terms))),
         friction=(*with_functions(directed, functions_in(found.friction, none)), *uniform),
     )  # fmt: skip
 

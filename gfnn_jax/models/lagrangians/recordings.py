@@ -192,8 +192,9 @@ def _found(
 
 
 def _samples(
-    recording: Recording, loss: Loss | None, on_progress: OnProgress, parameters: tuple[str, ...]
-) -> _Samples:
+    recording: Recording, loss: Loss | None, on_progress: OnProgress,
+    parameters: tuple[str, ...] = (),
+) -> _Samples:  # fmt: skip
     """The samples of the positions, without rests, each σ as given where it is."""
     observation, angles = _observation(recording)
     observation = observation if loss is None else dataclasses.replace(observation, loss=loss)
