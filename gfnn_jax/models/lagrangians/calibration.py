@@ -6,8 +6,8 @@ orbit followed. What has to be added to the variance that noise, state and coeff
 that two standard deviations hold 95 % of the errors is the misfit, by the time ahead (conformal
 prediction: Lei et al., J. Am. Stat. Assoc. 113 (2018) 1094). The colour of the noise is in it, and
 what is wrong with the law. Either is the same everywhere, or in proportion to how large the motion
-is (ibid., §5.2), as of friction of a wrong kind where motion dies down: the errors say which. The time
-until which 95 % of the errors are below 1 %, 5 % and 20 % of the spread is the horizon.
+is (ibid., §5.2), as of friction of a wrong kind where motion dies down: the errors say which. The
+time until which 95 % of the errors are below 1 %, 5 % and 20 % of the spread is the horizon.
 """
 
 from __future__ import annotations
