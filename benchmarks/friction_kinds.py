@@ -94,7 +94,7 @@ def case(system: str, kinds: tuple[str, ...], seed: int) -> Numbers:
             expected[kind, joint] = factor * share * loss
     errors = []
     for term, coefficient, std in fit.friction.terms:
-        kind = "dry" if "sqrt" in term else "quadratic" if "abs" in term else "linear"
+        kind = "quadratic" if "**3" in term else "dry" if "abs" in term else "linear"
         joint = "2 - omega1" if "omega2 - omega1" in term else "1" if "omega2" not in term else ""
         errors.append(abs(coefficient - expected.get((kind, joint), 0.0)) / std)
     return {
