@@ -82,7 +82,7 @@ def _with_constants(files: set[Path]) -> set[Path]:
         if path in found:
             continue
         found.add(path)
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(ast.parse(ran.text_of(path))):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(PACKAGE.name):
                 of = (PACKAGE.parent / str(node.module).replace(".", "/")).with_suffix(".py")
                 if of.exists() and {alias.name for alias in node.names} & _constants(of):
@@ -93,7 +93,7 @@ def _with_constants(files: set[Path]) -> set[Path]:
 @functools.cache
 def _constants(path: Path) -> frozenset[str]:
     """Names that a module assigns."""
-    body = ast.parse(path.read_text(encoding="utf-8")).body
+    body = ast.parse(ran.text_of(path)).body
     targets = [
         target for node in body
         for target in (node.targets if isinstance(node, ast.Assign) else
@@ -122,7 +122,7 @@ def _modules_of(study: Path) -> set[Path]:
 @functools.cache  # of the package's modules for every study
 def _meaning(path: Path) -> str:
     """A module without comments, docstrings and layout."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = ast.parse(ran.text_of(path))
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list) and body and isinstance(body[0], ast.Expr):

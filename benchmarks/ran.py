@@ -14,6 +14,7 @@ from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 
 _MARK = "__ran__"
+_texts: dict[Path, str] = {}  # of files as they were read, which may have changed since
 
 
 class _Loader(SourceFileLoader):
@@ -21,7 +22,8 @@ class _Loader(SourceFileLoader):
 
     def get_code(self, fullname: str):
         path = self.get_filename(fullname)
-        tree = ast.parse(self.get_data(path), path)
+        _texts[Path(path)] = self.get_data(path).decode("utf-8")
+        tree = ast.parse(_texts[Path(path)], path)
         for node in ast.walk(tree):
             if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
                 marked = ast.parse(f"global {_MARK}\n{_MARK} = True").body
@@ -68,6 +70,11 @@ def files(package: str) -> set[Path] | None:
         if holds_code and (hasattr(module, _MARK) or not _functions(path)):
             found.add(path)
     return found
+
+
+def text_of(path: Path) -> str:
+    """The text of a file, as this process has read it where it is noted."""
+    return _texts[path] if path in _texts else path.read_text(encoding="utf-8")
 
 
 def _functions(path: Path) -> bool:

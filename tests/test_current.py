@@ -63,7 +63,11 @@ def test_a_result_is_old_where_a_file_changed_that_it_ran(tmp_path, monkeypatch)
     assert noted_package.ran_one.f(5) == 3
     assert noted_package.ran_one.f.__doc__ == "Doc."
     path = tmp_path / "study.json"
+    (package / "ran_one.py").write_text("def f(x):\n    return 0\n")  # after it was imported
     path.write_text(json.dumps({"code": current.code_of(study)}))
+    (package / "ran_one.py").write_text(f"{files['ran_one']}\n")
+    ran._texts.clear()
+    current._meaning.cache_clear()
     result = current.Result(path, study, "")
     assert result.changed == []
     for name, text, changed in (
