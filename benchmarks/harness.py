@@ -167,7 +167,7 @@ def described(fit: gfnn.Fit) -> Numbers:
         "validation_bound": fit.chosen.validation_bound,
         "tolerance": fit.tolerance,
         "symplecticity_defect": fit.symplecticity_defect,
-        "determinants": {name: j.low for name, j in fit.judgements.items()},
+        "determinants": {name: j.low for name, j in fit.determinants.items()},
         "messages": list(fit.messages),
         "ended": fit.ended,
     }

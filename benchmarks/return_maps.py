@@ -131,7 +131,7 @@ def maps(scene: Scene, z0, reference, sizes: Sizes, times: int = 1) -> Numbers:
         })  # fmt: skip
         print(f"  {about['label']}: {found[-1]['single']:.1f}, {found[-1]['batch']:.1f} µs")
     return {"pairs": len(pairs), "fit_seconds": sum(fit.seconds for fit in fits), "maps": found,
-            "determinants": {n: j.low for n, j in fits[0].judgements.items()}}  # fmt: skip
+            "determinants": {n: j.low for n, j in fits[0].determinants.items()}}  # fmt: skip
 
 
 def compared(

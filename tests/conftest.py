@@ -89,13 +89,13 @@ def _interruptible():
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-_MODULES_TOGETHER = 8
+_MODULES_TOGETHER = 12
 _modules = itertools.count(1)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _no_more_programs_than_some_modules_need():
-    """Drop traced and compiled programs after every eighth module.
+    """Drop traced and compiled programs after every twelfth module.
 
     All of the suite's would fill gigabytes; dropped after each module, many would be traced and
     lowered again.

@@ -32,11 +32,12 @@ def spherical_pendulum_pairs(count, latitude=False):
     return gfnn.Pairs(*states, 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("latitude", "expected"),
     [
         (False, "0.5*p2**2/sin(q1)**2 - cos(q1) + 0.5*p1**2"),
-        pytest.param(True, "0.5*p2**2/cos(q1)**2 + sin(q1) + 0.5*p1**2", marks=pytest.mark.slow),
+        (True, "0.5*p2**2/cos(q1)**2 + sin(q1) + 0.5*p1**2"),
     ],
 )
 def test_a_spherical_pendulum_told_nothing(latitude, expected):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from gfnn_jax.diagnosis.local_jacobians import (
+    chart_determinant,
     data_defect,
     differs_between_sequences,
-    judge_chart,
     local_jacobians,
     look_symplectic,
     outliers,
@@ -29,8 +29,8 @@ def test_more_noisy_pairs_are_judged_no_worse():
     y0, y1, scale = z + noise[0], turned(z) + noise[1], z.std(axis=0)
     jacobians, _ = local_jacobians(y0, y1, scale)
     assert data_defect(jacobians, scale) < 0.1
-    judged = judge_chart(CHARTS["midpoint"], jacobians, scale)
-    assert abs(judged.low - np.cos(0.25) ** 2) < 0.15
+    found = chart_determinant(CHARTS["midpoint"], jacobians, scale)
+    assert abs(found.low - np.cos(0.25) ** 2) < 0.15
 
 
 def test_a_single_orbit_looks_symplectic():
@@ -40,7 +40,7 @@ def test_a_single_orbit_looks_symplectic():
     scale = z.std(axis=0)
     jacobians, _ = local_jacobians(z[:-1], z[1:], scale)
     assert data_defect(jacobians, scale) < 0.1
-    assert judge_chart(CHARTS["midpoint"], jacobians, scale).low > 0.9
+    assert chart_determinant(CHARTS["midpoint"], jacobians, scale).low > 0.9
 
 
 def test_noise_as_large_as_a_tenth_of_the_data_folds_no_chart():
@@ -49,7 +49,9 @@ def test_noise_as_large_as_a_tenth_of_the_data_folds_no_chart():
     noise = 5e-2 * rng.standard_normal((2, *z.shape))
     scale = z.std(axis=0)
     jacobians, _ = local_jacobians(z + noise[0], turned(z) + noise[1], scale)
-    assert abs(judge_chart(CHARTS["midpoint"], jacobians, scale).low - np.cos(0.25) ** 2) < 0.2
+    assert (
+        abs(chart_determinant(CHARTS["midpoint"], jacobians, scale).low - np.cos(0.25) ** 2) < 0.2
+    )
 
 
 def bent(z):

@@ -480,7 +480,7 @@ def test_auto_takes_the_chart_that_covers():
     fit = quiet_fit(pairs, scene, tolerance=1e-2, family="polynomial")
     assert fit.met
     assert fit.chosen.chart == "midpoint"
-    assert not fit.judgements["type2"].valid or fit.base_map
+    assert not fit.determinants["type2"].valid or fit.base_map
 
 
 @pytest.mark.slow

@@ -77,7 +77,7 @@ def check_number(pairs: Pairs) -> None:
         )
 
 
-class ChartJudgement(NamedTuple):
+class ChartDeterminant(NamedTuple):
     """The determinant of a chart over the data.
 
     low: its 1 % quantile towards zero, counted in the sign of the majority (negative where the sign
@@ -249,14 +249,14 @@ def _full_rank(design):
     return squares[:, 0] > _SPANNED_OF_GRAM**2 * squares[:, -1]
 
 
-def judge_chart(chart: AnyChart, jacobians, scale) -> ChartJudgement:
+def chart_determinant(chart: AnyChart, jacobians, scale) -> ChartDeterminant:
     """The chart's determinant over the data; type 1's in coordinates of unit size."""
     dim = len(scale) // 2
     determinant = chart.determinant(np.asarray(jacobians))
     if chart.name == "type1":
         determinant = determinant * np.prod(scale[dim:] / scale[:dim])
     sign = 1 if np.median(determinant) >= 0 else -1
-    return ChartJudgement(
+    return ChartDeterminant(
         float(np.quantile(sign * determinant, 0.01)), sign, float(np.mean(determinant < 0))
     )
 

@@ -87,7 +87,7 @@ def assemble(
             "positions": None if fit.positions is None else vars(fit.positions),
             "symplecticity_defect": fit.symplecticity_defect if fit.tells_defect else None,
             "chart_determinant_min": fit.model_determinant_min,
-            "chart_determinants_of_data": {n: j.low for n, j in fit.judgements.items()},
+            "chart_determinants_of_data": {n: j.low for n, j in fit.determinants.items()},
             "newton_iterations_max": chosen.newton_iterations_max,
         },
         "rollout": rollout,

@@ -25,7 +25,7 @@ _SMALLER = 3  # sizes that are looked at below maps all of which have steps that
 
 
 class Chosen(NamedTuple):
-    """The candidate with its map; the data set that it was fitted to and judged by; the seconds
+    """The candidate with its map; the data set that it was fitted to and measured on; the seconds
     that compiling took; the entry that it comes from, None for H and for an S with parameters."""
 
     candidate: Candidate

@@ -170,7 +170,7 @@ def fit(
         asked=request.tolerance,
         num_pairs=len(data),
         validation_pairs=data.pairs.take(data.validation),
-        judgements=found.charts.judgements,
+        determinants=found.charts.determinants,
         data_defect=diagnosis.data_defect,
         base_map=bool(chosen.data.before or chosen.data.after),
         hamiltonian=found.law,
@@ -240,7 +240,7 @@ def fit_positions(
     determinant = np.asarray(found.map.determinant(test.z0))
     return Fit(
         map=found.map, candidates=found.candidates, asked=asked,
-        num_pairs=found.positions.num_triples, judgements={}, data_defect=float("nan"),
+        num_pairs=found.positions.num_triples, determinants={}, data_defect=float("nan"),
         base_map=False, noise=None, messages=tuple(found.messages), ended=found.ended,
         seconds=budget.seconds, compile_seconds=found.compile_seconds,
         test_states=np.asarray(test.z0),

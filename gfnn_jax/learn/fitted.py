@@ -16,7 +16,7 @@ from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.damping import LearnedDamping
-from gfnn_jax.diagnosis.local_jacobians import ChartJudgement
+from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
 from gfnn_jax.errors import FitWarning, OutOfTime
 from gfnn_jax.learn.positions import OfPositions
@@ -37,7 +37,7 @@ class Fit:
 
     map: the chosen map. candidates: every candidate met on the way, by rising operations.
     asked: the tolerance, and ``met`` whether the chosen map's upper 95 % bound is within
-    it. num_pairs: that trained and judged. judgements: chart -> its determinant over the data.
+    it. num_pairs: that trained and validated. determinants: chart -> its determinant over the data.
     data_defect: how far the pairs' local Jacobians are from symplectic (median). base_map: whether
     one was factored out. noise: (2d,) standard deviation of each coordinate's noise that the
     residuals suggest where larger models stopped helping, else None. messages: the warnings,
@@ -63,7 +63,7 @@ class Fit:
     asked: Tolerance
     num_pairs: int
     validation_pairs: Pairs
-    judgements: dict[str, ChartJudgement]
+    determinants: dict[str, ChartDeterminant]
     data_defect: float
     base_map: bool
     noise: np.ndarray | None

@@ -1,6 +1,6 @@
 """S of noisy pairs: its size, chart and coefficients without the bias of noisy evaluation points.
 
-A search judges sizes by residuals that are nearly all noise, and fits at measured points. Where
+A search compares sizes by residuals that are nearly all noise, and fits at measured points. Where
 that is what stopped it, the sweeps that came as far as the best are fitted again to the states that
 the pairs most likely had (`models.generating_functions.map_arcs`). In these rows the residual is a
 distance from the map's graph in units of the noise, whatever the chart, and the expected error of
@@ -141,7 +141,7 @@ def best_size(sweep: LinearSweep, near: Size, most: Size, budget: Budget, on_pro
 
 
 def _last_of_group(sweep: LinearSweep, size: Size) -> Size:
-    """The largest size that is judged from the same factor."""
+    """The largest size that is estimated from the same factor."""
     return [other for other in sweep.sizes if other.group is size.group][-1]
 
 
@@ -238,7 +238,7 @@ class NoisySweep(LinearSweep):
         return self.plain.estimate(size, budget, on_progress)
 
     def validate(self, size: Size, estimated: Candidate, budget: Budget, on_progress) -> Candidate:
-        """The judged size solved in these rows, and its error measured by steps."""
+        """The estimated size solved in these rows, and its error measured by steps."""
         plain = self.plain.validate(size, estimated, budget, on_progress)
         solved, params = self.solve(size, budget, on_progress)
         candidate = dataclasses.replace(plain, condition=solved.condition, rank=solved.rank)

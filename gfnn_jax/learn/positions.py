@@ -2,7 +2,7 @@
 
 triples → sizes of S by rising degree, symmetric first → the smallest that meets the tolerance, else
 the best → where larger ones leave as much, and so the readings have noise, S with latent positions
-→ its map, judged by its own steps from positions that were held out.
+→ its map, measured by its own steps from positions that were held out.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ from gfnn_jax.models.maps_of_laws.law_maps import (
 )
 from gfnn_jax.search.search import Entry, Found, Search
 
-# Operations of a size of S that is judged before H is looked for: a fifth of a second.
+# Operations of a size of S that is estimated before H is looked for: a fifth of a second.
 _SMALL = 2e9
 _BETTER = 0.5  # of the error of an H, that S of a structure must have to be taken in its stead
 OnBetter = Callable[[SymplecticMap, Candidate], Any]
@@ -220,7 +220,7 @@ def _nothing_found(num_pairs: int, budget: Budget) -> str:
 
 class _Better:
     """Hands on the map of every entry that is more accurate than those before. Nothing is compiled:
-    the map is judged by the steps that the search made."""
+    the map is measured by the steps that the search made."""
 
     def __init__(self, on_better: OnBetter):
         self._on_better, self._best = on_better, np.inf

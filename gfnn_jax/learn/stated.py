@@ -42,7 +42,7 @@ FEWEST_TESTED = 10  # runs that state the error for all others
 # part of the tolerance above which that matters.
 _OF_FEW, _MATTERS = 10.0, 0.01
 _NINE_OF_TEN = 0.97  # quantile of the rows that bounds the one at 90 %, of some hundred rows
-# Numbers of the states at which a flow's own steps are judged, and times that the worst counts.
+# Numbers of the states at which a flow's own steps are measured, and times that the worst counts.
 _NUMBERS, _WORST = 8_192, 3
 _WHAT = "the stated error by cross-validation"
 

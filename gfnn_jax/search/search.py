@@ -89,9 +89,9 @@ class Search:
         self._cheapest, self._kept, self._unfinished = np.inf, np.inf, False
 
     def climb(self, dearest: float = np.inf, most: float = np.inf) -> None:
-        """Judge size after size, one at least, up to the first that takes more than ``most``
-        operations to judge, or as far as the budget goes. dearest: operations of a step from which
-        a size is of no use, because something else meets the tolerance with so many."""
+        """Estimate size after size, one at least, up to the first that takes more than ``most``
+        operations to estimate, or as far as the budget goes. dearest: operations of a step from
+        which a size is of no use, because something else meets the tolerance with so many."""
         self._cheapest = min(self._cheapest, dearest)
         try:
             while self._queue:

@@ -33,7 +33,7 @@ class Sweep(Protocol):
     linear: bool
 
     def named(self, size: Any) -> str:
-        """Name of the unit of work that judges the size."""
+        """Name of the unit of work that estimates the size."""
         ...
 
     def at(self, order: float) -> str:

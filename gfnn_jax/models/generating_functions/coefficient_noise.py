@@ -147,8 +147,9 @@ class CoefficientNoise(Generates):
 
     def _noise(self, size: Size, larger: Size, data, states) -> float:
         """The part of the residual's mean square that is noise, by what a larger size explains of
-        it: of all rows where that one was judged by all of them, else of these. states: residual,
-        its derivatives and which pairs go on, as `shared_noise.scores` takes them, or None."""
+        it: of all rows where that one was estimated from all of them, else of these. states:
+        residual, its derivatives and which pairs go on, as `shared_noise.scores` takes them, or
+        None."""
 
         def left(of: Size) -> tuple[float, float, int]:
             """Mean square, the degrees of freedom that noise takes, and the rows."""

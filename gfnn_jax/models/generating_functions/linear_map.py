@@ -36,11 +36,11 @@ def linear_map(data: Dataset, tolerance: Tolerance) -> Candidate | None:
     if half is not None:
         shift = half.matrix @ half.shift + half.shift
         tried.append(Affine(half.matrix @ half.matrix, half.centre, shift))
-    judged = [
+    tried = [
         (measured_error(data, tolerance, to_user(coordinates, piece.image(data.y0[held]))), piece)
         for piece in tried
     ]
-    error, piece = min(judged, key=lambda found: found[0].relative)
+    error, piece = min(tried, key=lambda found: found[0].relative)
     width = len(data.scale)
     candidate = Candidate(
         label="linear", family="linear", chart="affine", num_parameters=width * (width + 3) // 2,

@@ -35,7 +35,7 @@ class ModelSize:
 
 
 class ModelSweep:
-    """The sizes of one model, each fitted to the training pairs and judged by its own steps."""
+    """The sizes of one model, each fitted to the training pairs and measured by its own steps."""
 
     short_of_pairs = False
     linear = False
@@ -47,7 +47,7 @@ class ModelSweep:
         self._fitted: dict[int, Fitted] = {}
 
     def named(self, size: ModelSize) -> str:
-        """Name of the unit that judges the size."""
+        """Name of the unit that estimates the size."""
         return f"{self.model.name} {size.own}"
 
     def work(self, size: ModelSize) -> float:
@@ -55,7 +55,7 @@ class ModelSweep:
         return 1.0
 
     def work_of_steps(self, size: ModelSize) -> float:
-        """The steps are made when the size is judged."""
+        """The steps are made when the size is estimated."""
         return 0.0
 
     def work_of_refit(self, size: ModelSize) -> float:
@@ -83,7 +83,7 @@ class ModelSweep:
     def validate(
         self, size: ModelSize, estimated: Candidate, budget: Budget, on_progress
     ) -> Candidate:
-        """The judged size as it is: its steps have been made."""
+        """The estimated size as it is: its steps have been made."""
         return estimated
 
     def at(self, order: float) -> str:

@@ -48,7 +48,7 @@ class NetworkSweep(Generates):
         self._params: Any = None
 
     def named(self, size: Size) -> str:
-        """Name of the unit that judges the size."""
+        """Name of the unit that estimates the size."""
         return f"{self.chart.name} {size.family.label}"
 
     def work(self, size: Size) -> float:
@@ -56,7 +56,7 @@ class NetworkSweep(Generates):
         return 1.0
 
     def work_of_steps(self, size: Size) -> float:
-        """Operations that validating the judged size takes."""
+        """Operations that validating the estimated size takes."""
         return OF_STEPS * len(self.data.validation) * size.operations
 
     def work_of_refit(self, size: Size) -> float:

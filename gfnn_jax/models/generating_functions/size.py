@@ -21,10 +21,10 @@ OF_SOLVE, OF_STEPS = 22.0, 20.0
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """One size of a sweep: what a search needs to know before it is judged."""
+    """One size of a sweep: what a search needs to know before its error is estimated."""
 
     family: Any
-    group: Any  # the largest family that is judged from the same factor
+    group: Any  # the largest family whose error is estimated from the same factor
     order: float  # the logarithm of the error falls in proportion: a degree, or log₂ of a number
 
     @property

@@ -1,4 +1,4 @@
-"""Size sweeps: the sizes of one family in one chart, judged from a factor that they share."""
+"""Size sweeps: the sizes of one family in one chart, estimated from a factor that they share."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from gfnn_jax.models.generating_functions.parity import is_even
 from gfnn_jax.models.generating_functions.size import OF_SOLVE, OF_STEPS, Size
 
 # Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
-# judged from one factor of the rows of its largest.
+# estimated from one factor of the rows of its largest.
 _DEGREES = ((2, 3), (4, 5, 6), (7, 8), (9, 10), (12, 14), (16, 18, 20), (24, 28, 32))
 _TRIAL = (2, 3, 4, 5, 6)
 _EVEN_DEGREES = tuple((degree,) for degree in (2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 24, 28, 32))
@@ -147,21 +147,21 @@ class LinearSweep(CoefficientNoise):
         self._solved: dict[int, least_squares.LeastSquaresFit] = {}  # by the number of terms
 
     def named(self, size: Size) -> str:
-        """Name of the unit that judges the size."""
+        """Name of the unit that estimates the size."""
         return f"{self.chart.name} {self._prefix}{size.family.label}"
 
     def work(self, size: Size) -> float:
-        """Operations that judging the size takes: its group's factor, if that is not there yet."""
+        """Operations that estimating the size takes: its group's factor, if it is not there yet."""
         solved = size.family.num_parameters**2
         return solved if size.group in self._factors else solved + self.work_of_factor(size)
 
     def work_of_factor(self, size: Size) -> float:
-        """Operations of the factor that the size is judged from."""
+        """Operations of the factor that the size is estimated from."""
         count, width = self._rows_of(size.group)
         return 2 * (count + len(self._held[1])) * width * (size.group.num_parameters + 1) ** 2
 
     def work_of_steps(self, size: Size) -> float:
-        """Operations that validating the judged size takes, those of the steps as those that the
+        """Operations that validating the estimated size takes, those of the steps as those that the
         solution makes in their time."""
         steps = len(self.data.validation) * size.operations
         return OF_SOLVE * size.family.num_parameters**3 + OF_STEPS * steps
@@ -180,7 +180,7 @@ class LinearSweep(CoefficientNoise):
         return self._candidate(size, train_rms, held_rms, time.perf_counter() - started)
 
     def validate(self, size: Size, estimated: Candidate, budget: Budget, on_progress) -> Candidate:
-        """The judged size solved, and its error measured by steps."""
+        """The estimated size solved, and its error measured by steps."""
         budget.check()
         on_progress(f"{estimated.chart} {estimated.label}: steps of the held-out pairs")
         started = time.perf_counter()

@@ -13,7 +13,7 @@ class LawOptions:
     of the products that stand beside a user's own terms (0: his alone), given_products: by which
     his terms are multiplied too.
     most_terms: of a library; most_modes: of one that grows. rows_per_term: that a library needs.
-    judged_rows: per term, from which a library is judged; all pairs only count in the last fit.
+    judged_rows: per term, on which libraries are compared; all pairs only count in the last fit.
     thresholds: standard errors below which terms go, tried in turn.
     rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
     flat: libraries one after the other whose errors differ by less have met the pairs' noise;
