@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -89,7 +90,10 @@ def read(path: Path) -> list[Run]:
         def even(names: str, order: int = 0, of=one, at=t, now=times, dt=step) -> np.ndarray:
             columns = [of[f"{names}{k}"].to_numpy() for k in (1, 2)]
             if names == "theta":
-                columns = [savgol_filter(c, SMOOTHED, 3, deriv=order, delta=dt) for c in columns]
+                smooth = partial(
+                    savgol_filter, polyorder=3, window_length=SMOOTHED, deriv=order, delta=dt
+                )
+                columns = [np.asarray(smooth(c)) for c in columns]
             return np.stack([np.interp(at, now, c) for c in columns], axis=1)
 
         runs.append(Run(t, even("theta"), even("theta", 1), even("tau")))

@@ -62,6 +62,7 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.families.terms import polynomial_terms
 from gfnn_jax.fitting import gauss_newton, least_squares, linear_starts, row_blocks
 from gfnn_jax.fitting.together import levenberg_marquardt_together
+from gfnn_jax.fitting.training import Limits
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.learn.refit import help_refit, refit
@@ -145,7 +146,7 @@ def problem(task: str, quick: bool) -> Callable[[], Any]:
     def trained():
         result = levenberg_marquardt_together(
             network, starts, w[held:], target[held:], validation=(w[:held], target[:held]),
-            shares=np.ones((size, len(w) - held)), max_iterations=2 if quick else 5,
+            shares=np.ones((size, len(w) - held)), limits=Limits(2 if quick else 5),
         )  # fmt: skip
         return np.concatenate([np.ravel(a) for a in jax.tree.leaves(result.params)])
 

@@ -456,7 +456,7 @@ def _followed(
         sliding.append(after)
     size, count = root.shape[-1], roots.shape[-1]
     spread = np.concatenate([root, np.zeros((*x.shape, roots.shape[1]))], axis=2)
-    spreads, most = {}, max(1, _AT_ONCE // len(x))
+    spreads, most = [], max(1, _AT_ONCE // len(x))
     for first in range(0, h.shape[1], most):
         some = slice(first, first + most)
         begun, begun_in = (np.stack(of[:-1][some], axis=1) for of in (orbit, sliding))
@@ -471,8 +471,9 @@ def _followed(
         for k in range(begun.shape[1]):
             spread = by_state[:, k] @ spread
             spread[..., size:] += further[:, k]
-            spreads[first + k + 1] = spread
-    return np.stack(orbit, axis=1), np.stack([spreads[k] for k in asked.tolist()], axis=1)
+            if first + k + 1 == asked[len(spreads)]:
+                spreads.append(spread)
+    return np.stack(orbit, axis=1), np.stack(spreads, axis=1)
 
 
 def _side_by_side(laws: Sequence[Law], which: np.ndarray) -> tuple[Form, np.ndarray, np.ndarray]:

@@ -23,6 +23,7 @@ from gfnn_jax.solve.arc_models import Defects, Observed
 from gfnn_jax.solve.latent_arcs import rows_of_arcs
 from gfnn_jax.solve.wander import Wander
 
+_FEWEST = 3  # runs: two tell one difference, and no scatter
 _GAIN = 0.05  # of the held-out cost, that zeros of runs have to bring, as terms have
 _SIGNIFICANT = 4.0  # standard errors of the mean of the runs' zeros, as of a term
 _RCOND = 1e-6  # a zero that moves residuals less than this, the motion follows
@@ -35,7 +36,7 @@ def with_zeros_of_runs(
     fitted anew, where they have some."""
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     names = sorted({n.stretch.run for n in nodes})
-    if len(names) < 2 or not bench.observation.is_plain or not np.isfinite(fit.fitted.cost):
+    if len(names) < _FEWEST or not bench.observation.is_plain or not np.isfinite(fit.fitted.cost):
         return nodes, fit
     found = _found(bench, nodes, fit, names)
     if found is None:
