@@ -1,7 +1,7 @@
 """One law of recordings whose runs differ in a parameter: whether it is the one that was put in.
 
-    python benchmarks/parameters.py            every system (some six minutes)
-    python benchmarks/parameters.py --quick    two of them, one draw of one size of the noise
+    python benchmarks/parameters.py            every system (some two minutes)
+    python benchmarks/parameters.py --quick    two of them, one size of the noise
 
 Each system is integrated by SciPy from its own equations of motion, a run for each value of a
 length or of an added mass, and noise is added to its positions, of 1e-4 to 1e-2 of their spread.
@@ -26,7 +26,7 @@ from twins import WITHIN, plain
 import gfnn_jax as gfnn
 
 NOISES = (1e-4, 1e-3, 1e-2)  # of the spread
-DRAWS = 3  # of the noise
+DRAWS = 1  # of the noise
 G = 9.81
 
 
