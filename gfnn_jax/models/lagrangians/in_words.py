@@ -177,9 +177,10 @@ def about_parameters(
     for k, name in enumerate(names):
         values = [recording.values(name, run)[0] for run in recording.runs]
         if not any(row[k] for row in powers or ()):
+            unit = f" {recording.unit(name)}" if recording.unit(name) else ""
             found.append(
-                f"{name} is {min(values):g} to {max(values):g}, and no coefficient of the law "
-                "depends on it, as far as this recording tells"
+                f"{name} is {min(values):g} to {max(values):g}{unit}, and no coefficient of the law "
+                "depends on it, as far as this recording shows"
             )
     count = len({tuple(args_of(recording, run, names).tolist()) for run in recording.runs})
     if powers is not None and most_functions >= min(count, _MANY):

@@ -41,6 +41,7 @@ from gfnn_jax.models.lagrangians.search import (
 )
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.weak_start import weak_start
+from gfnn_jax.models.lagrangians.zeros_of_runs import with_zeros_of_runs
 
 
 def search_of_systems(
@@ -83,7 +84,7 @@ def search_of_systems(
     sigma = np.median([fit.sigma for fit in fits], axis=0)
     fit = bench.fit(found.structure, found.known, arcs, sigma)
     on_progress(f"depending on {', '.join(parameters)}: {describe(fit)}")
-    followed = with_states(followed, fit.arcs, fit.fitted.x)
+    followed, fit = with_zeros_of_runs(bench, followed, fit, on_progress)
     mean = dict(
         zip(structure.keys(), np.mean([one.p for one in values], axis=0).tolist(), strict=True)
     )
