@@ -179,8 +179,8 @@ def about_parameters(
         if not any(row[k] for row in powers or ()):
             unit = f" {recording.unit(name)}" if recording.unit(name) else ""
             found.append(
-                f"{name} is {min(values):g} to {max(values):g}{unit}, and no coefficient of the law "
-                "depends on it, as far as this recording shows"
+                f"{name} is {min(values):g} to {max(values):g}{unit}, and no coefficient of the "
+                "law depends on it, as far as this recording shows"
             )
     count = len({tuple(args_of(recording, run, names).tolist()) for run in recording.runs})
     if powers is not None and most_functions >= min(count, _MANY):

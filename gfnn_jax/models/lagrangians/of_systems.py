@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
+from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import UNIFORM
 from gfnn_jax.maps.observation import Observation
