@@ -124,7 +124,7 @@ def causes(law: Law, recording: Any, seconds: float) -> dict[str, Any]:
 
     gravity = [abs(c) for c in p[3:5]]  # g × (mass × arm) of either angle
     pull = [
-        rate(sum(g * f(q[..., i]) * v[..., i] for i, g in enumerate(gravity)))
+        rate(np.sum([g * f(q[..., i]) * v[..., i] for i, g in enumerate(gravity)], axis=0))
         for f in (np.cos, np.sin)
     ]
     yields = [rate(rate(f)) for f in pull]
