@@ -42,7 +42,7 @@ from gfnn_jax.models.lagrangians.traces import traces_of
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
 from gfnn_jax.solve.robust import Loss
 
-_CLEARLY = 0.9  # times the errors of forecasts, which chance does not make
+_CLEARLY = 0.8  # times the errors of forecasts, which chance does not make
 _IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
 
 OnProgress = Callable[[str], object]
