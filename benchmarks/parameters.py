@@ -143,10 +143,11 @@ def orbits(name: str, values: tuple[float, ...]) -> tuple[np.ndarray, ...]:
 
 
 def recording(name: str, values: tuple[float, ...], noise: float, seed: int) -> gfnn.Recording:
-    """Positions of a run of each value, with noise that is a share of their spread."""
+    """Positions of a run of each value, with noise that is a share of the spread of the runs that
+    are learned from."""
     family, rng, tables = FAMILIES[name], np.random.default_rng(seed), []
     t, found = np.arange(0, family.end, family.dt), orbits(name, values)
-    spread = np.concatenate(found, axis=1).std(axis=1)
+    spread = np.concatenate(orbits(name, family.values), axis=1).std(axis=1)
     for k, (q, value) in enumerate(zip(found, values, strict=True)):
         seen = q + noise * spread[:, None] * rng.normal(size=q.shape)
         columns = dict(zip(family.names, seen, strict=True))
