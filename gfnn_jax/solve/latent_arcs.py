@@ -38,7 +38,7 @@ _SETTLED = 0.003  # of the noise: a change that needs no further iteration
 # Of the largest pivot, below which one tells nothing: of an arc of gross errors alone, or of the
 # speed of a body that sticks.
 _LOOSE = 1e-12
-_HALVINGS = 8  # of a step of arcs that share no coefficients
+_HALVINGS = 4  # of a step of arcs that share no coefficients
 _BLOCK_BYTES = 64 * 2**20  # of the sensitivities of a block of arcs
 OUTLYING = 5.0  # standard deviations: a residual beyond does not tell the noise
 SOFT_L1 = SoftL1()
