@@ -316,7 +316,7 @@ class _Iterate(NamedTuple):
 
     @property
     def merits(self) -> np.ndarray:
-        """Those (A,) of the arcs."""
+        """Merit (A,) of each arc."""
         with np.errstate(all="ignore"):
             cost = np.sum(self.units.loss.of(self.white), axis=(1, 2))
             gaps = np.sum((self.steps.closing / self.units.state) ** 2, axis=(1, 2))
