@@ -38,6 +38,7 @@ _SETTLED = 0.003  # of the noise: a change that needs no further iteration
 # Of the largest pivot, below which one tells nothing: of an arc of gross errors alone, or of the
 # speed of a body that sticks.
 _LOOSE = 1e-12
+_HALVINGS = 4  # of a step of arcs that share no coefficients
 _BLOCK_BYTES = 64 * 2**20  # of the sensitivities of a block of arcs
 OUTLYING = 5.0  # standard deviations: a residual beyond does not tell the noise
 SOFT_L1 = SoftL1()
@@ -216,13 +217,29 @@ class _AtStates:
         return at.gap <= float(_CLOSED * np.sqrt(self.here.x.size))
 
     def tried(self, damping: float, failures: int) -> Tried:
-        """A step of p and x; each that failed halves the next."""
+        """A step of p and x; each that failed halves the next. Arcs that share no p halve their
+        own: one that is hard to follow holds back no other."""
         here, share = self.here, 0.5**failures
         dp, dx = _solve(self._rows, here.defects, damping)
-        there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
+        if len(here.p):
+            there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
+        else:
+            there = self._alone(share, dx)
         if self.closed(here):
             return Tried(there, here.merit * (1 + 1e-9) - there.merit, damping)
         return Tried(there, (1 - 0.5 * share) * here.gap - there.gap, damping)
+
+    def _alone(self, share: float, dx: np.ndarray) -> _Iterate:
+        """A step of arcs (A, L, m) each of which takes as much of it as lowers its own merit."""
+        here, shares = self.here, np.full((len(dx), 1, 1), share)
+        for _ in range(_HALVINGS):
+            there = self.data.at(here.p, here.x + shares * dx, here.units)
+            worse = ~(there.merits <= here.merits * (1 + 1e-9))
+            if not worse.any():
+                return there
+            shares[worse] /= 2
+        shares[worse] = 0
+        return self.data.at(here.p, here.x + shares * dx, here.units)
 
     def moved(self, there: _Iterate, damping: float) -> tuple[_AtStates, bool]:
         """The problem at the end of a step, in units of the noise that its residuals tell; settled
@@ -298,6 +315,14 @@ class _Iterate(NamedTuple):
     @property
     def merit(self) -> float:
         return self.cost + (self.gap / _DEFECT) ** 2
+
+    @property
+    def merits(self) -> np.ndarray:
+        """Merit (A,) of each arc."""
+        with np.errstate(all="ignore"):
+            cost = np.sum(self.units.loss.of(self.white), axis=(1, 2))
+            gaps = np.sum((self.steps.closing / self.units.state) ** 2, axis=(1, 2))
+        return cost + gaps / _DEFECT**2
 
     def rescaled(self, rows: _Rows, least: np.ndarray) -> _Iterate:
         """Iterate in units of the noise that these residuals tell: of each number as much is left
