@@ -321,7 +321,7 @@ class _Iterate(NamedTuple):
         """Merit (A,) of each arc."""
         with np.errstate(all="ignore"):
             cost = np.sum(self.units.loss.of(self.white), axis=(1, 2))
-            gaps = np.sum((self.steps.closing / self.units.state) ** 2, axis=(1, 2))
+            gaps = np.sum((self.defects.closing / self.units.state) ** 2, axis=(1, 2))
         return cost + gaps / _DEFECT**2
 
     def rescaled(self, rows: _Rows, least: np.ndarray) -> _Iterate:
