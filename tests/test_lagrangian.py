@@ -96,6 +96,15 @@ def test_energy_changes_by_the_power_of_the_forces():
     np.testing.assert_allclose(rate, supplied.sum(-1) - lost.sum(-1), rtol=1e-7)
 
 
+def test_dry_friction_without_a_width_has_finite_tables_at_rest():
+    friction = Friction.of([((1,), DRY, 0.0)], 1)
+    speeds = np.array([0.0, 1e-200, -1e-110, 0.3])
+    value, slope, curvature = (table[:, 0] for table in friction.tables(speeds[:, None]))
+    np.testing.assert_array_equal(slope, np.sign(speeds))
+    np.testing.assert_array_equal(curvature, 0.0)
+    assert value[-1] == 0.3
+
+
 def test_padding_moves_nothing():
     q, v = states()
     model = law()

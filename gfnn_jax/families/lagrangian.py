@@ -232,7 +232,7 @@ class Friction:
         linear, quadratic = kinds == LINEAR, kinds == QUADRATIC
         value = xp.where(linear, 0.5 * s * s, xp.where(quadratic, size**3 / 3, root - widths))
         slope = xp.where(linear, s, xp.where(quadratic, s * size, s / root))
-        dry = widths**2 / root**3
+        dry = (widths / root) ** 2 / root  # small speeds would underflow in ε²/root³
         curvature = xp.where(linear, xp.ones_like(s), xp.where(quadratic, 2 * size, dry))
         return value, slope, curvature
 

@@ -35,8 +35,8 @@ _DEFECT = 0.1  # a defect of this many standard deviations costs as much as a re
 _CLOSED = 0.1  # standard deviations, rms: arcs whose defects are smaller are orbits of the model
 _DAMPING = Factors(1e-4, first=5e-6, grown_by=5.0, shrunk_by=0.2, least=1e-12, keeps=True)
 _SETTLED = 0.003  # of the noise: a change that needs no further iteration
-# Of the largest pivot, below which one tells nothing: of an arc of gross errors alone, or of the
-# speed of a body that sticks.
+# Of the largest pivot, each in units of its column, below which one determines nothing: of an arc of
+# gross errors alone, or of the speed of a body that sticks.
 _LOOSE = 1e-12
 _HALVINGS = 4  # of a step of arcs that share no coefficients
 _BLOCK_BYTES = 64 * 2**20  # of the sensitivities of a block of arcs
@@ -418,10 +418,14 @@ def _solve(rows: _Rows, defects: Defects, damping: float) -> tuple[np.ndarray, n
     dp = np.linalg.lstsq(matrix, target, rcond=1e-13)[0] / scale
     right = (rows.arcs[:, :, -1] - rows.arcs[:, :, m : m + n] @ dp)[..., None]
     own, moved = rows.arcs[:, :, :m], np.empty_like(right)
-    pivots = np.abs(np.diagonal(own, axis1=1, axis2=2))
+    sizes = np.linalg.norm(own, axis=1)
+    units = np.max(sizes, axis=0, initial=0.0, where=np.isfinite(sizes))
+    units = np.where(units > 0, units, 1.0)
+    pivots = np.abs(np.diagonal(own, axis1=1, axis2=2)) / units
     loose = pivots.min(axis=1) <= _LOOSE * pivots.max(axis=1)
     moved[~loose] = np.linalg.solve(own[~loose], right[~loose])
-    moved[loose] = np.linalg.pinv(own[loose], rcond=_LOOSE) @ right[loose]
+    inverse = np.linalg.pinv(own[loose] / units, rcond=_LOOSE)
+    moved[loose] = inverse @ right[loose] / units[:, None]
     dx = [moved[..., 0]]
     for i in range(defects.closing.shape[1]):
         carried = (defects.by_state[:, i] @ dx[-1][..., None])[..., 0]
