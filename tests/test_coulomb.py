@@ -55,6 +55,17 @@ def test_bodies_that_stick_together_and_to_the_ground():
     assert np.abs(found[-1, 2:]).max() < 1e-15
 
 
+def test_directions_without_friction_do_not_hold_bodies_that_others_hold():
+    """Two masses at rest up to rounding, and a friction between them that is not there: no event
+    follows another without end."""
+    form, p = blocks([((1, 0), DRY, 0.0), ((0, 1), DRY, 0.0), ((-1, 1), DRY, 0.0)], [0.3, 0.3, 0.0])
+    x = np.array([[0.05, 0.02, 6e-18, -3e-18], [0.05, 0.02, 0.0, 0.0]])
+    step, modes = coulomb.step(form, p, x, np.full(2, 0.1), np.zeros((2, 1, 6, 1)))
+    np.testing.assert_allclose(step.states, x, atol=1e-15)
+    np.testing.assert_array_equal(modes[:, :2], 0)
+    assert np.isfinite(step.by_coefficients).all()
+
+
 def test_an_input_moves_a_body_once_it_is_strong_enough():
     """A mass that sticks on a slope: ẍ₁ = u − ρ sign(ẋ₁), its spring cut."""
     mass = [((2,), (0,), (0,), 0.0)]

@@ -92,12 +92,18 @@ class _Motion:
 
     def begin(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """The modes in which states start."""
-        return self._released(np.arange(len(x)), x, np.sign(self.speeds(x)), u)
+        lanes = np.arange(len(x))
+        modes = np.sign(self.speeds(x))
+        modes[(modes == 0) & (self.losses(lanes) <= 0)] = 1
+        return self._released(lanes, x, modes, u)
 
     def substep(self, x, D, modes, h, u):
         """States, derivatives and modes a time h (N,) later, with inputs u (N, 6, inputs) at its
         nodes; NaN of lanes with more events than can be followed."""
         x, D, modes, done = x.copy(), D.copy(), modes.copy(), np.zeros(len(x))
+        turned = np.zeros(
+            modes.shape, bool
+        )  # directions without friction that have: once in a step
         lanes = np.arange(len(x))
         self._forget(lanes, D, x, modes, u[:, 0])
         for _ in range(_EVENTS):
@@ -110,6 +116,7 @@ class _Motion:
             new, moved, first = self._smooth(lanes, before, D[lanes], left * h[lanes], now, mode)
             part = np.ones(len(lanes))
             speeds = self.speeds(before) * mode, self.speeds(new) * mode
+            speeds[1][turned[lanes]] = 0
             open_ = np.flatnonzero(np.any((speeds[1] < 0) | (mode == 0), axis=1))
             cut, event = open_, np.zeros(0, int)
             if len(open_):
@@ -135,6 +142,7 @@ class _Motion:
                 new[cut], moved[cut], modes[some] = self._changed(
                     some, at, by, mode[cut], event, inside[:, -1], rates, slope
                 )
+                turned[some, event] = self.losses(some)[k] <= 0
             x[lanes], D[lanes] = new, moved
             done[lanes] = np.where(part < 1, done[lanes] + part * left, 1.0)
             lanes = lanes[cut][done[lanes[cut]] < 1]
@@ -147,10 +155,12 @@ class _Motion:
 
     def _changed(self, lanes, x, D, modes, event, u, before, slope):
         """States, derivatives and modes where the direction ``event`` (n,) changes its own, speeds
-        that stick 0; before, slope: the rates there, and that of its speed (n,)."""
+        that stick 0; before, slope: the rates there, and that of its speed (n,). A direction
+        without friction turns and does not stick."""
         k, c, d = (np.arange(len(x)), event), self.directions, self.form.dim
         x, modes = x.copy(), modes.copy()
-        modes[k] = np.where(modes[k] != 0, 0, np.sign(before.held[k]))
+        stops = np.where(self.losses(lanes)[k] > 0, 0, -modes[k])
+        modes[k] = np.where(modes[k] != 0, stops, np.sign(before.held[k]))
         x[:, d:] -= self._impulse(lanes, x, modes, self.speeds(x)[..., None])[..., 0]
         modes = self._released(lanes, x, modes, u)
         after = self.rates(lanes, x, modes, u)

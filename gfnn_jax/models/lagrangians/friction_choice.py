@@ -152,6 +152,7 @@ def _table_of(bench: Workbench, fit: LawFit, candidates: Sequence[Loss]) -> Tabl
     noise, loss = fit.sigma * fit.arcs.noise, bench.observation.loss
     white = bench.whitening(fit.arcs)
     rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, noise, loss, white)
+    rows[~np.isfinite(rows).all(axis=(1, 2, 3))] = 0.0  # arcs that the larger law cannot follow
     keys = larger.keys()
     own = [keys.index(("loss", row)) for row in candidates]
     rest = [k for k in range(len(keys)) if k not in own]
