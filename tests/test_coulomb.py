@@ -56,11 +56,20 @@ def test_bodies_that_stick_together_and_to_the_ground():
 
 
 def test_directions_without_friction_do_not_hold_bodies_that_others_hold():
-    """Two masses at rest up to rounding, and a friction between them that is not there: no event
-    follows another without end."""
-    form, p = blocks([((1, 0), DRY, 0.0), ((0, 1), DRY, 0.0), ((-1, 1), DRY, 0.0)], [0.3, 0.3, 0.0])
-    x = np.array([[0.05, 0.02, 6e-18, -3e-18], [0.05, 0.02, 0.0, 0.0]])
-    step, modes = coulomb.step(form, p, x, np.full(2, 0.1), np.zeros((2, 1, 6, 1)))
+    """Two masses at rest up to rounding, and frictions between them that are not there: events
+    that follow each other without end left lanes without a solution."""
+    rng, directions = np.random.default_rng(0), ((1, 0), (0, 1), (-1, 1), (1, 1))
+    terms = [*TERMS, ((1, 1), (0, 0), (0, 0), 0.0)]
+    form, p = blocks(
+        [(c, DRY, 0.0) for c in directions],
+        [0.3, 0.3, 0.0, 0.0],
+        1.0,
+        terms,
+        np.append(SPRINGS, 0.3),
+    )
+    x = np.concatenate([rng.uniform(-0.1, 0.1, (99, 2)), 1e-18 * rng.normal(size=(99, 2))], axis=1)
+    u = np.repeat(0.1 * rng.normal(size=(99, 1, 1, 1)), 6, axis=2)
+    step, modes = coulomb.step(form, p, x, np.full(99, 0.1), u)
     np.testing.assert_allclose(step.states, x, atol=1e-15)
     np.testing.assert_array_equal(modes[:, :2], 0)
     assert np.isfinite(step.by_coefficients).all()

@@ -35,8 +35,8 @@ _DEFECT = 0.1  # a defect of this many standard deviations costs as much as a re
 _CLOSED = 0.1  # standard deviations, rms: arcs whose defects are smaller are orbits of the model
 _DAMPING = Factors(1e-4, first=5e-6, grown_by=5.0, shrunk_by=0.2, least=1e-12, keeps=True)
 _SETTLED = 0.003  # of the noise: a change that needs no further iteration
-# Of the largest pivot, each in units of its column, below which one determines nothing: of an arc of
-# gross errors alone, or of the speed of a body that sticks.
+# Of the largest pivot, each in units of its column, below which one determines nothing: of an arc
+# of gross errors alone, or of the speed of a body that sticks.
 _LOOSE = 1e-12
 _HALVINGS = 4  # of a step of arcs that share no coefficients
 _BLOCK_BYTES = 64 * 2**20  # of the sensitivities of a block of arcs
