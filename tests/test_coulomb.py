@@ -67,7 +67,8 @@ def test_directions_without_friction_do_not_hold_bodies_that_others_hold():
         terms,
         np.append(SPRINGS, 0.3),
     )
-    x = np.concatenate([rng.uniform(-0.04, 0.04, (99, 2)), 1e-18 * rng.normal(size=(99, 2))], axis=1)
+    positions, speeds = rng.uniform(-0.04, 0.04, (99, 2)), 1e-18 * rng.normal(size=(99, 2))
+    x = np.concatenate([positions, speeds], axis=1)
     u = np.repeat(0.03 * rng.normal(size=(99, 1, 1, 1)), 6, axis=2)
     step, modes = coulomb.step(form, p, x, np.full(99, 0.1), u)
     np.testing.assert_allclose(step.states, x, atol=1e-15)
