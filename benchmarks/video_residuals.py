@@ -83,7 +83,7 @@ def causes(law: Law, recording: Any, seconds: float) -> dict[str, Any]:
     scale = np.tile(sigma, 2) * np.repeat([1, scales.omega], 2)
     best = fit_arcs(own, law.p[1:], start, y, sigma, scale)
     x, p = best.x, np.append(law.p[0], best.p)
-    steps = LawOnArcs(law.form, plain, (), h, u, p, every).steps(p, x)
+    steps = LawOnArcs(law.form, plain, (), h, u, p, every).defects(p, x)
     lagrangian, (q, v) = law.form.lagrangian(p), np.split(x, 2, axis=-1)
     inverse = np.linalg.inv(lagrangian.masses(q))
     left = (y - q) / sigma
