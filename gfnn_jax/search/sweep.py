@@ -7,7 +7,7 @@ and never which model it is of.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from gfnn_jax.dataset.dataset import Dataset
 OnProgress = Callable[[str], Any]
 
 
+@runtime_checkable
 class Sweep(Protocol):
     """Sizes of one model on one data set.
 
