@@ -9,7 +9,6 @@ import pytest
 
 from gfnn_jax.budget import Budget
 from gfnn_jax.candidates.candidate import Candidate
-from gfnn_jax.search import sweep
 from gfnn_jax.search.search import Search
 
 WORK = 1_000  # operations that a made-up size takes, and its steps
@@ -22,7 +21,7 @@ class Size(NamedTuple):
     order: float
 
 
-class Sweep(sweep.Sweep):
+class Sweep:
     """Sizes with an estimate and an error each; it notes what it is asked."""
 
     def __init__(self, sizes, family="polynomial", chart="midpoint"):

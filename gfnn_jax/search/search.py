@@ -18,7 +18,7 @@ import numpy as np
 from gfnn_jax.budget import ROWS, SOLVE, Budget, OutOfTime
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.search.extrapolate import GAINED, Decay, decay_of
-from gfnn_jax.search.sweep import Sweep
+from gfnn_jax.search.sweep import Climbed
 
 # A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
 # the odd degrees), and larger families only fit noise.
@@ -58,7 +58,7 @@ class Found(NamedTuple):
 
 
 class Search:
-    """A climb of sweeps (`search.sweep.Sweep`), which may be made in parts.
+    """A climb of sweeps (`search.sweep.Climbed`), which may be made in parts.
 
     bound: the tolerance on a candidate's ``validation_bound``. on_candidate: called with every
     candidate. on_validated: called with every entry whose steps have been looked at.
@@ -66,7 +66,7 @@ class Search:
 
     def __init__(
         self,
-        sweeps: Sequence[Sweep],
+        sweeps: Sequence[Climbed],
         bound: float,
         budget: Budget,
         on_progress: Callable[[str], Any],

@@ -19,19 +19,15 @@ OnProgress = Callable[[str], Any]
 
 
 @runtime_checkable
-class Sweep(Protocol):
-    """Sizes of one model on one data set.
+class Climbed(Protocol):
+    """Sizes of one model as a search climbs them.
 
-    data: the pairs that it is fitted to. sizes: by rising ``operations`` of a step, each with an
-    ``order`` with which the logarithm of the error falls in proportion. short_of_pairs: whether
-    more pairs would allow larger sizes. linear: whether a size is a linear least-squares problem,
-    whose residuals, solutions from other rows and noise of the coefficients are at hand.
+    sizes: by rising ``operations`` of a step, each with an ``order`` with which the logarithm of
+    the error falls in proportion. short_of_pairs: whether more pairs would allow larger sizes.
     """
 
-    data: Dataset
     sizes: Sequence[Any]
     short_of_pairs: bool
-    linear: bool
 
     def named(self, size: Any) -> str:
         """Name of the unit of work that estimates the size."""
@@ -49,10 +45,6 @@ class Sweep(Protocol):
         """Operations that validating it takes."""
         ...
 
-    def work_of_refit(self, size: Any) -> float:
-        """Operations that fitting it to other rows takes, infinite where it is not fitted anew."""
-        ...
-
     def estimate(self, size: Any, budget: Budget, on_progress: OnProgress) -> Candidate:
         """The size fitted, with its estimated error."""
         ...
@@ -61,6 +53,22 @@ class Sweep(Protocol):
         self, size: Any, estimated: Candidate, budget: Budget, on_progress: OnProgress
     ) -> Candidate:
         """The estimated candidate with the error of its own steps."""
+        ...
+
+
+@runtime_checkable
+class Sweep(Climbed, Protocol):
+    """Sizes of one model on one data set, with what a fit goes on to ask of one of them.
+
+    data: the pairs that it is fitted to. linear: whether a size is a linear least-squares problem,
+    whose residuals, solutions from other rows and noise of the coefficients are at hand.
+    """
+
+    data: Dataset
+    linear: bool
+
+    def work_of_refit(self, size: Any) -> float:
+        """Operations that fitting it to other rows takes, infinite where it is not fitted anew."""
         ...
 
     def piece(self, size: Any) -> Any:
