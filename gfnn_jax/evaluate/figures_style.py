@@ -46,6 +46,7 @@ STYLE: dict[Any, Any] = {
 }
 HALO = [withStroke(linewidth=2, foreground="white")]  # keeps text legible on lines
 WIDTH, HEIGHT = 4.8, 3.2  # inches, of one panel; a column of a paper is about 3.3 wide
+DPI = 200  # dots per inch, of the files
 _DECADES = 1e3  # highest ÷ lowest value, from which on an axis has no minor ticks
 
 
@@ -56,10 +57,21 @@ def style():
 
 @style()
 def save(figure: Figure, path) -> None:
-    """Write a figure as ``.png`` (200 dots per inch) or ``.pdf``, by the suffix of ``path``."""
-    # A layout engine leaves room for all labels; "tight" would draw everything a second time.
-    whole = figure.get_layout_engine() is not None
-    figure.savefig(Path(path), dpi=200, bbox_inches=None if whole else "tight")
+    """Write a figure as ``.png`` (`DPI` dots per inch) or ``.pdf``, by the suffix of ``path``."""
+    engine = figure.get_layout_engine()
+    if engine is None:
+        figure.savefig(Path(path), dpi=DPI, bbox_inches="tight")
+        return
+    # The engine leaves room for all labels. Matplotlib calls it by a drawing of its own before the
+    # one that is saved; a call without that drawing takes a third less.
+    before, figure.dpi = figure.dpi, DPI
+    engine.execute(figure)
+    figure.set_layout_engine("none")
+    try:
+        figure.savefig(Path(path), dpi=DPI)
+    finally:
+        figure.dpi = before
+        figure.set_layout_engine(engine)
 
 
 def axes_or_new(ax, width=WIDTH, height=HEIGHT) -> Axes:
