@@ -375,6 +375,17 @@ def test_forecasts_hold_what_their_bands_say(swing):
     assert abs(states[0, 0] - clean[560]) < 5 * np.sqrt(covariance[0, 0, 0]) + 2e-3
 
 
+def test_a_forecast_says_where_it_leaves_the_motion_that_was_learned(swing):
+    recording, fit = swing
+    assert fit.map.forecast(recording.slice(26.0, 28.0), np.array([28.5, 30.0])).outside == ()
+    largest = np.abs(recording.values("theta", "0")).max()
+    t, theta = pendulum(end=4.0, amplitude=1.5 * largest)
+    wide = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+    (line,) = fit.map.forecast(wide.slice(stop=1.0), t[t > 1.0]).outside
+    assert "run 0" in line
+    assert "lies beyond the motion" in line
+
+
 def test_a_law_is_saved_with_its_sensors(swing, tmp_path):
     recording, fit = swing
     fit.map.save(tmp_path / "model")

@@ -39,8 +39,9 @@ _AT_ONCE = 4_096  # steps whose derivatives are taken together
 
 class Forecast(NamedTuple):
     """Forecast of what sensors will show, and of coordinates that no column is named for: name ->
-    (runs, n), and their standard deviations. outside: lines about runs whose parameters lie beyond
-    those that the law was learned from."""
+    (runs, n), and their standard deviations. outside: lines about runs whose parameters, or whose
+    motion, lie beyond those that the law was learned from, which the standard deviations leave
+    out."""
 
     times: np.ndarray
     values: dict[str, np.ndarray]
@@ -181,7 +182,29 @@ def forecast(
         if n not in values:
             values[n] = orbits.states[..., i]
             std[n] = np.sqrt(orbits.covariances[..., i, i])
-    return Forecast(times, values, std, _outside(map_.parameters, recording, windows))
+    outside = _outside(map_.parameters, recording, windows)
+    beyond = _beyond(map_, [laws[k] for k in which], recording, times, orbits.states)
+    return Forecast(times, values, std, outside + beyond)
+
+
+def _beyond(
+    map_: Any, laws: Sequence[Law], recording: Recording, times: np.ndarray, states: np.ndarray
+) -> tuple[str, ...]:
+    """A line for each run whose forecast (q, v), of the states (runs, n, 2d), leaves the domain."""
+    lines, d, angles = [], states.shape[-1] // 2, list(map_.coordinates.angles)
+    for run, law, x in zip(recording.runs, laws, states, strict=True):
+        momenta = law.form.lagrangian(law.p).derivatives(x[:, :d], x[:, d:]).by_v
+        z = np.concatenate([x[:, :d], momenta], axis=1)
+        turns = np.round((z[:, angles] - np.asarray(map_.angle_centre)) / (2 * np.pi))
+        z[:, angles] -= 2 * np.pi * turns
+        left = ~np.asarray(map_.domain.contains(z))
+        if np.any(left):
+            lines.append(
+                f"run {run}: {np.mean(left):.0%} of the forecast, first at t = "
+                f"{times[np.argmax(left)]:g} s, lies beyond the motion that the law was learned "
+                "from: errors there may be larger than the bands say"
+            )
+    return tuple(lines)
 
 
 def _outside(
