@@ -518,7 +518,7 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
 def test_the_gain_of_a_band_limited_input_has_no_bias():
     """ẍ = −4 x − 0.2 ẋ + 3 u, driven for long: an error of u between samples is one of the gain."""
     t, rates = np.arange(0, 60, 0.1), np.array([0.7, 1.3, 2.1, 3.3])
-    waves = np.exp(1j * (np.multiply.outer(t, rates) + [0.1, 2.0, 4.0, 5.0]))
+    waves = np.exp(1j * (np.multiply.outer(t, rates) + np.array([0.1, 2.0, 4.0, 5.0])))
     x = (waves @ (3 / (4 - rates**2 + 0.2j * rates))).imag
     seen = x + 1e-6 * x.std() * np.random.default_rng(0).normal(size=len(t))
     table = {"t": t, "x": seen, "u": waves.imag.sum(axis=1)}
