@@ -168,7 +168,7 @@ def test_inputs_between_samples():
     t = np.arange(0, 10, 0.1)
     u = np.sin(3 * t)[:, None]
     at = np.linspace(4, 6, 41)
-    assert np.abs(interpolate(t, u, at, "band")[:, 0] - np.sin(3 * at)).max() < 1e-3
+    assert np.abs(interpolate(t, u, at, "band")[:, 0] - np.sin(3 * at)).max() < 1e-7
     assert np.abs(interpolate(t, u, at, "linear")[:, 0] - np.sin(3 * at)).max() < 0.02
     start, end = np.array([4.0, 4.1, 4.3]), np.array([4.1, 4.3, 4.3])
     for hold in HOLDS:
@@ -524,6 +524,19 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     assert of["hold"].fit is found["hold"].acting.fit  # chosen before: as it was
     assert set(of["hold"].others) == {"linear", "band"}
     assert min(of["hold"].others.values()) > 1.5
+
+
+def test_the_gain_of_a_band_limited_input_has_no_bias():
+    """ẍ = −4 x − 0.2 ẋ + 3 u, driven for long: an error of u between samples is one of the gain."""
+    t, rates = np.arange(0, 60, 0.1), np.array([0.7, 1.3, 2.1, 3.3])
+    waves = np.exp(1j * (np.multiply.outer(t, rates) + np.array([0.1, 2.0, 4.0, 5.0])))
+    x = (waves @ (3 / (4 - rates**2 + 0.2j * rates))).imag
+    seen = x + 1e-6 * x.std() * np.random.default_rng(0).normal(size=len(t))
+    table = {"t": t, "x": seen, "u": waves.imag.sum(axis=1)}
+    recording = gfnn.Recording(table, positions=["x"], inputs=["u"])
+    fit = gfnn.fit(recording, terms=["V: x**2", "R: v**2"], input_hold="band")
+    gain, std = fit.gains["u"]["x"]
+    assert abs(gain - 3) < 3 * std < 3e-5
 
 
 @pytest.mark.slow

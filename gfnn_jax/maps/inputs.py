@@ -15,11 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.arrays import as_numbers, as_row, beside, namespace
-from gfnn_jax.flows.schedules import HOLDS
+from gfnn_jax.flows.schedules import HOLDS, TAPS, band_weights
 
 _DEGREE = {"hold": 0, "linear": 1, "band": 9}
-# Samples to either side of a band-limited value, and the shape of their window (Kaiser's β).
-_TAPS, _BETA = 32, 8.0
 
 
 class Scheduled(NamedTuple):
@@ -128,7 +126,7 @@ def _stencil(hold: str, delay: float) -> tuple[int, np.ndarray]:
     of it: the polynomial is then the nearest in the mean square, of the same momentum.
     """
     whole = int(np.floor(delay))
-    reach = _TAPS if hold == "band" else 1
+    reach = TAPS if hold == "band" else 1
     places = np.arange(1 - reach - (delay > whole), reach + 1) - whole
     count = _DEGREE[hold] + 1
     if hold == "band":
@@ -158,6 +156,4 @@ def _shares(hold: str, at: np.ndarray, places: np.ndarray) -> np.ndarray:
         return ((distance >= 0) & (distance < 1)).astype(float)
     if hold == "linear":
         return np.maximum(0.0, 1 - np.abs(distance))
-    window = np.i0(_BETA * np.sqrt(np.clip(1 - (distance / _TAPS) ** 2, 0, None)))
-    values = np.sinc(distance) * np.where(np.abs(distance) < _TAPS, window, 0.0)
-    return values / values.sum(axis=1, keepdims=True)
+    return band_weights(distance)
