@@ -62,6 +62,8 @@ def test_a_model_and_its_piece(pairs, fresh, tmp_path):
     assert (fit.chosen.family, fit.chosen.label) == ("kicks", "kicks 3")
     assert error_of(fit.map, fresh) < 2e-2
     assert fit.symplecticity_defect < 1e-14
+    with pytest.raises(ValueError, match="the action of each piece: Verlet has none"):
+        fit.map.modified_hamiltonian(fresh.z0)
     again = kept(fit.map, tmp_path / "m")
     states, info = again.rollout(fresh.z0[:5], 20)
     assert not np.any(info.status)

@@ -8,6 +8,7 @@ generating function is that of one map; in the midpoint chart it may be a functi
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -56,15 +57,16 @@ def check_varied(pairs: Pairs) -> None:
 
 
 def as_varied(
-    pairs: Pairs, *, learn: str, family: str, chart: str, base, structure=None
+    pairs: Pairs, *, learn: str, family: Any, chart: str, base: Any, structure: Any = None
 ) -> tuple[Pairs, str, list[str]]:
-    """The pairs as they vary, what is learned of them, and what is to be said.
+    """Return the pairs as they vary, what is learned of them, and messages for the user.
 
-    A dt that is the same in all is one number; so is one that is the same in nearly all, and the
-    others, those across a gap, are left out unless only H is asked for. A parameter that is the
-    same in all is none; nor is a time of the drive, but for the message that it leaves. Pairs of
-    different dt tell H, or S of dt and w in the midpoint chart; of different dt and parameters, or
-    of sites, they tell H alone. Raises FitError where anything else is asked for.
+    The options are those of a fit; a family is a name or a user's object. A dt that is the same in
+    all is one number; so is one that is the same in nearly all, and the others, those across a gap,
+    are left out unless only H is asked for. A parameter that is the same in all is left out; so is
+    the time of a drive, with a message. Of pairs of different dt H is learned, or S of dt and w in
+    the midpoint chart; of pairs that differ in dt and in parameters, or of sites, H alone. Raises
+    FitError where anything else is asked for.
     """
     pairs, messages = _without_constants(pairs)
     if np.ndim(pairs.dt) and learn != "hamiltonian":

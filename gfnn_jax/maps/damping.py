@@ -41,10 +41,6 @@ class _Shrinks:
         shrunk = _beside(self.of(args)[0], p) * p
         return image, jnp.concatenate([q, shrunk], axis=-1), info
 
-    def action(self, z, image, origin, args=None):
-        """NaN (B,): a map that loses area has no modified Hamiltonian."""
-        return jnp.full(z.shape[0], jnp.nan, z.dtype)
-
 
 @partial(jax.tree_util.register_dataclass, data_fields=("factor", "shift"), meta_fields=())
 @dataclasses.dataclass(frozen=True, eq=False)

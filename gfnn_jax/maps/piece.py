@@ -1,4 +1,4 @@
-"""Pieces of a map, one protocol: a step of a batch, its inverse, its action and its multiplier.
+"""Pieces of a map, one protocol: a step of a batch, its inverse and its multiplier.
 
 The derivative A of a step has AᵀJA = μJ: μ = 1 of a symplectic piece, e^(−γ dt) of one with uniform
 friction γ.
@@ -29,13 +29,6 @@ class Piece(Protocol):
         """Step z + compensation: (Z, compensation, Info). Rounding has lost the compensation."""
         ...
 
-    def action(self, z: Any, image: Any, origin: Any, args: Any = None) -> Any:
-        """Action (B,) of the step from z to its image, about the origin (B, 2d).
-
-        See `maps.modified_hamiltonian`.
-        """
-        ...
-
     def inverse(self) -> Any:
         """Make the inverse piece."""
         ...
@@ -44,6 +37,18 @@ class Piece(Protocol):
         """μ of AᵀJA = μJ, which holds for the derivative A of every step: 1.0 of a symplectic
         piece; another number, or one of each lane (B,), of a conformally symplectic one; None where
         there is no such number."""
+        ...
+
+
+@runtime_checkable
+class PieceWithAction(Piece, Protocol):
+    """Piece that also knows its action: what the modified Hamiltonian is made of."""
+
+    def action(self, z: Any, image: Any, origin: Any, args: Any = None) -> Any:
+        """Action (B,) of the step from z to its image, about the origin (B, 2d).
+
+        See `maps.modified_hamiltonian`.
+        """
         ...
 
 

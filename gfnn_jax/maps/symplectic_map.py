@@ -39,7 +39,7 @@ from gfnn_jax.maps.lanes import (
 )
 from gfnn_jax.maps.modified_hamiltonian import ModifiedHamiltonian
 from gfnn_jax.maps.parameters import Parameters, as_args
-from gfnn_jax.maps.piece import serves_any_dt
+from gfnn_jax.maps.piece import PieceWithAction, serves_any_dt
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.phase_space import require_x64
@@ -322,6 +322,12 @@ class SymplecticMap:
         multiplier = self.multiplier()
         if not (isinstance(multiplier, float) and multiplier == 1.0):
             raise ValueError("expected a map without friction: one with it conserves no energy")
+        without = [type(p).__name__ for p in self.pieces if not isinstance(p, PieceWithAction)]
+        if without:
+            raise ValueError(
+                "the modified Hamiltonian is made of the action of each piece: "
+                f"{without[0]} has none"
+            )
         z = self._states(z)
         return programs.modified(self, z, self._args(args, z))
 
