@@ -135,7 +135,7 @@ def _run_record(arguments: argparse.Namespace) -> None:
     ahead = ", ".join(f"{seconds:.3g}" for seconds in ran.forecasts.ahead)
     for name, errors in ran.forecasts.median.items():
         sizes = ", ".join(f"{error:.3g}" for error in errors)
-        unit = f" {ran.unseen.unit(name)}".rstrip()
+        unit = f" {ran.held_out.unit(name)}".rstrip()
         print(f"the last third, which no fit has seen: {name} errs by {sizes}{unit} after {ahead} "
               "s (medians)")  # fmt: skip
     print(f"{ran.forecasts.within:.0%} of it lies within two standard deviations (95 % expected)")
@@ -213,13 +213,13 @@ def _fit_law(
         )  # fmt: skip
     print(learned.fit.table)
     print(f"written to {arguments.out}")
-    told = " --inputs FILE" if learned.fit.gains else ""
-    ahead = f" --num-steps 1000{told}"
+    inputs_ahead = " --inputs FILE" if learned.fit.gains else ""
+    ahead = f" --num-steps 1000{inputs_ahead}"
     if "stop" in columns:  # what no fit has seen is in the file
-        ahead, told = f" --to {columns['stop']:g} --compare {arguments.data[0]}", ""
+        ahead, inputs_ahead = f" --to {columns['stop']:g} --compare {arguments.data[0]}", ""
     print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]}{ahead} --out "
           "forecast.csv")  # fmt: skip
-    if told:
+    if inputs_ahead:
         print(f"      FILE holds {', '.join(learned.fit.gains)} at the times of the forecast")
 
 
@@ -339,7 +339,7 @@ def _forecast(arguments: argparse.Namespace) -> None:
     from gfnn_jax.jobs.forecast import forecast_recording
     from gfnn_jax.maps.saved import record
 
-    found, judged = forecast_recording(
+    found, compared = forecast_recording(
         arguments.model, arguments.initial, out=arguments.out, num_steps=arguments.num_steps,
         save_every=arguments.save_every, stop=arguments.stop,
         estimate_from=arguments.estimate_from, inputs=arguments.inputs, compare=arguments.compare,
@@ -351,11 +351,11 @@ def _forecast(arguments: argparse.Namespace) -> None:
     print(f"{arguments.out}: forecasts of {runs}, up to t = {max(times):g} {unit}")
     for line in (line for one in found.values() for line in one.outside):
         print(f"note: {line}")
-    if judged is not None:
-        for name, (rms, median, within) in judged.columns.items():
-            unit = f" {judged.units[name]}" if judged.units[name] else ""
+    if compared is not None:
+        for name, (rms, median, within) in compared.columns.items():
+            unit = f" {compared.units[name]}" if compared.units[name] else ""
             print(f"{name}: RMS error {rms:.4g}{unit}, median of its size {median:.4g}{unit}; "
-                  f"{within:.0%} of {judged.num_samples} samples within two standard deviations "
+                  f"{within:.0%} of {compared.num_samples} samples within two standard deviations "
                   "(95 % expected)")  # fmt: skip
 
 

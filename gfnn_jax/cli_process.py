@@ -25,8 +25,8 @@ def set_up_jax(devices: int | str | None = None) -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    told = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if devices is not None and not told:
+    is_set = "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if devices is not None and not is_set:
         with contextlib.suppress(RuntimeError):  # in a session that has its devices already
             most = _cores() if isinstance(devices, str) else min(devices, _cores())
             jax.config.update("jax_num_cpu_devices", most)

@@ -57,9 +57,9 @@ def print_summary(ran: Any, out: Path) -> None:
         for loss in report["hamiltonian"]["friction"]:
             print(f"friction {loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
     if ran.fit.damping is not None:
-        print(ran.fit.damping.told(float(ran.fit.map.dt)))
-    told = report["hamiltonian"] is not None and report["hamiltonian"]["symmetries"]
-    if ran.fit.symmetries and not told:
+        print(ran.fit.damping.line(float(ran.fit.map.dt)))
+    in_formula = report["hamiltonian"] is not None and report["hamiltonian"]["symmetries"]
+    if ran.fit.symmetries and not in_formula:
         print(f"symmetries of the pairs: {'; '.join(map(str, ran.fit.symmetries))}")
     if not fit["tolerance_met"]:
         for law in ran.fit.partial_laws:

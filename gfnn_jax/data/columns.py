@@ -75,16 +75,17 @@ def angles_of(
     known = (*roles["positions"], *roles["velocities"])
     check_known(source, "angles", given, roles["positions"])
     check_known(source, "degrees", degrees, known)
-    told = [n for n in degrees if _unit(units, n).startswith("rad")]
-    if told:
-        raise InputError(f"{source}: degrees: {told[0]} is in {units[told[0]]} by its header")
+    in_radians = [n for n in degrees if _unit(units, n).startswith("rad")]
+    if in_radians:
+        name = in_radians[0]
+        raise InputError(f"{source}: degrees: {name} is in {units[name]} by its header")
     in_degrees = set(degrees) | {n for n in known if _unit(units, n).startswith(("deg", "°"))}
     angles = set(given) | {n for n in roles["positions"] if n in in_degrees}
     if by_names:
-        told = ("deg", "°", "rad")
+        units_of_angles = ("deg", "°", "rad")
         angles |= {
             n for n in roles["positions"]
-            if (is_angle(n) and not _unit(units, n)) or _unit(units, n).startswith(told)
+            if (is_angle(n) and not _unit(units, n)) or _unit(units, n).startswith(units_of_angles)
         }  # fmt: skip
     return tuple(n for n in roles["positions"] if n in angles), in_degrees
 

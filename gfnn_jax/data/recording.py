@@ -140,24 +140,24 @@ class Recording:
         numbers = [name for name in columned if name not in sigmas.values()]
         unit = time_unit_of(source, names, units, time_unit)
         runs = runs_of(tables, columned, SECONDS[unit], dt)
-        seen = listed(coordinates)
+        coordinate_names = listed(coordinates)
         check_known(source, "observe", observe or {}, numbers)
-        if seen and not given["positions"]:
-            given["positions"] = tuple(name for name in seen if name in numbers)
-        if seen and not any(given.values()):
+        if coordinate_names and not given["positions"]:
+            given["positions"] = tuple(name for name in coordinate_names if name in numbers)
+        if coordinate_names and not any(given.values()):
             given["sensors"] = tuple(observe or {})
         roles, decided = roles_of(source, numbers, given, runs)
         others = [name for of_role in roles.values() for name in of_role]
         more = (name for name in observe or {} if name not in others)
         roles = {**roles, "sensors": (*roles["sensors"], *more)}
-        seen = seen or roles["positions"]
+        coordinate_names = coordinate_names or roles["positions"]
         with_role = [name for role in ROLES for name in roles[role]]
         empty = [n for n in with_role if not any(np.isfinite(v[n]).any() for _, v in runs.values())]
         if empty:
             raise InputError(f"{source}: no value in column {', '.join(empty)}")
         angular, in_degrees = angles_of(
             source,
-            {**roles, "positions": seen},
+            {**roles, "positions": coordinate_names},
             listed(angles),
             listed(degrees),
             angles is None,
@@ -182,7 +182,7 @@ class Recording:
             "runs": tuple(runs),
             "angles": angular,
             "std": typical(std or {}, sigmas, with_role, factors, values),
-            "coordinates": seen,
+            "coordinates": coordinate_names,
             "observe": dict(observe or {}),
             "guess": {name: float(value) for name, value in (guess or {}).items()},
             "units": {n: u for n, u in units.items() if n in numbers},

@@ -264,14 +264,14 @@ def _short(value: Any) -> str:
 def as_typed(options: Mapping[str, Any]) -> str:
     """Keywords of `gfnn_jax.read` as options of the command line, with a blank before each."""
     words = {"start": "from", "stop": "to", "time_unit": "time-unit"}
-    said = []
+    parts = []
     for option, value in options.items():
         if option == "observe":
-            said += [f" --observe {shlex.quote(f'{c} = {f}')}" for c, f in value.items()]
+            parts += [f" --observe {shlex.quote(f'{c} = {f}')}" for c, f in value.items()]
             continue
         if isinstance(value, Mapping):
             value = ",".join(f"{name}={_short(number)}" for name, number in value.items())
         elif isinstance(value, (tuple, list)):
             value = ",".join(map(str, value))
-        said.append(f" --{words.get(option, option)} {shlex.quote(str(value))}")
-    return "".join(said)
+        parts.append(f" --{words.get(option, option)} {shlex.quote(str(value))}")
+    return "".join(parts)

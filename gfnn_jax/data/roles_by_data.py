@@ -57,9 +57,9 @@ def positions_and_velocities(
 def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tuple[str, str]]:
     """(position, velocity), the most alike first taken, in the order of the columns."""
     names, table = list(columns), np.stack(list(columns.values()))
-    told = noise(times, table)
-    size = max(min(n.size for n in told) // 2, _NARROWEST)
-    local = derivatives(times, table, size, [n.sigma for n in told])
+    noises = noise(times, table)
+    size = max(min(n.size for n in noises) // 2, _NARROWEST)
+    local = derivatives(times, table, size, [n.sigma for n in noises])
     if local is None:
         return []
     related = {

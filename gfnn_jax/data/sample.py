@@ -43,15 +43,15 @@ def read_sample(
     order.
     """
     alone, group = group is None, group or Group()
-    found, checksum, count, seen = None, np.zeros(1, np.uint64), 0, [np.inf, 0.0]
+    found, checksum, count, extremes = None, np.zeros(1, np.uint64), 0, [np.inf, 0.0]
     for pairs in iterate_pairs(paths, BLOCK_ROWS, dt=dt, share=group.share):
         new = _table(pairs, seed)
         checksum, count = checksum + _content(new).sum(), count + len(pairs)
-        seen = [min(seen[0], new["dt"].min()), max(seen[1], new["dt"].max())]
+        extremes = [min(extremes[0], new["dt"].min()), max(extremes[1], new["dt"].max())]
         found = _smallest(_both(found, new), num_pairs)
-    told = {"count": [count], "hash": checksum, "low": [seen[0]], "high": [seen[1]]}
-    all_told = group.folded({n: np.array(v) for n, v in told.items()}, _both)
-    total = group.broadcast({"count": all_told["count"].sum()} if group.first else None)["count"]
+    of_process = {"count": [count], "hash": checksum, "low": [extremes[0]], "high": [extremes[1]]}
+    of_group = group.folded({n: np.array(v) for n, v in of_process.items()}, _both)
+    total = group.broadcast({"count": of_group["count"].sum()} if group.first else None)["count"]
     if not total:
         raise InputError(f"{named(paths)}: no pair of consecutive states found")
     if group.share.count > 1:  # those that the first will want, and a few more
@@ -70,8 +70,8 @@ def read_sample(
     if of_pairs_alone:
         found = {**found, **_joined_arcs(found)}
     alone = alone and len(listed(paths)) == 1
-    digest = digest_of(listed(paths)[0]) if alone else f"{all_told['hash'].sum():016x}"
-    same = all_told["low"].min() == all_told["high"].max()
+    digest = digest_of(listed(paths)[0]) if alone else f"{of_group['hash'].sum():016x}"
+    same = of_group["low"].min() == of_group["high"].max()
     states = found["pairs"].reshape(-1, found["pairs"].shape[-1])
     args = {n.removeprefix(_ARG): v for n, v in found.items() if n.startswith(_ARG)}
     each = float(found["dt"][0]) if same and len(states) else found["dt"]

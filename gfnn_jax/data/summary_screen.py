@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from gfnn_jax.data.recording_summary import Column, RecordingSummary
 
 _WIDTH = 110
-_TOLD = 0.02  # error of a loss per period, above which its absence is not told
+_LARGEST_ERROR = 0.02  # error of a loss per period, above which its absence is not reported
 _MOST = 12  # columns, faults or runs that are shown
 _NOTEBOOK = '<pre style="line-height:normal;white-space:pre">{code}</pre>'
 
@@ -70,10 +70,10 @@ def _motion(summary: RecordingSummary) -> str:
     if summary.period is None:
         return ""
     per = summary.period / summary.dt_median
-    said = [f"motion: mean period {summary.period:.4g} s, {per:.3g} samples"]
+    parts = [f"motion: mean period {summary.period:.4g} s, {per:.3g} samples"]
     if summary.coarsest and summary.coarsest > 1.5 * summary.dt_median:
-        said.append(f"steps of {summary.coarsest:.3g} s would suffice")
-    return "; ".join([*said, _loss(summary)])
+        parts.append(f"steps of {summary.coarsest:.3g} s would suffice")
+    return "; ".join([*parts, _loss(summary)])
 
 
 def _loss(summary: RecordingSummary) -> str:
@@ -82,7 +82,7 @@ def _loss(summary: RecordingSummary) -> str:
         return "friction: not estimated, for the samples allow no balance of energy"
     beside = " beside what the inputs supply" if summary.driven else ""
     size = f"{100 * abs(loss.per_period):.2g} ± {100 * loss.error:.1g} % of the energy per period"
-    if not loss.significant and loss.error > _TOLD:
+    if not loss.significant and loss.error > _LARGEST_ERROR:
         return f"friction{beside} not determined ({size})"
     if not loss.significant:
         return f"no friction found{beside} ({size})"
@@ -111,19 +111,19 @@ def _short(value: float | None) -> str:
 
 
 def _remarks(column: Column) -> str:
-    said = ["angle"] if column.angle else []
+    parts = ["angle"] if column.angle else []
     if column.sigma is not None and not column.white:
-        said.append("coloured noise")
+        parts.append("coloured noise")
     if column.sigma and column.resolution and column.resolution > 0.25 * column.sigma:
-        said.append("quantised")
+        parts.append("quantised")
     if column.derivative_of is not None and column.factor is not None:
         late = f", lag {1e3 * column.lag:.2g} ms" if column.lag is not None else ""
-        said.append(f"{column.factor:.3g} × d{column.derivative_of}/dt{late}")
+        parts.append(f"{column.factor:.3g} × d{column.derivative_of}/dt{late}")
     if column.missing:
-        said.append(f"{column.missing} missing")
+        parts.append(f"{column.missing} missing")
     if column.outliers:
-        said.append(f"{column.outliers} outliers")
-    return ", ".join(said)
+        parts.append(f"{column.outliers} outliers")
+    return ", ".join(parts)
 
 
 def _fault(fault) -> Text:

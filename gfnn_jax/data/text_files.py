@@ -126,9 +126,9 @@ def _times_of_day(path: Path, column: Any) -> Any:
     try:
         return pd.to_datetime(column, utc=True, format="ISO8601")
     except ValueError as error:
-        told = str(error).split(" You might")[0][:120]
+        reason = str(error).split(" You might")[0][:120]
         raise InputError(
-            f"{path}: {column.name}: expected times like 2024-05-01 23:59:59.5 ({told})"
+            f"{path}: {column.name}: expected times like 2024-05-01 23:59:59.5 ({reason})"
         ) from None
 
 

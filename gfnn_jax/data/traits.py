@@ -56,22 +56,22 @@ def traits(recording: Recording) -> Traits:
         name: np.concatenate([recording.unwrapped(name, run) for run in recording.runs])
         for name in names
     }
-    told = {}
+    noises = {}
     inputs = np.stack([columns[n] for n in recording.inputs]) if recording.inputs else None
     driven = [n for n in names if n not in (*recording.inputs, *recording.parameters)]
     for group, by in ((driven, inputs), (recording.inputs, None)):
         if group:
             found = noise(times, np.stack([columns[n] for n in group]), by)
-            told |= dict(zip(group, found, strict=True))
-    positions = [told[n].size for n in recording.positions]
+            noises |= dict(zip(group, found, strict=True))
+    positions = [noises[n].size for n in recording.positions]
     size = max(min(positions, default=0) // 2, _NARROWEST)
     moving = tuple(driven)
     local = None
     if moving:
-        sigmas = [told[n].sigma for n in moving]
+        sigmas = [noises[n].sigma for n in moving]
         local = derivatives(times, np.stack([columns[n] for n in moving]), size, sigmas)
     steps = {
         n: resolution(np.concatenate([recording.values(n, run) for run in recording.runs]))
         for n in names
     }
-    return Traits(recording, times, columns, told, steps, moving, local, median_step(times))
+    return Traits(recording, times, columns, noises, steps, moving, local, median_step(times))

@@ -137,8 +137,8 @@ def stretches(
         q = y if coordinates_of is None else coordinates_of(y)
         lifted = {*recording.angles} - {*names}  # angles that no column shows: columns are lifted
         turns = [i for i, n in enumerate(recording.coordinates) if n in lifted]
-        seen = np.isfinite(q).all(1) & np.isfinite(u).all(1)
-        t, y, u, q, noise = t[seen], y[seen], u[seen], q[seen], noise[seen]
+        complete = np.isfinite(q).all(1) & np.isfinite(u).all(1)
+        t, y, u, q, noise = t[complete], y[complete], u[complete], q[complete], noise[complete]
         if coordinates_of is not None and len(q):
             q = q.copy()
             q[:, turns] = np.unwrap(q[:, turns], axis=0)
@@ -244,8 +244,8 @@ def arcs_of(nodes: Sequence[Nodes], length: int) -> Arcs:
         t.append(nodes[i].t[index])
         x.append(nodes[i].x[index])
         noise.append(nodes[i].stretch.noise[nodes[i].at[index]])
-        seen = np.arange(a, a + longest) < b
-        y.append(np.where(seen[:, None], nodes[i].y[index] - nodes[i].zero, np.nan))
+        inside = np.arange(a, a + longest) < b
+        y.append(np.where(inside[:, None], nodes[i].y[index] - nodes[i].zero, np.nan))
     return Arcs(np.array(t), np.array(y), np.array(x), np.array(noise), tuple(home))
 
 

@@ -90,20 +90,20 @@ class LearnedDamping:
         """Line about what was learned."""
         if self.functions is None:
             each = zip(self.factor.ravel(), self.std.ravel(), strict=True)
-            told = [f"{b:.12g} ± {s:.1g}" for b, s in each]
+            factors = [f"{b:.12g} ± {s:.1g}" for b, s in each]
         else:
             each = zip(*map(np.ravel, self.extremes), strict=True)
-            told = [f"{low:.6g} to {high:.6g}" for low, high in each]
+            factors = [f"{low:.6g} to {high:.6g}" for low, high in each]
         by = f", depending on {', '.join(self.names)}" if self.names else ""
         if self.uniform:
-            return f"every step multiplies areas by {told[0]}{by}, one factor for all states"
-        planes = [f"{factor} in (q{i}, p{i})" for i, factor in enumerate(told, 1)]
+            return f"every step multiplies areas by {factors[0]}{by}, one factor for all states"
+        planes = [f"{factor} in (q{i}, p{i})" for i, factor in enumerate(factors, 1)]
         return (
             f"every step multiplies areas by {', '.join(planes)}{by}: no multiple of the "
             "symplectic form is kept"
         )
 
-    def told(self, dt: float) -> str:
+    def line(self, dt: float) -> str:
         """Line about what was learned, with the rate γ of p' = −γ p where one factor b = e^(−γ dt)
         shrinks all areas."""
         if self.functions is not None or not self.uniform or not self.factor < 1:
@@ -164,7 +164,7 @@ def learn_damping(
     if not found.held_out < _GAIN * kept.held_out:
         return None
     found = problem.with_fewer_functions(found)
-    return problem.told(found)
+    return problem.as_learned(found)
 
 
 def where_areas_differ(jacobians, centres, scale, parameters: tuple[str, ...] = ()) -> str:
@@ -173,7 +173,7 @@ def where_areas_differ(jacobians, centres, scale, parameters: tuple[str, ...] = 
     centres: (n, 2d + k), the states at which the Jacobians are, and the ``parameters`` there.
     """
     factors = area_factors(jacobians, scale)
-    explained, told = _EXPLAINED, ""
+    explained, sentence = _EXPLAINED, ""
     names = (*coordinate_names(len(scale) // 2), *parameters)
     for name, x in zip(names, np.asarray(centres).T, strict=True):
         fitted = np.polyval(np.polyfit(x - x.mean(), factors, 2), x - x.mean())
@@ -181,8 +181,10 @@ def where_areas_differ(jacobians, centres, scale, parameters: tuple[str, ...] = 
         if share > explained:
             explained, ends = share, (np.argmin(fitted), np.argmax(fitted))
             low, high = (f"{fitted[i]:.3g} at {name} = {x[i]:.3g}" for i in ends)
-            told = f" Areas change by a factor that differs over phase space, from {low} to {high}"
-    return told
+            sentence = (
+                f" Areas change by a factor that differs over phase space, from {low} to {high}"
+            )
+    return sentence
 
 
 class _Fitted(NamedTuple):
@@ -250,7 +252,7 @@ class _Problem:
         error = np.linalg.norm(np.tensordot(values, found.root.reshape(t, k, -1), axes=1), axis=-1)
         return bool((np.abs(values @ found.factor - 1) > _CERTAIN * error).any())
 
-    def told(self, found: _Fitted) -> LearnedDamping:
+    def as_learned(self, found: _Fitted) -> LearnedDamping:
         """Damping that was found, without axes of length 1."""
         factor = found.factor
         std = np.linalg.norm(found.root, axis=1).reshape(factor.shape)

@@ -76,12 +76,12 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
 
 def _thin(data: Dataset) -> list[str]:
     """A warning where the states lie on a curve, or on the torus of an orbit."""
-    seen = [i for i in range(2 * data.dim) if i not in data.coordinates.cyclic]
-    dimension = sampled_dimension(data.y0[:, seen], data.scale[seen])
-    if dimension > min(data.dim, len(seen) - 1):
+    entering = [i for i in range(2 * data.dim) if i not in data.coordinates.cyclic]
+    dimension = sampled_dimension(data.y0[:, entering], data.scale[entering])
+    if dimension > min(data.dim, len(entering) - 1):
         return []
     where = "a curve" if dimension == 1 else f"a surface of dimension {dimension}"
     return [
-        f"the pairs lie on {where} of the {len(seen)}-dimensional phase space, as those of one "
+        f"the pairs lie on {where} of the {len(entering)}-dimensional phase space, as those of one "
         "orbit do. The map is learned there only: other initial states widen it"
     ]

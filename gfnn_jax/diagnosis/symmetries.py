@@ -28,7 +28,7 @@ _ROWS = 100_000  # pairs, the first ones, of which runs are followed
 _TRAINED, _HELD = 1_000, 500  # pairs to which gradients are fitted, and on which they are compared
 _FITTED = 0.2  # of the gradients, that polynomials may leave over where they are compared
 _AS_WELL = 1.5  # times what they leave of the pairs themselves, they may leave of the images
-_SEEN = 0.5  # part of the images that must lie among the pairs
+_COVERED = 0.5  # part of the images that must lie among the pairs
 
 
 class SymmetryOfPairs(NamedTuple):
@@ -96,7 +96,7 @@ def _reflected(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPai
     for text, matrix in reflections(data.dim, angles):
         there = middle[held] @ matrix.T
         inside = ((there[:, plain] >= low) & (there[:, plain] <= high)).all(axis=1)
-        if np.mean(inside) < _SEEN:
+        if np.mean(inside) < _COVERED:
             continue
         own = missed(middle[held][inside], gradient[held][inside])
         left = missed(there[inside], gradient[held][inside] @ matrix.T)

@@ -71,15 +71,15 @@ def error_statistics(error) -> ErrorStatistics:
     on the mean and the deviation are inf, and the median is inf once half are lost.
     """
     error = np.asarray(error, float)
-    judged = error[~np.isnan(error).any(axis=1)]
-    num_excluded = len(error) - len(judged)
-    if not len(judged):
+    kept = error[~np.isnan(error).any(axis=1)]
+    num_excluded = len(error) - len(kept)
+    if not len(kept):
         nothing = np.full(error.shape[1], np.nan)
         return ErrorStatistics(nothing, nothing, nothing, num_excluded, 0)
     with np.errstate(invalid="ignore"):
-        mean, std, median = judged.mean(axis=0), judged.std(axis=0), np.median(judged, axis=0)
+        mean, std, median = kept.mean(axis=0), kept.std(axis=0), np.median(kept, axis=0)
     # NumPy's deviation around an infinite mean is NaN, and so is the middle of two infinities.
     std = np.where(np.isfinite(mean), std, np.inf)
     median = np.where(np.isnan(median), np.inf, median)
-    num_lost = int(np.isinf(judged).any(axis=1).sum())
+    num_lost = int(np.isinf(kept).any(axis=1).sum())
     return ErrorStatistics(mean, std, median, num_excluded, num_lost)

@@ -77,8 +77,8 @@ def _forecast(axes, fit: LearnedLaw, recording: Recording, run: str, name: str) 
     begin = t[0] + (1 - _AHEAD) * np.ptp(t)
     ahead = t[t > begin][:: max(1, int(np.sum(t > begin)) // _MOST_TIMES)]
     factor, angle = recording.factors[name], name in recording.angles
-    seen = recording.unwrapped(name, run) if angle else recording.values(name, run)
-    axes.plot(t, seen / factor, ".", ms=2, color="0.6", label="measured")
+    readings = recording.unwrapped(name, run) if angle else recording.values(name, run)
+    axes.plot(t, readings / factor, ".", ms=2, color="0.6", label="measured")
     own = recording.slice(run=run)
     try:
         found = fit.map.forecast(own.slice(stop=begin), ahead, own if recording.inputs else None)
@@ -86,11 +86,11 @@ def _forecast(axes, fit: LearnedLaw, recording: Recording, run: str, name: str) 
         return
     value, std = found.values[name][0], found.std[name][0]
     if angle:  # the turn that the lift of the measured angle has there
-        begins = np.interp(begin, t[np.isfinite(seen)], seen[np.isfinite(seen)])
+        begins = np.interp(begin, t[np.isfinite(readings)], readings[np.isfinite(readings)])
         value = value + 2 * np.pi * np.round((begins - value[0]) / (2 * np.pi))
     axes.plot(ahead, value / factor, lw=1, color="C0", label="forecast")
     axes.fill_between(ahead, (value - 2 * std) / factor, (value + 2 * std) / factor, alpha=0.25)
-    low, high = np.nanmin(seen) / factor, np.nanmax(seen) / factor
+    low, high = np.nanmin(readings) / factor, np.nanmax(readings) / factor
     axes.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
     unit = recording.unit(name)
     axes.set_ylabel(f"{name} [{unit}]" if unit else name)

@@ -37,13 +37,13 @@ class Forecasts(NamedTuple):
     within: float
 
 
-def forecasts_along(map_: SymplecticMap, unseen: Recording, ahead: Sequence[float]) -> Forecasts:
-    """Forecasts from up to 24 states along ``unseen``, each estimated from the 20 samples before,
+def forecasts_along(map_: SymplecticMap, recording: Recording, ahead: Sequence[float]) -> Forecasts:
+    """Forecast from up to 24 states along a recording, each estimated from the 20 samples before,
     for as long as the last of the times ``ahead`` (s).
 
     Raises InputError where no run holds that many samples and as much time behind them.
     """
-    times = {run: unseen.times(run) for run in unseen.runs}
+    times = {run: recording.times(run) for run in recording.runs}
     starts = [
         (run, k)
         for run, t in times.items()
@@ -52,11 +52,12 @@ def forecasts_along(map_: SymplecticMap, unseen: Recording, ahead: Sequence[floa
     ]
     if not starts:
         raise InputError(
-            f"{unseen.source}: no run has {_SAMPLES} samples and {ahead[-1]:.3g} s behind them "
+            f"{recording.source}: no run has {_SAMPLES} samples and {ahead[-1]:.3g} s behind them "
             "that no fit has seen"
         )
     chosen = np.linspace(0, len(starts) - 1, min(_STARTS, len(starts))).astype(int)
-    each = tuple(_ahead(map_, unseen, run, k, ahead[-1]) for run, k in (starts[i] for i in chosen))
+    begins = (starts[i] for i in chosen)
+    each = tuple(_ahead(map_, recording, run, k, ahead[-1]) for run, k in begins)
     names = list(each[0].values)
     median = {
         name: tuple(
@@ -76,20 +77,20 @@ def forecasts_along(map_: SymplecticMap, unseen: Recording, ahead: Sequence[floa
     return Forecasts(each, tuple(ahead), median, within)
 
 
-def _ahead(map_: SymplecticMap, unseen: Recording, run: str, k: int, longest: float) -> Ahead:
+def _ahead(map_: SymplecticMap, recording: Recording, run: str, k: int, longest: float) -> Ahead:
     """The forecast of a run from its sample k on; angles as near what was measured as turns go."""
-    t = unseen.times(run)
+    t = recording.times(run)
     begin = float(t[k])
-    later = unseen.slice(np.nextafter(begin, np.inf), begin + longest, run=run)
-    start = unseen.slice(float(t[k - _SAMPLES + 1]), begin, run=run)
-    own = unseen.slice(run=run) if unseen.inputs else None
+    later = recording.slice(np.nextafter(begin, np.inf), begin + longest, run=run)
+    start = recording.slice(float(t[k - _SAMPLES + 1]), begin, run=run)
+    own = recording.slice(run=run) if recording.inputs else None
     found = map_.forecast(start, later.times(run), own)
     measured, values, std = {}, {}, {}
     for name in found.values:
-        factor = unseen.factors[name]
-        seen, value = later.values(name, run), found.values[name][0]
-        if name in unseen.angles:
-            seen = seen + 2 * np.pi * np.round((value - seen) / (2 * np.pi))
-        measured[name], values[name] = seen / factor, value / factor
+        factor = recording.factors[name]
+        readings, value = later.values(name, run), found.values[name][0]
+        if name in recording.angles:
+            readings = readings + 2 * np.pi * np.round((value - readings) / (2 * np.pi))
+        measured[name], values[name] = readings / factor, value / factor
         std[name] = found.std[name][0] / factor
     return Ahead(begin, later.times(run), measured, values, std)

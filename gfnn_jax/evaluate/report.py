@@ -85,7 +85,7 @@ def assemble(
             "multiplier": fit.map.multiplier(),
             "damping": _damping(fit),
             "positions": None if fit.positions is None else vars(fit.positions),
-            "symplecticity_defect": fit.symplecticity_defect if fit.tells_defect else None,
+            "symplecticity_defect": fit.symplecticity_defect if fit.defect_known else None,
             "chart_determinant_min": fit.model_determinant_min,
             "chart_determinants_of_data": {n: j.low for n, j in fit.determinants.items()},
             "newton_iterations_max": chosen.newton_iterations_max,

@@ -40,7 +40,7 @@ class GaussNewtonOptions:
     several devices takes; part_rows: rows of its part per term, at least.
     coarse_stages: of the early rounds.
     early_rows: rows per term that the early rounds look at; fewest: pairs at least.
-    judged: pairs at which a step's own error is measured; judged_free: of a family that does
+    error_pairs: at which a step's own error is measured; error_pairs_free: of a family that does
     without matrices, every pair of which has many coordinates.
     misfits, errors: a pair is resolved whose own error is below so many times what is left over in
     the median, or the median of these errors. selections: of resolved pairs in the end, at most.
@@ -57,8 +57,8 @@ class GaussNewtonOptions:
     coarse_stages: int = 4
     early_rows: float = 6.0
     fewest: int = 60
-    judged: int = 48
-    judged_free: int = 2
+    error_pairs: int = 48
+    error_pairs_free: int = 2
     misfits: float = 10.0
     errors: float = 100.0
     selections: int = 4
@@ -327,8 +327,8 @@ class Problem:
         """Find for each tolerance the cheapest steps whose own error, ÷ scale, is within it at
         nearly all of these rows; None: at roundoff."""
         options = self.options
-        judged = options.judged_free if matrix_free(family) else options.judged
-        sample = rows[:: -(-len(rows) // judged)]
+        error_pairs = options.error_pairs_free if matrix_free(family) else options.error_pairs
+        sample = rows[:: -(-len(rows) // error_pairs)]
         substeps = self.substeps_for(family, c, sample)
         reference = self.images(family, c, sample, Steps(12, 4 * substeps)).states
 

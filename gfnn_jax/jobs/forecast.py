@@ -23,7 +23,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
 
 
-class Judged(NamedTuple):
+class Comparison(NamedTuple):
     """A forecast against what was measured: column -> (root mean square error, its median size,
     both in the column's unit, share of samples within two standard deviations), the units, and the
     number of samples."""
@@ -37,7 +37,7 @@ def forecast_recording(
     model: Path, initial: Path, *, out: Path, num_steps: int | None = None, save_every: int = 1,
     stop: float | None = None, estimate_from: int | None = None, inputs: Path | None = None,
     compare: Path | None = None, columns: dict[str, Any] | None = None, overwrite: bool = False,
-) -> tuple[dict[str, Forecast], Judged | None]:  # fmt: skip
+) -> tuple[dict[str, Forecast], Comparison | None]:  # fmt: skip
     """Forecast from the states at the ends of a recording's runs; run -> its forecast.
 
     num_steps: of the model's dt; saved every so many. stop: time, in the file's unit, at which the
@@ -90,7 +90,7 @@ def forecast_recording(
     factors = dict.fromkeys(job.get("degrees", ()), np.pi / 180) | recording.factors
     found = {run: _in_units(one, factors, second) for run, one in found.items()}
     _write(out, tuple(next(iter(found.values())).values), found)
-    return found, None if measured is None else _judged(sensors, found, measured)
+    return found, None if measured is None else _compared(sensors, found, measured)
 
 
 def _read(
@@ -143,7 +143,7 @@ def _last_samples(recording: Recording, run: str, count: int | None) -> Recordin
     return recording.slice(start=float(np.sort(times)[-min(count, len(times)) :].min()))
 
 
-def _judged(sensors: Sensors, found: dict[str, Forecast], measured: Recording) -> Judged:
+def _compared(sensors: Sensors, found: dict[str, Forecast], measured: Recording) -> Comparison:
     columns, count = {}, 0
     for name in (n for n in sensors.observation_model.channels if n in measured.columns):
         errors, stds = [], []
@@ -164,7 +164,7 @@ def _judged(sensors: Sensors, found: dict[str, Forecast], measured: Recording) -
         rms, median = np.sqrt(np.mean(error**2)), np.median(np.abs(error))
         columns[name] = (float(rms), float(median), float(np.mean(np.abs(error) <= 2 * std)))
         count = len(error)
-    return Judged(columns, {name: measured.unit(name) for name in columns}, count)
+    return Comparison(columns, {name: measured.unit(name) for name in columns}, count)
 
 
 def _write(out: Path, names: tuple[str, ...], found: dict[str, Forecast]) -> None:

@@ -28,7 +28,7 @@ class Ran(NamedTuple):
 
     learned: Learned
     forecasts: Forecasts
-    unseen: Recording
+    held_out: Recording
 
 
 def run_record(
@@ -52,12 +52,12 @@ def run_record(
         map_ = learned.fit.map
         assert map_.sensors is not None
         progress.line("forecasting the last third, which no fit has seen")
-        unseen = whole.slice(start=np.nextafter(end, np.inf))
-        half = max(np.ptp(unseen.times(run)) for run in unseen.runs) / 2
+        held_out = whole.slice(start=np.nextafter(end, np.inf))
+        half = max(np.ptp(held_out.times(run)) for run in held_out.runs) / 2
         ahead = [periods * 2 * np.pi / map_.sensors.omega for periods in _PERIODS]
         ahead = [seconds for seconds in ahead if seconds < half] or [half]
-        found = forecasts_along(map_, unseen, ahead)
-        forecasts_figure(found, unseen, folder / FIGURE)
+        found = forecasts_along(map_, held_out, ahead)
+        forecasts_figure(found, held_out, folder / FIGURE)
         result = learned.report | {
             "forecasts": {
                 "begin": end, "num": len(found.each), "ahead": list(found.ahead),
@@ -66,4 +66,4 @@ def run_record(
             }
         }  # fmt: skip
         (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
-    return Ran(learned, found, unseen)
+    return Ran(learned, found, held_out)

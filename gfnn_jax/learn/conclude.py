@@ -76,9 +76,9 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         ended = MET
     if law is not None and searched.of_terms is None and searched.linear is None:
         on_law = chosen.entry is None or searched.met_by_law
-        said = on_law or (law.fast and not met)
-        messages += law.messages if said else ()
-        unmet = law.unmet if said else ""
+        law_matters = on_law or (law.fast and not met)
+        messages += law.messages if law_matters else ()
+        unmet = law.unmet if law_matters else ""
     structured = request.structure is not None  # too few pairs to look at their neighbours
     if met:
         messages += [] if structured else _hidden(chosen, searched)
@@ -240,7 +240,7 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
             "recording of the positions has friction (--positions, gfnn.Recording)"
         )
         return _LeftOver(None, [message], "volumes of phase space change, as by friction")
-    if np.isfinite(error) or _told_by_neighbours(sample) is False:
+    if np.isfinite(error) or _noise_by_neighbours(sample) is False:
         message = (
             "the residuals are no noise: neighbouring pairs have similar ones. Either the terms "
             "tried cannot represent the motion (give known ones: --terms, terms=), or it is not "
@@ -250,7 +250,7 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     return None
 
 
-def _told_by_neighbours(sample: _Sample) -> bool | None:
+def _noise_by_neighbours(sample: _Sample) -> bool | None:
     """Return whether the residuals are noise; None where the pairs lie too far apart to tell."""
     _, y0, _, residual, scale, sequence, place = sample
     return is_noise(y0 / scale, residual / scale, sequence, place)
@@ -274,11 +274,11 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     sample = _residuals_of_sample(candidate, entry, searched)
     of_h = law if candidate.learns == "hamiltonian" and entry is None else None
     if not stalled and of_h is not None:  # the search for H ended before it met the noise
-        stalled = _told_by_neighbours(sample) is True and leaves_white(of_h, data)
+        stalled = _noise_by_neighbours(sample) is True and leaves_white(of_h, data)
     known = _no_noise(sample, stalled)
     if known is not None:
         return known
-    if data.noise_of_channels is None and _told_by_neighbours(sample) is None:
+    if data.noise_of_channels is None and _noise_by_neighbours(sample) is None:
         return _LeftOver(None, [], "the pairs lie too far apart to distinguish noise from what "
                          "these functions lack")  # fmt: skip
     rows, sequence = sample.rows, sample.sequence

@@ -49,7 +49,7 @@ from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.phase_space import Pairs, require_x64
 from gfnn_jax.scenes.scene import Scene
 
-_JUDGED = 200  # states at which the chosen map's defect and determinant are taken
+_STATES_MEASURED = 200  # states at which the chosen map's defect and determinant are taken
 
 
 @with_options
@@ -161,9 +161,9 @@ def fit(
         warn([*conclusion.messages, *filter(None, [error.few])])
     damping = diagnosis.damping if chosen.candidate.learns == "map" else None
     if damping is not None:  # a fact, not a warning
-        messages.append(damping.told(data.dt))
-    judged = min(_JUDGED, block_of(2 * data.dim))
-    some = chosen.data.pairs.take(chosen.data.validation[:judged])
+        messages.append(damping.line(data.dt))
+    num_states = min(_STATES_MEASURED, block_of(2 * data.dim))
+    some = chosen.data.pairs.take(chosen.data.validation[:num_states])
     return Fit(
         map=chosen.candidate.map,
         candidates=_all_candidates(chosen, found),
@@ -236,7 +236,7 @@ def fit_positions(
     )  # fmt: skip
     for message in found.messages:
         warnings.warn(message, FitWarning, stacklevel=3)
-    test = found.states.take(found.test[: min(_JUDGED, block_of(2 * found.map.dim))])
+    test = found.states.take(found.test[: min(_STATES_MEASURED, block_of(2 * found.map.dim))])
     determinant = np.asarray(found.map.determinant(test.z0))
     return Fit(
         map=found.map, candidates=found.candidates, asked=asked,
@@ -279,7 +279,7 @@ def _smallest_determinant(chosen: Chosen) -> float:
     if piece is None:
         return float("nan")
     piece = jax.tree.map(np.asarray, piece)
-    rows = data.validation[:_JUDGED]
+    rows = data.validation[:_STATES_MEASURED]
     dt, args = data.given(rows)
     piece = dataclasses.replace(piece, dt=dt) if data.own_dt is not None else piece
     determinant = piece.determinant(data.y0[rows], data.y1[rows], args)

@@ -54,7 +54,7 @@ class Fit:
     fitted to them afterwards.
     validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
     too few for these. operations: of the search, as counted; as ``max_operations`` they give this
-    map again, whatever the clock. budget: what is left of it. tells_defect: whether there is
+    map again, whatever the clock. budget: what is left of it. defect_known: whether there is
     time in it to compile the derivative of a step.
     """
 
@@ -85,7 +85,7 @@ class Fit:
     test_pairs: Pairs | None = None
     operations: int = 0
     budget: Budget = dataclasses.field(default_factory=Budget, repr=False)
-    tells_defect: bool = True
+    defect_known: bool = True
 
     def __repr__(self) -> str:
         """One line: the chosen map, its error and the tolerance."""
@@ -122,7 +122,7 @@ class Fit:
         """Compute what a report and a saved model hold beside the map, as far as the budget goes:
         the posterior, which is left out of the map where it does not fit, and the defect of a step.
         Warns (FitWarning) of what is left out."""
-        known, map_, tells = len(self.budget.left_out), self.map, True
+        known, map_, defect_known = len(self.budget.left_out), self.map, True
         if map_.posterior is not None and not map_.posterior.known:
             work = work_of_posterior(self.chosen.num_parameters)
             try:
@@ -135,7 +135,7 @@ class Fit:
             with self.budget.last("the symplecticity defect of a step", COMPILE, seconds):
                 defect = self.symplecticity_defect
         except OutOfTime:
-            tells, defect = False, float("nan")
+            defect_known, defect = False, float("nan")
         messages = self.budget.left_out[known:]
         for message in messages:
             warnings.warn(message, FitWarning, stacklevel=2)
@@ -144,9 +144,9 @@ class Fit:
         )
         found = dataclasses.replace(
             self, map=map_, candidates=candidates, messages=(*self.messages, *messages),
-            tells_defect=tells, seconds=self.budget.seconds,
+            defect_known=defect_known, seconds=self.budget.seconds,
         )  # fmt: skip
-        if tells:
+        if defect_known:
             found.__dict__["symplecticity_defect"] = defect
         return found
 

@@ -34,7 +34,7 @@ from gfnn_jax.models.generating_functions.latent_monitors import Linear, latent_
 from gfnn_jax.phase_space import Pairs, sizes, symplectic_form
 
 _SYMPLECTIC = 1e-9  # ‖MᵀJM − J‖ of a stretch that is known
-_SEEN = 1e-8  # smallest singular value of B, ÷ its largest, that tells momenta
+_SINGULAR = 1e-8  # smallest singular value of B, ÷ its largest, that tells momenta
 _EVEN = 0.01  # of a turn, by which times may miss an even grid
 
 
@@ -125,8 +125,8 @@ def fit_monitors(
     ]
     noise, unknown = None, [k for k, one in enumerate(fits) if one is not None]
     k = unknown[0]
-    seen = fits[k]
-    if len(places) == 2 and seen is not None and not seen.met:
+    stretch = fits[k]
+    if len(places) == 2 and stretch is not None and not stretch.met:
         better = _of_latent_readings(whole[k], runs, known, k)
         if better is not None:
             whole[k], noise = better
@@ -191,7 +191,7 @@ def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
             f"{defect:.2g}"
         )
     values = np.linalg.svd(matrix[:dim, dim:], compute_uv=False)
-    if not values[-1] > _SEEN * max(values[0], 1e-300):
+    if not values[-1] > _SINGULAR * max(values[0], 1e-300):
         raise InputError(
             "between: the block ∂Q/∂p of a matrix is singular (a phase advance near a multiple of "
             "π), so that two readings determine no momenta. Give another stretch as the known one"

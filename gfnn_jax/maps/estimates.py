@@ -329,13 +329,13 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
         sensors.observation_model.loss,
         sensors.wander,
     )
-    unseen = np.where(np.isfinite(y), np.array(noise), np.inf)
-    white = None if wander is None else wander.whitening(t, unseen)
+    noise_of_readings = np.where(np.isfinite(y), np.array(noise), np.inf)
+    white = None if wander is None else wander.whitening(t, noise_of_readings)
     found = fit_arcs(arcs, np.zeros(0), x, y, sigma, scale, loss=loss, whitening=white)
     if wander is None or white is None:
         return found.x[:, -1], found.last_covariance()
     J, last = linearised(arcs, np.zeros(0), found.x, y, sigma, loss, white)
-    near = white @ wander.latest(t, unseen).swapaxes(1, 2)[..., None]
+    near = white @ wander.latest(t, noise_of_readings).swapaxes(1, 2)[..., None]
     weights = np.sqrt(np.nan_to_num(loss.weights(found.whitened)))
     near = weights * near[..., 0].swapaxes(1, 2)
     return _with_zeros(found.x[:, -1], J, last, near, wander.size**2, sensors.sigma)

@@ -29,7 +29,7 @@ from gfnn_jax.phase_space import sizes, split
 _STAGES, _SUBSTEPS = (3, 4, 6, 8), (1, 2, 4, 8, 16, 32)  # that are tried, by rising order
 # h × the fastest rate of a substep: of what fixed-point iterations solve, and Newton's method.
 _CONTRACTING, STIFFEST = 1.0, 30.0
-_JUDGED = 64  # states whose step tells the error of these
+_TEST_STATES = 64  # states whose step tells the error of these
 _NEARLY = 0.95  # of them, whose steps are to be within the tolerance
 
 
@@ -63,7 +63,7 @@ def map_of_law(
     coordinates = Coordinates("cartesian", angles=tuple(angles))
     z, _, centre, covered = lift(np.asarray(z, float), np.asarray(z, float), coordinates)
     whole = tuple(a for a, all_of_it in zip(angles, covered, strict=True) if all_of_it)
-    scale, some = sizes(z), slice(None, None, -(-len(z) // _JUDGED))
+    scale, some = sizes(z), slice(None, None, -(-len(z) // _TEST_STATES))
     own = args[some] if parameters else None
     if signals is not None:
         u = np.zeros((len(z), count)) if inputs is None else np.asarray(inputs, float)

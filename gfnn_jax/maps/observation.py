@@ -89,7 +89,7 @@ class Observation:
         for k, tree in enumerate(self._trees):
             i = self.coordinates.index(self.channels[k]) if tree is None else -1
             others = (depends_on(t) for t in self._trees if t is not None)
-            if tree is None and not any(i in seen for seen in others):
+            if tree is None and not any(i in used for used in others):
                 found[i] = k
         return found
 
@@ -155,9 +155,9 @@ class Observation:
         infinite where a coordinate moves no channel."""
         d, sizes = self.dim, np.full(len(x), np.inf)
         for _ in range(_ITERATIONS):
-            seen = self(x)
-            r = (y[:, still] - seen.values[:, still]) / scale
-            J = seen.by_state[:, still, :d] / scale[:, None]
+            shown = self(x)
+            r = (y[:, still] - shown.values[:, still]) / scale
+            J = shown.by_state[:, still, :d] / scale[:, None]
             sizes = np.sum(np.nan_to_num(r) ** 2, axis=1)
             J = np.where(np.isfinite(r)[..., None], J, 0.0)
             step = (np.linalg.pinv(J, rcond=1e-8) @ np.nan_to_num(r)[..., None])[..., 0]
@@ -221,12 +221,12 @@ class Observation:
         with its velocity) and in the parameters: (n, d) and (n, m)."""
         d = self.dim
         x = np.random.default_rng(0).normal(size=(40, 2 * d))
-        seen = self(x)
-        by = seen.by_state[..., :d]
+        shown = self(x)
+        by = shown.by_state[..., :d]
         if scaled:
-            by = by * x[:, None, :d] + seen.by_state[..., d:] * x[:, None, d:]
+            by = by * x[:, None, :d] + shown.by_state[..., d:] * x[:, None, d:]
         rows = by.shape[0] * by.shape[1]
-        return by.reshape(rows, d), seen.by_coefficients.reshape(rows, len(self.parameters))
+        return by.reshape(rows, d), shown.by_coefficients.reshape(rows, len(self.parameters))
 
 
 def observed(
@@ -309,17 +309,17 @@ def _started(g: Observation) -> np.ndarray:
     own = [(k, state.index(name)) for k, name in enumerate(g.channels) if name in state]
     x = np.random.default_rng(0).normal(size=(40, 2 * g.dim))
     values[open_] = 1.0
-    told = np.zeros(len(values), bool)
+    determined = np.zeros(len(values), bool)
     for _ in range(_ITERATIONS if len(open_) else 0):
-        seen = g(x, values)
-        rows = [seen.by_coefficients[:, k][:, open_] for k, _ in own]
-        left = [x[:, i] - seen.values[:, k] for k, i in own]
+        shown = g(x, values)
+        rows = [shown.by_coefficients[:, k][:, open_] for k, _ in own]
+        left = [x[:, i] - shown.values[:, k] for k, i in own]
         if not rows:
             break
         J = np.concatenate(rows)
-        told[open_] = np.any(J, axis=0)
+        determined[open_] = np.any(J, axis=0)
         values[open_] += np.linalg.pinv(J, rcond=1e-8) @ np.concatenate(left)
-    missing = [g.parameters[i] for i in open_ if not told[i] or not np.isfinite(values[i])]
+    missing = [g.parameters[i] for i in open_ if not determined[i] or not np.isfinite(values[i])]
     if missing:
         raise InputError(
             f"observe: {', '.join(missing)}: expected a first guess, guess={{{missing[0]!r}: …}} "

@@ -21,7 +21,7 @@ from gfnn_jax.phase_space import TIME
 _EDGE = 1e-9  # tolerance at the ends of a range, relative to it, for printed numbers
 # A part of a period that no pair covers and that is longer than this, relative to the period, lies
 # outside the data. Harmonics of up to the fourth are learned, which vary over an eighth.
-_UNSEEN = 1 / 8
+_LARGEST_GAP = 1 / 8
 _HALF_DIGITS = 2.0**27 + 1  # splits a float64 in two halves, whose products are exact (Veltkamp)
 
 
@@ -105,7 +105,7 @@ def _covered(t0: np.ndarray, dt: np.ndarray, period: float) -> tuple[float, floa
     # An interval that reaches into the next period covers the first part of this one.
     gaps = np.append(begin[1:], begin[0] + period) - np.maximum(end, end[-1] - period)
     longest = int(np.argmax(gaps))
-    if gaps[longest] <= _UNSEEN * period:
+    if gaps[longest] <= _LARGEST_GAP * period:
         return 0.0, period
     first = begin[(longest + 1) % len(begin)]
     return float(first), float(first + period - gaps[longest])

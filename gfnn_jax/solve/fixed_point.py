@@ -187,24 +187,24 @@ def refine(equation: Contraction, shared: Any, lanes: Any, guess: Any):
     that the fixed point does not solve have Newton updates from the guess.
     """
 
-    def judged(x):
+    def evaluated(x):
         evaluation = equation.evaluate(shared, lanes, x)
         return x, evaluation, largest(evaluation.residual / evaluation.size)
 
     with np.errstate(all="ignore"):
         unit, stale = equation.unit(shared, lanes), 0
-        new = best = judged(guess)
+        new = best = evaluated(guess)
         for _ in range(MOST):
             if stale == _STALE or (best[2] <= _CLOSE).all():
                 break
-            new = judged(new[0] - unit * new[1].residual)
+            new = evaluated(new[0] - unit * new[1].residual)
             better = new[2] < best[2]
             best, stale = where(better, new, best), 0 if better.any() else stale + 1
-        best = where(best[2] <= _SOLVED, best, judged(guess))
+        best = where(best[2] <= _SOLVED, best, evaluated(guess))
         while (left := ~(best[2] <= _SOLVED)).any():
             product = equation.product(shared, lanes, best[0])
             step = krylov.solve(product, np.where(left[:, None], best[1].residual, 0.0), _LINEAR)
-            new = judged(best[0] - unit * step)
+            new = evaluated(best[0] - unit * step)
             better = left & (new[2] < _SHRINKS * best[2])
             best = where(better, new, best)
             if not better.any():

@@ -17,8 +17,8 @@ _DERIVATIVE = 0.8  # of a velocity's variance that the position's derivative mus
 _BETTER = 0.25  # score by which other pairs of columns must be better than the declared ones
 _NEAR = 0.1  # of a factor like 180/π or 1000
 _OFF = 0.2  # logarithm of a factor that no filter makes
-_FILTERED = 0.03  # deviation of a factor from one that is told
-_LATE = 0.4  # steps of lag that are told
+_FILTERED = 0.03  # deviation of a factor from 1 that is reported
+_LATE = 0.4  # steps of lag that are reported
 
 
 def related(traits: Traits) -> Iterator[Fault]:
@@ -28,8 +28,8 @@ def related(traits: Traits) -> Iterator[Fault]:
     still = {
         n for n in recording.columns if np.nanmin(traits.columns[n]) == np.nanmax(traits.columns[n])
     }
-    told = still | recording.explained  # what a sensor shows is fitted with the law
-    declared = [p for p in declared if not told & set(p) and not _jumps(traits, p[0])]
+    excluded = still | recording.explained  # what a sensor shows is fitted with the law
+    declared = [p for p in declared if not excluded & set(p) and not _jumps(traits, p[0])]
     relations = {pair: traits.relation(*pair) for pair in declared}
     known = {pair: relation for pair, relation in relations.items() if relation is not None}
     if not known or len(known) < len(declared):
@@ -37,9 +37,9 @@ def related(traits: Traits) -> Iterator[Fault]:
     other = _other_order(traits, declared)
     if other is not None:
         positions, velocities = zip(*other, strict=True)
-        said = ", ".join(f"{v} is the derivative of {x}" for x, v in other)
+        finding = ", ".join(f"{v} is the derivative of {x}" for x, v in other)
         yield Fault(
-            "order", f"the columns are in another order than their names say: {said}",
+            "order", f"the columns are in another order than their names say: {finding}",
             f"--positions {','.join(positions)} --velocities {','.join(velocities)}",
             {"positions": positions, "velocities": velocities},
         )  # fmt: skip
@@ -47,8 +47,8 @@ def related(traits: Traits) -> Iterator[Fault]:
     factors = [relation.factor for relation in known.values()]
     second = _second(recording.time_unit, factors)
     if second is not None:
-        said = ", ".join(f"{v} is {r.factor:.4g} × d{x}/dt" for (x, v), r in known.items())
-        yield Fault("time unit", said, f"The times are in {second}: --time-unit {second}",
+        finding = ", ".join(f"{v} is {r.factor:.4g} × d{x}/dt" for (x, v), r in known.items())
+        yield Fault("time unit", finding, f"The times are in {second}: --time-unit {second}",
                     {"time_unit": second})  # fmt: skip
         return
     for (x, v), relation in known.items():
@@ -105,7 +105,7 @@ def _pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]
     factor, degree = relation.factor, 180 / np.pi
     without = f"or ignore {v}: --positions {','.join(traits.recording.positions)}"
     alone = {"positions": traits.recording.positions}
-    said = f"{v} is {factor:.4g} × d{x}/dt"
+    finding = f"{v} is {factor:.4g} × d{x}/dt"
     if relation.explained < _DERIVATIVE:
         yield Fault(
             "no derivative", f"{v} is not the derivative of {x}: d{x}/dt explains "
@@ -113,16 +113,16 @@ def _pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]
             f"Name {v} as an input (--inputs {v}), {without}", alone,
         )  # fmt: skip
     elif abs(factor * degree - 1) < _NEAR:
-        yield Fault("degrees", said, f"The unit of {x} is degrees: --degrees {x}",
+        yield Fault("degrees", finding, f"The unit of {x} is degrees: --degrees {x}",
                     {"degrees": (x,)})  # fmt: skip
     elif abs(factor / degree - 1) < _NEAR:
-        yield Fault("degrees", said, f"The unit of {v} is degrees per second: --degrees {v}",
+        yield Fault("degrees", finding, f"The unit of {v} is degrees per second: --degrees {v}",
                     {"degrees": (v,)})  # fmt: skip
     elif abs(factor + 1) < _NEAR:
-        yield Fault("sign", said, f"Change the sign of {v} in the file, {without}", alone)
+        yield Fault("sign", finding, f"Change the sign of {v} in the file, {without}", alone)
     elif factor < 0 or abs(np.log(factor)) > _OFF:
         yield Fault(
-            "factor", said, f"Check its unit, fit its scale (--scale {v}), {without}", alone
+            "factor", finding, f"Check its unit, fit its scale (--scale {v}), {without}", alone
         )
     else:
         yield from _derived(traits, x, v, relation)

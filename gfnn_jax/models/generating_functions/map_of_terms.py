@@ -245,10 +245,10 @@ def _fitted(chart: AnyChart, family: Terms | Sums, data: Dataset, tolerance: Tol
     """The library's S by least squares, and the error of its steps on the held-out pairs."""
     w, target, args = _data(chart, family, data, data.training)
     c = fitted_gradients(family, w, target, data.scale, args)
-    return _judged(Generated(family, c, chart, data.dt, data.scale), data, tolerance)
+    return _validated(Generated(family, c, chart, data.dt, data.scale), data, tolerance)
 
 
-def _judged(piece: Generated, data: Dataset, tolerance: Tolerance) -> _Tried:
+def _validated(piece: Generated, data: Dataset, tolerance: Tolerance) -> _Tried:
     """Measure the errors of its steps; infinite where the chart folds over the held-out pairs."""
     rows, family, params = data.validation, piece.family, piece.params
     w = piece.chart.evaluation_point(data.y0[rows], data.y1[rows])

@@ -39,7 +39,7 @@ _SINES = (100, 200, 400, 800, 1_600)
 # Products of degree 14 in four variables: benchmarks/storage_ring.py.
 _MOST_TERMS = 3_100
 # Enough to tell misfit from noise by a size, though not to choose it.
-_ROWS_THAT_TELL = 1.5
+_FEWEST_PER_TERM = 1.5
 # Rows per term up to which the test rows, an eighth as many, make the coefficients much better.
 _SCARCE = 6
 # Rows × terms² of one factor: about half a minute on one core. 2,000 terms take 80,000 rows.
@@ -289,7 +289,7 @@ class LinearSweep(CoefficientNoise):
         further = self.sizes[place + 1 : place + 3]
         if len(further) < 2:
             rows = self._determining
-            families = (f for g in _determined(self._groups(), rows, _ROWS_THAT_TELL) for f in g)
+            families = (f for g in _determined(self._groups(), rows, _FEWEST_PER_TERM) for f in g)
             beyond = (f for f in families if f.num_parameters > rows // ROWS_PER_TERM)
             further += [Size(f, f, _extent(f)) for f in itertools.islice(beyond, 2 - len(further))]
         return further[-1] if further else None

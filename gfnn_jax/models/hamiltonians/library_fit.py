@@ -34,7 +34,7 @@ def fitted_library(
     elsewhere = null_terms(family, _scattered(enough), args=args)[0] if null else []
     undetermined = tuple(names[j] for j in null if j in elsewhere)
     family = family.take(kept)
-    count = int(np.ceil(options.judged_rows * family.num_parameters / z.shape[1]))
+    count = int(np.ceil(options.rows_compared * family.num_parameters / z.shape[1]))
     rows = data.training[: max(count, fewest)]
     null_names, best = tuple(names[j] for j in null), None
     # Nothing but H is learned of such pairs.

@@ -169,11 +169,11 @@ def _searched(
     best = best._replace(stalled=poor == most_poor)
     if best.error.bound <= bound:
         return best, options
-    found, options = _as_noise_tells(tried, best, options)
+    found, options = _simplest_within_noise(tried, best, options)
     return (found._replace(stalled=True) if found.noisy else found), options
 
 
-def _as_noise_tells(
+def _simplest_within_noise(
     tried: Sequence[FittedLaw], best: FittedLaw, options: LawOptions
 ) -> tuple[FittedLaw, LawOptions]:
     """The first and simplest of the libraries that are as good as the best, and the options that
@@ -273,7 +273,7 @@ def _walked(
         raise FitError(f"expected more pairs: {len(data.y0)} are too few for any library of terms")
     if best.error.bound <= tolerance.bound:
         return best, options
-    return _as_noise_tells(tried, best._replace(stalled=stalled), options)
+    return _simplest_within_noise(tried, best._replace(stalled=stalled), options)
 
 
 def _grown(
@@ -311,7 +311,7 @@ def _grown(
             "a map without a flow, use --learn map (learn='map')"
         )
     work.capped((1 - options.growth_part) * options.mode_operations)
-    count = int(np.ceil(options.judged_rows * len(grown.coefficients) / (2 * data.dim)))
+    count = int(np.ceil(options.rows_compared * len(grown.coefficients) / (2 * data.dim)))
     rows = data.training[: max(count, 500)]
     fit = problem.fit(grown.family, grown.coefficients, rows, rounds=False, on_progress=on_progress)
     error = validation_error(grown.family, fit, data, tolerance)

@@ -38,9 +38,9 @@ from gfnn_jax.models.hamiltonians.whole_sequences import (
     Sequences,
     about_outliers,
     covariance_root_of,
+    has_rows_to_spare,
     lacks_terms,
     noise_of,
-    tells,
     triangle_of,
 )
 from gfnn_jax.models.hamiltonians.work import LawWork
@@ -157,15 +157,15 @@ def _chosen(
     if not laws:
         return None
     best = min(laws, key=lambda law: law.length)
-    judged = _fitted(sequences, held, best.formula, best.fitted.p, only_states=True)
-    for found in (best.fitted, judged):
+    on_held_out = _fitted(sequences, held, best.formula, best.fitted.p, only_states=True)
+    for found in (best.fitted, on_held_out):
         if found is None or not _rms(noise_of(found) / noise) <= _AS_NOISE:
             for law in sorted(laws, key=lambda law: law.length)[:3]:
                 left = _rms(noise_of(law.fitted) / noise)
                 partly(PartialLaw(_shown(law), left, "times the noise"))
             return None
     formula, fitted = best.formula, best.fitted
-    if tells(fitted, len(fitted.p)):
+    if has_rows_to_spare(fitted, len(fitted.p)):
         everyone = sequences.arcs(np.arange(len(data.y0)))
         again = None if everyone is None else _fitted(sequences, everyone, formula, fitted.p)
         fitted = again or fitted

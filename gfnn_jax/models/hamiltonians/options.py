@@ -13,7 +13,7 @@ class LawOptions:
     of the products that stand beside a user's own terms (0: his alone), given_products: by which
     his terms are multiplied too.
     most_terms: of a library; most_modes: of one that grows. rows_per_term: that a library needs.
-    judged_rows: per term, on which libraries are compared; all pairs only count in the last fit.
+    rows_compared: per term, on which libraries are compared; all pairs only count in the last fit.
     thresholds: standard errors below which terms go, tried in turn.
     rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
     flat: libraries one after the other whose errors differ by less have met the pairs' noise;
@@ -38,7 +38,7 @@ class LawOptions:
     most_terms: int = 350
     most_modes: int = 500
     rows_per_term: float = 1.6
-    judged_rows: float = 12.0
+    rows_compared: float = 12.0
     thresholds: tuple[float, ...] = (1e4, 1e3, 100.0, 30.0, 10.0, 5.0, 3.0)
     rise: float = 1.1
     rounding: float = 5e-15

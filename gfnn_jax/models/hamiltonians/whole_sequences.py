@@ -147,7 +147,7 @@ def fitted_to_sequences(
         if again is not None and left(fewer, again.p) <= _RISE * before:
             widened = _of_selection(triangle_of(found), found.p, few)
             kept, found, family = tuple(few.tolist()), again, fewer
-    if tells(found, len(kept)):
+    if has_rows_to_spare(found, len(kept)):
         everyone = sequences.arcs(np.arange(len(data.y0)))
         again = fitted(everyone, family, found.p) if everyone is not None else None
         if again is not None:
@@ -160,7 +160,7 @@ def fitted_to_sequences(
     )  # fmt: skip
 
 
-def tells(found: Fitted, numbers: int) -> bool:
+def has_rows_to_spare(found: Fitted, numbers: int) -> bool:
     """Return whether the arcs are so many for so many numbers of a law that it may be fitted to
     the held-out sequences too."""
     return _ROWS_PER_TERM * numbers <= triangle_of(found).rows

@@ -104,8 +104,8 @@ def calibrated(
     errors, deviations, x = _forecasts(thirds, found, starts, windows, leads)
     errors, deviations = _shared(errors), _shared(deviations)
     sensors, large = _with_size(law.sensors, x, errors, deviations)
-    told = np.isfinite(errors).all(axis=-1).sum(axis=0) >= _FEWEST
-    leads, errors, deviations = leads[told], errors[:, told], deviations[:, told]
+    enough = np.isfinite(errors).all(axis=-1).sum(axis=0) >= _FEWEST
+    leads, errors, deviations = leads[enough], errors[:, enough], deviations[:, enough]
     if not len(leads):
         return Calibration(law, [], np.zeros((0, len(spread))))
     missed = np.nanquantile((errors**2 / 4 - deviations**2) / large**2, _INSIDE, axis=0)

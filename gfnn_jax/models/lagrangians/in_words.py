@@ -30,7 +30,7 @@ from gfnn_jax.models.lagrangians.text import (
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
-_SEEN = 3.0  # standard errors of a gain, below which its input is not seen to act
+_CLEAR = 3.0  # standard errors of a gain, below which its input has no visible effect
 _MANY = 3  # functions of parameters in a term, of which laws of physics have fewer
 _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
 
@@ -160,10 +160,10 @@ def _warnings(best: InUse, recording: Recording, gains: Gains) -> list[str]:
     most = best.fit.structure.most_functions
     found += about_parameters(recording, best.law.powers, most)
     return found + [
-        f"no force of the input {u} is seen: its gain is within {_SEEN:g} standard errors of 0. "
+        f"no force of the input {u} is seen: its gain is within {_CLEAR:g} standard errors of 0. "
         f"Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
         for u, forces in gains.items()
-        if all(abs(gain) < _SEEN * error for gain, error in forces.values())
+        if all(abs(gain) < _CLEAR * error for gain, error in forces.values())
     ]
 
 

@@ -130,9 +130,9 @@ class LearnedLaw:
         lines += [f"{name} = {measured(value, std)}" for name, (value, std) in self.sensors.items()]
         lines += [f"velocity {name}: {one.text}" for name, one in self.velocities.items()]
         for name, forces in self.gains.items():
-            told = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
+            per_coordinate = ", ".join(f"{q} {g:.6g} ± {s:.2g}" for q, (g, s) in forces.items())
             unit = self.units[name]
-            lines.append(f"gain of {name}, force per {unit or 'unit'} of it: {told}")
+            lines.append(f"gain of {name}, force per {unit or 'unit'} of it: {per_coordinate}")
         lines += [self._inputs_line] if self.delay is not None else []
         energy = self.energy
         lines.append(
@@ -167,8 +167,8 @@ class LearnedLaw:
         """Units of the variables in L and R."""
         assert self.map.sensors is not None
         units = self.units | dict.fromkeys(self.map.sensors.angles, "rad")
-        told = [f"{name} in {units[name]}" for name in self.map.sensors.positions if units[name]]
-        return f"in L and R: {', '.join([*told, 'times in s'])}"
+        named = [f"{name} in {units[name]}" for name in self.map.sensors.positions if units[name]]
+        return f"in L and R: {', '.join([*named, 'times in s'])}"
 
     @property
     def _inputs_line(self) -> str:

@@ -117,11 +117,11 @@ def _at_bound(options: SearchOptions, choice: FrictionChoice, dim: int) -> list[
         return []
     taken = {FRICTIONS[KINDS.index(kind)] for kind in choice.kinds}
     taken |= {"uniform"} if dim == 1 and "linear" in taken else set()  # which is the same there
-    unseen = [kind for kind in options.frictions if kind not in taken]
-    if not unseen:
+    absent = [kind for kind in options.frictions if kind not in taken]
+    if not absent:
         return []
     return [
-        f"{' and '.join(unseen)} friction was asked for, and the record shows none: its "
+        f"{' and '.join(absent)} friction was asked for, and the record shows none: its "
         "coefficient is 0, the least that friction can have. fit.which_friction tells the largest "
         "that the record allows"
     ]

@@ -53,7 +53,7 @@ class SearchOptions:
     )
     gain: float = 0.05  # of the held-out cost, that a term has to bring
     choices: int = 3  # of the friction, each close to the fit with the one before
-    tells_more: float = 1.5  # times smaller standard errors, at which shorter arcs are tried
+    sharper: float = 1.5  # times smaller standard errors, at which shorter arcs are tried
     frictions: tuple[str, ...] = FRICTIONS
     choose_friction: bool = True  # by held-out arcs; else all of these
 
@@ -214,7 +214,7 @@ def telling_more(
         if not _errors(other) < _errors(best):
             break
         best = other
-    return best if options.tells_more * _errors(best) < _errors(fit) else None
+    return best if options.sharper * _errors(best) < _errors(fit) else None
 
 
 def _errors(fit: LawFit) -> float:

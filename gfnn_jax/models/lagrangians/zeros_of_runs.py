@@ -52,8 +52,8 @@ def with_zeros_of_runs(
     nodes = shifted(nodes, further)
     arcs = arcs_of(nodes, fit.arcs.t.shape[1])
     fit = bench.fit(fit.structure, known, arcs, fit.sigma)
-    told = ", ".join(f"{s:.3g}" for s in size)
-    on_progress(f"zeros that differ from run to run by {told}")
+    sizes = ", ".join(f"{s:.3g}" for s in size)
+    on_progress(f"zeros that differ from run to run by {sizes}")
     return with_states(nodes, fit.arcs, fit.fitted.x), fit
 
 

@@ -36,15 +36,15 @@ class Invariance:
         self, symmetries: Sequence[SymmetryOfPairs], z: np.ndarray, arguments: list[Argument],
         angles: tuple[int, ...], cyclic: tuple[int, ...],
     ):  # fmt: skip
-        dim, told = z.shape[1] // 2, {s.text: s.left for s in symmetries}
+        dim, left = z.shape[1] // 2, {s.text: s.left for s in symmetries}
         self._z = z
         self._generators = [
             matrix for text, matrix in generators(dim, angles)
-            if told.get(text, np.inf) <= CERTAIN
+            if left.get(text, np.inf) <= CERTAIN
         ]  # fmt: skip
         self._reflections = [
             matrix for text, matrix in reflections(dim, angles)
-            if self._generators and text in told and not np.any(matrix - np.diag(np.diag(matrix)))
+            if self._generators and text in left and not np.any(matrix - np.diag(np.diag(matrix)))
         ]  # fmt: skip
         still = np.ones(len(arguments), bool)
         for generator in self._generators:

@@ -243,9 +243,9 @@ class NoisyTextbook:
             c = np.linalg.lstsq(own, self._target, rcond=1e-13)[0]
             left = np.linalg.norm(self._target - own @ c) / np.sqrt(len(own) - len(kept))
             deviation = left * np.linalg.norm(np.linalg.pinv(own), axis=1)
-            told = np.abs(c) / deviation
-            worst = int(np.argmin(told))
-            if told[worst] >= OPTIONS.kept or len(kept) == 1:
+            significance = np.abs(c) / deviation
+            worst = int(np.argmin(significance))
+            if significance[worst] >= OPTIONS.kept or len(kept) == 1:
                 return whole.take(kept.tolist(), c / size)._replace(left=float(left))
             kept = np.delete(kept, worst)
 
