@@ -11,7 +11,6 @@ from rings.lattice import AMPLITUDE, ellipsoid, ring
 
 import gfnn_jax as gfnn
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.threads import one_thread
 
 NUM_PAIRS, FRESH, BATCH = 5_000, 1_000, 1_000
 TURNS, ORBITS = 300, 20  # compared with the tracking code
@@ -25,13 +24,12 @@ def learned(
 ) -> tuple[SymplecticMap, list[gfnn.Fit]]:  # fmt: skip
     """The map of the sectors' maps in a row, from ``count`` states at their ends (K + 1, N, 4).
 
-    delta: (N,), a parameter of the map. The linear algebra has one thread: two would wait for each
-    other beside other work, and both would count as seconds of the processor.
+    delta: (N,), a parameter of the map.
     """
     fits = []
     given = None if delta is None else {"delta": delta[:count]}
     for before, after in pairwise(sectors):
-        with warnings.catch_warnings(), one_thread():
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore", gfnn.FitWarning)
             pairs = gfnn.Pairs(before[:count], after[:count], 1 / (len(sectors) - 1), given)
             fits.append(

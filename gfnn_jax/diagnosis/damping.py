@@ -31,7 +31,6 @@ from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping, DampingOfArgs, FunctionsOfArgs
 from gfnn_jax.phase_space import split, symplectic_form
-from gfnn_jax.threads import one_thread
 
 _CERTAIN = 5.0  # standard errors that make a factor other than 1 certain
 # Of many more than these training pairs, so many tell whether D_b gains anything: neighbours of a
@@ -220,8 +219,7 @@ class _Problem:
         unknown = np.full((factor.size, 0), np.inf)
         best, worse = _Fitted(factor, unknown, self._drift(np.zeros((1, 0))), np.inf, spread), 0
         for family in self._families(spread, factor):
-            with one_thread():
-                found = self.fitted(family, self._functions(family.degree), spread, best.factor)
+            found = self.fitted(family, self._functions(family.degree), spread, best.factor)
             worse = 0 if found.held_out < _BETTER * best.held_out else worse + 1
             best = found if worse == 0 else best
             if worse == _WORSE or best.held_out < _ROUNDOFF:

@@ -26,10 +26,14 @@ _devices: ContextVar[tuple[Any, ...]] = ContextVar("devices", default=())
 
 @contextlib.contextmanager
 def on_devices(devices: Sequence[Any]) -> Iterator[None]:
-    """Fits inside the block share their rows among these devices, JAX's; none: as without it."""
+    """Fits inside the block share their rows among these devices, JAX's; none: as without it.
+
+    Linear algebra of the host has one thread inside: here devices share out the work.
+    """
     token = _devices.set(tuple(devices))
     try:
-        yield
+        with one_thread():
+            yield
     finally:
         _devices.reset(token)
 
@@ -92,10 +96,7 @@ def _workers() -> Iterator[Callable[[Callable, Any], Future]]:
         finally:
             free.put(device)
 
-    # The limit on BLAS holds for all threads: it is set here, once.
-    with one_thread(), ThreadPoolExecutor(
-        len(devices()), initializer=_devices.set, initargs=((),)
-    ) as pool:  # fmt: skip
+    with ThreadPoolExecutor(len(devices()), initializer=_devices.set, initargs=((),)) as pool:
         try:
             yield lambda function, part: pool.submit(on_a_device, function, part)
         except BaseException:

@@ -27,8 +27,6 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from gfnn_jax.threads import one_thread
-
 _PANEL = 32  # columns per panel of LAPACK's QR: a third faster than 64
 _EPS, _TINY = float(np.finfo(np.float64).eps), float(np.finfo(np.float64).tiny)
 
@@ -58,8 +56,7 @@ class Triangle:
         float64 in Fortran's order, and are overwritten."""
         factor, rows = np.zeros((terms + 1, terms + 1), order="F"), 0
         for block in blocks:
-            with one_thread():
-                folded(factor, block)
+            folded(factor, block)
             rows += len(block)
         return cls(factor, rows)
 
@@ -75,8 +72,7 @@ class Triangle:
 
         count: of the rows for which these stand, if they are a triangle themselves; None: N.
         """
-        with one_thread():
-            factor = folded(np.array(self.factor, order="F"), np.array(rows, order="F"))
+        factor = folded(np.array(self.factor, order="F"), np.array(rows, order="F"))
         return Triangle(factor, self.rows + (len(rows) if count is None else count))
 
     def stacked(self, rows: np.ndarray) -> Triangle:
@@ -88,8 +84,7 @@ class Triangle:
     def merge(self, other: Triangle) -> Triangle:
         """The triangle of the rows of both: ⅔ n³ operations."""
         factors = (np.array(one.factor, order="F") for one in (self, other))
-        with one_thread():
-            factor = folded(*factors, triangular=True)
+        factor = folded(*factors, triangular=True)
         return Triangle(factor, self.rows + other.rows)
 
     def spoilt(self) -> Triangle:

@@ -23,7 +23,6 @@ from gfnn_jax.families.inputs import Inputs, box_inputs
 from gfnn_jax.families.products import Basis, Products, basis_of
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.phase_space import sizes
-from gfnn_jax.threads import one_thread
 
 # A guess this close, in units of the data's spread, is the root of roundoff: one update is left.
 CLOSE = 5e-8
@@ -186,8 +185,7 @@ def _by_degree(inputs: Inputs, x, target, unit) -> list[tuple[PolynomialModel, f
     ridge = _RIDGE * np.linalg.norm(design[~held], axis=0)
     ridge = np.where(ridge > 0, ridge, 1.0)  # a product that vanishes on all states gets 0
     rows = np.vstack([design[~held], np.diag(ridge)])
-    with one_thread():
-        q, r = np.linalg.qr(rows)
+    q, r = np.linalg.qr(rows)
     along = q.T @ np.vstack([target[~held], np.zeros((width, target.shape[1]))])
     found, closest = [], np.inf
     for degree in range(1, top + 1):

@@ -48,6 +48,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.phase_space import Pairs, require_x64
 from gfnn_jax.scenes.scene import Scene
+from gfnn_jax.threads import one_thread
 
 _STATES_MEASURED = 200  # states at which the chosen map's defect and determinant are taken
 
@@ -98,12 +99,14 @@ def fit(
     options = dataclasses.replace(options or FitOptions(), **changes)
     if isinstance(pairs, Recording):
         _check_of_recording(scene, options)
-        if options.learn == "map":
-            return fit_positions(pairs, options, clock, on_progress, on_candidate)
-        law = fit_recording(
-            pairs, friction=options.friction, input_hold=options.input_hold, mass=options.mass,
-            terms=tuple(options.terms), loss=options.loss, on_progress=on_progress,
-        )  # fmt: skip
+        with one_thread():
+            if options.learn == "map":
+                return fit_positions(pairs, options, clock, on_progress, on_candidate)
+            law = fit_recording(
+                pairs, friction=options.friction, input_hold=options.input_hold,
+                mass=options.mass, terms=tuple(options.terms), loss=options.loss,
+                on_progress=on_progress,
+            )  # fmt: skip
         for message in law.messages:
             warnings.warn(message, FitWarning, stacklevel=2)
         return law
@@ -118,15 +121,15 @@ def fit(
         for message in new:
             warnings.warn(message, FitWarning, stacklevel=3)
 
-    request = checked(
-        pairs, scene, options, budget=budget, checkpoints=checkpoints, factors=factors,
-        on_progress=on_progress, on_candidate=on_candidate,
-    )  # fmt: skip
-    warn(request.messages)
-    taken = paid_for(identified(request.pairs), budget, options.seed)
-    request = dataclasses.replace(request, pairs=taken.pairs)
-    on_progress(f"estimating local Jacobians from {len(taken.pairs):,} pairs")
     with row_blocks.on_devices(_devices(options.devices)):
+        request = checked(
+            pairs, scene, options, budget=budget, checkpoints=checkpoints, factors=factors,
+            on_progress=on_progress, on_candidate=on_candidate,
+        )  # fmt: skip
+        warn(request.messages)
+        taken = paid_for(identified(request.pairs), budget, options.seed)
+        request = dataclasses.replace(request, pairs=taken.pairs)
+        on_progress(f"estimating local Jacobians from {len(taken.pairs):,} pairs")
         data, about_pairs = clean(
             taken, request.coordinates, request.structure,
             jumps=bool(wrapped(request.pairs, request.coordinates)),
@@ -159,6 +162,7 @@ def fit(
         chosen, stated_by = with_test_rows(chosen, error, found, budget)
         conclusion = conclude(chosen, found, request)
         warn([*conclusion.messages, *filter(None, [error.few])])
+        symmetries = symmetries_of_pairs(found.data)
     damping = diagnosis.damping if chosen.candidate.learns == "map" else None
     if damping is not None:  # a fact, not a warning
         messages.append(damping.line(data.dt))
@@ -185,7 +189,7 @@ def fit(
         pairs=data.pairs,
         scene=scene,
         damping=damping,
-        symmetries=symmetries_of_pairs(found.data),
+        symmetries=symmetries,
         partial_laws=() if found.met_by_law else tuple(request.partial_laws),
         stated_by=stated_by,
         test_pairs=data.pairs.take(data.test) if len(data.test) else None,

@@ -43,6 +43,7 @@ from gfnn_jax.maps.piece import PieceWithAction, serves_any_dt
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.phase_space import require_x64
+from gfnn_jax.threads import one_thread
 
 
 @partial(
@@ -285,7 +286,8 @@ class SymplecticMap:
         )  # stand after this module
 
         alone = positions.starts_from_positions(self)
-        return (position_estimates if alone else estimates).estimate(self, recording)
+        with one_thread():
+            return (position_estimates if alone else estimates).estimate(self, recording)
 
     def forecast(self, recording, times, inputs=None):
         """`maps.estimates.Forecast` of the positions at ``times`` (n,), the recording's clock, from
@@ -298,9 +300,10 @@ class SymplecticMap:
             positions,
         )  # stand after this module
 
-        if positions.starts_from_positions(self):
-            return position_estimates.forecast(self, recording, times)
-        return estimates.forecast(self, recording, times, inputs)
+        with one_thread():
+            if positions.starts_from_positions(self):
+                return position_estimates.forecast(self, recording, times)
+            return estimates.forecast(self, recording, times, inputs)
 
     def linearise(self, z, inputs=None, args=None, *, t0=None):
         """(A, B) of a step: ∂Z/∂z (..., 2d, 2d) and ∂Z/∂u (..., 2d, k), inputs u, (k,) or (B, k),

@@ -23,7 +23,6 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.models.generating_functions.map_arcs import LONGEST, GeneratedOnArcs
 from gfnn_jax.solve.latent_arcs import fit_arcs
-from gfnn_jax.threads import one_thread
 
 _FEWEST = 4  # turns of an arc: of fewer, noise of the two monitors is not told apart
 _MOST_NODES = 20_000  # of all arcs: a minute and a quarter of a gigabyte at a hundred terms
@@ -85,8 +84,7 @@ def latent_readings(
         if best and _PASSES * arcs.size * family.num_parameters**2 > _MOST_OPERATIONS:
             break
         on_progress(f"latent readings, S of {family.label}, {family.num_parameters} terms")
-        with one_thread():
-            found = _fitted(piece, family, ends, arcs)
+        found = _fitted(piece, family, ends, arcs)
         if found.converged and (best is None or found.criterion < best.criterion):
             best, worse = found, 0
         else:

@@ -27,7 +27,6 @@ from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.solve.arc_models import Defects, Known, Observed, observed_whole
 from gfnn_jax.solve.latent_arcs import eliminated_rows, fit_arcs
 from gfnn_jax.solve.robust import Biweight
-from gfnn_jax.threads import one_thread
 
 LONGEST = 10  # steps of an arc: what S cannot represent adds up along a longer one
 # Of normal residuals it takes one part in forty, so that rows keep their variance of one.
@@ -143,8 +142,7 @@ class NearestArcs:
         factor, count = found.factor, 0
         for rows, numbers in self.rows(along):
             on_block()
-            with one_thread():
-                folded(factor, np.asfortranarray(rows))
+            folded(factor, np.asfortranarray(rows))
             count += numbers
         return Triangle(factor, count)
 

@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.models.positions.triples import Triples
-from gfnn_jax.threads import one_thread
 
 _SAMPLED = 2_000  # positions by which the mixed term is taken
 _NULL = 1e-13  # of the largest singular value: a smaller one is a combination that nothing tells
@@ -64,13 +63,12 @@ def displacement(triples: Triples) -> np.ndarray:
 
 def solve(family: Any, triples: Triples) -> Solved:
     """S of these triples: least squares among the S of this mixed term, nearest to free motion."""
-    with one_thread():
-        triangle = _folded(family, triples)
-        free, mixed = _free_motion(family, triples), _mixed_terms(family, triples)
-        free = free / (mixed @ free)
-        # The changes of S that leave the mixed term as it is: all but the first column of Q.
-        others = np.linalg.qr(np.column_stack([mixed, np.eye(len(mixed))]))[0][:, 1 : len(mixed)]
-        u, values, v = np.linalg.svd(triangle @ others, full_matrices=False)
+    triangle = _folded(family, triples)
+    free, mixed = _free_motion(family, triples), _mixed_terms(family, triples)
+    free = free / (mixed @ free)
+    # The changes of S that leave the mixed term as it is: all but the first column of Q.
+    others = np.linalg.qr(np.column_stack([mixed, np.eye(len(mixed))]))[0][:, 1 : len(mixed)]
+    u, values, v = np.linalg.svd(triangle @ others, full_matrices=False)
     determined = values > _NULL * values[0]
     along = u[:, determined].T @ (triangle @ free)
     coefficients = free - others @ (v[determined].T @ (along / values[determined]))

@@ -17,7 +17,6 @@ from gfnn_jax.generating.position_arcs import PositionArcs, nodes_of
 from gfnn_jax.models.positions.discrete_lagrangian import Solved, residuals
 from gfnn_jax.models.positions.triples import Triples
 from gfnn_jax.solve.latent_arcs import SOFT_L1, fit_arcs
-from gfnn_jax.threads import one_thread
 
 _LONGEST = 24  # nodes of an arc: its own two positions cost a twelfth of what it tells
 _MOST_NODES = 20_000  # of all arcs: a minute and a quarter of a gigabyte at a hundred terms
@@ -87,8 +86,7 @@ def fit_latent(
     left = np.sqrt(arcs.size / max(equations - determined, 1))
     for _ in range(_SCALES):
         scale = np.tile(sigma, 2)
-        with one_thread():
-            found = fit_arcs(model, p, x, y, scale, scale)
+        found = fit_arcs(model, p, x, y, scale, scale)
         p, x = found.p, found.x
         change = _size(found.residuals, dim) * left
         sigma = sigma * change
