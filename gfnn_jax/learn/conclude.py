@@ -273,8 +273,9 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         data = entry.sweep.data
     sample = _residuals_of_sample(candidate, entry, searched)
     of_h = law if candidate.learns == "hamiltonian" and entry is None else None
-    if not stalled and of_h is not None:  # the search for H ended before it met the noise
-        stalled = _noise_by_neighbours(sample) is True and leaves_white(of_h, data)
+    if not stalled and of_h is not None and not of_h.misfit:
+        # The search for H ended before it met the noise.
+        stalled = _noise_by_neighbours(sample) is True and leaves_white(of_h.flow, data)
     known = _no_noise(sample, stalled)
     if known is not None:
         return known
@@ -309,7 +310,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         )
         reason += ", or something that the states do not hold"
     of_law = law if candidate.learns == "hamiltonian" and not hidden else None
-    if of_law is not None and leaves_white(of_law, searched.data):
+    if of_law is not None and not of_law.misfit and leaves_white(of_law.flow, searched.data):
         message = (
             "the residuals of H are white: these pairs do not contradict H. They are noise of "
             f"about {sizes_of_noise}"
