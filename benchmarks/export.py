@@ -33,6 +33,7 @@ from harness import (
     fitted,
     markdown,
     number,
+    on_one_core,
     provenance,
     read,
     results,
@@ -159,8 +160,7 @@ def tables() -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    on_one_core()
     run_pieces(__doc__ or "", PIECES, "export", tables, argv)
 
 

@@ -191,6 +191,12 @@ def cores() -> int | None:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
 
 
+def on_one_core() -> None:
+    """Keep this process on one processor core, where the system can."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+
 def circumstances() -> Numbers:
     """Seed, machine, versions, date and code of a measurement."""
     return {

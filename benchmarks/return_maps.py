@@ -14,7 +14,6 @@ heyoka is in the extra ``benchmarks``; without it its rows say so.
 from __future__ import annotations
 
 import functools
-import os
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -28,6 +27,7 @@ from harness import (
     between_markers,
     drawn,
     fitted,
+    on_one_core,
     once,
     one_step_rms,
     provenance,
@@ -267,8 +267,7 @@ def tables() -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    on_one_core()
     run_pieces(__doc__ or "", PIECES, "return-maps", tables, argv)
 
 

@@ -50,41 +50,45 @@ EXACT = 1e-8
 SEQUENCES, STATES, NOISE = 40, 50, 1e-3
 
 
-def learned(law: Law, count: int = PAIRS) -> tuple[gfnn.Fit, Numbers]:
-    """The fit of pairs of this law, and its verdict."""
-    pairs, fresh = law.pairs(count, SEED), law.pairs(FRESH, SEED + 1)
+def fitted(law: Law, pairs: gfnn.Pairs, tolerance: float) -> tuple[gfnn.Fit, Numbers]:
+    """The fit of these pairs of a law, and what is measured of any: the formula, the error of a
+    step from fresh states, the processor's seconds."""
     busy = time.process_time()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
         fit = gfnn.fit(
-            pairs, tolerance=TOLERANCE, angles=law.angles, seed=SEED, max_seconds=BUDGET,
+            pairs, tolerance=tolerance, angles=law.angles, seed=SEED, max_seconds=BUDGET,
             clock=time.process_time,
         )  # fmt: skip
     busy = time.process_time() - busy
+    fresh = law.pairs(FRESH, SEED + 1)
     t0 = {} if law.period is None else {"t0": fresh.t0}
     error = np.asarray(fit.map.step(fresh.z0, **t0)[0]) - fresh.z1
     found = fit.hamiltonian
-    terms = None if found is None else len(found.terms)
-    off = None if found is None else gradient_error(found.flow, law)
-    size = law.size or len(law.terms)
     return fit, {
         "kind": law.kind,
         "dim": law.dim,
-        "pairs": count,
+        "pairs": len(pairs),
         "label": fit.chosen.label,
         "chosen": fit.chosen.learns,
         "formula": None if found is None else found.formula,
-        "gradient_error": off,
-        "terms": terms,
-        "true_terms": size,
-        "found": off is not None and off <= EXACT and (terms or 0) <= size,
+        "gradient_error": None if found is None else gradient_error(found.flow, law),
+        "terms": None if found is None else len(found.terms),
+        "true_terms": law.size or len(law.terms),
         "one_step_rms": float(np.sqrt(np.mean(error**2))),
-        "tolerance_met": bool(fit.met),
         "processor_seconds": busy,
         "compile_seconds": fit.compile_seconds,
         "ended": fit.ended,
         "messages": list(fit.messages),
     }
+
+
+def learned(law: Law, count: int = PAIRS) -> tuple[gfnn.Fit, Numbers]:
+    """The fit of pairs of this law, and its verdict."""
+    fit, measured = fitted(law, law.pairs(count, SEED), TOLERANCE)
+    off, terms = measured["gradient_error"], measured["terms"]
+    found = off is not None and off <= EXACT and (terms or 0) <= measured["true_terms"]
+    return fit, {**measured, "found": found, "tolerance_met": bool(fit.met)}
 
 
 def gradient_error(flow: Flow, law: Law) -> float | None:
@@ -131,43 +135,16 @@ def kepler_few(quick: bool) -> Numbers:
 def noisy(name: str, quick: bool) -> Numbers:
     """One law of noisy sequences."""
     law = LAWS[name]
-    pairs, fresh = law.sequences(SEQUENCES, STATES, NOISE, SEED), law.pairs(FRESH, SEED + 1)
-    busy = time.process_time()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", gfnn.FitWarning)
-        fit = gfnn.fit(
-            pairs, tolerance=NOISE, angles=law.angles, seed=SEED, max_seconds=BUDGET,
-            clock=time.process_time,
-        )  # fmt: skip
-    busy = time.process_time() - busy
-    t0 = {} if law.period is None else {"t0": fresh.t0}
-    error = np.asarray(fit.map.step(fresh.z0, **t0)[0]) - fresh.z1
+    fit, measured = fitted(law, law.sequences(SEQUENCES, STATES, NOISE, SEED), NOISE)
     found = fit.hamiltonian
     true = None if found is None else true_numbers(found, law)
-    size = law.size or len(law.terms)
-    exact = bool(found and true and true[1] <= EXACT and len(found.terms) <= size)
+    fewest = measured["true_terms"]
+    exact = bool(found and true and true[1] <= EXACT and len(found.terms) <= fewest)
     off = None
     if found is not None and true is not None and exact:
-        told = [*found.terms, *found.constants]
-        off = [(t.coefficient - x) / t.std for t, x in zip(told, true[0], strict=True)]
-    return {
-        "kind": law.kind,
-        "dim": law.dim,
-        "pairs": len(pairs),
-        "label": fit.chosen.label,
-        "chosen": fit.chosen.learns,
-        "formula": None if found is None else found.formula,
-        "gradient_error": None if found is None else gradient_error(found.flow, law),
-        "terms": None if found is None else len(found.terms),
-        "true_terms": size,
-        "found": bool(exact),
-        "standard_errors": off,
-        "one_step_rms": float(np.sqrt(np.mean(error**2))),
-        "processor_seconds": busy,
-        "compile_seconds": fit.compile_seconds,
-        "ended": fit.ended,
-        "messages": list(fit.messages),
-    }
+        numbers = [*found.terms, *found.constants]
+        off = [(t.coefficient - x) / t.std for t, x in zip(numbers, true[0], strict=True)]
+    return {**measured, "found": exact, "standard_errors": off}
 
 
 def true_numbers(found, law: Law) -> tuple[np.ndarray, float] | None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import types
 import warnings
 from fractions import Fraction
 
@@ -70,7 +69,7 @@ def test_a_driven_law_is_white_where_it_is_right():
 
     def white(c):
         flow = Flow(LAW, np.array(c), DT, np.ones(2), 6, 1)
-        return leaves_white(types.SimpleNamespace(flow=flow, misfit=False), data)
+        return leaves_white(flow, data)
 
     assert white(C)
     assert not white([1.0, -1.0, -0.14])

@@ -24,6 +24,7 @@ class Network(DifferentiatedByJax):
     """Network of one hidden layer of tanh, with its gradient in closed form."""
 
     amplitude: float = 1.0
+    name = label = "tanh"
     operations = (0, 0)
 
     def value(self, params, w, args=None):

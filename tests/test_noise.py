@@ -1,7 +1,5 @@
 """The noise of the states from the residuals of a map that is known exactly."""
 
-from types import SimpleNamespace
-
 import jax
 import numpy as np
 import pytest
@@ -110,4 +108,4 @@ def test_a_law_is_right_where_it_leaves_white_noise_over(frequency, white, num_s
     pairs = noisy_turns(0.2, np.array([1e-3, 1e-3]), num_steps)[1]
     flow = Flow(given_terms(1, ["q1**2", "p1**2"]), 0.5 * frequency * np.ones(2), 0.2, np.ones(2))
     data = Dataset.of(pairs, CARTESIAN).divided(0)
-    assert leaves_white(SimpleNamespace(flow=flow, misfit=False), data) == white
+    assert leaves_white(flow, data) == white

@@ -27,12 +27,12 @@ from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting.least_squares import ROWS_PER_TERM
+from gfnn_jax.fitting.significance import CERTAIN
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping, DampingOfArgs, FunctionsOfArgs
 from gfnn_jax.phase_space import split, symplectic_form
 
-_CERTAIN = 5.0  # standard errors that make a factor other than 1 certain
 # Of many more than these training pairs, so many tell whether D_b gains anything: neighbours of a
 # million clean pairs are so close together that what their fits are off by, not friction, makes a
 # change of areas certain.
@@ -132,7 +132,7 @@ def learn_damping(
     factors, dim = area_factors(jacobians, data.scale), data.dim
     b = float(np.median(factors))
     deviation = 1.5 * float(np.median(np.abs(factors - b))) / np.sqrt(len(factors))
-    if not b > 0 or not abs(b - 1) > max(3 * error, _CERTAIN * deviation):
+    if not b > 0 or not abs(b - 1) > max(3 * error, CERTAIN * deviation):
         return None
     if len(data.training) > _PLENTY * _SAMPLE:
         some = data.take(np.concatenate([data.training[:_SAMPLE], data.validation[:_SAMPLE]]))
@@ -248,7 +248,7 @@ class _Problem:
         t, k = found.factor.shape
         values = self._values(found.functions)
         error = np.linalg.norm(np.tensordot(values, found.root.reshape(t, k, -1), axes=1), axis=-1)
-        return bool((np.abs(values @ found.factor - 1) > _CERTAIN * error).any())
+        return bool((np.abs(values @ found.factor - 1) > CERTAIN * error).any())
 
     def as_learned(self, found: _Fitted) -> LearnedDamping:
         """Damping that was found, without axes of length 1."""

@@ -107,6 +107,27 @@ def parameter_gradients(family: Any, params: Any, w: Any, args: Any = None, alon
     return (along or family).term_gradients(w, args)
 
 
+class AroundAnother:
+    """Base of a family that is made of another one, ``family``; its params are coefficients."""
+
+    family: Any
+
+    @property
+    def dim(self) -> int:
+        """Degrees of freedom d."""
+        return self.family.dim
+
+    def unflatten(self, coefficients):
+        """Return the coefficients: they are the parameters."""
+        return coefficients
+
+    def __call__(self, params, w, args=None):
+        return self.value(params, w, args)
+
+    def value(self, params, w, args=None):
+        raise NotImplementedError
+
+
 class DifferentiatedByJax:
     """Derivatives by JAX for a family that has no closed form of them.
 

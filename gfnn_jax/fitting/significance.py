@@ -9,6 +9,9 @@ import numpy as np
 from gfnn_jax.fitting.descent import ROUNDOFF
 from gfnn_jax.fitting.triangle import Triangle
 
+# Standard errors. A term that is smaller than the first is noise (a larger one is so by chance once
+# in 16,000); what a message states as certain is larger than the second (once in 1.7 million).
+ABOVE_NOISE, CERTAIN = 4.0, 5.0
 NULL = 1e-10  # of a term's size; one closer to the span of those before it is not known apart
 
 

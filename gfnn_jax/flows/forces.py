@@ -20,32 +20,20 @@ import jax
 import numpy as np
 
 from gfnn_jax.arrays import as_row, beside, matmul, namespace
-from gfnn_jax.families.family import at_time, parameter_gradients
+from gfnn_jax.families.family import AroundAnother, at_time, parameter_gradients
 from gfnn_jax.families.lagrangian import LINEAR, Friction, pushed
 from gfnn_jax.phase_space import split
 
 
-class WithForces:
-    """Family of H of which forces change the field: what stays H's own, ``family``'s."""
+class WithForces(AroundAnother):
+    """Family of H of which forces change the field; ``family`` is that of H alone."""
 
-    family: Any
     name = "terms with friction"
-
-    @property
-    def dim(self) -> int:
-        return self.family.dim
 
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the args that are no inputs."""
         return getattr(self.family, "parameters", ())
-
-    def unflatten(self, coefficients):
-        """Return the coefficients: they are the parameters."""
-        return coefficients
-
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
 
     def value(self, params, w, args=None):
         """H, shape (...), the energy that friction loses and inputs supply."""

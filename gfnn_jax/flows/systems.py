@@ -13,23 +13,19 @@ from typing import Any
 import jax
 
 from gfnn_jax.arrays import as_row, beside
-from gfnn_jax.families.family import at_time, parameter_gradients
+from gfnn_jax.families.family import AroundAnother, at_time, parameter_gradients
 from gfnn_jax.families.lagrangian import Powers, functions_of
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("family",), meta_fields=("powers",))
 @dataclasses.dataclass(frozen=True, eq=False)
-class OfSystems:
+class OfSystems(AroundAnother):
     """``family`` whose params (m,) are multiplied by these powers (m, k) of the first k args; the
     other args are the family's own."""
 
     family: Any
     powers: Powers
     name = "terms with parameters"
-
-    @property
-    def dim(self) -> int:
-        return self.family.dim
 
     @property
     def label(self) -> str:
@@ -54,10 +50,6 @@ class OfSystems:
         gradient, with_hessian = self.family.operations
         more = sum(1 + sum(map(abs, row)) for row in self.powers)
         return gradient + more, with_hessian + more
-
-    def unflatten(self, coefficients):
-        """Return the coefficients: they are the parameters."""
-        return coefficients
 
     def take(self, rows) -> Any:
         """The family of these terms alone."""
@@ -86,9 +78,6 @@ class OfSystems:
         if args.shape[-1] == count:
             return args
         return beside(args[..., :count], at_time(self.family, args[..., count:], after))
-
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
 
     def value(self, params, w, args=None):
         own, rest = self.of_one(params, args)

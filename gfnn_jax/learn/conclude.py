@@ -17,6 +17,7 @@ from gfnn_jax.diagnosis.local_jacobians import differs_between_sequences, volume
 from gfnn_jax.diagnosis.neighbours import is_noise
 from gfnn_jax.diagnosis.noise import noise_of_sites, state_noise
 from gfnn_jax.errors import OutOfTime
+from gfnn_jax.fitting.significance import CERTAIN
 from gfnn_jax.learn.check import not_radians, wrapped
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.propose import proposed
@@ -26,7 +27,8 @@ from gfnn_jax.models.generating_functions.size import OF_SOLVE, OF_STEPS
 from gfnn_jax.models.hamiltonians.choose_law import long_step
 from gfnn_jax.models.hamiltonians.law_messages import TURNS
 from gfnn_jax.models.hamiltonians.white import leaves_white
-from gfnn_jax.search.search import COMPARABLE, MET, Entry
+from gfnn_jax.search.extrapolate import GAINED
+from gfnn_jax.search.search import MET, Entry
 
 _NO_MORE = {
     False: "no larger set of terms promises to meet it",
@@ -34,7 +36,6 @@ _NO_MORE = {
 }
 _LOOK = "the test whether the residuals are noise"
 _WHITE = "the residuals of H are white, as noise is"
-_CERTAIN = 5.0  # standard errors that make a change of volume certain
 _SHARE = 0.1  # of the residual, that a change of volume must explain
 _KNOWN = 1.5  # times the noise that was given: up to it, what is left over is that noise
 # Times the noise: above it a map's own error is not what noise makes of it, √(2m/N) with N rows,
@@ -174,7 +175,7 @@ def _stalled(candidate: Candidate, entry: Entry | None, searched: Searched) -> b
         return searched.of_terms.stalled
     if entry is None and not found.ranking:
         return searched.law is not None and searched.law.stalled
-    limit = COMPARABLE * candidate.validation_relative
+    limit = candidate.validation_relative / GAINED
     return any(
         (e.candidate.chart, e.candidate.family) in found.stalled
         and e.candidate.validation_relative <= limit
@@ -233,7 +234,7 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     change, error = volume_change(y0, residual)
     # Friction shrinks every coordinate by a part of what is left over of it.
     size = float(np.sqrt(np.mean((residual / scale) ** 2)))
-    if abs(change) > max(_CERTAIN * error, _SHARE * residual.shape[1] * size):
+    if abs(change) > max(CERTAIN * error, _SHARE * residual.shape[1] * size):
         message = (
             f"the residuals are no noise: phase-space volumes change by {change:.2g} ± {error:.1g} "
             "(relative) in a step, as by friction, and a symplectic map keeps them. The law of a "
@@ -273,8 +274,9 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         data = entry.sweep.data
     sample = _residuals_of_sample(candidate, entry, searched)
     of_h = law if candidate.learns == "hamiltonian" and entry is None else None
-    if not stalled and of_h is not None:  # the search for H ended before it met the noise
-        stalled = _noise_by_neighbours(sample) is True and leaves_white(of_h, data)
+    if not stalled and of_h is not None and not of_h.misfit:
+        # The search for H ended before it met the noise.
+        stalled = _noise_by_neighbours(sample) is True and leaves_white(of_h.flow, data)
     known = _no_noise(sample, stalled)
     if known is not None:
         return known
@@ -309,7 +311,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         )
         reason += ", or something that the states do not hold"
     of_law = law if candidate.learns == "hamiltonian" and not hidden else None
-    if of_law is not None and leaves_white(of_law, searched.data):
+    if of_law is not None and not of_law.misfit and leaves_white(of_law.flow, searched.data):
         message = (
             "the residuals of H are white: these pairs do not contradict H. They are noise of "
             f"about {sizes_of_noise}"

@@ -37,7 +37,8 @@ from gfnn_jax.models.generating_functions.map_arcs import LONGEST, GeneratedOnAr
 from gfnn_jax.models.generating_functions.size import Size
 from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 from gfnn_jax.models.hamiltonians.choose_law import preferred
-from gfnn_jax.search.search import COMPARABLE, Entry
+from gfnn_jax.search.extrapolate import GAINED
+from gfnn_jax.search.search import Entry
 
 _MOST_SWEEPS = 3
 _WHAT = "the fit of S to the states that noisy pairs most likely had"
@@ -74,7 +75,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
     except np.linalg.LinAlgError:  # a chart that is singular at some pair
         request.budget.leave_out(_WHAT, "the chart is singular at some of the pairs")
         return found
-    if not entry.candidate.validation_relative <= COMPARABLE * best.candidate.validation_relative:
+    if not GAINED * entry.candidate.validation_relative <= best.candidate.validation_relative:
         return found
     request.on_candidate(entry.candidate)
     others = [e for e in found.found.entries if e.size is not entry.size]
@@ -85,7 +86,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
 def _as_far(found: Searched) -> list[Entry]:
     """The best entry of every sweep that has come as far as the best one and can be corrected."""
     best: dict[int, Entry] = {}
-    limit = COMPARABLE * found.found.ranking[0].candidate.validation_relative
+    limit = found.found.ranking[0].candidate.validation_relative / GAINED
     for entry in found.found.entries:
         error = entry.candidate.validation_relative
         known = best.get(id(entry.sweep))

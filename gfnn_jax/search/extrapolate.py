@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 # Sizes of a smaller range foretell nothing: an even S gains nothing from every other degree.
 _RANGE = 2.0
-# A size whose error ÷ the least before it is more than this has gained nothing.
+# A size whose error ÷ the least before it is more than this has gained nothing; a sweep whose least
+# error, times this, is no larger than the best one's has come as far.
 GAINED = 0.8
 # Extrapolated over more than so many times the orders that were seen, a decay means nothing.
 _FARTHEST = 3.0

@@ -32,8 +32,6 @@ _FINALISTS = 3  # that are validated where none meets the tolerance
 _CALIBRATED, _WITHIN_REACH = 1e3, 1.3
 _NO_WORSE = 1.03  # an error larger by this factor is as good, if the map is cheaper
 MET = "the tolerance is met"
-# A sweep whose error is within this factor of the best one's has come as far.
-COMPARABLE = 1.25
 _KEPT = 0.1  # of the last kept map's error: a map so much better is kept in its stead
 _FAR = 10.0  # times the tolerance: a sweep that leads to no smaller error misses it
 
@@ -328,7 +326,7 @@ def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
 def _why(sweeps: Sequence[Any], stalled: list[int], best: Sequence[float]) -> str:
     """Reason why a search that met nothing ended before its time. Sweeps far from the best one's
     error tell nothing."""
-    good = [i for i, s in enumerate(sweeps) if s.sizes and best[i] <= COMPARABLE * min(best)]
+    good = [i for i, s in enumerate(sweeps) if s.sizes and GAINED * best[i] <= min(best)]
     if any(stalled[i] == _STALLED for i in good):
         return "larger models are no more accurate"
     if any(sweeps[i].short_of_pairs for i in good):

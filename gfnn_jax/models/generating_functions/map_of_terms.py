@@ -30,7 +30,12 @@ from gfnn_jax.families.terms import Terms, joined, multiplied
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.least_squares import ROWS_PER_TERM
 from gfnn_jax.fitting.linear_starts import fitted_gradients
-from gfnn_jax.fitting.significance import null_terms, significant, terms_above_noise
+from gfnn_jax.fitting.significance import (
+    ABOVE_NOISE,
+    null_terms,
+    significant,
+    terms_above_noise,
+)
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
@@ -39,7 +44,6 @@ from gfnn_jax.models.parameters import functions_of_parameters, state_libraries,
 _CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
 _MOST_TERMS = 500
 _THRESHOLDS = (1e4, 1e3, 100.0, 30.0, 10.0)  # standard errors below which terms go, tried in turn
-_CERTAIN = 4.0  # where noise is left over: those that are larger it does not explain
 _RISE, _ROUNDING = 1.1, 1e-15  # of the held-out error that this may cost
 _STRUCTURED_ROWS = 50_000  # numbers of training pairs that sites are fitted to: no more are needed
 _NULL_ROWS = 4_000  # of them, which tell whose gradients are combinations of others
@@ -319,7 +323,7 @@ def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance, noisy: bool) -> _
     triangle = Triangle.of(np.column_stack([terms, residual]))
     tried: set[int] = set()
     remaining_terms, thresholds = (
-        (terms_above_noise, (_CERTAIN,)) if noisy else (significant, _THRESHOLDS)
+        (terms_above_noise, (ABOVE_NOISE,)) if noisy else (significant, _THRESHOLDS)
     )
     for threshold in thresholds:
         kept, _ = remaining_terms(triangle, piece.params, threshold)

@@ -38,10 +38,6 @@ _EVEN_DEGREES = tuple((degree,) for degree in (2, 4, 6, 8, 10, 12, 14, 16, 18, 2
 _SINES = (100, 200, 400, 800, 1_600)
 # Products of degree 14 in four variables: benchmarks/storage_ring.py.
 _MOST_TERMS = 3_100
-# Enough to tell misfit from noise by a size, though not to choose it.
-_FEWEST_PER_TERM = 1.5
-# Rows per term up to which the test rows, an eighth as many, make the coefficients much better.
-_SCARCE = 6
 # Rows × terms² of one factor: about half a minute on one core. 2,000 terms take 80,000 rows.
 _MOST_OPERATIONS = 3.2e11
 _WORTH_KEEPING = 1.0  # seconds
@@ -226,9 +222,10 @@ class LinearSweep(CoefficientNoise):
         return solved, size.family.unflatten(solved.coefficients)
 
     def work_of_test_rows(self, size: Size) -> float:
-        """Operations that `with_test_rows` takes; 0 where rows are not scarce."""
+        """Operations that `with_test_rows` takes. 0 above twice the rows that a size needs: the
+        test rows, an eighth as many, make its coefficients little better then."""
         rows, count = self._train[1].size, size.family.num_parameters
-        if not len(self.data.test) or rows > _SCARCE * count:
+        if not len(self.data.test) or rows > 2 * ROWS_PER_TERM * count:
             return 0.0
         more = len(self.data.test) * self._width
         return 2.0 * more * (size.group.num_parameters + 1) ** 2 + OF_SOLVE * count**3
@@ -284,12 +281,13 @@ class LinearSweep(CoefficientNoise):
 
     def _larger(self, size: Size) -> Size | None:
         """The size two further, as a symmetric map gains nothing from the odd degrees; the next, or
-        None, where there is none. Of few pairs, one that they tell, if too badly to be chosen."""
+        None, where there is none. Few pairs need half the rows here that a size needs which may be
+        chosen: enough to distinguish misfit from noise."""
         place = self.sizes.index(size)
         further = self.sizes[place + 1 : place + 3]
         if len(further) < 2:
             rows = self._determining
-            families = (f for g in _determined(self._groups(), rows, _FEWEST_PER_TERM) for f in g)
+            families = (f for g in _determined(self._groups(), rows, ROWS_PER_TERM / 2) for f in g)
             beyond = (f for f in families if f.num_parameters > rows // ROWS_PER_TERM)
             further += [Size(f, f, _extent(f)) for f in itertools.islice(beyond, 2 - len(further))]
         return further[-1] if further else None

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from gfnn_jax.budget import Allowance, Budget
-from gfnn_jax.fitting.significance import significant_terms, terms_above_noise
+from gfnn_jax.fitting.significance import ABOVE_NOISE, significant_terms, terms_above_noise
 from gfnn_jax.models.hamiltonians.fitted_law import Dropped, FittedLaw
 from gfnn_jax.models.hamiltonians.options import OPTIONS, LawOptions
 from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
@@ -33,7 +33,7 @@ def without_noise(
     few = refitted(problem, few, rows, data, tolerance)
     # Twice the logarithm of the likelihood's ratio.
     gained = 2 * few.fit.triangle.rows * np.log(found.fit.rms / few.fit.rms)
-    if gained > options.certain**2 * more and few.error.relative <= found.error.relative:
+    if gained > ABOVE_NOISE**2 * more and few.error.relative <= found.error.relative:
         return few._replace(noisy=True)
     return found
 
@@ -55,7 +55,7 @@ def _significant(problem, full: FittedLaw, rows, options: LawOptions) -> FittedL
     found = problem.linearised(full.family, full.fit.coefficients, full.fit.steps, resolved)
     if not np.isfinite(found.norm):
         return None
-    kept, start = terms_above_noise(found, full.fit.coefficients, options.certain)
+    kept, start = terms_above_noise(found, full.fit.coefficients, ABOVE_NOISE)
     if not len(kept):
         return None
     return full._replace(

@@ -21,6 +21,7 @@ from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.lagrangian import LINEAR, UNIFORM, Friction
 from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.fitting.significance import CERTAIN
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.uniform import Uniform, without_forces
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
@@ -37,7 +38,6 @@ from gfnn_jax.models.hamiltonians.options import OPTIONS, LawOptions
 from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
 from gfnn_jax.models.hamiltonians.work import LawWork
 
-_CERTAIN = 5.0  # standard errors of a coefficient of friction
 _GAINED = 0.5  # of the held-out error of H alone: what friction must lower it to
 _ALIKE = 0.7  # of what uniform friction leaves over: what rates of their own must lower it to
 _LOOKED_AT = 600  # pairs that tell whether friction explains anything
@@ -178,7 +178,7 @@ def _certain(law: FittedLaw) -> bool:
     """Return whether there is friction, all of it certain and above 0."""
     of_h = without_forces(law.family).num_parameters
     rates, errors = law.fit.coefficients[of_h:], law.fit.standard_errors[of_h:]
-    return bool(len(rates) and (rates > _CERTAIN * errors).all())
+    return bool(len(rates) and (rates > CERTAIN * errors).all())
 
 
 def _explains(problem: Problem, alone: FittedLaw, rows) -> bool:
@@ -191,7 +191,7 @@ def _explains(problem: Problem, alone: FittedLaw, rows) -> bool:
     # The last row of R but one is what γ alone explains, the last what nothing does.
     size, along, left = found.factor[-2, -2], found.factor[-2, -1], found.factor[-1, -1]
     noise = abs(left) / np.sqrt(max(found.rows - len(c), 1))
-    return bool(-along / size > _CERTAIN * noise / abs(size))
+    return bool(-along / size > CERTAIN * noise / abs(size))
 
 
 def _alike(problem: Problem, law: FittedLaw, rows) -> bool:

@@ -22,6 +22,7 @@ from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.growth import grow
+from gfnn_jax.fitting.significance import ABOVE_NOISE
 from gfnn_jax.models.hamiltonians.centrifugal import centrifugal_terms
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.friction import (
@@ -183,7 +184,7 @@ def _simplest_within_noise(
     if len(near) < 2:
         return best, options
     noisy = near[0]._replace(noisy=True, larger=near[-1], stalled=best.stalled)
-    return noisy, dataclasses.replace(options, thresholds=(options.certain,))
+    return noisy, dataclasses.replace(options, thresholds=(ABOVE_NOISE,))
 
 
 def _libraries(

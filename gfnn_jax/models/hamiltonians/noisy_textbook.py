@@ -24,6 +24,7 @@ from gfnn_jax.dataset.noise import of_differences
 from gfnn_jax.dataset.runs import next_of
 from gfnn_jax.errors import InputError, OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.fitting.significance import ABOVE_NOISE
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.flow_arcs import FlowWithConstants
@@ -53,7 +54,6 @@ _OPERATIONS = (2e8, 4e8, 8e8, 1.6e9)  # of a search, by degrees of freedom from 
 _ORDER, _ALIKE = 6, 1.5  # of the differences that tell the noise, see `arcs`
 _LEAST = 3e-6  # of the spread: less noise than that is not what weak gradients leave over
 _LOOKED_AT = 20_000  # rows by which laws are compared
-_CERTAIN = 4.0  # standard errors below which a term is noise
 _BEHIND = 40.0  # natural logarithms of likelihood by which a law is behind that is not fitted
 _BROUGHT = 3.0  # of it, that further terms must bring
 _FITTED = 4  # laws
@@ -257,7 +257,7 @@ def _certain(found: Fitted, formula: Formula) -> list[int]:
         spectrum = problem.pruned(np.array(columns)).spectrum()
         p = spectrum.solution(spectrum.inverse)
         size = np.abs(p / (noise * spectrum.deviations()))[: len(kept)]
-        weak = int((size < _CERTAIN).sum())
+        weak = int((size < ABOVE_NOISE).sum())
         if not weak:
             break
         gone = np.argsort(size)[: (weak + 1) // 2]

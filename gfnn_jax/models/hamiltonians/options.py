@@ -16,8 +16,7 @@ class LawOptions:
     rows_compared: per term, on which libraries are compared; all pairs only count in the last fit.
     thresholds: standard errors below which terms go, tried in turn.
     rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
-    flat: libraries one after the other whose errors differ by less have met the pairs' noise;
-    certain: standard errors below which a term is then noise (one in 16,000 by chance).
+    flat: libraries one after the other whose errors differ by less have met the pairs' noise.
     explained: standard errors of the part of a residual that is noise, within which all of it is.
     gained: a library that lowers the error by less has not helped; twice in a row ends the search.
     truncation: a flow's own error, as a part of the tolerance. goal: residual that modes grow to,
@@ -43,7 +42,6 @@ class LawOptions:
     rise: float = 1.1
     rounding: float = 5e-15
     flat: float = 1.2
-    certain: float = 4.0
     explained: float = 2.0
     gained: float = 0.5
     truncation: float = 0.1

@@ -6,8 +6,8 @@ import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.terms import Terms, multiplied
+from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.uniform import without_forces
-from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.libraries import angles_and_others
 from gfnn_jax.models.hamiltonians.unexplained import unexplained
 from gfnn_jax.models.parameters import functions_of_parameters, state_libraries
@@ -15,19 +15,19 @@ from gfnn_jax.models.parameters import functions_of_parameters, state_libraries
 _PAIRS = 2_000  # whose residuals are looked at
 
 
-def leaves_white(law: LearnedHamiltonian, data: Dataset) -> bool:
-    """Return whether no polynomial generator explains more than chance of what the law leaves over,
-    by an F test (`unexplained`). False where the pairs are too few to tell, of a law
-    over sites or of pairs of many dt, and where whole sequences are certain of a misfit."""
-    family = without_forces(law.flow.family)
+def leaves_white(flow: Flow, data: Dataset) -> bool:
+    """Return whether no polynomial generator explains more than chance of what the flow of H
+    leaves over, by an F test (`unexplained`). False also where the pairs are too few for the test,
+    for an H over sites, and for pairs of many dt."""
+    family = without_forces(flow.family)
     plain = isinstance(family, Terms) and data.own_dt is None and data.structure is None
-    if not plain or law.misfit:
+    if not plain:
         return False
     rows = np.sort(data.training)[:_PAIRS]
-    residual = data.y1[rows] - law.flow.image(data.y0[rows], data.given(rows)[1])
+    residual = data.y1[rows] - flow.image(data.y0[rows], data.given(rows)[1])
     resolved = np.isfinite(residual).all(axis=1)
     degree = int(np.max(np.sum(family.powers, axis=1), initial=0))
-    taken = law.flow.family.num_parameters
+    taken = flow.family.num_parameters
     given = data, rows[resolved], residual[resolved], taken, degree, None
     return unexplained(*given, _with_args(data, rows)) == 1.0
 

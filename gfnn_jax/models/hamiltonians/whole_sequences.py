@@ -14,7 +14,7 @@ from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.arcs import Arcs, arcs_of_pairs, onward
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
-from gfnn_jax.fitting.significance import terms_above_noise
+from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_above_noise
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.models.hamiltonians.flow_arcs import BIWEIGHT, FlowOnArcs, fit_flow, longest_arc
@@ -22,7 +22,6 @@ from gfnn_jax.solve.latent_arcs import OUTLYING, Fitted
 from gfnn_jax.solve.robust import robust
 
 _SHORTEST = 3  # steps of an arc that says more than its pairs do
-_CERTAIN = 4.0  # standard errors below which a term is noise
 _RISE = 1.01  # of the held-out arcs' noise, by chance
 # Measured numbers for each term from which on a law that held-out sequences have borne out is
 # fitted to these too: what judges it then is off by less than 1 / 200 of the noise's variance.
@@ -140,7 +139,7 @@ def fitted_to_sequences(
     if found is None or not left(family, found.p) <= _RISE * before:
         return None
     kept, widened = tuple(range(len(c))), 1.0
-    few = terms_above_noise(triangle_of(found), found.p, _CERTAIN)[0]
+    few = terms_above_noise(triangle_of(found), found.p, ABOVE_NOISE)[0]
     if 0 < len(few) < len(c):
         fewer = family.take(tuple(few.tolist()))
         again = fitted(train, fewer, found.p[few])
