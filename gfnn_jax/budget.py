@@ -125,12 +125,14 @@ class Budget:
 
     @contextlib.contextmanager
     def unit(
-        self, name: str, kind: str, operations: float, *, then: tuple[str, float] | None = None
-    ) -> Iterator[None]:
+        self, name: str, kind: str, operations: float, *, then: tuple[str, float] | None = None,
+        made: Callable[[], float] | None = None,
+    ) -> Iterator[None]:  # fmt: skip
         """One unit of work of the search. Raises OutOfTime where it does not fit.
 
         operations: that it is predicted to take. then: kind and operations of what must follow
-        should this be the last unit; the time for it is reserved.
+        should this be the last unit; the time for it is reserved. made: gives the operations that
+        were made so far, where a unit may make other than predicted: its time is theirs.
         """
         count = max(1, int(operations))
         if self.over:
@@ -149,20 +151,21 @@ class Budget:
                 needed = f"{name} needs about {seconds:.2g} s with what must follow it"
                 remaining = f"{left:.2g} of {self.max_seconds:g} s are left"
                 self._end(_NO_TIME, f"{needed}, and {remaining} (--max-seconds)")
-        with self._timed(kind, count):
+        with self._timed(kind, count, made):
             yield
         self.operations += count
         self._done, self._last = self._done + 1, name
 
     @contextlib.contextmanager
     def last(
-        self, name: str, kind: str, operations: float, *, decides: bool = False
-    ) -> Iterator[None]:
+        self, name: str, kind: str, operations: float, *, decides: bool = False,
+        made: Callable[[], float] | None = None,
+    ) -> Iterator[None]:  # fmt: skip
         """A unit after the search, which the search's end is no reason to leave out. Raises
         OutOfTime where there is no time for it, and then for those after it too.
 
         decides: whether the choice depends on it. It counts as one operation then: none of the
-        search's units could be done in its stead.
+        search's units could be done in its stead. made: as of ``unit``.
         """
         if self.max_seconds is not None:
             late = self.seconds + self._foretold(kind, operations) > self.max_seconds
@@ -171,13 +174,16 @@ class Budget:
         if self._closed or spent:
             self.leave_out(name, _NO_TIME if self._closed else _NO_OPERATIONS)
             raise OutOfTime
-        with self._timed(kind, operations):
+        with self._timed(kind, operations, made):
             yield
         self.operations += decides
 
-    def free(self, kind: str, operations: float) -> contextlib.AbstractContextManager[None]:
-        """Work that is done in any case, and counts as no operation; its time is measured."""
-        return self._timed(kind, operations)
+    def free(
+        self, kind: str, operations: float, made: Callable[[], float] | None = None
+    ) -> contextlib.AbstractContextManager[None]:
+        """Work that is done in any case, and counts as no operation; its time is measured. made: as
+        of ``unit``."""
+        return self._timed(kind, operations, made)
 
     def leave_out(self, what: str, why: str) -> None:
         """Have it told in the end; what the budget ended is told at length once, in ``ended``."""
@@ -220,9 +226,12 @@ class Budget:
         return operations * seconds / done
 
     @contextlib.contextmanager
-    def _timed(self, kind: str, operations: float) -> Iterator[None]:
-        started = self._clock()
+    def _timed(
+        self, kind: str, operations: float, made: Callable[[], float] | None
+    ) -> Iterator[None]:
+        started, before = self._clock(), 0.0 if made is None else made()
         yield
+        operations = operations if made is None else made() - before
         if operations >= _TELLING * RATES[kind]:
             done, seconds = self._measured.get(kind, (0.0, 0.0))
             self._measured[kind] = done + operations, seconds + self._clock() - started

@@ -79,6 +79,20 @@ def test_time_is_foretold_by_units_of_the_same_kind():
         assert budget.operations == LARGE * (2 if fits else 1)
 
 
+def test_time_is_that_of_the_operations_that_were_made():
+    """A unit that makes ten times the operations predicted does not make operations slow: as many
+    as it made take as long again, not ten times as long."""
+    hand, made = Hand(), [0.0]
+    budget = Budget(max_seconds=40.0, clock=hand)
+    with budget.unit("a library", FLOW, LARGE, made=lambda: made[0]):
+        hand.now += 10.0
+        made[0] += 10 * LARGE
+    with budget.unit("the next", FLOW, 10 * LARGE):
+        hand.now += 10.0
+    with pytest.raises(OutOfTime), budget.unit("the last", FLOW, 21 * LARGE):
+        pass  # of 20 s that are left
+
+
 def test_what_must_follow_the_last_unit_is_reserved():
     hand = Hand()
     budget = Budget(max_seconds=10.0, clock=hand)

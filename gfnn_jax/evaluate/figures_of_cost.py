@@ -69,10 +69,7 @@ def speed_against_error(
         ylabel="one-step error ÷ spread",
     )
     ax.margins(0.12)
-    ax.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))  # more labels would cover each other
-    ax.xaxis.set_major_formatter("{x:g}")
-    few = max(cost) < 1e3 * min(cost)
-    ax.xaxis.set_minor_formatter("{x:g}" if few else NullFormatter())
+    _costs_as_numbers(ax, cost)
     without_minor_ticks(ax)
     _number_points(ax, cost, error, order)
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
@@ -90,6 +87,14 @@ def speed_against_error(
         annotation_clip=False,
     )
     return ax
+
+
+def _costs_as_numbers(ax, cost):
+    """Label the axis of costs by 1, 2, 5, 10, …; more labels would cover each other."""
+    ax.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+    ax.xaxis.set_major_formatter("{x:g}")
+    few = max(cost) < 1e3 * min(cost)
+    ax.xaxis.set_minor_formatter("{x:g}" if few else NullFormatter())
 
 
 def _number_points(ax, x, y, order):
@@ -128,6 +133,7 @@ def work_precision(
     for place, (name, (cost, error)) in enumerate(curves.items()):
         ax.plot(cost, error, label=name, **look_of(place))
     ax.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
+    _costs_as_numbers(ax, np.concatenate([np.ravel(cost) for cost, _ in curves.values()]))
     legend_above(ax)
     return ax
 

@@ -294,12 +294,12 @@ def _grown(
     rounds = grow(problem, basis, data.training, goal, min(most, options.most_modes))
     try:
         while True:
-            before = work.made
+            before = work.made()
             with work.round("growth of H", expected):
                 further = next(rounds, None)
             if further is None:
                 break
-            grown, ended, expected = further, further.ended, work.made - before
+            grown, ended, expected = further, further.ended, work.made() - before
             why = f": {ended}" if ended else ""
             on_progress(f"H grows: {len(grown.coefficients)} modes, error {grown.rms:.1e}{why}")
     except OutOfTime:

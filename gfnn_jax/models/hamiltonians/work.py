@@ -40,7 +40,6 @@ class LawWork:
         capped = f"the search for H reached its own limit of {self._cap.most:.2g} operations"
         return self.budget.ended or (capped if self._cap.spent > self._cap.most else "")
 
-    @property
     def made(self) -> float:
         """Operations so far."""
         return self._cap.spent
@@ -61,9 +60,9 @@ class LawWork:
         before, allowance = self._cap.spent, self._problem.allowance
         if first:
             self._problem.allowance = Allowance(cap=self._cap)
-            unit = self.budget.free(FLOW, self._evaluations * one)
+            unit = self.budget.free(FLOW, self._evaluations * one, self.made)
         else:
-            unit = self.budget.unit(name, FLOW, self._evaluations * one)
+            unit = self.budget.unit(name, FLOW, self._evaluations * one, made=self.made)
         try:
             with unit:
                 yield
@@ -77,20 +76,20 @@ class LawWork:
         makes a law of a library, so that the end of the search is no reason to leave it out."""
         work = _CLOSE * self._one(family, rows)
         if not self.budget.over:
-            with self.budget.unit(name, FLOW, work):
+            with self.budget.unit(name, FLOW, work, made=self.made):
                 yield
             return
         allowance = self._problem.allowance
         self._problem.allowance = Allowance(cap=self._cap)
         try:
-            with self.budget.last(name, FLOW, work, decides=True):
+            with self.budget.last(name, FLOW, work, decides=True, made=self.made):
                 yield
         finally:
             self._problem.allowance = allowance
 
     def round(self, name: str, expected: float):
         """A unit of so many operations."""
-        return self.budget.unit(name, FLOW, expected)
+        return self.budget.unit(name, FLOW, expected, made=self.made)
 
     def _one(self, family, rows: int) -> float:
         """Operations of an evaluation."""
