@@ -1,13 +1,22 @@
 """Lengths of arcs: those that tell a law's coefficients best, where unknown forces act."""
 
+from functools import partial
+
 import numpy as np
+import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.models.lagrangians.given_law import fit_given
+from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.search import SearchOptions, search
 
+GIVEN = given_terms(
+    ["w1**2 + w1*w2*cos(q1 - q2) + w2**2 + cos(q1) + cos(q2)", "R: w1**2 + w2**2"],
+    ("q1", "q2"), ("w1", "w2"),
+)  # fmt: skip
 MASS, COUPLED, PULLS, DT, NOISE = 0.5, 0.4, (20.0, 8.0), 0.02, 1e-3
 
 
@@ -45,14 +54,14 @@ def swung(torque, seed=0, runs=4, end=12.0):
     return gfnn.Recording(tables, positions=names, angles=names)
 
 
-def searched(recording):
+def searched(recording, search=search):
     found = stretches(recording)
     scales = measure(found)
     nodes = nodes_of(found, scales)
     inputs = {"hold": ArcInputs(nodes, scales.substeps, "hold")}
     options = SearchOptions(frictions=("linear",), choose_friction=False)
     seen = Observation.plain(recording.positions)
-    return search(nodes, scales, (0, 1), 0, inputs, seen, options=options)
+    return search(nodes, scales, (0, 1), 0, inputs, seen, lambda line: None, options)
 
 
 def pulls_of(found):
@@ -67,9 +76,10 @@ def test_longer_arcs_tell_more_where_the_law_is_all_that_acts():
     np.testing.assert_allclose(pulls_of(found), PULLS, rtol=2e-3)
 
 
-def test_shorter_arcs_tell_more_where_unknown_torques_act():
+@pytest.mark.parametrize("search", [search, partial(fit_given, GIVEN)])
+def test_shorter_arcs_tell_more_where_unknown_torques_act(search):
     """The oracle are the pulls that made the data: the law of shorter arcs is nearer to them."""
-    found = searched(swung(0.03))
+    found = searched(swung(0.03), search)
     assert found.shorter is not None
     fit, other = found.acting.fit, found.shorter.acting.fit
     assert other.arcs.t.shape[1] < fit.arcs.t.shape[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -11,13 +12,15 @@ from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.fit import Systems, Workbench
+from gfnn_jax.models.lagrangians.fit import LawFit, Systems, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_terms import Given
-from gfnn_jax.models.lagrangians.input_rules import choose_rule, with_delay
+from gfnn_jax.models.lagrangians.input_rules import choose_rule
 from gfnn_jax.models.lagrangians.search import (
     Found,
     SearchOptions,
+    as_found,
+    by_arcs_that_tell,
     choose_friction,
     describe,
     frictions_tried,
@@ -62,10 +65,13 @@ def fit_given(
         fit = bench.fit(structure, fit.values, arcs, fit.sigma)
         nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
         on_progress(f"{periods:g} periods: {describe(fit)}")
-    if given.friction is None:
+        nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+
+    def choose(nodes: Sequence[Nodes], fit: LawFit) -> tuple[LawFit, FrictionChoice]:
+        if given.friction is not None:
+            return fit, FrictionChoice(given.friction, {}, {}, gains=False)
         tried = frictions_tried(d, options)
-        fit, choice = choose_friction(bench, nodes, fit, tried, on_progress, options)
-    else:
-        choice = FrictionChoice(given.friction, {}, {}, gains=False)
-    nodes = with_states(nodes, fit.arcs, fit.fitted.x)
-    return Found(with_delay(bench, nodes, fit, scales.dt), choice, nodes)
+        return choose_friction(bench, nodes, fit, tried, on_progress, options)
+
+    settled = partial(as_found, bench, scales.dt)
+    return by_arcs_that_tell(bench, nodes, fit, choose, settled, scales, on_progress, options)

@@ -165,9 +165,24 @@ def finished(
 ) -> Found:  # fmt: skip
     """The law that a fit to the longest arcs comes to: its friction chosen, terms dropped and
     added."""
-    fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
-    nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
+
+    def choose(nodes: Sequence[Nodes], fit: LawFit) -> tuple[LawFit, FrictionChoice]:
+        return choose_friction(bench, nodes, fit, every.friction, on_progress, options)
+
     settled = partial(_settled, bench, every, scales.dt, on_progress, options)
+    return by_arcs_that_tell(bench, nodes, fit, choose, settled, scales, on_progress, options)
+
+
+def by_arcs_that_tell(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit,
+    choose: Callable[[Sequence[Nodes], LawFit], tuple[LawFit, FrictionChoice]],
+    settled: Callable[[Sequence[Nodes], LawFit, FrictionChoice], Found],
+    scales: Scales, on_progress: Callable, options: SearchOptions,
+) -> Found:  # fmt: skip
+    """The law of a fit to the longest arcs, with the friction that is to ``choose``, as it is
+    ``settled``; and, where shorter arcs tell its coefficients better, that of these."""
+    fit, choice = choose(nodes, fit)
+    nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
     lengths = [max(6, round(p * scales.per_period)) for p in options.periods]
     shorter = telling_more(bench, nodes, fit, lengths, options)
     found = settled(nodes, fit, choice)
@@ -176,8 +191,7 @@ def finished(
     periods = shorter.arcs.t.shape[1] / scales.per_period
     on_progress(f"arcs of {periods:.2g} periods tell more than longer ones: {describe(shorter)}")
     nodes = with_states(nodes, shorter.arcs, shorter.fitted.x)
-    fit, choice = choose_friction(bench, nodes, shorter, every.friction, on_progress, options)
-    return found._replace(shorter=settled(nodes, fit, choice))
+    return found._replace(shorter=settled(nodes, *choose(nodes, shorter)))
 
 
 def _settled(
@@ -193,6 +207,13 @@ def _settled(
     fit = prune(bench, nodes, fit, on_progress, options, friction=False)
     if fit.structure != before:
         fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
+    return as_found(bench, dt, nodes, fit, choice)
+
+
+def as_found(
+    bench: Workbench, dt: float, nodes: Sequence[Nodes], fit: LawFit, choice: FrictionChoice
+) -> Found:
+    """The fit as it is, with the delay of its inputs, and the nodes with its states."""
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     return Found(with_delay(bench, nodes, fit, dt), choice, nodes)
 
