@@ -193,8 +193,26 @@ class _Data(NamedTuple):
         """The residuals and defects of coefficients p and states x."""
         with np.errstate(all="ignore"):
             defects, observed = evaluated(self.model, p, x)
+        return self._of(p, x, defects, observed, units)
+
+    def _of(
+        self, p: np.ndarray, x: np.ndarray, defects: Defects, observed: Observed, units: _Units
+    ) -> _Iterate:
+        with np.errstate(all="ignore"):
             off = np.where(self.measured, self.known - observed.values, 0.0)
         return _Iterate.at(p, x, defects, observed, self.measured, off, units)
+
+    def moved(self, here: _Iterate, arcs: np.ndarray, x: np.ndarray) -> _Iterate:
+        """The same iterate, but that these arcs (indices, n) have the states x (n, L, m)."""
+        with np.errstate(all="ignore"):
+            found = evaluated(self.model.take(arcs), here.p, x)
+        states = here.x.copy()
+        states[arcs] = x
+        defects, observed = (
+            type(of)(*(_replaced(every, arcs, some) for every, some in zip(of, own, strict=True)))
+            for of, own in zip((here.defects, here.observed), found, strict=True)
+        )
+        return self._of(here.p, states, defects, observed, here.units)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,20 +244,23 @@ class _AtStates:
         else:
             there = self._alone(share, dx)
         if self.closed(here):
-            return Tried(there, here.merit * (1 + 1e-9) - there.merit, damping)
+            least = here.merit * (1 + 1e-9)
+            if not failures and there.cost < least < there.merit:  # by its defects alone
+                there = self.data.at(there.p, there.x + _closing(there.defects), here.units)
+            return Tried(there, least - there.merit, damping)
         return Tried(there, (1 - 0.5 * share) * here.gap - there.gap, damping)
 
     def _alone(self, share: float, dx: np.ndarray) -> _Iterate:
         """A step of arcs (A, L, m) each of which takes as much of it as lowers its own merit."""
-        here, shares = self.here, np.full((len(dx), 1, 1), share)
-        for _ in range(_HALVINGS):
-            there = self.data.at(here.p, here.x + shares * dx, here.units)
-            worse = ~(there.merits <= here.merits * (1 + 1e-9))
-            if not worse.any():
-                return there
-            shares[worse] /= 2
-        shares[worse] = 0
-        return self.data.at(here.p, here.x + shares * dx, here.units)
+        here, merits = self.here, self.here.merits * (1 + 1e-9)
+        there = self.data.at(here.p, here.x + share * dx, here.units)
+        for halving in range(1, _HALVINGS + 1):
+            worse = np.flatnonzero(~(there.merits <= merits))
+            if not len(worse):
+                break
+            part = share * 0.5**halving if halving < _HALVINGS else 0.0
+            there = self.data.moved(there, worse, here.x[worse] + part * dx[worse])
+        return there
 
     def moved(self, there: _Iterate, damping: float) -> tuple[_AtStates, bool]:
         """The problem at the end of a step, in units of the noise that its residuals tell; settled
@@ -266,6 +287,12 @@ class _AtStates:
             rows.arcs[:, :, :m], rows.transports, best.cost if self.closed(best) else np.inf,
             iterations, converged,
         )  # fmt: skip
+
+
+def _replaced(every: np.ndarray, arcs: np.ndarray, some: np.ndarray) -> np.ndarray:
+    whole = every.copy()
+    whole[arcs] = some
+    return whole
 
 
 class _Units(NamedTuple):
@@ -405,6 +432,14 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     weight = np.where(at.measured[block], np.sqrt(at.units.loss.weights(at.white[block])), 0.0)
     J *= weight[..., None]
     return J.reshape(num_arcs, length * k, -1), S[:, -1]
+
+
+def _closing(defects: Defects) -> np.ndarray:
+    """δx (A, L, m) that closes the defects, as far as they are linear, behind each first state."""
+    dx = [np.zeros_like(defects.closing[:, 0])]
+    for i in range(defects.closing.shape[1]):
+        dx.append((defects.by_state[:, i] @ dx[-1][..., None])[..., 0] + defects.closing[:, i])
+    return np.stack(dx, axis=1)
 
 
 def _solve(rows: _Rows, defects: Defects, damping: float) -> tuple[np.ndarray, np.ndarray]:

@@ -23,7 +23,13 @@ from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, a_third
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, which_friction
-from gfnn_jax.models.lagrangians.input_rules import Acting, choose_rule, with_delay
+from gfnn_jax.models.lagrangians.input_rules import (
+    RULES,
+    Acting,
+    choose_again,
+    choose_rule,
+    with_delay,
+)
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
 from gfnn_jax.models.lagrangians.text import word_of
@@ -139,6 +145,10 @@ def search(
         if periods == 1:
             fit = grow(bench, nodes, fit, frictions, on_progress, options)
             fit = prune(bench, nodes, fit, on_progress, options)
+            rule = choose_again(Acting(fit, bench, np.nan), inputs, nodes, length(1), scales.dt)
+            if rule.hold != bench.inputs.hold:
+                on_progress(f"inputs {RULES[rule.hold]}: held-out arcs choose it with its friction")
+                bench, fit = rule.bench, rule.fit
             fit = grow(bench, nodes, fit, every, on_progress, options)
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
         on_progress(f"{periods:g} periods: {describe(fit)}")
