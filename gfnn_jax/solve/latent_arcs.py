@@ -22,7 +22,7 @@ Where it is not white, a *whitening* (`solve.wander`) mixes residuals along an a
 from __future__ import annotations
 
 import dataclasses
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -208,10 +208,8 @@ class _Data(NamedTuple):
             found = evaluated(self.model.take(arcs), here.p, x)
         states = here.x.copy()
         states[arcs] = x
-        defects, observed = (
-            type(of)(*(_replaced(every, arcs, some) for every, some in zip(of, own, strict=True)))
-            for of, own in zip((here.defects, here.observed), found, strict=True)
-        )
+        defects = Defects(*map(partial(_replaced, arcs), here.defects, found[0]))
+        observed = Observed(*map(partial(_replaced, arcs), here.observed, found[1]))
         return self._of(here.p, states, defects, observed, here.units)
 
 
@@ -289,7 +287,7 @@ class _AtStates:
         )  # fmt: skip
 
 
-def _replaced(every: np.ndarray, arcs: np.ndarray, some: np.ndarray) -> np.ndarray:
+def _replaced(arcs: np.ndarray, every: np.ndarray, some: np.ndarray) -> np.ndarray:
     whole = every.copy()
     whole[arcs] = some
     return whole
