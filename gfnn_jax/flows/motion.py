@@ -182,8 +182,11 @@ class Form:
             by_v = by_v + gamma[..., None] * masses
         columns = [by_q, by_v]
         if order > 1:
-            rows = push * f[..., None] + dg * along[..., None] - g[..., None] * df
-            rows = rows + gamma[..., None] * (f[..., None] * dg)
+            rows, part = push * f[..., None], dg * along[..., None]
+            rows += part
+            rows -= np.multiply(g[..., None], df, out=part)
+            if even.any():
+                rows += gamma[..., None] * np.multiply(f[..., None], dg, out=part)
             columns.append(rows.swapaxes(1, 2) @ self.basis)
             by_losses = np.empty((len(v), d, len(even)))
             by_losses[..., ~even] = (pull[..., None] * directions).swapaxes(1, 2)
