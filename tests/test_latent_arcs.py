@@ -70,3 +70,29 @@ def test_a_step_whose_defects_alone_are_too_large_is_closed_and_not_made_shorter
     assert fit.converged
     assert model.count <= 10
     assert abs(fit.p[0] - 1) < 4 * np.sqrt(fit.covariance()[0, 0])
+
+
+class _Fork:
+    """x' = x + p where x is above 0, x − p where it is not, seen directly."""
+
+    def take(self, arcs):
+        return self
+
+    def defects(self, p, x):
+        way = np.where(x[:, :-1] > 0, 1.0, -1.0)
+        ones = np.ones((*way.shape, 1))
+        return Defects(x[:, :-1] + p[0] * way - x[:, 1:], ones, way[..., None])
+
+    def observe(self, p, x):
+        return Observed(x, np.ones((*x.shape, 1)), np.zeros((*x.shape, 1)))
+
+
+def test_arcs_that_no_step_closes_are_made_orbits():
+    """The first arc stands where its steps jump, and its data pull it across: every step of the
+    coefficient, which both share, leaves larger defects than those of the second."""
+    n, unit = np.arange(6.0), np.ones(1)
+    x = np.stack([1e-12 + n, 2 + n + 0.4 * (-1) ** n])[..., None]
+    y = np.stack([-3 + n, 2 + n])[..., None]
+    fit = fit_arcs(_Fork(), np.ones(1), x, y, unit, unit)
+    assert np.isfinite(fit.cost)
+    np.testing.assert_allclose(np.diff(fit.x, axis=1), fit.p[0], atol=0.2)

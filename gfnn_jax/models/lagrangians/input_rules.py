@@ -118,9 +118,9 @@ def with_delay(bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, interval: 
 
 
 def _held_out(one: Acting, nodes: Sequence[Nodes], sigma: np.ndarray) -> float:
-    """The held-out cost of a fit's structure, in units of σ, the same for all that are compared."""
+    """The held-out cost of a fit, in units of σ, the same for all that are compared."""
     fit = dataclasses.replace(one.fit, sigma=sigma)
-    return float(np.sum(one.bench.cross_validate(nodes, fit, fit.structure, fit.values)))
+    return one.bench.held_out_nearby(nodes, fit)
 
 
 def _correction(here: Acting, interval: float) -> tuple[float, float]:
