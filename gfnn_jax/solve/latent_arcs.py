@@ -14,15 +14,18 @@ not be followed from its first state (multiple shooting; Bock, Springer Ser. Che
 
 c_n the move of x_{n+1} that would close the defect, which makes δx_n a function of δx_0 and δp
 alone. The arc's own δx_0 is eliminated by its own QR; what remains of all arcs are rows for δp.
-Where it converges the defects are zero, and each arc is an orbit of the model. Residuals enter in
-units of the noise through a robust loss (`solve.robust`). The noise may be estimated on the way.
-Where it is not white, a *whitening* (`solve.wander`) mixes residuals along an arc into white ones.
+Where it converges the defects are zero, and each arc is an orbit of the model. A whole step that
+would lower the cost, but leaves defects behind because orbits bend, has these closed by a further
+step of the states alone, before shorter steps are tried (a second-order correction: Nocedal &
+Wright, Numerical Optimization (2006) §15.6). Residuals enter in units of the noise through a robust
+loss (`solve.robust`). The noise may be estimated on the way. Where it is not white, a *whitening*
+(`solve.wander`) mixes residuals along an arc into white ones.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +41,7 @@ _SETTLED = 0.003  # of the noise: a change that needs no further iteration
 # Of the largest pivot, each in units of its column, below which one determines nothing: of an arc
 # of gross errors alone, or of the speed of a body that sticks.
 _LOOSE = 1e-12
+_SWEEPS = 10  # along arcs, to close them
 _HALVINGS = 4  # of a step of arcs that share no coefficients
 _BLOCK_BYTES = 64 * 2**20  # of the sensitivities of a block of arcs
 OUTLYING = 5.0  # standard deviations: a residual beyond does not tell the noise
@@ -117,6 +121,11 @@ def fit_arcs(
         return start.fitted(0, converged=False)
     found = descended(start, _DAMPING, max_iterations)
     last: _AtStates = found.problem
+    if found.stuck and not last.closed(last.here):  # steps that jump, as of a body that sticks
+        again = last.on_orbits()
+        if again.closed(again.here):
+            found = descended(again, _DAMPING, max_iterations)
+            last = found.problem
     converged = found.settled or (found.stuck and last.closed(last.here))
     return last.fitted(found.steps, converged and bool(np.isfinite(last.here.cost)))
 
@@ -193,8 +202,24 @@ class _Data(NamedTuple):
         """The residuals and defects of coefficients p and states x."""
         with np.errstate(all="ignore"):
             defects, observed = evaluated(self.model, p, x)
+        return self._of(p, x, defects, observed, units)
+
+    def _of(
+        self, p: np.ndarray, x: np.ndarray, defects: Defects, observed: Observed, units: _Units
+    ) -> _Iterate:
+        with np.errstate(all="ignore"):
             off = np.where(self.measured, self.known - observed.values, 0.0)
         return _Iterate.at(p, x, defects, observed, self.measured, off, units)
+
+    def moved(self, here: _Iterate, arcs: np.ndarray, x: np.ndarray) -> _Iterate:
+        """The same iterate, but that these arcs (indices, n) have the states x (n, L, m)."""
+        with np.errstate(all="ignore"):
+            found = evaluated(self.model.take(arcs), here.p, x)
+        states = here.x.copy()
+        states[arcs] = x
+        defects = Defects(*map(partial(_replaced, arcs), here.defects, found[0]))
+        observed = Observed(*map(partial(_replaced, arcs), here.observed, found[1]))
+        return self._of(here.p, states, defects, observed, here.units)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,20 +251,33 @@ class _AtStates:
         else:
             there = self._alone(share, dx)
         if self.closed(here):
-            return Tried(there, here.merit * (1 + 1e-9) - there.merit, damping)
+            least = here.merit * (1 + 1e-9)
+            if not failures and there.cost < least < there.merit:  # by its defects alone
+                there = self.data.at(there.p, there.x + _closing(there.defects), here.units)
+            return Tried(there, least - there.merit, damping)
         return Tried(there, (1 - 0.5 * share) * here.gap - there.gap, damping)
+
+    def on_orbits(self) -> _AtStates:
+        """The problem at orbits from the first states as they are: a sweep closes at least one more
+        step of each arc, and where steps bend little all at once."""
+        at = self.here
+        for _ in range(_SWEEPS):
+            at = self.data.at(at.p, at.x + _closing(at.defects), at.units)
+            if self.closed(at):
+                break
+        return _AtStates(self.data, at, at)
 
     def _alone(self, share: float, dx: np.ndarray) -> _Iterate:
         """A step of arcs (A, L, m) each of which takes as much of it as lowers its own merit."""
-        here, shares = self.here, np.full((len(dx), 1, 1), share)
-        for _ in range(_HALVINGS):
-            there = self.data.at(here.p, here.x + shares * dx, here.units)
-            worse = ~(there.merits <= here.merits * (1 + 1e-9))
-            if not worse.any():
-                return there
-            shares[worse] /= 2
-        shares[worse] = 0
-        return self.data.at(here.p, here.x + shares * dx, here.units)
+        here, merits = self.here, self.here.merits * (1 + 1e-9)
+        there = self.data.at(here.p, here.x + share * dx, here.units)
+        for halving in range(1, _HALVINGS + 1):
+            worse = np.flatnonzero(~(there.merits <= merits))
+            if not len(worse):
+                break
+            part = share * 0.5**halving if halving < _HALVINGS else 0.0
+            there = self.data.moved(there, worse, here.x[worse] + part * dx[worse])
+        return there
 
     def moved(self, there: _Iterate, damping: float) -> tuple[_AtStates, bool]:
         """The problem at the end of a step, in units of the noise that its residuals tell; settled
@@ -266,6 +304,12 @@ class _AtStates:
             rows.arcs[:, :, :m], rows.transports, best.cost if self.closed(best) else np.inf,
             iterations, converged,
         )  # fmt: skip
+
+
+def _replaced(arcs: np.ndarray, every: np.ndarray, some: np.ndarray) -> np.ndarray:
+    whole = every.copy()
+    whole[arcs] = some
+    return whole
 
 
 class _Units(NamedTuple):
@@ -405,6 +449,16 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     weight = np.where(at.measured[block], np.sqrt(at.units.loss.weights(at.white[block])), 0.0)
     J *= weight[..., None]
     return J.reshape(num_arcs, length * k, -1), S[:, -1]
+
+
+def _closing(defects: Defects) -> np.ndarray:
+    """δx (A, L, m) that closes the defects, as far as they are linear, behind each first state."""
+    dx = [np.zeros_like(defects.closing[:, 0])]
+    with np.errstate(all="ignore"):
+        for i in range(defects.closing.shape[1]):
+            carried = (defects.by_state[:, i] @ dx[-1][..., None])[..., 0]
+            dx.append(carried + defects.closing[:, i])
+    return np.stack(dx, axis=1)
 
 
 def _solve(rows: _Rows, defects: Defects, damping: float) -> tuple[np.ndarray, np.ndarray]:
