@@ -14,7 +14,7 @@ from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fit import Systems, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_terms import Given
-from gfnn_jax.models.lagrangians.input_rules import choose_again, choose_rule, with_delay
+from gfnn_jax.models.lagrangians.input_rules import choose_rule, with_delay
 from gfnn_jax.models.lagrangians.search import (
     Found,
     SearchOptions,
@@ -34,7 +34,7 @@ def fit_given(
 ) -> Found:  # fmt: skip
     """Fit exactly the terms that are given, with the result of `search.search`. parameters: in
     which the systems of the runs differ, and by which terms may be multiplied."""
-    d, begun = observation.dim, nodes
+    d = observation.dim
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
     systems = Systems.of(parameters, nodes)
     benches = {
@@ -68,12 +68,4 @@ def fit_given(
     else:
         choice = FrictionChoice(given.friction, {}, {}, gains=False)
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
-    acting, period = with_delay(bench, nodes, fit, scales.dt), max(6, round(scales.per_period))
-    last = choose_again(acting, inputs, nodes, period, scales.dt, on_progress)
-    if last.hold == acting.hold:
-        return Found(last, choice, nodes)
-    found = fit_given(
-        given, begun, scales, angles, num_inputs, {last.hold: inputs[last.hold]}, observation,
-        on_progress, options, parameters,
-    )  # fmt: skip
-    return found._replace(acting=found.acting._replace(others=last.others))
+    return Found(with_delay(bench, nodes, fit, scales.dt), choice, nodes)
