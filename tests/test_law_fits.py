@@ -504,7 +504,7 @@ def test_a_recording_is_run_from_file_to_forecasts(tmp_path, capsys):
     assert len(json.loads((out / "report.json").read_text(encoding="utf-8"))["forecasts"]) == 5
 
 
-def test_the_rule_between_samples_is_chosen_again_with_a_law_that_is_known():
+def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     """ẍ = −9 x − 0.3 ẋ + 2 u, u held: a law that was found with u linear in between."""
     rng, dt = np.random.default_rng(2), 0.1
     u, x = np.repeat(rng.normal(size=75), 4), np.zeros((301, 2))
@@ -520,7 +520,7 @@ def test_the_rule_between_samples_is_chosen_again_with_a_law_that_is_known():
         for hold in ("linear", "hold")
     }
     of = {
-        hold: choose_again(one.acting, inputs, one.nodes, 30, samples.scales.dt, print)
+        hold: choose_again(one.acting, inputs, one.nodes, 30, samples.scales.dt)
         for hold, one in found.items()
     }
     assert [one.hold for one in of.values()] == ["hold", "hold"]

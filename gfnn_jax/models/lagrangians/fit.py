@@ -118,26 +118,6 @@ class Without(NamedTuple):
     begins: float
 
 
-class _Thirds(NamedTuple):
-    """Arcs, the third (A,) of the record that each lies in, and the rows (A, L, k, n + 1) of their
-    coefficients and residuals close to a fit."""
-
-    arcs: Arcs
-    third: np.ndarray
-    rows: np.ndarray
-
-    def changes(self) -> dict[int, np.ndarray]:
-        """The change (n,) of the coefficients where a third is left out, by one Gauss–Newton step
-        from the fit to all: close to a fit its residuals are linear in the coefficients."""
-        found = {}
-        for k in np.unique(self.third).tolist():
-            others = self.rows[self.third != k].reshape(-1, self.rows.shape[-1])
-            size = np.maximum(np.linalg.norm(others[:, :-1], axis=0), 1e-300)
-            solved = np.linalg.lstsq(others[:, :-1] / size, others[:, -1], rcond=1e-10)[0]
-            found[k] = solved / size
-        return found
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Workbench:
     """Basis that all fits of one recording share: positions of the gauge, the inputs of arcs, the
@@ -229,27 +209,9 @@ class Workbench:
         return costs
 
     def without_thirds(self, nodes: Sequence[Nodes], fit: LawFit) -> list[Without]:
-        """The fit without each third of the record (`_Thirds`), and where the parts of each third
-        begin."""
-        near = self._thirds(nodes, fit)
-        fits = {}
-        for k, change in near.changes().items():
-            fitted = dataclasses.replace(fit.fitted, p=fit.p + change)
-            fits[k] = dataclasses.replace(fit, fitted=fitted)
-        begun = np.flatnonzero(np.diff(near.third, prepend=-1)).tolist()
-        homes = [(int(near.third[j]), *near.arcs.home[j][:2]) for j in begun]
-        return [Without(fits[k], nodes[i].stretch.run, float(nodes[i].t[a])) for k, i, a in homes]
-
-    def held_out_nearby(self, nodes: Sequence[Nodes], fit: LawFit) -> float:
-        """The cost of each third of the record by the fit without it (`_Thirds`): of a structure
-        that has been fitted `cross_validate` tells the same by six fits more."""
-        near, cost = self._thirds(nodes, fit), 0.0
-        for k, change in near.changes().items():
-            held = near.rows[near.third == k]
-            cost += float(np.sum((held[..., -1] - held[..., :-1] @ change) ** 2))
-        return cost if np.isfinite(cost) else np.inf
-
-    def _thirds(self, nodes: Sequence[Nodes], fit: LawFit) -> _Thirds:
+        """The fit without each third of the record, by one Gauss–Newton step from that to all of
+        it: close to a fit its residuals are linear in the coefficients; where the parts of each
+        third begin."""
         arcs, third = in_thirds(nodes, fit, self.systems)
         noise, scale, loss = (
             fit.sigma * arcs.noise,
@@ -262,9 +224,17 @@ class Workbench:
             known, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, loss=loss, whitening=whitening
         )
         model = self.model(fit.structure, arcs, fit.p, np.arange(len(fit.p)))
-        return _Thirds(
-            arcs, third, rows_of_arcs(model, fit.p, own.x, arcs.y, noise, loss, whitening)
-        )
+        rows = rows_of_arcs(model, fit.p, own.x, arcs.y, noise, loss, whitening)
+        fits = {}
+        for k in np.unique(third).tolist():
+            others = rows[third != k].reshape(-1, rows.shape[-1])
+            size = np.maximum(np.linalg.norm(others[:, :-1], axis=0), 1e-300)
+            change = np.linalg.lstsq(others[:, :-1] / size, others[:, -1], rcond=1e-10)[0] / size
+            fitted = dataclasses.replace(fit.fitted, p=fit.p + change)
+            fits[k] = dataclasses.replace(fit, fitted=fitted)
+        begun = np.flatnonzero(np.diff(third, prepend=-1)).tolist()
+        homes = [(int(third[j]), *arcs.home[j][:2]) for j in begun]
+        return [Without(fits[k], nodes[i].stretch.run, float(nodes[i].t[a])) for k, i, a in homes]
 
     def scores(self, fit: LawFit, candidates: Structure) -> dict[Key, float]:
         """Distance from zero, in standard errors, of each coefficient of ``candidates`` that the

@@ -15,7 +15,7 @@ from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fit import LawFit, Systems, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_terms import Given
-from gfnn_jax.models.lagrangians.input_rules import choose_again, choose_rule
+from gfnn_jax.models.lagrangians.input_rules import choose_rule
 from gfnn_jax.models.lagrangians.search import (
     Found,
     SearchOptions,
@@ -37,7 +37,7 @@ def fit_given(
 ) -> Found:  # fmt: skip
     """Fit exactly the terms that are given, with the result of `search.search`. parameters: in
     which the systems of the runs differ, and by which terms may be multiplied."""
-    d, begun = observation.dim, nodes
+    d = observation.dim
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
     systems = Systems.of(parameters, nodes)
     benches = {
@@ -74,13 +74,4 @@ def fit_given(
         return choose_friction(bench, nodes, fit, tried, on_progress, options)
 
     settled = partial(as_found, bench, scales.dt)
-    found = by_arcs_that_tell(bench, nodes, fit, choose, settled, scales, on_progress, options)
-    period = max(6, round(scales.per_period))
-    last = choose_again(found.acting, inputs, found.nodes, period, scales.dt, on_progress)
-    if last.hold == found.acting.hold:
-        return found._replace(acting=last)
-    found = fit_given(
-        given, begun, scales, angles, num_inputs, {last.hold: inputs[last.hold]}, observation,
-        on_progress, options, parameters,
-    )  # fmt: skip
-    return found._replace(acting=found.acting._replace(others=last.others))
+    return by_arcs_that_tell(bench, nodes, fit, choose, settled, scales, on_progress, options)

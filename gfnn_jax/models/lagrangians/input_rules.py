@@ -9,13 +9,13 @@ with G' the gains of further inputs ∂u(t − τ)/∂τ. So one evaluation of t
 fits best, with its standard error, and how far the coefficients imitate it. It is taken where it is
 significant and held-out arcs gain by it. The rule between samples is that of which held-out arcs
 cost least, each with its own delay: chosen with the first law, whose misfit may hide the choice,
-and again once friction is known.
+and again with the last.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -78,22 +78,19 @@ def choose_rule(
 
 
 def choose_again(
-    known: Acting, inputs: Mapping[str, ArcInputs], nodes: Sequence[Nodes], length: int,
-    interval: float, on_progress: Callable[[str], object],
+    last: Acting, inputs: Mapping[str, ArcInputs], nodes: Sequence[Nodes], length: int,
+    interval: float,
 ) -> Acting:  # fmt: skip
     """The rule between samples (of ``inputs``: rule -> inputs of arcs) that held-out arcs choose
-    with a law that is ``known``: that as it was, where the rule is its own. length: nodes of these
-    arcs; many short ones tell it better than a few long ones."""
+    with the last law: ``last`` as it was, where that is its own. length: nodes of these arcs; many
+    short ones tell it better than a few long ones."""
     if len(inputs) < 2:
-        return known
-    fit = known.fit
-    benches = {hold: dataclasses.replace(known.bench, inputs=of) for hold, of in inputs.items()}
+        return last
+    fit = last.fit
+    benches = {hold: dataclasses.replace(last.bench, inputs=of) for hold, of in inputs.items()}
     arcs = arcs_of(with_states(nodes, fit.arcs, fit.fitted.x), length)
     best = choose_rule(benches, nodes, fit.structure, fit.values, arcs, fit.sigma, interval)
-    if best.hold == known.hold:
-        return known._replace(others=best.others)
-    on_progress(f"inputs {RULES[best.hold]}: held-out arcs choose it with the law found")
-    return best
+    return last._replace(others=best.others) if best.hold == last.hold else best
 
 
 def with_delay(bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, interval: float) -> Acting:
@@ -118,9 +115,9 @@ def with_delay(bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, interval: 
 
 
 def _held_out(one: Acting, nodes: Sequence[Nodes], sigma: np.ndarray) -> float:
-    """The held-out cost of a fit, in units of σ, the same for all that are compared."""
+    """The held-out cost of a fit's structure, in units of σ, the same for all that are compared."""
     fit = dataclasses.replace(one.fit, sigma=sigma)
-    return one.bench.held_out_nearby(nodes, fit)
+    return float(np.sum(one.bench.cross_validate(nodes, fit, fit.structure, fit.values)))
 
 
 def _correction(here: Acting, interval: float) -> tuple[float, float]:

@@ -95,8 +95,7 @@ def search_of_systems(
         return None
     every = everything(angles, num_inputs, observation, options)
     every = _depending(every, fit.structure, (0,) * len(parameters))
-    law = finished(bench, followed, fit, every, scales, on_progress, options)
-    return law._replace(acting=law.acting._replace(others=rule.others))
+    return finished(bench, followed, fit, every, scales, on_progress, options)
 
 
 def _depending(every: Structure, found: Structure, none: tuple[int, ...]) -> Structure:

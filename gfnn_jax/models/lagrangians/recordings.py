@@ -31,7 +31,7 @@ from gfnn_jax.models.lagrangians.given_law import fit_given
 from gfnn_jax.models.lagrangians.given_terms import Given, given_terms
 from gfnn_jax.models.lagrangians.in_use import InUse, Record, best_in_use
 from gfnn_jax.models.lagrangians.in_words import in_words
-from gfnn_jax.models.lagrangians.input_rules import Acting
+from gfnn_jax.models.lagrangians.input_rules import RULES, Acting, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS
 from gfnn_jax.models.lagrangians.next_motion import next_motions
@@ -276,12 +276,21 @@ def _searched(
     elif samples.parameters:
         find = partial(search_of_systems, parameters=samples.parameters)
 
-    found = find(
-        nodes, scales, samples.angles, len(samples.recording.inputs), inputs, samples.observation,
-        on_progress, options,
-    )  # fmt: skip
+    def with_rules(inputs: Mapping[str, ArcInputs]) -> Found | None:
+        return find(
+            nodes, scales, samples.angles, len(samples.recording.inputs), inputs,
+            samples.observation, on_progress, options,
+        )  # fmt: skip
+
+    found = with_rules(inputs)
     if found is None:
         return None
+    period = max(6, round(scales.per_period))
+    acting = choose_again(found.acting, inputs, found.nodes, period, scales.dt)
+    if acting.hold != found.acting.hold:
+        on_progress(f"inputs {RULES[acting.hold]}: held-out arcs choose it with the law found")
+        found = with_rules({acting.hold: inputs[acting.hold]}) or found
+    found = found._replace(acting=found.acting._replace(others=acting.others))
     fit = found.acting.fit
     if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
         raise FitError(NO_LAW)

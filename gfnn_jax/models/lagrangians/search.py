@@ -23,12 +23,7 @@ from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, a_third
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, which_friction
-from gfnn_jax.models.lagrangians.input_rules import (
-    Acting,
-    choose_again,
-    choose_rule,
-    with_delay,
-)
+from gfnn_jax.models.lagrangians.input_rules import Acting, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
 from gfnn_jax.models.lagrangians.text import word_of
@@ -97,7 +92,7 @@ def search(
         return max(6, round(periods * scales.per_period))
 
     linear = libraries.losses(d, (LINEAR,), 0.0)
-    starts, others = [], {}
+    starts = []
     plain = [libraries.textbook(d, angles)]
     if d > 1 and len(angles) == d:
         plain.append(libraries.relative(d, angles))
@@ -119,7 +114,6 @@ def search(
             arcs = arcs_of(nodes, length(options.periods[0]))
             rule = choose_rule(benches, nodes, structure, known, arcs, scales.sigma, scales.dt)
             benches = {rule.hold: rule.bench}  # inputs act so in the other libraries too
-            others = rule.others or others
             starts.append(rule.fit)
             on_progress(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
     if not starts:
@@ -145,14 +139,10 @@ def search(
         if periods == 1:
             fit = grow(bench, nodes, fit, frictions, on_progress, options)
             fit = prune(bench, nodes, fit, on_progress, options)
-            rule = Acting(fit, bench, np.nan, others)
-            rule = choose_again(rule, inputs, nodes, length(1), scales.dt, on_progress)
-            bench, fit, others = rule.bench, rule.fit, rule.others
             fit = grow(bench, nodes, fit, every, on_progress, options)
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
         on_progress(f"{periods:g} periods: {describe(fit)}")
-    found = finished(bench, nodes, fit, every, scales, on_progress, options)
-    return found._replace(acting=found.acting._replace(others=others))
+    return finished(bench, nodes, fit, every, scales, on_progress, options)
 
 
 def everything(
