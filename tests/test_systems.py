@@ -90,6 +90,7 @@ def test_functions_are_products_of_powers():
     np.testing.assert_array_equal(slope, np.zeros((1, 2, 1, 2)))  # and not NaN
     assert functions_tried(np.array([[0.0], [0.5]])) == [(0,), (1,), (2,)]
     assert functions_tried(np.array([[0.5], [1.0]])) == [(0,), (1,), (-1,), (2,), (-2,)]
+    assert (-2, 2) in functions_tried(ARGS)  # l₂²/l₁², of both lengths of a double pendulum
 
 
 def test_a_law_of_one_system_has_plain_coefficients():

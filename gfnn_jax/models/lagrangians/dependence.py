@@ -28,7 +28,8 @@ from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.structure import Key, Structure, with_powers
 from gfnn_jax.models.parameters import keeps_away
 
-_LARGEST, _TOTAL = 2, 3  # powers of one parameter, and of all of them, as of laws of pairs
+# Powers of one parameter, and of all of them: of the lengths of a double pendulum l₂²/l₁² is one.
+_LARGEST, _TOTAL = 2, 4
 _SIGNIFICANT = 4.0  # standard errors of a coefficient that is one more
 _BELOW = 0.5  # of a power, that a negative one counts more
 _STEPS = 8  # of Gauss and Newton
