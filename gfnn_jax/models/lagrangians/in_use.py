@@ -100,8 +100,8 @@ class Record:
             return f"; gains of inputs are the same for all values of {names}"
         if any(map(any, inertia)):
             return (
-                f"; a run determines only ratios of coefficients: of the laws with the same ratios for "
-                f"every {names} this has the fewest terms"
+                f"; a run determines only ratios of coefficients: of the laws with the same ratios "
+                f"for every {names} this has the fewest terms"
             )
         return f"; for every {names}, since a run determines only ratios of coefficients"
 
