@@ -1,4 +1,4 @@
-"""Docstrings of what is public open with a verb or a noun."""
+"""Docstrings open with a verb or a noun."""
 
 import ast
 import re
@@ -16,15 +16,13 @@ FRAGMENTS = {
 
 
 def openings():
-    """List (place, first word) of the docstrings of all modules, classes and public functions."""
+    """List (place, first word) of the docstrings of all modules, classes and functions."""
     for path in sorted(PACKAGE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
                 text = ast.get_docstring(node)
                 word = re.search(r"\w[\w'’]*", text or "")
                 name = getattr(node, "name", "")
-                if name.startswith("_") and not name.startswith("__"):
-                    continue
                 yield f"{path.relative_to(PACKAGE)} {name}", word[0].lower() if word else ""
 
 

@@ -293,7 +293,7 @@ def _separator(path: Path, lines: list[str]) -> tuple[str, str]:
     header = _cells(lines[0], ",")
     if separator == "," and len(_cells(sample[0], ",")) == 2 * len(header) > 2 and share == 1:
         raise InputError(
-            f"{path}: commas between columns and decimal commas cannot be told apart: write "
+            f"{path}: commas between columns and decimal commas cannot be distinguished: write "
             "semicolons between columns, or decimal points"
         )
     return separator, decimal

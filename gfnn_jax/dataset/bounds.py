@@ -16,7 +16,7 @@ def bound_of_mean(square: np.ndarray, block: np.ndarray, worst: int = 2) -> floa
     A sum of squares of errors is near Γ-distributed: the mean times ν / χ²_ν(5 %), with ν = 2
     mean² / variance of the mean (Satterthwaite, Biometrics Bull. 2 (1946) 110). That variance is
     of the blocks' sums; with few blocks it is uncertain itself, and taken as much larger as
-    Student's quantile is than the normal one. NaN from one block alone.
+    Student's quantile is than the normal one. Infinite from one block alone, which has no scatter.
 
     The block of the largest error counts ``worst`` times, for what is rarer than one block in n,
     and worse, may not be among them: an event of probability 3/n is missed by n blocks in 5 % of
@@ -26,7 +26,7 @@ def bound_of_mean(square: np.ndarray, block: np.ndarray, worst: int = 2) -> floa
     sums, counts = np.bincount(block, square), np.bincount(block)
     blocks, largest = len(sums), np.full(worst - 1, np.argmax(sums))
     if blocks < 2 or not np.isfinite(sums).all():
-        return float("nan") if blocks < 2 else float("inf")
+        return float("inf")
     sums, counts = np.append(sums, sums[largest]), np.append(counts, counts[largest])
     rows = counts.sum()
     mean = float(sums.sum() / rows)

@@ -18,7 +18,7 @@ from gfnn_jax.phase_space import Pairs, sizes
 # Of the pairs, those that validate, and again those that test: a part, at least, at most.
 _FRACTION, _FEWEST, _MOST = 0.1, 4, 2_000
 # Fewer pairs than these have none to spare for a test: they state the error by cross-validation.
-FEWEST_TESTED = 60
+_FEWEST_SPLIT = 60
 _PARTS = 4  # blocks that are held out, of one long run
 _OUTSIDE = 0.05  # of the training pairs, by which errors outside the data are measured
 
@@ -57,7 +57,7 @@ def split_rows(pairs: Pairs, seed: int) -> Split:
     """
     rng, count = np.random.default_rng(seed), len(pairs)
     target = max(_FEWEST, int(_FRACTION * count))
-    tested = count >= FEWEST_TESTED
+    tested = count >= _FEWEST_SPLIT
     goes_on = steps_between(pairs) > 0  # from each row to the next
     # Single pairs are stretches of their own.
     if not goes_on.any():

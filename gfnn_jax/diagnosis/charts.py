@@ -72,7 +72,9 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
         return Charts([TYPE1], None, determinants, [])
     beyond = [n for n in near_identity if determinants[n].valid]
     if request == "auto" and beyond:
-        message = _about(beyond[0], determinants[beyond[0]], "is valid only beyond a fold of w", ())
+        message = _about(
+            beyond[0], determinants[beyond[0]], "is used beyond a fold, where w turns back", ()
+        )
         return Charts([CHARTS[beyond[0]]], None, determinants, [message])
     lows = ", ".join(f"{n} {j.sign * j.low:.2g}" for n, j in determinants.items())
     raise FitError(

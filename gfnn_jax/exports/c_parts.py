@@ -181,8 +181,8 @@ static int newton(const struct equation *of, const double *z, double *x, double 
         }}
         const double bent = largest(n, off)/fmax(largest(n, slope), merit);
         for (int i = 0; i < n; i++) {{
-            const double told = here.residual[i] + 0.5*factor*(slope[i] - here.residual[i]);
-            off[i] = there.residual[i] - told;
+            const double expected = here.residual[i] + 0.5*factor*(slope[i] - here.residual[i]);
+            off[i] = there.residual[i] - expected;
         }}
         const double floor = FLOOR*largest(n, there.size);
         const int near = largest(n, off) <= {off}*factor*merit + {floors}*floor;

@@ -23,7 +23,7 @@ from gfnn_jax.fitting.gauss_newton import FlowFit
 from gfnn_jax.learn.conclude import not_met
 from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.learn.refit_rows import RowsOfRefit, fitted_piece
-from gfnn_jax.learn.stated import FEWEST_TESTED
+from gfnn_jax.learn.stated import FEWEST_RUNS_TESTED
 from gfnn_jax.maps.saved import packed, unpacked
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.hamiltonians.formula import Term, formula
@@ -136,7 +136,7 @@ def refit(
         if found.map is not None:
             after = worker.error(found.map, held, tolerance).rms
             # Test pairs of few runs did not state the sample's error either, which then stands.
-            few = test.run is not None and len(np.unique(test.run)) < FEWEST_TESTED
+            few = test.run is not None and len(np.unique(test.run)) < FEWEST_RUNS_TESTED
             candidate = old if few else with_error(old, worker.error(found.map, test, tolerance))
             chosen = dataclasses.replace(candidate, map=found.map, train_rms=found.train_rms)
             num_pairs = found.count

@@ -1,9 +1,9 @@
-"""The error that a fit states: that of the chosen map, on pairs that chose nothing.
+"""The error that a fit states: that of the chosen map, on pairs that determined no coefficient.
 
 The test rows are looked at here for the first time, after everything is chosen, and once. Where
 they are of few runs, or the pairs were too few to keep some apart, the chosen model is fitted anew
-without each fifth of the runs in turn, and errs on that fifth: one run says nothing of the
-amplitudes of the others.
+without each fifth of the runs in turn, and errs on that fifth: one run knows nothing of the
+amplitudes of the others. Some of these pairs have chosen the size, and `Stated.words` adds that.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.hamiltonians.work import work_of_refit
 
 _FOLDS = 5
-FEWEST_TESTED = 10  # runs that state the error for all others
+FEWEST_RUNS_TESTED = 10  # runs that state the error for all others
 # Times the median that an RMS error is, which few of the states then make, as close passages do:
 # Gaussian errors have 1.5, those of polynomials over a box up to 5, beside three bodies 46. And the
 # part of the tolerance above which that matters.
@@ -69,7 +69,10 @@ class Stated(NamedTuple):
         if self.by == "test":
             return f"{count} that took no part in the fit or its choices"
         if self.by == "cross-validation":
-            return f"{count}, each predicted by a fit without its fifth (cross-validation)"
+            return (
+                f"{count}, each predicted by a fit without its fifth (cross-validation); some of "
+                "them chose the model's size"
+            )
         return f"{count} that also chose the model"
 
 
@@ -77,7 +80,7 @@ def stated(chosen: Chosen, found: Searched, budget: Budget) -> Stated:
     """The chosen candidate with its error on the test rows, or by cross-validation over runs where
     these are of few runs, or over blocks of time where all pairs are."""
     data = found.data
-    if count_of_runs(data, data.test) >= FEWEST_TESTED:
+    if count_of_runs(data, data.test) >= FEWEST_RUNS_TESTED:
         return _stated(chosen, found, "test", data.test, _images_of(chosen, found, data.test))
     everyone = np.concatenate([data.training, data.validation, data.test])
     by_runs = count_of_runs(data, everyone) >= FEWEST_RUNS

@@ -79,7 +79,8 @@ class Search:
         )
         self._entries: list[Entry] = []
         self._best = [np.inf] * len(sweeps)
-        self._ratio = [1.0 / _CALIBRATED] * len(sweeps)  # of a step's error to its estimate
+        # Of a step's error to its estimate, by sweep; None until a step has been looked at.
+        self._ratio: list[float | None] = [None] * len(sweeps)
         self._beaten, self._stalled = [0] * len(sweeps), [0] * len(sweeps)
         self._left: set[int] = set()
         # (order, bound) of the estimates
@@ -121,7 +122,9 @@ class Search:
         # Something to keep should the search be interrupted is worth a few more looks.
         keep = self._on_validated is not None and relative < _KEPT * self._kept
         self._kept = min(self._kept, relative) if keep else self._kept
-        if keep or self._ratio[i] * estimated.validation_bound <= _WITHIN_REACH * self._bound:
+        known = self._ratio[i]
+        ratio = 1.0 / _CALIBRATED if known is None else known
+        if keep or ratio * estimated.validation_bound <= _WITHIN_REACH * self._bound:
             entry = self._validated(entry)
             error = entry.candidate.validation_relative
             if np.isfinite(error) and relative > 0:
@@ -162,7 +165,7 @@ class Search:
 
     @property
     def _ratios(self) -> list[float]:
-        return [_known(r) for r in self._ratio]
+        return [1.0 if r is None else r for r in self._ratio]
 
     def found(self) -> Found:
         """Gather what there is; where nothing meets the tolerance, with the few best validated."""
@@ -180,8 +183,8 @@ class Search:
     def _validate_the_best(self) -> None:
         """The few best of the entries, validated: one at least, whatever the budget."""
         best = _finalists([e for e in self._entries if not e.candidate.validated])
-        for first, entry in zip((True, *[False] * len(best)), best, strict=False):
-            if first:
+        for place, entry in enumerate(best):
+            if place == 0:
                 work = entry.sweep.work_of_steps(entry.size)
                 with self._budget.free(SOLVE, work):
                     free = Budget()
@@ -194,11 +197,6 @@ class Search:
                 self._validated(entry)
             except OutOfTime:
                 return
-
-
-def _known(ratio: float) -> float:
-    """The ratio of a step's error to its estimate, 1 until a step has been looked at."""
-    return 1.0 if ratio == 1.0 / _CALIBRATED else ratio
 
 
 def _decays(errors, ratio: list[float]) -> list[Decay | None]:
@@ -248,10 +246,10 @@ def _promised(
     return f"; extrapolated, {sweeps[i].at(order)} would meet the tolerance"
 
 
-def _calibrated(entry: Entry, ratio: float) -> Entry:
+def _calibrated(entry: Entry, ratio: float | None) -> Entry:
     """The entry with its estimate multiplied by the ratio that its sweep has shown, if any."""
     candidate = entry.candidate
-    if candidate.validated or ratio == 1.0 / _CALIBRATED:
+    if candidate.validated or ratio is None:
         return entry
     return entry._replace(
         candidate=dataclasses.replace(

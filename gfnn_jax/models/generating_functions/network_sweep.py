@@ -1,4 +1,8 @@
-"""A sweep of one size: S as a network, trained by Levenberg–Marquardt."""
+"""A sweep of one size: S as a network, trained by Levenberg–Marquardt.
+
+Its weights θ minimise the same loss as the coefficients of a linear family, the mean of
+‖h ∇S(θ, w) + J (Z − z)‖² (paper, eq. (3)), which is not quadratic in θ.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""Size sweeps: the sizes of one family in one chart, estimated from a factor that they share."""
+"""Size sweeps: the sizes of one family in one chart, estimated from a factor that they share.
+
+S = Σ c_j φ_j(w) makes the map Z − z = h J ∇S(w), w between z and Z as the chart has it (paper,
+eq. (4)). Its coefficients minimise the mean of ‖h ∇S(w) + J (Z − z)‖² over the training pairs
+(eq. (3)): `dataset.rows` makes the rows of this linear problem, `fitting.least_squares` solves it
+for every size. The residual of the validation pairs estimates the error of a size.
+"""
 
 from __future__ import annotations
 

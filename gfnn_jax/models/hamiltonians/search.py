@@ -1,5 +1,8 @@
 """Learn H: the Hamiltonian whose flow over dt maps z₀ to z₁, as a formula of few terms.
 
+H = Σ c_j φ_j(z), and c minimises the mean of ‖Φ_h(z₀; c) − z₁‖² over the pairs, Φ_h the flow of
+ż = J ∇H over h = dt by Gauss collocation (`fitting.gauss_newton`, from linear starts).
+
 Libraries of terms are tried by rising size, each from the one before, until one meets the
 tolerance; where there are angles, one library grows mode by mode. Terms that are nothing but noise
 go while the held-out error does not rise.

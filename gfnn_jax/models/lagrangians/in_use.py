@@ -89,7 +89,7 @@ class Record:
         return InUse(bench, fit, choice, law, covariance, moving, root, scale, gauge, calibration)
 
     def _of_systems(self, law: Lagrangian) -> str:
-        """What fixes the scale of L in each run, where these are of different systems."""
+        """Clause on what fixes the scale of L in each run, where these are of different systems."""
         if law.powers is None:
             return ""
         names = ", ".join(parameters_of(self.recording))
@@ -100,10 +100,10 @@ class Record:
             return f"; gains of inputs are the same for all values of {names}"
         if any(map(any, inertia)):
             return (
-                f"; a run tells ratios of coefficients alone, and of laws with the same ratios for "
-                f"every {names} this has the fewest terms"
+                f"; a run determines only ratios of coefficients: of the laws with the same ratios "
+                f"for every {names} this has the fewest terms"
             )
-        return f"; for every {names}, since a run tells ratios of coefficients alone"
+        return f"; for every {names}, since a run determines only ratios of coefficients"
 
     def sensors(self, bench: Workbench, fit: LawFit) -> Sensors:
         """The sensors, as yet without a misfit."""

@@ -257,8 +257,9 @@ class Matching:
 
     @staticmethod
     def _parts(residual, own: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(what of the residual lies along each column without what ``own`` spans of it, 0 where
-        little of it is left; the length of that). Columns are without the base already."""
+        """Return the residual's components along the columns without what ``own`` spans of them, 0
+        where little of a column is left, and the lengths that are left. Columns are without the
+        base already."""
         size = np.sqrt(np.maximum(1 - np.sum((own.T @ columns) ** 2, axis=0), 0.0))
         large = size > _INDEPENDENT
         return np.where(large, residual @ columns / np.where(large, size, 1.0), 0.0), size
