@@ -1,14 +1,15 @@
 """One law of recordings whose runs differ in a parameter: whether it is the one that was put in.
 
-    python benchmarks/parameters.py            every system (some two minutes)
+    python benchmarks/parameters.py            every system (some ten minutes)
     python benchmarks/parameters.py --quick    two of them, one size of the noise
 
 Each system is integrated by SciPy from its own equations of motion, a run for each value of a
 length or of an added mass, and noise is added to its positions, of 1e-4 to 1e-2 of their spread.
 Counted are fits whose terms, with their functions of the parameter, and whose kinds of friction are
-those put in, and coefficients within three standard errors. Then runs of values that no fit has
-seen, one between the others and one a tenth beyond, are forecast from their first third: the error
-beside the noise, and the share within two standard deviations.
+those put in, and coefficients within three standard errors. Then runs of two values that no fit
+has seen, one between the others and one a tenth beyond, are forecast from their first third: the
+error beside the noise, and the share within two standard deviations. They are several, from starts
+and with noise of their own, for all of a forecast is as far off as its first state.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from twins import WITHIN, plain
 import gfnn_jax as gfnn
 
 NOISES = (1e-4, 1e-3, 1e-2)  # of the spread
-DRAWS = 1  # of the noise
+DRAWS = 5  # of the noise
+AHEAD = 4  # runs that are forecast, of each value
 G = 9.81
 
 
@@ -145,7 +147,8 @@ def orbits(name: str, values: tuple[float, ...]) -> tuple[np.ndarray, ...]:
 def recording(name: str, values: tuple[float, ...], noise: float, seed: int) -> gfnn.Recording:
     """Positions of a run of each value, with noise that is a share of the spread of the runs that
     are learned from."""
-    family, rng, tables = FAMILIES[name], np.random.default_rng(seed), []
+    family, tables = FAMILIES[name], []
+    rng = np.random.default_rng([seed, NOISES.index(noise)])
     t, found = np.arange(0, family.end, family.dt), orbits(name, values)
     spread = np.concatenate(orbits(name, family.values), axis=1).std(axis=1)
     for k, (q, value) in enumerate(zip(found, values, strict=True)):
@@ -196,19 +199,19 @@ def case(name: str, noise: float, draw: int) -> Numbers:
 
 
 def forecast(name: str, fit: Any, value: float, noise: float, seed: int) -> Numbers:
-    """The last two thirds of a run of this value from its first third: RMS error in units of the
+    """The last two thirds of runs of this value from their first third: RMS error in units of the
     noise, and the share of samples within two standard deviations."""
-    family, new = FAMILIES[name], recording(name, (value,), noise, seed)
+    family, new = FAMILIES[name], recording(name, (value,) * AHEAD, noise, seed)
     t = new.times("0")
     cut = family.end / 3
     found = fit.map.forecast(new.slice(stop=cut), t[t > cut], new if family.gain else None)
-    error, sigma, inside = [], [], []
-    for k, column in enumerate(family.names):
-        error.append(found.values[column][0] - new.values(column, "0")[t > cut])
-        inside.append(np.abs(error[-1]) <= 2 * found.std[column][0])
-        sigma.append(np.asarray(fit.map.sensors.sigma)[k])
-    size = np.sqrt(np.mean((np.array(error) / np.array(sigma)[:, None]) ** 2))
-    return {"error": float(size), "within": float(np.mean(inside))}
+    error, inside = [], []
+    for column, sigma in zip(family.names, fit.map.sensors.sigma, strict=True):
+        seen = np.array([new.values(column, run)[t > cut] for run in new.runs])
+        off = found.values[column] - seen
+        error.append(off / sigma)
+        inside.append(np.abs(off) <= 2 * found.std[column])
+    return {"error": float(np.sqrt(np.mean(np.square(error)))), "within": float(np.mean(inside))}
 
 
 def measured(name: str, quick: bool) -> Numbers:
