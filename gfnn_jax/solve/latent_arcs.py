@@ -14,12 +14,9 @@ not be followed from its first state (multiple shooting; Bock, Springer Ser. Che
 
 c_n the move of x_{n+1} that would close the defect, which makes δx_n a function of δx_0 and δp
 alone. The arc's own δx_0 is eliminated by its own QR; what remains of all arcs are rows for δp.
-Where it converges the defects are zero, and each arc is an orbit of the model. A whole step that
-would lower the cost, but leaves defects behind because orbits bend, has these closed by a further
-step of the states alone, before shorter steps are tried (a second-order correction: Nocedal &
-Wright, Numerical Optimization (2006) §15.6). Residuals enter in units of the noise through a robust
-loss (`solve.robust`). The noise may be estimated on the way. Where it is not white, a *whitening*
-(`solve.wander`) mixes residuals along an arc into white ones.
+Where it converges the defects are zero, and each arc is an orbit of the model. Residuals enter in
+units of the noise through a robust loss (`solve.robust`). The noise may be estimated on the way.
+Where it is not white, a *whitening* (`solve.wander`) mixes residuals along an arc into white ones.
 """
 
 from __future__ import annotations
@@ -41,7 +38,6 @@ _SETTLED = 0.003  # of the noise: a change that needs no further iteration
 # Of the largest pivot, each in units of its column, below which one determines nothing: of an arc
 # of gross errors alone, or of the speed of a body that sticks.
 _LOOSE = 1e-12
-_SWEEPS = 10  # along arcs, to close them
 _HALVINGS = 4  # of a step of arcs that share no coefficients
 _BLOCK_BYTES = 64 * 2**20  # of the sensitivities of a block of arcs
 OUTLYING = 5.0  # standard deviations: a residual beyond does not tell the noise
@@ -121,11 +117,6 @@ def fit_arcs(
         return start.fitted(0, converged=False)
     found = descended(start, _DAMPING, max_iterations)
     last: _AtStates = found.problem
-    if found.stuck and not last.closed(last.here):  # steps that jump, as of a body that sticks
-        again = last.on_orbits()
-        if again.closed(again.here):
-            found = descended(again, _DAMPING, max_iterations)
-            last = found.problem
     converged = found.settled or (found.stuck and last.closed(last.here))
     return last.fitted(found.steps, converged and bool(np.isfinite(last.here.cost)))
 
@@ -251,21 +242,8 @@ class _AtStates:
         else:
             there = self._alone(share, dx)
         if self.closed(here):
-            least = here.merit * (1 + 1e-9)
-            if not failures and there.cost < least < there.merit:  # by its defects alone
-                there = self.data.at(there.p, there.x + _closing(there.defects), here.units)
-            return Tried(there, least - there.merit, damping)
+            return Tried(there, here.merit * (1 + 1e-9) - there.merit, damping)
         return Tried(there, (1 - 0.5 * share) * here.gap - there.gap, damping)
-
-    def on_orbits(self) -> _AtStates:
-        """The problem at orbits from the first states as they are: a sweep closes at least one more
-        step of each arc, and where steps bend little all at once."""
-        at = self.here
-        for _ in range(_SWEEPS):
-            at = self.data.at(at.p, at.x + _closing(at.defects), at.units)
-            if self.closed(at):
-                break
-        return _AtStates(self.data, at, at)
 
     def _alone(self, share: float, dx: np.ndarray) -> _Iterate:
         """A step of arcs (A, L, m) each of which takes as much of it as lowers its own merit."""
@@ -449,16 +427,6 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     weight = np.where(at.measured[block], np.sqrt(at.units.loss.weights(at.white[block])), 0.0)
     J *= weight[..., None]
     return J.reshape(num_arcs, length * k, -1), S[:, -1]
-
-
-def _closing(defects: Defects) -> np.ndarray:
-    """δx (A, L, m) that closes the defects, as far as they are linear, behind each first state."""
-    dx = [np.zeros_like(defects.closing[:, 0])]
-    with np.errstate(all="ignore"):
-        for i in range(defects.closing.shape[1]):
-            carried = (defects.by_state[:, i] @ dx[-1][..., None])[..., 0]
-            dx.append(carried + defects.closing[:, i])
-    return np.stack(dx, axis=1)
 
 
 def _solve(rows: _Rows, defects: Defects, damping: float) -> tuple[np.ndarray, np.ndarray]:
