@@ -41,6 +41,38 @@ def test_states_at_the_rim_are_told_from_gross_errors(at_rim, monkeypatch):
     assert gross_errors._at_the_rim(found, rows) is at_rim
 
 
+@pytest.mark.parametrize(
+    ("off", "unsolved", "follows"), [(1e-3, (), True), (1.0, (), False), (1e-3, (1,), False)]
+)
+def test_states_at_the_rim_are_kept_where_the_map_of_the_others_is_lost_there(
+    off, unsolved, follows, monkeypatch
+):
+    """All pairs err by 1e-3; two of 100 pairs without which the map errs there by ``off``."""
+    z = np.linspace(-1, 1, 200).reshape(100, 2)
+
+    class Data(types.SimpleNamespace):
+        def __len__(self):
+            return 100
+
+    candidate = types.SimpleNamespace(validation_bound=1e-3)
+    entry = types.SimpleNamespace(
+        sweep=types.SimpleNamespace(piece=lambda size: None, data=None), size=3, candidate=candidate
+    )
+    data = Data(pairs=Pairs(z, z, 0.1), user_angles=(), spread=np.ones(2))
+    found = types.SimpleNamespace(
+        data=data, tolerance=types.SimpleNamespace(relative=True),
+        found=types.SimpleNamespace(ranking=[entry]),
+    )  # fmt: skip
+
+    def stepped(map_, z0, dt, args, timed):
+        failed = np.isin(np.arange(len(z0)), unsolved)
+        return types.SimpleNamespace(images=z0 + off, failed=failed)
+
+    monkeypatch.setattr(gross_errors, "composed", lambda piece, data: None)
+    monkeypatch.setattr(gross_errors, "stepped", stepped)
+    assert gross_errors._follows(found, found, np.array([0, 99])) is follows
+
+
 def test_copies_are_found_whatever_the_sign_of_a_zero():
     rng = np.random.default_rng(0)
     z0, z1 = rng.normal(size=(2, 1_000, 4))

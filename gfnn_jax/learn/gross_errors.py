@@ -20,8 +20,10 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.budget import FLOW
+from gfnn_jax.candidates.assemble import composed, stepped
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import error_of_each
 from gfnn_jax.diagnosis.diagnosis import Diagnosis
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.diagnose import diagnose_request
@@ -112,7 +114,8 @@ def without_gross_errors(request: Request, diagnosis: Diagnosis, found: Searched
                 rms = _rms(left.sizes())
             if not rms <= rise * _rms(size[others]):
                 break
-        if at_rim and left is not None:  # the tolerance is missed without these exact pairs too
+        # These pairs are exact: without them the tolerance is to be met, and no more lost there.
+        if at_rim and (left is not None or not _follows(found, again, rows)):
             break
         named = found.data.row[rows]
         wrong, rim = (wrong, np.append(rim, named)) if at_rim else (np.append(wrong, named), rim)
@@ -210,6 +213,19 @@ def _at_the_rim(found: Searched, rows: np.ndarray) -> bool:
             apart = differ[rows] > _DIFFER * np.median(differ[others])
             return bool(np.mean(more & apart) > 0.5)
     return False
+
+
+def _follows(found: Searched, again: Searched, rows: np.ndarray) -> bool:
+    """Return whether the steps of the map that was found again, without these rows, are solved
+    there, and err there by no more than the map before did over all pairs, added up."""
+    entry = again.found.ranking[0]
+    map_ = composed(entry.sweep.piece(entry.size), entry.sweep.data)
+    pairs = found.data.pairs.take(rows)
+    steps = stepped(map_, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
+    images = np.where(steps.failed[:, None], np.nan, steps.images)
+    error = error_of_each(found.data, found.tolerance, images, rows)
+    before = found.found.ranking[0].candidate.validation_bound
+    return bool(np.sum(error**2) <= len(found.data) * before**2)
 
 
 def _far(size: np.ndarray) -> np.ndarray:
