@@ -291,8 +291,7 @@ def _searched(
         on_progress(f"inputs {RULES[acting.hold]}: held-out arcs choose it with the law found")
         found = with_rules({acting.hold: inputs[acting.hold]}) or found
     found = found._replace(acting=found.acting._replace(others=acting.others))
-    fit = found.acting.fit
-    if not np.all(np.isfinite(fit.p)) or not np.isfinite(fit.fitted.cost):
+    if not found.follows:
         raise FitError(NO_LAW)
     return found
 

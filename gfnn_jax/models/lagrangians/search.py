@@ -68,6 +68,12 @@ class Found(NamedTuple):
     nodes: list[Nodes]
     shorter: Found | None = None
 
+    @property
+    def follows(self) -> bool:
+        """Whether orbits of the law follow all arcs."""
+        fit = self.acting.fit
+        return bool(np.all(np.isfinite(fit.p)) and np.isfinite(fit.fitted.cost))
+
 
 def search(
     nodes: Sequence[Nodes],
@@ -130,6 +136,7 @@ def search(
     every = everything(angles, num_inputs, observation, options)
     frictions = dataclasses.replace(every, terms=every.terms[:1])
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+    reached = [(nodes, fit)]
     for periods in options.periods[1:]:
         longer = to_longer_arcs(bench, nodes, fit, length(periods))
         if longer is None:
@@ -141,7 +148,12 @@ def search(
             fit = grow(bench, nodes, fit, every, on_progress, options)
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
         on_progress(f"{periods:g} periods: {describe(fit)}")
-    return finished(bench, nodes, fit, every, scales, on_progress, options)
+        reached.append((nodes, fit))
+    for nodes, fit in reversed(reached):
+        found = finished(bench, nodes, fit, every, scales, on_progress, options)
+        if found.follows:
+            break  # else its friction leaves it without an orbit along these arcs
+    return found
 
 
 def everything(
