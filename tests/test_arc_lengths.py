@@ -1,17 +1,18 @@
 """Lengths of arcs: those that tell a law's coefficients best, where unknown forces act."""
 
+import dataclasses
 from functools import partial
 
 import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
+from gfnn_jax.dataset.stretches import arcs_of, measure, nodes_of, stretches
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.given_law import fit_given
 from gfnn_jax.models.lagrangians.given_terms import given_terms
-from gfnn_jax.models.lagrangians.search import SearchOptions, search
+from gfnn_jax.models.lagrangians.search import SearchOptions, search, to_longer_arcs
 
 GIVEN = given_terms(
     ["w1**2 + w1*w2*cos(q1 - q2) + w2**2 + cos(q1) + cos(q2)", "R: w1**2 + w2**2"],
@@ -74,6 +75,26 @@ def test_longer_arcs_tell_more_where_the_law_is_all_that_acts():
     found = searched(swung(0.0))
     assert found.shorter is None
     np.testing.assert_allclose(pulls_of(found), PULLS, rtol=2e-3)
+
+
+@pytest.mark.parametrize(("longest", "followed"), [(np.inf, True), (40, False)])
+def test_arcs_that_no_orbit_follows_are_not_taken(longest, followed):
+    """Of a law whose orbits end after some nodes longer arcs cost infinitely much."""
+
+    @dataclasses.dataclass
+    class Bench:
+        def fit(self, structure, known, arcs, sigma):
+            cost = 1.0 if arcs.t.shape[1] <= longest else np.inf
+            fitted = dataclasses.make_dataclass("Fitted", ["cost"])(cost)
+            return dataclasses.make_dataclass(
+                "Fit", ["structure", "values", "sigma", "arcs", "fitted"]
+            )(structure, known, sigma, arcs, fitted)
+
+    found = stretches(swung(0.0, runs=1))
+    nodes = nodes_of(found, measure(found))
+    begun = Bench().fit(None, {}, arcs_of(nodes, 20), np.ones(2))
+    longer = to_longer_arcs(Bench(), nodes, begun, 80)
+    assert (longer is not None and longer.arcs.t.shape[1] > 40) == followed
 
 
 @pytest.mark.parametrize("search", [search, partial(fit_given, GIVEN)])

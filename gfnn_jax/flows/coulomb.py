@@ -21,14 +21,18 @@ A direction that sticks has lost the error of its speed.
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 
 import numpy as np
 
+from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.flows.motion import NODES, Form, Rates, Step, coulomb_rows
 from gfnn_jax.solve.linear import among
 
 _EVENTS = 64  # of a lane in one substep, after which it has no solution
 _HALVINGS = 40  # of a step, to the root of its cubic
+_OTHERS = np.array([np.delete(NODES, j) for j in range(6)])  # nodes beside each node (6, 5)
+_APART = NODES[:, None] - _OTHERS
 
 
 def step(
@@ -66,7 +70,7 @@ class _Motion:
     p: np.ndarray
     order: int
 
-    @property
+    @cached_property
     def directions(self) -> np.ndarray:
         """c (F, d)."""
         rows = coulomb_rows(self.form.friction)
@@ -83,12 +87,20 @@ class _Motion:
 
     def rates(self, lanes, x, modes, u) -> Rates:
         """The rates of some lanes in these modes."""
-        form, p = self._of(lanes)
+        form, law = self._of(lanes)
         d = form.dim
-        return form.accelerate(form.lagrangian(p), x[:, :d], x[:, d:], u, 0, modes)
+        return form.accelerate(law, x[:, :d], x[:, d:], u, 0, modes)
 
-    def _of(self, lanes: np.ndarray) -> tuple[Form, np.ndarray]:
-        return self.form.take(lanes), self.p[lanes] if self.p.ndim > 1 else self.p
+    @cached_property
+    def _law(self) -> Lagrangian:
+        return self.form.lagrangian(self.p)
+
+    def _of(self, lanes: np.ndarray) -> tuple[Form, Lagrangian]:
+        """The form and the law of some lanes."""
+        form = self.form.take(lanes)
+        if form is self.form and self.p.ndim == 1:
+            return form, self._law
+        return form, form.lagrangian(self.p[lanes] if self.p.ndim > 1 else self.p)
 
     def begin(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """The modes in which states start."""
@@ -113,7 +125,9 @@ class _Motion:
             if done.any():
                 now = _within(now, done[lanes], np.ones(len(lanes)))
             before, mode = x[lanes], modes[lanes]
-            new, moved, first = self._smooth(lanes, before, D[lanes], left * h[lanes], now, mode)
+            new, moved, first = self._smooth(
+                lanes, before, D[lanes], left * h[lanes], now, mode, self.order
+            )
             part = np.ones(len(lanes))
             speeds = self.speeds(before) * mode, self.speeds(new) * mode
             speeds[1][turned[lanes]] = 0
@@ -129,13 +143,14 @@ class _Motion:
                 part[open_] = shares
                 cut, event = open_[shares < 1], event[shares < 1]
             if len(cut):
-                some, start = lanes[cut], (before[cut], D[lanes[cut]])
-                for _ in range(2):  # the root of the cubic, and one step of Newton's from it
+                some, k = lanes[cut], (np.arange(len(cut)), event)
+                for order in (0, self.order):  # the root of the cubic, and Newton's step from it
                     inside = _within(now[cut], np.zeros(len(cut)), part[cut])
                     span = part[cut] * left[cut] * h[some]
-                    at, by, _ = self._smooth(some, *start, span, inside, mode[cut])
+                    at, by, _ = self._smooth(
+                        some, before[cut], D[some], span, inside, mode[cut], order
+                    )
                     rates = self.rates(some, at, mode[cut], inside[:, -1])
-                    k = np.arange(len(cut)), event
                     slope = _turning((rates.a @ self.directions.T)[k], mode[cut][k])
                     short = self.speeds(at)[k] / slope / (left[cut] * h[some])
                     part[cut] = np.clip(part[cut] - short, 0, 1)
@@ -149,9 +164,10 @@ class _Motion:
         x[lanes] = np.nan
         return x, D, modes
 
-    def _smooth(self, lanes, x, D, h, u, modes):
-        form, p = self._of(lanes)
-        return form.substep(form.lagrangian(p), x, D, h, u, self.order, modes)
+    def _smooth(self, lanes, x, D, h, u, modes, order):
+        form, law = self._of(lanes)
+        D = D if order else D[..., :0]
+        return form.substep(law, x, D, h, u, order, modes)
 
     def _changed(self, lanes, x, D, modes, event, u, before, slope):
         """States, derivatives and modes where the direction ``event`` (n,) changes its own, speeds
@@ -172,8 +188,8 @@ class _Motion:
     def _impulse(self, lanes, x, modes, speeds):
         """The change of velocities (n, d, m) that takes away the speeds (n, F, m) of directions
         that stick."""
-        form, p = self._of(lanes)
-        masses, c = form.lagrangian(p).masses(x[:, : form.dim]), self.directions
+        form, law = self._of(lanes)
+        masses, c = law.masses(x[:, : form.dim]), self.directions
         pushed = np.linalg.solve(masses, np.broadcast_to(c.T, (len(x), *c.T.shape)))
         return pushed @ among(modes == 0, c @ pushed, speeds)
 
@@ -210,11 +226,7 @@ def _within(u: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Inputs u (n, 6, k) at the nodes of the part of a step from ``begin`` to ``end`` (n,), by the
     polynomial through those at the nodes of the whole."""
     at = begin[:, None] + (end - begin)[:, None] * NODES
-    weights = np.ones((len(u), 6, 6))
-    for j, node in enumerate(NODES):
-        for other in np.delete(NODES, j):
-            weights[:, :, j] *= (at - other) / (node - other)
-    return weights @ u
+    return np.prod((at[..., None, None] - _OTHERS) / _APART, axis=-1) @ u
 
 
 def _first(modes, before, after, slope_before, slope_after, spare_before, spare_after):

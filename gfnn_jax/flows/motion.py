@@ -158,11 +158,14 @@ class Form:
         inverse = np.linalg.inv(masses) if d > 1 else 1 / masses
         a = np.einsum("nij,nj->ni", inverse, force)
         held, c = law.losses[..., dry] * pull[:, dry], directions[dry].astype(float)
-        stuck = np.zeros((1, 0)) if modes is None else modes == 0
-        moved = inverse @ c.T  # (N, d, F)
-        if stuck.any():
-            holding = among(stuck, c @ moved, (a @ c.T)[..., None])
-            a, held = a - (moved @ holding)[..., 0], held + holding[..., 0]
+        stuck = np.zeros((len(a), 0)) if modes is None else modes == 0
+        holds = np.flatnonzero(stuck.any(axis=1))
+        if len(holds):
+            moved = inverse[holds] @ c.T  # (n, d, F)
+            holding = among(stuck[holds], c @ moved, np.broadcast_to(c, (len(holds), *c.shape)))
+            forces = (holding @ a[holds, :, None])[..., 0]
+            a[holds] -= (moved @ forces[..., None])[..., 0]
+            held[holds] += forces
         if not order:
             return Rates(a, np.zeros((*a.shape, 0)), held)
         push = (a @ A.reshape(-1, d).T).reshape(df.shape)
@@ -179,8 +182,11 @@ class Form:
             by_v = by_v + gamma[..., None] * masses
         columns = [by_q, by_v]
         if order > 1:
-            rows = push * f[..., None] + dg * along[..., None] - g[..., None] * df
-            rows = rows + gamma[..., None] * (f[..., None] * dg)
+            rows, part = push * f[..., None], dg * along[..., None]
+            rows += part
+            rows -= np.multiply(g[..., None], df, out=part)
+            if even.any():
+                rows += gamma[..., None] * np.multiply(f[..., None], dg, out=part)
             columns.append(rows.swapaxes(1, 2) @ self.basis)
             by_losses = np.empty((len(v), d, len(even)))
             by_losses[..., ~even] = (pull[..., None] * directions).swapaxes(1, 2)
@@ -191,8 +197,8 @@ class Form:
             pushed = -u[:, None, None, :] * np.eye(d)[:, :, None]
             columns.append(pushed.reshape(len(v), d, -1))
         by = -inverse @ np.concatenate(columns, axis=-1)
-        if stuck.any():
-            by = by - moved @ among(stuck, c @ moved, c @ by)
+        if len(holds):
+            by[holds] -= moved @ (holding @ by[holds])
         return Rates(a, by, held)
 
     def step(
@@ -221,11 +227,12 @@ class Form:
         (N, 6, inputs) at its nodes, and the rates at its begin; ``order`` and ``modes`` as of
         `accelerate`."""
         d, every, rates, slopes = self.dim, [], [], []
-        h, wide = h[:, None], h[:, None, None]
+        h, wide, part = h[:, None], h[:, None, None], np.empty_like(D)
         for i in range(6):
-            xi, Di = x, D
+            xi, Di = x, D.copy()
             for j in np.flatnonzero(_A[i]):
-                xi, Di = xi + _A[i, j] * h * rates[j], Di + _A[i, j] * wide * slopes[j]
+                xi = xi + _A[i, j] * h * rates[j]
+                Di += np.multiply(_A[i, j] * wide, slopes[j], out=part)
             now = self.accelerate(law, xi[:, :d], xi[:, d:], u[:, i], order, modes)
             every.append(now)
             slope = np.empty_like(D)
@@ -235,8 +242,10 @@ class Form:
                 slope[:, d:, 2 * d :] += now.by[..., 2 * d :]
             rates.append(np.concatenate([xi[:, d:], now.a], axis=1))
             slopes.append(slope)
+        D = D.copy()
         for i in np.flatnonzero(WEIGHTS):
-            x, D = x + WEIGHTS[i] * h * rates[i], D + WEIGHTS[i] * wide * slopes[i]
+            x = x + WEIGHTS[i] * h * rates[i]
+            D += np.multiply(WEIGHTS[i] * wide, slopes[i], out=part)
         return x, D, every[0]
 
 

@@ -65,6 +65,9 @@ class PositionArcs:
         by_state = np.broadcast_to(np.eye(m), (*x.shape, m))
         return Observed(x, by_state, np.broadcast_to(0.0, (*x.shape, len(p))))
 
+    def take(self, arcs: np.ndarray) -> PositionArcs:
+        return self
+
 
 def nodes_of(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Arcs of positions (A, L + 1, d) as nodes: their states (A, L, 2d), which the readings

@@ -303,6 +303,9 @@ class _Windows:
         shown = self.law.sensors.observation_model(x)
         return shown._replace(by_coefficients=shown.by_coefficients[..., :0])
 
+    def take(self, arcs: np.ndarray) -> _Windows:
+        return dataclasses.replace(self, h=self.h[arcs], u=self.u[arcs])
+
 
 def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
     """(q, v, b) (B, m) at the last sample of each window, and its covariance (B, m, m) in the law:

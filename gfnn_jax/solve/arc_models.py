@@ -38,6 +38,10 @@ class Model(Protocol):
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed: ...
 
+    def take(self, arcs: np.ndarray) -> Model:
+        """The same model of some of the arcs (indices)."""
+        ...
+
 
 def observed_whole(x: np.ndarray, coefficients: int) -> Observed:
     """The states themselves, g(x; p) = x."""
@@ -51,6 +55,9 @@ class Known:
 
     model: Model
     p: np.ndarray
+
+    def take(self, arcs: np.ndarray) -> Known:
+        return Known(self.model.take(arcs), self.p)
 
 
 def evaluated(model: Model | Known, p: np.ndarray, x: np.ndarray) -> tuple[Defects, Observed]:

@@ -22,7 +22,7 @@ Where it is not white, a *whitening* (`solve.wander`) mixes residuals along an a
 from __future__ import annotations
 
 import dataclasses
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -193,8 +193,24 @@ class _Data(NamedTuple):
         """The residuals and defects of coefficients p and states x."""
         with np.errstate(all="ignore"):
             defects, observed = evaluated(self.model, p, x)
+        return self._of(p, x, defects, observed, units)
+
+    def _of(
+        self, p: np.ndarray, x: np.ndarray, defects: Defects, observed: Observed, units: _Units
+    ) -> _Iterate:
+        with np.errstate(all="ignore"):
             off = np.where(self.measured, self.known - observed.values, 0.0)
         return _Iterate.at(p, x, defects, observed, self.measured, off, units)
+
+    def moved(self, here: _Iterate, arcs: np.ndarray, x: np.ndarray) -> _Iterate:
+        """The same iterate, but that these arcs (indices, n) have the states x (n, L, m)."""
+        with np.errstate(all="ignore"):
+            found = evaluated(self.model.take(arcs), here.p, x)
+        states = here.x.copy()
+        states[arcs] = x
+        defects = Defects(*map(partial(_replaced, arcs), here.defects, found[0]))
+        observed = Observed(*map(partial(_replaced, arcs), here.observed, found[1]))
+        return self._of(here.p, states, defects, observed, here.units)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,15 +247,15 @@ class _AtStates:
 
     def _alone(self, share: float, dx: np.ndarray) -> _Iterate:
         """A step of arcs (A, L, m) each of which takes as much of it as lowers its own merit."""
-        here, shares = self.here, np.full((len(dx), 1, 1), share)
-        for _ in range(_HALVINGS):
-            there = self.data.at(here.p, here.x + shares * dx, here.units)
-            worse = ~(there.merits <= here.merits * (1 + 1e-9))
-            if not worse.any():
-                return there
-            shares[worse] /= 2
-        shares[worse] = 0
-        return self.data.at(here.p, here.x + shares * dx, here.units)
+        here, merits = self.here, self.here.merits * (1 + 1e-9)
+        there = self.data.at(here.p, here.x + share * dx, here.units)
+        for halving in range(1, _HALVINGS + 1):
+            worse = np.flatnonzero(~(there.merits <= merits))
+            if not len(worse):
+                break
+            part = share * 0.5**halving if halving < _HALVINGS else 0.0
+            there = self.data.moved(there, worse, here.x[worse] + part * dx[worse])
+        return there
 
     def moved(self, there: _Iterate, damping: float) -> tuple[_AtStates, bool]:
         """The problem at the end of a step, in units of the noise that its residuals tell; settled
@@ -266,6 +282,12 @@ class _AtStates:
             rows.arcs[:, :, :m], rows.transports, best.cost if self.closed(best) else np.inf,
             iterations, converged,
         )  # fmt: skip
+
+
+def _replaced(arcs: np.ndarray, every: np.ndarray, some: np.ndarray) -> np.ndarray:
+    whole = every.copy()
+    whole[arcs] = some
+    return whole
 
 
 class _Units(NamedTuple):

@@ -83,6 +83,9 @@ class GeneratedOnArcs:
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         return observed_whole(x, 0 if self.along is None else self.along.num_parameters)
 
+    def take(self, arcs: np.ndarray) -> GeneratedOnArcs:
+        return dataclasses.replace(self, moves=self.moves[arcs])
+
     def _of_states(self, width: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """(∂w, ∂g) in z, and in Z, (2d, 2d) each."""
         first = second = eye = np.eye(width)

@@ -72,6 +72,9 @@ class FlowOnArcs:
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         return observed_whole(x, len(p))
 
+    def take(self, arcs: np.ndarray) -> FlowOnArcs:
+        return dataclasses.replace(self, moves=self.moves[arcs])
+
     def images(self, p: np.ndarray, z: np.ndarray, direction: int = 1) -> np.ndarray:
         """Images of states z (n, 2d), a step ahead or back."""
         self.allowance.check()

@@ -73,3 +73,7 @@ class LawOnArcs:
             values[..., channel] += whole[k]
             by[..., channel, k] = 1.0
         return Observed(values, shown.by_state, by[..., self.free])
+
+    def take(self, arcs: np.ndarray) -> LawOnArcs:
+        args = None if self.args is None else self.args[arcs]
+        return dataclasses.replace(self, h=self.h[arcs], u=self.u[arcs], args=args)

@@ -24,6 +24,7 @@ from gfnn_jax.models.lagrangians.search import (
     choose_friction,
     describe,
     frictions_tried,
+    to_longer_arcs,
 )
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.weak_start import weak_start
@@ -59,11 +60,11 @@ def fit_given(
     on_progress(f"{options.periods[0]:g} periods: {describe(fit)}")
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     for periods in options.periods[1:]:
-        arcs = arcs_of(nodes, max(6, round(periods * scales.per_period)))
-        if arcs.t.shape == fit.arcs.t.shape:
-            break  # no run is longer
-        fit = bench.fit(structure, fit.values, arcs, fit.sigma)
-        nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
+        length = max(6, round(periods * scales.per_period))
+        longer = to_longer_arcs(bench, nodes, fit, length)
+        if longer is None:
+            break
+        nodes, fit = with_zeros_of_runs(bench, nodes, longer, on_progress)
         on_progress(f"{periods:g} periods: {describe(fit)}")
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
 

@@ -138,11 +138,10 @@ def search(
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     reached = [(nodes, fit)]
     for periods in options.periods[1:]:
-        arcs = arcs_of(nodes, length(periods))
-        if arcs.t.shape == fit.arcs.t.shape:
-            break  # no run is longer
-        fit = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
-        nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
+        longer = to_longer_arcs(bench, nodes, fit, length(periods))
+        if longer is None:
+            break
+        nodes, fit = with_zeros_of_runs(bench, nodes, longer, on_progress)
         if periods == 1:
             fit = grow(bench, nodes, fit, frictions, on_progress, options)
             fit = prune(bench, nodes, fit, on_progress, options)
@@ -270,6 +269,18 @@ def arcs_by_length(
         known, sigma, nodes = fit.values, fit.sigma, with_states(nodes, arcs, fit.fitted.x)
     assert fit is not None  # there is a length
     return fit, nodes
+
+
+def to_longer_arcs(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, length: int
+) -> LawFit | None:
+    """The same structure fitted to arcs of this length (nodes); None where no run is longer, or
+    where no orbit of the law follows one of them."""
+    arcs = arcs_of(nodes, length)
+    if arcs.t.shape == fit.arcs.t.shape:
+        return None
+    longer = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
+    return longer if np.isfinite(longer.fitted.cost) else None
 
 
 def describe(fit: LawFit) -> str:

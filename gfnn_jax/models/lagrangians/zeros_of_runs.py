@@ -135,3 +135,6 @@ class _ByRun:
             values=shown.values + more @ p[len(self.law.free) :],
             by_coefficients=np.concatenate([shown.by_coefficients, more], axis=-1),
         )
+
+    def take(self, arcs: np.ndarray) -> _ByRun:
+        return dataclasses.replace(self, law=self.law.take(arcs), runs=self.runs[arcs])

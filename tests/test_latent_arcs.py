@@ -1,0 +1,39 @@
+"""Gauss–Newton over arcs: how many evaluations of a model it takes."""
+
+import numpy as np
+
+from gfnn_jax.solve.arc_models import Defects, Observed
+from gfnn_jax.solve.latent_arcs import fit_arcs
+
+
+class _Still:
+    """A state x that does not move, of which arctan x is seen. ``sizes``: of each evaluation, in
+    arcs."""
+
+    def __init__(self, sizes, arcs=None):
+        self.sizes, self.arcs = sizes, arcs
+
+    def take(self, arcs):
+        return _Still(self.sizes, arcs)
+
+    def defects(self, p, x):
+        self.sizes.append((len(x), None if self.arcs is None else self.arcs.tolist()))
+        shape = (len(x), x.shape[1] - 1, 1)
+        return Defects(x[:, :-1] - x[:, 1:], np.ones((*shape, 1)), np.zeros((*shape, 0)))
+
+    def observe(self, p, x):
+        by_state = 1 / (1 + x**2)
+        return Observed(np.arctan(x), by_state[..., None], np.zeros((*x.shape, 0)))
+
+
+def test_of_arcs_that_share_nothing_only_those_are_halved_that_got_worse():
+    """From 3 a whole step to arctan x = 0 goes to −9.5, from 0.1 to −7e-4."""
+    sizes, start = [], np.array([0.1, 3.0, -0.2])
+    x, unit = np.tile(start[:, None, None], (1, 4, 1)), np.ones(1)
+    fit = fit_arcs(_Still(sizes), np.zeros(0), x, 0 * x, unit, unit, tolerance=1e-12)
+    assert fit.converged
+    np.testing.assert_allclose(fit.x, 0, atol=1e-6)
+    assert {arcs[0] for size, arcs in sizes if size == 1} == {1}
+    assert {size for size, _ in sizes} == {1, 3}
+    alone = fit_arcs(_Still([]), np.zeros(0), x[1:2], 0 * x[1:2], unit, unit, tolerance=1e-12)
+    np.testing.assert_allclose(fit.x[1], alone.x[0], atol=1e-9)
