@@ -70,7 +70,7 @@ class Found(NamedTuple):
 
     @property
     def follows(self) -> bool:
-        """Whether orbits of the law follow all arcs."""
+        """Return whether orbits of the law follow all arcs."""
         fit = self.acting.fit
         return bool(np.all(np.isfinite(fit.p)) and np.isfinite(fit.fitted.cost))
 
