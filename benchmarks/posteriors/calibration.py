@@ -205,8 +205,8 @@ class Cell:
 def cells(row: dict[str, Any]) -> list[Cell | str]:
     """Cells of a row, or the reason why there is none.
 
-    The reason is "roundoff", which no posterior describes, "large" errors at the last step, or ""
-    without a posterior.
+    The reason is "roundoff", which no posterior describes, "large" errors at the last step, where
+    all predictions may be lost, or "" without a posterior.
     """
     if "coverage" not in row:
         return [""] * len(STEPS)
@@ -218,6 +218,7 @@ def cells(row: dict[str, Any]) -> list[Cell | str]:
             STEPS, *(row[k] for k in ("coverage", "coverage_error", "width", "rms")), strict=True
         )
     ]  # fmt: skip
-    if not row["relative"][-1] < SMALL:
+    last = row["relative"][-1]
+    if last is None or not last < SMALL:
         found[-1] = "large"
     return found
