@@ -327,7 +327,7 @@ def test_a_map_without_all_images_is_still_given(monkeypatch):
     from gfnn_jax.dataset import measured_error
 
     def failing(error, spread, tolerance, block=None, worst=2):
-        return measured_error.OneStepError(np.inf, np.inf, np.inf, np.full(2, np.inf))
+        return measured_error.OneStepError(np.inf, np.inf, np.inf, np.full(2, np.inf), np.inf)
 
     monkeypatch.setattr(measured_error, "one_step_error", failing)
     with pytest.warns(gfnn.FitWarning, match="leaves held-out states without an image"):

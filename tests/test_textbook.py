@@ -3,6 +3,10 @@
 Truths are closed formulas integrated by SciPy; derivatives are held against finite differences.
 """
 
+import sys
+from pathlib import Path
+
+import jax
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -30,6 +34,10 @@ from gfnn_jax.models.textbook.matching import Matching, orthonormal
 from gfnn_jax.models.textbook.search import Textbook
 from gfnn_jax.models.textbook.shapes import constants_for, has_constant, kinds_for, values
 from gfnn_jax.phase_space import apply_j, sizes
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+from posteriors.calibration import pendulum
 
 
 def pairs_of(gradient, z0, dt=0.1):
@@ -355,6 +363,13 @@ def test_noise_is_no_formula():
 
 
 # In a fit
+
+
+def test_a_law_is_found_where_sums_with_spare_atoms_leave_roundoff_too():
+    # Of these pairs every sum of five atoms that holds cos q leaves roundoff, and no fewer are met.
+    pairs = gfnn.sample_pairs(pendulum(), 100, jax.random.key(29))
+    fit = gfnn.fit(pairs, seed=29, learn="hamiltonian", max_seconds=None)
+    assert fit.formula == "0.5*p1**2 - cos(q1)"
 
 
 def test_a_fit_told_nothing_finds_keplers_law():

@@ -46,13 +46,15 @@ class OneStepError(NamedTuple):
 
     rms: RMS per component. relative: the RMS over coordinates of error ÷ spread. deviations: (2d,)
     the RMS in each coordinate. bound: the upper 95 % bound in the tolerance's measure
-    (`dataset.bounds`). All infinite where a step fails.
+    (`dataset.bounds`). typical: the median over states of the RMS over coordinates of
+    error ÷ spread, which few states do not make. All infinite where a step fails.
     """
 
     rms: float
     relative: float
     bound: float
     deviations: np.ndarray
+    typical: float
 
 
 def measured_error(data: Dataset, tolerance: Tolerance, images, rows=None) -> OneStepError:
@@ -99,16 +101,18 @@ def one_step_error(
     (N,) which of them depend on each other; None: none do. worst: as of `bounds.bound_of_mean`."""
     if not np.isfinite(error).all():
         width = error.shape[1]
-        return OneStepError(np.inf, np.inf, np.inf, np.full(width, np.inf))
+        return OneStepError(np.inf, np.inf, np.inf, np.full(width, np.inf), np.inf)
     squares = error**2
     deviations = np.sqrt(squares.mean(axis=0))
-    measured = np.mean(squares / spread**2 if tolerance.relative else squares, axis=1)
+    by_state = np.mean(squares / spread**2, axis=1)
+    measured = by_state if tolerance.relative else np.mean(squares, axis=1)
     bound = bound_of_mean(measured, np.arange(len(measured)) if block is None else block, worst)
     return OneStepError(
         float(np.sqrt(squares.mean())),
-        float(np.sqrt(np.mean(squares / spread**2))),
+        float(np.sqrt(np.mean(by_state))),
         float(np.sqrt(bound)),
         deviations,
+        float(np.sqrt(np.median(by_state))),
     )
 
 
@@ -116,4 +120,4 @@ def estimated_error(data: Dataset, tolerance: Tolerance, relative: float) -> One
     """The error of a step that a relative residual of the gradient lets expect."""
     rms = relative * float(np.sqrt(np.mean(data.spread**2)))
     bound = relative if tolerance.relative else rms
-    return OneStepError(rms, relative, bound, relative * data.spread)
+    return OneStepError(rms, relative, bound, relative * data.spread, relative)

@@ -211,7 +211,7 @@ class Textbook:
             whole = sorted((matching.refined(b) for b in blocks), key=lambda m: m.left)
             tried += [m for m in whole if m.left < 10 * tried[0].left][:2]
             states = [s for m in tried for s in [self._converged(m, target)] if s is not None]
-            exact = [s for s in states if self._is_exact(s)]
+            exact = [s for s in map(self._without_spare, states) if self._is_exact(s)]
             if exact:
                 return min(exact, key=lambda s: complexity_of(s.match.atoms))
             if not states:
@@ -222,6 +222,13 @@ class Textbook:
                 break
             target, last, self._closest = best.target, best.law.left, best
         return None
+
+    def _without_spare(self, state: _State) -> _State:
+        """The law without the atoms that it does not need, where it leaves roundoff: beside spare
+        atoms no law is told from an approximation, because no residual is below roundoff."""
+        if state.law.left > OPTIONS.roundoff or self._is_exact(state):
+            return state
+        return self._fewer(state, 3 * OPTIONS.roundoff)
 
     def _is_exact(self, state: _State) -> bool:
         """Return whether the law is as exact as no approximation of so many numbers would be."""
