@@ -20,6 +20,7 @@ from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.bounds import bound_of_mean
 from gfnn_jax.dataset.measured_error import (
+    FEW,
     FEWEST_RUNS,
     Tolerance,
     clusters,
@@ -37,10 +38,7 @@ from gfnn_jax.models.hamiltonians.work import work_of_refit
 
 _FOLDS = 5
 FEWEST_RUNS_TESTED = 10  # runs that state the error for all others
-# Times the median that an RMS error is, which few of the states then make, as close passages do:
-# Gaussian errors have 1.5, those of polynomials over a box up to 5, beside three bodies 46. And the
-# part of the tolerance above which that matters.
-_OF_FEW, _MATTERS = 10.0, 0.01
+_MATTERS = 0.01  # of the tolerance: an error above it, that few states make, is told
 _NINE_OF_TEN = 0.97  # quantile of the rows that bounds the one at 90 %, of some hundred rows
 # Numbers of the states at which a flow's own steps are measured, and times that the worst counts.
 _NUMBERS, _WORST = 8_192, 3
@@ -134,7 +132,7 @@ def of_few(errors: np.ndarray, tolerance: Tolerance) -> str:
     """Warning where few of these errors (n,) make their RMS: then it has no bound that n of them
     tell (the variance of a heavy tail is infinite), and a quantile is stated beside it."""
     rms = float(np.sqrt(np.mean(errors**2)))
-    if not _OF_FEW * np.median(errors) < rms < np.inf or rms < _MATTERS * tolerance.bound:
+    if not FEW * np.median(errors) < rms < np.inf or rms < _MATTERS * tolerance.bound:
         return ""
     return (
         f"few states make most of the error: nine of ten err by less than "

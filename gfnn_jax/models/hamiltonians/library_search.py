@@ -16,7 +16,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
+from gfnn_jax.dataset.measured_error import FEW, OneStepError, Tolerance, measured_error
 from gfnn_jax.dataset.structures import Bodies
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
@@ -170,24 +170,28 @@ def _searched(
     best = best._replace(stalled=poor == most_poor)
     if best.error.bound <= bound:
         return best, options
-    best = simplest_that_errs_least(tried, best, tolerance)
+    best = simplest_where_few_decide(tried, best, tolerance, options)
     found, options = _simplest_within_noise(tried, best, options)
     return (found._replace(stalled=True) if found.noisy else found), options
 
 
-def simplest_that_errs_least(
-    tried: Sequence[FittedLaw], best: FittedLaw, tolerance: Tolerance
+def simplest_where_few_decide(
+    tried: Sequence[FittedLaw], best: FittedLaw, tolerance: Tolerance, options: LawOptions
 ) -> FittedLaw:
-    """The first and simplest of the libraries that the held-out states do not tell from the best:
-    its error lies below the best's 95 % bound, and it errs no more at most states. Few states, as
-    of a close passage, may make all of an RMS, and then chance decides which is lowest."""
+    """The first and simplest of the libraries whose error lies below the 95 % bound of the best's,
+    where few held-out states make that, as in a close passage: chance decides there which is
+    lowest. At most states the best must not have helped either. Elsewhere the best."""
+
+    def measured(found: FittedLaw) -> float:
+        return found.error.relative if tolerance.relative else found.error.rms
 
     def as_good(found: FittedLaw) -> bool:
-        error = found.error.relative if tolerance.relative else found.error.rms
-        return error <= best.error.bound and found.error.typical <= best.error.typical
+        helped = best.error.typical < options.gained * found.error.typical
+        return measured(found) <= best.error.bound and not helped
 
-    simplest = next((f for f in tried if as_good(f)), best)
-    return simplest._replace(stalled=best.stalled)
+    if not FEW * best.error.typical < measured(best):
+        return best
+    return next(filter(as_good, tried), best)._replace(stalled=best.stalled)
 
 
 def _simplest_within_noise(
