@@ -2,6 +2,6 @@
 
 import sys
 
-from gfnn_jax.cli import main
+from gfnn_jax.cli import process
 
-sys.exit(main())
+sys.exit(process())

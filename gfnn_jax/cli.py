@@ -18,7 +18,13 @@ from typing import Any
 from gfnn_jax import processes
 from gfnn_jax.cli_columns import column_options, masses, names_roles
 from gfnn_jax.cli_parser import fit_options, parser
-from gfnn_jax.cli_process import Terminated, set_up_jax, stopped_by_sigterm, warnings_in_one_line
+from gfnn_jax.cli_process import (
+    Terminated,
+    collect_garbage_seldom,
+    set_up_jax,
+    stopped_by_sigterm,
+    warnings_in_one_line,
+)
 from gfnn_jax.cli_summary import print_status, print_summary, print_table
 from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.errors import InputError, WorkError
@@ -30,6 +36,12 @@ _TO_BEGIN = (
     "try `gfnn run two-body --quick`, or with your own pairs `gfnn fit DATA.npz --out MODEL`; "
     "`gfnn --help` says more"
 )
+
+
+def process() -> int:
+    """Run the command line of this process, and return its exit status."""
+    collect_garbage_seldom()
+    return main()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

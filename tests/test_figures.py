@@ -67,7 +67,9 @@ def test_every_figure_is_labelled_saved_and_leaves_matplotlib_as_it_was(name, tm
     assert axes[-1].get_xlabel()
     assert name == "sections" or all(ax.get_legend() is not None for ax in axes)
     figure = axes[0].figure
+    was = figure.canvas, figure.dpi, figure.get_layout_engine()
     figures.save(figure, tmp_path / "figure.png")
+    assert (figure.canvas, figure.dpi, figure.get_layout_engine()) == was
     drawn, size = figure.get_tightbbox(), figure.get_size_inches()
     assert (drawn.min >= 0).all(), "a label is cut off"
     assert (drawn.max <= size).all(), "a label is cut off"
