@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -54,7 +53,7 @@ from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.scene import Scene
 from gfnn_jax.solve.robust import Biweight, SoftL1
 from gfnn_jax.solve.wander import Wander
-from gfnn_jax.storage.checkpoints import load_description, load_model, save_model
+from gfnn_jax.storage.checkpoints import load_model, save_model
 from gfnn_jax.storage.outputs import ensure_new
 
 _TYPES: dict[str, type] = {
@@ -183,9 +182,8 @@ def unpacked(arrays: dict[str, np.ndarray], scene: Scene | None = None) -> Sympl
 
 
 def record(folder) -> dict[str, Any]:
-    """Load the record that was saved beside a map. Raises InputError where the folder is damaged or
-    of another format."""
-    return load_description(folder)["record"]
+    """Load the record that was saved beside a map. Raises InputError as `load` does."""
+    return load_model(folder)[1]["record"]
 
 
 def digest(folder) -> str:
@@ -195,15 +193,13 @@ def digest(folder) -> str:
 
 def versions() -> dict[str, str | None]:
     """Versions of the packages that a result depends on; None for one that is not installed."""
-    return {package: _version(package) for package in _PACKAGES}
-
-
-@cache  # a search saves its best map several times
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+    found: dict[str, str | None] = {}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = None
+    return found
 
 
 def _features(map_: SymplecticMap) -> list:

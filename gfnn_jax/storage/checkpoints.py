@@ -61,12 +61,6 @@ def load_model(folder) -> tuple[dict[str, Any], dict[str, Any]]:
     return tree, record["description"]
 
 
-def load_description(folder) -> dict[str, Any]:
-    """Load the description alone. Raises InputError where anything is missing or changed, the
-    arrays too, or is of another format."""
-    return _verified(Path(folder))["description"]
-
-
 class TrainingCheckpoints:
     """Store of the last two checkpoints of a training, in ``folder/step_...``.
 
@@ -178,8 +172,8 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
         (new / _SUMS).write_text("".join(sums), encoding="utf-8")
 
 
-def _verified(folder: Path) -> dict[str, Any]:
-    """Read the content of ``model.json``; verify it and the files of the arrays."""
+def _read(folder: Path, like: Any = None) -> tuple[Any, dict[str, Any]]:
+    """Read the tree, with NumPy leaves, and the content of ``model.json``; verify both."""
     with failures_as_work_errors(folder):
         restore_interrupted(folder)
     if not folder.is_dir():
@@ -198,12 +192,7 @@ def _verified(folder: Path) -> dict[str, Any]:
             raise Damaged(f"{other}; or damaged: {error}") from error
         raise InputError(other)
     _verify_files(folder)
-    return json.loads((folder / _JSON).read_bytes())
-
-
-def _read(folder: Path, like: Any = None) -> tuple[Any, dict[str, Any]]:
-    """Read the tree, with NumPy leaves, and the content of ``model.json``; verify both."""
-    record = _verified(folder)
+    record = json.loads((folder / _JSON).read_bytes())
     try:
         stored = _orbax().restore((folder / "arrays").absolute()) if _any_stored(record) else {}
         leaves = [_restored(folder, entry, stored) for entry in record["leaves"]]
