@@ -3,6 +3,7 @@ and against exact solutions."""
 
 import numpy as np
 import scipy.integrate
+import scipy.optimize
 
 from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Terms
 from gfnn_jax.flows import coulomb
@@ -74,6 +75,28 @@ def test_directions_without_friction_do_not_hold_bodies_that_others_hold():
     np.testing.assert_allclose(step.states, x, atol=1e-15)
     np.testing.assert_array_equal(modes[:, :2], 0)
     assert np.isfinite(step.by_coefficients).all()
+
+
+def test_bodies_are_held_where_frictions_together_can_hold_them():
+    """Against linear programming: λ of three directions, |λ| ≤ ρ, that balance the springs. Of the
+    third, the difference of the two others, ρ is small; from speeds of roundoff it turned without
+    end."""
+    rng, c = np.random.default_rng(1), np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 1.0]])
+    losses, terms = np.array([0.3, 0.2, 0.02]), [*TERMS, ((1, 1), (0, 0), (0, 0), 0.0)]
+    rows = [(tuple(map(int, row)), DRY, 0.0) for row in c]
+    form, p = blocks(rows, losses, 0.0, terms, np.append(SPRINGS, 0.3))
+    q = rng.uniform(-0.3, 0.3, (300, 2))
+    bounds = np.stack([-losses, losses], axis=1)
+    held = np.array([
+        scipy.optimize.linprog(np.zeros(3), A_eq=c.T, b_eq=force, bounds=bounds).success
+        for force in q @ [[-2.0, 1.0], [1.0, -2.0]]
+    ])  # fmt: skip
+    assert 0.2 < held.mean() < 0.8
+    for speed in (0.0, 1e-18, 1e-17):
+        x = np.concatenate([q, speed * rng.normal(size=q.shape)], axis=1)
+        states = coulomb.step(form, p, x, np.full(300, 0.1), np.zeros((300, 1, 6, 1)))[0].states
+        np.testing.assert_array_equal(np.abs(states - x).max(axis=1) < 1e-12, held)
+        assert np.isfinite(states).all()
 
 
 def test_an_input_moves_a_body_once_it_is_strong_enough():

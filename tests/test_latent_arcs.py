@@ -37,3 +37,33 @@ def test_of_arcs_that_share_nothing_only_those_are_halved_that_got_worse():
     assert {size for size, _ in sizes} == {1, 3}
     alone = fit_arcs(_Still([]), np.zeros(0), x[1:2], 0 * x[1:2], unit, unit, tolerance=1e-12)
     np.testing.assert_allclose(fit.x[1], alone.x[0], atol=1e-9)
+
+
+class _Rising:
+    """A state x that does not move, of which −x + p n is seen at the sample n, and 10⁶ x + p n
+    below zero."""
+
+    def take(self, arcs):
+        return self
+
+    def defects(self, p, x):
+        shape = (len(x), x.shape[1] - 1, 1)
+        return Defects(x[:, :-1] - x[:, 1:], np.ones((*shape, 1)), np.zeros((*shape, 1)))
+
+    def observe(self, p, x):
+        n = np.broadcast_to(np.arange(x.shape[1])[None, :, None], x.shape)
+        slope = np.where(x > 0, -1.0, 1e6)
+        return Observed(slope * x + p * n, slope[..., None], n[..., None].astype(float))
+
+
+def test_an_arc_that_no_step_makes_better_holds_back_no_other():
+    """Of the first arc 1 is seen, which no state shows: from 1e-6 each step leads below zero. The
+    others tell p = 0.7, as they would alone."""
+    x = np.tile(np.array([1e-6, *5 * [0.5]])[:, None, None], (1, 4, 1))
+    y = np.broadcast_to(0.7 * np.arange(4)[None, :, None], x.shape) - 1
+    y[0] += 2
+    unit = np.ones(1)
+    fit = fit_arcs(_Rising(), np.zeros(1), x, y, 0.01 * unit, 0.01 * unit)
+    np.testing.assert_allclose(fit.p, 0.7, rtol=1e-3)
+    np.testing.assert_allclose(fit.x[1:], 1.0, rtol=1e-3)
+    np.testing.assert_array_equal(fit.x[0], x[0])

@@ -1,6 +1,7 @@
 """From simulated positions to the law: the engine, the start, the search, forecasts and files."""
 
 import json
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -28,11 +29,11 @@ from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate, 
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.recordings import _samples
-from gfnn_jax.models.lagrangians.search import search
+from gfnn_jax.models.lagrangians.search import _likeliest, search, search_on
 from gfnn_jax.models.lagrangians.text import WhichFriction, speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.arc_models import Defects, Observed
-from gfnn_jax.solve.latent_arcs import fit_arcs, rows_of_arcs
+from gfnn_jax.solve.latent_arcs import SOFT_L1, fit_arcs, rows_of_arcs
 
 
 def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):
@@ -527,6 +528,36 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     assert of["hold"].fit is found["hold"].acting.fit  # chosen before: as it was
     assert set(of["hold"].others) == {"linear", "band"}
     assert min(of["hold"].others.values()) > 1.5
+    on = search_on(of["linear"], found["linear"].nodes, samples.scales, (), 1)
+    assert on.acting.hold == "hold"
+    p, error = on.acting.fit.p, np.sqrt(np.diag(on.acting.fit.covariance()))
+    # L = ½ẋ² − 4.5 x², R = 0.3 ½ẋ², in the order of the terms, the losses and the gain.
+    np.testing.assert_array_less(np.abs(p - [-4.5, 0.3, 2.0]), 4 * error)
+    np.testing.assert_allclose(p, found["hold"].acting.fit.p, atol=2 * error.max())
+
+
+def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():
+    """By residuals and how many coefficients they took, in the noise of the last; friction that
+    drives, or an arc that no orbit follows, is not taken."""
+    rng, x = np.random.default_rng(0), np.zeros((1, 200, 2))
+    noise = rng.normal(size=(1, 200, 1))
+
+    def fit(size, losses, sigma=1.0, cost=1.0):
+        friction = tuple(((1,), kind, 0.0) for kind in range(len(losses)))
+        values = {("loss", row): loss for row, loss in zip(friction, losses, strict=True)}
+        return SimpleNamespace(
+            values=values, structure=SimpleNamespace(friction=friction), sigma=np.array([sigma]),
+            p=np.array(losses), correlation=2.0, arcs=SimpleNamespace(y=x[..., :1]),
+            fitted=SimpleNamespace(residuals=size * noise / sigma, cost=cost),
+        )  # fmt: skip
+
+    bench = SimpleNamespace(observation=SimpleNamespace(loss=SOFT_L1))
+    drives, lost, two = fit(0.5, [0.3, -0.1]), fit(0.4, [0.1], cost=np.inf), fit(1.0, [0.2, 0.1])
+    one, last = fit(1.001, [0.2], sigma=3.0), fit(1.2, [0.3])
+    tried = [(each, None) for each in (drives, lost, two, one, last)]
+    assert _likeliest(bench, tried)[0] is one
+    assert _likeliest(bench, [(two, None), (last, None)])[0] is two
+    assert _likeliest(bench, [(drives, None), (lost, None)])[0] is lost  # none can be: the last
 
 
 def test_the_gain_of_a_band_limited_input_has_no_bias():

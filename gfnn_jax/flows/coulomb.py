@@ -30,6 +30,7 @@ from gfnn_jax.flows.motion import NODES, Form, Rates, Step, coulomb_rows
 from gfnn_jax.solve.linear import among
 
 _EVENTS = 64  # of a lane in one substep, after which it has no solution
+_APART_FROM = 1e-6  # of a direction, left of others that it depends on
 _HALVINGS = 40  # of a step, to the root of its cubic
 _OTHERS = np.array([np.delete(NODES, j) for j in range(6)])  # nodes beside each node (6, 5)
 _APART = NODES[:, None] - _OTHERS
@@ -131,7 +132,7 @@ class _Motion:
             )
             part = np.ones(len(lanes))
             speeds = self.speeds(before) * mode, self.speeds(new) * mode
-            speeds[1][turned[lanes]] = 0
+            speeds[1][turned[lanes] | self._carried(mode)] = 0
             open_ = np.flatnonzero(np.any((speeds[1] < 0) | (mode == 0), axis=1))
             cut, event = open_, np.zeros(0, int)
             if len(open_):
@@ -200,6 +201,19 @@ class _Motion:
         if len(some):
             off = self.directions @ D[some, d:]
             D[some, d:] -= self._impulse(lanes[some], x[some], modes[some], off)
+
+    def _carried(self, modes) -> np.ndarray:
+        """The directions (n, F) that slide by their modes and whose speeds are sums of those that
+        stick, as a relative speed where both bodies do: they are 0, and turn nowhere. λ is then ρ
+        there, and the others hold the rest."""
+        carried = np.zeros(modes.shape, bool)
+        some = np.flatnonzero(np.sum(modes == 0, axis=1) > 1)
+        if len(some):
+            stuck, c = modes[some] == 0, self.directions
+            alike = np.broadcast_to(c @ c.T, (len(some), len(c), len(c)))
+            left = c - among(stuck, alike, alike).swapaxes(1, 2) @ c
+            carried[some] = ~stuck & (np.abs(left).max(axis=2) < _APART_FROM)
+        return carried
 
     def _released(self, lanes, x, modes, u) -> np.ndarray:
         """Modes without the directions that stick by a λ beyond ρ, the farthest beyond it first:

@@ -38,7 +38,9 @@ _SETTLED = 0.003  # of the noise: a change that needs no further iteration
 # Of the largest pivot, each in units of its column, below which one determines nothing: of an arc
 # of gross errors alone, or of the speed of a body that sticks.
 _LOOSE = 1e-12
-_HALVINGS = 4  # of a step of arcs that share no coefficients
+# Of a step, that an arc which it made worse goes with its states: where arcs share no coefficients,
+# and where they do.
+_PARTS_ALONE, _PARTS_TOGETHER = (0.5, 0.25, 0.125, 0.0), (0.25, 0.0)
 _BLOCK_BYTES = 64 * 2**20  # of the sensitivities of a block of arcs
 OUTLYING = 5.0  # standard deviations: a residual beyond does not tell the noise
 SOFT_L1 = SoftL1()
@@ -52,8 +54,8 @@ class Fitted:
     nothing was measured; whitened: the same after the whitening. sigma: the noise as given or
     estimated, (k,) or (A, L, k). factor: the triangle (n + 1, n + 1) of [∂r/∂p, r] without the
     states. scores: (A, n) each arc's part of the gradient in p. arcs: (A, m, m) triangles of each
-    δx_0 with p fixed. transports: (A, m, m) ∂x_{L−1}/∂x_0. cost: infinite where the defects could
-    not be closed.
+    δx_0 with p fixed. transports: (A, m, m) ∂x_{L−1}/∂x_0. open: (A,) what each arc's defects cost,
+    0 of an arc that is an orbit. cost: infinite where the defects could not be closed.
     """
 
     p: np.ndarray
@@ -65,6 +67,7 @@ class Fitted:
     scores: np.ndarray
     arcs: np.ndarray
     transports: np.ndarray
+    open: np.ndarray
     cost: float
     iterations: int
     converged: bool
@@ -206,11 +209,20 @@ class _Data(NamedTuple):
         """The same iterate, but that these arcs (indices, n) have the states x (n, L, m)."""
         with np.errstate(all="ignore"):
             found = evaluated(self.model.take(arcs), here.p, x)
-        states = here.x.copy()
-        states[arcs] = x
-        defects = Defects(*map(partial(_replaced, arcs), here.defects, found[0]))
-        observed = Observed(*map(partial(_replaced, arcs), here.observed, found[1]))
-        return self._of(here.p, states, defects, observed, here.units)
+        return self._with(here, arcs, x, *found)
+
+    def mixed(self, here: _Iterate, other: _Iterate, arcs: np.ndarray) -> _Iterate:
+        """The same iterate, but that these arcs (indices, n) are as in the other."""
+        defects = Defects(*(part[arcs] for part in other.defects))
+        observed = Observed(*(part[arcs] for part in other.observed))
+        return self._with(here, arcs, other.x[arcs], defects, observed)
+
+    def _with(
+        self, here: _Iterate, arcs: np.ndarray, x: np.ndarray, defects: Defects, observed: Observed
+    ) -> _Iterate:
+        defects = Defects(*map(partial(_replaced, arcs), here.defects, defects))
+        observed = Observed(*map(partial(_replaced, arcs), here.observed, observed))
+        return self._of(here.p, _replaced(arcs, here.x, x), defects, observed, here.units)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,28 +245,38 @@ class _AtStates:
         return at.gap <= float(_CLOSED * np.sqrt(self.here.x.size))
 
     def tried(self, damping: float, failures: int) -> Tried:
-        """A step of p and x; each that failed halves the next. Arcs that share no p halve their
-        own: one that is hard to follow holds back no other."""
+        """A step of p and x; each that failed halves the next. Where it fails, or arcs share no p,
+        each arc halves its own: one that is hard to follow holds back no other."""
         here, share = self.here, 0.5**failures
         dp, dx = _solve(self._rows, here.defects, damping)
-        if len(here.p):
-            there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
-        else:
-            there = self._alone(share, dx)
-        if self.closed(here):
-            return Tried(there, here.merit * (1 + 1e-9) - there.merit, damping)
-        return Tried(there, (1 - 0.5 * share) * here.gap - there.gap, damping)
+        there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
+        if not len(here.p) or not self._decrease(there, share) > 0:
+            there = self._alone(there, share, dx)
+        return Tried(there, self._decrease(there, share), damping)
 
-    def _alone(self, share: float, dx: np.ndarray) -> _Iterate:
-        """A step of arcs (A, L, m) each of which takes as much of it as lowers its own merit."""
-        here, merits = self.here, self.here.merits * (1 + 1e-9)
-        there = self.data.at(here.p, here.x + share * dx, here.units)
-        for halving in range(1, _HALVINGS + 1):
-            worse = np.flatnonzero(~(there.merits <= merits))
+    def _decrease(self, there: _Iterate, share: float) -> float:
+        """What this share of a step has lowered: the cost, or the defects while they matter."""
+        if self.closed(self.here):
+            return self.here.merit * (1 + 1e-9) - there.merit
+        return (1 - 0.5 * share) * self.here.gap - there.gap
+
+    def _alone(self, there: _Iterate, share: float, dx: np.ndarray) -> _Iterate:
+        """The end of a step with which arcs (A, L, m) that it made worse go less far with their
+        states, each as far as is best for it."""
+        here, of_gaps = self.here, len(self.here.p) > 0 and not self.closed(self.here)
+
+        def left(at: _Iterate) -> np.ndarray:
+            return at.gaps if of_gaps else at.merits
+
+        before = left(here) * (1 + 1e-9)
+        for part in _PARTS_ALONE if not len(here.p) else _PARTS_TOGETHER:
+            now = left(there)
+            worse = np.flatnonzero(~(now <= before))
             if not len(worse):
                 break
-            part = share * 0.5**halving if halving < _HALVINGS else 0.0
-            there = self.data.moved(there, worse, here.x[worse] + part * dx[worse])
+            other = self.data.moved(there, worse, here.x[worse] + share * part * dx[worse])
+            better = (left(other)[worse] < now[worse]) | ~np.isfinite(now[worse])
+            there = self.data.mixed(there, other, worse[better])
         return there
 
     def moved(self, there: _Iterate, damping: float) -> tuple[_AtStates, bool]:
@@ -279,8 +301,8 @@ class _AtStates:
         return Fitted(
             best.p, best.x, np.where(measured, best.residuals, np.nan),
             np.where(measured, best.white, np.nan), best.units.sigma, rows.factor, rows.scores,
-            rows.arcs[:, :, :m], rows.transports, best.cost if self.closed(best) else np.inf,
-            iterations, converged,
+            rows.arcs[:, :, :m], rows.transports, best.open,
+            best.cost if self.closed(best) else np.inf, iterations, converged,
         )  # fmt: skip
 
 
@@ -343,8 +365,19 @@ class _Iterate(NamedTuple):
         """Merit (A,) of each arc."""
         with np.errstate(all="ignore"):
             cost = np.sum(self.units.loss.of(self.white), axis=(1, 2))
-            gaps = np.sum((self.defects.closing / self.units.state) ** 2, axis=(1, 2))
-        return cost + gaps / _DEFECT**2
+        return cost + self.gaps / _DEFECT**2
+
+    @property
+    def open(self) -> np.ndarray:
+        """What the defects of each arc (A,) cost where it is no orbit, and 0."""
+        most = _CLOSED**2 * self.x[0].size
+        return np.where(self.gaps <= most, 0.0, self.gaps / _DEFECT**2)
+
+    @property
+    def gaps(self) -> np.ndarray:
+        """Sum of squares (A,) of each arc's defects, in units of the states'."""
+        with np.errstate(all="ignore"):
+            return np.sum((self.defects.closing / self.units.state) ** 2, axis=(1, 2))
 
     def rescaled(self, rows: _Rows, least: np.ndarray) -> _Iterate:
         """Iterate in units of the noise that these residuals tell: of each number as much is left

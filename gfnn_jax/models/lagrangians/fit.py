@@ -184,7 +184,8 @@ class Workbench:
         return LawFit(structure, model.form, arcs, found, sigma, correlation_time(found.whitened))
 
     def held_out(self, fit: LawFit, arcs: Arcs) -> np.ndarray:
-        """The cost (A,) of arcs that the fit has not seen, with their own states."""
+        """The cost (A,) of arcs that the fit has not seen, with their own states; of one that no
+        orbit of the law follows, with the defects that are left."""
         model = self.model(fit.structure, arcs, fit.p, np.arange(0))
         noise, scale = fit.sigma * arcs.noise, self.state_scale(fit.sigma)
         loss = self.observation.loss
@@ -192,9 +193,8 @@ class Workbench:
             model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3, loss,
             whitening=self.whitening(arcs),
         )  # fmt: skip
-        if not np.isfinite(found.cost):
-            return np.full(len(arcs.home), np.inf)
-        return np.nansum(loss.of(found.residuals), axis=(1, 2))
+        costs = np.nansum(loss.of(found.residuals), axis=(1, 2)) + found.open
+        return np.where(np.isfinite(costs), costs, np.inf)
 
     def cross_validate(
         self, nodes: Sequence[Nodes], fit: LawFit, structure: Structure, known: Mapping[Key, float]

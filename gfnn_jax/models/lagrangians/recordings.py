@@ -36,7 +36,14 @@ from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS
 from gfnn_jax.models.lagrangians.next_motion import next_motions
 from gfnn_jax.models.lagrangians.of_systems import search_of_systems
-from gfnn_jax.models.lagrangians.search import NO_LAW, Found, SearchOptions, describe, search
+from gfnn_jax.models.lagrangians.search import (
+    NO_LAW,
+    Found,
+    SearchOptions,
+    describe,
+    search,
+    search_on,
+)
 from gfnn_jax.models.lagrangians.text import speed_names
 from gfnn_jax.models.lagrangians.traces import traces_of
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
@@ -289,7 +296,13 @@ def _searched(
     acting = choose_again(found.acting, inputs, found.nodes, period, scales.dt)
     if acting.hold != found.acting.hold:
         on_progress(f"inputs {RULES[acting.hold]}: held-out arcs choose it with the law found")
-        found = with_rules({acting.hold: inputs[acting.hold]}) or found
+        if find is search:
+            found = search_on(
+                acting, found.nodes, scales, samples.angles, len(samples.recording.inputs),
+                on_progress, options,
+            )  # fmt: skip
+        else:
+            found = with_rules({acting.hold: inputs[acting.hold]}) or found
     found = found._replace(acting=found.acting._replace(others=acting.others))
     if not found.follows:
         raise FitError(NO_LAW)

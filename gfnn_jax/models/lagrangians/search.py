@@ -134,11 +134,36 @@ def search(
     simple = [k for k in simple if misfit[k] <= options.plain_is_enough * misfit[best]]
     fit = starts[min(simple, key=lambda k: misfit[k]) if simple else best]
     every = everything(angles, num_inputs, observation, options)
-    frictions = dataclasses.replace(every, terms=every.terms[:1])
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+    periods = options.periods[1:]
+    return _along_longer_arcs(bench, nodes, fit, periods, every, scales, on_progress, options)
+
+
+def search_on(
+    acting: Acting, nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...],
+    num_inputs: int, on_progress: Callable[[str], object] = lambda line: None,
+    options: SearchOptions = SearchOptions(),
+) -> Found:  # fmt: skip
+    """The law that a search comes to from one that was found, with its inputs as they are found to
+    act and arcs of a period."""
+    fit, bench = acting.fit, acting.bench
+    every = everything(angles, num_inputs, bench.observation, options)
+    nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+    on_progress(f"1 periods: {describe(fit)}")
+    longer = tuple(periods for periods in options.periods if periods > 1)
+    return _along_longer_arcs(bench, nodes, fit, longer, every, scales, on_progress, options)
+
+
+def _along_longer_arcs(
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, lengths: Sequence[float],
+    every: Structure, scales: Scales, on_progress: Callable[[str], object],
+    options: SearchOptions,
+) -> Found:  # fmt: skip
+    """The law that a fit comes to by arcs of these lengths, in periods."""
+    frictions = dataclasses.replace(every, terms=every.terms[:1])
     reached = [(nodes, fit)]
-    for periods in options.periods[1:]:
-        longer = to_longer_arcs(bench, nodes, fit, length(periods))
+    for periods in lengths:
+        longer = to_longer_arcs(bench, nodes, fit, max(6, round(periods * scales.per_period)))
         if longer is None:
             break
         nodes, fit = with_zeros_of_runs(bench, nodes, longer, on_progress)
@@ -420,13 +445,15 @@ def choose_friction(
 ) -> tuple[LawFit, FrictionChoice]:  # fmt: skip
     """The fit with the friction that held-out arcs choose, and how sure that is. Arcs are as long
     as those of the fit, or as long as three of them can be. A choice holds close to its fit, so
-    that it is made again until it stands."""
+    that it is made again until it stands; of choices that follow each other without an end the
+    likeliest is taken."""
     whole, sigma = dataclasses.replace(fit.arcs, x=fit.fitted.x), fit.sigma
     length = max(6, min(whole.t.shape[1], a_third(nodes, bench.systems)))
     arcs = arcs_of(with_states(nodes, whole, whole.x), length)
     if arcs.t.shape != whole.t.shape:
         fit = bench.fit(fit.structure, fit.values, arcs, sigma)
     choice = which_friction(bench, fit, candidates, options.choose_friction)
+    tried = [(fit, choice)]
     for _ in range(options.choices):
         rows = [_word(bench, ("loss", row)) for row in choice.rows]
         on_progress(f"  friction: {', '.join(rows) or 'none'}")
@@ -436,8 +463,36 @@ def choose_friction(
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
         fit = bench.fit(structure, fit.values, arcs, fit.sigma)
         choice = which_friction(bench, fit, candidates, options.choose_friction, choice)
+        tried.append((fit, choice))
+    else:
+        if options.choose_friction:
+            fit, choice = _likeliest(bench, tried)
     choice = choice._replace(rows=fit.structure.friction)
     return bench.fit(fit.structure, fit.values, whole, sigma), choice
+
+
+def _likeliest(
+    bench: Workbench, tried: Sequence[tuple[LawFit, FrictionChoice]]
+) -> tuple[LawFit, FrictionChoice]:
+    """The likeliest of these fits whose friction does not drive, by Schwarz's criterion: what their
+    residuals add up to, of which those that are correlated count once."""
+    fits = [one for one in tried if _can_be_chosen(one[0])] or tried[-1:]
+    last, loss = tried[-1][0], bench.observation.loss
+    count = np.count_nonzero(np.isfinite(last.arcs.y)) / last.correlation
+
+    def criterion(fit: LawFit) -> float:
+        cost = np.nansum(loss.of(fit.fitted.residuals * fit.sigma / last.sigma))
+        return float(count * np.log(cost) + len(fit.p) * np.log(count))
+
+    return min(fits, key=lambda one: criterion(one[0]))
+
+
+def _can_be_chosen(fit: LawFit) -> bool:
+    """Return whether the friction does not drive, and is not both linear and uniform."""
+    losses = [value for key, value in fit.values.items() if key[0] == "loss"]
+    kinds = {row[1] for row in fit.structure.friction}
+    followed = np.isfinite(fit.fitted.cost)
+    return bool(followed and min(losses, default=0.0) >= 0 and not {LINEAR, UNIFORM} <= kinds)
 
 
 def frictions_tried(dim: int, options: SearchOptions) -> tuple[Loss, ...]:
