@@ -53,9 +53,10 @@ class Fitted:
     p: (n,) coefficients. x: (A, L, m) states. residuals: (A, L, k) in units of the noise, NaN where
     nothing was measured; whitened: the same after the whitening. sigma: the noise as given or
     estimated, (k,) or (A, L, k). factor: the triangle (n + 1, n + 1) of [∂r/∂p, r] without the
-    states. scores: (A, n) each arc's part of the gradient in p. arcs: (A, m, m) triangles of each
-    δx_0 with p fixed. transports: (A, m, m) ∂x_{L−1}/∂x_0. open: (A,) what each arc's defects cost,
-    0 of an arc that is an orbit. cost: infinite where the defects could not be closed.
+    states; 0 where derivatives along an arc overflow. scores: (A, n) each arc's part of the
+    gradient in p. arcs: (A, m, m) triangles of each δx_0 with p fixed. transports: (A, m, m)
+    ∂x_{L−1}/∂x_0. open: (A,) what each arc's defects cost, 0 of an arc that is an orbit. cost:
+    infinite where the defects could not be closed.
     """
 
     p: np.ndarray
@@ -248,6 +249,8 @@ class _AtStates:
         """A step of p and x; each that failed halves the next. Where it fails, or arcs share no p,
         each arc halves its own: one that is hard to follow holds back no other."""
         here, share = self.here, 0.5**failures
+        if not np.isfinite(self._rows.factor).all():  # derivatives along an arc have overflown
+            return Tried(here, -np.inf, damping, hopeless=True)
         dp, dx = _solve(self._rows, here.defects, damping)
         there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
         if not len(here.p) or not self._decrease(there, share) > 0:
@@ -298,9 +301,11 @@ class _AtStates:
         """The fit that ends here."""
         best, measured = self.best if self.closed(self.best) else self.here, self.data.measured
         rows, m = _reduced(best), best.x.shape[-1]
+        finite = np.isfinite(rows.factor).all()
         return Fitted(
             best.p, best.x, np.where(measured, best.residuals, np.nan),
-            np.where(measured, best.white, np.nan), best.units.sigma, rows.factor, rows.scores,
+            np.where(measured, best.white, np.nan), best.units.sigma,
+            rows.factor if finite else np.zeros_like(rows.factor), rows.scores,
             rows.arcs[:, :, :m], rows.transports, best.open,
             best.cost if self.closed(best) else np.inf, iterations, converged,
         )  # fmt: skip
@@ -448,11 +453,12 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     n = observed.by_coefficients.shape[-1]
     S = np.zeros((num_arcs, length, m, m + n + 1))
     S[:, 0, range(m), range(m)] = 1.0
-    for i in range(length - 1):
-        S[:, i + 1] = defects.by_state[:, i] @ S[:, i]
-        S[:, i + 1, :, m : m + n] += defects.by_coefficients[:, i]
-        S[:, i + 1, :, -1] += defects.closing[:, i]
-    J = observed.by_state @ S
+    with np.errstate(all="ignore"):  # along an arc that is no orbit they may overflow
+        for i in range(length - 1):
+            S[:, i + 1] = defects.by_state[:, i] @ S[:, i]
+            S[:, i + 1, :, m : m + n] += defects.by_coefficients[:, i]
+            S[:, i + 1, :, -1] += defects.closing[:, i]
+        J = observed.by_state @ S
     J[..., m:-1] += observed.by_coefficients
     J /= sigma[..., None]
     J[..., -1] = residuals - J[..., -1]
