@@ -20,12 +20,12 @@ class Terminated(KeyboardInterrupt):
 
 
 def collect_garbage_seldom() -> None:
-    """Let 200,000 new objects, not 700, start a search for reference cycles, and none at the exit.
+    """Let 20,000 new objects, not 700, start a search for reference cycles, and none at the exit.
 
-    Imports and traces make millions of objects that live on: searches among them take 0.8 of the
+    Imports and traces make millions of objects that live on: searches among them take some 0.6 of the
     5.3 seconds of ``gfnn run two-body --quick``.
     """
-    gc.set_threshold(200_000, 30)
+    gc.set_threshold(20_000, 20)
     atexit.register(gc.freeze)
 
 

@@ -546,9 +546,11 @@ def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():
         friction = tuple(((1,), kind, 0.0) for kind in range(len(losses)))
         values = {("loss", row): loss for row, loss in zip(friction, losses, strict=True)}
         return SimpleNamespace(
-            values=values, structure=SimpleNamespace(friction=friction), sigma=np.array([sigma]),
-            p=np.array(losses), correlation=2.0, arcs=SimpleNamespace(y=x[..., :1]),
-            fitted=SimpleNamespace(residuals=size * noise / sigma, cost=cost),
+            values=values, structure=SimpleNamespace(friction=friction), p=np.array(losses),
+            correlation=2.0, arcs=SimpleNamespace(y=x[..., :1]),
+            fitted=SimpleNamespace(
+                residuals=size * noise / sigma, cost=cost, sigma=np.array([sigma])
+            ),
         )  # fmt: skip
 
     bench = SimpleNamespace(observation=SimpleNamespace(loss=SOFT_L1))

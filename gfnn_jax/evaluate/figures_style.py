@@ -67,10 +67,10 @@ def save(figure: Figure, path) -> None:
     # one that is saved; a call without that drawing takes a third less. With one canvas for both,
     # the labels are set once.
     canvas, dpi = figure.canvas, figure.dpi
-    FigureCanvasAgg(figure).figure.dpi = DPI
-    engine.execute(figure)
-    figure.set_layout_engine("none")
     try:
+        FigureCanvasAgg(figure).figure.dpi = DPI
+        engine.execute(figure)
+        figure.set_layout_engine("none")
         figure.savefig(Path(path), dpi=DPI)
     finally:
         figure.dpi = dpi

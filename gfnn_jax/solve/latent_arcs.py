@@ -56,7 +56,7 @@ class Fitted:
     states; 0 where derivatives along an arc overflow. scores: (A, n) each arc's part of the
     gradient in p. arcs: (A, m, m) triangles of each δx_0 with p fixed. transports: (A, m, m)
     ∂x_{L−1}/∂x_0. open: (A,) what each arc's defects cost, 0 of an arc that is an orbit. cost:
-    infinite where the defects could not be closed.
+    infinite where the defects could not be closed, or derivatives overflow, and open then too.
     """
 
     p: np.ndarray
@@ -79,7 +79,9 @@ class Fitted:
         return self.factor[:-1, :-1]
 
     def covariance(self) -> np.ndarray:
-        """(RᵀR)⁻¹, for white residuals of unit variance."""
+        """(RᵀR)⁻¹, for white residuals of unit variance; infinite where derivatives overflow."""
+        if not self.triangle.any():
+            return np.full_like(self.triangle, np.inf)
         inverse = np.linalg.pinv(self.triangle)
         return inverse @ inverse.T
 
@@ -277,7 +279,8 @@ class _AtStates:
             worse = np.flatnonzero(~(now <= before))
             if not len(worse):
                 break
-            other = self.data.moved(there, worse, here.x[worse] + share * part * dx[worse])
+            x = here.x[worse] + share * part * dx[worse] if part else here.x[worse]
+            other = self.data.moved(there, worse, x)
             better = (left(other)[worse] < now[worse]) | ~np.isfinite(now[worse])
             there = self.data.mixed(there, other, worse[better])
         return there
@@ -306,8 +309,9 @@ class _AtStates:
             best.p, best.x, np.where(measured, best.residuals, np.nan),
             np.where(measured, best.white, np.nan), best.units.sigma,
             rows.factor if finite else np.zeros_like(rows.factor), rows.scores,
-            rows.arcs[:, :, :m], rows.transports, best.open,
-            best.cost if self.closed(best) else np.inf, iterations, converged,
+            rows.arcs[:, :, :m], rows.transports, best.open if finite else best.open + np.inf,
+            best.cost if self.closed(best) and finite else np.inf, iterations,
+            converged and bool(finite),
         )  # fmt: skip
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 
 import numpy as np
 
@@ -46,26 +45,34 @@ def by_cofactors(matrix, rhs):
     entries = [[matrix[..., i, j] for j in range(n)] for i in range(n)]
     right = [rhs[..., i] for i in range(n)]
 
-    @cache
-    def minor(rows, columns):
-        """Determinant of these rows and columns, expanded along the first row."""
-        if not rows:
-            return 1.0
-        if len(rows) == 1:
-            return entries[rows[0]][columns[0]]
-        return _alternating(
-            entries[rows[0]][j] * minor(rows[1:], tuple(k for k in columns if k != j))
-            for j in columns
-        )
-
+    known = {}
     everything = tuple(range(n))
     without = [tuple(k for k in everything if k != i) for i in everything]
-    determinant = minor(everything, everything)
+    determinant = _minor(entries, everything, everything, known)
     x = []
     for j in everything:
-        total = _alternating(minor(without[i], without[j]) * right[i] for i in everything)
+        total = _alternating(
+            _minor(entries, without[i], without[j], known) * right[i] for i in everything
+        )
         x.append((total if j % 2 == 0 else -total) / determinant)
     return xp.stack(x, axis=-1), determinant
+
+
+def _minor(entries, rows, columns, known):
+    """Determinant of these rows and columns, expanded along the first row. known: those of others.
+    No closure of `by_cofactors`: a function that names itself is a cycle, which keeps what it
+    holds until garbage is collected."""
+    if not rows:
+        return 1.0
+    if len(rows) == 1:
+        return entries[rows[0]][columns[0]]
+    if (rows, columns) not in known:
+        known[rows, columns] = _alternating(
+            entries[rows[0]][j]
+            * _minor(entries, rows[1:], tuple(k for k in columns if k != j), known)
+            for j in columns
+        )
+    return known[rows, columns]
 
 
 def _alternating(terms):

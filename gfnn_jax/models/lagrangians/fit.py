@@ -62,6 +62,8 @@ class LawFit:
     def degenerate(self) -> dict[Key, float]:
         """The combination of coefficients that moves nothing, where there is one: as any two
         springs without friction follow from Lagrangians of a whole family."""
+        if not np.isfinite(self.fitted.cost):
+            return {}
         R = self.fitted.triangle
         size = np.linalg.norm(R, axis=0)
         _, singular, across = np.linalg.svd(R / np.where(size > 0, size, 1.0))
@@ -185,7 +187,8 @@ class Workbench:
 
     def held_out(self, fit: LawFit, arcs: Arcs) -> np.ndarray:
         """The cost (A,) of arcs that the fit has not seen, with their own states; of one that no
-        orbit of the law follows, with the defects that are left."""
+        orbit of the law follows, with the defects that are left. Infinite, of all, where one has
+        states that the law has no steps from: nothing was fitted then."""
         model = self.model(fit.structure, arcs, fit.p, np.arange(0))
         noise, scale = fit.sigma * arcs.noise, self.state_scale(fit.sigma)
         loss = self.observation.loss
@@ -193,8 +196,10 @@ class Workbench:
             model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3, loss,
             whitening=self.whitening(arcs),
         )  # fmt: skip
-        costs = np.nansum(loss.of(found.residuals), axis=(1, 2)) + found.open
-        return np.where(np.isfinite(costs), costs, np.inf)
+        lost = np.isfinite(arcs.y) & ~np.isfinite(found.residuals)
+        if lost.any() or not np.isfinite(found.open).all():
+            return np.full(len(arcs.home), np.inf)
+        return np.nansum(loss.of(found.residuals), axis=(1, 2)) + found.open
 
     def cross_validate(
         self, nodes: Sequence[Nodes], fit: LawFit, structure: Structure, known: Mapping[Key, float]

@@ -96,17 +96,19 @@ def which_friction(
     candidates: Sequence[Loss],
     choose: bool = True,
     before: FrictionChoice | None = None,
+    rows: Sequence[Loss] | None = None,
 ) -> FrictionChoice:
     """The choice by the arcs of a fit (`chosen`)."""
-    return chosen(_table_of(bench, fit, candidates), choose, before)
+    return chosen(_table_of(bench, fit, candidates), choose, before, rows)
 
 
 def chosen(
-    table: Table, choose: bool = True, before: FrictionChoice | None = None
-) -> FrictionChoice:
+    table: Table, choose: bool = True, before: FrictionChoice | None = None,
+    rows: Sequence[Loss] | None = None,
+) -> FrictionChoice:  # fmt: skip
     """The choice among sets of the candidates' kinds, each with the directions that it needs; not
     to ``choose`` is to take as many of the kinds as there are. Among equals the kinds chosen
-    ``before`` stay."""
+    ``before`` stay. rows: friction that has been taken, where only its odds are asked for."""
     kinds = sorted({row[1] for row in table.candidates})
     every = (chosen for n in range(len(kinds) + 1) for chosen in combinations(kinds, n))
     every = (chosen for chosen in every if not (choose and {LINEAR, UNIFORM} <= set(chosen)))
@@ -118,6 +120,9 @@ def chosen(
     tied = [s for s in sets if evidence.odds(best, s) < DECIDED]
     known = before.kinds if before else ()
     taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, _plainness(s.kinds)))
+    if rows is not None and set(rows) <= set(table.candidates):
+        taken = table.judged([table.candidates.index(row) for row in rows])
+        sets = [s for s in sets if s.kinds != taken.kinds]
     odds = {s.kinds: evidence.odds(taken, s) for s in sets if s is not taken}
     others = table.others(taken.rows)
     gains = not taken.rows and any(rho < -_GAINS * error for rho, error in others.values())

@@ -297,13 +297,15 @@ def _searched(
     if acting.hold != found.acting.hold:
         on_progress(f"inputs {RULES[acting.hold]}: held-out arcs choose it with the law found")
         if find is search:
-            found = search_on(
+            again = search_on(
                 acting, found.nodes, scales, samples.angles, len(samples.recording.inputs),
                 on_progress, options,
             )  # fmt: skip
         else:
-            found = with_rules({acting.hold: inputs[acting.hold]}) or found
-    found = found._replace(acting=found.acting._replace(others=acting.others))
+            again = with_rules({acting.hold: inputs[acting.hold]}) or found
+        found = again if again.follows or not found.follows else found
+    if acting.hold == found.acting.hold:
+        found = found._replace(acting=found.acting._replace(others=acting.others))
     if not found.follows:
         raise FitError(NO_LAW)
     return found

@@ -445,8 +445,8 @@ def choose_friction(
 ) -> tuple[LawFit, FrictionChoice]:  # fmt: skip
     """The fit with the friction that held-out arcs choose, and how sure that is. Arcs are as long
     as those of the fit, or as long as three of them can be. A choice holds close to its fit, so
-    that it is made again until it stands; of choices that follow each other without an end the
-    likeliest is taken."""
+    that it is made again until it stands; where none has stood when the third is looked at, the
+    likeliest of these fits is taken."""
     whole, sigma = dataclasses.replace(fit.arcs, x=fit.fitted.x), fit.sigma
     length = max(6, min(whole.t.shape[1], a_third(nodes, bench.systems)))
     arcs = arcs_of(with_states(nodes, whole, whole.x), length)
@@ -467,6 +467,10 @@ def choose_friction(
     else:
         if options.choose_friction:
             fit, choice = _likeliest(bench, tried)
+    if set(choice.rows) != set(fit.structure.friction):
+        choice = which_friction(
+            bench, fit, candidates, options.choose_friction, rows=fit.structure.friction
+        )
     choice = choice._replace(rows=fit.structure.friction)
     return bench.fit(fit.structure, fit.values, whole, sigma), choice
 
@@ -481,7 +485,8 @@ def _likeliest(
     count = np.count_nonzero(np.isfinite(last.arcs.y)) / last.correlation
 
     def criterion(fit: LawFit) -> float:
-        cost = np.nansum(loss.of(fit.fitted.residuals * fit.sigma / last.sigma))
+        unit = last.fitted.sigma / fit.fitted.sigma
+        cost = np.nansum(loss.of(fit.fitted.residuals / unit))
         return float(count * np.log(cost) + len(fit.p) * np.log(count))
 
     return min(fits, key=lambda one: criterion(one[0]))
