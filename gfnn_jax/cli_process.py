@@ -22,8 +22,8 @@ class Terminated(KeyboardInterrupt):
 def collect_garbage_seldom() -> None:
     """Let 20,000 new objects, not 700, start a search for reference cycles, and none at the exit.
 
-    Imports and traces make millions of objects that live on: searches among them take some 0.6 of the
-    5.3 seconds of ``gfnn run two-body --quick``.
+    Imports and traces make millions of objects that live on: searches among them take half a second
+    of the five of ``gfnn run two-body --quick``.
     """
     gc.set_threshold(20_000, 20)
     atexit.register(gc.freeze)
