@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
-from gfnn_jax.dataset.stretches import nodes_of
+from gfnn_jax.dataset.stretches import Arcs, nodes_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import (
     DRY,
@@ -29,7 +29,8 @@ from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate, 
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.recordings import _samples
-from gfnn_jax.models.lagrangians.search import _likeliest, search, search_on
+from gfnn_jax.models.lagrangians.search import _likeliest, _without_drives, search, search_on
+from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.text import WhichFriction, speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.arc_models import Defects, Observed
@@ -534,6 +535,29 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     # L = ½ẋ² − 4.5 x², R = 0.3 ½ẋ², in the order of the terms, the losses and the gain.
     np.testing.assert_array_less(np.abs(p - [-4.5, 0.3, 2.0]), 4 * error)
     np.testing.assert_allclose(p, found["hold"].acting.fit.p, atol=2 * error.max())
+
+
+def test_friction_that_falls_below_zero_by_longer_arcs_is_dropped():
+    """One at a time, the surest first, and the fit made anew: then the other is above zero."""
+    rows = tuple(((1,), kind, 0.0) for kind in (LINEAR, QUADRATIC, DRY))
+    of = {rows: [0.2, -0.1, -0.2], rows[:2]: [0.2, 0.1]}
+
+    def fit(structure, *_):
+        p = np.array(of[structure.friction])
+        return SimpleNamespace(
+            structure=structure, p=p, values=dict(zip(structure.keys(), p, strict=True)),
+            covariance=lambda: np.diag(np.full(len(p), 1e-4)), arcs=Arcs(*5 * [None]), sigma=None,
+            fitted=SimpleNamespace(cost=1.0, x=None),
+        )  # fmt: skip
+
+    plain = SimpleNamespace(coordinates=("x",), speeds=("v",))
+    bench = SimpleNamespace(fit=fit, systems=None, observation=plain)
+    told = []
+    left = _without_drives(
+        bench, fit(Structure(1, (((2,), (0,), (0,), 0.0),), rows, (), 0, ())), told.append
+    )
+    assert left.structure.friction == rows[:2]
+    assert told == ["  dropped R: abs(v): -20.0 standard errors"]
 
 
 def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():

@@ -471,8 +471,25 @@ def choose_friction(
         choice = which_friction(
             bench, fit, candidates, options.choose_friction, rows=fit.structure.friction
         )
-    choice = choice._replace(rows=fit.structure.friction)
-    return bench.fit(fit.structure, fit.values, whole, sigma), choice
+    fit = _without_drives(bench, bench.fit(fit.structure, fit.values, whole, sigma), on_progress)
+    return fit, choice._replace(rows=fit.structure.friction)
+
+
+def _without_drives(
+    bench: Workbench, fit: LawFit, on_progress: Callable[[str], object]
+) -> LawFit:  # fmt: skip
+    """The fit without friction whose coefficient has fallen below zero by other arcs than those
+    that chose it, the farthest below first: friction does not drive."""
+    while np.isfinite(fit.fitted.cost):
+        z = {key: size for key, size in significance(fit).items() if fit.values[key] < 0}
+        z = {key: size for key, size in z.items() if key[0] == "loss"}
+        if not z:
+            break
+        key: Key = min(z, key=lambda key: z[key])
+        on_progress(f"  dropped {_word(bench, key)}: {z[key]:.1f} standard errors")
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        fit = bench.fit(fit.structure.without({key}), fit.values, arcs, fit.sigma)
+    return fit
 
 
 def _likeliest(
