@@ -260,7 +260,7 @@ class _AtStates:
         return Tried(there, self._decrease(there, share), damping)
 
     def _decrease(self, there: _Iterate, share: float) -> float:
-        """What this share of a step has lowered: the cost, or the defects while they matter."""
+        """Decrease of the cost by this share of a step, or of the defects while they matter."""
         if self.closed(self.here):
             return self.here.merit * (1 + 1e-9) - there.merit
         return (1 - 0.5 * share) * self.here.gap - there.gap
@@ -378,7 +378,7 @@ class _Iterate(NamedTuple):
 
     @property
     def open(self) -> np.ndarray:
-        """What the defects of each arc (A,) cost where it is no orbit, and 0."""
+        """Cost of the defects of each arc (A,) that is no orbit, and 0."""
         most = _CLOSED**2 * self.x[0].size
         return np.where(self.gaps <= most, 0.0, self.gaps / _DEFECT**2)
 
