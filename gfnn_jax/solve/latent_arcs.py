@@ -251,7 +251,7 @@ class _AtStates:
         """A step of p and x; each that failed halves the next. Where it fails, or arcs share no p,
         each arc halves its own: one that is hard to follow holds back no other."""
         here, share = self.here, 0.5**failures
-        if not np.isfinite(self._rows.factor).all():  # derivatives along an arc have overflown
+        if not np.isfinite(self._rows.factor).all():  # derivatives along an arc have overflowed
             return Tried(here, -np.inf, damping, hopeless=True)
         dp, dx = _solve(self._rows, here.defects, damping)
         there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
