@@ -165,3 +165,10 @@ def test_every_result_of_the_repository_has_a_study(monkeypatch):
     folder, said = Path(current.__file__).parent / "results", []
     assert current.check(list(studies()), folder, only_tell=True, say=said.append) == 0
     assert not [line for line in said if "no study" in line]
+
+
+def test_a_figure_drawn_otherwise_makes_no_result_old(tmp_path):
+    path = tmp_path / "study-one.json"
+    files = ["evaluate/figures_style.py", "evaluate/metrics.py"]
+    path.write_text(json.dumps({"code": {f"gfnn_jax/{name}": "other" for name in files}}))
+    assert current.Result(path, tmp_path / "study.py", "one").changed == [f"gfnn_jax/{files[1]}"]

@@ -1,7 +1,6 @@
 """From simulated positions to the law: the engine, the start, the search, forecasts and files."""
 
 import json
-from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.linalg import expm
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
-from gfnn_jax.dataset.stretches import Arcs, nodes_of
+from gfnn_jax.dataset.stretches import nodes_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import (
     DRY,
@@ -29,12 +28,11 @@ from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate, 
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.recordings import _samples
-from gfnn_jax.models.lagrangians.search import _likeliest, _without_drives, search, search_on
-from gfnn_jax.models.lagrangians.structure import Structure
-from gfnn_jax.models.lagrangians.text import WhichFriction, speed_names, terms_of
+from gfnn_jax.models.lagrangians.search import search, search_on
+from gfnn_jax.models.lagrangians.text import speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.arc_models import Defects, Observed
-from gfnn_jax.solve.latent_arcs import SOFT_L1, fit_arcs, rows_of_arcs
+from gfnn_jax.solve.latent_arcs import fit_arcs, rows_of_arcs
 
 
 def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):
@@ -287,15 +285,6 @@ def undamped():
     return gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
 
 
-def test_friction_kept_against_odds_is_said_to_be_that_of_fewest_kinds():
-    kept = WhichFriction(("linear",), {"none": 1e7, "linear+dry": 1 / 3.9}, {})
-    assert str(kept) == (
-        "linear, on held-out arcs odds of 1 : 3.9 against linear+dry; "
-        "of sets within odds of 20 : 1 that of fewest kinds is kept"
-    )
-    assert "kept" not in str(WhichFriction(("linear",), {"none": 1e7, "linear+dry": 30.0}, {}))
-
-
 def test_the_friction_that_a_record_shows(swing):
     """Linear friction is told from the others, and limits of these are below what was put in."""
     _, fit = swing
@@ -535,55 +524,6 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     # L = ½ẋ² − 4.5 x², R = 0.3 ½ẋ², in the order of the terms, the losses and the gain.
     np.testing.assert_array_less(np.abs(p - [-4.5, 0.3, 2.0]), 4 * error)
     np.testing.assert_allclose(p, found["hold"].acting.fit.p, atol=2 * error.max())
-
-
-def test_friction_that_falls_below_zero_by_longer_arcs_is_dropped():
-    """One at a time, the surest first, and the fit made anew: then the other is above zero."""
-    rows = tuple(((1,), kind, 0.0) for kind in (LINEAR, QUADRATIC, DRY))
-    of = {rows: [0.2, -0.1, -0.2], rows[:2]: [0.2, 0.1]}
-
-    def fit(structure, *_):
-        p = np.array(of[structure.friction])
-        return SimpleNamespace(
-            structure=structure, p=p, values=dict(zip(structure.keys(), p, strict=True)),
-            covariance=lambda: np.diag(np.full(len(p), 1e-4)), arcs=Arcs(*5 * [None]), sigma=None,
-            fitted=SimpleNamespace(cost=1.0, x=None),
-        )  # fmt: skip
-
-    plain = SimpleNamespace(coordinates=("x",), speeds=("v",))
-    bench = SimpleNamespace(fit=fit, systems=None, observation=plain)
-    told = []
-    left = _without_drives(
-        bench, fit(Structure(1, (((2,), (0,), (0,), 0.0),), rows, (), 0, ())), told.append
-    )
-    assert left.structure.friction == rows[:2]
-    assert told == ["  dropped R: abs(v): -20.0 standard errors"]
-
-
-def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():
-    """By residuals and how many coefficients they took, in the noise of the last; friction that
-    drives, or an arc that no orbit follows, is not taken."""
-    rng, x = np.random.default_rng(0), np.zeros((1, 200, 2))
-    noise = rng.normal(size=(1, 200, 1))
-
-    def fit(size, losses, sigma=1.0, cost=1.0):
-        friction = tuple(((1,), kind, 0.0) for kind in range(len(losses)))
-        values = {("loss", row): loss for row, loss in zip(friction, losses, strict=True)}
-        return SimpleNamespace(
-            values=values, structure=SimpleNamespace(friction=friction), p=np.array(losses),
-            correlation=2.0, arcs=SimpleNamespace(y=x[..., :1]),
-            fitted=SimpleNamespace(
-                residuals=size * noise / sigma, cost=cost, sigma=np.array([sigma])
-            ),
-        )  # fmt: skip
-
-    bench = SimpleNamespace(observation=SimpleNamespace(loss=SOFT_L1))
-    drives, lost, two = fit(0.5, [0.3, -0.1]), fit(0.4, [0.1], cost=np.inf), fit(1.0, [0.2, 0.1])
-    one, last = fit(1.001, [0.2], sigma=3.0), fit(1.2, [0.3])
-    tried = [(each, None) for each in (drives, lost, two, one, last)]
-    assert _likeliest(bench, tried)[0] is one
-    assert _likeliest(bench, [(two, None), (last, None)])[0] is two
-    assert _likeliest(bench, [(drives, None), (lost, None)])[0] is lost  # none can be: the last
 
 
 def test_the_gain_of_a_band_limited_input_has_no_bias():

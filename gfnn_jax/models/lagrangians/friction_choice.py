@@ -17,6 +17,11 @@ which the best has odds of less than 20 the one with the fewest kinds is taken: 
 which has one coefficient and keeps a multiple of the symplectic form, before linear friction, and
 that before quadratic and dry friction. Uniform friction is tried beside linear friction only where
 both are asked for.
+
+Odds alone let chance in: a direction that is not there takes up a part of what the other
+coefficients miss on the arcs that they are not from. A set is therefore taken only where each of
+its coefficients, found from all arcs, is seen: where it lowers Schwarz's criterion, which a
+coefficient of z standard errors does for z² > log n, of n independent residuals.
 """
 
 from __future__ import annotations
@@ -75,11 +80,13 @@ def _plainness(kinds: tuple[int, ...]) -> tuple[int, ...]:
 
 
 class _Judged(NamedTuple):
-    """A set of frictions and its held-out residuals (A, L, k); rounding: of each of these."""
+    """A set of frictions and its held-out residuals (A, L, k); rounding: of each of these;
+    sizes: of each ρ from all arcs, in units of the least that is seen."""
 
     rows: tuple[Loss, ...]
     residuals: np.ndarray
     rounding: float
+    sizes: np.ndarray
 
     @property
     def kinds(self) -> tuple[int, ...]:
@@ -88,6 +95,10 @@ class _Judged(NamedTuple):
     @property
     def cost(self) -> float:
         return float(np.sum(self.residuals**2) + self.residuals.size * self.rounding**2)
+
+    @property
+    def is_seen(self) -> bool:
+        return bool(np.all(self.sizes > 1))
 
 
 def which_friction(
@@ -115,9 +126,10 @@ def chosen(
     sets = [judged for judged in map(table.leanest, every) if judged is not None]
     if not choose:
         sets = sets[-1:]
-    best = min(sets, key=lambda s: s.cost)
+    seen = [s for s in sets if s.is_seen] if choose else sets
+    best = min(seen, key=lambda s: s.cost)
     evidence = _Evidence(best)
-    tied = [s for s in sets if evidence.odds(best, s) < DECIDED]
+    tied = [s for s in seen if evidence.odds(best, s) < DECIDED]
     known = before.kinds if before else ()
     taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, _plainness(s.kinds)))
     if rows is not None and set(rows) <= set(table.candidates):
@@ -217,11 +229,32 @@ class Table:
             others = np.linalg.lstsq(triangle[:f, :f], aim, rcond=_RCOND)[0]
             residuals[held] = self.rows[held] @ np.concatenate([-others, -losses, [1.0]])
         rows = tuple(self.candidates[k] for k in subset)
-        return _Judged(rows, residuals, self.rounding)
+        sizes = self.significance(subset) / np.sqrt(np.log(max(self.independent, np.e)))
+        return _Judged(rows, residuals, self.rounding, sizes)
+
+    @property
+    def independent(self) -> float:
+        """The number of residuals, of which those that are correlated count once."""
+        return np.count_nonzero(self.rows[..., -1]) / self.correlation
+
+    def significance(self, subset: Sequence[int]) -> np.ndarray:
+        """ρ of these candidates from all arcs, in standard errors."""
+        triangle, columns = self.triangles[-1], list(subset)
+        own = triangle[self.width :, self.width :]
+        if not columns or not len(own):
+            return np.full(len(columns), np.inf)  # nothing sets their errors
+        losses = self.solve(triangle, columns)
+        rest = float(np.linalg.norm(own[:, -1] - own[:, :-1] @ losses))
+        norms = np.maximum(np.linalg.norm(own[:, columns], axis=0), 1e-300)
+        inverse = np.linalg.pinv(own[:, columns] / norms, rcond=_RCOND)
+        variance = self.correlation * (self._variance(rest) + self.rounding**2)
+        errors = np.linalg.norm(inverse, axis=1) * np.sqrt(variance)
+        return losses[columns] * norms / np.maximum(errors, 1e-300)
 
     def leanest(self, kinds: tuple[int, ...]) -> _Judged | None:
-        """The set of all these kinds without the directions that held-out arcs do not miss; None
-        where the record has no friction of one of the kinds."""
+        """The set of all these kinds without the directions that held-out arcs do not miss, or that
+        are not seen beside others of their kind; None where the record has no friction of one of
+        the kinds."""
         subset = [k for k, row in enumerate(self.candidates) if row[1] in kinds]
         found = self.solve(self.triangles[-1], subset)
         subset = [k for k in subset if found[k] > 0]
@@ -230,12 +263,20 @@ class Table:
             return None
         evidence = _Evidence(here)
         while True:
-            fewer = [self.judged([k for k in subset if k != gone]) for gone in subset]
-            fewer = [s for s in fewer if s.kinds == kinds]
-            least = min(fewer, key=lambda s: s.cost, default=here)
-            if not fewer or evidence.odds(here, least) > _NEEDED:
+            fewer = {k: self.judged([other for other in subset if other != k]) for k in subset}
+            fewer = {k: s for k, s in fewer.items() if s.kinds == kinds}
+            if not fewer:
                 return here
-            here, subset = least, [self.candidates.index(row) for row in least.rows]
+            sizes = dict(zip(subset, here.sizes, strict=True))
+            missed_least = min(fewer, key=lambda k: fewer[k].cost)
+            smallest = min(fewer, key=lambda k: sizes[k])
+            if evidence.odds(here, fewer[missed_least]) <= _NEEDED:
+                gone = missed_least
+            elif sizes[smallest] <= 1:
+                gone = smallest
+            else:
+                return here
+            here, subset = fewer[gone], [k for k in subset if k != gone]
 
     def others(self, taken: tuple[Loss, ...]) -> dict[Loss, tuple[float, float]]:
         """ρ, of either sign, and its standard error of the candidates that were not taken, each
