@@ -19,9 +19,11 @@ that before quadratic and dry friction. Uniform friction is tried beside linear 
 both are asked for.
 
 Odds alone let chance in: a direction that is not there takes up a part of what the other
-coefficients miss on the arcs that they are not from. A set is therefore taken only where each of
-its coefficients, found from all arcs, is seen: where it lowers Schwarz's criterion, which a
-coefficient of z standard errors does for z² > log n, of n independent residuals.
+coefficients miss on the arcs that they are not from. Where there is a choice, a set is therefore
+taken only where each of its coefficients, found from all arcs, is seen: it lowers Schwarz's
+criterion, which of n independent residuals, n large, asks for z² > log n, z in standard errors.
+Chance can still hide friction that is there, where held-out arcs are those that alone determine
+another coefficient.
 """
 
 from __future__ import annotations
@@ -81,12 +83,14 @@ def _plainness(kinds: tuple[int, ...]) -> tuple[int, ...]:
 
 class _Judged(NamedTuple):
     """A set of frictions and its held-out residuals (A, L, k); rounding: of each of these;
-    sizes: of each ρ from all arcs, in units of the least that is seen."""
+    sizes: each ρ from all arcs, divided by the least that counts as seen, √log n of its standard
+    errors; criterion: Schwarz's, of all arcs."""
 
     rows: tuple[Loss, ...]
     residuals: np.ndarray
     rounding: float
     sizes: np.ndarray
+    criterion: float
 
     @property
     def kinds(self) -> tuple[int, ...]:
@@ -119,13 +123,15 @@ def chosen(
 ) -> FrictionChoice:  # fmt: skip
     """The choice among sets of the candidates' kinds, each with the directions that it needs; not
     to ``choose`` is to take as many of the kinds as there are. Among equals the kinds chosen
-    ``before`` stay. rows: friction that has been taken, where only its odds are asked for."""
+    ``before`` stay. rows: friction that has been taken, where only its odds are asked for. Odds are
+    those against sets whose coefficients are all seen."""
     kinds = sorted({row[1] for row in table.candidates})
     every = (chosen for n in range(len(kinds) + 1) for chosen in combinations(kinds, n))
     every = (chosen for chosen in every if not (choose and {LINEAR, UNIFORM} <= set(chosen)))
     sets = [judged for judged in map(table.leanest, every) if judged is not None]
     if not choose:
-        sets = sets[-1:]
+        most = max(len(s.kinds) for s in sets)
+        sets = [min((s for s in sets if len(s.kinds) == most), key=lambda s: s.cost)]
     seen = [s for s in sets if s.is_seen] if choose else sets
     best = min(seen, key=lambda s: s.cost)
     evidence = _Evidence(best)
@@ -134,8 +140,8 @@ def chosen(
     taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, _plainness(s.kinds)))
     if rows is not None and set(rows) <= set(table.candidates):
         taken = table.judged([table.candidates.index(row) for row in rows])
-        sets = [s for s in sets if s.kinds != taken.kinds]
-    odds = {s.kinds: evidence.odds(taken, s) for s in sets if s is not taken}
+        seen = [s for s in seen if s.kinds != taken.kinds]
+    odds = {s.kinds: evidence.odds(taken, s) for s in seen if s is not taken}
     others = table.others(taken.rows)
     gains = not taken.rows and any(rho < -_GAINS * error for rho, error in others.values())
     return FrictionChoice(taken.rows, odds, table.limits(taken.rows), gains)
@@ -229,54 +235,72 @@ class Table:
             others = np.linalg.lstsq(triangle[:f, :f], aim, rcond=_RCOND)[0]
             residuals[held] = self.rows[held] @ np.concatenate([-others, -losses, [1.0]])
         rows = tuple(self.candidates[k] for k in subset)
-        sizes = self.significance(subset) / np.sqrt(np.log(max(self.independent, np.e)))
-        return _Judged(rows, residuals, self.rounding, sizes)
+        n = max(self.independent, np.e)
+        rest = self._rest(self.solve(self.triangles[-1], subset)) ** 2
+        rest += np.count_nonzero(self.rows[..., -1]) * self.rounding**2
+        criterion = float(n * np.log(max(rest, 1e-300)) + len(rows) * np.log(n))
+        sizes = self.significance(subset) / np.sqrt(np.log(n))
+        return _Judged(rows, residuals, self.rounding, sizes, criterion)
+
+    def _rest(self, losses: np.ndarray) -> float:
+        """Norm of the residuals of all arcs with these ρ."""
+        own = self.triangles[-1][self.width :, self.width :]
+        return float(np.linalg.norm(own[:, -1] - own[:, :-1] @ losses))
 
     @property
     def independent(self) -> float:
-        """The number of residuals, of which those that are correlated count once."""
+        """The number of residuals, of which those that are correlated in the fit count once."""
         return np.count_nonzero(self.rows[..., -1]) / self.correlation
 
     def significance(self, subset: Sequence[int]) -> np.ndarray:
         """ρ of these candidates from all arcs, in standard errors."""
         triangle, columns = self.triangles[-1], list(subset)
         own = triangle[self.width :, self.width :]
-        if not columns or not len(own):
-            return np.full(len(columns), np.inf)  # nothing sets their errors
+        if len(own) <= len(columns):
+            return np.zeros(len(columns))  # nothing sets their errors
         losses = self.solve(triangle, columns)
-        rest = float(np.linalg.norm(own[:, -1] - own[:, :-1] @ losses))
         norms = np.maximum(np.linalg.norm(own[:, columns], axis=0), 1e-300)
         inverse = np.linalg.pinv(own[:, columns] / norms, rcond=_RCOND)
-        variance = self.correlation * (self._variance(rest) + self.rounding**2)
+        variance = self.correlation * (self._variance(self._rest(losses)) + self.rounding**2)
         errors = np.linalg.norm(inverse, axis=1) * np.sqrt(variance)
         return losses[columns] * norms / np.maximum(errors, 1e-300)
 
     def leanest(self, kinds: tuple[int, ...]) -> _Judged | None:
-        """The set of all these kinds without the directions that held-out arcs do not miss, or that
-        are not seen beside others of their kind; None where the record has no friction of one of
-        the kinds."""
+        """The set of all these kinds without the directions that are not seen beside others of
+        their kind, or that held-out arcs do not miss; None where the record has no friction of one
+        of the kinds. Of directions alike one may stand for another, so that the order decides which
+        are left: held-out arcs are asked first, or last where that ends with the only coefficients
+        that are seen, or by Schwarz's criterion with odds of 20."""
         subset = [k for k, row in enumerate(self.candidates) if row[1] in kinds]
         found = self.solve(self.triangles[-1], subset)
         subset = [k for k in subset if found[k] > 0]
-        here = self.judged(subset)
-        if here.kinds != kinds:
+        if kinds_of([self.candidates[k] for k in subset]) != kinds:
             return None
+        here, other = self._lean(subset, False), self._lean(subset, True)
+        if here.is_seen != other.is_seen:
+            return here if here.is_seen else other
+        likelier = here.criterion - other.criterion > 2 * np.log(DECIDED)
+        return other if likelier else here
+
+    def _lean(self, subset: list[int], seen_first: bool) -> _Judged:
+        """The set without its spare directions: first those that are not seen, or first those that
+        held-out arcs do not miss. Each of its kinds keeps one."""
+        here = self.judged(subset)
         evidence = _Evidence(here)
         while True:
             fewer = {k: self.judged([other for other in subset if other != k]) for k in subset}
-            fewer = {k: s for k, s in fewer.items() if s.kinds == kinds}
+            fewer = {k: s for k, s in fewer.items() if s.kinds == here.kinds}
             if not fewer:
                 return here
             sizes = dict(zip(subset, here.sizes, strict=True))
-            missed_least = min(fewer, key=lambda k: fewer[k].cost)
             smallest = min(fewer, key=lambda k: sizes[k])
+            missed_least = min(fewer, key=lambda k: fewer[k].cost)
+            spare = [smallest] if sizes[smallest] <= 1 else []
             if evidence.odds(here, fewer[missed_least]) <= _NEEDED:
-                gone = missed_least
-            elif sizes[smallest] <= 1:
-                gone = smallest
-            else:
+                spare = [*spare, missed_least] if seen_first else [missed_least, *spare]
+            if not spare:
                 return here
-            here, subset = fewer[gone], [k for k in subset if k != gone]
+            here, subset = fewer[spare[0]], [k for k in subset if k != spare[0]]
 
     def others(self, taken: tuple[Loss, ...]) -> dict[Loss, tuple[float, float]]:
         """ρ, of either sign, and its standard error of the candidates that were not taken, each

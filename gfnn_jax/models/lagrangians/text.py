@@ -155,10 +155,7 @@ class WhichFriction:
             rival = min(self.odds, key=lambda name: self.odds[name])
             text += f", on held-out arcs odds of {odds_text(self.odds[rival])} against {rival}"
             if self.odds[rival] < 1:
-                text += (
-                    f"; of sets within odds of {DECIDED:.0f} : 1 whose coefficients are all seen "
-                    "that of fewest kinds is kept"
-                )
+                text += f"; of sets within odds of {DECIDED:.0f} : 1 that of fewest kinds is kept"
         below = [f"of {_pretty(term)} below {limit:.2g}" for term, limit in self.limits.items()]
         return text + (f"; not seen, coefficients in R (2 σ): {', '.join(below)}" if below else "")
 
