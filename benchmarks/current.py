@@ -2,8 +2,8 @@
 
 A result holds a digest of every file that it ran (`ran`): of the package those of which a function
 ran, or a constant was taken by one of these, and the study's own; comments, docstrings and layout
-left out. It is of current code where each of these files means what it meant; those of the package
-that only draw change no number. A study that starts Python anew, in which nothing is noted, counts
+left out. It is of current code where each of these files means what it meant; the style of figures
+changes no number. A study that starts Python anew, in which nothing is noted, counts
 the whole package. Of an older result whose files are not recorded nothing is known: it is old.
 `--tell` says what has changed, and how long measuring again would take. A run that is interrupted
 goes on with what is still old.
@@ -28,7 +28,7 @@ import ran
 HERE = Path(__file__).resolve().parent
 PACKAGE = HERE.parent / "gfnn_jax"
 _RECORDING = {HERE / "current.py", HERE / "ran.py"}  # which change no result
-_DRAWS = "evaluate/figures"  # how files of the package begin that only draw
+_STYLE = "evaluate/figures_style.py"  # of the package, which changes no result
 # Numbers that moved by more than this part are told, the largest moves first; names of times and
 # circumstances, which move with the machine.
 _MOVED, _TOLD = 0.1, 4
@@ -53,9 +53,8 @@ class Result(NamedTuple):
         found = json.loads(self.path.read_text(encoding="utf-8")).get("code")
         if not isinstance(found, dict):
             return None
-        draws = f"{PACKAGE.name}/{_DRAWS}"
-        code = {name: digest for name, digest in found.items() if not name.startswith(draws)}
-        return [name for name, digest in code.items() if _digest(PACKAGE.parent / name) != digest]
+        found.pop(f"{PACKAGE.name}/{_STYLE}", None)
+        return [name for name, digest in found.items() if _digest(PACKAGE.parent / name) != digest]
 
 
 def code_of(study: Path) -> dict[str, str | None]:

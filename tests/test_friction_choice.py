@@ -24,7 +24,6 @@ def table(seed, size=0.8, alike=0.0, correlation=1.0):
     candidate and another direction of its kind, the correlation."""
     rng = np.random.default_rng(seed)
     law = rng.normal(size=(30, 20, 1, 8)) * np.exp(2 * rng.normal(size=(30, 1, 1, 8)))
-    rng.normal(size=(30, 20, 1, 1))
     friction = rng.normal(size=(30, 20, 1, 6)) + 0.3 * law[..., :6]
     friction[..., 3] = alike * friction[..., 0] + np.sqrt(1 - alike**2) * friction[..., 3]
     residuals = size * friction[..., :1] + rng.normal(size=(30, 20, 1, 1))
@@ -32,26 +31,23 @@ def table(seed, size=0.8, alike=0.0, correlation=1.0):
 
 
 def test_friction_that_is_not_there_is_not_taken_by_the_errors_of_other_coefficients():
-    """By odds on held-out arcs alone several of these twenty had another friction as well. That
-    some have none is the limit which the module names."""
+    """By odds on held-out arcs alone seven of these twenty had another friction as well. That some
+    have none is the limit which the module names."""
     found = [chosen(table(seed)).rows for seed in range(20)]
     assert not any(set(rows) - {CANDIDATES[0]} for rows in found)
     assert sum(rows == CANDIDATES[:1] for rows in found) >= 17
 
 
-@pytest.mark.parametrize(
-    ("seed", "alike", "size"), [(80, 0.95, 1.5), (2, 0.8, 1.5), (8, 0.95, 0.8)]
-)
+@pytest.mark.parametrize(("seed", "alike", "size"), [(2, 0.8, 1.5), (3, 0.95, 0.8), (1, 0.95, 1.5)])
 def test_a_direction_alike_does_not_stand_for_the_one_that_is_there(seed, alike, size):
-    """Of the two the one in fault is at 0.3 to 1.5 standard errors, the other at 6 to 20."""
+    """Where held-out arcs alone, asked first, leave the other direction."""
     assert chosen(table(seed, size, alike)).rows == CANDIDATES[:1]
 
 
 def test_kinds_that_are_asked_for_are_taken_and_odds_are_those_against_sets_that_are_seen():
-    made = table(0)
-    asked = chosen(made, choose=False)
-    assert len(asked.kinds) == 2  # all three ask for ρ < 0
-    assert LINEAR in asked.kinds
+    assert chosen(table(0), choose=False).kinds == (LINEAR, QUADRATIC, DRY)
+    made = table(6)  # in which all three at once ask for ρ < 0
+    assert chosen(made, choose=False).kinds == (LINEAR, QUADRATIC)
     found = chosen(made)
     assert found.odds[()] > 1e6
     assert all(made.leanest(kinds).is_seen for kinds in found.odds)

@@ -269,8 +269,9 @@ class Table:
         """The set of all these kinds without the directions that are not seen beside others of
         their kind, or that held-out arcs do not miss; None where the record has no friction of one
         of the kinds. Of directions alike one may stand for another, so that the order decides which
-        are left: held-out arcs are asked first, or last where that ends with the only coefficients
-        that are seen, or by Schwarz's criterion with odds of 20."""
+        are left. Those that held-out arcs do not miss go first. The other order is taken where all
+        that it leaves are seen and of the first order not all, or where Schwarz's criterion gives
+        it odds of 20."""
         subset = [k for k, row in enumerate(self.candidates) if row[1] in kinds]
         found = self.solve(self.triangles[-1], subset)
         subset = [k for k in subset if found[k] > 0]
