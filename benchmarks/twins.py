@@ -3,7 +3,8 @@
     python benchmarks/twins.py            every twin (some twenty minutes of a processor)
     python benchmarks/twins.py --quick    two of them, one draw of the noise
 
-Each twin is integrated by SciPy from its own equations of motion, with coefficients, sampling and
+Each twin is integrated by SciPy from its own equations of motion, its dry friction from event to
+event (`coulomb_motion`), with coefficients, sampling and
 length close to those of the record that it is named for (of the filmed pendulum, the robot arm and
 the circuit a part of its length); inputs are held from sample to sample. To its positions noise is
 added, from 1e-6 to 1e-2 of their spread. Counted are fits whose formula has exactly the terms and
@@ -17,13 +18,12 @@ import re
 import warnings
 from collections.abc import Callable, Mapping
 from functools import cache
-from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from coulomb_motion import Body
 from harness import TABLES, Numbers, between_markers, main, markdown, number, once, results
-from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 
@@ -33,12 +33,12 @@ WITHIN = 3.0  # standard errors
 
 
 class Twin(NamedTuple):
-    """accelerate(q, v, u) -> q̈; the start of each run (q, v), their end and step; the terms of L
+    """Its equations of motion; the start of each run (q, v), their end and step; the terms of L
     and R as formulas have them, where each angle's zero is its own. inputs: by name their force on
     each coordinate, held from sample to sample; push(rng, t) -> (n, inputs) a run's. inertia: the
     two terms of M₁₁, whose mean over the data is 1 in a fit. wrapped: angles in (−π, π]."""
 
-    accelerate: Callable
+    body: Body
     starts: tuple[tuple[float, ...], ...]
     end: float
     dt: float
@@ -52,38 +52,25 @@ class Twin(NamedTuple):
     wrapped: bool = False
 
 
-def _pendulum(q, v, u):
-    return -1.357 * np.sin(q) - 0.012 * v
-
-
-def _track(q, v, u):
-    return -6.22 * q - 0.014 * v
+def along(force: Callable, masses: tuple[float, ...] = (1.0,), dry: tuple[float, ...] = ()) -> Body:
+    """Of coordinates with masses of their own."""
+    joints = np.eye(len(masses))[: len(dry)]
+    return Body(lambda q: np.diag(masses), force, joints, np.array(dry))
 
 
 def _carts(q, v, u):
-    force = [-85.6 * q[0] + 77.8 * q[1], -85.4 * q[1] + 77.8 * q[0]]
-    return np.array(force) / [1.0, 2.44]
+    return np.array([-85.6 * q[0] + 77.8 * q[1], -85.4 * q[1] + 77.8 * q[0]])
 
 
-def sign(v):
-    """Of a speed, over a thousandth of a unit: SciPy's steps follow it."""
-    return v / np.hypot(v, 1e-3)
-
-
-def _oscillator(q, v, u):
-    return -184_200 * q - 734_000 * q**3 - 41 * v + 180_000 * u
-
-
-def links(masses, weights, friction):
+def links(masses, weights, friction, dry: tuple[float, ...] = ()) -> Body:
     """Of links with angles of their own: L = Σ ½ M_ij v_i v_j cos(q_i − q_j) + Σ c_i cos q_i, the
-    M_ij ``masses`` and c_i ``weights``, and the forces friction(v)."""
+    M_ij ``masses`` and c_i ``weights``, the forces friction(v), and dry friction in joints."""
 
-    def accelerate(q, v, u):
-        off = q[:, None] - q
-        force = friction(v) - weights * np.sin(q) - (masses * np.sin(off)) @ v**2
-        return np.linalg.solve(masses * np.cos(off), force)
+    def force(q, v, u):
+        return friction(v) - weights * np.sin(q) - (masses * np.sin(q[:, None] - q)) @ v**2
 
-    return accelerate
+    joints = (np.eye(len(weights)) - np.eye(len(weights), k=-1))[: len(dry)]
+    return Body(lambda q: masses * np.cos(q[:, None] - q), force, joints, np.array(dry))
 
 
 def joints(v, forces):
@@ -95,16 +82,17 @@ def joints(v, forces):
 _ROD, _REACH, _FAR = 0.33, 0.22, 0.165
 
 
-def _robot(q, v, u):
-    """Two links, the second's angle measured from the first."""
-    c, s, both = np.cos(q[1]), np.sin(q[1]), np.sin(q[0] + q[1])
-    across = 2 * _FAR + _REACH * c
-    force = [
-        _REACH * s * v[1] * (2 * v[0] + v[1]) - 14 * np.sin(q[0]) - 10.5 * both
-        + 10 * u[0] - 1.4 * sign(v[0]),
-        -_REACH * s * v[0] ** 2 - 10.5 * both + 10 * u[1] - 0.8 * sign(v[1]),
-    ]  # fmt: skip
-    return np.linalg.solve([[2 * _ROD + 2 * _REACH * c, across], [across, 2 * _FAR]], force)
+def _robot_masses(q):
+    """Of two links, the second's angle measured from the first."""
+    turning = _REACH * np.cos(q[1])
+    across = 2 * _FAR + turning
+    return np.array([[2 * _ROD + 2 * turning, across], [across, 2 * _FAR]])
+
+
+def _robot_force(q, v, u):
+    turning, both = _REACH * np.sin(q[1]), 10.5 * np.sin(q[0] + q[1])
+    first = turning * v[1] * (2 * v[0] + v[1]) - 14 * np.sin(q[0]) - both + 10 * u[0]
+    return np.array([first, -turning * v[0] ** 2 - both + 10 * u[1]])
 
 
 def multisine(lowest, highest, count, sizes):
@@ -130,15 +118,15 @@ def swings(count, dim, angle, speed, about=0.0):
 TWO, THREE = ("theta1", "theta2"), ("theta1", "theta2", "theta3")
 TWINS = {
     "pendulum": Twin(
-        _pendulum, ((1.45, 0.0),), 57.0, 1 / 6, ("theta",), ("theta",),
+        along(lambda q, v, u: -1.357 * np.sin(q) - 0.012 * v), ((1.45, 0.0),), 57.0, 1 / 6, ("theta",), ("theta",),
         {"omega**2": 0.5, "cos(theta)": 1.357}, {"omega**2": 0.006},
     ),
     "air_track": Twin(
-        _track, ((100.0, 0.0),), 17.4, 1 / 30, ("x",), (),
+        along(lambda q, v, u: -6.22 * q - 0.014 * v), ((100.0, 0.0),), 17.4, 1 / 30, ("x",), (),
         {"v**2": 0.5, "x**2": -3.11}, {"v**2": 0.007},
     ),
     "two_carts": Twin(
-        _carts, ((60.0, -40.0, 0.0, 150.0),), 9.9, 1 / 30, ("x1", "x2"), (),
+        along(_carts, (1.0, 2.44)), ((60.0, -40.0, 0.0, 150.0),), 9.9, 1 / 30, ("x1", "x2"), (),
         {"v1**2": 0.5, "v2**2": 1.22, "x1**2": -42.8, "x1*x2": 77.8, "x2**2": -42.7}, {},
     ),
     "double_pendulum": Twin(
@@ -152,15 +140,13 @@ TWINS = {
         {"omega1**2": 0.01, "(omega2 - omega1)**2": 0.004},
     ),
     "arm1": Twin(
-        lambda q, v, u: 64.0 * np.sin(q) - 0.0047 * v * abs(v) - 0.13 * sign(v),
-        ((4.7, 0.0), (4.2, 0.0)), 9.0, 0.004, ("theta",), ("theta",),
+        along(lambda q, v, u: 64.0 * np.sin(q) - 0.0047 * v * abs(v), dry=(0.13,)), ((4.7, 0.0), (4.2, 0.0)), 9.0, 0.004, ("theta",), ("theta",),
         {"omega**2": 0.5, "cos(theta)": -64.0}, {"abs(omega)**3": 0.0047 / 3, "abs(omega)": 0.13},
     ),
     "arm2": Twin(
         links(
             np.array([[1.0, 0.4914], [0.4914, 0.5563]]), np.array([-58.9, -27.83]),
-            lambda v: joints(v, [lambda s: 0.003 * s * abs(s), lambda s: 0.056 * sign(s)])
-            - [0.0, 0.002 * v[1] * abs(v[1])],
+            lambda v: -np.array([0.003, 0.002]) * v * abs(v), (0.0, 0.056),
         ),
         swings(16, 2, 1.0, 4.0, about=np.pi), 2.667, 0.001, TWO, TWO,
         {"omega1**2": 0.5, "omega1*omega2*cos(theta1 - theta2)": 0.4914, "omega2**2": 0.27815,
@@ -171,8 +157,8 @@ TWINS = {
         links(
             np.array([[1.0, 0.778, 0.2], [0.778, 0.966, 0.265], [0.2, 0.265, 0.22]]),
             np.array([-58.0, -44.0, -11.3]),
-            lambda v: joints(v, [lambda s: 0.033 * sign(s), lambda s: 0.027 * sign(s),
-                                 lambda s: 0.0006 * s * abs(s)]),
+            lambda v: joints(v, [lambda s: 0.0, lambda s: 0.0, lambda s: 0.0006 * s * abs(s)]),
+            (0.033, 0.027),
         ),
         swings(12, 3, 0.5, 2.0, about=np.pi), 1.539, 0.001, THREE, THREE,
         {"omega1**2": 0.5, "omega1*omega2*cos(theta1 - theta2)": 0.778,
@@ -192,7 +178,7 @@ TWINS = {
         {"omega1**2": 0.015, "(omega2 - omega1)**2": 0.002}, wrapped=True,
     ),
     "robot_arm": Twin(
-        _robot, ((0.0,) * 4,) * 3, 10.0, 0.002, TWO, TWO,
+        Body(_robot_masses, _robot_force, np.eye(2), np.array([1.4, 0.8])), ((0.0,) * 4,) * 3, 10.0, 0.002, TWO, TWO,
         {"omega1**2": _ROD, "omega1**2*cos(theta2)": _REACH, "omega1*omega2*cos(theta2)": _REACH,
          "omega1*omega2": 2 * _FAR, "omega2**2": _FAR, "cos(theta1)": 14.0,
          "cos(theta1 + theta2)": 10.5},
@@ -201,7 +187,7 @@ TWINS = {
         ("omega1**2", "omega1**2*cos(theta2)"),
     ),
     "silverbox": Twin(
-        _oscillator, ((0.0, 0.0),), 20.0, 1 / 610.35, ("y",), (),
+        along(lambda q, v, u: -184_200 * q - 734_000 * q**3 - 41 * v + 180_000 * u), ((0.0, 0.0),), 20.0, 1 / 610.35, ("y",), (),
         {"y_dot**2": 0.5, "y**2": -92_100.0, "y**4": -183_500.0}, {"y_dot**2": 20.5},
         {"u": (180_000.0,)}, multisine(1.0, 200.0, 400, (0.022,)),
     ),
@@ -216,23 +202,15 @@ def orbits(name: str, draw: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     x = np.array(twin.starts) * (1 + 0.02 * draw)
     options = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-11, "max_step": 0.05}
     if twin.push is None:
-
-        def free(_, x):
-            return [*x[d:], *np.ravel(twin.accelerate(x[:d], x[d:], None))]
-
-        q = [solve_ivp(free, (0, t[-1]), one, t_eval=t, **options).y[:d] for one in x]
+        q = [twin.body.follow(one, t, **options)[:, :d].T for one in x]
         return t, np.array(q), np.zeros((len(x), len(t), 0))
-    u, q = np.array([twin.push(rng, t) for _ in x]), [x[:, :d]]
-    for k, (begin, end) in enumerate(pairwise(t)):
-
-        def rate(_, y, k=k):
-            states = y.reshape(-1, 2 * d)
-            return np.ravel([[*s[d:], *np.ravel(twin.accelerate(s[:d], s[d:], now))]
-                             for s, now in zip(states, u[:, k], strict=True)])  # fmt: skip
-
-        x = solve_ivp(rate, (begin, end), x.ravel(), **options).y[:, -1].reshape(x.shape)
-        q.append(x[:, :d])
-    return t, np.stack(q, axis=-1), u
+    u, q = np.array([twin.push(rng, t) for _ in x]), []
+    for state, inputs in zip(x, u, strict=True):
+        states = [state]
+        for k in range(len(t) - 1):
+            states.append(twin.body.follow(states[-1], t[k : k + 2], inputs[k], **options)[-1])
+        q.append(np.array(states)[:, :d].T)
+    return t, np.array(q), u
 
 
 def recording(name: str, noise: float, draw: int) -> gfnn.Recording:

@@ -511,7 +511,7 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
         for hold in ("linear", "hold")
     }
     of = {
-        hold: choose_again(one.acting, inputs, one.nodes, 30, samples.scales.dt)
+        hold: choose_again(one.acting, HOLDS, one.nodes, 30, samples.scales.dt)
         for hold, one in found.items()
     }
     assert [one.hold for one in of.values()] == ["hold", "hold"]

@@ -15,8 +15,8 @@ class ArcInputs:
     inputs an array without columns. ``delay``: seconds by which an input acts later."""
 
     def __init__(self, nodes: Sequence[Nodes], substeps: int, hold: str, delay: float = 0.0):
-        self.hold, self.delay = hold, delay
-        self._nodes, self._substeps = nodes, substeps
+        self.hold, self.delay, self.substeps = hold, delay, substeps
+        self._nodes = nodes
         self._of_nodes = [
             at_stages(n.stretch.t, n.stretch.u, n.t[:-1], n.t[1:], substeps, hold, delay)
             for n in nodes
@@ -24,7 +24,15 @@ class ArcInputs:
 
     def delayed(self, delay: float) -> ArcInputs:
         """Make those of another delay."""
-        return ArcInputs(self._nodes, self._substeps, self.hold, delay)
+        return ArcInputs(self._nodes, self.substeps, self.hold, delay)
+
+    def by_rule(self, hold: str) -> ArcInputs:
+        """Make those of another rule between samples."""
+        return ArcInputs(self._nodes, self.substeps, hold)
+
+    def finer(self) -> ArcInputs:
+        """Make those of steps half as long."""
+        return ArcInputs(self._nodes, 2 * self.substeps, self.hold, self.delay)
 
     def __call__(self, arcs: Arcs) -> np.ndarray:
         steps = arcs.t.shape[1] - 1

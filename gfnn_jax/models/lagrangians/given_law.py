@@ -68,11 +68,13 @@ def fit_given(
         on_progress(f"{periods:g} periods: {describe(fit)}")
         nodes = with_states(nodes, fit.arcs, fit.fitted.x)
 
-    def choose(nodes: Sequence[Nodes], fit: LawFit) -> tuple[LawFit, FrictionChoice]:
+    def choose(
+        bench: Workbench, nodes: Sequence[Nodes], fit: LawFit
+    ) -> tuple[LawFit, FrictionChoice]:
         if given.friction is not None:
             return fit, FrictionChoice(given.friction, {}, {}, gains=False)
         tried = frictions_tried(d, options)
         return choose_friction(bench, nodes, fit, tried, on_progress, options)
 
-    settled = partial(as_found, bench, scales.dt)
+    settled = partial(as_found, scales.dt)
     return by_arcs_that_tell(bench, nodes, fit, choose, settled, scales, on_progress, options)

@@ -22,7 +22,6 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs, Nodes, arcs_of, with_states
-from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
 from gfnn_jax.models.lagrangians.structure import Key, Structure
 from gfnn_jax.solve.latent_arcs import sensitivities
@@ -78,15 +77,15 @@ def choose_rule(
 
 
 def choose_again(
-    last: Acting, inputs: Mapping[str, ArcInputs], nodes: Sequence[Nodes], length: int,
-    interval: float,
+    last: Acting, holds: Sequence[str], nodes: Sequence[Nodes], length: int, interval: float
 ) -> Acting:  # fmt: skip
-    """The rule between samples (of ``inputs``: rule -> inputs of arcs) that held-out arcs choose
-    with the last law: ``last`` as it was, where that is its own. length: nodes of these arcs; many
-    short ones tell it better than a few long ones."""
-    if len(inputs) < 2:
+    """The rule between samples (of ``holds``) that held-out arcs choose with the last law: ``last``
+    as it was, where that is its own. length: nodes of these arcs; many short ones tell it better
+    than a few long ones."""
+    if len(holds) < 2:
         return last
     fit = last.fit
+    inputs = {hold: last.bench.inputs.by_rule(hold) for hold in holds}
     benches = {hold: dataclasses.replace(last.bench, inputs=of) for hold, of in inputs.items()}
     arcs = arcs_of(with_states(nodes, fit.arcs, fit.fitted.x), length)
     best = choose_rule(benches, nodes, fit.structure, fit.values, arcs, fit.sigma, interval)

@@ -293,7 +293,7 @@ def _searched(
     if found is None:
         return None
     period = max(6, round(scales.per_period))
-    acting = choose_again(found.acting, inputs, found.nodes, period, scales.dt)
+    acting = choose_again(found.acting, holds, found.nodes, period, scales.dt)
     if acting.hold != found.acting.hold:
         on_progress(f"inputs {RULES[acting.hold]}: held-out arcs choose it with the law found")
         if find is search:
@@ -340,7 +340,7 @@ def _with_finer_steps(
     fit, scales = acting.fit, samples.scales
     bench = dataclasses.replace(acting.bench, gauge=gauge)
     finer = scales.substeps_for(fit.sigma)
-    if finer > scales.substeps:
+    if finer > bench.inputs.substeps:
         inputs = ArcInputs(nodes, finer, acting.hold, acting.delay)
         bench = dataclasses.replace(bench, inputs=inputs)
         fit = bench.fit(fit.structure, fit.values, fit.arcs, fit.sigma)

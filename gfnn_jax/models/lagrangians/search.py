@@ -21,6 +21,7 @@ from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, a_third
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, which_friction
 from gfnn_jax.models.lagrangians.input_rules import Acting, choose_rule, with_delay
@@ -168,6 +169,7 @@ def _along_longer_arcs(
             break
         nodes, fit = with_zeros_of_runs(bench, nodes, longer, on_progress)
         if periods == 1:
+            bench, fit = with_fine_steps(bench, fit, on_progress)
             fit = grow(bench, nodes, fit, frictions, on_progress, options)
             fit = prune(bench, nodes, fit, on_progress, options)
             fit = grow(bench, nodes, fit, every, on_progress, options)
@@ -202,37 +204,41 @@ def finished(
     """The law that a fit to the longest arcs comes to: its friction chosen, terms dropped and
     added."""
 
-    def choose(nodes: Sequence[Nodes], fit: LawFit) -> tuple[LawFit, FrictionChoice]:
+    def choose(
+        bench: Workbench, nodes: Sequence[Nodes], fit: LawFit
+    ) -> tuple[LawFit, FrictionChoice]:
         return choose_friction(bench, nodes, fit, every.friction, on_progress, options)
 
-    settled = partial(_settled, bench, every, scales.dt, on_progress, options)
+    settled = partial(_settled, every, scales.dt, on_progress, options)
     return by_arcs_that_tell(bench, nodes, fit, choose, settled, scales, on_progress, options)
 
 
 def by_arcs_that_tell(
     bench: Workbench, nodes: Sequence[Nodes], fit: LawFit,
-    choose: Callable[[Sequence[Nodes], LawFit], tuple[LawFit, FrictionChoice]],
-    settled: Callable[[Sequence[Nodes], LawFit, FrictionChoice], Found],
+    choose: Callable[[Workbench, Sequence[Nodes], LawFit], tuple[LawFit, FrictionChoice]],
+    settled: Callable[[Workbench, Sequence[Nodes], LawFit, FrictionChoice], Found],
     scales: Scales, on_progress: Callable, options: SearchOptions,
 ) -> Found:  # fmt: skip
-    """The law of a fit to the longest arcs, with the friction that is to ``choose``, as it is
-    ``settled``; and, where shorter arcs tell its coefficients better, that of these."""
-    fit, choice = choose(nodes, fit)
+    """The law of a fit to the longest arcs, by steps that are short enough, with the friction that
+    is to ``choose``, as it is ``settled``; and, where shorter arcs tell its coefficients better,
+    that of these."""
+    bench, fit = with_fine_steps(bench, fit, on_progress)
+    fit, choice = choose(bench, nodes, fit)
     nodes, fit = with_zeros_of_runs(bench, nodes, fit, on_progress)
     lengths = [max(6, round(p * scales.per_period)) for p in options.periods]
     shorter = telling_more(bench, nodes, fit, lengths, options)
-    found = settled(nodes, fit, choice)
+    found = settled(bench, nodes, fit, choice)
     if shorter is None:
         return found
     periods = shorter.arcs.t.shape[1] / scales.per_period
     on_progress(f"arcs of {periods:.2g} periods tell more than longer ones: {describe(shorter)}")
     nodes = with_states(nodes, shorter.arcs, shorter.fitted.x)
-    return found._replace(shorter=settled(nodes, *choose(nodes, shorter)))
+    return found._replace(shorter=settled(bench, nodes, *choose(bench, nodes, shorter)))
 
 
 def _settled(
-    bench: Workbench, every: Structure, dt: float, on_progress: Callable[[str], object],
-    options: SearchOptions, nodes: Sequence[Nodes], fit: LawFit, choice: FrictionChoice,
+    every: Structure, dt: float, on_progress: Callable[[str], object], options: SearchOptions,
+    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, choice: FrictionChoice,
 ) -> Found:  # fmt: skip
     """The law by arcs as long as those of the fit: terms that they do not tell are dropped, and
     others of ``every`` tried."""
@@ -243,11 +249,11 @@ def _settled(
     fit = prune(bench, nodes, fit, on_progress, options, friction=False)
     if fit.structure != before:
         fit, choice = choose_friction(bench, nodes, fit, every.friction, on_progress, options)
-    return as_found(bench, dt, nodes, fit, choice)
+    return as_found(dt, bench, nodes, fit, choice)
 
 
 def as_found(
-    bench: Workbench, dt: float, nodes: Sequence[Nodes], fit: LawFit, choice: FrictionChoice
+    dt: float, bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, choice: FrictionChoice
 ) -> Found:
     """The fit as it is, with the delay of its inputs, and the nodes with its states."""
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
