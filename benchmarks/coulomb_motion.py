@@ -54,35 +54,45 @@ class Body(NamedTuple):
         raise ValueError(f"expected a state whose joints slide or stick, got {x}")
 
     def follow(self, x: np.ndarray, times: np.ndarray, u=None, **options) -> np.ndarray:
-        """States (n, 2d) at times (n,), from x (2d,) at the first one, with an input u that is held.
+        """States (n, 2d) at times (n,), from x (2d,) at the first one, with an input u held.
 
         options: of `scipy.integrate.solve_ivp`.
         """
-        found, d, t, last = np.full((len(times), len(x)), np.nan), len(x) // 2, *times[[0, -1]]
+        found, t, last = np.full((len(times), len(x)), np.nan), *times[[0, -1]]
         found[0] = x
         while t < last:
-            modes = self.modes(x, u)
-
-            def rate(_, x, modes=modes):
-                return np.append(x[d:], self.accelerate(x, modes, u)[0])
-
-            def event(joint, modes=modes):
-                def left(_, x):
-                    if modes[joint]:
-                        return modes[joint] * (self.joints[joint] @ x[d:])
-                    return self.sizes[joint] - abs(self.accelerate(x, modes, u)[1][joint])
-
-                left.terminal, left.direction = True, -1
-                return left
-
-            events = [event(joint) for joint in range(len(modes))]
-            done = solve_ivp(rate, (t, last), x, events=events, dense_output=True, **options)
+            done = self._to_an_event(x, t, last, u, options)
             inside = (times > t) & (times <= done.t[-1])
             if inside.any():
                 found[inside] = done.sol(times[inside]).T
-            t, x = done.t[-1], done.y[:, -1]
-            v = x[d:]
-            s = np.where(abs(self.joints @ v) < _AT_REST, self.joints @ v, 0.0)
-            x = np.append(x[:d], v - np.linalg.pinv(self.joints) @ s)
-        found[-1] = x
+            t, x = done.t[-1], self._at_rest(done.y[:, -1])
         return found
+
+    def _to_an_event(self, x, t, last, u, options):
+        """The motion from x at t until a joint slides or sticks that did not, or to the last t."""
+        modes, d = self.modes(x, u), len(x) // 2
+
+        def rate(_, z):
+            return np.append(z[d:], self.accelerate(z, modes, u)[0])
+
+        def left(joint, z):
+            if modes[joint]:
+                return modes[joint] * (self.joints[joint] @ z[d:])
+            return self.sizes[joint] - abs(self.accelerate(z, modes, u)[1][joint])
+
+        def event(joint):
+            def of(_, z):
+                return left(joint, z)
+
+            of.terminal, of.direction = True, -1
+            return of
+
+        events = [event(joint) for joint in range(len(modes))]
+        return solve_ivp(rate, (t, last), x, events=events, dense_output=True, **options)
+
+    def _at_rest(self, x: np.ndarray) -> np.ndarray:
+        """The state with speeds of 0 where they are close to it."""
+        v = x[len(x) // 2 :]
+        s = self.joints @ v
+        rest = np.where(abs(s) < _AT_REST, s, 0.0)
+        return np.append(x[: len(v)], v - np.linalg.pinv(self.joints) @ rest)

@@ -118,7 +118,8 @@ def swings(count, dim, angle, speed, about=0.0):
 TWO, THREE = ("theta1", "theta2"), ("theta1", "theta2", "theta3")
 TWINS = {
     "pendulum": Twin(
-        along(lambda q, v, u: -1.357 * np.sin(q) - 0.012 * v), ((1.45, 0.0),), 57.0, 1 / 6, ("theta",), ("theta",),
+        along(lambda q, v, u: -1.357 * np.sin(q) - 0.012 * v),
+        ((1.45, 0.0),), 57.0, 1 / 6, ("theta",), ("theta",),
         {"omega**2": 0.5, "cos(theta)": 1.357}, {"omega**2": 0.006},
     ),
     "air_track": Twin(
@@ -140,7 +141,8 @@ TWINS = {
         {"omega1**2": 0.01, "(omega2 - omega1)**2": 0.004},
     ),
     "arm1": Twin(
-        along(lambda q, v, u: 64.0 * np.sin(q) - 0.0047 * v * abs(v), dry=(0.13,)), ((4.7, 0.0), (4.2, 0.0)), 9.0, 0.004, ("theta",), ("theta",),
+        along(lambda q, v, u: 64.0 * np.sin(q) - 0.0047 * v * abs(v), dry=(0.13,)),
+        ((4.7, 0.0), (4.2, 0.0)), 9.0, 0.004, ("theta",), ("theta",),
         {"omega**2": 0.5, "cos(theta)": -64.0}, {"abs(omega)**3": 0.0047 / 3, "abs(omega)": 0.13},
     ),
     "arm2": Twin(
@@ -178,7 +180,8 @@ TWINS = {
         {"omega1**2": 0.015, "(omega2 - omega1)**2": 0.002}, wrapped=True,
     ),
     "robot_arm": Twin(
-        Body(_robot_masses, _robot_force, np.eye(2), np.array([1.4, 0.8])), ((0.0,) * 4,) * 3, 10.0, 0.002, TWO, TWO,
+        Body(_robot_masses, _robot_force, np.eye(2), np.array([1.4, 0.8])),
+        ((0.0,) * 4,) * 3, 10.0, 0.002, TWO, TWO,
         {"omega1**2": _ROD, "omega1**2*cos(theta2)": _REACH, "omega1*omega2*cos(theta2)": _REACH,
          "omega1*omega2": 2 * _FAR, "omega2**2": _FAR, "cos(theta1)": 14.0,
          "cos(theta1 + theta2)": 10.5},
@@ -187,7 +190,8 @@ TWINS = {
         ("omega1**2", "omega1**2*cos(theta2)"),
     ),
     "silverbox": Twin(
-        along(lambda q, v, u: -184_200 * q - 734_000 * q**3 - 41 * v + 180_000 * u), ((0.0, 0.0),), 20.0, 1 / 610.35, ("y",), (),
+        along(lambda q, v, u: -184_200 * q - 734_000 * q**3 - 41 * v + 180_000 * u),
+        ((0.0, 0.0),), 20.0, 1 / 610.35, ("y",), (),
         {"y_dot**2": 0.5, "y**2": -92_100.0, "y**4": -183_500.0}, {"y_dot**2": 20.5},
         {"u": (180_000.0,)}, multisine(1.0, 200.0, 400, (0.022,)),
     ),

@@ -21,9 +21,7 @@ from gfnn_jax.signals.local_cubics import Smooth, choose_half, smooth
 GAP = 3.5  # median steps: a longer one ends a stretch
 PER_PERIOD = 40  # nodes
 MOST_STEPS = 6_000  # of a fit: more tell little more
-# Radians of a Runge–Kutta step of order 5 by the fifth root of noise ÷ spread, least and most: its
-# error in the coefficients is then a third of a standard error (`python benchmarks/twins.py`).
-_STEP, _FINEST, _COARSEST = 1.27, 0.05, 0.25
+_STEP = 0.25  # radians of the fastest motion, of a Runge–Kutta step
 _BLOCK = 8.0  # periods of a block, where only some blocks of a long recording are taken
 _SHORTEST = (
     9  # samples of a stretch, nodes of an arc: shorter ones tell less than their state needs
@@ -63,15 +61,14 @@ class Nodes:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scales:
     """Scales of the samples, from the samples: noise σ (k,) of the channels, rms speeds (d,), the
-    fastest frequency ω (1/s), the median step dt, the window of the local cubics (samples to either
-    side), and the spread (k,) of the channels."""
+    fastest frequency ω (1/s), the median step dt, and the window of the local cubics (samples to
+    either side)."""
 
     sigma: np.ndarray
     speed: np.ndarray
     omega: float
     dt: float
     half: int
-    spread: np.ndarray
 
     @property
     def period(self) -> float:
@@ -89,14 +86,8 @@ class Scales:
 
     @property
     def substeps(self) -> int:
-        """Runge–Kutta steps between two nodes."""
-        return self.substeps_for(self.sigma)
-
-    def substeps_for(self, sigma: np.ndarray) -> int:
-        """Runge–Kutta steps between two nodes whose error is nothing beside this noise."""
-        share = np.min(sigma / np.maximum(self.spread, 1e-300))
-        step = np.clip(_STEP * share**0.2, _FINEST, _COARSEST)
-        return max(1, int(np.ceil(2 * np.pi / self.per_period / step)))
+        """Runge–Kutta steps between two nodes that a search begins with."""
+        return max(1, int(np.ceil(2 * np.pi / self.per_period / _STEP)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -181,12 +172,11 @@ def measure(found: Sequence[Stretch]) -> Scales:
     resolution = np.nanmedian(np.abs(steps), axis=0)
     size = np.sqrt(np.nanmean(steps**2, axis=0))
     sigma = np.maximum(sigma, 1e-9 * np.maximum(resolution, size))  # clean data have none
-    spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
     systems: dict[tuple[float, ...], list[Smooth]] = {}
     for stretch, own in zip(found, smooths, strict=True):
         systems.setdefault(tuple(stretch.args.tolist()), []).append(own)
     omega = max(_frequency(own, _SLOW * speed) for own in systems.values())
-    return Scales(sigma, speed, omega, dt, half, spread)
+    return Scales(sigma, speed, omega, dt, half)
 
 
 def _frequency(smooths: Sequence[Smooth], slow: np.ndarray) -> float:

@@ -435,7 +435,8 @@ def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
         rest = R[:, m:, m:]
         stack = np.concatenate([factor, rest.reshape(-1, n + 1)])
         factor = np.asarray(np.linalg.qr(stack, mode="r"))
-        scores = (rest[..., :n].swapaxes(1, 2) @ rest[..., n:])[..., 0]
+        with np.errstate(all="ignore"):
+            scores = (rest[..., :n].swapaxes(1, 2) @ rest[..., n:])[..., 0]
         follows = np.zeros((len(J), length, k))
         if leverage:
             own = np.linalg.qr(J[..., :m])[0]

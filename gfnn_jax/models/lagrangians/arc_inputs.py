@@ -30,9 +30,9 @@ class ArcInputs:
         """Make those of another rule between samples."""
         return ArcInputs(self._nodes, self.substeps, hold)
 
-    def finer(self) -> ArcInputs:
-        """Make those of steps half as long."""
-        return ArcInputs(self._nodes, 2 * self.substeps, self.hold, self.delay)
+    def of_steps(self, substeps: int) -> ArcInputs:
+        """Make those of so many steps between two nodes."""
+        return ArcInputs(self._nodes, substeps, self.hold, self.delay)
 
     def __call__(self, arcs: Arcs) -> np.ndarray:
         steps = arcs.t.shape[1] - 1

@@ -25,6 +25,7 @@ from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_law import fit_given
@@ -40,7 +41,6 @@ from gfnn_jax.models.lagrangians.search import (
     NO_LAW,
     Found,
     SearchOptions,
-    describe,
     search,
     search_on,
 )
@@ -84,7 +84,8 @@ def fit_recording(
     parameters = parameters_of(recording)
     samples, gauge, found = _found(recording, loss, parameters, terms, holds, note, options)
     acting, choice, nodes, _ = _forecasting_best(found, samples, note)
-    bench, fit = _with_finer_steps(acting, gauge, samples, nodes, note)
+    bench = dataclasses.replace(acting.bench, gauge=gauge)
+    bench, fit = with_fine_steps(bench, acting.fit, note)
     measured = velocities(recording, fit, nodes)
     for name, one in measured.items():
         note(f"velocity {name}: {one.in_file(recording, name).text}")
@@ -326,26 +327,6 @@ def _forecasting_best(found: Found, samples: _Samples, on_progress: OnProgress) 
         return found
     acting = found.shorter.acting._replace(others=found.acting.others)
     return found.shorter._replace(acting=acting)
-
-
-def _with_finer_steps(
-    acting: Acting,
-    gauge: np.ndarray,
-    samples: _Samples,
-    nodes: Sequence[Nodes],
-    on_progress: OnProgress,
-) -> tuple[Workbench, LawFit]:
-    """The fit with the steps between nodes that its noise asks for: local cubics may have seen more
-    noise than there is."""
-    fit, scales = acting.fit, samples.scales
-    bench = dataclasses.replace(acting.bench, gauge=gauge)
-    finer = scales.substeps_for(fit.sigma)
-    if finer > bench.inputs.substeps:
-        inputs = ArcInputs(nodes, finer, acting.hold, acting.delay)
-        bench = dataclasses.replace(bench, inputs=inputs)
-        fit = bench.fit(fit.structure, fit.values, fit.arcs, fit.sigma)
-        on_progress(f"{finer} steps between nodes: {describe(fit)}")
-    return bench, fit
 
 
 def _with_velocities(
