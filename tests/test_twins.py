@@ -3,14 +3,11 @@
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import twins
-
-from gfnn_jax.dataset.stretches import Scales
 
 
 @pytest.mark.slow
@@ -23,14 +20,6 @@ def test_the_terms_of_a_twin_come_out_with_true_errors(name, noise):
     found = twins.case(name, noise, 0)
     assert found["same"] == {"lagrangian": True, "friction": True}
     assert max(found["standard_errors"].values()) < 4
-
-
-def test_steps_are_finer_where_there_is_less_noise():
-    one = np.ones(1)
-    scales = Scales(1e-3 * one, one, 1.0, 2 * np.pi / 40, 3, one)
-    assert scales.substeps == 1
-    assert scales.substeps_for(1e-6 * one) == 2
-    assert scales.substeps_for(1e-12 * one) == 4
 
 
 def test_terms_lose_zeros():

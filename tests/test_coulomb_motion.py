@@ -1,0 +1,51 @@
+"""The simulator of dry friction that benchmarks measure by, against exact motion."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+from coulomb_motion import Body
+
+OPTIONS = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-12}
+
+
+def test_a_block_on_a_spring_loses_twice_the_friction_in_each_half_period_and_stops():
+    """ẍ = −x − 0.3 sign ẋ from x = 1.45 at rest: it turns at −0.85 and at 0.25, where it stays."""
+    block = Body(lambda q: np.eye(1), lambda q, v, u: -q, np.eye(1), np.array([0.3]))
+    t = np.linspace(0, 12, 601)
+    x = block.follow(np.array([1.45, 0.0]), t, **OPTIONS)
+    first, second = t <= np.pi, (t > np.pi) & (t <= 2 * np.pi)
+    np.testing.assert_allclose(x[first, 0], 0.3 + 1.15 * np.cos(t[first]), atol=1e-9)
+    np.testing.assert_allclose(x[second, 0], -0.3 + 0.55 * np.cos(t[second]), atol=1e-9)
+    np.testing.assert_allclose(x[t > 2 * np.pi, 0], 0.25, atol=1e-9)
+    assert np.all(x[t > 2 * np.pi, 1] == 0)
+
+
+def test_a_block_that_sticks_is_let_go_by_the_force_that_it_can_hold():
+    """A force 0.5 t on a block with friction 1: at rest until t = 2, then v = (t − 2)²/4."""
+
+    def push(q, v, u):
+        return np.array([0.0, 0.5 * q[0]])  # q₀ runs as time does
+
+    both = Body(lambda q: np.eye(2), push, np.array([[0.0, 1.0]]), np.array([1.0]))
+    t = np.linspace(0, 5, 51)
+    x = both.follow(np.array([0.0, 0.0, 1.0, 0.0]), t, **OPTIONS)
+    late = np.maximum(t - 2, 0)
+    np.testing.assert_allclose(x[:, 3], late**2 / 4, atol=1e-8)
+    np.testing.assert_allclose(x[:, 1], late**3 / 12, atol=1e-8)
+
+
+@pytest.mark.parametrize("push", [0.5, 1.5])
+def test_friction_between_two_blocks_takes_them_along_up_to_its_size(push):
+    """Of two blocks of mass 1 the first is pushed, with friction 0.5 between them: together they
+    gain push/2 each while that holds, else push − 0.5 and 0.5."""
+    force = lambda q, v, u: np.array([push, 0.0])  # noqa: E731
+    pair = Body(lambda q: np.eye(2), force, np.array([[-1.0, 1.0]]), np.array([0.5]))
+    t = np.linspace(0, 2, 5)
+    v = pair.follow(np.zeros(4), t, **OPTIONS)[:, 2:]
+    gains = [push / 2, push / 2] if push < 1 else [push - 0.5, 0.5]
+    np.testing.assert_allclose(v, t[:, None] * gains, atol=1e-12)

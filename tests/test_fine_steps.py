@@ -1,0 +1,70 @@
+"""Steps between nodes are as short as the coefficients ask for."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.dataset.stretches import arcs_of, nodes_of
+from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
+from gfnn_jax.models.lagrangians.fit import Workbench
+from gfnn_jax.models.lagrangians.recordings import _samples
+from gfnn_jax.models.lagrangians.structure import Structure
+
+TRUE = {"loss": 0.05, "term": 2.0}  # θ̈ = −2 sin θ − 0.05 θ̇
+TERMS = (((2,), (0,), (0,), 0.0), ((0,), (0,), (1,), 0.0))  # θ̇² and cos θ
+PENDULUM = Structure(1, TERMS, tuple(libraries.losses(1, (LINEAR,), 0.0)[:1]), (), 0, ())
+
+
+def fitted(noise: float):
+    """The workbench of a swinging pendulum with steps of a whole interval, and the fit of its law
+    along arcs of a period."""
+    t = np.arange(0, 60, 0.45)
+    rate = lambda _, x: [x[1], -2 * np.sin(x[0]) - 0.05 * x[1]]  # noqa: E731
+    theta = solve_ivp(rate, (0, t[-1]), [2.6, 0.0], t_eval=t, rtol=1e-12, atol=1e-12).y[0]
+    theta += noise * np.random.default_rng(3).normal(size=len(t))
+    recording = gfnn.Recording({"t": t, "theta": theta}, angles="theta")
+    samples = _samples(recording, None, print, ())
+    nodes = nodes_of(samples.stretches, samples.scales)
+    gauge = np.concatenate([n.x[:, :1] for n in nodes])
+    bench = Workbench(gauge, ArcInputs(nodes, 1, "hold"), samples.scales.omega, samples.observation)
+    keys = PENDULUM.keys()
+    known = {key: TRUE["loss" if key[0] == "loss" else "term"] for key in keys}
+    fit = bench.fit(PENDULUM, known, arcs_of(nodes, 20), np.full(1, max(noise, 1e-9)))
+    return bench, fit, np.array([known[key] for key in keys])
+
+
+def off(fit, true) -> float:
+    """The largest error in standard errors."""
+    return float(np.max(np.abs(fit.p - true) / np.sqrt(np.diag(fit.covariance()))))
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-4])
+def test_errors_of_steps_do_not_move_coefficients(noise):
+    bench, fit, true = fitted(noise)
+    assert off(fit, true) > 10  # by steps of a whole interval
+    lines: list[str] = []
+    finer, found = with_fine_steps(bench, fit, lines.append)
+    assert off(found, true) < 4
+    assert finer.inputs.substeps > 1
+    assert len(lines) >= 1
+    assert f"{finer.inputs.substeps} steps between nodes" in lines[-1]
+
+
+def test_less_noise_asks_for_shorter_steps_and_much_noise_for_none():
+    counts = [with_fine_steps(*fitted(noise)[:2], print)[0].inputs.substeps
+              for noise in (1e-6, 1e-4, 3e-2)]  # fmt: skip
+    assert counts[0] > counts[1] > counts[2] == 1
+    bench, fit, _ = fitted(3e-2)
+    assert with_fine_steps(bench, fit, print) == (bench, fit)
+
+
+def test_a_fit_without_an_orbit_is_left_as_it_is():
+    bench, fit, _ = fitted(1e-4)
+    lost = dataclasses.replace(fit, fitted=dataclasses.replace(fit.fitted, cost=np.inf))
+    assert with_fine_steps(bench, lost, print) == (bench, lost)
