@@ -38,6 +38,7 @@ _NEAR = 2  # leads to either side that share their errors
 _SHORT = 20  # samples, at least, of the shortest window
 _FEWEST = 20  # errors that tell a quantile of 95 %
 _INSIDE = 0.95  # of the errors, within two standard deviations
+_PARTS = 8  # of the record, in the jackknife of its errors
 FRACTIONS = (0.01, 0.05, 0.20)  # of the spread, that horizons are told for
 
 
@@ -54,11 +55,13 @@ class Horizon(NamedTuple):
 
 class Calibration(NamedTuple):
     """The law with the window of its estimates and its misfit, its horizons, and the median errors
-    (n, k) of forecasts by the time ahead, in units of the spread."""
+    (n, k) of forecasts by the time ahead, in units of the spread; parts: (P, n, k) the same without
+    one part of the record each, NaN where no other is long enough."""
 
     law: Law
     horizons: list[Horizon]
     median: np.ndarray
+    parts: np.ndarray
 
     def against(self, other: Calibration) -> float:
         """Median errors as a multiple of another's, in the geometric mean; 1 where they are of
@@ -66,6 +69,15 @@ class Calibration(NamedTuple):
         if self.median.shape != other.median.shape or not self.median.size:
             return 1.0
         return float(np.exp(np.mean(np.log(self.median / other.median))))
+
+    def errs_more(self, other: Calibration) -> bool:
+        """Return whether median errors are larger than another's by more than a standard error of
+        their ratio, of the jackknife over parts of the record."""
+        if not np.log(self.against(other)) > 0:
+            return False
+        logs = np.nanmean(np.log(self.parts / other.parts), axis=(1, 2))
+        error = np.sqrt((len(logs) - 1) * np.mean((logs - logs.mean()) ** 2))
+        return bool(np.log(self.against(other)) > error)
 
 
 class Thirds(NamedTuple):
@@ -86,7 +98,7 @@ def calibrated(
     horizons. ``spread`` (k,) of the channels."""
     starts = _starts(found, scales)
     if not starts:
-        return Calibration(law, [], np.zeros((0, len(spread))))
+        return _unknown(law, spread)
     short = (_SHORT - 1) * scales.dt
     tried = np.unique(np.maximum(np.array(_CHOICES) * scales.period, short))
     some = starts[:: -(-len(starts) // _TRIED)]
@@ -107,7 +119,7 @@ def calibrated(
     enough = np.isfinite(errors).all(axis=-1).sum(axis=0) >= _FEWEST
     leads, errors, deviations = leads[enough], errors[:, enough], deviations[:, enough]
     if not len(leads):
-        return Calibration(law, [], np.zeros((0, len(spread))))
+        return _unknown(law, spread)
     missed = np.nanquantile((errors**2 / 4 - deviations**2) / large**2, _INSIDE, axis=0)
     misfit = np.sqrt(np.maximum(missed, 0.0))
     sensors = dataclasses.replace(sensors, window=best, leads=leads, misfit=misfit)
@@ -117,8 +129,19 @@ def calibrated(
     horizons = [
         Horizon(f, _passed(measured, leads, f), _passed(predicted, leads, f)) for f in FRACTIONS
     ]
-    median = np.nanmedian(np.abs(errors), axis=0) / spread
-    return Calibration(law._replace(sensors=sensors), horizons, median)
+    sizes = np.abs(errors) / spread
+    part = np.tile(np.arange(len(starts)) * _PARTS // len(starts), len(sizes) // len(starts))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # times of one part alone
+        parts = np.stack([np.nanmedian(sizes[part != k], axis=0) for k in range(_PARTS)])
+    median = np.nanmedian(sizes, axis=0)
+    return Calibration(law._replace(sensors=sensors), horizons, median, parts)
+
+
+def _unknown(law: Law, spread: np.ndarray) -> Calibration:
+    """The calibration of a record that is too short for one."""
+    none = np.zeros((0, len(spread)))
+    return Calibration(law, [], none, none[None])
 
 
 def _with_size(

@@ -18,7 +18,7 @@ from gfnn_jax.solve.latent_arcs import sensitivities
 
 _MOVED = 1 / 3  # of a standard error: what steps may move a combination of coefficients by
 _ORDER = 5
-_MOST, _SHORTEST = 4, 1 / 8  # times that steps are shortened, and to which part of the first
+_MOST, _SHORTEST = 6, 1 / 32  # times that steps are shortened, and to which part of the first
 
 
 def with_fine_steps(

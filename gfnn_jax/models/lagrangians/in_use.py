@@ -1,7 +1,7 @@
 """A fit made ready for forecasts: the law in columns, its sensors, bands by held-out thirds.
 
-Where residuals show that zeros of channels wander there are two such fits, and the one whose
-forecasts of held-out data err less is taken.
+Where residuals show that zeros of channels wander there are two such fits. The one with zeros that
+wander is taken where its forecasts of held-out data do not err more than chance makes.
 """
 
 from __future__ import annotations
@@ -150,7 +150,8 @@ def best_in_use(
     on_progress: Callable[[str], object],
 ) -> InUse:  # fmt: skip
     """The fit as it is, or fitted anew with zeros of channels that wander: where its residuals show
-    these (the likelihood's evidence) and forecasts of held-out data do not err more with them."""
+    these (the likelihood's evidence) and forecasts of held-out data do not err more with them than
+    chance makes."""
     steady = record.in_use(bench, fit, choice)
     wander = wander_of(bench, fit)
     if wander is None:
@@ -164,4 +165,4 @@ def best_in_use(
         f"zeros that wander by {wander.size:.2g} σ over {wander.time:.3g} s: held-out forecasts "
         f"err by {share:.3g} times as much"
     )
-    return wandering if share < 1 else steady
+    return steady if wandering.calibration.errs_more(steady.calibration) else wandering
