@@ -2,13 +2,12 @@
 
 Between events each joint slides, with a friction of a constant size against its speed, or sticks,
 held by a force of at most that size. An event is a sliding speed that comes to zero, or a holding
-force that comes to its size: there, and at a start, those that can slide or stick are tried until
-one agrees with itself.
+force that comes to its size. Where a joint sticks by more than its friction it is let go, the one
+farthest beyond it first.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 _AT_REST = 1e-9  # of a joint's speed, in its units
-_TURNS = 1e-9  # share of friction's size by which a force that still holds is below it
+_EVENTS = 100_000  # of one motion
 
 
 class Body(NamedTuple):
@@ -40,55 +39,66 @@ class Body(NamedTuple):
         pull[held] = found[d:]
         return found[:d], pull
 
-    def modes(self, x: np.ndarray, u) -> np.ndarray:
-        """Which joints slide and which stick in a state."""
-        d = len(x) // 2
-        s = self.joints @ x[d:]
-        choices = [(0, 1, -1) if abs(one) < _AT_REST else (np.sign(one),) for one in s]
-        for modes in map(np.array, itertools.product(*choices)):
-            a, pull = self.accelerate(x, modes, u)
-            slides = (abs(s) >= _AT_REST) | (modes * (self.joints @ a) > -_AT_REST)
-            holds = abs(pull) < self.sizes * (1 - _TURNS)
-            if np.where(modes == 0, holds, slides).all():
-                return modes
-        raise ValueError(f"expected a state whose joints slide or stick, got {x}")
-
     def follow(self, x: np.ndarray, times: np.ndarray, u=None, **options) -> np.ndarray:
         """States (n, 2d) at times (n,), from x (2d,) at the first one, with an input u held.
 
-        options: of `scipy.integrate.solve_ivp`.
+        options: of `scipy.integrate.solve_ivp`. Raises RuntimeError where that fails.
         """
         found, t, last = np.full((len(times), len(x)), np.nan), *times[[0, -1]]
         found[0] = x
-        while t < last:
-            done = self._to_an_event(x, t, last, u, options)
+        s = self.joints @ x[len(x) // 2 :]
+        modes = self._released(x, np.where(abs(s) < _AT_REST, 0.0, np.sign(s)), u)
+        for _ in range(_EVENTS):
+            done = self._to_an_event(x, modes, t, last, u, options)
+            if done.status < 0:
+                raise RuntimeError(f"no solution beyond t = {done.t[-1]:g}: {done.message}")
             inside = (times > t) & (times <= done.t[-1])
             if inside.any():
                 found[inside] = done.sol(times[inside]).T
+            if done.status == 0:
+                return found
             t, x = done.t[-1], self._at_rest(done.y[:, -1])
-        return found
+            modes = self._changed(x, modes, np.array([len(at) > 0 for at in done.t_events]), u)
+        raise RuntimeError(f"expected at most {_EVENTS:,} events, came to t = {t:g}")
 
-    def _to_an_event(self, x, t, last, u, options):
+    def _to_an_event(self, x, modes, t, last, u, options):
         """The motion from x at t until a joint slides or sticks that did not, or to the last t."""
-        modes, d = self.modes(x, u), len(x) // 2
+        d = len(x) // 2
 
         def rate(_, z):
             return np.append(z[d:], self.accelerate(z, modes, u)[0])
 
-        def left(joint, z):
-            if modes[joint]:
-                return modes[joint] * (self.joints[joint] @ z[d:])
-            return self.sizes[joint] - abs(self.accelerate(z, modes, u)[1][joint])
-
         def event(joint):
-            def of(_, z):
-                return left(joint, z)
+            def left(_, z):
+                if modes[joint]:
+                    return modes[joint] * (self.joints[joint] @ z[d:])
+                return self.sizes[joint] - abs(self.accelerate(z, modes, u)[1][joint])
 
-            of.terminal, of.direction = True, -1
-            return of
+            left.terminal, left.direction = True, -1
+            return left
 
         events = [event(joint) for joint in range(len(modes))]
         return solve_ivp(rate, (t, last), x, events=events, dense_output=True, **options)
+
+    def _changed(self, x: np.ndarray, modes: np.ndarray, ended: np.ndarray, u) -> np.ndarray:
+        """The modes behind an event of the joints that have ``ended`` theirs: one that stuck slides
+        to where it was held from; one that slid sticks where its friction can hold it."""
+        held = self.accelerate(x, modes, u)[1]
+        after = np.where(ended, np.where(modes == 0, np.sign(held), 0.0), modes)
+        return self._released(x, after, u)
+
+    def _released(self, x: np.ndarray, modes: np.ndarray, u) -> np.ndarray:
+        """The modes without joints that stick by a force beyond their friction, which slide to
+        where it held them from: the one farthest beyond first."""
+        modes = modes.copy()
+        for _ in range(len(modes)):
+            held = self.accelerate(x, modes, u)[1]
+            beyond = np.where(modes == 0, abs(held) - self.sizes, 0.0)
+            joint = int(np.argmax(beyond))
+            if not beyond[joint] > 0:
+                break
+            modes[joint] = np.sign(held[joint])
+        return modes
 
     def _at_rest(self, x: np.ndarray) -> np.ndarray:
         """The state with speeds of 0 where they are close to it."""

@@ -69,8 +69,9 @@ def links(masses, weights, friction, dry: tuple[float, ...] = ()) -> Body:
     def force(q, v, u):
         return friction(v) - weights * np.sin(q) - (masses * np.sin(q[:, None] - q)) @ v**2
 
-    joints = (np.eye(len(weights)) - np.eye(len(weights), k=-1))[: len(dry)]
-    return Body(lambda q: masses * np.cos(q[:, None] - q), force, joints, np.array(dry))
+    sizes = np.array(dry)
+    directions = (np.eye(len(weights)) - np.eye(len(weights), k=-1))[: len(dry)][sizes > 0]
+    return Body(lambda q: masses * np.cos(q[:, None] - q), force, directions, sizes[sizes > 0])
 
 
 def joints(v, forces):

@@ -283,60 +283,35 @@ def _with_inputs(window: Window, inputs: Recording, sensors: Sensors, run: str) 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Windows:
-    """Windows of equal length as arcs whose laws are known, ``laws[which]``, which (B,): what
-    `fit_arcs` asks for."""
+    """Windows of equal length as arcs whose law is known: what `fit_arcs` asks for."""
 
-    laws: Sequence[Law]
-    which: np.ndarray
+    law: Law
     h: np.ndarray
     u: np.ndarray
 
     def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         arcs, length, m = x.shape
         num = arcs * (length - 1)
-        form, law = self.laws[0].form, self.laws[0].p
-        if len(self.laws) > 1:
-            form, law, _ = _side_by_side(self.laws, np.repeat(self.which, length - 1))
         u = self.u.reshape(num, *self.u.shape[2:])
         start = x[:, :-1].reshape(num, m)
-        step, _ = coulomb.step(form, law, start, self.h.reshape(num), u, order=1)
+        step, _ = coulomb.step(self.law.form, self.law.p, start, self.h.reshape(num), u, order=1)
         shape = (arcs, length - 1, m)
         closing = step.states.reshape(shape) - x[:, 1:]
         return Defects(closing, step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
-        model = self.laws[0].sensors.observation_model
-        shown = model(x, _of_channels(self.laws, self.which)[:, None])
+        shown = self.law.sensors.observation_model(x)
         return shown._replace(by_coefficients=shown.by_coefficients[..., :0])
 
     def take(self, arcs: np.ndarray) -> _Windows:
-        which, h, u = (every[arcs] for every in (self.which, self.h, self.u))
-        return dataclasses.replace(self, which=which, h=h, u=u)
-
-
-def _of_channels(laws: Sequence[Law], which: np.ndarray) -> np.ndarray:
-    """Parameters (B, k) of the channels, of lanes of which each follows one of the laws."""
-    return np.stack([law.sensors.observation_model.values for law in laws])[which]
+        return dataclasses.replace(self, h=self.h[arcs], u=self.u[arcs])
 
 
 def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
-    """`estimates_of` windows that all follow one law."""
-    return estimates_of([law], np.zeros(len(windows), int), windows)
-
-
-def estimates_of(
-    laws: Sequence[Law], which: np.ndarray, windows: Sequence[Window]
-) -> tuple[np.ndarray, np.ndarray]:
-    """(q, v, b) (B, m) at the last sample of each window, and its covariance (B, m, m) in the law
-    that it follows, ``laws[which]``, which (B,): b (k,) the zeros of the channels where these
-    wander, of length 0 where they do not.
-
-    The laws differ as those of `propagate_each` may.
-    """
-    laws, which = of_windows(laws, which, windows)
-    sensors = laws[0].sensors
-    begun = (_started(laws[k].sensors, w) for k, w in zip(which, windows, strict=True))
-    windows, starts = zip(*begun, strict=True)
+    """(q, v, b) (B, m) at the last sample of each window, and its covariance (B, m, m) in the law:
+    b (k,) the zeros of the channels where these wander, of length 0 where they do not."""
+    sensors = law.sensors
+    windows, starts = zip(*(_started(sensors, w) for w in windows), strict=True)
     length = max(len(w.t) for w in windows)
     count = windows[0].y.shape[1]
     t, y, x, noise = [], [], [], []
@@ -348,9 +323,8 @@ def estimates_of(
         noise.append(np.concatenate([np.ones((pad, count)), own_noise]))
         x.append(np.concatenate([np.repeat(own[:1], pad, axis=0), own]))
     t, y, x = np.array(t), np.array(y), np.array(x)
-    h = np.diff(t, axis=1)
-    u = _inputs(laws[0], windows, t, substeps_of(sensors, np.max(h, initial=0.0)))
-    arcs = _Windows(laws, which, h, u)
+    u = _inputs(law, windows, t, substeps_of(sensors, np.max(np.diff(t, axis=1), initial=0.0)))
+    arcs = _Windows(law, np.diff(t, axis=1), u)
     sigma = sensors.observation_model.state_sigma(x[:, -1], sensors.sigma)
     scale = np.concatenate([sigma, sigma * sensors.omega])
     sigma, loss, wander = (
@@ -393,6 +367,23 @@ def _with_zeros(
         [across.swapaxes(1, 2), sigma[:, None] * open_ * sigma],
     ])  # fmt: skip
     return np.concatenate([x, (c.swapaxes(1, 2) @ r)[..., 0] * sigma], axis=1), covariance
+
+
+def estimates_of(
+    laws: Sequence[Law], which: np.ndarray, windows: Sequence[Window]
+) -> tuple[np.ndarray, np.ndarray]:
+    """`estimate_states` of windows of which each follows its own law, ``laws[which]``, which
+    (B,)."""
+    laws, which = of_windows(laws, which, windows)
+    states: list[Any] = [None] * len(windows)
+    for number in np.unique(which).tolist():
+        own = np.flatnonzero(which == number).tolist()
+        for n, x, covariance in zip(
+            own, *estimate_states(laws[number], [windows[n] for n in own]), strict=True
+        ):
+            states[n] = x, covariance
+    x, covariance = (np.stack(part) for part in zip(*states, strict=True))
+    return x, covariance
 
 
 def _started(sensors: Sensors, window: Window) -> tuple[Window, np.ndarray]:
@@ -460,7 +451,7 @@ def propagate_each(
     orbit, spread = _followed(laws, which, x, root[:, : 2 * d], np.diff(ends, axis=1), u, asked)
     of_zeros = np.pad(root[:, 2 * d :], ((0, 0), (0, 0), (0, spread.shape[-1] - root.shape[-1])))
     orbit = orbit[:, asked]
-    scales = _of_channels(laws, which)[:, None]
+    scales = np.stack([law.sensors.observation_model.values for law in laws])[which, None]
     channels, ahead = sensors.observation_model(orbit, scales), times - last[:, None]
     values, shown, further = channels.values, channels.by_state @ spread, 0.0
     if sensors.wander is not None:

@@ -22,7 +22,6 @@ Where it is not white, a *whitening* (`solve.wander`) mixes residuals along an a
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from functools import cached_property, partial
 from typing import NamedTuple
 
@@ -42,6 +41,7 @@ _LOOSE = 1e-12
 # Of a step, that an arc which it made worse goes with its states: where arcs share no coefficients,
 # and where they do.
 _PARTS_ALONE, _PARTS_TOGETHER = (0.5, 0.25, 0.125, 0.0), (0.25, 0.0)
+_GROWN = 2.0  # times the defects of an arc that stays, at the most, by a step of the coefficients
 _BLOCK_BYTES = 64 * 2**20  # of the sensitivities of a block of arcs
 OUTLYING = 5.0  # standard deviations: a residual beyond does not tell the noise
 SOFT_L1 = SoftL1()
@@ -209,18 +209,11 @@ class _Data(NamedTuple):
             off = np.where(self.measured, self.known - observed.values, 0.0)
         return _Iterate.at(p, x, defects, observed, self.measured, off, units)
 
-    def moved(self, here: _Iterate, arcs: np.ndarray, x: np.ndarray) -> Iterator[_Iterate]:
-        """The same iterate, but that these arcs (indices, n) have the states x (P, n, L, m): P of
-        them, evaluated at once."""
+    def moved(self, here: _Iterate, arcs: np.ndarray, x: np.ndarray) -> _Iterate:
+        """The same iterate, but that these arcs (indices, n) have the states x (n, L, m)."""
         with np.errstate(all="ignore"):
-            every = self.model.take(np.tile(arcs, len(x)))
-            defects, observed = evaluated(every, here.p, x.reshape(-1, *x.shape[2:]))
-        for k, states in enumerate(x):
-            own = slice(k * len(arcs), (k + 1) * len(arcs))
-            yield self._with(
-                here, arcs, states, Defects(*(part[own] for part in defects)),
-                Observed(*(part[own] for part in observed)),
-            )  # fmt: skip
+            found = evaluated(self.model.take(arcs), here.p, x)
+        return self._with(here, arcs, x, *found)
 
     def mixed(self, here: _Iterate, other: _Iterate, arcs: np.ndarray) -> _Iterate:
         """The same iterate, but that these arcs (indices, n) are as in the other."""
@@ -240,14 +233,12 @@ class _Data(NamedTuple):
 class _AtStates:
     """The problem of all arcs where a descent stands, and the best iterate that it came by.
 
-    While defects matter a step has to close them; then it has to lower the cost. going: the arcs
-    (indices) that still gain, where they share no coefficients; None: all of them.
+    While defects matter a step has to close them; then it has to lower the cost.
     """
 
     data: _Data
     here: _Iterate
     best: _Iterate
-    going: np.ndarray | None = None
 
     @cached_property
     def _rows(self) -> _Rows:
@@ -264,49 +255,45 @@ class _AtStates:
         if not np.isfinite(self._rows.factor).all():  # derivatives along an arc have overflowed
             return Tried(here, -np.inf, damping, hopeless=True)
         dp, dx = _solve(self._rows, here.defects, damping)
-        x, stays = here.x + share * dx, None
-        if self.going is None:
-            there = self.data.at(here.p + share * dp, x, here.units)
-        else:
-            (there,) = self.data.moved(here, self.going, x[self.going][None])
-        if not len(here.p) or not self._decrease(there, share) > 0:
+        there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
+        stays = np.zeros(len(here.x), bool)
+        if not len(here.p) or not self._decrease(there, share, stays) > 0:
             there, stays = self._alone(there, share, dx)
         return Tried(there, self._decrease(there, share, stays), damping)
 
-    def _decrease(self, there: _Iterate, share: float, stays: np.ndarray | None = None) -> float:
+    def _decrease(self, there: _Iterate, share: float, stays: np.ndarray) -> float:
         """Decrease of the cost by this share of a step, or of the defects while they matter: of
-        those of arcs that do not stay (A,) as they are."""
+        those of arcs but for the ones that stay (A,) where they are."""
         if self.closed(self.here):
             return self.here.merit * (1 + 1e-9) - there.merit
-        if stays is None:
-            return (1 - 0.5 * share) * self.here.gap - there.gap
+        if not np.isfinite(there.gap):
+            return -np.inf
         before, after = (np.sqrt(np.sum(at.gaps[~stays])) for at in (self.here, there))
         return float((1 - 0.5 * share) * before - after)
 
-    def _alone(
-        self, there: _Iterate, share: float, dx: np.ndarray
-    ) -> tuple[_Iterate, np.ndarray | None]:
+    def _alone(self, there: _Iterate, share: float, dx: np.ndarray) -> tuple[_Iterate, np.ndarray]:
         """The end of a step with which arcs (A, L, m) that it made worse go less far with their
-        states, each as far as is best for it; and, while defects matter, which arcs stay (A,)."""
-        here, of_gaps = self.here, len(self.here.p) > 0 and not self.closed(self.here)
+        states, each as far as is best for it; and, while defects matter, which arcs stay (A,): no
+        part of the step is good for these, and their defects at the new p are not much larger."""
+        here, stays = self.here, np.zeros(len(self.here.x), bool)
+        of_gaps = len(self.here.p) > 0 and not self.closed(self.here)
 
         def left(at: _Iterate) -> np.ndarray:
             return at.gaps if of_gaps else at.merits
 
         before = left(here) * (1 + 1e-9)
-        worse = np.flatnonzero(~(left(there) <= before))
-        stays = np.zeros(len(before), bool)
-        if len(worse):
-            parts = _PARTS_TOGETHER if len(here.p) else _PARTS_ALONE
-            steps = [part * dx[worse] if part else np.zeros_like(dx[worse]) for part in parts]
-            tried = self.data.moved(there, worse, here.x[worse] + share * np.array(steps))
-            for part, other in zip(parts, tried, strict=True):
-                now = left(there)[worse]
-                better = (left(other)[worse] < now) | ~np.isfinite(now)
-                better &= ~(now <= before[worse])
-                there = self.data.mixed(there, other, worse[better])
-                stays[worse[better]] = part == 0
-        return there, stays if of_gaps else None
+        for part in _PARTS_ALONE if not len(here.p) else _PARTS_TOGETHER:
+            now = left(there)
+            worse = np.flatnonzero(~(now <= before))
+            if not len(worse):
+                break
+            x = here.x[worse] + share * part * dx[worse] if part else here.x[worse]
+            other = self.data.moved(there, worse, x)
+            better = (left(other)[worse] < now[worse]) | ~np.isfinite(now[worse])
+            there = self.data.mixed(there, other, worse[better])
+            if of_gaps and part == 0:
+                stays[worse] = better & (left(other)[worse] <= _GROWN**2 * before[worse])
+        return there, stays
 
     def moved(self, there: _Iterate, damping: float) -> tuple[_AtStates, bool]:
         """The problem at the end of a step, in units of the noise that its residuals tell; settled
@@ -321,12 +308,7 @@ class _AtStates:
             settled &= bool(np.allclose(here.units.sigma, sigma, rtol=_SETTLED, atol=0))
         elif self.closed(here) and (not self.closed(best) or here.merit < best.merit):
             best = here
-        going = None
-        if not len(here.p) and least is None:
-            gained = before.merits - there.merits
-            going = np.flatnonzero(~(gained <= self.data.tolerance * before.cost / len(gained)))
-            settled |= not len(going)
-        return _AtStates(self.data, here, best, going), settled or not np.isfinite(here.cost)
+        return _AtStates(self.data, here, best), settled or not np.isfinite(here.cost)
 
     def fitted(self, iterations: int, converged: bool) -> Fitted:
         """The fit that ends here."""
@@ -463,8 +445,7 @@ def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
         rest = R[:, m:, m:]
         stack = np.concatenate([factor, rest.reshape(-1, n + 1)])
         factor = np.asarray(np.linalg.qr(stack, mode="r"))
-        with np.errstate(all="ignore"):
-            scores = (rest[..., :n].swapaxes(1, 2) @ rest[..., n:])[..., 0]
+        scores = (rest[..., :n].swapaxes(1, 2) @ rest[..., n:])[..., 0]
         follows = np.zeros((len(J), length, k))
         if leverage:
             own = np.linalg.qr(J[..., :m])[0]

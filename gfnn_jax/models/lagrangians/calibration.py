@@ -16,7 +16,7 @@ import dataclasses
 import warnings
 from bisect import bisect
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from gfnn_jax.dataset.stretches import Scales, Stretch
 from gfnn_jax.maps.estimates import (
     Law,
     Window,
-    estimates_of,
+    estimate_states,
     of_windows,
     propagate_each,
     thinned,
@@ -211,7 +211,13 @@ def _forecasts(
     third = np.array([thirds.of(i, found[i].t[k]) for i, k in starts])
     laws, which = of_windows(thirds.laws, third, cut)
     last = np.array([w.t[-1] for w in cut])
-    x, covariance = estimates_of(laws, which, cut)
+    states: list[Any] = [None] * len(cut)
+    for number, window in sorted(set(zip(which.tolist(), windows.tolist(), strict=True))):
+        own = np.flatnonzero((which == number) & (windows == window)).tolist()
+        found_there = estimate_states(laws[number], [cut[n] for n in own])
+        for n, x, covariance in zip(own, *found_there, strict=True):
+            states[n] = x, covariance
+    x, covariance = (np.stack(part) for part in zip(*states, strict=True))
     orbits = propagate_each(laws, which, cut, x, covariance, last, np.array(times))
     d = thirds.laws[0].form.dim
     return orbits.values - np.array(measured), orbits.std, x[:, : 2 * d]

@@ -1,9 +1,9 @@
 """Runge–Kutta steps between nodes, so short that what they are wrong by moves no coefficient.
 
 One evaluation of the arcs with steps half as long tells by how much these would move the
-coefficients of a fit: by the Gauss–Newton step that they ask for, less what is left of the fit's
-own. Of a step of order 5 the error falls with the fifth power of its length; where dry friction
-acts or inputs jump it falls more slowly, and what the shorter steps are wrong by is measured again.
+coefficients of a fit: by the Gauss–Newton step that they ask for, less that which the fit's own
+steps do. Of a step of order 5 the error falls with the fifth power of its length. Where dry
+friction acts or inputs jump it falls more slowly, so that it is measured again.
 """
 
 from __future__ import annotations
@@ -18,30 +18,36 @@ from gfnn_jax.solve.latent_arcs import sensitivities
 
 _MOVED = 1 / 3  # of a standard error: what steps may move a combination of coefficients by
 _ORDER = 5
-_MOST, _SHORTEST = 6, 1 / 32  # times that steps are shortened, and to which part of the first
+_TIMES = 6  # that steps are shortened
+_SHORTEST = 0.008  # radians of the fastest motion in a step
+_RCOND = 1e-9  # of scaled columns: a combination that moves nothing
 
 
 def with_fine_steps(
     bench: Workbench, fit: LawFit, on_progress: Callable[[str], object]
 ) -> tuple[Workbench, LawFit]:
-    """The fit, and the workbench, with steps between nodes of which shorter ones move nothing."""
-    first = bench.inputs.substeps
-    for _ in range(_MOST):
+    """The fit, and the workbench, with steps between nodes of which shorter ones move nothing; a
+    line says where the shortest still do."""
+    if not (len(fit.p) and np.isfinite(fit.fitted.cost)):
+        return bench, fit
+    most = int(np.ceil(bench.omega * np.median(np.diff(fit.arcs.t, axis=1)) / _SHORTEST))
+    for _ in range(_TIMES):
         now = bench.inputs.substeps
-        moved = _moved(_with_steps(bench, 2 * now), fit)
-        if not moved > _MOVED or now >= first / _SHORTEST:
+        moved = _moved(bench, _with_steps(bench, 2 * now), fit)
+        if not moved > _MOVED:
+            return bench, fit
+        wanted = np.ceil(now * (moved / _MOVED) ** (1 / _ORDER))
+        finer = _with_steps(bench, int(min(max(wanted, now + 1), most)))
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
+        other = finer.fit(fit.structure, fit.values, arcs, fit.sigma) if now < most else fit
+        if now >= most or not np.isfinite(other.fitted.cost):
             break
-        more = np.ceil(now * (moved / _MOVED) ** (1 / _ORDER))
-        finer = _with_steps(bench, int(np.clip(more, now + 1, first / _SHORTEST)))
         on_progress(
             f"{finer.inputs.substeps} steps between nodes: {now} move coefficients by {moved:.2g} "
             "standard errors"
         )
-        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
-        other = finer.fit(fit.structure, fit.values, arcs, fit.sigma)
-        if not np.isfinite(other.fitted.cost):
-            break
         bench, fit = finer, other
+    on_progress(f"{bench.inputs.substeps} steps between nodes, which are too few for this noise")
     return bench, fit
 
 
@@ -49,18 +55,25 @@ def _with_steps(bench: Workbench, count: int) -> Workbench:
     return dataclasses.replace(bench, inputs=bench.inputs.of_steps(count))
 
 
-def _moved(finer: Workbench, fit: LawFit) -> float:
-    """The most by which any combination of coefficients moves, in its standard errors; 0 of a fit
-    that tells none."""
-    n, before = len(fit.p), fit.fitted.factor
-    if not (n and np.isfinite(fit.fitted.cost)):
+def _moved(bench: Workbench, finer: Workbench, fit: LawFit) -> float:
+    """The most by which any combination of coefficients moves, in its standard errors; 0 where no
+    orbit follows the arcs by the finer steps."""
+    here, there = (_rows(one, fit) for one in (bench, finer))
+    if not (np.isfinite(here).all() and np.isfinite(there).all()):
         return 0.0
-    model = finer.model(fit.structure, fit.arcs, fit.p, np.arange(n))
-    noise, whitening = fit.sigma * fit.arcs.noise, finer.whitening(fit.arcs)
-    after = sensitivities(
-        model, fit.p, fit.fitted.x, fit.arcs.y, noise, finer.observation.loss, whitening
-    )
-    if not np.isfinite(after).all():
-        return 0.0
-    left, asked = (np.linalg.lstsq(R[:n, :n], R[:n, n])[0] for R in (before, after))
-    return float(np.linalg.norm(before[:n, :n] @ (asked - left)) / np.sqrt(fit.correlation))
+    change = _asked(there) - _asked(here)
+    return float(np.linalg.norm(here[:-1, :-1] @ change) / np.sqrt(fit.correlation))
+
+
+def _rows(bench: Workbench, fit: LawFit) -> np.ndarray:
+    """The triangle (n + 1, n + 1) of coefficients and residuals by the steps of a workbench."""
+    model = bench.model(fit.structure, fit.arcs, fit.p, np.arange(len(fit.p)))
+    noise, whitening = fit.sigma * fit.arcs.noise, bench.whitening(fit.arcs)
+    loss = bench.observation.loss
+    return sensitivities(model, fit.p, fit.fitted.x, fit.arcs.y, noise, loss, whitening)
+
+
+def _asked(rows: np.ndarray) -> np.ndarray:
+    """The Gauss–Newton step (n,) of the coefficients."""
+    size = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), 1e-300)
+    return np.linalg.lstsq(rows[:, :-1] / size, rows[:, -1], rcond=_RCOND)[0] / size

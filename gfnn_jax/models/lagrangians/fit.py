@@ -127,7 +127,7 @@ class Workbench:
     parameters of the systems, if these differ."""
 
     gauge: np.ndarray
-    inputs: Any  # of arcs: ArcInputs, or a function in its place
+    inputs: Any  # ArcInputs, or a function of arcs in their place where only fits are asked for
     omega: float
     observation: Observation
     wander: Wander | None = None
