@@ -15,6 +15,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 _AT_REST = 1e-9  # of a joint's speed, in its units
+_ROUNDING = 1e-12  # of a force that a joint holds for ever
 _EVENTS = 100_000  # of one motion
 
 
@@ -72,7 +73,8 @@ class Body(NamedTuple):
             def left(_, z):
                 if modes[joint]:
                     return modes[joint] * (self.joints[joint] @ z[d:])
-                return self.sizes[joint] - abs(self.accelerate(z, modes, u)[1][joint])
+                held = self.accelerate(z, modes, u)[1][joint]
+                return self.sizes[joint] * (1 + _ROUNDING) - abs(held)
 
             left.terminal, left.direction = True, -1
             return left

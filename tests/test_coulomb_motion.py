@@ -49,3 +49,29 @@ def test_friction_between_two_blocks_takes_them_along_up_to_its_size(push):
     v = pair.follow(np.zeros(4), t, **OPTIONS)[:, 2:]
     gains = [push / 2, push / 2] if push < 1 else [push - 0.5, 0.5]
     np.testing.assert_allclose(v, t[:, None] * gains, atol=1e-12)
+
+
+@pytest.mark.parametrize("push", [0.3 * (1 - 5e-10), 0.3, 0.3 * (1 + 5e-10), 0.3001])
+def test_a_push_beside_what_friction_holds(push):
+    """A block at rest with friction 0.3 gains push − 0.3, or stays."""
+    block = Body(lambda q: np.eye(1), lambda q, v, u: u, np.eye(1), np.array([0.3]))
+    x = block.follow(np.zeros(2), np.array([0.0, 0.5, 1.0]), np.array([push]), **OPTIONS)
+    gained = max(push - 0.3, 0.0) * np.array([0.0, 0.5, 1.0])
+    np.testing.assert_allclose(x[:, 1], gained, atol=1e-15)
+
+
+def test_two_joints_stick_and_are_let_go_by_an_input_that_jumps():
+    """Two blocks at rest, on the ground and on one another, friction 1 and 0.5: pushed by 1.8 and 0
+    they go together by (1.8 − 1)/2; then by −4 and 0 they slow down, the lower one by more."""
+    ground = np.array([[1.0, 0.0], [-1.0, 1.0]])
+    both = Body(lambda q: np.eye(2), lambda q, v, u: u, ground, np.array([1.0, 0.5]))
+    x = both.follow(np.zeros(4), np.array([0.0, 1.0]), np.array([1.8, 0.0]), **OPTIONS)
+    np.testing.assert_allclose(x[-1, 2:], [0.4, 0.4], atol=1e-12)
+    x = both.follow(x[-1], np.array([0.0, 0.05]), np.array([-4.0, 0.0]), **OPTIONS)
+    np.testing.assert_allclose(x[-1, 2:], [0.4 - 0.05 * 4.5, 0.4 - 0.05 * 0.5], atol=1e-12)
+
+
+def test_a_solver_that_fails_is_told():
+    runaway = Body(lambda q: np.eye(1), lambda q, v, u: v**2, np.zeros((0, 1)), np.zeros(0))
+    with pytest.raises(RuntimeError, match="no solution beyond t = 1"):
+        runaway.follow(np.array([0.0, 1.0]), np.array([0.0, 2.0]), **OPTIONS)

@@ -68,3 +68,16 @@ def test_a_fit_without_an_orbit_is_left_as_it_is():
     bench, fit, _ = fitted(1e-4)
     lost = dataclasses.replace(fit, fitted=dataclasses.replace(fit.fitted, cost=np.inf))
     assert with_fine_steps(bench, lost, print) == (bench, lost)
+
+
+def test_no_step_goes_on_beyond_a_sample_where_inputs_may_jump():
+    t = np.arange(0, 30, 0.02)
+    x, u = np.sin(t) + 0.1 * np.sin(3 * t), np.repeat(np.sin(t[::5]), 5)
+    for columns, wanted in (({}, 3), ({"u": u}, 4)):
+        recording = gfnn.Recording({"t": t, "x": x, **columns}, inputs=tuple(columns))
+        samples = _samples(recording, None, print, ())
+        nodes = nodes_of(samples.stretches, dataclasses.replace(samples.scales, omega=np.pi / 3.2))
+        assert np.all(np.diff(nodes[0].at) == 8)
+        inputs = ArcInputs(nodes, 1, "hold")
+        assert inputs.of_steps(3).substeps == wanted
+        assert inputs.of_steps(9).substeps == (16 if columns else 9)

@@ -1,6 +1,7 @@
 """Gauss–Newton over arcs: how many evaluations of a model it takes."""
 
 import numpy as np
+import pytest
 
 from gfnn_jax.solve.arc_models import Defects, Observed
 from gfnn_jax.solve.latent_arcs import fit_arcs
@@ -67,3 +68,50 @@ def test_an_arc_that_no_step_makes_better_holds_back_no_other():
     np.testing.assert_allclose(fit.p, 0.7, rtol=1e-3)
     np.testing.assert_allclose(fit.x[1:], 1.0, rtol=1e-3)
     np.testing.assert_array_equal(fit.x[0], x[0])
+
+
+class _Broken:
+    """A state x after which 1.2 sin x comes, of which x + p is seen; but each step that is made
+    from where the first arc is leaves it farther from any orbit. Beyond ``most`` of p it has
+    none."""
+
+    def __init__(self, home, begun, most=np.inf):
+        self.home, self.begun, self.most = home, begun, most
+
+    def take(self, arcs):
+        return _Broken(self.home[arcs], self.begun, self.most)
+
+    def defects(self, p, x):
+        closing = 1.2 * np.sin(x[:, :-1]) - x[:, 1:]
+        moved = np.abs(x - self.begun).max(axis=(1, 2)) > 1e-9
+        first = self.home == 0
+        closing[first] = 0.3 + 0.1 * moved[first, None, None] if p[0] < self.most else np.nan
+        by_state = 1.2 * np.cos(x[:, :-1])
+        return Defects(closing, by_state[..., None], np.zeros((*closing.shape, 1)))
+
+    def observe(self, p, x):
+        return Observed(x + p, np.ones((*x.shape, 1)), np.ones((*x.shape, 1)))
+
+
+def _beside_a_broken_arc(most: float):
+    orbit = np.empty((5, 6, 1))
+    orbit[:, 0, 0] = [0.3, 1.5, 2.5, 0.2, 2.9]
+    for n in range(5):
+        orbit[:, n + 1] = 1.2 * np.sin(orbit[:, n])
+    model, x = _Broken(np.arange(5), 0.4, most), np.full(orbit.shape, 0.4)
+    return fit_arcs(model, np.zeros(1), x, orbit + 0.1, 0.01 * np.ones(1), 0.01 * np.ones(1))
+
+
+def test_an_arc_whose_defects_no_step_closes_keeps_no_other_open():
+    fit = _beside_a_broken_arc(np.inf)
+    assert fit.open[0] > 0
+    assert fit.cost == np.inf
+    np.testing.assert_array_equal(fit.open[1:], 0)
+
+
+@pytest.mark.parametrize("most", [0.05, 0.15])
+def test_a_step_after_which_an_arc_that_stays_has_no_orbit_at_all_is_refused(most):
+    fit = _beside_a_broken_arc(most)
+    assert fit.p[0] < most
+    assert np.isfinite(fit.open[0])
+    assert fit.iterations > 1

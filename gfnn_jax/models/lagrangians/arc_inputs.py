@@ -30,9 +30,14 @@ class ArcInputs:
         """Make those of another rule between samples."""
         return ArcInputs(self._nodes, self.substeps, hold)
 
-    def of_steps(self, substeps: int) -> ArcInputs:
-        """Make those of so many steps between two nodes."""
-        return ArcInputs(self._nodes, substeps, self.hold, self.delay)
+    def of_steps(self, fewest: int) -> ArcInputs:
+        """Make those of so many steps between two nodes, or the next number of which no step goes
+        on beyond a sample: inputs may jump there."""
+        every = int(np.median(np.concatenate([np.diff(n.at) for n in self._nodes])))
+        count = fewest
+        while self._nodes[0].stretch.u.shape[1] and every % count and count % every:
+            count += 1
+        return ArcInputs(self._nodes, count, self.hold, self.delay)
 
     def __call__(self, arcs: Arcs) -> np.ndarray:
         steps = arcs.t.shape[1] - 1

@@ -19,7 +19,7 @@ from gfnn_jax.solve.latent_arcs import sensitivities
 _MOVED = 1 / 3  # of a standard error: what steps may move a combination of coefficients by
 _ORDER = 5
 _TIMES = 6  # that steps are shortened
-_SHORTEST = 0.008  # radians of the fastest motion in a step
+_SHORTEST = 0.005  # radians of the fastest motion in a step
 _RCOND = 1e-9  # of scaled columns: a combination that moves nothing
 
 
