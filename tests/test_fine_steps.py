@@ -74,7 +74,9 @@ def test_no_step_goes_on_beyond_a_sample_where_inputs_may_jump():
     t = np.arange(0, 30, 0.02)
     x, u = np.sin(t) + 0.1 * np.sin(3 * t), np.repeat(np.sin(t[::5]), 5)
     for columns, wanted in (({}, 3), ({"u": u}, 4)):
-        recording = gfnn.Recording({"t": t, "x": x, **columns}, inputs=tuple(columns))
+        recording = gfnn.Recording(
+            {"t": t, "x": x, **columns}, positions=("x",), inputs=tuple(columns)
+        )
         samples = _samples(recording, None, print, ())
         nodes = nodes_of(samples.stretches, dataclasses.replace(samples.scales, omega=np.pi / 3.2))
         assert np.all(np.diff(nodes[0].at) == 8)
