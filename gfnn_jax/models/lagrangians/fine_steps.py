@@ -19,7 +19,8 @@ from gfnn_jax.solve.latent_arcs import sensitivities
 _MOVED = 1 / 3  # of a standard error: what steps may move a combination of coefficients by
 _ORDER = 5
 _TIMES = 6  # that steps are shortened
-_SHORTEST = 0.005  # radians of the fastest motion in a step
+_GAINS = 0.5  # times what longer steps moved: shortening that leaves more does not help
+_SHORTEST = 0.02  # radians of the fastest motion in a step
 _RCOND = 1e-9  # of scaled columns: a combination that moves nothing
 
 
@@ -31,22 +32,25 @@ def with_fine_steps(
     if not (len(fit.p) and np.isfinite(fit.fitted.cost)):
         return bench, fit
     most = int(np.ceil(bench.omega * np.median(np.diff(fit.arcs.t, axis=1)) / _SHORTEST))
+    before = np.inf
     for _ in range(_TIMES):
         now = bench.inputs.substeps
         moved = _moved(bench, _with_steps(bench, 2 * now), fit)
         if not moved > _MOVED:
             return bench, fit
+        if now >= most or moved > _GAINS * before:
+            break
         wanted = np.ceil(now * (moved / _MOVED) ** (1 / _ORDER))
         finer = _with_steps(bench, int(min(max(wanted, now + 1), most)))
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
-        other = finer.fit(fit.structure, fit.values, arcs, fit.sigma) if now < most else fit
-        if now >= most or not np.isfinite(other.fitted.cost):
+        other = finer.fit(fit.structure, fit.values, arcs, fit.sigma)
+        if not np.isfinite(other.fitted.cost):
             break
         on_progress(
             f"{finer.inputs.substeps} steps between nodes: {now} move coefficients by {moved:.2g} "
             "standard errors"
         )
-        bench, fit = finer, other
+        bench, fit, before = finer, other, moved
     on_progress(f"{bench.inputs.substeps} steps between nodes, which are too few for this noise")
     return bench, fit
 
