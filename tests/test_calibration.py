@@ -1,32 +1,63 @@
-"""Two laws by the errors of their forecasts, against chance."""
+"""Statistics in benchmarks/bands.py of errors and bands of several data sets."""
+
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gfnn_jax.models.lagrangians.calibration import Calibration
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+from posteriors.calibration import FAR, STATES, STEPS, Cell, cells, pooled
+
+SHAPE = (STATES, len(STEPS), 4)
 
 
-def calibration(errors: np.ndarray) -> Calibration:
-    """Of errors (8, n) of forecasts from the parts of a record."""
-    parts = np.stack([np.median(np.delete(errors, k, axis=0), axis=0) for k in range(8)])
-    none: list = []
-    return Calibration(None, none, np.median(errors, axis=0)[:, None], parts[..., None])  # pyright: ignore
+def data_sets(count, error_of, band=2.0):
+    """(error, band) of each; at the last step only the first FAR states go on."""
+    found = []
+    for k in range(count):
+        error = np.broadcast_to(error_of(k), SHAPE).copy()
+        error[FAR:, -1] = np.nan
+        found.append((error, np.full(SHAPE, band)))
+    return found
 
 
-@pytest.mark.parametrize("more", [1.3, 1.02, 0.8])
-def test_a_law_errs_more_where_its_errors_are_larger_beyond_their_scatter(more):
-    """Errors in eight parts of a record at five times ahead: of either law by itself they scatter
-    alike by a third; of one to the other by a twentieth."""
-    rng = np.random.default_rng(1)
-    one = np.exp(rng.normal(size=(8, 5)) / 3)
-    other = one * more * np.exp(rng.normal(size=(8, 5)) / 20)
-    assert calibration(other).errs_more(calibration(one)) == (more > 1.1)
-    assert calibration(one).errs_more(calibration(other)) == (more < 0.9)
+def row(found, **others):
+    return {**pooled(found, np.ones(4)), **others}
 
 
-def test_errors_at_times_that_one_part_alone_shows_say_nothing_of_chance():
-    one, other = calibration(np.full((8, 3), 1.0)), calibration(np.full((8, 3), 1.2))
-    other.parts[0, 2] = np.nan
-    assert other.errs_more(one)
-    assert not one.errs_more(other)
-    assert not calibration(np.zeros((8, 0))).errs_more(calibration(np.zeros((8, 0))))
+def test_normal_errors_are_covered_as_they_should_be():
+    rng = np.random.default_rng(0)
+    found = row(data_sets(200, lambda k: rng.normal(size=SHAPE)))
+    np.testing.assert_allclose(found["coverage"], 0.9545, atol=0.01)
+    np.testing.assert_allclose(found["width"], 2.0, rtol=0.02)
+    np.testing.assert_allclose(found["rms"], 1.0, rtol=0.02)
+    assert all(isinstance(c, Cell) and c.covers for c in cells(found)[:-1])
+    assert cells(found)[-1] == "large"
+
+
+def test_chance_is_that_of_data_sets_and_not_of_their_errors():
+    """All errors of one data set lie inside together, those of one in four outside."""
+    found = row(data_sets(8, lambda k: 3.0 if k % 4 == 0 else 1.0))
+    assert found["coverage"] == [0.75] * len(STEPS)
+    expected = np.std([0, 1, 1, 1] * 2, ddof=1) / np.sqrt(8)
+    np.testing.assert_allclose(found["coverage_error"], expected)
+    assert row(data_sets(1, lambda k: 1.0))["coverage_error"] == [None] * len(STEPS)
+
+
+def test_a_lost_prediction_lies_outside():
+    found = row(data_sets(2, lambda k: np.nan if k else 1.0))
+    assert found["coverage"] == [0.5] * len(STEPS)
+    assert found["lost"] == [STATES] * (len(STEPS) - 1) + [FAR]
+    np.testing.assert_allclose(found["rms"], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("relative", "judged"), [(1e-13, ["roundoff"] * 4), (0.01, [Cell] * 4), (0.06, [Cell] * 3)]
+)
+def test_rows_of_roundoff_and_far_steps_of_large_errors_are_not_judged(relative, judged):
+    found = row(data_sets(2, lambda k: relative))
+    for cell, expected in zip(cells(found), judged, strict=False):
+        assert cell == expected if isinstance(expected, str) else isinstance(cell, expected)
+    assert (cells(found)[-1] == "large") == (relative == 0.06)
