@@ -3,8 +3,9 @@
 A result holds a digest of every file that it ran (`ran`): of the package those of which a function
 ran, or a constant was taken by one of these, and the study's own; comments, docstrings and layout
 left out. It is of current code where each of these files means what it meant; the style of figures
-changes no number. A study that starts Python anew, in which nothing is noted, counts
-the whole package. Of an older result whose files are not recorded nothing is known: it is old.
+changes no number. What a Python runs that a study starts counts too (`ran.python`); a study whose
+start of Python is timed, in which nothing is noted, counts the whole package. Of an older result
+whose files are not recorded nothing is known: it is old.
 `--tell` says what has changed, and how long measuring again would take. A run that is interrupted
 goes on with what is still old.
 """

@@ -2,19 +2,26 @@
 
 Imported before the package, this reads its modules with one more statement in every function, an
 assignment to a global name, which takes some nanoseconds of a call. Functions that ran while their
-module was imported are counted too.
+module was imported are counted too, and those of processes that were started with `python`:
+
+    python ran.py PACKAGE FOLDER (SCRIPT | -m MODULE | -c TEXT) …    leaves what it ran in FOLDER
 """
 
 from __future__ import annotations
 
 import ast
+import atexit
+import os
+import runpy
 import sys
+import tempfile
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 
 _MARK = "__ran__"
 _texts: dict[Path, str] = {}  # of files as they were read, which may have changed since
+_started: list[tempfile.TemporaryDirectory[str]] = []  # where other processes leave what they ran
 
 
 class _Loader(SourceFileLoader):
@@ -53,17 +60,37 @@ def note(package: str) -> None:
     """Note what runs of a package from now on. Raises RuntimeError where it is imported already."""
     if package in sys.modules:
         raise RuntimeError(f"{package} is imported already: what it ran is not known")
-    sys.meta_path.insert(0, Noting(package))
+    if not _notes(package):
+        sys.meta_path.insert(0, Noting(package))
+
+
+def _notes(package: str) -> bool:
+    finders = (finder for finder in sys.meta_path if isinstance(finder, Noting))
+    return any(finder.package == package for finder in finders)
+
+
+def python(package: str, *arguments: object) -> list[str]:
+    """The command of a new Python with these arguments: what it runs of a package counts as what
+    this process ran, where that is noted."""
+    words = [str(argument) for argument in arguments]
+    if not _notes(package):
+        return [sys.executable, *words]
+    _started.append(tempfile.TemporaryDirectory())
+    return [sys.executable, __file__, package, _started[-1].name, *words]
 
 
 def files(package: str) -> set[Path] | None:
     """Files of the package of which a function ran, and those that have none and are imported;
-    None where this is not noted."""
+    None where this is not noted, or where a process did not come to its end."""
     loaded = {n: m for n, m in sys.modules.items() if n.partition(".")[0] == package}
-    if not any(isinstance(finder, Noting) and finder.package == package
-               for finder in sys.meta_path):  # fmt: skip
+    if not _notes(package):
         return None
     found = set()
+    for folder in _started:
+        left = list(Path(folder.name).iterdir())
+        if not left:
+            return None
+        found |= {Path(line) for one in left for line in one.read_text("utf-8").splitlines()}
     for module in loaded.values():
         path = Path(module.__file__ or "")
         holds_code = path.suffix == ".py" and path.stat().st_size > 0
@@ -80,3 +107,29 @@ def text_of(path: Path) -> str:
 def _functions(path: Path) -> bool:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     return any(isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) for node in ast.walk(tree))
+
+
+def _leave(package: str, folder: Path) -> None:
+    lines = sorted(map(str, files(package) or ()))
+    (folder / str(os.getpid())).write_text("\n".join(lines), encoding="utf-8")
+
+
+def _run(package: str, folder: str, *arguments: str) -> None:
+    """Run what the arguments of a Python name, and leave what it ran of a package in a folder."""
+    sys.modules["ran"] = sys.modules[__name__]  # whose notes a study goes on with
+    note(package)
+    atexit.register(_leave, package, Path(folder))
+    kind, *rest = arguments
+    if kind == "-c":
+        sys.argv = ["-c", *rest[1:]]
+        exec(compile(rest[0], "<string>", "exec"), {"__name__": "__main__"})
+    elif kind == "-m":
+        sys.argv = rest
+        runpy.run_module(rest[0], run_name="__main__", alter_sys=True)
+    else:
+        sys.argv = [kind, *rest]
+        runpy.run_path(kind, run_name="__main__")
+
+
+if __name__ == "__main__":
+    _run(*sys.argv[1:])

@@ -36,6 +36,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import ran
 from harness import (
     SEED,
     TABLES,
@@ -106,11 +107,11 @@ def measure(quick: bool, *, learns: str) -> Numbers:
     rows = []
     for devices in DEVICES:
         flags = f"--xla_force_host_platform_device_count={devices}"
-        ran = subprocess.run(
-            [sys.executable, __file__, "--here", learns, str(20 if quick else STEPS)],
+        done = subprocess.run(
+            ran.python("gfnn_jax", __file__, "--here", learns, 20 if quick else STEPS),
             env={**os.environ, "XLA_FLAGS": flags}, stdout=subprocess.PIPE, text=True, check=True,
         )  # fmt: skip
-        rows.append(json.loads(ran.stdout.splitlines()[-1]))
+        rows.append(json.loads(done.stdout.splitlines()[-1]))
         print(f"  {devices}: {rows[-1]['microseconds']:.2f} µs")
     same = len({row["digest"] for row in rows}) == 1
     if not same:
@@ -161,10 +162,10 @@ def on_devices_here(count: int, quick: bool) -> Numbers:
         work = problem(task, quick)
         with row_blocks.on_devices(jax.local_devices()[:count]):
             work()
-            ran = min((once(work) for _ in range(3)), key=lambda ran: ran.seconds)
+            best = min((once(work) for _ in range(3)), key=lambda one: one.seconds)
         found[task] = {
-            "seconds": ran.seconds, "processor_seconds": ran.processor_seconds,
-            "digest": hashlib.sha256(np.ascontiguousarray(ran.out).tobytes()).hexdigest(),
+            "seconds": best.seconds, "processor_seconds": best.processor_seconds,
+            "digest": hashlib.sha256(np.ascontiguousarray(best.out).tobytes()).hexdigest(),
         }  # fmt: skip
     return found
 
@@ -174,11 +175,11 @@ def measure_fits_on_devices(quick: bool) -> Numbers:
     rows = []
     for count in (0, *DEVICES):
         flags = f"--xla_force_host_platform_device_count={max(count, 1)}"
-        ran = subprocess.run(
-            [sys.executable, __file__, "--fits-here", str(count), str(int(quick))],
+        done = subprocess.run(
+            ran.python("gfnn_jax", __file__, "--fits-here", count, int(quick)),
             env={**os.environ, "XLA_FLAGS": flags}, stdout=subprocess.PIPE, text=True, check=True,
         )  # fmt: skip
-        rows.append(json.loads(ran.stdout.splitlines()[-1]))
+        rows.append(json.loads(done.stdout.splitlines()[-1]))
         print(f"  {count}: " + ", ".join(f"{t} {rows[-1][t]['seconds']:.2f} s" for t in SHARED))
     if any(len({row[task]["digest"] for row in rows[1:]}) > 1 for task in SHARED):
         raise SystemExit("the bits depend on the number of devices")
@@ -273,8 +274,8 @@ def run_group(task: str, file: Path, count: int) -> list[Numbers]:
     told = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": str(count)}
     running = [
         subprocess.Popen(
-            [sys.executable, __file__, "--group", task, str(file)], stdout=subprocess.PIPE,
-            text=True,
+            ran.python("gfnn_jax", __file__, "--group", task, file),
+            stdout=subprocess.PIPE, text=True,
             env={"OPENBLAS_NUM_THREADS": "1", **os.environ, **told, "JAX_PROCESS_ID": str(i)},
         )
         for i in range(count)

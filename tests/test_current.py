@@ -1,6 +1,8 @@
 """Results that are older than their code: found, measured again oldest first, what moved told."""
 
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -172,3 +174,33 @@ def test_a_figure_drawn_otherwise_makes_no_result_old(tmp_path):
     files = ["evaluate/figures_style.py", "evaluate/metrics.py"]
     path.write_text(json.dumps({"code": {f"gfnn_jax/{name}": "other" for name in files}}))
     assert current.Result(path, tmp_path / "study.py", "one").changed == [f"gfnn_jax/{files[1]}"]
+
+
+@pytest.mark.parametrize("how", ["script", "-m", "-c"])
+def test_what_another_python_runs_counts(tmp_path, how):
+    """Of a process that comes to its end; where one is killed nothing is known."""
+    package, study = tmp_path / "counted", tmp_path / "study.py"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "idle.py").write_text("def g(x):\n    return x\n")
+    (package / "works.py").write_text("import sys, counted.idle\ndef f(x):\n    print(x)\n"
+                                      "if __name__ == '__main__':\n    import counted.works\n"
+                                      "    counted.works.f(*sys.argv[1:])\n")  # fmt: skip
+    text = "import sys\nfrom counted.works import f\nf(*sys.argv[1:])"
+    (tmp_path / "script.py").write_text(text)
+    words = {"script": [tmp_path / "script.py"], "-m": ["-m", "counted.works"], "-c": ["-c", text]}
+    study.write_text(f"""
+import os, subprocess, sys
+sys.path.insert(0, {str(Path(ran.__file__).parent)!r})
+import ran
+ran.note("counted")
+import counted
+command = ran.python("counted", *{list(map(str, words[how]))}, "heard")
+print(subprocess.run(command, capture_output=True, text=True).stdout.strip())
+print(sorted(path.name for path in ran.files("counted")))
+ran.python("counted", "-c", "")
+print(ran.files("counted"))
+""")
+    done = subprocess.run([sys.executable, study], capture_output=True, text=True, check=False,
+                          env=os.environ | {"PYTHONPATH": str(tmp_path)})  # fmt: skip
+    assert done.stdout.splitlines() == ["heard", "['works.py']", "None"], done.stderr

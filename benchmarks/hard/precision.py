@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 # Sets float64, so it comes before all of JAX.
@@ -15,6 +14,7 @@ from harness import HERE, RESULTS, Numbers, angles_of, drawn, fitted, in_float32
 import jax
 import jax.numpy as jnp
 import numpy as np
+import ran
 from current import code_of
 from hard.cases import Case, counts, digits_of, tried
 
@@ -64,8 +64,8 @@ def precision(quick: bool) -> tuple[list[Case], Numbers]:
                           3, counts(info.status)))  # fmt: skip
     code = ("import gfnn_jax as g, numpy as n; z = n.random.rand(100, 2); "
             "g.fit(g.Pairs(z, z, 1.0))")  # fmt: skip
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False,
-                          env=x64_off())  # fmt: skip
+    command = ran.python("gfnn_jax", "-c", code)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=x64_off())
     line = done.stderr.strip().splitlines()[-1] if done.stderr else ""
     cases.append(Case("float64 switched off", None, None, failed=line,
                       wrong=int(done.returncode == 0 or "float64" not in line)))  # fmt: skip
