@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.budget import MATCHING, Allowance
+from gfnn_jax.budget import FLOW, MATCHING, Allowance
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.noise import of_differences
@@ -25,7 +25,7 @@ from gfnn_jax.dataset.runs import next_of
 from gfnn_jax.errors import InputError, OutOfTime
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.significance import ABOVE_NOISE
-from gfnn_jax.flows.collocation import Steps
+from gfnn_jax.flows.collocation import Steps, operations
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.flow_arcs import FlowWithConstants
 from gfnn_jax.models.hamiltonians.formula import OnPartial, PartialLaw, Rival, Term
@@ -57,6 +57,7 @@ _LOOKED_AT = 20_000  # rows by which laws are compared
 _BEHIND = 40.0  # natural logarithms of likelihood by which a law is behind that is not fitted
 _BROUGHT = 3.0  # of it, that further terms must bring
 _FITTED = 4  # laws
+_EVALUATIONS = 3  # of the flow at each state, that the fits of a law to sequences take together
 _SCREENED, _ITERATIONS = 3e-4, 12  # of the cost, and iterations, while laws are compared
 _AS_NOISE = 1.1  # times the noise, that a law may leave over
 _STEPS = Steps(6, 1)
@@ -92,9 +93,11 @@ def law_of_sequences(
     name = "laws of physics behind noise"
     try:
         with work.budget.unit(name, MATCHING, _OPERATIONS[data.dim - 1]):
-            formulas = search.formulas()
+            formulas = _worth(search.formulas())
         family = formulas[0].family(formulas[0].constants)
-        with work.library(name, family, len(formulas) * len(data.training)):
+        states = len(formulas) * len(data.training)
+        expected = _EVALUATIONS * states * operations(family, 2 * data.dim, _STEPS, family)
+        with work.budget.unit(name, FLOW, expected):
             return _chosen(
                 problem, formulas, data, tolerance, noise, Allowance(work.budget), partly
             )
@@ -148,7 +151,7 @@ def _chosen(
     if train is None or held is None:
         return None
     laws: list[_LawOfSequences] = []
-    for tried, formula in enumerate(_worth(formulas)):
+    for tried, formula in enumerate(formulas):
         with contextlib.suppress(np.linalg.LinAlgError, InputError):  # constants have run away
             found = _significant(sequences, train, formula)
             laws += [] if found is None else [found]
