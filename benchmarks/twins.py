@@ -53,9 +53,9 @@ class Twin(NamedTuple):
 
 
 def along(force: Callable, masses: tuple[float, ...] = (1.0,), dry: tuple[float, ...] = ()) -> Body:
-    """Of coordinates with masses of their own."""
-    joints = np.eye(len(masses))[: len(dry)]
-    return Body(lambda q: np.diag(masses), force, joints, np.array(dry))
+    """Coordinates with masses of their own; dry friction acts on the first of them."""
+    rubbed = np.eye(len(masses))[: len(dry)]
+    return Body(lambda q: np.diag(masses), force, rubbed, np.array(dry))
 
 
 def _carts(q, v, u):
