@@ -40,6 +40,7 @@ from textbook_laws import LAWS, OUTSIDE, Law
 import gfnn_jax as gfnn
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.models.textbook import shapes as texts
 
 PAIRS, FRESH, WIDER = 1_000, 200, 1.2
@@ -149,14 +150,23 @@ def noisy(name: str, quick: bool) -> Numbers:
 
 def true_numbers(found, law: Law) -> tuple[np.ndarray, float] | None:
     """The coefficients and constants with which the terms that were found come nearest to the true
-    ∇H, and the part of it that they leave over. None of what is no expression in q and p."""
+    ∇H, and the part of it that they leave over. None of what is no expression in q and p, nor the
+    Legendre transform of one in q and v."""
     family = found.flow.family
-    if not isinstance(family, Terms):
-        return None
     rng = np.random.default_rng(SEED + 2)
     z = law.states(FRESH, rng)
     t = None if law.period is None else rng.uniform(0, law.period, FRESH)
     true = law.gradient(z, t)
+    if isinstance(family, Legendre):
+        size = np.linalg.norm(true)
+        near = least_squares(
+            lambda c: (np.asarray(family.gradient(c, z)) - true).ravel() / size,
+            np.array([term.coefficient for term in found.terms]), xtol=1e-15, ftol=1e-15,
+            gtol=1e-15,
+        )  # fmt: skip
+        return near.x, float(np.linalg.norm(near.fun))
+    if not isinstance(family, Terms):
+        return None
     start = np.array([c.coefficient for c in found.constants])
 
     def solved(constants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
