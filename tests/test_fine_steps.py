@@ -70,7 +70,7 @@ def test_a_fit_without_an_orbit_is_left_as_it_is():
     assert with_fine_steps(bench, lost, print) == (bench, lost)
 
 
-def test_no_step_goes_on_beyond_a_sample_where_inputs_may_jump():
+def test_no_step_goes_on_beyond_a_sample_where_inputs_jump():
     t = np.arange(0, 30, 0.02)
     x, u = np.sin(t) + 0.1 * np.sin(3 * t), np.repeat(np.sin(t[::5]), 5)
     for columns, wanted in (({}, 3), ({"u": u}, 4)):
@@ -83,3 +83,5 @@ def test_no_step_goes_on_beyond_a_sample_where_inputs_may_jump():
         inputs = ArcInputs(nodes, 1, "hold")
         assert inputs.of_steps(3).substeps == wanted
         assert inputs.of_steps(9).substeps == (16 if columns else 9)
+        for smooth in ("linear", "band"):
+            assert ArcInputs(nodes, 1, smooth).of_steps(3).substeps == 3

@@ -31,11 +31,12 @@ class ArcInputs:
         return ArcInputs(self._nodes, self.substeps, hold)
 
     def of_steps(self, fewest: int) -> ArcInputs:
-        """Make those of so many steps between two nodes, or the next number of which no step goes
-        on beyond a sample: inputs may jump there."""
+        """Make those of so many steps between two nodes; of inputs that are held, which jump at
+        samples, of the next number of which no step goes on beyond a sample."""
         every = int(np.median(np.concatenate([np.diff(n.at) for n in self._nodes])))
+        jump = self.hold == "hold" and self._nodes[0].stretch.u.shape[1] > 0
         count = fewest
-        while self._nodes[0].stretch.u.shape[1] and every % count and count % every:
+        while jump and every % count and count % every:
             count += 1
         return ArcInputs(self._nodes, count, self.hold, self.delay)
 
