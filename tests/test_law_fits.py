@@ -526,6 +526,41 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     np.testing.assert_allclose(p, found["hold"].acting.fit.p, atol=2 * error.max())
 
 
+@pytest.mark.parametrize("hold", ["hold", "linear"])
+def test_rules_that_chance_tells_apart_have_no_delay(hold):
+    """ẍ = −36.8 x − 0.32 ẋ + 1.24 u, u slow beside its samples: held, or linear in between. Half a
+    sample later one rule acts as the other does."""
+    rng, dt, n = np.random.default_rng(5), 0.01, 1_200
+    A = np.zeros((4, 4))  # of x, ẋ, u and its slope
+    A[:3, 1:] = [[1, 0, 0], [-0.32, 1.24, 0], [0, 0, 1]]
+    A[1, 0] = -36.8
+    step, tables = expm(A * dt), []
+    for _ in range(2):
+        rates, phases = 2 * np.pi * rng.uniform(0.3, 3, 6), rng.uniform(0, 6.28, 6)
+        u = 0.5 * np.sin(np.multiply.outer(dt * np.arange(n + 1), rates) + phases).sum(axis=1)
+        slopes = np.diff(u) / dt if hold == "linear" else np.zeros(n)
+        x = np.zeros((n + 1, 2))
+        x[0, 0] = 0.06
+        for k in range(n):
+            x[k + 1] = (step @ np.array([*x[k], u[k], slopes[k]]))[:2]
+        seen = x[:n, 0] + 3e-4 * rng.normal(size=n)
+        tables.append({"t": dt * np.arange(n), "x": seen, "u": u[:n]})
+    fit = gfnn.fit(gfnn.Recording(tables))
+    assert fit.delay[0] == 0
+    assert fit.map.sensors.hold in ({hold} if hold == "hold" else {hold, "band"})
+    gain, std = fit.gains["u"]["x"]
+    assert abs(gain - 1.24) < 3 * std < 3e-3
+
+
+def test_an_input_that_was_not_named_is_told():
+    t = np.arange(0, 20, 0.05)
+    seen = np.cos(2 * t) + 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    recording = gfnn.Recording({"t": t, "x": seen, "u_V": np.sin(t), "lamp": t}, positions="x")
+    with pytest.warns(gfnn.FitWarning, match="column u_V is not used: if it drives the motion"):
+        fit = gfnn.fit(recording)
+    assert not any("lamp" in line for line in fit.messages)
+
+
 def test_the_gain_of_a_band_limited_input_has_no_bias():
     """ẍ = −4 x − 0.2 ẋ + 3 u, driven for long: an error of u between samples is one of the gain."""
     t, rates = np.arange(0, 60, 0.1), np.array([0.7, 1.3, 2.1, 3.3])

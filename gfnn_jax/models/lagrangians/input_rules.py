@@ -9,7 +9,8 @@ with G' the gains of further inputs ∂u(t − τ)/∂τ. So one evaluation of t
 fits best, with its standard error, and how far the coefficients imitate it. It is taken where it is
 significant and held-out arcs gain by it. The rule between samples is that of which held-out arcs
 cost least, each with its own delay: chosen with the first law, whose misfit may hide the choice,
-and again with the last.
+and again with the last. Inputs that are held act as those in between do half a sample later, but
+for little: of rules whose costs differ by no more than chance the one without a delay is taken.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ _APART = 0.05  # of a sample: the change of a delay by which inputs are differen
 _SETTLED = 0.1  # standard errors, within which a delay is found
 _MOST = 4  # corrections of a delay
 _FURTHEST = 1.0  # samples, of a correction
+_CHANCE = 2.0  # standard errors of a difference of costs
 _IMITATED = 0.03  # of what a delay changes, that no coefficient does: less is not told apart
 
 
@@ -70,9 +72,12 @@ def choose_rule(
         found.append(with_delay(bench, nodes, fit, interval))
     if len(found) == 1:
         return found[0]
-    costs = [_held_out(one, nodes, sigma) for one in found]
-    best = int(np.argmin(costs))
-    others = {one.hold: c / costs[best] for one, c in zip(found, costs, strict=True)}
+    of_arcs = [_held_out(one, nodes, sigma) for one in found]
+    costs = np.array([np.sum(cost) for cost in of_arcs])
+    least = of_arcs[int(np.argmin(costs))]
+    alike = [k for k, cost in enumerate(of_arcs) if not _costs_more(cost, least)]
+    best = min(alike, key=lambda k: (found[k].delay != 0, costs[k]))
+    others = {one.hold: float(c / costs[best]) for one, c in zip(found, costs, strict=True)}
     return found[best]._replace(others={h: c for h, c in others.items() if h != found[best].hold})
 
 
@@ -109,14 +114,25 @@ def with_delay(bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, interval: 
         here = Acting(later.fit(fit.structure, here.fit.values, arcs, here.fit.sigma), later, error)
     if here.bench is bench:
         return here
-    gains = _held_out(here, nodes, fit.sigma) < _held_out(begun, nodes, fit.sigma)
+    gains = np.sum(_held_out(here, nodes, fit.sigma)) < np.sum(_held_out(begun, nodes, fit.sigma))
     return here if gains else begun._replace(error=here.error)
 
 
-def _held_out(one: Acting, nodes: Sequence[Nodes], sigma: np.ndarray) -> float:
-    """The held-out cost of a fit's structure, in units of σ, the same for all that are compared."""
+def _held_out(one: Acting, nodes: Sequence[Nodes], sigma: np.ndarray) -> np.ndarray:
+    """The held-out cost (A,) of a fit's structure, in units of σ, the same for all that are
+    compared."""
     fit = dataclasses.replace(one.fit, sigma=sigma)
-    return float(np.sum(one.bench.cross_validate(nodes, fit, fit.structure, fit.values)))
+    return one.bench.cross_validate(nodes, fit, fit.structure, fit.values)
+
+
+def _costs_more(of_arcs: np.ndarray, least: np.ndarray) -> bool:
+    """Return whether these costs (A,) are together above the least by more than chance, as their
+    differences from arc to arc tell it."""
+    if of_arcs is least:
+        return False
+    more = of_arcs - least
+    chance = np.sqrt(len(more)) * np.std(more, ddof=min(1, len(more) - 1))
+    return not float(np.sum(more)) <= _CHANCE * chance
 
 
 def _correction(here: Acting, interval: float) -> tuple[float, float]:

@@ -182,7 +182,7 @@ class LearnedLaw:
             when = f", no delay seen (standard error {error:.2g} s)"
         else:
             when = f", acting {measured(delay, error)} s later"
-        others = [f"{RULES[rule]} {cost:.3g}" for rule, cost in self.input_rules.items()]
+        others = [f"{RULES[rule]} {cost:.4g}" for rule, cost in self.input_rules.items()]
         chosen = f"; cost of held-out arcs, this rule 1: {', '.join(others)}" if others else ""
         return f"inputs: {RULES[self.map.sensors.hold]}{when}{chosen}"
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from gfnn_jax.data.channels import parameters_of
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.data.roles import symbols
+from gfnn_jax.data.roles import by_name, symbols
 from gfnn_jax.dataset.rests import without_rests
 from gfnn_jax.dataset.stretches import Nodes, Scales, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
@@ -99,7 +99,11 @@ def fit_recording(
         recording, samples.observation.channels, best.fit, best.law, nodes, bench.inputs
     )
     note("finding the motion to record next")
-    messages = (*samples.messages, *_at_bound(options, best.choice, best.law.dim))
+    messages = (
+        *samples.messages,
+        *_without_role(recording),
+        *_at_bound(options, best.choice, best.law.dim),
+    )
     motions = next_motions(best.bench, best.fit, samples.angles)
     seconds = time.process_time() - started
     return in_words(
@@ -117,6 +121,15 @@ def _options(friction: str) -> SearchOptions:
             f"{friction!r}"
         )
     return SearchOptions(frictions=kinds, choose_friction=False)
+
+
+def _without_role(recording: Recording) -> list[str]:
+    """A message of columns that are inputs by their names, and that no role was given."""
+    numbers = [name for name in recording.ignored if name in recording.factors]
+    return [
+        f"column {name} is not used: if it drives the motion, name it: --inputs (inputs=)"
+        for name in by_name(numbers)["inputs"]
+    ]
 
 
 def _at_bound(options: SearchOptions, choice: FrictionChoice, dim: int) -> list[str]:
