@@ -55,6 +55,7 @@ TEXTS = {
     "a header of savetxt": "# t theta omega\n" + rows(T, THETA, OMEGA, separator=" "),
     "a row of units": "t,theta,omega\ns,rad,rad/s\n" + rows(T, THETA, OMEGA),
     "units in brackets": "t [s],theta [rad],omega (rad/s)\n" + rows(T, THETA, OMEGA),
+    "units under a stroke": "t/s,theta / rad,omega/(rad/s)\n" + rows(T, THETA, OMEGA),
     "milliseconds": "t [ms],theta,omega\n" + rows(1e3 * T, THETA, OMEGA),
     "a unit row of ms": "t;theta;omega\n[ms];[rad];[rad/s]\n"
     + rows(1e3 * T, THETA, OMEGA, separator=";"),

@@ -28,6 +28,12 @@ _OF_RUN = re.compile(
     re.IGNORECASE,
 )
 _BRACKETS = re.compile(r"^\s*([^\[(]*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))?\s*$")
+# A name over its unit, as ISO 80000 has it: Zeit/ms, x / mm, v/(m/s).
+_OVER = re.compile(
+    r"^\s*(?P<name>[^/\[(]+?)\s*/\s*(?P<open>\()?"
+    r"(?P<unit>(?:[nµum]?s|[nµumck]?m|m?rad|k?g|[mk]?N|[µumk]?V|[µum]?A|min|h|deg|°|Nm|px)"
+    r"(?:/(?:ms|s|min))?)(?(open)\))\s*$"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -316,9 +322,14 @@ def _undecorated(path: Path, cells: list[str]) -> list[str]:
 
 
 def _named(cells: list[str]) -> tuple[list[str], dict[str, str]]:
-    """Names, and units by name where brackets give them."""
+    """Names, and units by name where brackets, or a stroke before them, give them."""
     names, units = [], {}
     for cell in cells:
+        over = _OVER.match(cell)
+        if over:
+            names.append(over["name"])
+            units[over["name"]] = over["unit"]
+            continue
         match = _BRACKETS.match(cell)
         name = match[1] if match and match[1] else cell
         if match and (match[2] or match[3]):
