@@ -349,9 +349,8 @@ def _forecast(arguments: argparse.Namespace) -> None:
     """Forecast from the end of a recording."""
     set_up_jax()
     from gfnn_jax.jobs.forecast import forecast_recording
-    from gfnn_jax.maps.saved import record
 
-    found, compared = forecast_recording(
+    found, unit, compared = forecast_recording(
         arguments.model, arguments.initial, out=arguments.out, num_steps=arguments.num_steps,
         save_every=arguments.save_every, stop=arguments.stop,
         estimate_from=arguments.estimate_from, inputs=arguments.inputs, compare=arguments.compare,
@@ -359,7 +358,6 @@ def _forecast(arguments: argparse.Namespace) -> None:
     )  # fmt: skip
     times = [f.times[-1] for f in found.values()]
     runs = "1 run" if len(found) == 1 else f"{len(found)} runs"
-    unit = record(arguments.model).get("job", {}).get("time_unit", "s")
     print(f"{arguments.out}: forecasts of {runs}, up to t = {max(times):g} {unit}")
     for line in (line for one in found.values() for line in one.outside):
         print(f"note: {line}")

@@ -377,7 +377,7 @@ def test_a_forecast_is_compared_with_what_was_read(of_noisy, tmp_path):
                    comments="", fmt="%.17g")  # fmt: skip
     of_noisy.map.save(tmp_path / "model")
     files = {"out": tmp_path / "on.csv", "compare": tmp_path / "read.csv"}
-    found, judged = forecast_recording(tmp_path / "model", tmp_path / "begun.csv", **files)
+    found, _, judged = forecast_recording(tmp_path / "model", tmp_path / "begun.csv", **files)
     assert len(found) == 20
     rms, _, within = judged.columns["theta"]
     assert rms < 5e-3

@@ -109,23 +109,37 @@ def check_known(source: str, what: str, wanted: Any, known: Sequence[str]) -> No
         )
 
 
-def time_unit_of(source: str, names: list[str], units: Mapping[str, str], given: str | None) -> str:
-    """The unit of the times: the given one, the header's, that at the end of their name, or s."""
-    if given is not None:
-        if given not in SECONDS:
-            raise InputError(f"expected a time unit among {', '.join(SECONDS)}, got {given!r}")
-        return given
-    for name in names:
-        if is_time(name):
-            end = plain(name).rpartition("_")[2]
-            end = {"millis": "ms", "micros": "us"}.get(end, end)
-            for unit in (_unit(units, name), end):
-                unit = unit.removesuffix("ec") if unit in ("sec", "msec", "usec") else unit
-                if unit in SECONDS:
-                    return unit
-            if _unit(units, name) and _unit(units, name) not in ("seconds", "second"):
-                raise InputError(
-                    f"{source}: {name}: unit {units[name]!r} is not known: give --time-unit "
-                    f"{'|'.join(SECONDS)}"
-                )
-    return "s"
+def time_unit_of(
+    source: str, names: list[str], units: Mapping[str, str], given: str | None
+) -> str | None:
+    """The unit of the times: the given one, the header's, or that at the end of their name; None
+    where nothing tells. Raises InputError where two of these differ, or one is not known."""
+    if given is not None and given not in SECONDS:
+        raise InputError(f"expected a time unit among {', '.join(SECONDS)}, got {given!r}")
+    for name in filter(is_time, names):
+        told = _time_unit(name, units)
+        if told is None and given is None and _unit(units, name):
+            raise InputError(
+                f"{source}: {name}: unit {units[name]!r} is not known: give --time-unit "
+                f"{'|'.join(SECONDS)}"
+            )
+        if told is not None and given is not None and SECONDS[told] != SECONDS[given]:
+            raise InputError(
+                f"{source}: {name} is in {told} by its header, got the time unit {given} "
+                "(--time-unit, time_unit=)"
+            )
+        if told is not None:
+            return told
+    return given
+
+
+def _time_unit(name: str, units: Mapping[str, str]) -> str | None:
+    """The unit of a column of times, by its header or the end of its name."""
+    end = plain(name).rpartition("_")[2]
+    end = {"millis": "ms", "micros": "us"}.get(end, end)
+    for unit in (_unit(units, name), end):
+        unit = {"seconds": "s", "second": "s"}.get(unit, unit)
+        unit = unit.removesuffix("ec") if unit in ("sec", "msec", "usec") else unit
+        if unit in SECONDS:
+            return unit
+    return None

@@ -53,7 +53,8 @@ class Recording:
     units:      name -> unit, as the file gives it, in its header or at the end of the name; of all
                 columns: `unit`.
     factors:    name -> value here ÷ number in the file: π/180 of a column in degrees, else 1.
-    time_unit:  of the file; `times` are in seconds.
+    time_unit:  of the file; `times` are in seconds. time_unit_given: whether it was told, here or
+                by the file, not taken to be s.
     coordinates: what moves, the positions unless other names were given.
     observe:    column -> what its sensor shows: text in coordinates, velocities and parameters that
                 are fitted, or a function of these (`maps.observation`).
@@ -79,6 +80,7 @@ class Recording:
     units: dict[str, str]
     factors: dict[str, float]
     time_unit: str
+    time_unit_given: bool
     observe: dict[str, Any]
     guess: dict[str, float]
     offsets: tuple[str, ...]
@@ -109,7 +111,7 @@ class Recording:
                  ignored; where none is, the names of the columns decide.
         angles:  positions of period 2π; without it those whose name or unit says so.
         degrees: columns in degrees, or degrees per second; a position among them is an angle.
-        time_unit: s (the default), ms, us, ns, min or h; a header's own unit serves too.
+        time_unit: s, ms, us, ns, min or h; by default the header's own, else s.
         std:     σ of columns, in their own unit: a number, one for each value (T,) of a table, or
                  the name of a column that holds them; of column x also a column x_std.
         columns: those to take beside times and runs; all others are as if they were not there.
@@ -138,7 +140,8 @@ class Recording:
         units |= {name: unit for t in reversed(tables) for name, unit in t.units.items()}
         columned = [name for name in names if not is_run(name) and not is_time(name)]
         numbers = [name for name in columned if name not in sigmas.values()]
-        unit = time_unit_of(source, names, units, time_unit)
+        told = time_unit_of(source, names, units, time_unit)
+        unit = told or "s"
         runs = runs_of(tables, columned, SECONDS[unit], dt)
         coordinate_names = listed(coordinates)
         check_known(source, "observe", observe or {}, numbers)
@@ -188,6 +191,7 @@ class Recording:
             "units": {n: u for n, u in units.items() if n in numbers},
             "factors": factors,
             "time_unit": unit,
+            "time_unit_given": told is not None,
             "offsets": listed(offset),
             "scales": listed(scale),
             "ignored": tuple(n for n in numbers if n not in with_role)

@@ -52,6 +52,7 @@ def fit_recording(
         "command": "fit", "data": recording.source, **asked.deciding,
         "degrees": [name for name, factor in recording.factors.items() if factor != 1],
         "time_unit": recording.time_unit,
+        "units": {name: recording.unit(name) for name in recording.columns},
     }  # fmt: skip
     record = {"job": job, **report.finite({key: result[key] for key in kept})}
     with atomic_folder(out) as folder:

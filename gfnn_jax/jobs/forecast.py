@@ -1,8 +1,8 @@
 """Job of ``gfnn predict MODEL --initial RECORDING``: forecasts from the end of each run.
 
 The file written has times (R, n), values and std (R, n, d) by runs and columns; with .csv at its
-end, columns run, t, each position and std_ of each. Times and values are in the units of the
-recording that the law was learned from.
+end, columns run, t, each position and std_ of each. Times are in the unit of the recording that is
+gone on from, values in those of the recording that the law was learned from.
 """
 
 from __future__ import annotations
@@ -33,12 +33,20 @@ class Comparison(NamedTuple):
     num_samples: int
 
 
+class Forecasts(NamedTuple):
+    """Forecasts by run, the unit of their times, and how they compare with what was measured."""
+
+    of_runs: dict[str, Forecast]
+    time_unit: str
+    compared: Comparison | None
+
+
 def forecast_recording(
     model: Path, initial: Path, *, out: Path, num_steps: int | None = None, save_every: int = 1,
     stop: float | None = None, estimate_from: int | None = None, inputs: Path | None = None,
     compare: Path | None = None, columns: dict[str, Any] | None = None, overwrite: bool = False,
-) -> tuple[dict[str, Forecast], Comparison | None]:  # fmt: skip
-    """Forecast from the states at the ends of a recording's runs; run -> its forecast.
+) -> Forecasts:  # fmt: skip
+    """Forecast from the states at the ends of a recording's runs.
 
     num_steps: of the model's dt; saved every so many. stop: time, in the file's unit, at which the
     recording ends that lies in the file. estimate_from: samples of each run that the
@@ -62,7 +70,7 @@ def forecast_recording(
         recording = recording.slice(stop=stop * SECONDS[recording.time_unit])
     bare = ("positions", "velocities", "sensors", "coordinates", "angles", "degrees", "parameters")
     only_inputs = {**roles, **dict.fromkeys(bare)}
-    ahead = None if inputs is None else read(inputs, **only_inputs)
+    ahead = None if inputs is None else _checked(inputs, job, only_inputs)
     measured = None if compare is None else _read(compare, map_, job, columns)[0]
     if num_steps is None and measured is None:
         raise InputError("expected --num-steps, or --compare, whose times the forecast is for")
@@ -90,7 +98,10 @@ def forecast_recording(
     factors = dict.fromkeys(job.get("degrees", ()), np.pi / 180) | recording.factors
     found = {run: _in_units(one, factors, second) for run, one in found.items()}
     _write(out, tuple(next(iter(found.values())).values), found)
-    return found, None if measured is None else _compared(sensors, found, measured)
+    unit = recording.time_unit
+    if measured is None:
+        return Forecasts(found, unit, None)
+    return Forecasts(found, unit, _compared(sensors, found, second, measured))
 
 
 def _read(
@@ -105,12 +116,29 @@ def _read(
     columns = {"parameters": varied, **columns}
     roles = _roles(sensors, job, observation.channels) | columns
     try:
-        return read(path, **roles), roles
+        return _checked(path, job, roles), roles
     except InputError:
         if observation.needed == observation.channels:
             raise
     roles = _roles(sensors, job, observation.needed) | columns
-    return read(path, **roles), roles
+    return _checked(path, job, roles), roles
+
+
+def _checked(path: Path, job: dict[str, Any], roles: dict[str, Any]) -> Recording:
+    """Read a recording whose times are in its header's unit, else in that of the recording that
+    the law was learned from. Raises InputError where a column has another unit than there."""
+    recording = read(path, **roles)
+    unit = job.get("time_unit", "s")
+    if not recording.time_unit_given and unit != "s":
+        recording = read(path, **roles, time_unit=unit)
+    for name, known in job.get("units", {}).items():
+        own = recording.unit(name) if name in recording.columns else ""
+        turned = name in job.get("degrees", ()) or recording.factors.get(name, 1.0) != 1.0
+        if own and known and own != known and not turned:
+            raise InputError(
+                f"{path}: expected {name} in {known}, in which the law was learned, got {own}"
+            )
+    return recording
 
 
 def _roles(sensors: Sensors, job: dict[str, Any], channels: tuple[str, ...]) -> dict[str, Any]:
@@ -123,8 +151,7 @@ def _roles(sensors: Sensors, job: dict[str, Any], channels: tuple[str, ...]) -> 
         "inputs": sensors.inputs, "coordinates": sensors.positions, "angles": sensors.angles,
     }  # fmt: skip
     degrees = [n for n in job.get("degrees", ()) if n in channels]
-    unit = job.get("time_unit", "s")
-    return {**roles, "degrees": degrees or None, "time_unit": None if unit == "s" else unit}
+    return {**roles, "degrees": degrees or None}
 
 
 def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> Forecast:
@@ -143,14 +170,17 @@ def _last_samples(recording: Recording, run: str, count: int | None) -> Recordin
     return recording.slice(start=float(np.sort(times)[-min(count, len(times)) :].min()))
 
 
-def _compared(sensors: Sensors, found: dict[str, Forecast], measured: Recording) -> Comparison:
+def _compared(
+    sensors: Sensors, found: dict[str, Forecast], second: float, measured: Recording
+) -> Comparison:
+    """Forecasts, whose times are in units of ``second``, against what was measured."""
     columns, count = {}, 0
     for name in (n for n in sensors.observation_model.channels if n in measured.columns):
         errors, stds = [], []
         for run, one in found.items():
             own = run if len(measured.runs) > 1 else next(iter(measured.runs))
             factor = measured.factors[name]
-            seconds = one.times * SECONDS[measured.time_unit]
+            seconds = one.times * second
             times = measured.times(own)
             at = np.searchsorted(times, seconds - 0.5 * np.min(np.diff(times)))
             error = one.values[name][0] - measured.values(name, own)[at] / factor

@@ -34,6 +34,7 @@ from gfnn_jax.solve.linear import covariance_root
 FEWEST = 5  # samples from which a state is estimated
 _MOST = 160  # samples of a window that are used
 _FINE = 0.16  # radians of the fastest motion in a step
+_FEW = 4  # steps between inputs, of which those in between are filled in
 _AT_ONCE = 4_096  # steps whose derivatives are taken together
 
 
@@ -171,6 +172,8 @@ def forecast(
             _with_inputs(window, inputs, sensors, run)
             for window, run in zip(windows, recording.runs, strict=True)
         ]
+        for window, run in zip(windows, recording.runs, strict=True):
+            _check_inputs(window.inputs_t, float(np.max(window.t)), float(times[-1]), run)
     laws, which = of_windows([law], np.zeros(len(windows), int), windows)
     x, covariance = estimates_of(laws, which, windows)
     ahead = np.broadcast_to(times, (len(windows), len(times)))
@@ -279,6 +282,20 @@ def _with_inputs(window: Window, inputs: Recording, sensors: Sensors, run: str) 
         inputs_t=np.concatenate([window.inputs_t, t[later]]),
         inputs=np.concatenate([window.inputs, u[later]]),
     )
+
+
+def _check_inputs(t: np.ndarray, begin: float, end: float, run: str) -> None:
+    """Raises InputError where inputs at times t leave out part of begin … end: the last may be a
+    step before it, and a few between others may be missing."""
+    ahead = np.concatenate([[begin], t[(t > begin) & (t < end)], [end]])
+    steps = np.diff(ahead) / np.median(np.diff(t))
+    lacks = steps > np.append(np.full(len(steps) - 1, _FEW), 1) + 0.5
+    if lacks.any():
+        gap = int(np.argmax(lacks))
+        raise InputError(
+            f"run {run}: the forecast needs inputs from {begin:g} to {end:g} s, and there are none "
+            f"from {ahead[gap]:g} to {ahead[gap + 1]:g} s: --inputs FILE (inputs=)"
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

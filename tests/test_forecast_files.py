@@ -1,0 +1,114 @@
+"""Files that a forecast goes on from: their units beside those of the law's, and inputs ahead."""
+
+import contextlib
+import io
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from gfnn_jax.cli import main
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.errors import InputError
+
+DT, SEEN, AHEAD = 0.05, 400, 60
+
+
+@pytest.fixture(scope="module")
+def motion():
+    """t in s, x in mm, u in V of ẍ = −9 x − 0.4 ẋ + 600 u, u held."""
+    rng, n = np.random.default_rng(0), SEEN + AHEAD
+    u, x = np.round(np.repeat(rng.normal(size=n // 10), 10), 2), np.zeros((n + 1, 2))
+    step = expm(np.array([[0, 1, 0], [-9, -0.4, 600], [0, 0, 0]]) * DT)
+    x[0] = 50, 0
+    for k, one in enumerate(u):
+        x[k + 1] = (step @ np.append(x[k], one))[:2]
+    return DT * np.arange(n), x[:-1, 0] + 0.02 * rng.normal(size=n), u
+
+
+@pytest.fixture(scope="module")
+def folder(motion, tmp_path_factory):
+    """Files of the motion, and the model of the first, in ms, mm and V."""
+    t, x, u = motion
+    folder = tmp_path_factory.mktemp("files")
+
+    def write(name, header, *columns, rows=slice(None)):
+        lines = [",".join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True)]
+        (folder / name).write_text("\n".join([header, *lines[rows]]) + "\n", encoding="utf-8")
+
+    past, ahead = slice(SEEN), slice(SEEN, None)
+    write("ms.csv", "t [ms],x [mm],u [V]", 1e3 * t, x, u, rows=past)
+    write("s.csv", "t [s],x [mm],u [V]", t, x, u, rows=past)
+    write("bare.csv", "t,x,u", 1e3 * t, x, u, rows=past)
+    write("metres.csv", "t [ms],x [m],u [V]", 1e3 * t, 1e-3 * x, u, rows=past)
+    write("u_ms.csv", "t [ms],u [V]", 1e3 * t, u, rows=ahead)
+    write("u_s.csv", "t [s],u [V]", t, u, rows=ahead)
+    write("u_mV.csv", "t [s],u [mV]", t, 1e3 * u, rows=ahead)
+    write("u_short.csv", "t [s],u [V]", t, u, rows=slice(SEEN, SEEN + 30))
+    write("u_later.csv", "t [s],u [V]", t, u, rows=slice(SEEN + 20, None))
+    write("u_before.csv", "t [s],u [V]", t, u, rows=slice(40))
+    fit = ["fit", str(folder / "ms.csv"), "--out", str(folder / "model"), "--input-hold", "hold"]
+    with contextlib.redirect_stderr(io.StringIO()):
+        assert main(fit) == 0
+    return folder
+
+
+def predicted(folder, initial, inputs, capsys, steps=AHEAD):
+    """(exit status, rows of the forecast or None, what stood on standard error)."""
+    out = folder / "f.csv"
+    out.unlink(missing_ok=True)
+    status = main(["predict", str(folder / "model"), "--initial", str(folder / initial), "--inputs",
+                   str(folder / inputs), "--num-steps", str(steps), "--out", str(out)])  # fmt: skip
+    rows = np.genfromtxt(out, delimiter=",", names=True) if out.exists() else None
+    return status, rows, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("initial", "inputs", "unit"),
+    [("ms.csv", "u_ms.csv", 1e3), ("ms.csv", "u_s.csv", 1e3), ("bare.csv", "u_s.csv", 1e3),
+     ("s.csv", "u_ms.csv", 1.0)],
+)  # fmt: skip
+def test_times_are_in_the_unit_of_each_files_header(motion, folder, initial, inputs, unit, capsys):
+    """A file that names none is in the unit of the law's recording; times are written in that of
+    the recording that is gone on from."""
+    t, x, _ = motion
+    status, rows, _ = predicted(folder, initial, inputs, capsys, AHEAD - 1)
+    assert status == 0
+    np.testing.assert_allclose(rows["t"], unit * t[SEEN:-1], rtol=1e-9)
+    assert np.abs(rows["x"] - x[SEEN:-1]).max() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("initial", "inputs", "told"),
+    [
+        ("metres.csv", "u_s.csv", "expected x in mm, in which the law was learned, got m"),
+        ("ms.csv", "u_mV.csv", "expected u in V, in which the law was learned, got mV"),
+        ("ms.csv", "u_short.csv", "needs inputs from 19.95 to 22.95 s, and there are none from "
+         "21.45 to 22.95 s"),
+        ("ms.csv", "u_later.csv", "there are none from 19.95 to 21 s"),
+        ("ms.csv", "u_before.csv", "there are none from 19.95 to 22.95 s"),
+    ],
+)  # fmt: skip
+def test_other_units_and_inputs_that_end_early_are_refused(folder, initial, inputs, told, capsys):
+    status, rows, errors = predicted(folder, initial, inputs, capsys)
+    assert status == 2
+    assert rows is None
+    assert told in errors
+
+
+def test_a_comparison_may_be_in_another_unit_of_time(folder, capsys):
+    out = folder / "c.csv"
+    arguments = ["predict", str(folder / "model"), "--initial", str(folder / "s.csv"), "--to", "18",
+                 "--compare", str(folder / "ms.csv"), "--out", str(out)]  # fmt: skip
+    assert main(arguments) == 0
+    told = capsys.readouterr().out
+    assert "up to t = 19.95 s" in told
+    rms = float(told.split("x: RMS error ")[1].split(" mm")[0])
+    assert rms < 0.1
+
+
+def test_a_time_unit_that_the_header_contradicts_is_refused():
+    table = {"t_ms": np.arange(20.0), "x": np.arange(20.0)}
+    assert Recording(table).time_unit == "ms"
+    with pytest.raises(InputError, match="t_ms is in ms by its header, got the time unit s"):
+        Recording(table, time_unit="s")
