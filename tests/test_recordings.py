@@ -345,3 +345,10 @@ def test_options_of_the_command_line_are_keywords_of_read():
     assert not names_roles(column_options(parser.parse_args(["--angles", "0,2"])))
     assert column_options(parser.parse_args(["--angles", "0,2"]))["angles"] == (0, 2)
     assert masses(parser.parse_args(["--mass", "x=2,y=3"])) == {"x": 2.0, "y": 3.0}
+
+
+def test_names_with_blanks_are_one_word_of_the_command_that_is_told():
+    t = np.arange(40) * 0.1
+    table = {"t": t, "frame": np.arange(40.0), "pendulum angle": np.cos(t) + 0.1 * np.sin(9 * t)}
+    with pytest.raises(InputError, match="--positions 'frame,pendulum angle', or some"):
+        gfnn.Recording(table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -43,12 +44,12 @@ def positions_and_velocities(
     pairs = _pairs(times, {name: columns[name] for name in moving}) if moving else []
     rest = [name for name in moving if not any(name in pair for pair in pairs)]
     if rest or not pairs:
-        shown = ", ".join(rest or names)
+        shown, typed = ", ".join(rest or names), shlex.quote(",".join(moving))
         if not moving:
             raise InputError(f"{source}: none of the columns {', '.join(names)} varies")
         raise InputError(
             f"{source}: the names {', '.join(names)} do not show what was measured, and {shown} "
-            f"may be motion or what drives it. Name them: --positions {','.join(moving)}, or some "
+            f"may be motion or what drives it. Name them: --positions {typed}, or some "
             "of them and --inputs"
         )
     return tuple(x for x, _ in pairs), tuple(v for _, v in pairs)

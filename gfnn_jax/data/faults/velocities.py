@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -40,7 +41,7 @@ def related(traits: Traits) -> Iterator[Fault]:
         finding = ", ".join(f"{v} is the derivative of {x}" for x, v in other)
         yield Fault(
             "order", f"the columns are in another order than their names say: {finding}",
-            f"--positions {','.join(positions)} --velocities {','.join(velocities)}",
+            f"--positions {_typed(positions)} --velocities {_typed(velocities)}",
             {"positions": positions, "velocities": velocities},
         )  # fmt: skip
         return
@@ -101,9 +102,14 @@ def _second(unit: str, factors: list[float]) -> str | None:
     return next((name for name, s in SECONDS.items() if np.isclose(s, second)), None)
 
 
+def _typed(names: Sequence[str]) -> str:
+    """Names as one word of a command line."""
+    return shlex.quote(",".join(names))
+
+
 def _pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
     factor, degree = relation.factor, 180 / np.pi
-    without = f"or ignore {v}: --positions {','.join(traits.recording.positions)}"
+    without = f"or ignore {v}: --positions {_typed(traits.recording.positions)}"
     alone = {"positions": traits.recording.positions}
     finding = f"{v} is {factor:.4g} × d{x}/dt"
     if relation.explained < _DERIVATIVE:
@@ -131,7 +137,7 @@ def _pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]
 def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
     """Notes about a velocity that was made of the position."""
     alone = {"positions": traits.recording.positions}
-    without = f"To ignore {v}: --positions {','.join(traits.recording.positions)}"
+    without = f"To ignore {v}: --positions {_typed(traits.recording.positions)}"
     kind = difference(traits.times, traits.columns[x], traits.columns[v])
     if kind is not None:
         yield Fault("difference", f"{v} is the {kind} difference of {x} and adds no information",
