@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import arcs_of, nodes_of
 from gfnn_jax.families.lagrangian import LINEAR
-from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians import fine_steps, libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.fit import Workbench
@@ -81,7 +81,28 @@ def test_no_step_goes_on_beyond_a_sample_where_inputs_jump():
         nodes = nodes_of(samples.stretches, dataclasses.replace(samples.scales, omega=np.pi / 3.2))
         assert np.all(np.diff(nodes[0].at) == 8)
         inputs = ArcInputs(nodes, 1, "hold")
-        assert inputs.of_steps(3).substeps == wanted
-        assert inputs.of_steps(9).substeps == (16 if columns else 9)
+        assert inputs.within_samples(3) == wanted
+        assert inputs.within_samples(9) == (16 if columns else 9)
         for smooth in ("linear", "band"):
-            assert ArcInputs(nodes, 1, smooth).of_steps(3).substeps == 3
+            assert ArcInputs(nodes, 1, smooth).within_samples(3) == 3
+
+
+def test_steps_end_at_samples_where_shorter_ones_do_not_help(monkeypatch):
+    """Errors of jumps: what shorter steps move falls little until none goes on beyond a sample."""
+    bench, fit, _ = fitted(1e-4)
+    tried: list[int] = []
+
+    def moved(bench, finer, fit):
+        tried.append(bench.inputs.substeps)
+        return 0.1 if bench.inputs.substeps % 11 == 0 else 0.8
+
+    def within(self, fewest):
+        return 1 if fewest == 1 else -(-fewest // 11) * 11
+
+    monkeypatch.setattr(fine_steps, "_moved", moved)
+    monkeypatch.setattr(ArcInputs, "within_samples", within)
+    lines: list[str] = []
+    finer, _ = with_fine_steps(bench, fit, lines.append)
+    assert tried == [1, 2, 11]
+    assert finer.inputs.substeps == 11
+    assert not any("too few" in line for line in lines)

@@ -30,15 +30,19 @@ class ArcInputs:
         """Make those of another rule between samples."""
         return ArcInputs(self._nodes, self.substeps, hold)
 
-    def of_steps(self, fewest: int) -> ArcInputs:
-        """Make those of so many steps between two nodes; of inputs that are held, which jump at
-        samples, of the next number of which no step goes on beyond a sample."""
+    def of_steps(self, count: int) -> ArcInputs:
+        """Make those of so many steps between two nodes."""
+        return ArcInputs(self._nodes, count, self.hold, self.delay)
+
+    def within_samples(self, fewest: int) -> int:
+        """The least number of steps between two nodes, from ``fewest`` on, of which none goes on
+        beyond a sample where inputs jump, as those do that are held."""
         every = int(np.median(np.concatenate([np.diff(n.at) for n in self._nodes])))
         jump = self.hold == "hold" and self._nodes[0].stretch.u.shape[1] > 0
         count = fewest
         while jump and every % count and count % every:
             count += 1
-        return ArcInputs(self._nodes, count, self.hold, self.delay)
+        return count
 
     def __call__(self, arcs: Arcs) -> np.ndarray:
         steps = arcs.t.shape[1] - 1

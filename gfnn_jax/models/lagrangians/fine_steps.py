@@ -34,14 +34,17 @@ def with_fine_steps(
     most = int(np.ceil(bench.omega * np.median(np.diff(fit.arcs.t, axis=1)) / _SHORTEST))
     before = np.inf
     for _ in range(_TIMES):
-        now = bench.inputs.substeps
-        moved = _moved(bench, _with_steps(bench, 2 * now), fit)
+        now, within = bench.inputs.substeps, bench.inputs.within_samples
+        half = within(2 * now) if within(now) == now else 2 * now
+        moved = _moved(bench, _with_steps(bench, half), fit)
         if not moved > _MOVED:
             return bench, fit
-        if now >= most or moved > _GAINS * before:
+        count = int(max(np.ceil(now * (moved / _MOVED) ** (1 / _ORDER)), now + 1))
+        if moved > _GAINS * before:
+            count = within(now)
+        if now >= most or count == now:
             break
-        wanted = np.ceil(now * (moved / _MOVED) ** (1 / _ORDER))
-        finer = _with_steps(bench, int(min(max(wanted, now + 1), most)))
+        finer = _with_steps(bench, min(count, most))
         arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
         other = finer.fit(fit.structure, fit.values, arcs, fit.sigma)
         if not np.isfinite(other.fitted.cost):
