@@ -5,11 +5,13 @@ import io
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from gfnn_jax.cli import main
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
+from gfnn_jax.jobs.units import read_in_units
 
 DT, SEEN, AHEAD = 0.05, 400, 60
 
@@ -81,8 +83,8 @@ def test_times_are_in_the_unit_of_each_files_header(motion, folder, initial, inp
 @pytest.mark.parametrize(
     ("initial", "inputs", "told"),
     [
-        ("metres.csv", "u_s.csv", "expected x in mm, in which the law was learned, got m"),
-        ("ms.csv", "u_mV.csv", "expected u in V, in which the law was learned, got mV"),
+        ("metres.csv", "u_s.csv", "expected x in mm, in which the model was learned, got m"),
+        ("ms.csv", "u_mV.csv", "expected u in V, in which the model was learned, got mV"),
         ("ms.csv", "u_short.csv", "needs inputs from 19.95 to 22.95 s, and there are none from "
          "21.45 to 22.95 s"),
         ("ms.csv", "u_later.csv", "there are none from 19.95 to 21 s"),
@@ -112,3 +114,76 @@ def test_a_time_unit_that_the_header_contradicts_is_refused():
     assert Recording(table).time_unit == "ms"
     with pytest.raises(InputError, match="t_ms is in ms by its header, got the time unit s"):
         Recording(table, time_unit="s")
+
+
+@pytest.fixture(scope="module")
+def swings(tmp_path_factory):
+    """Files of a damped swing in degrees and in radians, and models of the first part of each."""
+    rng, folder = np.random.default_rng(1), tmp_path_factory.mktemp("swings")
+    t = DT * np.arange(SEEN)
+    swing = solve_ivp(lambda _, x: [x[1], -9 * np.sin(x[0]) - 0.1 * x[1]], (0, t[-1]), [0.8, 0],
+                      t_eval=t, rtol=1e-9, atol=1e-9)  # fmt: skip
+    theta = swing.y[0] + 1e-4 * rng.normal(size=SEEN)
+    for unit, factor in (("deg", 180 / np.pi), ("rad", 1.0), ("mrad", 1e3)):
+        np.savetxt(folder / f"{unit}.csv", np.stack([t, factor * theta], axis=1), delimiter=",",
+                   header=f"t [s],theta [{unit}]", comments="")  # fmt: skip
+    for unit in ("deg", "rad"):
+        with contextlib.redirect_stderr(io.StringIO()):
+            assert main(["fit", str(folder / f"{unit}.csv"), "--to", "15", "--out",
+                         str(folder / f"model-{unit}")]) == 0  # fmt: skip
+    return folder
+
+
+@pytest.mark.parametrize("model", ["deg", "rad"])
+@pytest.mark.parametrize(("initial", "compare"), [("deg", "rad"), ("rad", "deg")])
+def test_degrees_and_radians_go_together(swings, model, initial, compare, capsys):
+    """What is compared is in the unit of the file that is compared with."""
+    status = main(["predict", str(swings / f"model-{model}"), "--initial",
+                   str(swings / f"{initial}.csv"), "--to", "15", "--compare",
+                   str(swings / f"{compare}.csv"), "--out", str(swings / "f.csv"),
+                   "--overwrite"])  # fmt: skip
+    assert status == 0
+    told = capsys.readouterr().out
+    rms, unit = told.split("theta: RMS error ")[1].split(",")[0].split(" ")
+    assert unit == compare
+    assert float(rms) < 5e-3 * (180 / np.pi if compare == "deg" else 1)
+
+
+@pytest.mark.parametrize("model", ["deg", "rad"])
+def test_parts_of_a_radian_are_refused(swings, model, capsys):
+    status = main(["predict", str(swings / f"model-{model}"), "--initial",
+                   str(swings / "mrad.csv"), "--num-steps", "5", "--out",
+                   str(swings / "m.csv")])  # fmt: skip
+    assert status == 2
+    assert f"expected theta in {model}, in which the model was learned, got mrad" in (
+        capsys.readouterr().err
+    )
+
+
+def test_a_velocity_in_another_unit_is_not_left_out_in_silence(tmp_path, capsys):
+    rng, t = np.random.default_rng(2), DT * np.arange(SEEN)
+    x, v = np.exp(-0.05 * t) * np.stack([np.cos(3 * t), -3 * np.sin(3 * t) - 0.05 * np.cos(3 * t)])
+    x, v = x + 1e-2 * rng.normal(size=SEEN), v + 1e-2 * rng.normal(size=SEEN)
+    for name, unit, factor in (("both", "m/s", 1.0), ("other", "mm/s", 1e3)):
+        np.savetxt(tmp_path / f"{name}.csv", np.stack([t, x, factor * v], axis=1), delimiter=",",
+                   header=f"t [s],x [m],v [{unit}]", comments="")  # fmt: skip
+    columns = ["--positions", "x", "--velocities", "v"]
+    model = str(tmp_path / "model")
+    assert main(["fit", str(tmp_path / "both.csv"), *columns, "--out", model]) == 0
+    status = main(["predict", model, "--initial", str(tmp_path / "other.csv"), "--num-steps", "5",
+                   "--out", str(tmp_path / "f.csv")])  # fmt: skip
+    assert status == 2
+    assert "expected v in m/s, in which the model was learned, got mm/s" in capsys.readouterr().err
+
+
+def test_a_header_that_is_silent_is_read_in_the_units_of_the_model(tmp_path):
+    (tmp_path / "bare.csv").write_text("t,theta\n0,0\n100,90\n200,180\n", encoding="utf-8")
+    (tmp_path / "rad.csv").write_text("t [s],theta [rad]\n0,0\n0.1,1\n0.2,2\n", encoding="utf-8")
+    job = {"degrees": ["theta"], "time_unit": "ms", "units": {"theta": "deg"}}
+    bare, rad = (
+        read_in_units(tmp_path / name, job, {"positions": ("theta",)})
+        for name in ("bare.csv", "rad.csv")
+    )
+    np.testing.assert_allclose(bare.array("positions", "0")[:, 0], [0, np.pi / 2, np.pi])
+    np.testing.assert_allclose(rad.array("positions", "0")[:, 0], [0, 1, 2])
+    np.testing.assert_allclose(bare.times("0"), rad.times("0"))

@@ -412,6 +412,11 @@ def test_positions_in_a_file_are_fitted_and_continued(tmp_path, monkeypatch, cap
     assert cli.main(go_on) == 0
     ahead = np.load("on.npz")["trajectories"][..., 0]
     assert np.abs(nearest_image(ahead - read[:20, 3:], tuple(range(5)))).max() < 1e-11
+    text = Path("begun.csv").read_text(encoding="utf-8").replace("theta", "theta [mrad]")
+    Path("begun.csv").write_text(text, encoding="utf-8")
+    assert cli.main([*go_on, "--overwrite"]) == 2
+    expected = "expected theta in rad, in which the model was learned, got mrad"
+    assert expected in capsys.readouterr().err
 
 
 # What is refused, in a line

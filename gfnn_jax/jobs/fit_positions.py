@@ -13,6 +13,7 @@ from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.evaluate import report
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import failures_of_arithmetic, line, refusals
+from gfnn_jax.jobs.units import units_of
 from gfnn_jax.jobs.written import Ran, write
 from gfnn_jax.learn.fit import fit as learn_fit
 from gfnn_jax.learn.options import FitOptions
@@ -45,7 +46,7 @@ def fit_positions(
     )  # fmt: skip
     job = {
         "command": "fit", "data": recording.source, "positions": list(recording.positions),
-        **asked.deciding, "angles": list(recording.angles),
+        **asked.deciding, "angles": list(recording.angles), **units_of(recording),
     }  # fmt: skip
     with atomic_folder(out) as folder:
         write(folder, folder, fitted, result, job)

@@ -12,6 +12,7 @@ from gfnn_jax.evaluate import law_report, report
 from gfnn_jax.evaluate.figures_of_laws import law_figure
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import failures_of_arithmetic, refusals
+from gfnn_jax.jobs.units import units_of
 from gfnn_jax.jobs.written import REPORT
 from gfnn_jax.learn.fit import fit as learn_fit
 from gfnn_jax.learn.options import FitOptions
@@ -49,10 +50,7 @@ def fit_recording(
     result = law_report.assemble(fitted, source=recording.source, seed=asked.seed)
     kept = ("seed", "device", "data", "fit", "map", "lagrangian", "friction", "gauge")
     job = {
-        "command": "fit", "data": recording.source, **asked.deciding,
-        "degrees": [name for name, factor in recording.factors.items() if factor != 1],
-        "time_unit": recording.time_unit,
-        "units": {name: recording.unit(name) for name in recording.columns},
+        "command": "fit", "data": recording.source, **asked.deciding, **units_of(recording),
     }  # fmt: skip
     record = {"job": job, **report.finite({key: result[key] for key in kept})}
     with atomic_folder(out) as folder:

@@ -2,7 +2,7 @@
 
 The file written has times (R, n), values and std (R, n, d) by runs and columns; with .csv at its
 end, columns run, t, each position and std_ of each. Times are in the unit of the recording that is
-gone on from, values in those of the recording that the law was learned from.
+gone on from, and so are values; of columns that it lacks in those of the law's.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.data.recording import SECONDS, Recording, read
+from gfnn_jax.data.recording import SECONDS, Recording
 from gfnn_jax.errors import InputError
+from gfnn_jax.jobs.units import read_in_units, refuse_other_units
 from gfnn_jax.maps.estimates import Forecast
 from gfnn_jax.maps.saved import load, record
 from gfnn_jax.maps.sensors import Sensors
@@ -68,9 +69,11 @@ def forecast_recording(
     recording, roles = _read(initial, map_, job, columns)
     if stop is not None:
         recording = recording.slice(stop=stop * SECONDS[recording.time_unit])
-    bare = ("positions", "velocities", "sensors", "coordinates", "angles", "degrees", "parameters")
-    only_inputs = {**roles, **dict.fromkeys(bare)}
-    ahead = None if inputs is None else _checked(inputs, job, only_inputs)
+    ahead = None
+    if inputs is not None:
+        bare = ("positions", "velocities", "sensors", "coordinates", "angles", "parameters")
+        ahead = read_in_units(inputs, job, {**roles, **dict.fromkeys(bare)})
+        refuse_other_units(ahead, job)
     measured = None if compare is None else _read(compare, map_, job, columns)[0]
     if num_steps is None and measured is None:
         raise InputError("expected --num-steps, or --compare, whose times the forecast is for")
@@ -94,14 +97,12 @@ def forecast_recording(
             steps = np.arange(save_every, num_steps + 1, save_every)
             times = last + float(np.asarray(map_.dt)) * steps
         found[run] = map_.forecast(part, times, ahead)
+    compared = None if measured is None else _compared(sensors, found, measured)
     second = SECONDS[recording.time_unit]
     factors = dict.fromkeys(job.get("degrees", ()), np.pi / 180) | recording.factors
     found = {run: _in_units(one, factors, second) for run, one in found.items()}
     _write(out, tuple(next(iter(found.values())).values), found)
-    unit = recording.time_unit
-    if measured is None:
-        return Forecasts(found, unit, None)
-    return Forecasts(found, unit, _compared(sensors, found, second, measured))
+    return Forecasts(found, recording.time_unit, compared)
 
 
 def _read(
@@ -114,44 +115,28 @@ def _read(
     observation = sensors.observation_model
     varied = () if map_.parameters is None else map_.parameters.names
     columns = {"parameters": varied, **columns}
-    roles = _roles(sensors, job, observation.channels) | columns
+    roles = _roles(sensors, observation.channels) | columns
     try:
-        return _checked(path, job, roles), roles
+        recording = read_in_units(path, job, roles)
     except InputError:
         if observation.needed == observation.channels:
             raise
-    roles = _roles(sensors, job, observation.needed) | columns
-    return _checked(path, job, roles), roles
+        roles = _roles(sensors, observation.needed) | columns
+        recording = read_in_units(path, job, roles)
+    # Outside of ``try``: a velocity in another unit is no velocity that is lacking.
+    refuse_other_units(recording, job)
+    return recording, roles
 
 
-def _checked(path: Path, job: dict[str, Any], roles: dict[str, Any]) -> Recording:
-    """Read a recording whose times are in its header's unit, else in that of the recording that
-    the law was learned from. Raises InputError where a column has another unit than there."""
-    recording = read(path, **roles)
-    unit = job.get("time_unit", "s")
-    if not recording.time_unit_given and unit != "s":
-        recording = read(path, **roles, time_unit=unit)
-    for name, known in job.get("units", {}).items():
-        own = recording.unit(name) if name in recording.columns else ""
-        turned = name in job.get("degrees", ()) or recording.factors.get(name, 1.0) != 1.0
-        if own and known and own != known and not turned:
-            raise InputError(
-                f"{path}: expected {name} in {known}, in which the law was learned, got {own}"
-            )
-    return recording
-
-
-def _roles(sensors: Sensors, job: dict[str, Any], channels: tuple[str, ...]) -> dict[str, Any]:
+def _roles(sensors: Sensors, channels: tuple[str, ...]) -> dict[str, Any]:
     """Keywords of `read` for a recording with these columns."""
     speeds = sensors.observation_model.speeds
-    roles: dict[str, Any] = {
+    return {
         "positions": tuple(n for n in channels if n in sensors.positions),
         "velocities": tuple(n for n in channels if n in speeds),
         "sensors": tuple(n for n in channels if n not in (*sensors.positions, *speeds)),
         "inputs": sensors.inputs, "coordinates": sensors.positions, "angles": sensors.angles,
     }  # fmt: skip
-    degrees = [n for n in job.get("degrees", ()) if n in channels]
-    return {**roles, "degrees": degrees or None}
 
 
 def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> Forecast:
@@ -170,26 +155,23 @@ def _last_samples(recording: Recording, run: str, count: int | None) -> Recordin
     return recording.slice(start=float(np.sort(times)[-min(count, len(times)) :].min()))
 
 
-def _compared(
-    sensors: Sensors, found: dict[str, Forecast], second: float, measured: Recording
-) -> Comparison:
-    """Forecasts, whose times are in units of ``second``, against what was measured."""
+def _compared(sensors: Sensors, found: dict[str, Forecast], measured: Recording) -> Comparison:
+    """Forecasts, in seconds and radians, against what was measured, in the units of its file."""
     columns, count = {}, 0
     for name in (n for n in sensors.observation_model.channels if n in measured.columns):
         errors, stds = [], []
         for run, one in found.items():
             own = run if len(measured.runs) > 1 else next(iter(measured.runs))
             factor = measured.factors[name]
-            seconds = one.times * second
             times = measured.times(own)
-            at = np.searchsorted(times, seconds - 0.5 * np.min(np.diff(times)))
-            error = one.values[name][0] - measured.values(name, own)[at] / factor
+            at = np.searchsorted(times, one.times - 0.5 * np.min(np.diff(times)))
+            error = (one.values[name][0] - measured.values(name, own)[at]) / factor
             if name in sensors.angles:
                 half = np.pi / factor
                 error = (error + half) % (2 * half) - half
             finite = np.isfinite(error)
             errors.append(error[finite])
-            stds.append(one.std[name][0][finite])
+            stds.append(one.std[name][0][finite] / factor)
         error, std = np.concatenate(errors), np.concatenate(stds)
         rms, median = np.sqrt(np.mean(error**2)), np.median(np.abs(error))
         columns[name] = (float(rms), float(median), float(np.mean(np.abs(error) <= 2 * std)))

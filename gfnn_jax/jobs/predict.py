@@ -14,9 +14,9 @@ from gfnn_jax.data.files import read_initial, read_initial_noise
 from gfnn_jax.data.kinds import are_recordings
 from gfnn_jax.data.parts import number_of_parts, part_of, put_together
 from gfnn_jax.data.predictions import PredictionWriter, is_done, job_of
-from gfnn_jax.data.recording import read
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs.progress import SILENT, Progress
+from gfnn_jax.jobs.units import read_in_units, refuse_other_units
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.bands import bands, horizon
 from gfnn_jax.maps.lanes import Lanes
@@ -188,7 +188,9 @@ def _last_states(map_: SymplecticMap, model: Path, initial: Path) -> np.ndarray:
     """(B, 2d): the states at the end of every run, from its last two positions."""
     job = saved.record(model).get("job", {})
     names = job.get("positions")
-    recording = read(initial, positions=names, angles=job.get("angles"))
+    roles = {"positions": names, "angles": job.get("angles")}
+    recording = read_in_units(initial, job, roles)
+    refuse_other_units(recording, job)
     ends = np.array([recording.array("positions", run)[-2:] for run in recording.runs])
     if ends.shape[1:] != (2, map_.dim) or not np.isfinite(ends).all():
         raise InputError(
