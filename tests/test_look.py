@@ -127,6 +127,16 @@ def test_columns_that_are_odd_are_named(tmp_path, change, kind):
     assert kind in [k for k, _ in found(path)]
 
 
+def test_names_with_blanks_are_quoted_for_the_shell():
+    t = np.arange(400) * 0.02
+    table = {"t": t, "the angle": np.cos(t), "its rate": -2.5 * np.sin(t),
+             "other angle": np.mod(90 * t, 360)}  # fmt: skip
+    roles = {"positions": ["the angle", "other angle"], "velocities": ["its rate"]}
+    said = " ".join(map(str, gfnn.Recording(table, **roles).summary().faults))
+    assert "--scale 'its rate'" in said
+    assert "--degrees 'other angle'" in said
+
+
 # The command line
 
 

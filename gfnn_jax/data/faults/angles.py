@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 
 import numpy as np
@@ -49,14 +50,14 @@ def units(traits: Traits) -> Iterator[Fault]:
     for name in _angles(traits):
         if recording.factors[name] != 1 or name in recording.explained:
             continue
-        option = {"degrees": (name,)}
+        option, typed = {"degrees": (name,)}, shlex.quote(name)
         jump, swing = jumps(traits, name), _swing(_raw(traits, name))
         if jump is not None and jump[0] == 360:
             found = f"{name} jumps by 360 ({jump[1]} times)"
-            yield Fault("degrees", found, f"Its unit is degrees: --degrees {name}", option)
+            yield Fault("degrees", found, f"Its unit is degrees: --degrees {typed}", option)
         elif swing > _SWING and np.ptp(_all(traits, name)) < 720 and not _settled(traits, name):
             found = f"{name} swings by {swing:.3g}, degrees or {swing / TURN:.0f} turns in radians"
-            remedy = f"If degrees: --degrees {name}. If radians: --angles {name}"
+            remedy = f"If degrees: --degrees {typed}. If radians: --angles {typed}"
             yield Fault("degrees", found, remedy, option)
 
 
@@ -94,7 +95,7 @@ def wraps(traits: Traits) -> Iterator[Fault]:
         if jump is not None:
             option = "degrees" if jump[0] == 360 else "angles"
             found = f"{name} jumps by {jump[0]:.3g} ({jump[1]} times)"
-            yield Fault("wrapped", found, f"Name it as an angle: --{option} {name}",
+            yield Fault("wrapped", found, f"Name it as an angle: --{option} {shlex.quote(name)}",
                         {option: (name,)})  # fmt: skip
 
 

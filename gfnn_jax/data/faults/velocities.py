@@ -109,6 +109,7 @@ def _typed(names: Sequence[str]) -> str:
 
 def _pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
     factor, degree = relation.factor, 180 / np.pi
+    typed_x, typed_v = shlex.quote(x), shlex.quote(v)
     without = f"or ignore {v}: --positions {_typed(traits.recording.positions)}"
     alone = {"positions": traits.recording.positions}
     finding = f"{v} is {factor:.4g} × d{x}/dt"
@@ -116,20 +117,23 @@ def _pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]
         yield Fault(
             "no derivative", f"{v} is not the derivative of {x}: d{x}/dt explains "
             f"{100 * relation.explained:.0f} % of its variance",
-            f"Name {v} as an input (--inputs {v}), {without}", alone,
+            f"Name {v} as an input (--inputs {typed_v}), {without}", alone,
         )  # fmt: skip
     elif abs(factor * degree - 1) < _NEAR:
-        yield Fault("degrees", finding, f"The unit of {x} is degrees: --degrees {x}",
+        yield Fault("degrees", finding, f"The unit of {x} is degrees: --degrees {typed_x}",
                     {"degrees": (x,)})  # fmt: skip
     elif abs(factor / degree - 1) < _NEAR:
-        yield Fault("degrees", finding, f"The unit of {v} is degrees per second: --degrees {v}",
-                    {"degrees": (v,)})  # fmt: skip
+        yield Fault(
+            "degrees", finding, f"The unit of {v} is degrees per second: --degrees {typed_v}",
+            {"degrees": (v,)},
+        )  # fmt: skip
     elif abs(factor + 1) < _NEAR:
         yield Fault("sign", finding, f"Change the sign of {v} in the file, {without}", alone)
     elif factor < 0 or abs(np.log(factor)) > _OFF:
         yield Fault(
-            "factor", finding, f"Check its unit, fit its scale (--scale {v}), {without}", alone
-        )
+            "factor", finding,
+            f"Check its unit, fit its scale (--scale {typed_v}), {without}", alone,
+        )  # fmt: skip
     else:
         yield from _derived(traits, x, v, relation)
 
