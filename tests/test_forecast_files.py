@@ -98,6 +98,22 @@ def test_other_units_and_inputs_that_end_early_are_refused(folder, initial, inpu
     assert told in errors
 
 
+@pytest.mark.parametrize("plan", ["coarse", "with a gap"])
+def test_inputs_ahead_may_be_coarse_or_lack_values(motion, folder, plan, capsys):
+    """They are held here for ten samples each; a value that is missing is that before it."""
+    t, x, u = motion
+    columns = zip(t[SEEN:], u[SEEN:], strict=True)
+    lines = [f"{a:.9g},{b:.9g}" for a, b in columns]
+    if plan == "coarse":
+        lines = [*lines[::10], lines[-1]]
+    else:
+        lines[14] = lines[14].split(",")[0] + ","
+    (folder / "plan.csv").write_text("\n".join(["t [s],u [V]", *lines]) + "\n", encoding="utf-8")
+    status, rows, _ = predicted(folder, "ms.csv", "plan.csv", capsys, AHEAD - 1)
+    assert status == 0
+    assert np.abs(rows["x"] - x[SEEN:-1]).max() < 0.5
+
+
 def test_a_comparison_may_be_in_another_unit_of_time(folder, capsys):
     out = folder / "c.csv"
     arguments = ["predict", str(folder / "model"), "--initial", str(folder / "s.csv"), "--to", "18",

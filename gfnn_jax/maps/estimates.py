@@ -277,7 +277,7 @@ def _with_inputs(window: Window, inputs: Recording, sensors: Sensors, run: str) 
     run = run if len(inputs.runs) > 1 else next(iter(inputs.runs))
     t = inputs.times(run)
     u = np.stack([inputs.values(n, run) for n in sensors.inputs], axis=1)
-    later = t > np.max(window.inputs_t, initial=-np.inf)
+    later = (t > np.max(window.inputs_t, initial=-np.inf)) & np.isfinite(u).all(axis=1)
     return window._replace(
         inputs_t=np.concatenate([window.inputs_t, t[later]]),
         inputs=np.concatenate([window.inputs, u[later]]),
@@ -285,10 +285,12 @@ def _with_inputs(window: Window, inputs: Recording, sensors: Sensors, run: str) 
 
 
 def _check_inputs(t: np.ndarray, begin: float, end: float, run: str) -> None:
-    """Raises InputError where inputs at times t leave out part of begin … end: the last may be a
-    step before it, and a few between others may be missing."""
-    ahead = np.concatenate([[begin], t[(t > begin) & (t < end)], [end]])
-    steps = np.diff(ahead) / np.median(np.diff(t))
+    """Raises InputError where inputs at times t leave out part of begin … end. The last holds for a
+    step, and a few between others may be missing."""
+    inside = t[(t > begin) & (t < end)]
+    usual = np.median(np.diff(inside if len(inside) > 1 else t))
+    ahead = np.concatenate([[begin], inside, [end]])
+    steps = np.diff(ahead) / usual
     lacks = steps > np.append(np.full(len(steps) - 1, _FEW), 1) + 0.5
     if lacks.any():
         gap = int(np.argmax(lacks))
