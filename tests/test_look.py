@@ -229,3 +229,60 @@ def test_one_missing_value_is_told_as_one_row():
         x[gone] = np.nan
         notes = str(gfnn.Recording({"t": t, "x": x}, positions=["x"]).summary())
         assert f"x has no value in {told} not used for it" in notes
+
+
+def two_carts(wrong=True):
+    """Three runs of two carts, σ = 0.2 mm; wrong: with spikes, a stuck sensor and a burst."""
+    rng, runs = np.random.default_rng(4), []
+    for run in range(3):
+        t = 0.01 * np.arange(1000)
+        one, other = (a * np.exp(-0.05 * t) * np.cos(w * t + run) for a, w in ((0.1, 6), (0.06, 9)))
+        left, right = np.round(
+            [one + other, one - other] + 2e-4 * rng.standard_normal((2, 1000)), 5
+        )
+        runs.append({"t": t, "left": left, "right": right})
+    if wrong:
+        runs[0]["left"][[40, 300, 312, 700, 850]] += 0.05
+        runs[1]["right"][403:440] = runs[1]["right"][403]
+        runs[2]["left"][500:515] += 0.14 * (-1.0) ** np.arange(15)
+    return gfnn.Recording(runs, positions=("left", "right"))
+
+
+def test_wrong_values_are_told_with_run_and_time_and_left_out_of_the_figures():
+    found, clean = two_carts().summary(), two_carts(wrong=False).summary()
+    assert clean.faults == ()
+    lines = [(fault.kind, str(fault).split(". ")[0]) for fault in found.faults]
+    assert [kind for kind, _ in lines] == ["stuck", "outliers", "outliers"]
+    assert lines[0][1] == "right is stuck from 4.04 s to 4.39 s of run 1 (37 equal values)"
+    assert lines[1][1] == "left has 5 outliers, up to 0.05 off, the first at 0.4 s of run 0"
+    assert (
+        lines[2][1] == "left has 15 outliers in a row from 5 s to 5.14 s of run 2, up to 0.14 off"
+    )
+    assert [(c.outliers, c.stuck) for c in found.columns] == [(20, 0), (0, 36)]
+    assert found.period == pytest.approx(clean.period, rel=0.02)
+    assert found.loss.per_period == pytest.approx(clean.loss.per_period, rel=0.05)
+    assert found.gaps == ()
+
+
+def test_empty_cells_are_gaps_and_do_not_hide_friction():
+    recording, runs = two_carts(wrong=False), []
+    rng = np.random.default_rng(0)
+    for run in recording.runs:
+        kept = np.ones(1000, bool)
+        kept[rng.choice(np.arange(5, 990, 5), 15, replace=False)] = False
+        kept[600:612] = False
+        table = {
+            "t": recording.times(run),
+            **{n: recording.values(n, run) for n in ("left", "right")},
+        }
+        runs.append((table, kept))
+    positions = ("left", "right")
+    empty = [
+        {n: x if n == "t" else np.where(k, x, np.nan) for n, x in of.items()} for of, k in runs
+    ]
+    without = [{n: x[k] for n, x in of.items()} for of, k in runs]
+    found, expected = (gfnn.Recording(r, positions=positions).summary() for r in (empty, without))
+    assert found.gaps == expected.gaps
+    assert len(found.gaps) >= 40
+    assert found.loss.per_period == expected.loss.per_period
+    assert found.columns[0].sigma == expected.columns[0].sigma

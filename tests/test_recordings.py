@@ -120,6 +120,25 @@ def test_times_that_fall_begin_a_run():
     recording = gfnn.Recording({"t": [0, 1, 2, 0, 1], "x": [1.0, 2, 3, 4, 5]})
     assert recording.runs == ("0", "1")
     np.testing.assert_array_equal(recording.values("x", "1"), [4, 5])
+    assert recording.notes == ("the times run back once, at row 4, and a run begins there",)
+    t = np.concatenate([np.arange(0, 9, 0.1), np.arange(0.3, 8, 0.1), np.arange(0, 3, 0.1)])
+    assert gfnn.Recording({"t": t, "x": t}).notes[0].startswith("the times run back 2 times, first")
+
+
+@pytest.mark.parametrize(
+    "moved", [[0, 1, 2, 4, 3, 5, 6, 7, 8], [0, 1, 2, 7, 3, 4, 5, 6, 8], [0, 1, 3, 4, 5, 6, 7, 2, 8]]
+)
+def test_a_row_out_of_place_is_no_run_and_has_its_line(tmp_path, moved):
+    text = "t,x\n" + "".join(f"{t},{t}\n" for t in moved)
+    row = int(np.flatnonzero(np.diff(moved) < 0)[0]) + 1
+    with pytest.raises(InputError, match=f"line {row + 2}: t = {moved[row]} runs back .* sort"):
+        gfnn.read(write(tmp_path / "r.csv", text))
+
+
+def test_a_second_column_of_times_is_named():
+    table = {"t": [0, 1, 2], "time": [0, 5, 9], "x": [1.0, 2, 3]}
+    assert gfnn.Recording(table).notes == ("time is not used, for the times are those of t",)
+    assert gfnn.Recording({n: table[n] for n in ("t", "x")}).notes == ()
 
 
 def test_several_files_are_runs_and_a_column_may_be_missing(tmp_path):

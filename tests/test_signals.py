@@ -8,8 +8,11 @@ from gfnn_jax.signals import energy
 from gfnn_jax.signals.derivatives import derivatives, difference
 from gfnn_jax.signals.local_polynomials import local_fits
 from gfnn_jax.signals.noise import noise, resolution
+from gfnn_jax.signals.roughness import misses, roughness
 from gfnn_jax.signals.spectra import dominant_frequencies
 from gfnn_jax.signals.steps import drift, even_runs, gaps, median_step
+from gfnn_jax.signals.strays import strays
+from gfnn_jax.signals.stuck import stuck
 
 RNG = np.random.default_rng(0)
 T = np.arange(0, 20, 0.01)
@@ -99,6 +102,67 @@ def test_missing_values_and_short_columns():
     (found,) = noise([T], x[None])
     assert found.sigma == pytest.approx(1e-3, rel=0.15)
     assert noise([T[:6]], x[None, :6])[0].sigma is None
+
+
+# Wrong values
+
+
+def found_in(x, resolution=0.0):
+    t = 0.01 * np.arange(len(x))
+    rough = roughness([misses(t, x)])
+    return stuck(t, x, resolution, rough), [s[:2] for s in strays(t, x, resolution, rough)]
+
+
+def test_spikes_and_a_burst_are_found_sample_by_sample():
+    x = swing(T)[0] + 1e-3 * RNG.standard_normal(len(T))
+    x[[200, 215, 901, 1500]] += [0.05, -0.05, -0.03, 0.4]
+    x[1200:1215] += 0.2 * (-1.0) ** np.arange(15)
+    assert found_in(x) == ([], [(200, 201), (215, 216), (901, 902), (1200, 1215), (1500, 1501)])
+
+
+def test_a_sensor_that_is_stuck_at_speed_is_found():
+    x = swing(T)[0] + 1e-3 * RNG.standard_normal(len(T))
+    fast = int(np.abs(np.gradient(x)[100:300]).argmax()) + 100
+    x[fast : fast + 25] = x[fast]
+    assert found_in(x) == ([(fast + 1, fast + 25)], [])
+
+
+def stick_slip():
+    """Positions of a body on a belt: it rests, and slips within a sample."""
+    return np.repeat(np.cumsum(RNG.uniform(0.5, 1, 60)), 20)
+
+
+def falling_to_rest():
+    """A swing that dry friction ends, and rest."""
+    t = 0.01 * np.arange(1200)
+    turns = np.floor(t / 0.5)
+    size = np.maximum(1.0 - 0.1 * turns, 0)
+    offset = 0.05 * np.where(size > 0, (-1.0) ** turns, 0)
+    return np.where(size > 0, (size - 0.05) * np.cos(2 * np.pi * t) + offset, 0)
+
+
+CLEAN = {
+    "rest": lambda: np.where(np.abs(T - 6) < 3, np.cos(np.pi * (T - 6) / 3), -1.0),
+    "counts": lambda: 0.02 * np.round(swing(T)[0] / 0.02),
+    "counts with noise": lambda: 2e-3 * np.round(
+        (swing(T)[0] + 1e-3 * RNG.standard_normal(len(T))) / 2e-3
+    ),
+    "dry friction": falling_to_rest,
+    "stick and slip": stick_slip,
+    "a slower sensor, held": lambda: np.repeat(swing(T)[0][::5], 5)[: len(T)],
+    "impacts": lambda: np.abs(np.sin(4 * T)),
+    "stops": lambda: np.maximum(np.sin(4 * T), 0.0),
+    "steps": lambda: np.sign(np.sin(4 * T)),
+    "long tails": lambda: swing(T)[0] + 1e-3 * RNG.laplace(size=len(T)),
+    "no noise": lambda: swing(T)[0],
+    "few samples a period": lambda: np.sin(1.3 * np.arange(900.0)) + np.sin(0.9 * np.arange(900)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CLEAN)
+def test_rest_counts_friction_and_impacts_are_no_wrong_values(name):
+    x = CLEAN[name]()
+    assert found_in(x, resolution(x) or 0.0) == ([], [])
 
 
 # Derivatives

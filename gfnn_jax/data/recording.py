@@ -28,7 +28,7 @@ from gfnn_jax.data.columns import (
     time_unit_of,
 )
 from gfnn_jax.data.roles import ROLES, is_run, is_time, unit_in
-from gfnn_jax.data.runs import restarts, runs_of
+from gfnn_jax.data.runs import restarts, runs_of, second_times
 from gfnn_jax.data.sigmas import check_sigmas, typical, with_sigmas
 from gfnn_jax.data.tables import Table, from_arrays, from_memory
 from gfnn_jax.data.text_files import from_text
@@ -180,6 +180,7 @@ class Recording:
             check_known(source, what, wanted, with_role)
         sigmas = {name: of for name, of in sigmas.items() if name in with_role}
         check_sigmas(source, sigmas, values)
+        of_times = (*(second_times(tables) if dt is None else ()), *restarts(tables, runs))
         fields = {
             **roles,
             "runs": tuple(runs),
@@ -197,7 +198,7 @@ class Recording:
             "ignored": tuple(n for n in numbers if n not in with_role)
             + tuple(dict.fromkeys(n for t in tables for n in t.text)),
             "angles_given": angles is not None or degrees is not None,
-            "notes": (*(n for t in tables for n in t.notes), *restarts(tables, runs), *decided),
+            "notes": (*(n for t in tables for n in t.notes), *of_times, *decided),
             "source": source,
             "_times": {run: times for run, (times, _) in runs.items()},
             "_values": values,

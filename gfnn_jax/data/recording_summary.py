@@ -11,7 +11,8 @@ import numpy as np
 
 from gfnn_jax.data.faults import WRONG, Fault, faults
 from gfnn_jax.data.roles import ROLES
-from gfnn_jax.data.traits import Traits, traits
+from gfnn_jax.data.traits import Traits, of_rows, traits
+from gfnn_jax.data.wrong_values import WrongValues
 from gfnn_jax.errors import InputError
 from gfnn_jax.signals import energy
 from gfnn_jax.signals.spectra import dominant_frequencies
@@ -49,6 +50,7 @@ class Column:
     frequencies: tuple[float, ...]
     missing: int
     outliers: int
+    stuck: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,8 +148,9 @@ def summarise(recording: Recording, options: Mapping[str, Any] | None = None) ->
         run: (len(t), float(t[0]), float(t[-1]))
         for run, t in zip(recording.runs, known.times, strict=True)
     }
-    holes = gaps(known.times)
-    steps = np.concatenate([np.diff(t) for t in known.times])
+    times = of_rows(known.times, known.seen)
+    holes = gaps(times)
+    steps = np.concatenate([np.diff(t) for t in times])
     longest = min((b - a for _, a, b in holes), default=np.inf)
     between = steps[steps < longest] if len(steps) else np.array([np.nan])
     period, loss = _motion(known)
@@ -190,7 +193,7 @@ def _motion(known: Traits) -> tuple[float | None, energy.Loss | None]:
     )  # fmt: skip
     if not np.isfinite(fits.slopes).all(axis=0).any() or not np.any(np.nanstd(fits.slopes, axis=1)):
         return None, None
-    middle = fits.rows[:, fits.rows.shape[1] // 2]
+    middle = known.sound[fits.rows[:, fits.rows.shape[1] // 2]]
     inputs = np.array([known.columns[name][middle] for name in recording.inputs])
     period = energy.mean_period(fits, len(recording.runs))
     angles = [name in recording.angles for name in recording.positions]
@@ -223,8 +226,14 @@ def _column(known: Traits, name: str) -> Column:
         noise is None or noise.white, name in recording.angles, of,
         None if relation is None else relation.factor, None if relation is None else relation.lag,
         tuple(dominant_frequencies(known.times, _turning(known, name))) if noise and have else (),
-        int(np.sum(~np.isfinite(values))), len(noise.outliers) if noise else 0,
+        int(np.sum(~np.isfinite(values))), *_counts(known.wrong.get(name, ())),
     )  # fmt: skip
+
+
+def _counts(wrong: Sequence[WrongValues]) -> tuple[int, int]:
+    """(samples far from those around them, samples of a sensor that was stuck)."""
+    sizes = [[len(w.rows) for w in wrong if (w.off is None) == held] for held in (False, True)]
+    return sum(sizes[0]), sum(sizes[1])
 
 
 def _turning(known: Traits, name: str) -> np.ndarray:

@@ -12,6 +12,8 @@ from gfnn_jax.data.roles import is_run, is_time
 from gfnn_jax.data.tables import Table
 from gfnn_jax.errors import InputError
 
+_MOST_MOVED = 3  # rows in a row that are taken to be out of place; more are a run
+
 
 def runs_of(
     tables: list[Table], names: list[str], second: float, dt: float | None
@@ -46,7 +48,7 @@ def _parts(
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Run -> its rows (n,) and their times (n,) in seconds."""
     column = _run_column(table)
-    time = next((name for name in table.columns if is_time(name)), None)
+    time = next(iter(_time_columns(table)), None)
     if time is None and dt is None:
         raise InputError(
             f"{table.source}: expected a column t or time, found {', '.join(table.columns)}; give "
@@ -59,7 +61,8 @@ def _parts(
         groups = {str(labels[i]): np.flatnonzero(inverse == i) for i in np.argsort(first)}
     elif dt is None:
         assert time is not None
-        falls = np.flatnonzero(np.diff(table.columns[time]) < 0) + 1
+        falls = _falls(table.columns[time])
+        _check_places(table, time, falls)
         groups = {str(i): rows for i, rows in enumerate(np.split(np.arange(length), falls))}
     else:
         groups = {"0": np.arange(length)}
@@ -78,7 +81,43 @@ def restarts(tables: list[Table], runs: Mapping[str, Any]) -> list[str]:
     """A note where times that fall have made runs."""
     if len(runs) == len(tables) or any(_run_column(table) for table in tables):
         return []
-    return [f"the times run back {len(runs) - len(tables)} times, and a run begins there"]
+    table = next(t for t in tables if len(_falls(t.columns[_time_columns(t)[0]])))
+    place = table.locate(int(_falls(table.columns[_time_columns(table)[0]])[0]))
+    if len(runs) == len(tables) + 1:
+        return [f"the times run back once, at {place}, and a run begins there"]
+    count = len(runs) - len(tables)
+    return [f"the times run back {count} times, first at {place}, and a run begins there"]
+
+
+def second_times(tables: list[Table]) -> list[str]:
+    """A note where a table has more columns of times than the one that is taken."""
+    found = dict.fromkeys((_time_columns(t)[0], n) for t in tables for n in _time_columns(t)[1:])
+    return [f"{other} is not used, for the times are those of {taken}" for taken, other in found]
+
+
+def _time_columns(table: Table) -> list[str]:
+    return [name for name in table.columns if is_time(name)]
+
+
+def _falls(times: np.ndarray) -> np.ndarray:
+    """The rows whose time is before that of the row above."""
+    return np.flatnonzero(np.diff(times) < 0) + 1
+
+
+def _check_places(table: Table, name: str, falls: np.ndarray) -> None:
+    """Raises InputError at a row out of place: without up to `_MOST_MOVED` rows the times go on
+    rising, and do not begin again from where they began."""
+    times, begin = table.columns[name], 0
+    for row in falls:
+        before, behind = times[begin:row], times[row : row + _MOST_MOVED + 1]
+        goes_on = before[-_MOST_MOVED - 1 :].min() < times[row] or behind.max() > before[-1]
+        if before[0] < times[row] and goes_on:
+            raise InputError(
+                f"{table.source}: {table.locate(int(row))}: {name} = {times[row]:.9g} runs back "
+                f"from {times[row - 1]:.9g} and goes on from there: sort the rows, or number the "
+                "runs in a column run"
+            )
+        begin = int(row)
 
 
 def _check_times(table: Table, name: str, rows: np.ndarray, times: np.ndarray) -> None:

@@ -122,7 +122,9 @@ def _remarks(column: Column) -> str:
     if column.missing:
         parts.append(f"{column.missing} missing")
     if column.outliers:
-        parts.append(f"{column.outliers} outliers")
+        parts.append(f"{column.outliers} outlier{'s' * (column.outliers > 1)}")
+    if column.stuck:
+        parts.append(f"{column.stuck} stuck")
     return ", ".join(parts)
 
 

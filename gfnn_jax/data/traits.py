@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gfnn_jax.data.wrong_values import WrongValues, wrong_values
 from gfnn_jax.signals.derivatives import Derivatives, Relation, derivatives
 from gfnn_jax.signals.noise import Noise, noise, resolution
 from gfnn_jax.signals.steps import median_step
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 _MOST_IGNORED = 8  # columns without a role that are looked at
 _NARROWEST = 7  # samples of a window for derivatives
+_MOST_GONE = 0.5  # of the rows; where more lack a position, columns take turns, and all rows count
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,13 +25,18 @@ class Traits:
     """Traits of a recording's columns, from their samples.
 
     times: (n_r,) of each run. columns: name -> (T,), the runs one after another, angles lifted.
-    noise, resolution: by name. local: local polynomials of the columns named in ``moving``.
-    step: the median one, in s.
+    wrong: stretches of wrong values, of positions and sensors by name. seen: (K,) rows in which
+    none of these is missing, and sound: (K',) those in which none is wrong either; noise and local
+    are of them. noise, resolution: by name. local: local polynomials of the columns named in
+    ``moving``. step: the median one, in s.
     """
 
     recording: Recording
     times: list[np.ndarray]
     columns: dict[str, np.ndarray]
+    wrong: dict[str, tuple[WrongValues, ...]]
+    seen: np.ndarray
+    sound: np.ndarray
     noise: dict[str, Noise]
     resolution: dict[str, float | None]
     moving: tuple[str, ...]
@@ -56,12 +63,27 @@ def traits(recording: Recording) -> Traits:
         name: np.concatenate([recording.unwrapped(name, run) for run in recording.runs])
         for name in names
     }
+    steps = {
+        n: resolution(np.concatenate([recording.values(n, run) for run in recording.runs]))
+        for n in names
+    }
+    shown = (*recording.positions, *recording.sensors)
+    parts = {n: np.split(columns[n], np.cumsum([len(t) for t in times])[:-1]) for n in shown}
+    wrong = {n: wrong_values(times, parts[n], steps[n]) for n in shown}
+    gone = np.zeros(len(recording), bool)
+    for name in shown:
+        gone |= ~np.isfinite(columns[name])
+    seen = _rows(gone)
+    for stretch in (stretch for of in wrong.values() for stretch in of):
+        gone[stretch.rows] = True
+    sound = _rows(gone)
+    sound_times = of_rows(times, sound)
     noises = {}
-    inputs = np.stack([columns[n] for n in recording.inputs]) if recording.inputs else None
+    inputs = np.stack([columns[n][sound] for n in recording.inputs]) if recording.inputs else None
     driven = [n for n in names if n not in (*recording.inputs, *recording.parameters)]
     for group, by in ((driven, inputs), (recording.inputs, None)):
         if group:
-            found = noise(times, np.stack([columns[n] for n in group]), by)
+            found = noise(sound_times, np.stack([columns[n][sound] for n in group]), by)
             noises |= dict(zip(group, found, strict=True))
     positions = [noises[n].size for n in recording.positions]
     size = max(min(positions, default=0) // 2, _NARROWEST)
@@ -69,9 +91,20 @@ def traits(recording: Recording) -> Traits:
     local = None
     if moving:
         sigmas = [noises[n].sigma for n in moving]
-        local = derivatives(times, np.stack([columns[n] for n in moving]), size, sigmas)
-    steps = {
-        n: resolution(np.concatenate([recording.values(n, run) for run in recording.runs]))
-        for n in names
-    }
-    return Traits(recording, times, columns, noises, steps, moving, local, median_step(times))
+        table = np.stack([columns[n][sound] for n in moving])
+        local = derivatives(sound_times, table, size, sigmas)
+    return Traits(
+        recording, times, columns, wrong, seen, sound, noises, steps, moving, local,
+        median_step(times),
+    )  # fmt: skip
+
+
+def of_rows(times: list[np.ndarray], rows: np.ndarray) -> list[np.ndarray]:
+    """The times of some rows, of each run, the runs one after another."""
+    ends = np.cumsum([len(t) for t in times])[:-1]
+    return np.split(np.concatenate(times)[rows], np.searchsorted(rows, ends))
+
+
+def _rows(gone: np.ndarray) -> np.ndarray:
+    """The rows that are not gone, or all where most are."""
+    return np.flatnonzero(~gone) if gone.mean() <= _MOST_GONE else np.arange(len(gone))

@@ -11,8 +11,8 @@ WRONG = (
     "wrapped", "interpolated jump", "clipped", "drifting clock", "different systems",
 )  # fmt: skip
 NOTES = (
-    "constant", "coarse", "missing column", "missing", "outliers", "difference", "filtered",
-    "reading",
+    "constant", "coarse", "missing column", "missing", "outliers", "stuck", "difference",
+    "filtered", "reading",
 )  # fmt: skip
 
 
