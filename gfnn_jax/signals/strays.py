@@ -60,7 +60,8 @@ def strays(
         if t[behind[-1]] - t[before[0]] > _WIDEST * step * (2 * count + end - begin):
             continue
         sides = np.concatenate([before, behind])
-        stray = _stray(t, x, np.arange(begin, end), sides, usual[part[0]] / _OF_MEDIAN)
+        noise = float(usual[part[0]]) / _OF_MEDIAN
+        stray = _stray(t, x, np.arange(begin, end), sides, noise)
         if stray is not None and stray[2] > _ROUGH * rough:
             found.append(stray)
     return found
