@@ -1,11 +1,11 @@
 """Which results are of current code, and those that are not measured again, oldest first.
 
-A result holds a digest of every file that it ran (`ran`): of the package those of which a function
-ran, or a constant was taken by one of these, and the study's own; comments, docstrings and layout
-left out. It is of current code where each of these files means what it meant; the style of figures
-changes no number. What a Python runs that a study starts counts too (`ran.python`); a study whose
-start of Python is timed, in which nothing is noted, counts the whole package. Of an older result
-whose files are not recorded nothing is known: it is old.
+A result notes what it ran (`code`): of the package the parts of every file of which a function
+ran, or a constant was taken by one of these, as `parts` tells them; of the study's own files the
+whole. Comments, docstrings and layout are left out. It is of current code where all of these mean
+what they meant; the style of figures changes no number. What a Python runs that a study starts
+counts too (`ran.python`); a study whose start of Python is timed, in which nothing is noted, counts
+the whole package. Of an older result whose files are not recorded nothing is known: it is old.
 `--tell` says what has changed, and how long measuring again would take. A run that is interrupted
 goes on with what is still old.
 """
@@ -25,10 +25,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import ran
+from parts import parts
 
 HERE = Path(__file__).resolve().parent
 PACKAGE = HERE.parent / "gfnn_jax"
-_RECORDING = {HERE / "current.py", HERE / "ran.py"}  # which change no result
+_RECORDING = {HERE / f"{name}.py" for name in ("current", "parts", "ran")}  # change no result
 _STYLE = "evaluate/figures_style.py"  # of the package, which changes no result
 # Numbers that moved by more than this part are told, the largest moves first; names of times and
 # circumstances, which move with the machine.
@@ -55,17 +56,37 @@ class Result(NamedTuple):
         if not isinstance(found, dict):
             return None
         found.pop(f"{PACKAGE.name}/{_STYLE}", None)
-        return [name for name, digest in found.items() if _digest(PACKAGE.parent / name) != digest]
+        return [name for name, code in found.items() if not _same(PACKAGE.parent / name, code)]
 
 
 def code_of(study: Path) -> dict[str, str | None]:
-    """Digests, by file, of what this process has run of the package, of a study and of the
-    studies' modules that it imports; of the folder of the package where it is not known."""
-    own, noted = _modules_of(study) - _RECORDING, ran.files(PACKAGE.name)
+    """What this process has run, by file: the digests of the parts of the package's files; one
+    digest of the whole of a study and of the studies' modules that it imports, and of the folder of
+    the package where nothing is noted of it."""
+    own, noted = _modules_of(study) - _RECORDING, ran.functions(PACKAGE.name)
     elsewhere = any("sys.executable" in path.read_text(encoding="utf-8") for path in own)
-    used = {PACKAGE} if noted is None or elsewhere else _with_constants(noted)
-    paths = sorted({path.resolve() for path in used | own})
-    return {str(path.relative_to(PACKAGE.parent)): _digest(path) for path in paths}
+    whole = {path.resolve() for path in own}
+    some: dict[Path, set[str]] = {}
+    if noted is None or elsewhere:
+        whole.add(PACKAGE)
+    else:
+        some = {path: noted.get(path, set()) for path in _with_constants(set(noted))}
+    found: dict[Path, str | None] = {path: _digest(path) for path in whole}
+    for path, names in some.items():
+        found[path.resolve()] = " ".join(sorted(parts(ran.text_of(path), names)))
+    return {str(path.relative_to(PACKAGE.parent)): found[path] for path in sorted(found)}
+
+
+def _same(path: Path, code: str | None) -> bool:
+    """Whether a file holds the parts that a result notes, or is the one whose digest it notes."""
+    if _digest(path) == code:
+        return True
+    return path.is_file() and code is not None and _parts(path).issuperset(code.split())
+
+
+@functools.cache  # of the package's modules for every study
+def _parts(path: Path) -> frozenset[str]:
+    return parts(path.read_text(encoding="utf-8"))
 
 
 def _digest(path: Path) -> str | None:

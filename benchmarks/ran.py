@@ -1,4 +1,4 @@
-"""Which files of the package a process ran a function of, noted as it runs.
+"""Which functions of the package a process ran, noted as it runs.
 
 Imported before the package, this reads its modules with one more statement in every function, an
 assignment to a global name, which takes some nanoseconds of a call. Functions that ran while their
@@ -15,11 +15,12 @@ import os
 import runpy
 import sys
 import tempfile
+from collections.abc import Iterator
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 
-_MARK = "__ran__"
+_MARK = "__ran_{}__"  # of the function of this number; no class mangles it
 _texts: dict[Path, str] = {}  # of files as they were read, which may have changed since
 _started: list[tempfile.TemporaryDirectory[str]] = []  # where other processes leave what they ran
 
@@ -31,13 +32,13 @@ class _Loader(SourceFileLoader):
         path = self.get_filename(fullname)
         _texts[Path(path)] = self.get_data(path).decode("utf-8")
         tree = ast.parse(_texts[Path(path)], path)
-        for node in ast.walk(tree):
-            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-                marked = ast.parse(f"global {_MARK}\n{_MARK} = True").body
-                for new in (one for statement in marked for one in ast.walk(statement)):
-                    ast.copy_location(new, node)
-                first = 1 if ast.get_docstring(node, clean=False) is not None else 0
-                node.body[first:first] = marked
+        for number, (_, node) in enumerate(list(functions_of(tree))):
+            mark = _MARK.format(number)
+            marked = ast.parse(f"global {mark}\n{mark} = True").body
+            for new in (one for statement in marked for one in ast.walk(statement)):
+                ast.copy_location(new, node)
+            first = 1 if ast.get_docstring(node, clean=False) is not None else 0
+            node.body[first:first] = marked
         return compile(tree, path, "exec", dont_inherit=True)
 
 
@@ -79,24 +80,43 @@ def python(package: str, *arguments: object) -> list[str]:
     return [sys.executable, __file__, package, _started[-1].name, *words]
 
 
-def files(package: str) -> set[Path] | None:
-    """Files of the package of which a function ran, and those that have none and are imported;
-    None where this is not noted, or where a process did not come to its end."""
+def functions(package: str) -> dict[Path, set[str]] | None:
+    """Functions of the package that ran, by file, with none of a file that has none and is
+    imported; None where this is not noted, or where a process did not come to its end."""
     loaded = {n: m for n, m in sys.modules.items() if n.partition(".")[0] == package}
     if not _notes(package):
         return None
-    found = set()
+    found: dict[Path, set[str]] = {}
     for folder in _started:
         left = list(Path(folder.name).iterdir())
         if not left:
             return None
-        found |= {Path(line) for one in left for line in one.read_text("utf-8").splitlines()}
+        for line in (line for one in left for line in one.read_text("utf-8").splitlines()):
+            path, *names = line.split("\t")
+            found.setdefault(Path(path), set()).update(names)
     for module in loaded.values():
         path = Path(module.__file__ or "")
-        holds_code = path.suffix == ".py" and path.stat().st_size > 0
-        if holds_code and (hasattr(module, _MARK) or not _functions(path)):
-            found.add(path)
+        if path.suffix != ".py" or not path.stat().st_size:
+            continue
+        names = [name for name, _ in functions_of(ast.parse(text_of(path)))]
+        marked = {name for i, name in enumerate(names) if hasattr(module, _MARK.format(i))}
+        if marked or not names:
+            found.setdefault(path, set()).update(marked)
     return found
+
+
+def functions_of(
+    tree: ast.AST, within: str = ""
+) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
+    """Functions in a syntax tree by their qualified names, those inside of others too."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            yield within + node.name, node
+            yield from functions_of(node, f"{within}{node.name}.<locals>.")
+        elif isinstance(node, ast.ClassDef):
+            yield from functions_of(node, f"{within}{node.name}.")
+        else:
+            yield from functions_of(node, within)
 
 
 def text_of(path: Path) -> str:
@@ -104,13 +124,9 @@ def text_of(path: Path) -> str:
     return _texts[path] if path in _texts else path.read_text(encoding="utf-8")
 
 
-def _functions(path: Path) -> bool:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return any(isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) for node in ast.walk(tree))
-
-
 def _leave(package: str, folder: Path) -> None:
-    lines = sorted(map(str, files(package) or ()))
+    noted = functions(package) or {}
+    lines = ("\t".join([str(path), *sorted(noted[path])]) for path in sorted(noted))
     (folder / str(os.getpid())).write_text("\n".join(lines), encoding="utf-8")
 
 

@@ -12,6 +12,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import current
 import ran
+from parts import parts
 
 STUDY = '''"""A study."""
 import json, pathlib, sys
@@ -37,15 +38,16 @@ def test_code_is_told_by_what_it_does(tmp_path):
     assert meanings[0] == meanings[1] != meanings[2]
 
 
-def test_a_result_is_old_where_a_file_changed_that_it_ran(tmp_path, monkeypatch):
-    """Of a package that is imported whole, the files of which a function ran count, and those whose
-    constants they take."""
+def test_a_result_is_old_where_a_function_changed_that_it_ran(tmp_path, monkeypatch):
+    """Of a package that is imported whole, the functions that ran count, and constants that files
+    with some of them take."""
     package, study = tmp_path / "noted_package", tmp_path / "study.py"
     package.mkdir()
     files = {
         "__init__": "from noted_package import ran_one, idle, limits",
-        "ran_one": "from noted_package.limits import MOST\n"
-        "def f(x):\n    'Doc.'\n    return min(x, MOST)",
+        "ran_one": "from math import pi\nfrom noted_package.limits import MOST\n_HALF = 0.5\n"
+        "def f(x):\n    'Doc.'\n    return min(x, MOST)\n"
+        "def other():\n    return pi * _HALF",
         "idle": "def g(x):\n    return x",
         "limits": "MOST = 3\ndef h():\n    return MOST",
     }  # fmt: skip
@@ -69,21 +71,59 @@ def test_a_result_is_old_where_a_file_changed_that_it_ran(tmp_path, monkeypatch)
     path.write_text(json.dumps({"code": current.code_of(study)}))
     (package / "ran_one.py").write_text(f"{files['ran_one']}\n")
     ran._texts.clear()
-    current._meaning.cache_clear()
+    current._parts.cache_clear()
     result = current.Result(path, study, "")
     assert result.changed == []
     for name, text, changed in (
         ("idle", "def g(x):\n    return x + 1", []),
         ("ran_one", files["ran_one"] + "  # a comment", []),
+        ("ran_one", files["ran_one"].replace("pi * _HALF", "1"), []),
+        ("ran_one", files["ran_one"].replace("_HALF = 0.5", "_HALF = 0.6"), []),
+        ("ran_one", files["ran_one"] + "\ndef new(x):\n    return x", []),
+        ("ran_one", files["ran_one"].replace("min", "max"), ["noted_package/ran_one.py"]),
+        (
+            "ran_one",
+            files["ran_one"].replace("MOST\n_", "h as MOST\n_"),
+            ["noted_package/ran_one.py"],
+        ),
+        ("ran_one", files["ran_one"], []),
         ("limits", "MOST = 4", ["noted_package/limits.py"]),
     ):
         (package / f"{name}.py").write_text(f"{text}\n")
-        current._meaning.cache_clear()
-        assert result.changed == changed, name
+        current._parts.cache_clear()
+        assert result.changed == changed, (name, text)
     path.write_text(json.dumps({"code": "0123456789abcdef"}))  # as of a version before
     assert result.changed is None
     study.write_text("import sys\nprint(sys.executable)\n")  # what Python it starts runs is unknown
     assert "noted_package" in current.code_of(study)
+
+
+def test_parts_of_a_module():
+    """Of a class each method alone, with the names of all; of an import each name."""
+    text = """
+from a import b, c
+X: int = 3
+_y = b(1)
+class C:
+    "Doc."
+    size = 2
+    def one(self):
+        def inner():
+            return c
+        return _y
+    def two(self):
+        return inner
+print(X)
+"""
+    all_of, some = parts(text), parts(text, {"C.one"})
+    assert (len(all_of), len(some)) == (9, 6)
+    assert some < all_of  # X, C, print; one, _y, b
+    for old, new in (("return inner", "return 1"), ("return c", "return b"), ("b, c", "b, c, d")):
+        assert parts(text.replace(old, new)) >= some
+    for old, new in (("print(X)", "print(2)"), ("size = 2", "size = 3"), ("two", "three"),
+                     ("b(1)", "b(2)"), ("import b", "import e as b"),
+                     ("return _y", "return 1")):  # fmt: skip
+        assert not parts(text.replace(old, new)) >= some, new
 
 
 def test_what_is_old_is_measured_again(tmp_path, monkeypatch):
@@ -197,10 +237,10 @@ ran.note("counted")
 import counted
 command = ran.python("counted", *{list(map(str, words[how]))}, "heard")
 print(subprocess.run(command, capture_output=True, text=True).stdout.strip())
-print(sorted(path.name for path in ran.files("counted")))
+print({{path.name: names for path, names in ran.functions("counted").items()}})
 ran.python("counted", "-c", "")
-print(ran.files("counted"))
+print(ran.functions("counted"))
 """)
     done = subprocess.run([sys.executable, study], capture_output=True, text=True, check=False,
                           env=os.environ | {"PYTHONPATH": str(tmp_path)})  # fmt: skip
-    assert done.stdout.splitlines() == ["heard", "['works.py']", "None"], done.stderr
+    assert done.stdout.splitlines() == ["heard", "{'works.py': {'f'}}", "None"], done.stderr
