@@ -1,6 +1,7 @@
 """From simulated positions to the law: the engine, the start, the search, forecasts and files."""
 
 import json
+import re
 
 import jax
 import numpy as np
@@ -278,6 +279,41 @@ def test_a_damped_pendulum_from_noisy_angles(swing):
     assert abs(loss.coefficient - 0.025) < 4 * loss.std < 0.003
     assert fit.noise["theta"] == pytest.approx(1e-3, rel=0.2)
     assert abs(fit.energy["closure"]) < 0.01 * abs(fit.energy["stored"])
+
+
+@pytest.mark.parametrize("wrong", ["stuck", "burst"])
+def test_wrong_values_are_left_out_of_a_fit_and_told(wrong):
+    """The law is that of the record in which they are missing."""
+    t, x = pendulum()
+    rows = np.arange(311, 322)
+    missing, spoilt = x.copy(), x.copy()
+    missing[rows] = np.nan
+    spoilt[rows] = x[310] if wrong == "stuck" else x[rows] + 0.6
+    of = {"positions": ["theta"], "angles": ["theta"]}
+    expected = gfnn.fit(gfnn.Recording({"t": t, "theta": missing}, **of))
+    with pytest.warns(gfnn.FitWarning, match="left out"):
+        found = gfnn.fit(gfnn.Recording({"t": t, "theta": spoilt}, **of))
+    assert str(found) == str(expected)
+    kind = "is stuck" if wrong == "stuck" else "has 11 outliers in a row"
+    assert found.messages[0].startswith(f"theta {kind} from 15.55 s to 16.05 s")
+
+
+@pytest.mark.slow
+def test_a_burst_in_a_measured_record_leaves_its_law(recwarn):
+    """Nine samples that are 0.8 rad off, in 5.5 s."""
+    whole = gfnn.read(gfnn.records.path("double_pendulum"), angles=["theta1", "theta2"])
+    columns = {name: whole.values(name, "0").copy() for name in ("theta1", "theta2")}
+    begin = len(whole) // 2
+    columns["theta1"][begin : begin + 9] += 0.8
+    spoilt = gfnn.Recording({"t": whole.times("0"), **columns}, angles=["theta1", "theta2"])
+    expected, found = gfnn.fit(whole), gfnn.fit(spoilt)
+    assert found.messages[0].startswith("theta1 has 9 outliers in a row")
+    of_whole, of_spoilt = (
+        np.array(re.findall(r"(?:^| )([\d.]+)\*[oc]", fit.formula), float)
+        for fit in (expected, found)
+    )
+    assert len(of_whole) == 5
+    np.testing.assert_allclose(of_spoilt, of_whole, rtol=2e-3)
 
 
 def undamped():

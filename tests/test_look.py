@@ -16,6 +16,7 @@ from recordings.generated import MISTAKES, sheet
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
 from gfnn_jax.data.recording_summary import refuse_mistakes, summarise
+from gfnn_jax.data.wrong_values import without_wrong_values
 from gfnn_jax.errors import InputError
 
 
@@ -262,6 +263,20 @@ def test_wrong_values_are_told_with_run_and_time_and_left_out_of_the_figures():
     assert found.period == pytest.approx(clean.period, rel=0.02)
     assert found.loss.per_period == pytest.approx(clean.loss.per_period, rel=0.05)
     assert found.gaps == ()
+
+
+def test_wrong_values_are_missing_where_they_are_left_out():
+    wrong, clean = two_carts(), two_carts(wrong=False)
+    kept, lines = without_wrong_values(wrong)
+    assert [line.endswith(": left out") for line in lines] == [True] * 3
+    for run, name in ((run, name) for run in wrong.runs for name in ("left", "right")):
+        expected = wrong.values(name, run).copy()
+        expected[expected != clean.values(name, run)] = np.nan
+        np.testing.assert_array_equal(kept.values(name, run), expected)
+        assert np.isfinite(wrong.values(name, run)).all()  # which stays as it is
+    same, none = without_wrong_values(clean)
+    assert none == ()
+    np.testing.assert_array_equal(same.values("left", "0"), clean.values("left", "0"))
 
 
 def test_empty_cells_are_gaps_and_do_not_hide_friction():

@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from gfnn_jax.data.wrong_values import wrong_values
 from gfnn_jax.signals import energy
 from gfnn_jax.signals.derivatives import derivatives, difference
 from gfnn_jax.signals.local_polynomials import local_fits
 from gfnn_jax.signals.noise import noise, resolution
-from gfnn_jax.signals.roughness import misses, roughness
 from gfnn_jax.signals.spectra import dominant_frequencies
 from gfnn_jax.signals.steps import drift, even_runs, gaps, median_step
-from gfnn_jax.signals.strays import strays
-from gfnn_jax.signals.stuck import stuck
 
 RNG = np.random.default_rng(0)
 T = np.arange(0, 20, 0.01)
@@ -108,9 +106,10 @@ def test_missing_values_and_short_columns():
 
 
 def found_in(x, resolution=0.0):
-    t = 0.01 * np.arange(len(x))
-    rough = roughness([misses(t, x)])
-    return stuck(t, x, resolution, rough), [s[:2] for s in strays(t, x, resolution, rough)]
+    """(begin, end) of the stretches of a stuck sensor, and of outliers in what is left."""
+    found = wrong_values([0.01 * np.arange(len(x))], [x], resolution)
+    ends = [(w.off is None, (int(w.rows[0]), int(w.rows[-1]) + 1)) for w in found]
+    return [e for held, e in ends if held], [e for held, e in ends if not held]
 
 
 def test_spikes_and_a_burst_are_found_sample_by_sample():
@@ -118,6 +117,12 @@ def test_spikes_and_a_burst_are_found_sample_by_sample():
     x[[200, 215, 901, 1500]] += [0.05, -0.05, -0.03, 0.4]
     x[1200:1215] += 0.2 * (-1.0) ** np.arange(15)
     assert found_in(x) == ([], [(200, 201), (215, 216), (901, 902), (1200, 1215), (1500, 1501)])
+
+
+def test_a_stretch_that_is_shifted_as_a_whole_is_found():
+    x = swing(T)[0] + 1e-3 * RNG.standard_normal(len(T))
+    x[1200:1220] += 0.4
+    assert found_in(x) == ([], [(1200, 1220)])
 
 
 def test_a_sensor_that_is_stuck_at_speed_is_found():
@@ -153,6 +158,7 @@ CLEAN = {
     "impacts": lambda: np.abs(np.sin(4 * T)),
     "stops": lambda: np.maximum(np.sin(4 * T), 0.0),
     "steps": lambda: np.sign(np.sin(4 * T)),
+    "fast steps": lambda: np.sign(np.sin(16 * T)) + 1e-3 * RNG.standard_normal(len(T)),
     "long tails": lambda: swing(T)[0] + 1e-3 * RNG.laplace(size=len(T)),
     "no noise": lambda: swing(T)[0],
     "few samples a period": lambda: np.sin(1.3 * np.arange(900.0)) + np.sin(0.9 * np.arange(900)),

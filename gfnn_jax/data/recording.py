@@ -295,13 +295,32 @@ class Recording:
         kept = {r: keep for r, keep in kept.items() if keep.any()}
         if not kept:
             raise InputError(f"{self.source}: no sample from {start:g} s to {stop:g} s")
+        times = {r: self._times[r][k] for r, k in kept.items()}
+        values = {r: {n: v[k] for n, v in self._values[r].items()} for r, k in kept.items()}
+        return self._with(runs=tuple(kept), _times=times, _values=values)
+
+    def without(self, rows: Mapping[str, np.ndarray]) -> Recording:
+        """The recording without the values of some columns, by name, in rows (k,) of all runs one
+        after another: they are missing."""
+        begin, values = 0, {}
+        for run, of_run in self._values.items():
+            count = len(self._times[run])
+            values[run] = dict(of_run)
+            for name, every in rows.items():
+                own = every[(every >= begin) & (every < begin + count)] - begin
+                column = of_run[name].copy()
+                column[own] = np.nan
+                column.flags.writeable = False
+                values[run][name] = column
+            begin += count
+        return self._with(_values=values)
+
+    def _with(self, **changed: Any) -> Recording:
+        """The same recording with other fields."""
         part = object.__new__(Recording)
         for field in dataclasses.fields(self):
-            object.__setattr__(part, field.name, getattr(self, field.name))
-        object.__setattr__(part, "runs", tuple(kept))
-        object.__setattr__(part, "_times", {r: self._times[r][k] for r, k in kept.items()})
-        values = {r: {n: v[k] for n, v in self._values[r].items()} for r, k in kept.items()}
-        object.__setattr__(part, "_values", values)
+            value = changed.get(field.name, getattr(self, field.name))
+            object.__setattr__(part, field.name, value)
         return part
 
     def summary(self) -> RecordingSummary:

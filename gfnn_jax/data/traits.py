@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gfnn_jax.data.wrong_values import WrongValues, wrong_values
+from gfnn_jax.data.wrong_values import WrongValues, wrong_values_of
 from gfnn_jax.signals.derivatives import Derivatives, Relation, derivatives
 from gfnn_jax.signals.noise import Noise, noise, resolution
 from gfnn_jax.signals.steps import median_step
@@ -68,8 +68,7 @@ def traits(recording: Recording) -> Traits:
         for n in names
     }
     shown = (*recording.positions, *recording.sensors)
-    parts = {n: np.split(columns[n], np.cumsum([len(t) for t in times])[:-1]) for n in shown}
-    wrong = {n: wrong_values(times, parts[n], steps[n]) for n in shown}
+    wrong = wrong_values_of(recording)
     gone = np.zeros(len(recording), bool)
     for name in shown:
         gone |= ~np.isfinite(columns[name])

@@ -19,6 +19,7 @@ import numpy as np
 from gfnn_jax.candidates.assemble import block_of
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.wrong_values import without_wrong_values
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.diagnosis.clean import clean
@@ -232,20 +233,22 @@ def fit_positions(
     """
     require_x64("a fit")
     asked = Tolerance.of(options)
+    recording, left_out = without_wrong_values(recording)
     budget = options.budget(clock, len(recording.positions) or None)
     found = learn_positions(
         recording, tolerance=asked, structure=options.structure, seed=options.seed,
         budget=budget,
         on_progress=on_progress, on_candidate=on_candidate,
     )  # fmt: skip
-    for message in found.messages:
+    messages = (*left_out, *found.messages)
+    for message in messages:
         warnings.warn(message, FitWarning, stacklevel=3)
     test = found.states.take(found.test[: min(_STATES_MEASURED, block_of(2 * found.map.dim))])
     determinant = np.asarray(found.map.determinant(test.z0))
     return Fit(
         map=found.map, candidates=found.candidates, asked=asked,
         num_pairs=found.positions.num_triples, determinants={}, data_defect=float("nan"),
-        base_map=False, noise=None, messages=tuple(found.messages), ended=found.ended,
+        base_map=False, noise=None, messages=messages, ended=found.ended,
         seconds=budget.seconds, compile_seconds=found.compile_seconds,
         test_states=np.asarray(test.z0),
         model_determinant_min=float(determinant[np.argmin(np.abs(determinant))]),

@@ -8,6 +8,8 @@ stray begins and ends abruptly; a short swing of the motion rises and falls from
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
@@ -48,23 +50,46 @@ def strays(
         clean[k:] &= ~suspected[:-k]
         clean[:-k] &= ~suspected[k:]
     right = np.flatnonzero(clean)
-    step, found = float(np.median(np.diff(t))), []
-    for part in np.split(at, np.flatnonzero(np.diff(at) > _JOINED) + 1):
-        begin, end = part[0] - _BESIDE, part[-1] + _BESIDE + 1
-        count = max(_SIDE, end - begin)
-        before = right[right < begin][-count:]
-        behind = right[right >= end][:count]
-        few = min(len(before), len(behind)) < count
-        if end - begin > _LONGEST or few:
-            continue
-        if t[behind[-1]] - t[before[0]] > _WIDEST * step * (2 * count + end - begin):
-            continue
-        sides = np.concatenate([before, behind])
-        noise = float(usual[part[0]]) / _OF_MEDIAN
-        stray = _stray(t, x, np.arange(begin, end), sides, noise)
-        if stray is not None and stray[2] > _ROUGH * rough:
+    parts, found = np.split(at, np.flatnonzero(np.diff(at) > _JOINED) + 1), []
+    series = _Series(t, x, right, float(np.median(np.diff(t))), usual, _ROUGH * rough)
+    while parts:
+        first, *parts = parts
+        stray = series.stray(first[0], first[-1])
+        if stray is None and parts:  # all between a jump and the one that leads back
+            stray = series.stray(first[0], parts[0][-1])
+            parts = parts if stray is None else parts[1:]
+        if stray is not None:
             found.append(stray)
     return found
+
+
+class _Series(NamedTuple):
+    """Samples (n,), those of them that are right (K,), the median step, how far cubics usually
+    miss them (n,), and what is no stray yet."""
+
+    t: np.ndarray
+    x: np.ndarray
+    right: np.ndarray
+    step: float
+    usual: np.ndarray
+    least: float
+
+    def stray(self, first: int, last: int) -> tuple[int, int, float] | None:
+        """(begin, end, how far off) of the stretch with the suspected samples from ``first`` to
+        ``last``; None where it is none, or too few samples around it tell."""
+        begin, end = first - _BESIDE, last + _BESIDE + 1
+        count = max(_SIDE, end - begin)
+        before = self.right[self.right < begin][-count:]
+        behind = self.right[self.right >= end][:count]
+        if end - begin > _LONGEST or min(len(before), len(behind)) < count:
+            return None
+        widest = _WIDEST * self.step * (2 * count + end - begin)
+        if self.t[behind[-1]] - self.t[before[0]] > widest:
+            return None
+        sides = np.concatenate([before, behind])
+        noise = float(self.usual[first]) / _OF_MEDIAN
+        stray = _stray(self.t, self.x, np.arange(begin, end), sides, noise)
+        return stray if stray is not None and stray[2] > self.least else None
 
 
 def _nearby(miss: np.ndarray) -> np.ndarray:

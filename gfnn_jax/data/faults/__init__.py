@@ -15,7 +15,7 @@ __all__ = ["WRONG", "Fault", "faults"]
 _CHECKS = (
     sensors.constant, sensors.repeated, velocities.related, angles.units, angles.wraps,
     angles.interpolated_jumps, sensors.clipped, times.units, times.drifting, times.systems,
-    sensors.missing, sensors.stuck, sensors.outliers, angles.coarse, times.reading,
+    sensors.missing, sensors.wrong, angles.coarse, times.reading,
 )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from gfnn_jax.data.faults.angles import TURN
 from gfnn_jax.data.faults.fault import Fault
 from gfnn_jax.data.traits import Traits
-from gfnn_jax.data.wrong_values import WrongValues
+from gfnn_jax.data.wrong_values import in_words
 
 _REMEDY = "Leave these samples out: --from, --to, or NaN in them"
 _FLAT = 3  # equal extremes in a row that a sensor's limit makes
@@ -91,49 +91,12 @@ def missing(traits: Traits) -> Iterator[Fault]:
             yield Fault("missing", found, "", wrong=False)
 
 
-def stuck(traits: Traits) -> Iterator[Fault]:
-    """Sensors that repeat one value while the motion goes on."""
-    for name, wrong in traits.wrong.items():
-        held = [stretch for stretch in wrong if stretch.off is None]
-        if held:
-            often = "" if len(held) == 1 else f", and {_times(len(held) - 1)} more"
-            count = len(held[0].rows) + 1
-            found = f"{name} is stuck{_when(traits, held[0])} ({count} equal values){often}"
-            yield Fault("stuck", found, _REMEDY, wrong=False)
-
-
-def outliers(traits: Traits) -> Iterator[Fault]:
-    """Samples far from where those around them lead, single ones apart from those in a row."""
-    for name, wrong in traits.wrong.items():
-        off = [stretch for stretch in wrong if stretch.off is not None]
-        for single in (True, False):
-            of_kind = [stretch for stretch in off if (len(stretch.rows) == 1) == single]
-            if of_kind:
-                yield _outliers(traits, name, of_kind, single)
-
-
-def _outliers(traits: Traits, name: str, off: list[WrongValues], single: bool) -> Fault:
-    recording = traits.recording
-    most = max(stretch.off or 0.0 for stretch in off) / recording.factors[name]
-    size = f"{'up to ' * (len(off) > 1 or not single)}{most:.2g} {recording.unit(name)}".rstrip()
-    first = "" if len(off) == 1 else ", the first"
-    if single:
-        count = "1 outlier" if len(off) == 1 else f"{len(off)} outliers"
-        return Fault(
-            "outliers", f"{name} has {count}, {size} off{first}{_when(traits, off[0])}",
-            "A fit leaves them out", wrong=False,
-        )  # fmt: skip
-    often = "" if len(off) == 1 else f", and {_times(len(off) - 1)} more"
-    found = f"{name} has {len(off[0].rows)} outliers in a row{_when(traits, off[0])}, {size} off"
-    return Fault("outliers", f"{found}{often}", _REMEDY, wrong=False)
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"
-
-
-def _when(traits: Traits, stretch: WrongValues) -> str:
-    """The time, and the run where there are several."""
-    begin, end = np.concatenate(traits.times)[stretch.rows[[0, -1]]]
-    of = f" of run {traits.recording.runs[stretch.run]}" if len(traits.recording.runs) > 1 else ""
-    return f" at {begin:.6g} s{of}" if begin == end else f" from {begin:.6g} s to {end:.6g} s{of}"
+def wrong(traits: Traits) -> Iterator[Fault]:
+    """Sensors that repeat one value while the motion goes on, and samples far from where those
+    around them lead."""
+    each = (in_words(traits.recording, name, of) for name, of in traits.wrong.items())
+    told = [one for of_column in each for one in of_column]
+    for kind in ("stuck", "outliers"):
+        for one in told:
+            if one.kind == kind:
+                yield Fault(kind, one.text, "A fit leaves them out", wrong=False)

@@ -17,6 +17,7 @@ import numpy as np
 from gfnn_jax.data.channels import parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import by_name, symbols
+from gfnn_jax.data.wrong_values import without_wrong_values
 from gfnn_jax.dataset.rests import without_rests
 from gfnn_jax.dataset.stretches import Nodes, Scales, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
@@ -80,6 +81,9 @@ def fit_recording(
         steps.append(line)
         on_progress(line)
 
+    recording, left_out = without_wrong_values(recording)
+    for line in left_out:
+        note(line)
     holds = _holds(recording, input_hold)
     parameters = parameters_of(recording)
     samples, gauge, found = _found(recording, loss, parameters, terms, holds, note, options)
@@ -100,6 +104,7 @@ def fit_recording(
     )
     note("finding the motion to record next")
     messages = (
+        *left_out,
         *samples.messages,
         *_without_role(recording),
         *_at_bound(options, best.choice, best.law.dim),
