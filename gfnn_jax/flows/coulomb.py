@@ -26,7 +26,8 @@ from functools import cached_property
 import numpy as np
 
 from gfnn_jax.families.lagrangian import Lagrangian
-from gfnn_jax.flows.motion import NODES, Form, Rates, Step, coulomb_rows
+from gfnn_jax.flows.dissipation import coulomb_rows
+from gfnn_jax.flows.motion import NODES, Form, Rates, Step
 from gfnn_jax.solve.linear import among
 
 _EVENTS = 64  # of a lane in one substep, after which it has no solution

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.families.lagrangian import (
-    DRY,
     UNIFORM,
     Friction,
     Lagrangian,
@@ -26,6 +25,8 @@ from gfnn_jax.families.lagrangian import (
     Terms,
     functions_of,
 )
+from gfnn_jax.flows.dissipation import Dissipation
+from gfnn_jax.flows.quadratic import Parts, Quadratic
 from gfnn_jax.solve.linear import among
 
 # Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19: the solution of order 5.
@@ -38,6 +39,7 @@ _A = np.array([
     [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
     [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
 ])  # fmt: skip
+_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # of three rows, in a circle
 WEIGHTS = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
 
 
@@ -65,7 +67,8 @@ class Form:
     friction, and gains of the inputs. Its coefficients are (c, ρ, G row by row); that of a row of
     friction of the kind UNIFORM is γ, of the force −γ ∂L/∂v. They are p (count,), or (N, count) of
     N states that follow laws of their own; phases of the terms are then (P,) or (N, P). powers: of
-    parameters that systems differ in, by which (θ, ρ, G) are multiplied (`in_systems`)."""
+    parameters that systems differ in, by which (θ, ρ, G) are multiplied (`in_systems`).
+    quadratic, dissipation: of the terms and the friction, made of them."""
 
     terms: Terms
     fixed: np.ndarray
@@ -73,6 +76,13 @@ class Form:
     friction: Friction
     num_inputs: int = 0
     powers: Powers | None = None
+    quadratic: Quadratic = None  # pyright: ignore[reportAssignmentType]
+    dissipation: Dissipation = None  # pyright: ignore[reportAssignmentType]
+
+    def __post_init__(self):
+        if self.quadratic is None:
+            object.__setattr__(self, "quadratic", Quadratic.of(self.terms))
+            object.__setattr__(self, "dissipation", Dissipation.of(self.friction))
 
     @property
     def dim(self) -> int:
@@ -134,72 +144,91 @@ class Form:
         """The rates, with derivatives in the states (``order`` 1) and in the coefficients (2).
         modes: (N, F) of the dry friction without a width, 1 or −1 where it slides, 0 where it
         sticks."""
-        f, df, ddf = self.terms.potentials(q, order=2 if order else 1)
-        g, dg = self.terms.motion(v)
-        A, _, _ = self.terms.quadratic()
-        theta, d = law.coefficients, self.dim
-        gamma = np.asarray(law.uniform)[..., None]
-        A = A.reshape(-1, d * d)
-        even = self.friction.kinds == UNIFORM
-        _, pull, stiffness = law.friction.tables(v)
-        directions = law.friction.directions
-        dry = coulomb_rows(law.friction)
+        a, by, held = self._rates(law, q.T, v.T, u.T, order, modes)
+        return Rates(a.T, by.transpose(2, 0, 1), held)
+
+    def _rates(
+        self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, order: int,
+        modes: np.ndarray | None,
+    ) -> Rates:  # fmt: skip
+        """`accelerate` of q, v (d, N) and u (inputs, N): a (d, N), by (d, 2d + n, N), held (N, F).
+
+        With the momentum p = M v + w the equation of motion is M a + (∂p/∂q) v − ∂L/∂q = force.
+        """
+        d, num = self.dim, q.shape[1]
+        L = self.quadratic.parts(self.terms, _of_lanes(law.coefficients), q, order)
+        losses, gamma = _of_lanes(law.losses), np.asarray(law.uniform)
+        directions, dry = self.dissipation.directions, self.dissipation.coulomb
+        pull, stiffness = self.dissipation.slopes(v, order)
         if modes is not None:
-            pull[:, dry] = modes
-        along = np.einsum("npi,ni->np", df, v)
-        forced, turned = theta * g, np.einsum("np,npi->ni", theta * along, dg)
-        force = np.einsum("np,npi->ni", forced, df) - turned - (law.losses * pull) @ directions
+            pull[dry] = modes.T
+        turning = np.einsum("ikjn,kn->ijn", L.masses_by, v) + L.drift_by  # ∂p/∂q
+        force = 0.5 * np.einsum("ijn,in->jn", turning + L.drift_by, v) + L.pull
+        force -= np.einsum("ijn,jn->in", turning, v)
+        force -= directions.T @ (losses * pull)
         if self.num_inputs:
-            force = force + (law.gains @ u[..., None])[..., 0]
-        if even.any():
-            momentum = np.einsum("np,npi->ni", theta * f, dg)
-            force = force - gamma * momentum
-        masses = ((theta * f) @ A).reshape(-1, d, d)
-        inverse = np.linalg.inv(masses) if d > 1 else 1 / masses
-        a = np.einsum("nij,nj->ni", inverse, force)
-        held, c = law.losses[..., dry] * pull[:, dry], directions[dry].astype(float)
-        stuck = np.zeros((len(a), 0)) if modes is None else modes == 0
+            gains = law.gains
+            force += gains @ u if gains.ndim == 2 else np.einsum("nik,kn->in", gains, u)
+        uniform, momentum = self.dissipation.even.any(), np.zeros(0)
+        if uniform:
+            momentum = np.einsum("ikn,kn->in", L.masses, v) + L.drift
+            force -= gamma * momentum
+        inverse = _inverse(L.masses)
+        a = np.einsum("ikn,kn->in", inverse, force)
+        held, c = (losses * pull)[dry].T, directions[dry]
+        stuck = np.zeros((num, 0), bool) if modes is None else modes == 0
         holds = np.flatnonzero(stuck.any(axis=1))
         if len(holds):
-            moved = inverse[holds] @ c.T  # (n, d, F)
+            moved = inverse[:, :, holds].transpose(2, 0, 1) @ c.T  # (n, d, F)
             holding = among(stuck[holds], c @ moved, np.broadcast_to(c, (len(holds), *c.shape)))
-            forces = (holding @ a[holds, :, None])[..., 0]
-            a[holds] -= (moved @ forces[..., None])[..., 0]
+            forces = (holding @ a[:, holds].T[:, :, None])[..., 0]
+            a[:, holds] -= (moved @ forces[..., None])[..., 0].T
             held[holds] += forces
         if not order:
-            return Rates(a, np.zeros((*a.shape, 0)), held)
-        push = (a @ A.reshape(-1, d).T).reshape(df.shape)
-        weighted = theta[..., None] * df
-        by_q = push.swapaxes(1, 2) @ weighted
-        by_q += dg.swapaxes(1, 2) @ (theta[..., None] * np.einsum("npij,nj->npi", ddf, v))
-        by_q -= np.einsum("np,npij->nij", forced, ddf)
-        turned = dg.swapaxes(1, 2) @ weighted
-        outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, d * d)
-        by_v = ((theta * along) @ A + (law.losses * stiffness) @ outer).reshape(-1, d, d)
-        by_v = by_v + turned - turned.swapaxes(1, 2)
-        if even.any():
-            by_q += gamma[..., None] * turned
-            by_v = by_v + gamma[..., None] * masses
-        columns = [by_q, by_v]
+            return Rates(a, np.zeros((d, 0, num)), held)
+        width = 2 * d + (self.count if order > 1 else 0)
+        by = np.empty((d, width, num))
+        twisted = np.einsum("ikjln,kn->ijln", L.masses_by_two, v) + L.drift_by_two
+        by_q, by_v = by[:, :d], by[:, d : 2 * d]
+        np.einsum("ikln,kn->iln", L.masses_by, a, out=by_q)
+        by_q += np.einsum("ijln,jn->iln", twisted, v)
+        by_q -= 0.5 * np.einsum("miln,mn->iln", twisted + L.drift_by_two, v)
+        by_q -= L.pull_by
+        np.einsum("iljn,jn->iln", L.masses_by, v, out=by_v)
+        by_v += turning
+        by_v -= turning.swapaxes(0, 1)
+        by_v += (self.dissipation.outer @ (losses * stiffness)).reshape(d, d, num)
+        if uniform:
+            by_q += gamma * turning
+            by_v += gamma * L.masses
         if order > 1:
-            rows, part = push * f[..., None], dg * along[..., None]
-            rows += part
-            rows -= np.multiply(g[..., None], df, out=part)
-            if even.any():
-                rows += gamma[..., None] * np.multiply(f[..., None], dg, out=part)
-            columns.append(rows.swapaxes(1, 2) @ self.basis)
-            by_losses = np.empty((len(v), d, len(even)))
-            by_losses[..., ~even] = (pull[..., None] * directions).swapaxes(1, 2)
-            if even.any():
-                by_losses[..., even] = momentum[..., None]
-            columns.append(by_losses)
-        if order > 1 and self.num_inputs:
-            pushed = -u[:, None, None, :] * np.eye(d)[:, :, None]
-            columns.append(pushed.reshape(len(v), d, -1))
-        by = -inverse @ np.concatenate(columns, axis=-1)
+            self._by_coefficients(by[:, 2 * d :], L, v, a, u, pull, gamma, momentum)
+        by = np.einsum("ikn,kwn->iwn", -inverse, by)
         if len(holds):
-            by[holds] -= moved @ (holding @ by[holds])
+            some = by[..., holds].transpose(2, 0, 1)
+            by[..., holds] -= (moved @ (holding @ some)).transpose(1, 2, 0)
         return Rates(a, by, held)
+
+    def _by_coefficients(
+        self, by: np.ndarray, L: Parts, v: np.ndarray, a: np.ndarray, u: np.ndarray,
+        pull: np.ndarray, gamma: np.ndarray, momentum: np.ndarray,
+    ) -> None:  # fmt: skip
+        """The residuals (d, n, N) of each coefficient alone, into ``by``."""
+        d, own = self.dim, self.basis.shape[1]
+        rows = self.quadratic.residuals(L, v, a)
+        even = self.dissipation.even
+        if even.any():
+            rows += gamma * self.quadratic.momenta(L, v)
+        by[:, :own] = (
+            (self.basis.T @ rows.reshape(len(rows), -1)).reshape(own, d, -1).swapaxes(0, 1)
+        )
+        losses = by[:, own : own + len(even)]
+        losses[:, ~even] = self.dissipation.directions.T[..., None] * pull
+        if even.any():
+            losses[:, even] = momentum[:, None]
+        if self.num_inputs:
+            gains = by[:, own + len(even) :].reshape(d, d, self.num_inputs, -1)
+            gains[...] = -np.eye(d)[..., None, None] * u
 
     def step(
         self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray, order: int = 2
@@ -226,29 +255,51 @@ class Form:
         """States x (N, 2d) and their derivatives D (N, 2d, n) a time h (N,) later, with inputs u
         (N, 6, inputs) at its nodes, and the rates at its begin; ``order`` and ``modes`` as of
         `accelerate`."""
-        d, every, rates, slopes = self.dim, [], [], []
-        h, wide, part = h[:, None], h[:, None, None], np.empty_like(D)
+        d, rates, slopes = self.dim, [], []
+        x, D, u = (
+            np.array(of, order="C") for of in (x.T, D.transpose(1, 2, 0), u.transpose(1, 2, 0))
+        )
+        part, every = np.empty_like(D), []
         for i in range(6):
-            xi, Di = x, D.copy()
+            xi, Di = x.copy(), D.copy() if order else D
             for j in np.flatnonzero(_A[i]):
-                xi = xi + _A[i, j] * h * rates[j]
-                Di += np.multiply(_A[i, j] * wide, slopes[j], out=part)
-            now = self.accelerate(law, xi[:, :d], xi[:, d:], u[:, i], order, modes)
+                step = _A[i, j] * h
+                xi += step * rates[j]
+                if order:
+                    Di += np.multiply(step, slopes[j], out=part)
+            now = self._rates(law, xi[:d], xi[d:], u[i], order, modes)
             every.append(now)
-            slope = np.empty_like(D)
+            rates.append(np.concatenate([xi[d:], now.a]))
             if order:
-                slope[:, :d] = Di[:, d:]
-                slope[:, d:] = now.by[..., : 2 * d] @ Di
-                slope[:, d:, 2 * d :] += now.by[..., 2 * d :]
-            rates.append(np.concatenate([xi[:, d:], now.a], axis=1))
-            slopes.append(slope)
-        D = D.copy()
+                slope = np.empty_like(D)
+                slope[:d] = Di[d:]
+                np.einsum("ikn,kwn->iwn", now.by[:, : 2 * d], Di, out=slope[d:])
+                slope[d:, 2 * d :] += now.by[:, 2 * d :]
+                slopes.append(slope)
         for i in np.flatnonzero(WEIGHTS):
-            x = x + WEIGHTS[i] * h * rates[i]
-            D += np.multiply(WEIGHTS[i] * wide, slopes[i], out=part)
-        return x, D, every[0]
+            step = WEIGHTS[i] * h
+            x += step * rates[i]
+            if order:
+                D += np.multiply(step, slopes[i], out=part)
+        a, by, held = every[0]
+        return x.T, D.transpose(2, 0, 1), Rates(a.T, by.transpose(2, 0, 1), held)
 
 
-def coulomb_rows(friction: Friction) -> np.ndarray:
-    """The dry friction (F,) that has no width: its force jumps where its speed turns."""
-    return (friction.kinds == DRY) & (friction.widths == 0)
+def _of_lanes(values: np.ndarray) -> np.ndarray:
+    """Coefficients (n,), or (N, n) of each lane, with the lanes last: (n, 1) or (n, N)."""
+    return values[:, None] if values.ndim == 1 else values.T
+
+
+def _inverse(masses: np.ndarray) -> np.ndarray:
+    """The inverse (d, d, N) of matrices."""
+    d = len(masses)
+    if d == 1:
+        return 1 / masses
+    if d == 2:
+        (m11, m12), (m21, m22) = masses
+        return np.array([[m22, -m12], [-m21, m11]]) / (m11 * m22 - m12 * m21)
+    if d == 3:
+        one, two = masses[_NEXT], masses[_AFTER]
+        cofactors = one[:, _NEXT] * two[:, _AFTER] - one[:, _AFTER] * two[:, _NEXT]
+        return cofactors.swapaxes(0, 1) / np.sum(masses[0] * cofactors[0], axis=0)
+    return np.linalg.inv(masses.transpose(2, 0, 1)).transpose(1, 2, 0)

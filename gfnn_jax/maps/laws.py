@@ -15,9 +15,9 @@ import numpy as np
 from gfnn_jax.coordinates import Coordinates, lift
 from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian
 from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.flows.dissipation import coulomb_rows
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre, family_of, law_of
-from gfnn_jax.flows.motion import coulomb_rows
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.inputs import Signals

@@ -141,6 +141,9 @@ _ALIKE = 1e-9  # of the largest entry, added for unknowns that depend on each ot
 def among(some, matrix, rhs):
     """x (B, n, m) with matrix (B, n, n) x = rhs (B, n, m) among ``some`` (B, n) of the unknowns, 0
     of the others; the least x where they depend on each other (Tikhonov's, iterated once)."""
+    if some.sum(axis=1).max(initial=0) <= 1:
+        own = np.where(some, np.diagonal(matrix, axis1=1, axis2=2), 1.0)
+        return np.where(some[..., None], rhs, 0.0) / own[..., None]
     both = some[:, :, None] & some[:, None, :]
     size = np.abs(matrix).max(axis=(1, 2), initial=0.0)[:, None]
     own = np.where(some, _ALIKE * size, 1.0)[:, :, None] * np.eye(some.shape[1])
