@@ -298,6 +298,27 @@ def test_wrong_values_are_left_out_of_a_fit_and_told(wrong):
     assert found.messages[0].startswith(f"theta {kind} from 15.55 s to 16.05 s")
 
 
+def test_a_driven_mass_has_a_law_of_one_term():
+    """ẍ = u − ẋ/2: no coefficient of L is free."""
+    t = 0.02 * np.arange(1000)
+    u = np.sin(1.3 * t) + 0.5 * np.sin(2.9 * t + 1)
+    x = solve_ivp(lambda s, z: [z[1], np.interp(s, t, u) - 0.5 * z[1]], (0, t[-1]), [0, 0],
+                  t_eval=t, rtol=1e-9, atol=1e-11, max_step=0.02).y[0]  # fmt: skip
+    x += 1e-5 * np.random.default_rng(0).normal(size=len(t))
+    fit = gfnn.fit(gfnn.Recording({"t": t, "x": x, "u": u}, positions=["x"], inputs=["u"]))
+    assert fit.lagrangian.formula == "0.5*v**2"
+    (friction,) = fit.friction.terms
+    assert friction.coefficient == pytest.approx(0.25, rel=1e-3)
+
+
+def test_a_law_that_does_not_follow_its_record_is_said_to():
+    """As where the sensor moved half way, for good."""
+    t, x = pendulum(end=20.0)
+    x[len(t) // 2 :] += 0.7
+    with pytest.warns(gfnn.FitWarning, match="the law follows only .* of the variation of x"):
+        gfnn.fit(gfnn.Recording({"t": t, "x": x}, positions=["x"]))
+
+
 @pytest.mark.slow
 def test_a_burst_in_a_measured_record_leaves_its_law(recwarn):
     """Nine samples that are 0.8 rad off, in 5.5 s."""

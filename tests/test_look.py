@@ -254,7 +254,10 @@ def test_wrong_values_are_told_with_run_and_time_and_left_out_of_the_figures():
     assert clean.faults == ()
     lines = [(fault.kind, str(fault).split(". ")[0]) for fault in found.faults]
     assert [kind for kind, _ in lines] == ["stuck", "outliers", "outliers"]
-    assert lines[0][1] == "right is stuck from 4.04 s to 4.39 s of run 1 (37 equal values)"
+    assert (
+        lines[0][1]
+        == "right is stuck from 4.04 s to 4.39 s of run 1 (36 samples repeat the one before)"
+    )
     assert lines[1][1] == "left has 5 outliers, up to 0.05 off, the first at 0.4 s of run 0"
     assert (
         lines[2][1] == "left has 15 outliers in a row from 5 s to 5.14 s of run 2, up to 0.14 off"
@@ -277,6 +280,21 @@ def test_wrong_values_are_missing_where_they_are_left_out():
     same, none = without_wrong_values(clean)
     assert none == ()
     np.testing.assert_array_equal(same.values("left", "0"), clean.values("left", "0"))
+
+
+@pytest.mark.parametrize("angles", [("a",), ()])
+@pytest.mark.parametrize(("row", "value"), [(None, 0.0), (200, 0.7), (200, 999.0), (300, 3.6)])
+def test_a_wrong_value_of_a_wrapped_angle_does_not_take_its_wraps_along(angles, row, value):
+    """Of the measured double pendulum, its first angle wrapped within the record."""
+    whole = gfnn.read(gfnn.records.path("double_pendulum"), angles=["theta1", "theta2"])
+    a = np.mod(whole.unwrapped("theta1", "0") + 2.0 + np.pi, 2 * np.pi) - np.pi
+    assert np.sum(np.abs(np.diff(a)) > 3) >= 4
+    if row is not None:
+        a[row] += value
+    recording = gfnn.Recording({"t": whole.times("0"), "a": a}, positions=["a"], angles=angles)
+    kept, lines = without_wrong_values(recording)
+    missing = np.flatnonzero(np.isnan(kept.values("a", "0")))
+    assert missing.tolist() == ([] if row is None else [row]), lines
 
 
 def test_empty_cells_are_gaps_and_do_not_hide_friction():

@@ -59,9 +59,28 @@ def wrong_values_of(recording: Recording) -> dict[str, tuple[WrongValues, ...]]:
     found = {}
     for name in (*recording.positions, *recording.sensors):
         values = np.concatenate([recording.values(name, run) for run in recording.runs])
-        lifted = [recording.unwrapped(name, run) for run in recording.runs]
-        found[name] = wrong_values(times, lifted, resolution(values))
+        parts = [recording.unwrapped(name, run) for run in recording.runs]
+        found[name] = wrong_values(times, parts, resolution(values))
+        if name in recording.angles:  # one wrong value makes a wrapped angle seem lifted
+            lifted = wrong_values(times, [_lifted(x) for x in parts], resolution(values))
+            found[name] = _joined(found[name], lifted)
     return found
+
+
+def _joined(
+    one: Sequence[WrongValues], other: Sequence[WrongValues]
+) -> tuple[WrongValues, ...]:  # fmt: skip
+    """Both, without stretches of the second that share a sample with one of the first."""
+    known = {int(row) for wrong in one for row in wrong.rows}
+    more = [wrong for wrong in other if known.isdisjoint(wrong.rows.tolist())]
+    return tuple(sorted([*one, *more], key=lambda wrong: wrong.rows[0]))
+
+
+def _lifted(angle: np.ndarray) -> np.ndarray:
+    """An angle that moves by less than half a turn between neighbours."""
+    known, lifted = np.isfinite(angle), angle.copy()
+    lifted[known] = np.unwrap(angle[known])
+    return lifted
 
 
 def without_wrong_values(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
@@ -79,19 +98,15 @@ class Told(NamedTuple):
     text: str
 
 
-def in_words(
-    recording: Recording, name: str, wrong: Sequence[WrongValues]
-) -> tuple[Told, ...]:  # fmt: skip
+def in_words(recording: Recording, name: str, wrong: Sequence[WrongValues]) -> tuple[Told, ...]:
     """The wrong values of a column by kinds: of a stuck sensor, single outliers, several in a
     row."""
     found = []
     held = [stretch for stretch in wrong if stretch.off is None]
     if held:
-        count = len(held[0].rows) + 1
-        when = _when(recording, held[0])
-        found.append(
-            Told("stuck", f"{name} is stuck{when} ({count} equal values){_more(len(held))}")
-        )
+        stuck_at = f"{name} is stuck{_when(recording, held[0])}"
+        repeated = f"{len(held[0].rows)} samples repeat the one before"
+        found.append(Told("stuck", f"{stuck_at} ({repeated}){_more(len(held))}"))
     off = [stretch for stretch in wrong if stretch.off is not None]
     for single in (True, False):
         of_kind = [stretch for stretch in off if (len(stretch.rows) == 1) == single]

@@ -27,6 +27,9 @@ def without_rests(found: Sequence[Stretch], scales: Scales) -> tuple[list[Stretc
     kept, left_out = [], 0.0
     for stretch in found:
         still = _still(stretch, scales.sigma, window)
+        if not still.any():
+            kept.append(stretch)
+            continue
         parts = _runs(~_shrunk(still, round(_KEPT * window)))
         kept += [_part(stretch, a, b) for a, b in parts if b - a >= window]
         lengths = [stretch.t[b - 1] - stretch.t[a] for a, b in parts if b - a >= window]

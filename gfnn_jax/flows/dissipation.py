@@ -11,10 +11,11 @@ from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Fricti
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Dissipation:
-    """Friction that is not uniform, row by row: its directions (F, d), their outer products (d²,
-    F), which rows are linear, quadratic, or dry with widths (indices), the widths (n, 1) of these,
-    and which have none. even: of all rows, which are uniform."""
+    """Rows of ``friction`` that are not uniform: their directions (F, d), the outer products of
+    these (d², F), which rows (indices) are linear, quadratic, or dry and smoothed, the widths (n,
+    1) of those, and which are dry without a width. even: of all rows, which are uniform."""
 
+    friction: Friction
     directions: np.ndarray
     outer: np.ndarray
     linear: np.ndarray
@@ -33,11 +34,13 @@ class Dissipation:
         smoothed = np.flatnonzero((own.kinds == DRY) & ~coulomb)
         linear, quadratic = (np.flatnonzero(own.kinds == kind) for kind in (LINEAR, QUADRATIC))
         widths = own.widths[smoothed][:, None]
-        return cls(c, outer, linear, quadratic, smoothed, widths, np.flatnonzero(coulomb), even)
+        return cls(
+            friction, c, outer, linear, quadratic, smoothed, widths, np.flatnonzero(coulomb), even
+        )
 
-    def slopes(self, v: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-        """dr/ds and d²r/ds² (F, N) of the terms r of R, at velocities v (d, N); these are 0 where
-        ``order`` asks for none."""
+    def derivatives(self, v: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+        """dr/ds and d²r/ds² (F, N) of the terms r of R, at velocities v (d, N); with ``order`` 0
+        the second ones are not all computed. As `Friction.tables`, row by row."""
         s = self.directions @ v
         first, second = np.sign(s), np.zeros_like(s)
         first[self.linear] = s[self.linear]

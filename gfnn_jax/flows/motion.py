@@ -27,7 +27,7 @@ from gfnn_jax.families.lagrangian import (
 )
 from gfnn_jax.flows.dissipation import Dissipation
 from gfnn_jax.flows.quadratic import Parts, Quadratic
-from gfnn_jax.solve.linear import among
+from gfnn_jax.solve.linear import among, inverses
 
 # Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19: the solution of order 5.
 NODES = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
@@ -39,7 +39,6 @@ _A = np.array([
     [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
     [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
 ])  # fmt: skip
-_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # of three rows, in a circle
 WEIGHTS = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
 
 
@@ -68,7 +67,8 @@ class Form:
     friction of the kind UNIFORM is γ, of the force −γ ∂L/∂v. They are p (count,), or (N, count) of
     N states that follow laws of their own; phases of the terms are then (P,) or (N, P). powers: of
     parameters that systems differ in, by which (θ, ρ, G) are multiplied (`in_systems`).
-    quadratic, dissipation: of the terms and the friction, made of them."""
+    quadratic, dissipation: made of the terms and the friction, and of those of the form that this
+    one was made from where they are the same."""
 
     terms: Terms
     fixed: np.ndarray
@@ -80,8 +80,9 @@ class Form:
     dissipation: Dissipation = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self):
-        if self.quadratic is None:
+        if self.quadratic is None or not self.quadratic.is_of(self.terms):
             object.__setattr__(self, "quadratic", Quadratic.of(self.terms))
+        if self.dissipation is None or self.dissipation.friction is not self.friction:
             object.__setattr__(self, "dissipation", Dissipation.of(self.friction))
 
     @property
@@ -159,11 +160,11 @@ class Form:
         L = self.quadratic.parts(self.terms, _of_lanes(law.coefficients), q, order)
         losses, gamma = _of_lanes(law.losses), np.asarray(law.uniform)
         directions, dry = self.dissipation.directions, self.dissipation.coulomb
-        pull, stiffness = self.dissipation.slopes(v, order)
+        pull, stiffness = self.dissipation.derivatives(v, order)
         if modes is not None:
             pull[dry] = modes.T
         turning = np.einsum("ikjn,kn->ijn", L.masses_by, v) + L.drift_by  # ∂p/∂q
-        force = 0.5 * np.einsum("ijn,in->jn", turning + L.drift_by, v) + L.pull
+        force = 0.5 * np.einsum("ijn,in->jn", turning + L.drift_by, v) + L.force
         force -= np.einsum("ijn,jn->in", turning, v)
         force -= directions.T @ (losses * pull)
         if self.num_inputs:
@@ -173,7 +174,7 @@ class Form:
         if uniform:
             momentum = np.einsum("ikn,kn->in", L.masses, v) + L.drift
             force -= gamma * momentum
-        inverse = _inverse(L.masses)
+        inverse = inverses(L.masses)
         a = np.einsum("ikn,kn->in", inverse, force)
         held, c = (losses * pull)[dry].T, directions[dry]
         stuck = np.zeros((num, 0), bool) if modes is None else modes == 0
@@ -193,7 +194,7 @@ class Form:
         np.einsum("ikln,kn->iln", L.masses_by, a, out=by_q)
         by_q += np.einsum("ijln,jn->iln", twisted, v)
         by_q -= 0.5 * np.einsum("miln,mn->iln", twisted + L.drift_by_two, v)
-        by_q -= L.pull_by
+        by_q -= L.force_by
         np.einsum("iljn,jn->iln", L.masses_by, v, out=by_v)
         by_v += turning
         by_v -= turning.swapaxes(0, 1)
@@ -214,20 +215,19 @@ class Form:
         pull: np.ndarray, gamma: np.ndarray, momentum: np.ndarray,
     ) -> None:  # fmt: skip
         """The residuals (d, n, N) of each coefficient alone, into ``by``."""
-        d, own = self.dim, self.basis.shape[1]
+        d, own, num = self.dim, self.basis.shape[1], v.shape[1]
         rows = self.quadratic.residuals(L, v, a)
         even = self.dissipation.even
         if even.any():
             rows += gamma * self.quadratic.momenta(L, v)
-        by[:, :own] = (
-            (self.basis.T @ rows.reshape(len(rows), -1)).reshape(own, d, -1).swapaxes(0, 1)
-        )
+        columns = self.basis.T @ rows.reshape(len(rows), d * num)
+        by[:, :own] = columns.reshape(own, d, num).swapaxes(0, 1)
         losses = by[:, own : own + len(even)]
         losses[:, ~even] = self.dissipation.directions.T[..., None] * pull
         if even.any():
             losses[:, even] = momentum[:, None]
         if self.num_inputs:
-            gains = by[:, own + len(even) :].reshape(d, d, self.num_inputs, -1)
+            gains = by[:, own + len(even) :].reshape(d, d, self.num_inputs, num)
             gains[...] = -np.eye(d)[..., None, None] * u
 
     def step(
@@ -288,18 +288,3 @@ class Form:
 def _of_lanes(values: np.ndarray) -> np.ndarray:
     """Coefficients (n,), or (N, n) of each lane, with the lanes last: (n, 1) or (n, N)."""
     return values[:, None] if values.ndim == 1 else values.T
-
-
-def _inverse(masses: np.ndarray) -> np.ndarray:
-    """The inverse (d, d, N) of matrices."""
-    d = len(masses)
-    if d == 1:
-        return 1 / masses
-    if d == 2:
-        (m11, m12), (m21, m22) = masses
-        return np.array([[m22, -m12], [-m21, m11]]) / (m11 * m22 - m12 * m21)
-    if d == 3:
-        one, two = masses[_NEXT], masses[_AFTER]
-        cofactors = one[:, _NEXT] * two[:, _AFTER] - one[:, _AFTER] * two[:, _NEXT]
-        return cofactors.swapaxes(0, 1) / np.sum(masses[0] * cofactors[0], axis=0)
-    return np.linalg.inv(masses.transpose(2, 0, 1)).transpose(1, 2, 0)

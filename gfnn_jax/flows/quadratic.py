@@ -4,7 +4,7 @@
 
 M, w and −V are d² + d + 1 functions of q, each a sum S_rj θ_j f_j(q) over the terms of L, with
 f = ∏ q_i^n_i cos(m·q + φ). Where terms are cosines alone, the derivatives of these functions are
-such sums too, with the weights S_rj m_ji of sines and S_rj m_ji m_jk of cosines: a sine and a
+such sums too, with the weights −S_rj m_ji of sines and −S_rj m_ji m_jk of cosines: a sine and a
 cosine of each term, and products of matrices, are all that a state costs. Arrays have the states
 last.
 """
@@ -20,18 +20,18 @@ from gfnn_jax.families.lagrangian import Terms
 
 
 class Parts(NamedTuple):
-    """M (d, d, N), w (d, N) and −V, their slopes (…, d, N) and curvatures (…, d, d, N), of which −V
-    has slopes (d, N) and curvatures (d, d, N) alone; the potentials f_j (P, N) and their slopes (P,
-    d, N). What was not asked for is empty."""
+    """M (d, d, N) and w (d, N), their derivatives in q (…, d, N) and second ones (…, d, d, N);
+    the force −∂V/∂q (d, N) and its derivatives (d, d, N); the potentials f_j (P, N) of the terms
+    and their slopes (P, d, N). What was not asked for may be empty."""
 
     masses: np.ndarray
     drift: np.ndarray
     masses_by: np.ndarray
     drift_by: np.ndarray
-    pull: np.ndarray
+    force: np.ndarray
     masses_by_two: np.ndarray
     drift_by_two: np.ndarray
-    pull_by: np.ndarray
+    force_by: np.ndarray
     potentials: np.ndarray
     slopes: np.ndarray
 
@@ -40,11 +40,13 @@ class Parts(NamedTuple):
 class Quadratic:
     """Terms, but for their phases, as they make M, w and −V.
 
-    weights: S (R, P), R = d² + d + 1. of_slopes: (R d, P), −S_rj m_ji. of_curvatures: (R d², P),
-    −S_rj m_ji m_jk. modes: m (P, d). plain: whether the terms are cosines alone. products, linear,
-    constant: A, b and c of `Terms.quadratic`, as (P d, d), (P, d, 1) and (P, 1).
+    terms: which these are. weights: S (R, P), R = d² + d + 1. of_slopes: (R d, P), −S_rj m_ji.
+    of_curvatures: (R d², P), −S_rj m_ji m_jk. modes: m (P, d). plain: whether the terms are cosines
+    alone. products, linear, constant: A, b and c of `Terms.quadratic`, as (P d, d), (P, d, 1) and
+    (P, 1).
     """
 
+    terms: Terms
     weights: np.ndarray
     of_slopes: np.ndarray
     of_curvatures: np.ndarray
@@ -63,14 +65,21 @@ class Quadratic:
         slopes = -weights[:, None] * modes.T
         curvatures = slopes[:, :, None] * modes.T
         return cls(
-            np.ascontiguousarray(weights), slopes.reshape(-1, count),
+            terms, np.ascontiguousarray(weights), slopes.reshape(-1, count),
             curvatures.reshape(-1, count), modes, not np.any(terms.powers),
             A.reshape(count * d, d), b[..., None], c[:, None],
         )  # fmt: skip
 
+    def is_of(self, terms: Terms) -> bool:
+        """Return whether these are the terms, of any phases."""
+        own = self.terms
+        same = own.speeds is terms.speeds and own.modes is terms.modes
+        return same and own.powers is terms.powers
+
     def parts(self, terms: Terms, theta: np.ndarray, q: np.ndarray, order: int) -> Parts:
-        """The parts of L at q (d, N), with coefficients θ (P, 1) or (P, N): slopes, curvatures
-        (``order`` 1), and the slopes of each term (2)."""
+        """The parts of L at q (d, N), with coefficients θ (P, 1) or (P, N); with ``order`` 1 or 2
+        second derivatives too, with 2 the slopes of each term. terms: these with any phases, (P,)
+        or (N, P)."""
         (count, d), num = self.modes.shape, q.shape[1]
         curved = slopes = nothing = np.zeros(0)
         if self.plain:
@@ -87,15 +96,15 @@ class Quadratic:
             found = terms.potentials(q.T, order=2 if order else 1)
             f, slopes = found.value.T, found.slope.transpose(1, 2, 0)
             sums = self.weights @ (theta * f)
-            steep = self.weights @ (theta[:, None] * slopes).reshape(count, -1)
+            steep = self.weights @ (theta[:, None] * slopes).reshape(count, d * num)
             if order:
                 curvature = theta[:, None, None] * found.curvature.transpose(1, 2, 3, 0)
-                curved = self.weights @ curvature.reshape(count, -1)
-        steep = steep.reshape(-1, d, num)
+                curved = self.weights @ curvature.reshape(count, d * d * num)
+        steep = steep.reshape(len(sums), d, num)
         M, w = slice(d * d), slice(d * d, d * d + d)
         by_two = (nothing, nothing, nothing)
         if order:
-            curved = curved.reshape(-1, d, d, num)
+            curved = curved.reshape(len(sums), d, d, num)
             by_two = (curved[M].reshape(d, d, d, d, num), curved[w], curved[-1])
         return Parts(
             sums[M].reshape(d, d, num), sums[w], steep[M].reshape(d, d, d, num), steep[w],
@@ -118,5 +127,5 @@ class Quadratic:
 
     def momenta(self, parts: Parts, v: np.ndarray) -> np.ndarray:
         """∂ℓ_j/∂v (P, d, N) of each term."""
-        moved = (self.products @ v).reshape(*self.modes.shape, -1) + self.linear
+        moved = (self.products @ v).reshape(*self.modes.shape, v.shape[1]) + self.linear
         return moved * parts.potentials[:, None]

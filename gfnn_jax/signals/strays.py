@@ -4,6 +4,7 @@ Samples that cubics through four neighbours miss by far are suspected. A polynom
 samples on both sides then tells what the suspected ones should be, and how well it can: at a kink,
 a step or with few samples a period the sides themselves do not lie on it, and nothing is said. A
 stray begins and ends abruptly; a short swing of the motion rises and falls from sample to sample.
+Nor is it a stray that is off by a whole turn: an angle that was not lifted.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ _DEGREE = 5
 _WIDEST = 1.5  # of the duration of so many samples without a gap
 _FAR = 10.0  # standard deviations of what the sides tell
 _ROUGH = 3.0  # times the ordinary roughness of the column
+_TURN, _OF_TURN = 2 * np.pi, 0.1  # a stray is not off by one, to this part of it
 _ABRUPT = 3.0  # times as far off as the sample beside it, that a stray's first and last are
 
 
@@ -117,5 +119,7 @@ def _stray(
         return None
     first, last = far[0], far[-1]
     if off[first] < _ABRUPT * off[first - 1] or off[last] < _ABRUPT * off[last + 1]:
+        return None
+    if abs(np.median(off[far]) - _TURN) < _OF_TURN * _TURN:
         return None
     return int(rows[first]), int(rows[last]) + 1, float(off[far].max())

@@ -30,8 +30,12 @@ def jumps(traits: Traits, name: str) -> tuple[float, int] | None:
 
 
 def _raw(traits: Traits, name: str) -> list[np.ndarray]:
-    """A column as it came, in radians, without what is missing, run by run."""
-    found = [traits.recording.values(name, run) for run in traits.recording.runs]
+    """A column as it came, in radians, without what is missing or wrong, run by run."""
+    wrong = [stretch.rows for stretch in traits.wrong.get(name, ())]
+    recording = traits.recording
+    if wrong:
+        recording = recording.without({name: np.concatenate(wrong)})
+    found = [recording.values(name, run) for run in recording.runs]
     return [x[np.isfinite(x)] for x in found]
 
 
@@ -57,7 +61,8 @@ def units(traits: Traits) -> Iterator[Fault]:
             yield Fault("degrees", found, f"Its unit is degrees: --degrees {typed}", option)
         elif swing > _SWING and np.ptp(_all(traits, name)) < 720 and not _settled(traits, name):
             found = f"{name} swings by {swing:.3g}, degrees or {swing / TURN:.0f} turns in radians"
-            remedy = f"If degrees: --degrees {typed}. If radians: --angles {typed}"
+            angles = shlex.quote(",".join(recording.angles))
+            remedy = f"If degrees: --degrees {typed}. If radians: --angles {angles}"
             yield Fault("degrees", found, remedy, option)
 
 
@@ -104,9 +109,10 @@ def interpolated_jumps(traits: Traits) -> Iterator[Fault]:
     for name in _angles(traits):
         count = sum(_cuts(x) for x in _raw(traits, name))
         if count:
+            jump = "1 jump by a turn takes" if count == 1 else f"{count} jumps by a turn take"
             yield Fault(
-                "interpolated jump", f"{name} was resampled across its wraps: {count} jumps by a "
-                "turn take several samples",
+                "interpolated jump",
+                f"{name} was resampled across its wraps: {jump} several samples",
                 "Unwrap the angle before resampling, or resample its sine and cosine",
             )  # fmt: skip
 

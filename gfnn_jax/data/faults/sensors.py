@@ -99,4 +99,4 @@ def wrong(traits: Traits) -> Iterator[Fault]:
     for kind in ("stuck", "outliers"):
         for one in told:
             if one.kind == kind:
-                yield Fault(kind, one.text, "A fit leaves them out", wrong=False)
+                yield Fault(kind, one.text, "Left out of a fit", wrong=False)

@@ -17,7 +17,7 @@ from gfnn_jax.models.lagrangians.in_use import InUse
 from gfnn_jax.models.lagrangians.input_rules import Acting
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw, NextMotion, hamiltonian_of
 from gfnn_jax.models.lagrangians.next_motion import Motion
-from gfnn_jax.models.lagrangians.residuals import Trace, whiteness
+from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness, whiteness
 from gfnn_jax.models.lagrangians.text import (
     Expression,
     Term,
@@ -32,6 +32,7 @@ from gfnn_jax.models.lagrangians.velocities import Velocity
 
 _CLEAR = 3.0  # standard errors of a gain, below which its input has no visible effect
 _MANY = 3  # functions of parameters in a term, of which laws of physics have fewer
+_FOLLOWED = 90.0  # % of a channel's variation, of which a law that explains it follows more
 _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
 
 Gains = dict[str, dict[str, tuple[float, float]]]
@@ -54,7 +55,7 @@ def in_words(
     channels = sensors.observation_model.channels
     factors = np.array([recording.factors[name] for name in channels])
     lagrangian, friction = _expressions(best, names)
-    gains = _gains(best, recording)
+    gains, found = _gains(best, recording), whiteness(traces, channels, recording.inputs)
     zeros, parameters = _zeros_and_sensors(fit, recording)
     shown = dict(zip(channels, sensors.observation_model.formulas, strict=True))
     return LearnedLaw(
@@ -69,13 +70,14 @@ def in_words(
         gauge=best.gauge,
         units={n: recording.unit(n) for n in (*recording.columns, *recording.coordinates)},
         velocities={n: one.in_file(recording, n) for n, one in measured.items()},
-        whiteness=whiteness(traces, channels, recording.inputs), traces=traces,
+        whiteness=found, traces=traces,
         next_motions=_next_motions(motions, recording, names),
         observe={n: f for n, f in shown.items() if n != f}, sensors=parameters,
         alike=_alike(fit, lagrangian, friction), horizon=tuple(best.calibration.horizons),
         energy=_energy(traces, friction, recording.inputs),
-        messages=(*messages, *_warnings(best, recording, gains)), steps=steps,
-        num_samples=len(recording), seconds=seconds, ended="every length of arcs was fitted",
+        messages=(*messages, *_not_followed(found), *_warnings(best, recording, gains)),
+        steps=steps, num_samples=len(recording), seconds=seconds,
+        ended="every length of arcs was fitted",
     )  # fmt: skip
 
 
@@ -142,6 +144,17 @@ def _zeros_and_sensors(
     zeros = {recording.coordinates[i]: one for i, one in zip(where, fitted, strict=False)}
     keys = fit.structure.keys()[first + len(where) :]
     return zeros, {name: one for (_, name), one in zip(keys, fitted[len(where) :], strict=True)}
+
+
+def _not_followed(found: Mapping[str, Whiteness]) -> list[str]:
+    """Warnings about channels much of whose variation is neither the law's nor noise."""
+    return [
+        f"the law follows only {one.fit_percent:.0f} % of the variation of {name}, and the rest is "
+        "no noise: a force, an input or a change of the sensor is missing. law.png (fit.traces) "
+        "shows when"
+        for name, one in found.items()
+        if one.fit_percent < _FOLLOWED and not one.white
+    ]
 
 
 def _warnings(best: InUse, recording: Recording, gains: Gains) -> list[str]:
