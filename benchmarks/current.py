@@ -66,15 +66,40 @@ def code_of(study: Path) -> dict[str, str | None]:
     own, noted = _modules_of(study) - _RECORDING, ran.functions(PACKAGE.name)
     elsewhere = any("sys.executable" in path.read_text(encoding="utf-8") for path in own)
     whole = {path.resolve() for path in own}
-    some: dict[Path, set[str]] = {}
+    found: dict[Path, str | None] = {}
     if noted is None or elsewhere:
         whole.add(PACKAGE)
     else:
-        some = {path: noted.get(path, set()) for path in _with_constants(set(noted))}
-    found: dict[Path, str | None] = {path: _digest(path) for path in whole}
-    for path, names in some.items():
-        found[path.resolve()] = " ".join(sorted(parts(ran.text_of(path), names)))
+        found |= parts_of(noted)
+    found |= {path: _digest(path) for path in whole}
     return {str(path.relative_to(PACKAGE.parent)): found[path] for path in sorted(found)}
+
+
+def parts_of(noted: dict[Path, set[str]]) -> dict[Path, str]:
+    """Digests of the parts of files of the package of which these functions ran, and of those whose
+    constants they import."""
+    files = _with_constants(set(noted))
+    imported: dict[Path, set[str]] = {}
+    for node in (node for path in files for node in _imports(path)):
+        names = {alias.name for alias in node.names}
+        imported.setdefault(_file_of(node), set()).update(names)
+    return {
+        path.resolve(): " ".join(
+            sorted(parts(ran.text_of(path), noted.get(path, set()), imported.get(path, set())))
+        )
+        for path in files
+    }
+
+
+def _imports(path: Path) -> Iterator[ast.ImportFrom]:
+    """Imports of names of the package in a file."""
+    for node in ast.walk(ast.parse(ran.text_of(path))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(PACKAGE.name):
+            yield node
+
+
+def _file_of(node: ast.ImportFrom) -> Path:
+    return (PACKAGE.parent / str(node.module).replace(".", "/")).with_suffix(".py")
 
 
 def _same(path: Path, code: str | None) -> bool:
@@ -107,11 +132,10 @@ def _with_constants(files: set[Path]) -> set[Path]:
         if path in found:
             continue
         found.add(path)
-        for node in ast.walk(ast.parse(ran.text_of(path))):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(PACKAGE.name):
-                of = (PACKAGE.parent / str(node.module).replace(".", "/")).with_suffix(".py")
-                if of.exists() and {alias.name for alias in node.names} & _constants(of):
-                    left.append(of)
+        for node in _imports(path):
+            of = _file_of(node)
+            if of.exists() and {alias.name for alias in node.names} & _constants(of):
+                left.append(of)
     return found
 
 

@@ -1,5 +1,6 @@
 """Results that are older than their code: found, measured again oldest first, what moved told."""
 
+import ast
 import json
 import os
 import subprocess
@@ -7,6 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+import gfnn_jax
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
@@ -98,12 +101,15 @@ def test_a_result_is_old_where_a_function_changed_that_it_ran(tmp_path, monkeypa
     assert "noted_package" in current.code_of(study)
 
 
-def test_parts_of_a_module():
-    """Of a class each method alone, with the names of all; of an import each name."""
-    text = """
-from a import b, c
+MODULE = """
+\'\'\'Doc.\'\'\'
+from typing import TYPE_CHECKING
+from a import b, c, shown
+if TYPE_CHECKING:
+    from a import T
 X: int = 3
 _y = b(1)
+_z = 2
 class C:
     "Doc."
     size = 2
@@ -112,18 +118,51 @@ class C:
             return c
         return _y
     def two(self):
-        return inner
+        return inner, _z
+def _f():
+    return c
+_f = wrap(_f)
 print(X)
 """
-    all_of, some = parts(text), parts(text, {"C.one"})
-    assert (len(all_of), len(some)) == (9, 6)
-    assert some < all_of  # X, C, print; one, _y, b
-    for old, new in (("return inner", "return 1"), ("return c", "return b"), ("b, c", "b, c, d")):
-        assert parts(text.replace(old, new)) >= some
-    for old, new in (("print(X)", "print(2)"), ("size = 2", "size = 3"), ("two", "three"),
-                     ("b(1)", "b(2)"), ("import b", "import e as b"),
-                     ("return _y", "return 1")):  # fmt: skip
-        assert not parts(text.replace(old, new)) >= some, new
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("Doc.", "Docs."), ("a import T\n", "a import S\n"), ("return inner, _z", "return 1"),
+        ("return c\n        return", "return b\n        return"), ("b, c", "b, c, d"),
+        ("_z = 2", "_z = 3"),
+        ("print(X)", "print(X)  # shows it"), ("def _f():", "def g():\n    pass\ndef _f():"),
+    ],
+)  # fmt: skip
+def test_parts_that_a_result_did_not_run(old, new):
+    assert old in MODULE
+    assert parts(MODULE.replace(old, new)) >= parts(MODULE, {"C.one"})
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("print(X)", "print(2)"), ("size = 2", "size = 3"), ("two", "three"), ("b(1)", "b(2)"),
+        ("import b", "import e as b"), ("return _y", "return 1"), ("X: int = 3", "X: int = 4"),
+        ("shown", "e as shown"),
+    ],
+)  # fmt: skip
+def test_parts_that_a_result_ran_or_that_the_module_shows(old, new):
+    assert not parts(MODULE.replace(old, new)) >= parts(MODULE, {"C.one"})
+
+
+def test_parts_that_are_imported_elsewhere_and_a_name_that_is_given_twice():
+    assert not parts(MODULE.replace("_z = 2", "_z = 3")) >= parts(MODULE, {"C.one"}, {"_z"})
+    assert parts(MODULE) >= parts(MODULE, {"_f"})
+    assert not parts(MODULE.replace("wrap(_f)", "other(_f)")) >= parts(MODULE, {"_f"})
+
+
+def test_parts_of_each_function_are_among_those_of_its_module():
+    for path in (Path(gfnn_jax.__file__).parent / "signals").glob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        for name, _ in ran.functions_of(ast.parse(text)):
+            assert parts(text, {name}) <= parts(text), name
 
 
 def test_what_is_old_is_measured_again(tmp_path, monkeypatch):
