@@ -37,8 +37,9 @@ def record(seed=0):
 
 def test_what_stands_still_is_left_out():
     found = stretches(record())
-    parts, seconds = without_rests(found, measure(found))
+    parts, seconds, short = without_rests(found, measure(found))
     assert 50 < seconds < 75
+    assert short == 0
     assert len(parts) == 3
     for part, whole in zip(parts, found, strict=True):
         assert part.t[0] == whole.t[0]
@@ -50,9 +51,18 @@ def test_what_moves_is_kept():
     t = np.arange(0, 40, DT)
     x = np.sin(t) + NOISE * np.random.default_rng(0).normal(size=len(t))
     found = stretches(gfnn.Recording({"t": t, "x": x}, positions=["x"]))
-    parts, seconds = without_rests(found, measure(found))
-    assert seconds == 0
+    parts, *seconds = without_rests(found, measure(found))
+    assert seconds == [0, 0]
     np.testing.assert_array_equal(parts[0].t, found[0].t)
+
+
+def test_parts_shorter_than_a_period_are_no_rests():
+    t = np.concatenate([np.arange(0, 40, DT), np.arange(45, 48, DT)])
+    x = np.sin(t) + NOISE * np.random.default_rng(0).normal(size=len(t))
+    found = stretches(gfnn.Recording({"t": t, "x": x}, positions=["x"]))
+    parts, seconds, short = without_rests(found, measure(found))
+    assert (len(found), len(parts), seconds) == (2, 1, 0)
+    assert short == pytest.approx(3 - DT)
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,21 +21,28 @@ _STILL = 1.5  # of the noise: the standard deviation up to which a coordinate st
 _KEPT = 0.25  # periods of a rest that stay, in which the body comes to a stop or starts
 
 
-def without_rests(found: Sequence[Stretch], scales: Scales) -> tuple[list[Stretch], float]:
-    """The stretches of plain positions without their rests, and the seconds that were left out; the
-    stretches as they are where too little would be left."""
+class Moving(NamedTuple):
+    """The stretches without their rests, the seconds of these, and those of what moves for less
+    than a period of the fastest motion, which is left out too."""
+
+    stretches: list[Stretch]
+    resting: float
+    short: float
+
+
+def without_rests(found: Sequence[Stretch], scales: Scales) -> Moving:
+    """What moves in stretches of plain positions; all of them where too little would be left."""
     window = max(9, round(scales.period / scales.dt))
-    kept, left_out = [], 0.0
+    kept, resting, short = [], 0.0, 0.0
     for stretch in found:
-        still = _still(stretch, scales.sigma, window)
-        if not still.any():
-            kept.append(stretch)
-            continue
-        parts = _runs(~_shrunk(still, round(_KEPT * window)))
-        kept += [_part(stretch, a, b) for a, b in parts if b - a >= window]
-        lengths = [stretch.t[b - 1] - stretch.t[a] for a, b in parts if b - a >= window]
-        left_out += float(stretch.t[-1] - stretch.t[0] - sum(lengths))
-    return (kept, left_out) if kept else (list(found), 0.0)
+        at_rest = _shrunk(_still(stretch, scales.sigma, window), round(_KEPT * window))
+        resting += sum(float(stretch.t[b - 1] - stretch.t[a]) for a, b in _runs(at_rest))
+        for a, b in _runs(~at_rest):
+            if b - a >= window:
+                kept.append(_part(stretch, a, b))
+            else:
+                short += float(stretch.t[b - 1] - stretch.t[a])
+    return Moving(kept, resting, short) if kept else Moving(list(found), 0.0, 0.0)
 
 
 def _still(stretch: Stretch, sigma: np.ndarray, window: int) -> np.ndarray:

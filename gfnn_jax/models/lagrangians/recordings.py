@@ -18,7 +18,7 @@ from gfnn_jax.data.channels import parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import by_name, symbols
 from gfnn_jax.data.wrong_values import without_wrong_values
-from gfnn_jax.dataset.rests import without_rests
+from gfnn_jax.dataset.rests import Moving, without_rests
 from gfnn_jax.dataset.stretches import Nodes, Scales, Stretch, measure, nodes_of, stretches
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.maps.inputs import HOLDS, Signals
@@ -234,15 +234,29 @@ def _samples(
         found = _stretches(recording, observation, angles, parameters)
     samples = _Samples(recording, observation, angles, found, measure(found), parameters)
     if observation.is_plain:
-        found, resting = without_rests(found, samples.scales)
-        if resting:
-            line = f"{resting:.3g} s at rest left out: a body at rest shows no dynamics"
-            on_progress(line)
+        moving = without_rests(found, samples.scales)
+        if lines := _left_out(moving):
+            for line in lines:
+                on_progress(line)
             samples = dataclasses.replace(
-                samples, stretches=found, scales=measure(found), messages=(line,)
-            )
+                samples, stretches=moving.stretches, scales=measure(moving.stretches),
+                messages=lines,
+            )  # fmt: skip
     sigma = np.where(samples.given > 0, samples.given, samples.scales.sigma)
     return dataclasses.replace(samples, scales=dataclasses.replace(samples.scales, sigma=sigma))
+
+
+def _left_out(moving: Moving) -> tuple[str, ...]:
+    """A line on what does not move, and one on what moves for less than a period."""
+    lines = []
+    if moving.resting:
+        lines.append(f"{moving.resting:.3g} s at rest left out: a body at rest shows no dynamics")
+    if moving.short:
+        lines.append(
+            f"{moving.short:.3g} s in parts shorter than a period left out: they tell little more "
+            "than their own state"
+        )
+    return tuple(lines)
 
 
 def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
@@ -365,7 +379,7 @@ def _with_velocities(
     fit = bench.fit(fit.structure, fit.values, arcs, np.concatenate([fit.sigma, sigma]))
     scales = dataclasses.replace(scales, sigma=np.concatenate([scales.sigma, sigma]))
     found = _stretches(recording, observation, samples.angles, samples.parameters)
-    found = without_rests(found, scales)[0] if samples.messages else found
+    found = without_rests(found, scales).stretches if samples.messages else found
     samples = dataclasses.replace(samples, observation=observation, stretches=found, scales=scales)
     return samples, nodes, bench, fit
 
