@@ -76,7 +76,9 @@ class _Series(NamedTuple):
     usual: np.ndarray
     least: float
 
-    def stray(self, first: int, last: int) -> tuple[int, int, float] | None:
+    def stray(
+        self, first: int | np.integer, last: int | np.integer
+    ) -> tuple[int, int, float] | None:
         """(begin, end, how far off) of the stretch with the suspected samples from ``first`` to
         ``last``; None where it is none, or too few samples around it tell."""
         begin, end = first - _BESIDE, last + _BESIDE + 1
