@@ -31,7 +31,7 @@ class Moving(NamedTuple):
 
 
 def without_rests(found: Sequence[Stretch], scales: Scales) -> Moving:
-    """What moves in stretches of plain positions; all of them where too little would be left."""
+    """Take the rests out of stretches of plain positions; where no motion would be left, none."""
     window = max(9, round(scales.period / scales.dt))
     kept, resting, short = [], 0.0, 0.0
     for stretch in found:
