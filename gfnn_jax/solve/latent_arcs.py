@@ -87,9 +87,14 @@ class Fitted:
         return inverse @ inverse.T
 
     def last_covariance(self) -> np.ndarray:
-        """Covariance of the last state of each arc (A, m, m), with p as it is."""
-        root = self.transports @ np.linalg.pinv(self.arcs)
-        return root @ root.swapaxes(1, 2)
+        """Covariance of the last state of each arc (A, m, m), with p as it is; 1e100 of each
+        coordinate where derivatives overflow."""
+        both = self.arcs + self.transports
+        known = np.asarray(np.isfinite(both).all(axis=(1, 2)))
+        root = self.transports[known] @ np.linalg.pinv(self.arcs[known])
+        covariance = np.tile(1e100 * np.eye(self.transports.shape[1]), (len(known), 1, 1))
+        covariance[known] = root @ root.swapaxes(1, 2)
+        return covariance
 
 
 def fit_arcs(

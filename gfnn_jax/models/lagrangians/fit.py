@@ -20,6 +20,7 @@ from gfnn_jax.solve.wander import Wander
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
 _NOTHING = 1e-9  # of the largest singular value of scaled columns: a combination that does nothing
 _PART = 1e-3  # of the largest coefficient of a combination, that is part of it
+_LEAST_LEFT = 1e-4  # of the squares of residuals, that one more term may leave over
 FOLDS = 3
 
 
@@ -53,7 +54,14 @@ class LawFit:
 
     @property
     def values(self) -> dict[Key, float]:
-        return dict(zip(self.structure.keys(), map(float, self.p), strict=True))
+        """The coefficients, and those that the gauge gives of parts which nothing couples with the
+        first coordinate."""
+        structure, form = self.structure, self.form
+        values = dict(zip(structure.keys(), map(float, self.p), strict=True))
+        if structure.given[1:]:
+            theta = form.lagrangian(self.p[: form.count]).coefficients
+            values |= {("term", structure.terms[k]): float(theta[k]) for k in structure.given[1:]}
+        return values
 
     def covariance(self) -> np.ndarray:
         """Covariance of p: that of white residuals, times their correlation time."""
@@ -167,7 +175,7 @@ class Workbench:
         rescale: bool = True,
     ) -> LawFit:
         """Fit coefficients from those ``known``; σ is made that of the residuals if ``rescale``."""
-        p = structure.start(known)
+        p = structure.start(structure.in_gauge(known, self.gauge))
         x = arcs.x
         model = self.model(structure, arcs, p, np.arange(len(p)))
         whitening = self.whitening(arcs)
@@ -243,7 +251,8 @@ class Workbench:
 
     def scores(self, fit: LawFit, candidates: Structure) -> dict[Key, float]:
         """Distance from zero, in standard errors, of each coefficient of ``candidates`` that the
-        fit lacks, were it alone added; 0 for those that the others imitate."""
+        fit lacks, were it alone added, by the scatter of what it would leave over; 0 for those that
+        the others imitate."""
         known = fit.values
         new = [k for k in candidates.keys() if k not in known]  # noqa: SIM118
         larger = fit.structure.plus(new)
@@ -253,17 +262,21 @@ class Workbench:
         noise = fit.sigma * fit.arcs.noise
         white = self.whitening(fit.arcs)
         R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, self.observation.loss, white)
-        old = [keys.index(k) for k in known]
+        old = [keys.index(k) for k in fit.structure.keys()]  # noqa: SIM118
         own = [keys.index(k) for k in new]
         Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))
         rest = R - Q @ (Q.T @ R)
         length = np.linalg.norm(R, axis=0)
+        whole = max(rest[:, -1] @ rest[:, -1], 1e-300)
         scores = {}
         for key, k in zip(new, own, strict=True):
             size = np.linalg.norm(rest[:, k])
-            independent = size > 0.03 * length[k] and size > 0
-            z = rest[:, k] @ rest[:, -1] / size / np.sqrt(fit.correlation) if independent else 0.0
-            scores[key] = float(abs(z))
+            if not (size > 0.03 * length[k] and size > 0):
+                scores[key] = 0.0
+                continue
+            along = rest[:, k] @ rest[:, -1] / size
+            over = max(1 - along**2 / whole, _LEAST_LEFT)
+            scores[key] = float(abs(along) / np.sqrt(fit.correlation * over))
         return scores
 
 

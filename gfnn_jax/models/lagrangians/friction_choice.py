@@ -50,6 +50,7 @@ from gfnn_jax.solve.linear import non_negative
 
 DECIDED = 20.0  # odds, below which two sets are as good
 _NEEDED = 3.0  # odds, below which a direction is left out
+_LARGEST = 1e100  # of a residual, or of its derivatives
 _SURE = 20.0  # the logarithm of the largest odds that are told
 _GAINS = 5.0  # standard errors below zero, at which friction would have to drive
 _RCOND = 1e-10  # of coefficients that a record tells only together
@@ -175,7 +176,8 @@ def _table_of(bench: Workbench, fit: LawFit, candidates: Sequence[Loss]) -> Tabl
     noise, loss = fit.sigma * fit.arcs.noise, bench.observation.loss
     white = bench.whitening(fit.arcs)
     rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, noise, loss, white)
-    rows[~np.isfinite(rows).all(axis=(1, 2, 3))] = 0.0  # arcs that the larger law cannot follow
+    # Arcs that the larger law cannot follow: their squares would overflow.
+    rows[~(np.abs(rows) < _LARGEST).all(axis=(1, 2, 3))] = 0.0
     keys = larger.keys()
     own = [keys.index(("loss", row)) for row in candidates]
     rest = [k for k in range(len(keys)) if k not in own]

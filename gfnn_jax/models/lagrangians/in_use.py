@@ -23,6 +23,7 @@ from gfnn_jax.models.lagrangians.calibration import Calibration, Thirds, calibra
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.learned_law import in_columns, scaled
+from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.wandering import wander_of
 from gfnn_jax.models.lagrangians.zeros_of_runs import wander_of_runs
 from gfnn_jax.solve.latent_arcs import SOFT_L1
@@ -79,7 +80,7 @@ class Record:
             scale = value / float(np.mean(of_systems.masses(q)[:, i, i]))
             law, covariance = scaled(law, covariance, scale)
             gauge = f"the mean inertia of {name} over the data is {value:g}, as given"
-        gauge += self._of_systems(law)
+        gauge += _of_uncoupled(fit.structure, names, scale) + self._of_systems(law)
         moving, of_moving = conformal(law, covariance)
         root, sensors = covariance_root(of_moving), self.sensors(bench, fit)
         spread = np.nanstd(np.concatenate([s.y for s in self.found]), axis=0)
@@ -143,6 +144,19 @@ class Record:
                 )
             )  # fmt: skip
         return Thirds(tuple(laws), tuple(begins))
+
+
+def _of_uncoupled(structure: Structure, names: Sequence[str], scale: float) -> str:
+    """Clause on coordinates that nothing couples with the first one: each part of L has a scale of
+    its own."""
+    parts = structure.uncoupled[1:]
+    if not parts:
+        return ""
+    firsts = ", ".join(names[part[0]] for part in parts)
+    return (
+        f"; nothing couples {names[0]} with {firsts}: whatever their masses are, the motion is the "
+        f"same, and the mean inertia of {firsts} is set to {scale:g} too"
+    )
 
 
 def best_in_use(

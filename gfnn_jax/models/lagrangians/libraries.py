@@ -48,6 +48,22 @@ def textbook(dim: int, angles: tuple[int, ...]) -> list[Row]:
     return kept
 
 
+def uncoupled(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """The textbook's terms of one coordinate each."""
+    rows = textbook(dim, angles)
+    return [row for row in rows if sum(map(any, zip(*row[:3], strict=True))) == 1]
+
+
+def bodies(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """The same, and potentials of lengths to degree 4: bodies with masses of their own."""
+    rows, none = uncoupled(dim, angles), (0,) * dim
+    lengths = [i for i in range(dim) if i not in angles]
+    for degree in (2, 3, 4):
+        for axes in combinations_with_replacement(lengths, degree):
+            rows.append((none, unit(dim, *axes), none, 0.0))
+    return list(dict.fromkeys(rows))
+
+
 def relative(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """The same chain where each angle is measured from the link before it: with φ_i = q_1 + … + q_i
     masses v_k v_l, v_k v_l cos(φ_j − φ_i), and cos φ_i."""

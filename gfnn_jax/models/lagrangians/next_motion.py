@@ -57,6 +57,8 @@ def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[M
     hardly = rest < _IMITATED * np.linalg.norm(R, axis=0)
     kept = [k for k, key in enumerate(keys) if k in own or (key in lacking and hardly[k])]
     scale = np.linalg.norm(R[:, kept], axis=0)
+    if not scale.any():
+        return []  # the law moves no residual, nor would it elsewhere
     scale = np.where(scale > 0, scale, 1.0)
     before = _information(R[:, kept] / scale)
     found = []

@@ -56,6 +56,14 @@ def search_of_systems(
         groups, nodes, scales, angles, num_inputs, tuple(inputs), observation, on_progress, options
     )
     structure = rule.fit.structure
+    if len(structure.uncoupled) > 1:
+        parts = "; ".join(
+            ", ".join(observation.coordinates[i] for i in part) for part in structure.uncoupled
+        )
+        raise FitError(
+            f"nothing couples {parts}: where runs differ in a parameter, expected the positions of "
+            "one of these (--positions)"
+        )
     gauge = np.concatenate([n.x[:, : observation.dim] for n in nodes])
 
     def bench_of(some: Sequence[Nodes], systems: Systems | None = None) -> Workbench:

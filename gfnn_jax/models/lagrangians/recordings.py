@@ -50,6 +50,8 @@ from gfnn_jax.models.lagrangians.traces import traces_of
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
 from gfnn_jax.solve.robust import Loss
 
+_MISSED = 0.8  # of a channel's variation: no law that leaves as much over follows the recording
+_ABOVE_NOISE = 3.0  # times: such a rest is no noise
 _CLEARLY = 0.8  # times the errors of forecasts, which chance does not make
 _IMITATED = 1e-4  # of what a sensor's parameter changes, that no coefficient of the law does
 
@@ -339,9 +341,17 @@ def _searched(
         found = again if again.follows or not found.follows else found
     if acting.hold == found.acting.hold:
         found = found._replace(acting=found.acting._replace(others=acting.others))
-    if not found.follows:
+    if not found.follows or _misses(found.acting.fit, scales.sigma):
         raise FitError(NO_LAW)
     return found
+
+
+def _misses(fit: LawFit, noise: np.ndarray) -> bool:
+    """Return whether a law leaves nearly all of the variation of every channel over, or of one that
+    is no noise (k,)."""
+    left = fit.rms()
+    missed = left > _MISSED * np.nanstd(fit.arcs.y, axis=(0, 1))
+    return bool(np.all(missed) or np.any(missed & (left > _ABOVE_NOISE * noise)))
 
 
 def _forecasting_best(found: Found, samples: _Samples, on_progress: OnProgress) -> Found:

@@ -26,11 +26,12 @@ from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, a_third
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, which_friction
 from gfnn_jax.models.lagrangians.input_rules import Acting, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
-from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
+from gfnn_jax.models.lagrangians.structure import Key, Loss, Row, Structure
 from gfnn_jax.models.lagrangians.text import word_of
 from gfnn_jax.models.lagrangians.weak_start import protected, weak_start
 from gfnn_jax.models.lagrangians.zeros_of_runs import with_zeros_of_runs
 
+_FOLLOWED = 10.0  # times the noise: what a start leaves over, above which others are tried
 _AS_WELL = 1.01  # times the cost, with which a law follows the record as well
 
 NO_LAW = (
@@ -99,20 +100,18 @@ def search(
         return max(6, round(periods * scales.per_period))
 
     linear = libraries.losses(d, (LINEAR,), 0.0)
-    starts = []
-    plain = [libraries.textbook(d, angles)]
-    if d > 1 and len(angles) == d:
-        plain.append(libraries.relative(d, angles))
-    plain_terms = []
-    for rows in (*plain, libraries.first(d, angles)):
+    starts: list[LawFit] = []
+
+    def start(rows: Sequence[Row], friction: Sequence[Loss] = linear) -> tuple[Row, ...] | None:
+        """Terms of this library that the weak form shows, whose fit is then among the starts; None
+        where it does not determine them."""
+        nonlocal benches
         terms = libraries.without_forces(rows, shifted)
-        library = Structure(d, terms, tuple(linear), (), num_inputs, sensors)
+        library = Structure(d, terms, tuple(friction), (), num_inputs, sensors)
         try:
             structure, known = weak_start(library, nodes, scales)
         except FitError:
-            continue
-        if rows in plain:
-            plain_terms.append(structure.terms)
+            return None
         zeros = tuple(i for i in turned if any(row[2][i] for row in structure.terms))
         structure = structure.plus(
             [("loss", row) for row in linear[:d]] + [("zero", i) for i in zeros]
@@ -123,19 +122,33 @@ def search(
             benches = {rule.hold: rule.bench}  # inputs act so in the other libraries too
             starts.append(rule.fit)
             on_progress(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
+        return structure.terms
+
+    def misfit(fit: LawFit) -> float:
+        finite = np.isfinite(fit.fitted.cost)
+        return float(np.max(fit.rms() / scales.sigma)) if finite else np.inf
+
+    plain = [start(libraries.textbook(d, angles))]
+    if d > 1 and len(angles) == d:
+        plain.append(start(libraries.relative(d, angles)))
+    start(libraries.first(d, angles))
+    if d > 1 and not any(misfit(fit) < _FOLLOWED for fit in starts):
+        plain.append(start(libraries.uncoupled(d, angles), linear[:d]))
+        start(libraries.bodies(d, angles), linear[:d])
     if not starts:
         raise FitError(NO_LAW)
     (bench,) = benches.values()
-    misfit = [
-        float(np.max(start.rms() / scales.sigma)) if np.isfinite(start.fitted.cost) else np.inf
-        for start in starts
-    ]
-    best = min(range(len(starts)), key=lambda k: misfit[k])
-    simple = [k for k, start in enumerate(starts) if start.structure.terms in plain_terms]
-    simple = [k for k in simple if misfit[k] <= options.plain_is_enough * misfit[best]]
-    fit = starts[min(simple, key=lambda k: misfit[k]) if simple else best]
+    best = min(map(misfit, starts))
+    simple = [
+        fit for fit in starts
+        if fit.structure.terms in plain and misfit(fit) <= options.plain_is_enough * best
+    ]  # fmt: skip
+    fit = min(simple or starts, key=misfit)
     every = everything(angles, num_inputs, observation, options)
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
+    if len(fit.structure.uncoupled) > 1:  # what couples them is seen best along short arcs
+        fit = grow(bench, nodes, fit, every, on_progress, options)
+        nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     periods = options.periods[1:]
     return _along_longer_arcs(bench, nodes, fit, periods, every, scales, on_progress, options)
 

@@ -4,7 +4,8 @@ and its gauge.
 L → c L + const moves nothing, so one coefficient has to be given: the mean of M₁₁ over the data is
 1. (To set the coefficient of ½v₁² alone would admit M₁₁ = 1 − 1.3 cos q + 0.3 cos 2q, which is
 nearly zero where the data are, and fits any record with nothing.) In a law whose M₁₁ is constant
-that is ½ of v₁².
+that is ½ of v₁². Coordinates that no term or friction couples with q₁ have a scale of their own, by
+which their part of L may be multiplied: there the mean of the first one's inertia is 1 too.
 
 Where runs differ in parameters of the system, a row has one more entry, the whole powers of these
 that its coefficient is multiplied by; a row without it does not depend on them. Within a run
@@ -15,6 +16,7 @@ of the others is their ratio to it.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -39,11 +41,21 @@ def powers_of(row: Row | Loss, count: int) -> tuple[int, ...]:
     return row[-1] if isinstance(row[-1], tuple) else (0,) * count
 
 
+def _moves(key: Key, part: tuple[int, ...]) -> bool:
+    """Return whether a coefficient is of a term, friction or gain of these coordinates."""
+    if key[0] == "gain":
+        return key[1] in part
+    if key[0] not in ("term", "loss"):
+        return False
+    vectors = key[1][:3] if key[0] == "term" else key[1][:1]
+    return any(vector[i] for vector in vectors for i in part)
+
+
 @dataclasses.dataclass(frozen=True)
 class Structure:
-    """Terms of L (the first is ½v₁²·2, whose coefficient the gauge gives), friction, the
-    coordinates whose zero is unknown, the number of inputs, each with a gain for each coordinate,
-    and the names of the sensors' parameters with where they start."""
+    """Terms of L (the first is ½v₁²·2), friction, the coordinates whose zero is unknown, the number
+    of inputs, each with a gain for each coordinate, and the names of the sensors' parameters with
+    where they start."""
 
     dim: int
     terms: tuple[Row, ...]
@@ -56,7 +68,7 @@ class Structure:
         """A name of each free coefficient, in their order."""
         gains = [("gain", i, j) for i in range(self.dim) for j in range(self.num_inputs)]
         return [
-            *(("term", row) for row in self.terms[1:]),
+            *(("term", self.terms[k]) for k in self._free),
             *(("loss", row) for row in self.friction),
             *gains,
             *(("zero", i) for i in self.zeros),
@@ -67,6 +79,39 @@ class Structure:
         """The coefficients that are known, for sensors those they start from, 0 for the others."""
         known = {**{("sensor", name): value for name, value in self.sensors}, **known}
         return np.array([known.get(key, 0.0) for key in self.keys()])
+
+    @functools.cached_property
+    def uncoupled(self) -> tuple[tuple[int, ...], ...]:
+        """The coordinates in parts that no term or friction couples, that of the first one first; a
+        part that nothing sets in motion belongs to the first. One part where systems differ."""
+        rows = [[any(of) for of in zip(*row[:3], strict=True)] for row in self.terms]
+        rows += [list(map(bool, row[0])) for row in self.friction]
+        part = np.arange(self.dim) if self.powers is None else np.zeros(self.dim, int)
+        for row in rows:
+            axes = np.flatnonzero(row)
+            part[np.isin(part, part[axes])] = min(part[axes], default=0)
+        moved = [row[0].index(2) for row in self.terms if max(row[0]) == 2]
+        part[~np.isin(part, part[moved])] = 0
+        return tuple(tuple(np.flatnonzero(part == i).tolist()) for i in np.unique(part))
+
+    @functools.cached_property
+    def given(self) -> tuple[int, ...]:
+        """Places of the terms whose coefficients the gauge gives: the first one, and of each other
+        uncoupled part v² of its first coordinate, constant where there is such a term."""
+        return (0, *map(self._inertia_of, self.uncoupled[1:]))
+
+    def _inertia_of(self, part: tuple[int, ...]) -> int:
+        own = [k for k, row in enumerate(self.terms) if any(row[0][i] == 2 for i in part)]
+
+        def rank(k: int) -> tuple[int, bool]:
+            speeds, powers, wave = self.terms[k][:3]
+            return speeds.index(2), any(powers) or any(wave)
+
+        return min(own, key=rank)
+
+    @property
+    def _free(self) -> list[int]:
+        return [k for k in range(len(self.terms)) if k not in self.given]
 
     @property
     def powers(self) -> Powers | None:
@@ -91,18 +136,39 @@ class Structure:
         values = terms.potentials(q, order=0).value
         if powers is not None:
             values = values * functions_of(powers[: terms.count], args)
-        own = terms.quadratic()[0][:, 0, 0] * values.mean(axis=0)
-        fixed = np.zeros(terms.count)
-        fixed[0] = 1 / own[0]
-        basis = np.eye(terms.count)[:, 1:]
-        basis[0] = -own[1:] / own[0]
+        inertia, fixed = terms.quadratic()[0], np.zeros(terms.count)
+        basis = np.eye(terms.count)[:, self._free]
+        for k in self.given:
+            i = self.terms[k][0].index(2)
+            own = inertia[:, i, i] * values.mean(axis=0)
+            fixed[k] = 1 / own[k]
+            basis[k] = -own[self._free] / own[k]
         friction = Friction.of(self.friction, self.dim)
         return Form(terms, fixed, basis, friction, self.num_inputs, powers)
+
+    def in_gauge(self, known: Mapping[Key, float], q: np.ndarray) -> Mapping[Key, float]:
+        """Coefficients that are known of a law which may couple more, with each uncoupled part in
+        the gauge of the positions q (n, d)."""
+        for part, place in zip(self.uncoupled[1:], self.given[1:], strict=True):
+            i, own = self.terms[place][0].index(2), {}
+            for key, value in known.items():
+                if key[0] == "term" and key[1][0][i] == 2:
+                    own[key[1]] = value
+            if self.terms[place] not in own:
+                continue
+            terms = Terms.of(tuple(own), self.dim)
+            means = terms.potentials(q, order=0).value.mean(axis=0)
+            mean = np.sum(terms.quadratic()[0][:, i, i] * means * list(own.values()))
+            by = 1 / mean if mean > 0 else 1.0
+            known = {k: by * c if _moves(k, part) else c for k, c in known.items()}
+        return known
 
     def without(self, keys: set[Key]) -> Structure:
         return dataclasses.replace(
             self,
-            terms=(self.terms[0], *(r for r in self.terms[1:] if ("term", r) not in keys)),
+            terms=tuple(
+                r for k, r in enumerate(self.terms) if k in self.given or ("term", r) not in keys
+            ),
             friction=tuple(r for r in self.friction if ("loss", r) not in keys),
             zeros=tuple(i for i in self.zeros if ("zero", i) not in keys),
         )

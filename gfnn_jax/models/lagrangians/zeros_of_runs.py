@@ -81,7 +81,8 @@ def _found(
     rows = rows_of_arcs(model, start, fit.fitted.x, arcs.y, noise, bench.observation.loss)
     rows = rows.reshape(len(rows), -1, rows.shape[-1])
     own, of_runs, left = np.split(rows, [len(p), len(start)], axis=-1)
-    own = own[..., [key[0] != "zero" for key in fit.values]]
+    keys = fit.structure.keys()
+    own = own[..., [key[0] != "zero" for key in keys]]
     own = own / np.maximum(np.linalg.norm(own, axis=(0, 1)), 1e-300)
     unit = np.linalg.norm(left)
     of_runs = of_runs / unit
