@@ -61,14 +61,15 @@ class Nodes:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scales:
     """Scales of the samples, from the samples: noise σ (k,) of the channels, rms speeds (d,), the
-    fastest frequency ω (1/s), the median step dt, and the window of the local cubics (samples to
-    either side)."""
+    fastest frequency ω (1/s), the median step dt, the window of the local cubics (samples to either
+    side), and the largest rms step of a channel ÷ its standard deviation."""
 
     sigma: np.ndarray
     speed: np.ndarray
     omega: float
     dt: float
     half: int
+    stride: float
 
     @property
     def period(self) -> float:
@@ -83,6 +84,11 @@ class Scales:
     def per_period(self) -> float:
         """Nodes to a period: some forty, fewer of a recording with fewer samples."""
         return self.period / (self.dt * self.every)
+
+    @property
+    def samples(self) -> float:
+        """Samples in a period of a sine whose steps are as large."""
+        return float(np.pi / np.arcsin(min(self.stride / 2, 1.0)))
 
     @property
     def substeps(self) -> int:
@@ -176,7 +182,9 @@ def measure(found: Sequence[Stretch]) -> Scales:
     for stretch, own in zip(found, smooths, strict=True):
         systems.setdefault(tuple(stretch.args.tolist()), []).append(own)
     omega = max(_frequency(own, _SLOW * speed) for own in systems.values())
-    return Scales(sigma, speed, omega, dt, half)
+    with np.errstate(invalid="ignore"):
+        stride = size / np.nanstd(np.concatenate([s.y for s in found]), axis=0)
+    return Scales(sigma, speed, omega, dt, half, float(np.nanmax(stride)))
 
 
 def _frequency(smooths: Sequence[Smooth], slow: np.ndarray) -> float:

@@ -382,7 +382,8 @@ class _Iterate(NamedTuple):
 
     @property
     def merit(self) -> float:
-        return self.cost + (self.gap / _DEFECT) ** 2
+        gap = self.gap / _DEFECT
+        return self.cost + gap * gap  # infinite where it overflows, which a power of 2 refuses
 
     @property
     def merits(self) -> np.ndarray:

@@ -29,7 +29,6 @@ from gfnn_jax.models.lagrangians.dependence import (
 from gfnn_jax.models.lagrangians.fit import LawFit, Systems, Workbench
 from gfnn_jax.models.lagrangians.input_rules import Acting
 from gfnn_jax.models.lagrangians.search import (
-    NO_LAW,
     Found,
     SearchOptions,
     arcs_by_length,
@@ -37,6 +36,7 @@ from gfnn_jax.models.lagrangians.search import (
     everything,
     finished,
     gains,
+    no_law,
     search,
 )
 from gfnn_jax.models.lagrangians.structure import Structure
@@ -146,7 +146,7 @@ def _first_law(
             continue
         if np.isfinite(found.acting.fit.fitted.cost):
             return found.acting
-    raise FitError(NO_LAW)
+    raise no_law(scales)
 
 
 def _fitted(

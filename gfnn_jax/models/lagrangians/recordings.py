@@ -39,9 +39,9 @@ from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS
 from gfnn_jax.models.lagrangians.next_motion import next_motions
 from gfnn_jax.models.lagrangians.of_systems import search_of_systems
 from gfnn_jax.models.lagrangians.search import (
-    NO_LAW,
     Found,
     SearchOptions,
+    no_law,
     search,
     search_on,
 )
@@ -342,7 +342,7 @@ def _searched(
     if acting.hold == found.acting.hold:
         found = found._replace(acting=found.acting._replace(others=acting.others))
     if not found.follows or _misses(found.acting.fit, scales.sigma):
-        raise FitError(NO_LAW)
+        raise no_law(scales)
     return found
 
 

@@ -34,11 +34,21 @@ from gfnn_jax.models.lagrangians.zeros_of_runs import with_zeros_of_runs
 _FOLLOWED = 10.0  # times the noise: what a start leaves over, above which others are tried
 _AS_WELL = 1.01  # times the cost, with which a law follows the record as well
 
-NO_LAW = (
-    "no law of the terms tried follows this recording. Check units and roles (gfnn look); name a "
-    "missing input or position (--inputs, --positions); cut off rest and collisions (--from, "
-    "--to); or give terms that you know (--terms)"
-)
+_FEW = 8.0  # samples a period, below which more of them are the remedy
+
+
+def no_law(scales: Scales) -> FitError:
+    """Error where no law follows a recording of these scales."""
+    few = (
+        f"; sample more often: it has about {scales.samples:.1f} samples in a period"
+        if scales.samples < _FEW
+        else ""
+    )
+    return FitError(
+        "no law of the terms tried follows this recording. Check units and roles (gfnn look); name "
+        "a missing input or position (--inputs, --positions); cut off rest and collisions (--from, "
+        f"--to); or give terms that you know (--terms){few}"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,7 +146,7 @@ def search(
         plain.append(start(libraries.uncoupled(d, angles), linear[:d]))
         start(libraries.bodies(d, angles), linear[:d])
     if not starts:
-        raise FitError(NO_LAW)
+        raise no_law(scales)
     (bench,) = benches.values()
     best = min(map(misfit, starts))
     simple = [
@@ -281,6 +291,8 @@ def telling_more(
     longer ones first as long as shorter ones tell more. None where the standard errors, in the
     geometric mean, are not much smaller than those of ``fit``: longer arcs are a longer lever, but
     where motion is chaotic, or forces unknown, their residuals grow faster."""
+    if not len(fit.p):
+        return None  # a driven mass: nothing of its law is free
     best = fit
     for size in sorted(lengths, reverse=True):
         arcs = arcs_of(with_states(nodes, best.arcs, best.fitted.x), size)

@@ -180,15 +180,15 @@ def which_friction_line(
 
 
 def speed_names(positions: Sequence[str], velocities: Sequence[str]) -> tuple[str, ...]:
-    """Names of the velocities: of their columns, or omega1 of theta1, v1 of x1, q_dot of q."""
+    """Names of the velocities: of their columns, or omega1 of theta1 and v1 of x1; q_dot of q, and
+    of all where one is named otherwise."""
     if len(velocities) == len(positions):
         return tuple(velocities)
-    named = []
-    for name in positions:
-        found = re.fullmatch(r"(theta|x)(\w*)", name)
-        stem = {"theta": "omega", "x": "v"}[found[1]] if found else ""
-        named.append(stem + found[2] if found else f"{name}_dot")
-    return tuple(named) if not set(named) & set(positions) else tuple(f"{n}_dot" for n in positions)
+    found = [re.fullmatch(r"(theta|x)(\w*)", name) for name in positions]
+    named = [{"theta": "omega", "x": "v"}[one[1]] + one[2] for one in found if one]
+    if len(named) < len(positions) or set(named) & set(positions):
+        return tuple(f"{name}_dot" for name in positions)
+    return tuple(named)
 
 
 def _wave(m: Sequence[int], phase: float, names: Sequence[str]) -> str:

@@ -1,0 +1,129 @@
+"""Coordinates that nothing couples: each part of L has a scale of its own; laws of bodies in
+potentials of lengths, from positions."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.errors import FitError
+from gfnn_jax.models.lagrangians.structure import Structure
+from gfnn_jax.solve.latent_arcs import Fitted
+
+
+def recorded(acceleration, start, names, end=40.0, samples=2_000, noise=1e-4, **roles):
+    """Positions of q̈ = acceleration(q, v) from ``start`` (2d,), by SciPy, with noise."""
+    d, t = len(start) // 2, np.linspace(0, end, samples)
+    z = solve_ivp(
+        lambda _, z: np.concatenate([z[d:], acceleration(z[:d], z[d:])]), (0, end), start,
+        t_eval=t, rtol=1e-10, atol=1e-12,
+    ).y.T  # fmt: skip
+    q = z[:, :d] + noise * np.random.default_rng(0).normal(size=(samples, d))
+    columns = dict(zip(names, q.T, strict=True))
+    return gfnn.Recording({"t": t, **columns}, positions=names, **roles)
+
+
+def coefficients(expression):
+    return {term.term: term.coefficient for term in expression.terms}
+
+
+def test_a_trap_whose_axes_are_not_coupled_has_its_law():
+    trap = recorded(lambda q, v: -np.array([1.0, 2.3]) * q - 0.01 * v, [1, 0.7, 0, 0], ["x", "y"])
+    fit = gfnn.fit(trap)
+    found = coefficients(fit.lagrangian)
+    assert found == pytest.approx(
+        {"x_dot**2": 0.5, "y_dot**2": 0.5, "x**2": -0.5, "y**2": -1.15}, rel=1e-4
+    )
+    assert [term.coefficient for term in fit.friction.terms] == [pytest.approx(0.01, rel=3e-3)]
+    assert "nothing couples x with y" in fit.gauge
+    (kind,) = fit.which_friction.kinds
+    assert kind == "uniform"
+
+
+@pytest.mark.slow
+def test_two_pendulums_in_one_file_have_their_laws():
+    both = recorded(
+        lambda q, v: -np.array([1.0, 2.3]) * np.sin(q) - 0.01 * v, [1, 1.7, 0, 0], ["a", "b"],
+        angles=["a", "b"],
+    )  # fmt: skip
+    found = coefficients(gfnn.fit(both).lagrangian)
+    assert found["cos(a)"] == pytest.approx(1.0, rel=1e-4)
+    assert found["cos(b)"] == pytest.approx(2.3, rel=1e-4)
+    assert len(found) == 4
+
+
+@pytest.mark.parametrize("start", [[0.2, 0.1, 0.1, 0.3], [0.2, 0.25, 0, 0]], ids=["turns", "rest"])
+def test_henon_and_heiles_potential_from_positions(start):
+    """From rest the motion is nearly along a line, of which a law with couplings alone makes
+    nothing."""
+
+    def acceleration(q, v):
+        x, y = q
+        return np.array([-x - 2 * x * y, -y - x * x + y * y]) - 0.01 * v
+
+    fit = gfnn.fit(recorded(acceleration, start, ["x", "y"]))
+    found = coefficients(fit.lagrangian)
+    exact = {"x**2": -0.5, "y**2": -0.5, "x**2*y": -1.0, "y**3": 1 / 3}
+    assert {name: found[name] for name in exact} == pytest.approx(exact, rel=2e-3)
+    assert len(found) == 6
+
+
+def test_a_quartic_spring_of_five_periods_is_seen():
+    """Its own misfit is correlated over a third of a period; what it leaves over is not."""
+    spring = recorded(
+        lambda q, v: -q - 0.87 * q**3 - 0.01 * v, [0.65, 0], ["x"], 34.0, 431, 4e-6
+    )  # fmt: skip
+    found = coefficients(gfnn.fit(spring).lagrangian)
+    assert found["x**4"] == pytest.approx(-0.2175, rel=1e-3)
+
+
+def test_a_recording_of_too_few_samples_is_refused_by_their_number():
+    spring = recorded(lambda q, v: -q - q**3 - 0.02 * v, [0.9, 0], ["x"], 68 * 1.9, 68)
+    with pytest.raises(FitError, match=r"sample more often: it has about 2.\d samples in a period"):
+        gfnn.fit(spring)
+
+
+NONE = (0, 0)
+MASSES = (((2, 0), NONE, NONE, 0.0), ((0, 2), NONE, NONE, 0.0))
+SPRINGS = ((NONE, (2, 0), NONE, 0.0), (NONE, (0, 2), NONE, 0.0))
+COUPLING = (NONE, (2, 1), NONE, 0.0)
+FRICTION = tuple(((int(i == 0), int(i == 1)), 0, 0.0) for i in range(2))
+
+
+def test_a_part_that_nothing_couples_has_its_mean_inertia_given():
+    q = np.random.default_rng(0).normal(size=(50, 2))
+    apart = Structure(2, (*MASSES, *SPRINGS), FRICTION)
+    assert apart.uncoupled == ((0,), (1,))
+    assert apart.given == (0, 1)
+    assert ("term", MASSES[1]) not in apart.keys()  # noqa: SIM118
+    together = apart.plus([("term", COUPLING)])
+    assert together.uncoupled == ((0, 1),)
+    assert ("term", MASSES[1]) in together.keys()  # noqa: SIM118
+    rubbing = apart.plus([("loss", ((-1, 1), 0, 0.0))])
+    assert rubbing.uncoupled == ((0, 1),)
+    # Without its coupling a law moves as it did, its second part by another scale.
+    known = {("term", MASSES[1]): 1.7, ("term", SPRINGS[0]): -0.4, ("term", SPRINGS[1]): -2.1,
+             ("loss", FRICTION[0]): 0.03, ("loss", FRICTION[1]): 0.05}  # fmt: skip
+    v, u = q[::-1] * 0.3, np.zeros((50, 0))
+    accelerations = []
+    for structure in (together, apart):
+        form = structure.form(q)
+        p = structure.start(structure.in_gauge(known, q))
+        law = form.lagrangian(p)
+        assert np.mean(law.masses(q)[:, 0, 0]) == pytest.approx(1.0)
+        accelerations.append(form.accelerate(law, q, v, u, order=0).a)
+        last = np.mean(law.masses(q)[:, 1, 1])
+    np.testing.assert_allclose(*accelerations, rtol=1e-12)
+    assert last == pytest.approx(1.0)
+
+
+def test_a_state_whose_derivatives_overflow_is_not_known():
+    empty = np.zeros(0)
+    triangles = np.array([[[2.0, 0.0], [0.0, 4.0]], [[np.inf, 0.0], [0.0, 1.0]]])
+    fitted = Fitted(
+        empty, empty, empty, empty, empty, empty, empty, triangles, np.tile(np.eye(2), (2, 1, 1)),
+        empty, 0.0, 0, True,
+    )  # fmt: skip
+    known, unknown = fitted.last_covariance()
+    np.testing.assert_allclose(known, np.diag([0.25, 0.0625]))
+    np.testing.assert_array_equal(unknown, 1e100 * np.eye(2))
