@@ -18,8 +18,8 @@ _DEGREES = (8, 6, 5, 4, 3, 2)  # of K
 _ROWS_PER_TERM, _MOST_TERMS = 10, 400
 # A change of volume is reported where it is certain, in the inner half of the states by so many
 # standard errors and in the outer too, and where both are the same within this factor. It is larger
-# than the square of the residuals, to which order J∇K is what they are.
-_OF_HALVES, _ALIKE = 3.0, 2.0
+# than the square of the residuals, to which order J∇K is what they are, and than roundoff.
+_OF_HALVES, _ALIKE, _ROUNDOFF = 3.0, 2.0, 1e-13
 
 
 def hidden_friction(images, residual, angles: tuple[int, ...] = ()) -> tuple[float, float] | None:
@@ -28,7 +28,7 @@ def hidden_friction(images, residual, angles: tuple[int, ...] = ()) -> tuple[flo
     are too few."""
     images, residual = np.asarray(images), np.asarray(residual)
     whole, square = _change(images, residual, angles), np.mean((residual / sizes(images)) ** 2)
-    if whole is None or not abs(whole[0]) > max(CERTAIN * whole[1], square):
+    if whole is None or not abs(whole[0]) > max(CERTAIN * whole[1], square, _ROUNDOFF):
         return None
     distance = np.linalg.norm((images - images.mean(axis=0)) / sizes(images), axis=1)
     inside = distance <= np.median(distance)

@@ -90,6 +90,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     diagnosis: list[str] = []
     jumps = wrapped(request.pairs, request.coordinates)
     if jumps:
+        messages = []  # of a law that misses them
         ended = reason = "no map follows the jumps of an angle that is wrapped and was not named"
     elif candidate.validation_relative > _ROUNDOFF and searched.linear is None:
         stalled = _stalled(candidate, chosen.entry, searched)

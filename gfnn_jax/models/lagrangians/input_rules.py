@@ -130,8 +130,9 @@ def _costs_more(of_arcs: np.ndarray, least: np.ndarray) -> bool:
     differences from arc to arc tell it."""
     if of_arcs is least:
         return False
-    more = of_arcs - least
-    chance = np.sqrt(len(more)) * np.std(more, ddof=min(1, len(more) - 1))
+    with np.errstate(invalid="ignore"):  # infinite ones, of which chance is NaN
+        more = np.where(of_arcs == least, 0.0, of_arcs - least)
+        chance = np.sqrt(len(more)) * np.std(more, ddof=min(1, len(more) - 1))
     return not float(np.sum(more)) <= _CHANCE * chance
 
 
@@ -151,7 +152,7 @@ def _correction(here: Acting, interval: float) -> tuple[float, float]:
     p = structure.start(known)
     model = bench.model(structure, fit.arcs, p, np.arange(len(p)))
     R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, fit.sigma * fit.arcs.noise)
-    own = [keys.index(key) for key in known]
+    own = [keys.index(key) for key in fit.structure.keys()]  # noqa: SIM118
     column = sum(
         known["gain", i, j] * R[:, keys.index(("gain", i, count + j))]
         for i in range(fit.form.dim)
