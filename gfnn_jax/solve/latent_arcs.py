@@ -390,7 +390,7 @@ class _Iterate(NamedTuple):
         """Merit (A,) of each arc."""
         with np.errstate(all="ignore"):
             cost = np.sum(self.units.loss.of(self.white), axis=(1, 2))
-        return cost + self.gaps / _DEFECT**2
+            return cost + self.gaps / _DEFECT**2
 
     @property
     def open(self) -> np.ndarray:

@@ -280,6 +280,17 @@ class Workbench:
         return scores
 
 
+def describe(fit: LawFit) -> str:
+    """A line for people; residuals in units of their channels' standard deviations."""
+    share = 100 * fit.rms() / np.nanstd(fit.arcs.y, axis=(0, 1))
+    rms = ", ".join(f"{r:.2g}" for r in share)
+    return (
+        f"{len(fit.p)} coefficients, RMS residual {rms} % of the spread, correlated over "
+        f"{fit.correlation:.1f} samples, {fit.fitted.iterations} iterations"
+        + ("" if fit.fitted.converged else ", not converged")
+    )
+
+
 def in_thirds(
     nodes: Sequence[Nodes], fit: LawFit, systems: Systems | None = None
 ) -> tuple[Arcs, np.ndarray]:

@@ -12,7 +12,7 @@ from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.fit import LawFit, Systems, Workbench
+from gfnn_jax.models.lagrangians.fit import LawFit, Systems, Workbench, describe
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import choose_rule
@@ -22,7 +22,6 @@ from gfnn_jax.models.lagrangians.search import (
     as_found,
     by_arcs_that_tell,
     choose_friction,
-    describe,
     frictions_tried,
     to_longer_arcs,
 )

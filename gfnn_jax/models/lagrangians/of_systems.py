@@ -26,19 +26,18 @@ from gfnn_jax.models.lagrangians.dependence import (
     seen,
     with_functions,
 )
-from gfnn_jax.models.lagrangians.fit import LawFit, Systems, Workbench
+from gfnn_jax.models.lagrangians.fit import LawFit, Systems, Workbench, describe
 from gfnn_jax.models.lagrangians.input_rules import Acting
 from gfnn_jax.models.lagrangians.search import (
     Found,
     SearchOptions,
     arcs_by_length,
-    describe,
     everything,
     finished,
     gains,
-    no_law,
     search,
 )
+from gfnn_jax.models.lagrangians.starts import no_law
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.weak_start import weak_start
 from gfnn_jax.models.lagrangians.zeros_of_runs import with_zeros_of_runs

@@ -41,10 +41,10 @@ from gfnn_jax.models.lagrangians.of_systems import search_of_systems
 from gfnn_jax.models.lagrangians.search import (
     Found,
     SearchOptions,
-    no_law,
     search,
     search_on,
 )
+from gfnn_jax.models.lagrangians.starts import no_law
 from gfnn_jax.models.lagrangians.text import speed_names
 from gfnn_jax.models.lagrangians.traces import traces_of
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels

@@ -16,39 +16,22 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of, with_states
-from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
-from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, a_third
+from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, a_third, describe
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, which_friction
-from gfnn_jax.models.lagrangians.input_rules import Acting, choose_rule, with_delay
+from gfnn_jax.models.lagrangians.input_rules import Acting, with_delay
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
-from gfnn_jax.models.lagrangians.structure import Key, Loss, Row, Structure
+from gfnn_jax.models.lagrangians.starts import best_start
+from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
 from gfnn_jax.models.lagrangians.text import word_of
-from gfnn_jax.models.lagrangians.weak_start import protected, weak_start
+from gfnn_jax.models.lagrangians.weak_start import protected
 from gfnn_jax.models.lagrangians.zeros_of_runs import with_zeros_of_runs
 
-_FOLLOWED = 10.0  # times the noise: what a start leaves over, above which others are tried
 _AS_WELL = 1.01  # times the cost, with which a law follows the record as well
-
-_FEW = 8.0  # samples a period, below which more of them are the remedy
-
-
-def no_law(scales: Scales) -> FitError:
-    """Error where no law follows a recording of these scales."""
-    few = (
-        f"; sample more often: it has about {scales.samples:.1f} samples in a period"
-        if scales.samples < _FEW
-        else ""
-    )
-    return FitError(
-        "no law of the terms tried follows this recording. Check units and roles (gfnn look); name "
-        "a missing input or position (--inputs, --positions); cut off rest and collisions (--from, "
-        f"--to); or give terms that you know (--terms){few}"
-    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,9 +43,6 @@ class SearchOptions:
     nothing: float = 1.0  # standard errors, below which it is, without asking held-out arcs
     asked_for: float = 5.0  # standard errors, above which a term is tried
     tries: int = 3  # terms tried in a row
-    plain_is_enough: float = (
-        1.5  # times the residual of the larger library, the textbook's may have
-    )
     gain: float = 0.05  # of the held-out cost, that a term has to bring
     choices: int = 3  # of the friction, each close to the fit with the one before
     sharper: float = 1.5  # times smaller standard errors, at which shorter arcs are tried
@@ -102,58 +82,9 @@ def search(
     d = observation.dim
     gauge = np.concatenate([n.x[:, :d] for n in nodes])
     benches = {hold: Workbench(gauge, u, scales.omega, observation) for hold, u in inputs.items()}
-    sensors = tuple(zip(observation.parameters, map(float, observation.values), strict=True))
-    shifted = observation.shifts()
-    turned = tuple(i for i in angles if i in observation.direct and i not in shifted)  # with a zero
-
-    def length(periods: float) -> int:
-        return max(6, round(periods * scales.per_period))
-
-    linear = libraries.losses(d, (LINEAR,), 0.0)
-    starts: list[LawFit] = []
-
-    def start(rows: Sequence[Row], friction: Sequence[Loss] = linear) -> tuple[Row, ...] | None:
-        """Terms of this library that the weak form shows, whose fit is then among the starts; None
-        where it does not determine them."""
-        nonlocal benches
-        terms = libraries.without_forces(rows, shifted)
-        library = Structure(d, terms, tuple(friction), (), num_inputs, sensors)
-        try:
-            structure, known = weak_start(library, nodes, scales)
-        except FitError:
-            return None
-        zeros = tuple(i for i in turned if any(row[2][i] for row in structure.terms))
-        structure = structure.plus(
-            [("loss", row) for row in linear[:d]] + [("zero", i) for i in zeros]
-        )
-        if all(structure.terms != other.structure.terms for other in starts):
-            arcs = arcs_of(nodes, length(options.periods[0]))
-            rule = choose_rule(benches, nodes, structure, known, arcs, scales.sigma, scales.dt)
-            benches = {rule.hold: rule.bench}  # inputs act so in the other libraries too
-            starts.append(rule.fit)
-            on_progress(f"{options.periods[0]:g} periods: {describe(starts[-1])}")
-        return structure.terms
-
-    def misfit(fit: LawFit) -> float:
-        finite = np.isfinite(fit.fitted.cost)
-        return float(np.max(fit.rms() / scales.sigma)) if finite else np.inf
-
-    plain = [start(libraries.textbook(d, angles))]
-    if d > 1 and len(angles) == d:
-        plain.append(start(libraries.relative(d, angles)))
-    start(libraries.first(d, angles))
-    if d > 1 and not any(misfit(fit) < _FOLLOWED for fit in starts):
-        plain.append(start(libraries.uncoupled(d, angles), linear[:d]))
-        start(libraries.bodies(d, angles), linear[:d])
-    if not starts:
-        raise no_law(scales)
-    (bench,) = benches.values()
-    best = min(map(misfit, starts))
-    simple = [
-        fit for fit in starts
-        if fit.structure.terms in plain and misfit(fit) <= options.plain_is_enough * best
-    ]  # fmt: skip
-    fit = min(simple or starts, key=misfit)
+    bench, fit = best_start(
+        nodes, scales, angles, num_inputs, benches, observation, options.periods[0], on_progress
+    )
     every = everything(angles, num_inputs, observation, options)
     nodes = with_states(nodes, fit.arcs, fit.fitted.x)
     if len(fit.structure.uncoupled) > 1:  # what couples them is seen best along short arcs
@@ -337,17 +268,6 @@ def to_longer_arcs(
         return None
     longer = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
     return longer if np.isfinite(longer.fitted.cost) else None
-
-
-def describe(fit: LawFit) -> str:
-    """A line for people; residuals in units of their channels' standard deviations."""
-    share = 100 * fit.rms() / np.nanstd(fit.arcs.y, axis=(0, 1))
-    rms = ", ".join(f"{r:.2g}" for r in share)
-    return (
-        f"{len(fit.p)} coefficients, RMS residual {rms} % of the spread, correlated over "
-        f"{fit.correlation:.1f} samples, {fit.fitted.iterations} iterations"
-        + ("" if fit.fitted.converged else ", not converged")
-    )
 
 
 def _word(bench: Workbench, key: Key) -> str:

@@ -8,7 +8,8 @@ import numpy as np
 
 from gfnn_jax.dataset.stretches import Nodes, Scales
 from gfnn_jax.errors import FitError
-from gfnn_jax.models.lagrangians.structure import Key, Structure
+from gfnn_jax.models.lagrangians.libraries import SINE
+from gfnn_jax.models.lagrangians.structure import Key, Loss, Row, Structure
 from gfnn_jax.models.lagrangians.weak_form import weak_rows
 
 _LENGTHS = (0.5, 1.0)  # of the windows, in periods
@@ -73,6 +74,29 @@ def weak_start(
         del keep[int(np.argmin(z))]
     kept = {keys[k]: float(value) for k, value in zip(keep, c, strict=True)}
     return structure.without({k for k in keys if k not in kept}), kept
+
+
+def zeros_of_angles(
+    terms: Sequence[Row], friction: Sequence[Loss], num_inputs: int, nodes: Sequence[Nodes],
+    scales: Scales,
+) -> np.ndarray:  # fmt: skip
+    """Zeros (d,) of angles, up to a quarter of a turn, from which their own potentials cos q_i have
+    no sine; 0 of coordinates without.
+
+    Raises FitError as `weak_start`.
+    """
+    sines = [(*row[:3], row[3] + SINE) for row in terms if any(row[2])]
+    structure = Structure(len(terms[0][0]), (*terms, *sines), tuple(friction), (), num_inputs)
+    known = weak_start(structure, nodes, scales, prune=False)[1]
+    zeros = np.zeros(structure.dim)
+    for row in terms:
+        speeds, powers, wave, phase = row
+        if any(speeds) or any(powers) or sum(map(abs, wave)) != 1:
+            continue
+        own = known.get(("term", row), 0.0), known.get(("term", (*row[:3], phase + SINE)), 0.0)
+        if any(own):
+            zeros[list(map(abs, wave)).index(1)] = np.arctan2(own[1], own[0])
+    return np.where(np.abs(zeros) > np.pi / 2, zeros - np.pi * np.sign(zeros), zeros)
 
 
 def _solve(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,8 +1,9 @@
-"""Coordinates that nothing couples: each part of L has a scale of its own; laws of bodies in
-potentials of lengths, from positions."""
+"""Laws of recordings that the textbook's library does not start: coordinates that nothing couples,
+bodies in potentials of lengths, zeros of angles that are far off."""
 
 import numpy as np
 import pytest
+import sympy as sp
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
@@ -40,7 +41,6 @@ def test_a_trap_whose_axes_are_not_coupled_has_its_law():
     assert kind == "uniform"
 
 
-@pytest.mark.slow
 def test_two_pendulums_in_one_file_have_their_laws():
     both = recorded(
         lambda q, v: -np.array([1.0, 2.3]) * np.sin(q) - 0.01 * v, [1, 1.7, 0, 0], ["a", "b"],
@@ -75,6 +75,38 @@ def test_a_quartic_spring_of_five_periods_is_seen():
     )  # fmt: skip
     found = coefficients(gfnn.fit(spring).lagrangian)
     assert found["x**4"] == pytest.approx(-0.2175, rel=1e-3)
+
+
+@pytest.mark.parametrize("zero", [1.3, -2.0])
+def test_an_encoder_that_was_switched_on_anywhere(zero):
+    """Of a pendulum: 2 cos(theta − zero), whichever of cos and sin has the smaller phase."""
+    swings = recorded(
+        lambda q, v: -2 * np.sin(q - zero) - 0.02 * v, [zero + 1, 0], ["theta"], angles=["theta"]
+    )  # fmt: skip
+    _, potential = gfnn.fit(swings).lagrangian.terms
+    law = sp.sympify(str(potential.coefficient)) * sp.sympify(potential.term)
+    at = np.linspace(-3, 3, 7)
+    np.testing.assert_allclose(
+        sp.lambdify(sp.Symbol("theta"), law)(at), 2 * np.cos(at - zero), atol=1e-4
+    )
+
+
+def test_two_encoders_that_were_switched_on_anywhere():
+    """Zeros of 1 and −0.7 rad: from 0 no fit finds them."""
+
+    def acceleration(q, v):
+        a, b = q - np.array([1.0, -0.7])
+        c, s = 0.4 * np.cos(a - b), 0.4 * np.sin(a - b)
+        force = [-s * v[1] ** 2 - 20 * np.sin(a), s * v[0] ** 2 - 8 * np.sin(b)]
+        return np.linalg.solve([[1.0, c], [c, 0.5]], force - 0.02 * v)
+
+    pair = recorded(
+        acceleration, [2.2, -1.3, 0, 0], ["theta1", "theta2"], 12.0, 1_200, 1e-3,
+        angles=["theta1", "theta2"],
+    )  # fmt: skip
+    terms = gfnn.fit(pair).lagrangian.terms
+    sizes = sorted(abs(term.coefficient) for term in terms)
+    assert sizes == pytest.approx([0.25, 0.4, 0.5, 8.0, 20.0], rel=2e-3)
 
 
 def test_a_recording_of_too_few_samples_is_refused_by_their_number():

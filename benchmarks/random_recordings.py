@@ -1,0 +1,279 @@
+"""Random recordings: systems, sampling, noise and friction are drawn, and what comes out is judged.
+
+    python benchmarks/random_recordings.py            every system (a quarter of an hour)
+    python benchmarks/random_recordings.py --quick    two recordings of each, into runs/
+
+Each recording begins at rest, as a body that is let go, and has 3 to 150 samples a period, 5 to 40
+periods, noise up to 3 % of the spread, steps of the sensor up to 1 % or none, and linear,
+quadratic, dry or no friction. Only angles are told. The law is the text of the formula, read by
+SymPy and integrated by SciPy: forecasts of a period from true states along the recording are
+compared with the truth. A law is *right* whose median forecast errs by less than 2 % of the spread,
+or by less than the noise; *said* of others is where a message warns, or the horizon of 20 % is
+shorter than a period.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy as sp
+from harness import TABLES, Numbers, between_markers, main, markdown, number, once, provenance
+from harness import results as results_of
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.errors import FitError
+
+DRAWS, QUICK = 24, 2
+SAMPLES, PERIODS = (3.0, 150.0), (5.0, 40.0)  # samples a period, and periods
+NOISES = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 3e-2)  # of the spread
+STEPS = (0.0, 0.0, 0.0, 1e-3, 1e-2)  # of the sensor, of the largest spread
+KINDS, SHARES = ("none", "linear", "quadratic", "dry"), (0.2, 0.5, 0.15, 0.15)
+RIGHT = 0.02  # of the spread
+FEW = 8.0  # samples a period
+MOST, LEAST = 4_000, 30  # samples
+_SMOOTH = 1e-3  # of the speeds, over which dry friction turns
+_STARTS, _AHEAD = 11, 10
+
+Force = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+class System(NamedTuple):
+    """force(q, v) -> accelerations without friction, in units of 1/ω; masses(q) that friction is
+    divided by; where it is let go; which coordinates are angles."""
+
+    force: Force
+    masses: Callable[[np.ndarray], np.ndarray]
+    start: np.ndarray
+    angles: tuple[int, ...] = ()
+
+
+def pendulum(rng: np.random.Generator) -> System:
+    return System(lambda q, v: -np.sin(q), _unit(1), rng.uniform(0.3, 2.8, 1), (0,))
+
+
+def spring(rng: np.random.Generator) -> System:
+    hardening = rng.uniform(-0.5, 2)
+    return System(lambda q, v: -q - hardening * q**3, _unit(1), rng.uniform(0.5, 1, 1))
+
+
+def trap(rng: np.random.Generator) -> System:
+    stiffness = np.array([1.0, rng.uniform(0.3, 3)])
+    return System(lambda q, v: -stiffness * q, _unit(2), rng.uniform(0.3, 1, 2))
+
+
+def two_pendulums(rng: np.random.Generator) -> System:
+    weights = np.array([1.0, rng.uniform(0.3, 3)])
+    return System(lambda q, v: -weights * np.sin(q), _unit(2), rng.uniform(0.4, 2.2, 2), (0, 1))
+
+
+def carts(rng: np.random.Generator) -> System:
+    masses = np.diag([1.0, rng.uniform(0.5, 2)])
+    between = rng.uniform(0.3, 2)
+    stiffness = np.array([[1 + between, -between], [-between, 1 + between]])
+    return _solved(lambda q, v: -stiffness @ q, lambda q: masses, rng.normal(size=2))
+
+
+def henon_heiles(rng: np.random.Generator) -> System:
+    def force(q, v):
+        return np.array([-q[0] - 2 * q[0] * q[1], -q[1] - q[0] ** 2 + q[1] ** 2])
+
+    return System(force, _unit(2), rng.uniform(-0.35, 0.35, 2))
+
+
+def double_pendulum(rng: np.random.Generator) -> System:
+    a, weight = rng.uniform(0.2, 0.6), rng.uniform(0.3, 0.8)
+
+    def masses(q):
+        c = np.cos(q[0] - q[1])
+        return np.array([[1, a * c], [a * c, a]])
+
+    def force(q, v):
+        s = a * np.sin(q[0] - q[1])
+        return np.array([-s * v[1] ** 2 - np.sin(q[0]), s * v[0] ** 2 - weight * a * np.sin(q[1])])
+
+    start = rng.uniform(0.4, 2.2, 2) * rng.choice([-1, 1], 2)
+    return _solved(force, masses, start, (0, 1))
+
+
+def pendulum_on_a_cart(rng: np.random.Generator) -> System:
+    m = rng.uniform(0.2, 0.8)
+
+    def masses(q):
+        return np.array([[1, m * np.cos(q[1])], [m * np.cos(q[1]), m]])
+
+    def force(q, v):
+        return np.array([m * v[1] ** 2 * np.sin(q[1]) - 0.5 * q[0], -m * np.sin(q[1])])
+
+    start = np.array([rng.uniform(-0.5, 0.5), rng.uniform(0.5, 2.2)])
+    return _solved(force, masses, start, (1,))
+
+
+def _unit(dim: int) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda q: np.eye(dim)
+
+
+def _solved(force: Force, masses, start: np.ndarray, angles: tuple[int, ...] = ()) -> System:
+    return System(lambda q, v: np.linalg.solve(masses(q), force(q, v)), masses, start, angles)
+
+
+SYSTEMS = {
+    "pendulum": pendulum, "spring": spring, "trap": trap, "two pendulums": two_pendulums,
+    "carts": carts, "Hénon–Heiles": henon_heiles, "double pendulum": double_pendulum,
+    "pendulum on a cart": pendulum_on_a_cart,
+}  # fmt: skip
+
+
+def friction(kind: str, size: float, v: np.ndarray) -> np.ndarray:
+    """Force of friction on each coordinate."""
+    of_speed = {"none": 0 * v, "linear": v, "quadratic": v * np.abs(v),
+                "dry": 0.3 * np.tanh(v / _SMOOTH)}  # fmt: skip
+    return -size * of_speed[kind]
+
+
+def integrated(acceleration: Force, q, v, t: np.ndarray) -> np.ndarray:
+    """States (n, 2d) at times t from positions and velocities."""
+    d = len(q)
+
+    def rates(_, z):
+        return np.concatenate([z[d:], acceleration(z[:d], z[d:])])
+
+    done = solve_ivp(rates, (0, t[-1]), [*q, *v], t_eval=t, rtol=1e-9, atol=1e-11)
+    if not done.success:
+        raise ArithmeticError(done.message)
+    return done.y.T
+
+
+def law_of(fit: Any, width: float) -> Force:
+    """q̈ of the formulas of L and R, read by SymPy; dry friction turns over speeds of ``width``."""
+    names = tuple(fit.map.sensors.positions)
+    q = [sp.Symbol(name, real=True) for name in names]
+    v = [sp.Symbol(name.replace("x", "v"), real=True) for name in names]
+    known = {str(s): s for s in (*q, *v)} | {"abs": sp.Abs, "cos": sp.cos, "sin": sp.sin}
+    L, R = (
+        sp.parse_expr(text, local_dict=known)
+        for text in (fit.lagrangian.formula, fit.friction.formula or "0")
+    )
+    mass = sp.hessian(L, v)
+    left = [
+        sp.diff(L, x) - sum(sp.diff(L, s, y) * w for y, w in zip(q, v, strict=True)) - sp.diff(R, s)
+        for x, s in zip(q, v, strict=True)
+    ]
+    of_mass = sp.lambdify((*q, *v), mass)
+    of_force = sp.lambdify((*q, *v), left, [{"sign": lambda s: np.tanh(s / width)}, "numpy"])
+
+    def acceleration(q, v):
+        force = np.array(of_force(*q, *v), float)
+        return np.linalg.solve(np.array(of_mass(*q, *v), float), force)
+
+    return acceleration
+
+
+def case(name: str, draw: int) -> Numbers:
+    rng = np.random.default_rng([list(SYSTEMS).index(name), draw])
+    system = SYSTEMS[name](rng)
+    omega, size = 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(-2.5, -1)
+    kind = str(rng.choice(KINDS, p=SHARES))
+    samples, periods = np.exp([rng.uniform(*np.log(ends)) for ends in (SAMPLES, PERIODS)])
+    noise, step = rng.choice(NOISES), rng.choice(STEPS)
+    count = int(np.clip(samples * periods, LEAST, MOST))
+    t, d = 2 * np.pi / omega / samples * np.arange(count), len(system.start)
+
+    def truth(q, v):
+        rubbed = np.linalg.solve(system.masses(q), friction(kind, size, v / omega))
+        return omega**2 * (system.force(q, v / omega) + rubbed)
+
+    states = integrated(truth, system.start, 0 * system.start, t)
+    q = states[:, :d]
+    spread = q.std(axis=0)
+    seen = q + noise * spread * rng.normal(size=q.shape)
+    if step:
+        step *= spread.max()
+        seen = step * np.round(seen / step)
+    names = [f"x{i}" for i in range(1, d + 1)]
+    columns = dict(zip(names, seen.T, strict=True))
+    recording = gfnn.Recording(
+        {"t": t, **columns}, positions=names, angles=[names[i] for i in system.angles]
+    )
+    found: Numbers = {
+        "draw": draw, "friction": kind, "samples": float(samples), "count": count,
+        "noise": float(noise), "step": float(step),
+    }  # fmt: skip
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", gfnn.FitWarning)  # kept in fit.messages
+            done = once(lambda: gfnn.fit(recording))
+    except FitError as error:
+        return found | {"refused": str(error)}
+    fit: Any = done.out
+    period = 2 * np.pi / omega
+    ahead = period * np.arange(_AHEAD + 1) / _AHEAD
+    law, errors = law_of(fit, _SMOOTH * omega), []
+    for k in np.linspace(0, count - 1, _STARTS).astype(int):
+        start = states[k, :d], states[k, d:]
+        try:
+            miss = integrated(law, *start, ahead) - integrated(truth, *start, ahead)
+            errors.append(np.sqrt(np.mean((miss[1:, :d] / spread) ** 2)))
+        except (ArithmeticError, np.linalg.LinAlgError):
+            errors.append(np.inf)
+    error = float(np.median(errors))
+    return found | {
+        "formula": fit.formula, "rubs": fit.friction.formula,
+        "error": error if np.isfinite(error) else None, "right": error < max(RIGHT, noise),
+        "said": bool(fit.messages) or fit.horizon[-1].measured < period,
+        "messages": list(fit.messages), "processor_seconds": done.processor_seconds,
+    }  # fmt: skip
+
+
+def measured(name: str, quick: bool) -> Numbers:
+    cases = []
+    for draw in range(QUICK if quick else DRAWS):
+        c = case(name, draw)
+        cases.append(c)
+        what = (
+            c.get("refused")
+            or f"{c['error']}, {'right' if c['right'] else 'wrong'}; {c['formula']}"
+        )
+        print(
+            f"  {draw}: {c['samples']:.1f} samples a period, {c['friction']}: {what[:110]}",
+            flush=True,
+        )
+    return {"cases": cases}
+
+
+def _piece(name: str) -> Callable[[bool], Numbers]:
+    return lambda quick: measured(name, quick)
+
+
+PIECES = {name.lower().replace("é", "e").replace("–", "-").replace(" ", "-"): _piece(name)
+          for name in SYSTEMS}  # fmt: skip
+
+
+def tables() -> None:
+    """The table of RESULTS.md."""
+    found = results_of(PIECES, "random")
+    if not found:
+        return
+    rows = []
+    for result, name in ((found[p], n) for p, n in zip(PIECES, SYSTEMS, strict=True) if p in found):
+        for label, often in ((f"{FEW:g} or more", True), (f"under {FEW:g}", False)):
+            cases = [c for c in result["measured"]["cases"] if (c["samples"] >= FEW) == often]
+            laws = [c for c in cases if "formula" in c]
+            errors = [np.inf if c["error"] is None else c["error"] for c in laws if c["right"]]
+            wrong = [c for c in laws if not c["right"]]
+            rows.append([
+                name, label, str(len(cases)), str(len(errors)), str(len(cases) - len(laws)),
+                str(sum(c["said"] for c in wrong)), str(sum(not c["said"] for c in wrong)),
+                number(np.median(errors)) if errors else "–",
+                number(np.mean([c["processor_seconds"] for c in laws])) if laws else "–",
+            ])  # fmt: skip
+    heads = ("system", "samples a period", "recordings", "right", "refused", "wrong, and said",
+             "wrong, not said", "median error of the right, a period ahead", "CPU s")  # fmt: skip
+    between_markers(TABLES, "random-recordings", f"{markdown(heads, rows)}\n\n{provenance(found)}")
+
+
+if __name__ == "__main__":
+    main(__doc__ or "", PIECES, "random", tables, None)
