@@ -27,7 +27,7 @@ from gfnn_jax.flows.schedules import HOLDS, at_stages, interpolate
 from gfnn_jax.jobs.forecast import forecast_recording
 from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate, propagate_each
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.input_rules import choose_again
+from gfnn_jax.models.lagrangians.input_rules import _costs_more, choose_again
 from gfnn_jax.models.lagrangians.recordings import _samples
 from gfnn_jax.models.lagrangians.search import search, search_on
 from gfnn_jax.models.lagrangians.text import speed_names, terms_of
@@ -681,3 +681,10 @@ def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs(tmp_path):
     )  # fmt: skip
     rows = np.genfromtxt(out, delimiter=",", names=True)
     assert np.abs(rows["x"] - x[500:599]).max() < 0.02
+
+
+def test_costs_that_are_both_infinite_are_alike():
+    """Of arcs that no rule between samples follows."""
+    one, other = np.array([np.inf, 1.0, 2.0]), np.array([np.inf, 1.0, 2.1])
+    assert not _costs_more(other, one)
+    assert _costs_more(np.array([np.inf, np.inf, 2.0]), one)
