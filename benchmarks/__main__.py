@@ -53,8 +53,10 @@ def main(argv: Sequence[str]) -> int:
         return 0
     unknown = [name for name in names if name not in known]
     if unknown:
-        print(f"expected studies of this folder, got '{unknown[0]}'; there are "
-              f"{', '.join(known)}", file=sys.stderr)  # fmt: skip
+        print(
+            f"expected studies of this folder, got '{unknown[0]}'; there are {', '.join(known)}",
+            file=sys.stderr,
+        )
         return 2
     if "--check" in options:
         if set(options) - {"--check", "--tell"}:
@@ -67,8 +69,11 @@ def main(argv: Sequence[str]) -> int:
     paths = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     failed = []
     for name in names or known:
-        done = subprocess.run([sys.executable, HERE / f"{name}.py", *options], check=False,
-                              env=os.environ | {"PYTHONPATH": paths})  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, HERE / f"{name}.py", *options],
+            check=False,
+            env=os.environ | {"PYTHONPATH": paths},
+        )
         if done.returncode:
             failed.append(name)
     if failed:

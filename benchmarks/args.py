@@ -83,21 +83,38 @@ def pendulum(z, t=0.0, args=None):
 
 
 KEPLER = Scene(
-    "kepler-mass", "planets of stars of different masses", 2, 0.2, DrawnFrom(Ellipses()),
-    hamiltonian=kepler_of_mass, parameters=("m",),
-)  # fmt: skip
+    "kepler-mass",
+    "planets of stars of different masses",
+    2,
+    0.2,
+    DrawnFrom(Ellipses()),
+    hamiltonian=kepler_of_mass,
+    parameters=("m",),
+)
 
 PENDULUM = Scene(
-    "pendulum", "a pendulum of unit length, mass and gravity", 1, 0.25,
-    DrawnFrom(Swings(2.6)), test_states=DrawnFrom(Swings(2.2)), hamiltonian=pendulum,
-    coordinates=Coordinates("cartesian", angles=(0,)), reversor=(1, -1),
-)  # fmt: skip
+    "pendulum",
+    "a pendulum of unit length, mass and gravity",
+    1,
+    0.25,
+    DrawnFrom(Swings(2.6)),
+    test_states=DrawnFrom(Swings(2.2)),
+    hamiltonian=pendulum,
+    coordinates=Coordinates("cartesian", angles=(0,)),
+    reversor=(1, -1),
+)
 
 
 def learned(
-    scene: Scene, num_pairs: int, quick: bool, *, dt_range=None, dt: float | None = None,
-    lend: bool = False, **options,
-) -> Numbers:  # fmt: skip
+    scene: Scene,
+    num_pairs: int,
+    quick: bool,
+    *,
+    dt_range=None,
+    dt: float | None = None,
+    lend: bool = False,
+    **options,
+) -> Numbers:
     """Figures of the law of these pairs. dt: at which it is judged. lend: the scene's coordinates
     and reversor are told."""
     key, fresh = jax.random.split(jax.random.key(SEED))
@@ -113,34 +130,45 @@ def learned(
     key = jax.random.key(SEED + 2)
     z0 = gfnn.sample_test_states(scene, ORBITS, key)
     params = sample_params(scene, ORBITS, key, test=True)
-    reference = gfnn.reference_trajectories(
-        judged, z0, STEPS, save_every=STEPS, params=params
-    )[:, -1:]  # fmt: skip
+    reference = gfnn.reference_trajectories(judged, z0, STEPS, save_every=STEPS, params=params)[
+        :, -1:
+    ]
     halved = dataclasses.replace(judged, dt=0.5 * judged.dt)
-    again = gfnn.reference_trajectories(
-        halved, z0, 2 * STEPS, save_every=2 * STEPS, params=params
-    )[:, -1:]  # fmt: skip
+    again = gfnn.reference_trajectories(halved, z0, 2 * STEPS, save_every=2 * STEPS, params=params)[
+        :, -1:
+    ]
     predicted, ended = fit.map.rollout(z0, STEPS, params=params, dt=judged.dt, save_every=STEPS)
     angles = fit.map.coordinates.angles
     error = gfnn.metrics.position_error(np.asarray(predicted)[:, -1:], reference, angles)
     own = gfnn.metrics.position_error(again, reference, angles)
-    begun, with_params = (None if a is None else np.resize(a, (BATCH, a.shape[1]))
-                          for a in (np.asarray(z0), params))  # fmt: skip
+    begun, with_params = (
+        None if a is None else np.resize(a, (BATCH, a.shape[1])) for a in (np.asarray(z0), params)
+    )
     rolled = timed(
         lambda: fit.map.rollout(
-            begun, 10 if quick else 100, params=with_params, dt=judged.dt,
+            begun,
+            10 if quick else 100,
+            params=with_params,
+            dt=judged.dt,
             save_every=10 if quick else 100,
         )
-    )  # fmt: skip
+    )
     return {
-        "pairs": num_pairs, "judged_at_dt": judged.dt, "num_terms": fit.chosen.num_parameters,
-        "one_step_rms": one, "error_median": float(np.median(error)),
-        "error_largest": float(np.max(error)), "reference_error": float(np.max(own)),
-        "outside": int(np.sum(np.asarray(ended.status) > 0)), "fit_seconds": fit.chosen.fit_seconds,
+        "pairs": num_pairs,
+        "judged_at_dt": judged.dt,
+        "num_terms": fit.chosen.num_parameters,
+        "one_step_rms": one,
+        "error_median": float(np.median(error)),
+        "error_largest": float(np.max(error)),
+        "reference_error": float(np.max(own)),
+        "outside": int(np.sum(np.asarray(ended.status) > 0)),
+        "fit_seconds": fit.chosen.fit_seconds,
         "microseconds_per_step": 1e6 * rolled.seconds / ((10 if quick else 100) * BATCH),
-        "symplecticity_defect": fit.symplecticity_defect, "formula": fit.formula,
-        "messages": list(fit.messages), "statuses": int(np.sum(np.asarray(info.status) > 0)),
-    }  # fmt: skip
+        "symplecticity_defect": fit.symplecticity_defect,
+        "formula": fit.formula,
+        "messages": list(fit.messages),
+        "statuses": int(np.sum(np.asarray(info.status) > 0)),
+    }
 
 
 def irregular(quick: bool) -> Numbers:
@@ -192,13 +220,20 @@ def standard_map(quick: bool) -> Numbers:
     one = gfnn.metrics.one_step_rms(np.asarray(states), kicked(z, strength), (0, 1))
     rolled = timed(lambda: fit.map.rollout(z, 100, params=strength, save_every=100))
     return {
-        "pairs": len(pairs), "judged_at_dt": 1.0, "num_terms": fit.chosen.num_parameters,
-        "one_step_rms": one, "error_median": None, "error_largest": None, "reference_error": None,
-        "outside": int(np.sum(np.asarray(info.status) > 0)), "fit_seconds": fit.chosen.fit_seconds,
+        "pairs": len(pairs),
+        "judged_at_dt": 1.0,
+        "num_terms": fit.chosen.num_parameters,
+        "one_step_rms": one,
+        "error_median": None,
+        "error_largest": None,
+        "reference_error": None,
+        "outside": int(np.sum(np.asarray(info.status) > 0)),
+        "fit_seconds": fit.chosen.fit_seconds,
         "microseconds_per_step": 1e6 * rolled.seconds / (100 * BATCH),
         "symplecticity_defect": fit.symplecticity_defect,
-        "terms": list(fit.map.pieces[0].family.term_names), "messages": list(fit.messages),
-    }  # fmt: skip
+        "terms": list(fit.map.pieces[0].family.term_names),
+        "messages": list(fit.messages),
+    }
 
 
 def driven(quick: bool, num_pairs: int = 4_000, **options) -> Numbers:
@@ -227,14 +262,22 @@ def driven(quick: bool, num_pairs: int = 4_000, **options) -> Numbers:
     timed_steps = 10 if quick else 100
     rolled = timed(lambda: fit.map.rollout(begun, timed_steps, t0=at, save_every=timed_steps))
     return {
-        "pairs": num_pairs, "judged_at_dt": scene.dt, "num_terms": fit.chosen.num_parameters,
-        "learns": fit.chosen.learns, "one_step_rms": one, "error_median": float(np.median(error)),
-        "error_largest": float(np.max(error)), "reference_error": float(np.max(own)),
-        "outside": int(np.sum(np.asarray(ended.status) > 0)), "fit_seconds": fit.chosen.fit_seconds,
+        "pairs": num_pairs,
+        "judged_at_dt": scene.dt,
+        "num_terms": fit.chosen.num_parameters,
+        "learns": fit.chosen.learns,
+        "one_step_rms": one,
+        "error_median": float(np.median(error)),
+        "error_largest": float(np.max(error)),
+        "reference_error": float(np.max(own)),
+        "outside": int(np.sum(np.asarray(ended.status) > 0)),
+        "fit_seconds": fit.chosen.fit_seconds,
         "microseconds_per_step": 1e6 * rolled.seconds / (timed_steps * BATCH),
-        "symplecticity_defect": fit.symplecticity_defect, "formula": fit.formula,
-        "messages": list(fit.messages), "statuses": int(np.sum(np.asarray(info.status) > 0)),
-    }  # fmt: skip
+        "symplecticity_defect": fit.symplecticity_defect,
+        "formula": fit.formula,
+        "messages": list(fit.messages),
+        "statuses": int(np.sum(np.asarray(info.status) > 0)),
+    }
 
 
 PIECES = {
@@ -262,19 +305,41 @@ PIECES = {
 def tables() -> None:
     """The table of RESULTS.md."""
     heads = (
-        "system", "pairs", "terms", "one-step RMS", "in the end, median", "largest",
-        "of the reference", "outside", "fit, s", "µs a step", "defect",
-    )  # fmt: skip
+        "system",
+        "pairs",
+        "terms",
+        "one-step RMS",
+        "in the end, median",
+        "largest",
+        "of the reference",
+        "outside",
+        "fit, s",
+        "µs a step",
+        "defect",
+    )
     rows = []
     for name, result in results(PIECES, "args").items():
         m = result["measured"]
-        rows.append([
-            name, *(number(m[key]) for key in (
-                "pairs", "num_terms", "one_step_rms", "error_median", "error_largest",
-                "reference_error", "outside", "fit_seconds", "microseconds_per_step",
-                "symplecticity_defect",
-            )),
-        ])  # fmt: skip
+        rows.append(
+            [
+                name,
+                *(
+                    number(m[key])
+                    for key in (
+                        "pairs",
+                        "num_terms",
+                        "one_step_rms",
+                        "error_median",
+                        "error_largest",
+                        "reference_error",
+                        "outside",
+                        "fit_seconds",
+                        "microseconds_per_step",
+                        "symplecticity_defect",
+                    )
+                ),
+            ]
+        )
     between_markers(TABLES, "args", markdown(heads, rows))
 
 

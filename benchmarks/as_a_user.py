@@ -69,8 +69,17 @@ _BEYOND = 0.1  # part of the states that errs by more than nine of ten are said 
 _IN_TIME = 1.2  # times the budget, in processor seconds
 
 CASES: dict[str, Callable[[], Case | Refused]] = {**KNOWN, **TRIED, **REFUSED}
-QUICK = ("single-orbit", "micro-units", "hidden-parameter", "twenty-pairs", "friction", "degrees",
-         "degrees-as-angle", "noise-pendulum-1e-03", *REFUSED)  # fmt: skip
+QUICK = (
+    "single-orbit",
+    "micro-units",
+    "hidden-parameter",
+    "twenty-pairs",
+    "friction",
+    "degrees",
+    "degrees-as-angle",
+    "noise-pendulum-1e-03",
+    *REFUSED,
+)
 
 
 class Learned(NamedTuple):
@@ -101,17 +110,28 @@ def by_python(case: Case) -> Learned:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)  # kept in fit.messages
         fit = gfnn.fit(
-            case.pairs, tolerance=case.tolerance, max_seconds=case.max_seconds, angles=case.angles,
-            clock=time.process_time, **case.options,
-        )  # fmt: skip
+            case.pairs,
+            tolerance=case.tolerance,
+            max_seconds=case.max_seconds,
+            angles=case.angles,
+            clock=time.process_time,
+            **case.options,
+        )
     seconds, chosen = time.process_time() - started, fit.chosen
     return Learned(
-        fit.map, seconds, list(fit.messages), fit.ended, f"{chosen.chart} {chosen.label}",
-        chosen.validation_relative, chosen.validation_bound, fit.met,
+        fit.map,
+        seconds,
+        list(fit.messages),
+        fit.ended,
+        f"{chosen.chart} {chosen.label}",
+        chosen.validation_relative,
+        chosen.validation_bound,
+        fit.met,
         None if fit.noise is None else fit.noise.tolist(),
-        "" if fit.formula is None else f"H = {fit.formula}", fit.formula,
+        "" if fit.formula is None else f"H = {fit.formula}",
+        fit.formula,
         _of_friction(fit),
-    )  # fmt: skip
+    )
 
 
 def _of_friction(fit: gfnn.Fit) -> str:
@@ -129,11 +149,24 @@ def by_command(case: Case) -> Learned:
         data.write_text(case.csv, encoding="utf-8")
         started = _of_children()
         done = subprocess.run(
-            [sys.executable, "-m", "gfnn_jax", "fit", data, "--out", model, "--tolerance",
-             f"{case.tolerance:g}", "--max-seconds", f"{case.max_seconds:g}"],
-            capture_output=True, text=True, check=True,
+            [
+                sys.executable,
+                "-m",
+                "gfnn_jax",
+                "fit",
+                data,
+                "--out",
+                model,
+                "--tolerance",
+                f"{case.tolerance:g}",
+                "--max-seconds",
+                f"{case.max_seconds:g}",
+            ],
+            capture_output=True,
+            text=True,
+            check=True,
             env=os.environ | {"PYTHONPATH": str(HERE.parent)},
-        )  # fmt: skip
+        )
         seconds = _of_children() - started
         report = json.loads((model / "report.json").read_text(encoding="utf-8"))
         map_ = gfnn.load(model)
@@ -142,10 +175,17 @@ def by_command(case: Case) -> Learned:
     said = [line.removeprefix(before) for line in lines if line.startswith(before)]
     law = re.search(r"^.*(H = |partial law).*$", done.stdout, re.MULTILINE)
     return Learned(
-        map_, seconds, said, fit["ended"], f"{chosen['chart']} {chosen['label']}",
-        fit["validation_relative"], fit["validation_bound"], fit["tolerance_met"],
-        report["data"]["noise"], law[0] if law else "",
-    )  # fmt: skip
+        map_,
+        seconds,
+        said,
+        fit["ended"],
+        f"{chosen['chart']} {chosen['label']}",
+        fit["validation_relative"],
+        fit["validation_bound"],
+        fit["tolerance_met"],
+        report["data"]["noise"],
+        law[0] if law else "",
+    )
 
 
 def _of_children() -> float:
@@ -165,8 +205,9 @@ def true_errors(map_: gfnn.SymplecticMap, case: Case) -> np.ndarray:
 def untruths(case: Case, learned: Learned, errors: np.ndarray) -> list[str]:
     """List what the fit said wrongly, or did not say."""
     error = float(np.sqrt(np.mean(errors**2)))
-    said = " ".join([*learned.messages, learned.ended, learned.model, learned.law,
-                     learned.friction])  # fmt: skip
+    said = " ".join(
+        [*learned.messages, learned.ended, learned.model, learned.law, learned.friction]
+    )
     found = [f"not said: {pattern}" for pattern in case.words if not re.search(pattern, said)]
     found += [f"said: {pattern}" for pattern in case.never if re.search(pattern, said)]
     if case.quiet and learned.messages:
@@ -253,13 +294,24 @@ def measure(name: str) -> Numbers:
     errors = true_errors(learned.map, case)
     wrong, error = untruths(case, learned, errors), float(np.sqrt(np.mean(errors**2)))
     return {
-        "seconds": learned.seconds, "in_time": learned.seconds <= _IN_TIME * case.max_seconds,
-        "budget": case.max_seconds, "pairs": len(case.pairs), "dim": case.pairs.dim,
-        "tolerance": case.tolerance, "messages": learned.messages, "ended": learned.ended,
-        "model": learned.model, "law": learned.law, "claimed": learned.claimed,
-        "bound": learned.bound, "true_error": error, "met": learned.met,
-        "noise_ratio": noise_ratio(case, learned), "wrong": wrong, "truthful": not wrong,
-    }  # fmt: skip
+        "seconds": learned.seconds,
+        "in_time": learned.seconds <= _IN_TIME * case.max_seconds,
+        "budget": case.max_seconds,
+        "pairs": len(case.pairs),
+        "dim": case.pairs.dim,
+        "tolerance": case.tolerance,
+        "messages": learned.messages,
+        "ended": learned.ended,
+        "model": learned.model,
+        "law": learned.law,
+        "claimed": learned.claimed,
+        "bound": learned.bound,
+        "true_error": error,
+        "met": learned.met,
+        "noise_ratio": noise_ratio(case, learned),
+        "wrong": wrong,
+        "truthful": not wrong,
+    }
 
 
 def refused(case: Refused) -> Numbers:
@@ -275,11 +327,24 @@ def refused(case: Refused) -> Numbers:
     except Exception as error:  # whatever else is no answer to a user
         said, wrong = f"{type(error).__name__}: {error}".splitlines()[0], ["no error of one's own"]
     return {
-        "seconds": time.process_time() - started, "in_time": True, "budget": None, "pairs": None,
-        "dim": None, "tolerance": None, "messages": [said], "ended": "", "model": "refused",
-        "law": "", "claimed": None, "bound": None, "true_error": None, "met": None,
-        "noise_ratio": None, "wrong": wrong, "truthful": not wrong,
-    }  # fmt: skip
+        "seconds": time.process_time() - started,
+        "in_time": True,
+        "budget": None,
+        "pairs": None,
+        "dim": None,
+        "tolerance": None,
+        "messages": [said],
+        "ended": "",
+        "model": "refused",
+        "law": "",
+        "claimed": None,
+        "bound": None,
+        "true_error": None,
+        "met": None,
+        "noise_ratio": None,
+        "wrong": wrong,
+        "truthful": not wrong,
+    }
 
 
 # Table
@@ -287,8 +352,18 @@ def refused(case: Refused) -> Numbers:
 
 def table(measured: Numbers) -> str:
     """Markdown: a line per case."""
-    heads = ["case", "pairs", "CPU s (of)", "chosen", "claimed", "true error", "met",
-             "noise measured ÷ true", "what was said", "truthful"]  # fmt: skip
+    heads = [
+        "case",
+        "pairs",
+        "CPU s (of)",
+        "chosen",
+        "claimed",
+        "true error",
+        "met",
+        "noise measured ÷ true",
+        "what was said",
+        "truthful",
+    ]
     rows = []
     for name, m in measured.items():
         said = [message.split(":")[0] for message in m["messages"]]
@@ -298,8 +373,18 @@ def table(measured: Numbers) -> str:
         met = {True: "yes", False: "no", None: "–"}[m["met"]]
         within = "" if m["in_time"] else "**"
         seconds = f"{within}{number(m['seconds'])}{within} ({number(m['budget'])})"
-        row = [name, number(m["pairs"]), seconds, m["model"], number(m["claimed"]),
-               number(m["true_error"]), met, noise, said, truthful]  # fmt: skip
+        row = [
+            name,
+            number(m["pairs"]),
+            seconds,
+            m["model"],
+            number(m["claimed"]),
+            number(m["true_error"]),
+            met,
+            noise,
+            said,
+            truthful,
+        ]
         rows.append([cell.replace("|", "/") for cell in row])
     return markdown(heads, rows)
 
@@ -318,8 +403,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="few short cases; no table")
     parser.add_argument("--tables", action="store_true", help="only make the table again")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the result")
-    parser.add_argument(PROCESSOR_TIME, action="store_true",
-                        help="stages too are timed in seconds of the processor")  # fmt: skip
+    parser.add_argument(
+        PROCESSOR_TIME, action="store_true", help="stages too are timed in seconds of the processor"
+    )
     arguments = parser.parse_args(argv)
     chosen = (
         arguments.only.split(",") if arguments.only else list(QUICK if arguments.quick else CASES)
@@ -338,8 +424,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         measured[name] = m = measure(name) | {"code": code}
         measured = {n: measured[n] for n in CASES if n in measured}
         same = all(m.get("code") == code for m in measured.values())  # as old as its oldest case
-        write(path, {"quick": arguments.quick, "measured": measured,
-                     "code": code if same else None})  # fmt: skip
+        write(
+            path, {"quick": arguments.quick, "measured": measured, "code": code if same else None}
+        )
         verdict = "; ".join(m["wrong"]) or "truthful"
         print(
             f"{name}: {m['seconds']:.1f} s, {m['model']}, claimed {number(m['claimed'])}, true "

@@ -37,9 +37,13 @@ from gfnn_jax.models.hamiltonians.choose_law import MAX_COST_RATIO
 
 STEPS, ORBITS, BATCH = 1_000, 100, 1_000
 SCENES = (
-    "two-body", "henon-heiles-regular", "henon-heiles-chaotic", "pcr3bp", "standard-map-regular",
+    "two-body",
+    "henon-heiles-regular",
+    "henon-heiles-chaotic",
+    "pcr3bp",
+    "standard-map-regular",
     "standard-map-chaotic",
-)  # fmt: skip
+)
 
 
 def both(name: str, quick: bool) -> Numbers:
@@ -59,16 +63,21 @@ def both(name: str, quick: bool) -> Numbers:
         z = np.resize(np.asarray(fresh.z0), (BATCH, fresh.z0.shape[1]))
         rolled = timed(lambda m=fit.map, z=z: m.rollout(z, 100, save_every=100)[0], 3)
         found[learn] = {
-            "learns": fit.chosen.learns, "label": f"{fit.chosen.chart} {fit.chosen.label}",
-            "why": why(fit), "met": fit.met, "one_step_rms": one_step_rms(
-                fit.map, fresh, angles_of(scene)),
+            "learns": fit.chosen.learns,
+            "label": f"{fit.chosen.chart} {fit.chosen.label}",
+            "why": why(fit),
+            "met": fit.met,
+            "one_step_rms": one_step_rms(fit.map, fresh, angles_of(scene)),
             "error_median": float(np.median(np.where(known, error, np.inf))),
-            "error_mean": float(np.mean(error[known])), "lost": int((~known).sum()),
+            "error_mean": float(np.mean(error[known])),
+            "lost": int((~known).sum()),
             "left_domain": int(np.sum(np.asarray(info.status) > 0)),
             "microseconds_per_step": 1e6 * rolled.seconds / (100 * BATCH),
-            "fit_seconds": fit.seconds, "formula": fit.formula, "ended": fit.ended,
+            "fit_seconds": fit.seconds,
+            "formula": fit.formula,
+            "ended": fit.ended,
             "messages": list(fit.messages),
-        }  # fmt: skip
+        }
     return found
 
 
@@ -94,20 +103,38 @@ PIECES = {name: partial(both, name) for name in SCENES}
 def tables() -> None:
     """The table of RESULTS.md."""
     heads = (
-        "scene", "learn", "chosen", "one-step RMS", "median at step 1,000", "lost", "µs a step",
-        "fit, s", "why",
-    )  # fmt: skip
+        "scene",
+        "learn",
+        "chosen",
+        "one-step RMS",
+        "median at step 1,000",
+        "lost",
+        "µs a step",
+        "fit, s",
+        "why",
+    )
     found, rows = results(PIECES, "auto"), []
     for name, result in found.items():
         for learn in ("auto", "map"):
             m = result["measured"][learn]
-            rows.append([
-                name if learn == "auto" else "", learn, m["label"],
-                *(number(m[key]) for key in (
-                    "one_step_rms", "error_median", "lost", "microseconds_per_step", "fit_seconds",
-                )),
-                m["why"] if learn == "auto" else "",
-            ])  # fmt: skip
+            rows.append(
+                [
+                    name if learn == "auto" else "",
+                    learn,
+                    m["label"],
+                    *(
+                        number(m[key])
+                        for key in (
+                            "one_step_rms",
+                            "error_median",
+                            "lost",
+                            "microseconds_per_step",
+                            "fit_seconds",
+                        )
+                    ),
+                    m["why"] if learn == "auto" else "",
+                ]
+            )
     between_markers(TABLES, "auto", f"{markdown(heads, rows)}\n\n{provenance(found)}")
 
 

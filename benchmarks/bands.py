@@ -53,7 +53,11 @@ CASES = {
         calibrated, henon_heiles, lend=False, data_sets=SETS_OF_LAWS, learn="hamiltonian"
     ),
     "two-body-law": partial(
-        calibrated, two_body, lend=False, data_sets=SETS_OF_LAWS, learn="hamiltonian",
+        calibrated,
+        two_body,
+        lend=False,
+        data_sets=SETS_OF_LAWS,
+        learn="hamiltonian",
         terms=KEPLER_TERMS,
     ),
     "pendulum-law": partial(
@@ -67,10 +71,8 @@ CASES = {
     "ring-32": partial(
         calibrated, partial(froeschle, 32), lend=True, data_sets=SETS_OF_RINGS, learn="map"
     ),
-    "ensemble": partial(
-        calibrated, henon_heiles, lend=False, data_sets={500: 3}, **NETWORKS
-    ),
-}  # fmt: skip
+    "ensemble": partial(calibrated, henon_heiles, lend=False, data_sets={500: 3}, **NETWORKS),
+}
 PIECES = {
     **{
         f"{case}-{sigma}": partial(calibrate, sigma=SIGMAS[sigma])
@@ -92,21 +94,29 @@ def calibration() -> dict[str, list[dict[str, Any]]]:
     found = results(PIECES, "bands")
     return {
         case: [
-            row for sigma in SIGMAS if (name := f"{case}-{sigma}") in found
+            row
+            for sigma in SIGMAS
+            if (name := f"{case}-{sigma}") in found
             for row in found[name]["measured"]["rows"]
         ]
         for case in CASES
-    }  # fmt: skip
+    }
 
 
 def _calibration_table(found: dict[str, list[dict[str, Any]]]) -> str:
     head = ["case", "σ ÷ spread", "pairs × data sets", "chosen"]
     head += [f"step {k:,}: covered %, width ÷ RMS, RMS" for k in STEPS]
     rows = [
-        [case, f"{row['sigma']:g}", f"{row['pairs']:,} × {sum(row['labels'].values())}",
-         _labels(row["labels"]), *(_cell(c) for c in cells(row))]
-        for case, of_case in found.items() for row in of_case
-    ]  # fmt: skip
+        [
+            case,
+            f"{row['sigma']:g}",
+            f"{row['pairs']:,} × {sum(row['labels'].values())}",
+            _labels(row["labels"]),
+            *(_cell(c) for c in cells(row)),
+        ]
+        for case, of_case in found.items()
+        for row in of_case
+    ]
     return markdown(head, rows)
 
 
@@ -139,11 +149,18 @@ def _noise_table(found: dict[str, Numbers]) -> str:
         m = found[name]["measured"] if name in found else {"runs": ()}
         for run in m["runs"]:
             noise = ", ".join(f"{1e3 * s:.2f}" for s in run["noise"] or ()) or "–"
-            rows.append([str(m["dt"]), str(run["terms"]), noise,
-                         *(f"{r:.1e}" for r in run["rms_of_all"])])  # fmt: skip
+            rows.append(
+                [str(m["dt"]), str(run["terms"]), noise, *(f"{r:.1e}" for r in run["rms_of_all"])]
+            )
         if m["runs"]:
-            rows.append([str(m["dt"]), "all", "bands: covered %, width ÷ RMS, RMS",
-                         *(_cell(c) for c in cells(m))])  # fmt: skip
+            rows.append(
+                [
+                    str(m["dt"]),
+                    "all",
+                    "bands: covered %, width ÷ RMS, RMS",
+                    *(_cell(c) for c in cells(m)),
+                ]
+            )
     return markdown(head, rows)
 
 
@@ -154,9 +171,7 @@ def _told_table(found: dict[str, Numbers]) -> str:
         ratios = [r for of_fit in row["ratios"] for r in of_fit or ()]
         known = sum(r is not None for r in row["ratios"])
         span = f"{min(ratios):.2f} to {max(ratios):.2f}" if ratios else "–"
-        rows.append(
-            [row["case"], f"{row['sigma']:g}", f"{known} of {len(row['ratios'])}", span]
-        )  # fmt: skip
+        rows.append([row["case"], f"{row['sigma']:g}", f"{known} of {len(row['ratios'])}", span])
     return markdown(head, rows)
 
 
@@ -168,22 +183,39 @@ def _kinds_table(found: dict[str, Numbers]) -> str:
         m = found[f"kind-{name}"]["measured"]
         chance = m["coverage_error"] or [None] * len(KIND_STEPS)
         each = zip(KIND_STEPS, m["coverage"], chance, m["width"], m["rms"], strict=True)
-        rows.append([name, str(m["data_sets"]), _labels(m["labels"]),
-                     *(_cell(Cell(*values)) for values in each)])  # fmt: skip
+        rows.append(
+            [
+                name,
+                str(m["data_sets"]),
+                _labels(m["labels"]),
+                *(_cell(Cell(*values)) for values in each),
+            ]
+        )
     return markdown(head, rows)
 
 
 def _cost_table(found: dict[str, Numbers]) -> str:
     m = found["cost"]["measured"] if "cost" in found else {}
-    head = ["map", "samples × states × steps", "as samples, s (CPU s)",
-            "as lanes of one map, s (CPU s)", "ratio (of CPU s)"]  # fmt: skip
+    head = [
+        "map",
+        "samples × states × steps",
+        "as samples, s (CPU s)",
+        "as lanes of one map, s (CPU s)",
+        "ratio (of CPU s)",
+    ]
     rows = [
-        [m[k]["label"], f"{m[k]['samples']} × {m[k]['lanes']:,} × {m[k]['steps']:,}",
-         *(f"{number(m[k]['seconds'][c])} ({number(m[k]['processor_seconds'][c])})"
-           for c in ("samples", "lanes")),
-         f"{number(m[k]['ratio'])} ({number(m[k]['processor_ratio'])})"]
-        for k in COSTS if k in m
-    ]  # fmt: skip
+        [
+            m[k]["label"],
+            f"{m[k]['samples']} × {m[k]['lanes']:,} × {m[k]['steps']:,}",
+            *(
+                f"{number(m[k]['seconds'][c])} ({number(m[k]['processor_seconds'][c])})"
+                for c in ("samples", "lanes")
+            ),
+            f"{number(m[k]['ratio'])} ({number(m[k]['processor_ratio'])})",
+        ]
+        for k in COSTS
+        if k in m
+    ]
     return markdown(head, rows)
 
 
@@ -191,10 +223,15 @@ def _together_table(found: dict[str, Numbers]) -> str:
     head = ["networks trained together", "pairs", "iterations", "s", "models per second"]
     m = found["together"]["measured"] if "together" in found else {"seconds": {}}
     rows = [
-        [count, str(m["pairs"]), str(m["iterations"]), number(seconds),
-         number(m["models_per_second"][count])]
+        [
+            count,
+            str(m["pairs"]),
+            str(m["iterations"]),
+            number(seconds),
+            number(m["models_per_second"][count]),
+        ]
         for count, seconds in m["seconds"].items()
-    ]  # fmt: skip
+    ]
     return markdown(head, rows)
 
 

@@ -105,10 +105,8 @@ SYSTEMS: dict[str, Callable[[], tuple[gfnn.Pairs, gfnn.Pairs]]] = {
         heavy_top, near([0.0, 1.2, 0.0, 0.5, 0.0, 1.0], [1.0, 0.3, 1.0, 0.2, 0.3, 0.2]), 0.1, 2_000
     ),
     "kepler": lambda: drawn(kepler, orbits, 0.1, 1_800),
-    "million-pairs": lambda: drawn(
-        henon_heiles, box([0.3] * 4), 0.3, 1_000_000
-    ),
-}  # fmt: skip
+    "million-pairs": lambda: drawn(henon_heiles, box([0.3] * 4), 0.3, 1_000_000),
+}
 
 
 CLOCKS = {"processor": time.process_time, "wall": time.perf_counter}
@@ -131,15 +129,23 @@ def measured_here(system: str, budget: float, clock_name: str) -> Numbers:
     busy = time.process_time() - busy
     error = np.asarray(found.map.step(fresh.z0)[0]) - fresh.z1
     return {
-        "budget": budget, "clock": clock_name, "processor_seconds": busy,
-        "load": [load, os.getloadavg()[0]], "seconds": seconds, "ratio": seconds / budget,
-        "fit_seconds": fitted, "report_seconds": reported - fitted,
-        "chosen": f"{chosen.chart} {chosen.label}", "operations": found.operations,
-        "max_operations": found.max_operations, "claimed": chosen.validation_relative,
-        "met": found.met, "ended": found.ended,
+        "budget": budget,
+        "clock": clock_name,
+        "processor_seconds": busy,
+        "load": [load, os.getloadavg()[0]],
+        "seconds": seconds,
+        "ratio": seconds / budget,
+        "fit_seconds": fitted,
+        "report_seconds": reported - fitted,
+        "chosen": f"{chosen.chart} {chosen.label}",
+        "operations": found.operations,
+        "max_operations": found.max_operations,
+        "claimed": chosen.validation_relative,
+        "met": found.met,
+        "ended": found.ended,
         "true_error": float(np.sqrt(np.mean((error / sizes(pairs.z0)) ** 2))),
         "messages": list(found.messages),
-    }  # fmt: skip
+    }
 
 
 def measure(system: str, budget: float, clock_name: str, quick: bool) -> Numbers:
@@ -152,11 +158,12 @@ def measure(system: str, budget: float, clock_name: str, quick: bool) -> Numbers
 
 PIECES = {
     f"{system}-{budget}": partial(measure, system, float(budget), "processor")
-    for system in SYSTEMS for budget in BUDGETS
+    for system in SYSTEMS
+    for budget in BUDGETS
 } | {
     f"{system}-30-wall": partial(measure, system, 30.0, "wall")
     for system in ("elastic-pendulum", "kepler")
-}  # fmt: skip
+}
 QUICK = ("elastic-pendulum-10", "kepler-10")
 
 
@@ -173,14 +180,26 @@ def tables() -> None:
     if not found:
         return
     heads = [
-        "system, budget in s", "seconds ÷ budget", "load", "chosen", "claimed", "true error",
+        "system, budget in s",
+        "seconds ÷ budget",
+        "load",
+        "chosen",
+        "claimed",
+        "true error",
         "ended",
-    ]  # fmt: skip
+    ]
     rows = [
-        [name, number(m["ratio"]), _load(m), m["chosen"], number(m["claimed"]),
-         number(m["true_error"]), m["ended"]]
+        [
+            name,
+            number(m["ratio"]),
+            _load(m),
+            m["chosen"],
+            number(m["claimed"]),
+            number(m["true_error"]),
+            m["ended"],
+        ]
         for name, m in ((name, result["measured"]) for name, result in found.items())
-    ]  # fmt: skip
+    ]
     between_markers(TABLES, "budgets", f"{markdown(heads, rows)}\n\n{provenance(found)}")
 
 

@@ -135,9 +135,9 @@ def record() -> Outcome:
         angle.append(z[0, 0])
         z = moved(PENDULUM, z, 0.1)
     noisy = np.array(angle) + 2e-3 * rng.standard_normal(600)
-    fit = gfnn.fit(gfnn.Recording(
-        {"t": 0.1 * np.arange(600), "x": noisy}, positions=["x"], angles=["x"]
-    ))  # fmt: skip
+    fit = gfnn.fit(
+        gfnn.Recording({"t": 0.1 * np.arange(600), "x": noisy}, positions=["x"], angles=["x"])
+    )
     law = {term.term: term.coefficient for term in fit.lagrangian.terms}
     found = next((abs(c) for name, c in law.items() if "cos" in name), 0.0)
     return Outcome(abs(found - 1.0), float(len(law)), ", ".join(law))
@@ -152,11 +152,9 @@ CASES: dict[str, Callable[[], Outcome]] = {
     "damped": damped,
     "two": lambda: learned(HENON_HEILES, pairs_of(HENON_HEILES, 400), learn="map", tolerance=1e-6),
     "law": lambda: learned(HENON_HEILES, pairs_of(HENON_HEILES, 300, 1e-5), tolerance=1e-6),
-    "long": lambda: learned(
-        PENDULUM, pairs_of(PENDULUM, 300, dt=2.0), learn="map", tolerance=1e-6
-    ),
+    "long": lambda: learned(PENDULUM, pairs_of(PENDULUM, 300, dt=2.0), learn="map", tolerance=1e-6),
     "record": record,
-}  # fmt: skip
+}
 
 S, H, L = "models.generating_functions", "models.hamiltonians", "models.lagrangians"
 
@@ -171,34 +169,45 @@ class Constant(NamedTuple):
     unit: str
 
 
-CONSTANTS = tuple(Constant(*row) for row in (
-    ("fitting.least_squares", "ROWS_PER_TERM", ("few", "two", "noisy", "damped"),
-     "rows ÷ terms of S"),
-    ("search.extrapolate", "GAINED", ("clean", "noisy"), "error ÷ least before, no gain above"),
-    ("search.extrapolate", "_FARTHEST", ("clean", "two"), "orders ÷ range of orders"),
-    ("search.search", "_STALLED", ("noisy",), "sizes in a row without a gain"),
-    ("search.search", "_NO_WORSE", ("noisy",), "error ÷ error, as good below"),
-    ("search.search", "_FAR", ("clean", "few"), "foretold error ÷ tolerance"),
-    ("learn.choose", "_CONFIRMED", ("clean", "long"), "bound of own steps ÷ of the search"),
-    ("learn.noisy_sweeps", "_NO_WORSE", ("noisy",), "squared error ÷ least, as good below"),
-    ("dataset.split", "_FRACTION", ("few", "noisy"), "part of the pairs that validates"),
-    ("diagnosis.charts", "_FAR", ("long",), "determinant of ∂w/∂z"),
-    ("diagnosis.local_jacobians", "_NEIGHBOURS_PER_TERM", ("damped", "outliers"),
-     "neighbours ÷ unknowns"),
-    ("diagnosis.clean", "_MOST_OUTLIERS", ("outliers",), "part of the pairs"),
-    ("learn.gross_errors", "_BEYOND", ("outliers",), "residual ÷ neighbours'"),
-    ("fitting.significance", "CERTAIN", ("damped",), "standard errors"),
-    ("fitting.significance", "ABOVE_NOISE", ("law", "sequences"), "standard errors"),
-    (f"{H}.choose_law", "MAX_COST_RATIO", ("law",), "operations ÷ the map's"),
-    (f"{H}.options", "OPTIONS.rise", ("law", "sequences"), "held-out error ÷ before"),
-    (f"{H}.options", "OPTIONS.flat", ("sequences",), "error ÷ error"),
-    ("solve.latent_arcs", "OUTLYING", ("sequences",), "standard deviations"),
-    ("solve.latent_arcs", "_DEFECT", ("record",), "standard deviations"),
-    ("solve.latent_arcs", "SOFT_L1.k", ("record",), "standard deviations"),
-    (f"{L}.search", "SearchOptions.significant", ("record",), "standard errors"),
-    (f"{L}.search", "SearchOptions.asked_for", ("record",), "standard errors"),
-    (f"{L}.search", "SearchOptions.gain", ("record",), "part of the held-out cost"),
-))  # fmt: skip
+CONSTANTS = tuple(
+    Constant(*row)
+    for row in (
+        (
+            "fitting.least_squares",
+            "ROWS_PER_TERM",
+            ("few", "two", "noisy", "damped"),
+            "rows ÷ terms of S",
+        ),
+        ("search.extrapolate", "GAINED", ("clean", "noisy"), "error ÷ least before, no gain above"),
+        ("search.extrapolate", "_FARTHEST", ("clean", "two"), "orders ÷ range of orders"),
+        ("search.search", "_STALLED", ("noisy",), "sizes in a row without a gain"),
+        ("search.search", "_NO_WORSE", ("noisy",), "error ÷ error, as good below"),
+        ("search.search", "_FAR", ("clean", "few"), "foretold error ÷ tolerance"),
+        ("learn.choose", "_CONFIRMED", ("clean", "long"), "bound of own steps ÷ of the search"),
+        ("learn.noisy_sweeps", "_NO_WORSE", ("noisy",), "squared error ÷ least, as good below"),
+        ("dataset.split", "_FRACTION", ("few", "noisy"), "part of the pairs that validates"),
+        ("diagnosis.charts", "_FAR", ("long",), "determinant of ∂w/∂z"),
+        (
+            "diagnosis.local_jacobians",
+            "_NEIGHBOURS_PER_TERM",
+            ("damped", "outliers"),
+            "neighbours ÷ unknowns",
+        ),
+        ("diagnosis.clean", "_MOST_OUTLIERS", ("outliers",), "part of the pairs"),
+        ("learn.gross_errors", "_BEYOND", ("outliers",), "residual ÷ neighbours'"),
+        ("fitting.significance", "CERTAIN", ("damped",), "standard errors"),
+        ("fitting.significance", "ABOVE_NOISE", ("law", "sequences"), "standard errors"),
+        (f"{H}.choose_law", "MAX_COST_RATIO", ("law",), "operations ÷ the map's"),
+        (f"{H}.options", "OPTIONS.rise", ("law", "sequences"), "held-out error ÷ before"),
+        (f"{H}.options", "OPTIONS.flat", ("sequences",), "error ÷ error"),
+        ("solve.latent_arcs", "OUTLYING", ("sequences",), "standard deviations"),
+        ("solve.latent_arcs", "_DEFECT", ("record",), "standard deviations"),
+        ("solve.latent_arcs", "SOFT_L1.k", ("record",), "standard deviations"),
+        (f"{L}.search", "SearchOptions.significant", ("record",), "standard errors"),
+        (f"{L}.search", "SearchOptions.asked_for", ("record",), "standard errors"),
+        (f"{L}.search", "SearchOptions.gain", ("record",), "part of the held-out cost"),
+    )
+)
 
 
 def value_of(module: str, name: str) -> Any:
@@ -275,9 +284,10 @@ def halved_and_doubled(quick: bool) -> harness.Numbers:
                     there = tried(case)
                 here = known[case]
                 row[f"{case} × {factor:g}"] = {
-                    "error": there.error / here.error, "cost": there.cost / here.cost,
+                    "error": there.error / here.error,
+                    "cost": there.cost / here.cost,
                     "label": there.label if there.label != here.label else "",
-                }  # fmt: skip
+                }
         found[f"{module}.{name}"] = row
         print(f"{module}.{name} = {value:g}: {shown(row)}", flush=True)
     return {"cases": {c: o._asdict() for c, o in known.items()}, "constants": found}
@@ -308,9 +318,12 @@ def parity(quick: bool) -> harness.Numbers:
                 value = value_of(f"{S}.parity", "OPTIONS.no_gain") if gain is None else gain
                 with set_to(f"{S}.parity", "OPTIONS.no_gain", value):
                     out = learned(
-                        system, pairs_of(system, count), learn="map", family="polynomial",
+                        system,
+                        pairs_of(system, count),
+                        learn="map",
+                        family="polynomial",
                         tolerance=1e-7,
-                    )  # fmt: skip
+                    )
                 row[rule] = out._asdict()
             found[f"{name}, {count} pairs"] = row
             told = ", ".join(f"{r} {o['error']:.1e} ({o['label']})" for r, o in row.items())

@@ -144,10 +144,16 @@ def _constants(path: Path) -> frozenset[str]:
     """Names that a module assigns."""
     body = ast.parse(ran.text_of(path)).body
     targets = [
-        target for node in body
-        for target in (node.targets if isinstance(node, ast.Assign) else
-                       [node.target] if isinstance(node, ast.AnnAssign) else [])
-    ]  # fmt: skip
+        target
+        for node in body
+        for target in (
+            node.targets
+            if isinstance(node, ast.Assign)
+            else [node.target]
+            if isinstance(node, ast.AnnAssign)
+            else []
+        )
+    ]
     return frozenset(target.id for target in targets if isinstance(target, ast.Name))
 
 

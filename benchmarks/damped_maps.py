@@ -64,16 +64,20 @@ def driven(number: int, seed: int) -> gfnn.Pairs:
         q, p = np.split(y, 2)
         return np.concatenate([p, -np.sin(q) - RATE * p + DRIVE * np.cos(t)])
 
-    solution = solve_ivp(
-        field, (0, PERIOD), z.T.ravel(), method="DOP853", rtol=1e-13, atol=1e-14
-    )  # fmt: skip
+    solution = solve_ivp(field, (0, PERIOD), z.T.ravel(), method="DOP853", rtol=1e-13, atol=1e-14)
     return gfnn.Pairs(z, solution.y[:, -1].reshape(2, -1).T, PERIOD)
 
 
 def measured(
-    quick: bool, *, sample: Callable, pairs: int, b: float | None, tolerance: float,
-    angles: tuple[int, ...] = (), noise: float = 0.0,
-) -> Numbers:  # fmt: skip
+    quick: bool,
+    *,
+    sample: Callable,
+    pairs: int,
+    b: float | None,
+    tolerance: float,
+    angles: tuple[int, ...] = (),
+    noise: float = 0.0,
+) -> Numbers:
     """A fit, its b beside the true one, and its step on pairs that it has not seen."""
     pairs = pairs // 2 if quick else pairs
     given, test = sample(pairs, SEED), sample(400, SEED + 1)
@@ -87,16 +91,25 @@ def measured(
     error = nearest_image(np.asarray(fit.map.step(test.z0, test.args)[0]) - test.z1, angles)
     damping = fit.damping
     found: Numbers = {
-        "pairs": pairs, "b": None, "b_error": None, "b_std": None,
-        "one_step": float(np.sqrt(np.mean(error**2))), "defect": fit.symplecticity_defect,
-        "terms": fit.chosen.num_parameters, "cpu_seconds": seconds, "rotation_error": None,
-    }  # fmt: skip
+        "pairs": pairs,
+        "b": None,
+        "b_error": None,
+        "b_std": None,
+        "one_step": float(np.sqrt(np.mean(error**2))),
+        "defect": fit.symplecticity_defect,
+        "terms": fit.chosen.num_parameters,
+        "cpu_seconds": seconds,
+        "rotation_error": None,
+    }
     if damping is not None and test.args is not None:
         own = np.asarray(fit.map.multiplier(test.args))
         found |= {"b_error": float(np.abs(own / np.exp(-test.args["decay"]) - 1).max())}
     elif damping is not None and b is not None:
-        found |= {"b": float(damping.factor), "b_std": float(damping.std),
-                  "b_error": float(abs(damping.factor / b - 1))}  # fmt: skip
+        found |= {
+            "b": float(damping.factor),
+            "b_std": float(damping.std),
+            "b_error": float(abs(damping.factor / b - 1)),
+        }
     if sample is kicked:
         start, steps = np.array([1.0, 0.5]), STEPS // 4 if quick else STEPS
         states = np.asarray(fit.map.rollout(start, TRANSIENT + steps)[0])
@@ -127,14 +140,29 @@ def tables() -> None:
     found = results(PIECES, "damped-maps")
     rows = [
         [
-            name, number(m["pairs"]), number(m["b_error"]), number(m["b_std"]),
-            number(m["one_step"]), number(m["defect"]), number(m["rotation_error"]),
-            number(m["terms"]), number(m["cpu_seconds"]),
+            name,
+            number(m["pairs"]),
+            number(m["b_error"]),
+            number(m["b_std"]),
+            number(m["one_step"]),
+            number(m["defect"]),
+            number(m["rotation_error"]),
+            number(m["terms"]),
+            number(m["cpu_seconds"]),
         ]
         for name, m in ((name, result["measured"]) for name, result in found.items())
-    ]  # fmt: skip
-    heads = ("map", "pairs", "error of b ÷ b", "its standard error", "one step, RMS",
-             "‖AᵀJA − bJ‖", "error of the rotation number", "terms of S", "CPU s")  # fmt: skip
+    ]
+    heads = (
+        "map",
+        "pairs",
+        "error of b ÷ b",
+        "its standard error",
+        "one step, RMS",
+        "‖AᵀJA − bJ‖",
+        "error of the rotation number",
+        "terms of S",
+        "CPU s",
+    )
     between_markers(TABLES, "damped-maps", f"{markdown(heads, rows)}\n\n{provenance(found)}")
 
 

@@ -53,19 +53,28 @@ def measured() -> dict:
         inside.append(np.abs(off) <= 2 * std)
         line = np.linspace(0, AHEAD, 101)
         smooth = fit.map.forecast(start, t[k] + line[1:]).values
-        forecasts.append({
-            "start": t[k], "t": t[rows].tolist(), "std": std.tolist(), "error": off.tolist(),
-            "measured": (values - off).tolist(), "line_t": line[1:].tolist(),
-            "line": [smooth[n][0].tolist() for n in ANGLES],
-        })  # fmt: skip
+        forecasts.append(
+            {
+                "start": t[k],
+                "t": t[rows].tolist(),
+                "std": std.tolist(),
+                "error": off.tolist(),
+                "measured": (values - off).tolist(),
+                "line_t": line[1:].tolist(),
+                "line": [smooth[n][0].tolist() for n in ANGLES],
+            }
+        )
     shown = np.linspace(0, len(forecasts) - 1, STARTS).astype(int)
     return {
-        "lagrangian": str(fit.lagrangian), "friction": str(fit.friction), "formula": fit.formula,
-        "cpu_seconds": seconds, "samples": len(record.slice(stop=end)),
+        "lagrangian": str(fit.lagrangian),
+        "friction": str(fit.friction),
+        "formula": fit.formula,
+        "cpu_seconds": seconds,
+        "samples": len(record.slice(stop=end)),
         "median_error": dict(zip(("0.1", "0.5", "1"), np.median(errors, axis=0), strict=True)),
         "within_two_deviations": float(np.mean(np.concatenate(inside, axis=1))),
         "forecasts": [forecasts[i] for i in shown],
-    }  # fmt: skip
+    }
 
 
 def draw(found: dict, path: Path) -> None:
@@ -77,13 +86,31 @@ def draw(found: dict, path: Path) -> None:
     for (above, below), forecast in zip(axes.T, found["forecasts"], strict=True):
         t = np.array(forecast["t"]) - forecast["start"]
         for i, (name, colour) in enumerate(zip(("θ₁", "θ₂"), ("C0", "C1"), strict=True)):
-            above.plot(forecast["line_t"], forecast["line"][i], color=colour, lw=1.2,
-                       label=f"{name} forecast")  # fmt: skip
-            above.plot(t, forecast["measured"][i], ".", ms=3, color="black",
-                       label="measured" if i else None)  # fmt: skip
+            above.plot(
+                forecast["line_t"],
+                forecast["line"][i],
+                color=colour,
+                lw=1.2,
+                label=f"{name} forecast",
+            )
+            above.plot(
+                t,
+                forecast["measured"][i],
+                ".",
+                ms=3,
+                color="black",
+                label="measured" if i else None,
+            )
             error, std = (1e3 * np.array(forecast[of][i]) for of in ("error", "std"))
-            below.fill_between(t, -2 * std, 2 * std, color=colour, alpha=0.2, lw=0,
-                               label=f"{name} ± 2 standard deviations")  # fmt: skip
+            below.fill_between(
+                t,
+                -2 * std,
+                2 * std,
+                color=colour,
+                alpha=0.2,
+                lw=0,
+                label=f"{name} ± 2 standard deviations",
+            )
             below.plot(t, error, ".", ms=3, color=colour)
         below.set_xlabel("seconds ahead")
     axes[0, 0].set_ylabel("angle [rad]")

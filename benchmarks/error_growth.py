@@ -35,7 +35,7 @@ from harness import (
     one_step_rms,
     provenance,
     results,
-)  # fmt: skip
+)
 
 # isort: split
 import jax
@@ -64,9 +64,14 @@ def perturbed(name: str, quick: bool):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
         fit = gfnn.fit(
-            pairs, scene, absolute_tolerance=1e-7 if quick else 1e-10, chart="midpoint",
-            family="polynomial", seed=SEED, on_progress=lambda line: print(f"  {line}"),
-        )  # fmt: skip
+            pairs,
+            scene,
+            absolute_tolerance=1e-7 if quick else 1e-10,
+            chart="midpoint",
+            family="polynomial",
+            seed=SEED,
+            on_progress=lambda line: print(f"  {line}"),
+        )
     index = next(i for i, piece in enumerate(fit.map.pieces) if isinstance(piece, Generated))
     whole: Any = fit.map.pieces[index]
     first, second = whole.family.basis.halves
@@ -102,14 +107,22 @@ def growth(name: str) -> Callable[[bool], Numbers]:
             usable = statistics.mean < SATURATED
             last = int(steps[usable][-1]) if usable.all() else int(np.argmin(usable)) - 1
             exponent = metrics.growth_exponent(steps, position, last=max(last, 12))
-            rows.append({
-                "label": label, "one_step_rms": error, "last": last,
-                "exponent": exponent.value, "interval": list(exponent.interval),
-                "error_end": float(statistics.mean[-1]),
-                "error_100": float(statistics.mean[100]),
-                "curve": {"steps": shown.tolist(), "mean": statistics.mean[shown].tolist(),
-                          "std": statistics.std[shown].tolist()},
-            })  # fmt: skip
+            rows.append(
+                {
+                    "label": label,
+                    "one_step_rms": error,
+                    "last": last,
+                    "exponent": exponent.value,
+                    "interval": list(exponent.interval),
+                    "error_end": float(statistics.mean[-1]),
+                    "error_100": float(statistics.mean[100]),
+                    "curve": {
+                        "steps": shown.tolist(),
+                        "mean": statistics.mean[shown].tolist(),
+                        "std": statistics.std[shown].tolist(),
+                    },
+                }
+            )
         return {"scene": name, "rows": rows, "proportionality": slope(rows, "error_100")}
 
     return measure
@@ -129,8 +142,9 @@ def slope(rows: list[Numbers], key: str) -> Numbers:
     return {
         "exponent": float(fitted.slope),
         "interval": [float(fitted.slope - half), float(fitted.slope + half)],
-        "decades": float(np.ptp(x)), "points": len(used),
-    }  # fmt: skip
+        "decades": float(np.ptp(x)),
+        "points": len(used),
+    }
 
 
 def actions(quick: bool) -> Numbers:
@@ -147,11 +161,16 @@ def actions(quick: bool) -> Numbers:
         action = np.sqrt(np.asarray(metrics.semi_major_axis(states)))
         change = np.max(np.abs(action - start[:, None]), axis=0)
         tenth = len(change) // 10
-        rows.append({
-            "label": label, "one_step_rms": error, "num_steps": num_steps,
-            "whole_time": bool(num_steps < most),
-            "largest": float(change.max()), "largest_in_first_tenth": float(change[:tenth].max()),
-        })  # fmt: skip
+        rows.append(
+            {
+                "label": label,
+                "one_step_rms": error,
+                "num_steps": num_steps,
+                "whole_time": bool(num_steps < most),
+                "largest": float(change.max()),
+                "largest_in_first_tenth": float(change[:tenth].max()),
+            }
+        )
     return {"rows": rows, "proportionality": slope(rows, "largest")}
 
 
@@ -200,16 +219,19 @@ def vfnn(quick: bool) -> Numbers:
         mean = metrics.error_statistics(position).mean
         last = int(np.argmax(mean > SATURATED)) or NUM_STEPS
         curves[name] = {
-            "steps": shown.tolist(), "mean": mean[shown].tolist(),
+            "steps": shown.tolist(),
+            "mean": mean[shown].tolist(),
             "axis": metrics.error_statistics(energy).mean[shown].tolist(),
             "last": last,
             "exponent": metrics.growth_exponent(steps, position, first=2, last=last)._asdict(),
             "axis_exponent": metrics.growth_exponent(steps, energy, first=2, last=last)._asdict(),
-        }  # fmt: skip
+        }
     return {
         "vfnn_one_step_rms": vfnn_rms,
-        "map_one_step_rms": error, "map": label, "curves": curves,
-    }  # fmt: skip
+        "map_one_step_rms": error,
+        "map": label,
+        "curves": curves,
+    }
 
 
 def generic_bound(quick: bool) -> Numbers:
@@ -232,8 +254,15 @@ def generic_bound(quick: bool) -> Numbers:
         bound = np.expm1(time_end) * (delta + h / 2)
         late = times > 2
         rate = np.polyfit(times[late], np.log(np.abs(x[late])), 1)[0]
-        rows.append({"h": h, "error": float(x[-1]), "bound": float(bound),
-                     "ratio": float(x[-1] / bound), "rate": float(rate)})  # fmt: skip
+        rows.append(
+            {
+                "h": h,
+                "error": float(x[-1]),
+                "bound": float(bound),
+                "ratio": float(x[-1] / bound),
+                "rate": float(rate),
+            }
+        )
     return {"delta": delta, "time": time_end, "rows": rows}
 
 
@@ -276,7 +305,7 @@ def verdicts(m: dict[str, Numbers]) -> list[str]:
             f"{pace}, α = {interval(row)} of the mean"
             + (NEAR_RESONANCE.get(name, "") if pace.startswith("faster") else "")
             + f"; proportional to ε over {p['decades']:.1f} decades, b = {interval(p)}."
-        )  # fmt: skip
+        )
     if "actions" in m:
         rows = [r for r in m["actions"]["rows"] if r["largest"] is not None]
         quotients = [r["largest"] / r["one_step_rms"] for r in rows]
@@ -290,16 +319,18 @@ def verdicts(m: dict[str, Numbers]) -> list[str]:
     if "vfnn" in m:
         curves = m["vfnn"]["curves"]
         names = [n for n in curves if n.endswith("slightly off")]
-        position, axis = ({n: curves[n][k]["value"] for n in names}
-                          for k in ("exponent", "axis_exponent"))  # fmt: skip
+        position, axis = (
+            {n: curves[n][k]["value"] for n in names} for k in ("exponent", "axis_exponent")
+        )
         said.append(
             "two-body, *a vector field without the structure errs exponentially*: an upper bound "
             "that these orbits do not attain. The semi-major axis of VFNN drifts at once, and the "
             f"orbit is lost by step {curves['VFNN']['last']}. Where errors stay small: "
-            + "; ".join(f"{n}, position α = {position[n]:.2f}, axis α = {axis[n]:.2f}"
-                        for n in names)
+            + "; ".join(
+                f"{n}, position α = {position[n]:.2f}, axis α = {axis[n]:.2f}" for n in names
+            )
             + ". The actions drift, and the position errs a power faster than the map's."
-        )  # fmt: skip
+        )
     if "generic-bound" in m:
         said.append(
             "*The generic bound is attained by f(x) = x*: yes, error/bound = "
@@ -318,30 +349,36 @@ def section(found: dict[str, Numbers]) -> str:
         lines += [
             "**Growth with the step number and proportionality to ε.** Every line one learned map; "
             "the exponent α of error ∝ nᵅ, from step 10 up to where the error is a tenth, with its "
-            "95 % interval.", "",
+            "95 % interval.",
+            "",
             "| scene | s | ε, one step | error at step 100 | at 1,000 | α |",
             "|---" * 6 + "|",
-        ]  # fmt: skip
+        ]
         lines += [
             f"| {s['scene']} | {r['label']} | {number(r['one_step_rms'])} | "
             f"{number(r['error_100'])} | {number(r['error_end'])} | {interval(r)} |"
-            for s in scenes for r in s["rows"]
-        ]  # fmt: skip
+            for s in scenes
+            for r in s["rows"]
+        ]
         lines += ["", "Error at step 100 ∝ εᵇ, with b:", ""]
         for s in scenes:
             p = s["proportionality"]
             decades = "" if p["decades"] is None else f" over {p['decades']:.1f} decades of ε"
             lines.append(f"- {s['scene']}: b = {interval(p)}{decades}, {p['points']} maps")
-        lines += ["", "![Error against ε](figures/growth_proportionality.png)",
-                  "![Growth on two bodies](figures/growth_two_body.png)", ""]  # fmt: skip
+        lines += [
+            "",
+            "![Error against ε](figures/growth_proportionality.png)",
+            "![Growth on two bodies](figures/growth_two_body.png)",
+            "",
+        ]
     if "actions" in m:
         lines += [
             "**Actions.** Two bodies: the largest change of Delaunay's action √a over 1/(ε dt) "
-            f"steps (at most {LONGEST:,}), 8 orbits.", "",
-            "| s | ε | steps | all of 1/(ε dt) | largest change | in the first tenth | "
-            "change/ε |",
+            f"steps (at most {LONGEST:,}), 8 orbits.",
+            "",
+            "| s | ε | steps | all of 1/(ε dt) | largest change | in the first tenth | change/ε |",
             "|---" * 7 + "|",
-        ]  # fmt: skip
+        ]
         for r in m["actions"]["rows"]:
             quotient = None if r["largest"] is None else r["largest"] / r["one_step_rms"]
             lines.append(
@@ -356,26 +393,32 @@ def section(found: dict[str, Numbers]) -> str:
         lines += [
             "**A learned vector field.** Two bodies, one-step error "
             f"{number(v['vfnn_one_step_rms'])} beside a map's {number(v['map_one_step_rms'])}; "
-            "exponents until the mean position error is a tenth.", "",
-            "| | until step | α of the position | α of the semi-major axis |", "|---" * 4 + "|",
-        ]  # fmt: skip
+            "exponents until the mean position error is a tenth.",
+            "",
+            "| | until step | α of the position | α of the semi-major axis |",
+            "|---" * 4 + "|",
+        ]
         for name, c in v["curves"].items():
-            e, a = ({"exponent": c[k]["value"], "interval": c[k]["interval"]}
-                    for k in ("exponent", "axis_exponent"))  # fmt: skip
+            e, a = (
+                {"exponent": c[k]["value"], "interval": c[k]["interval"]}
+                for k in ("exponent", "axis_exponent")
+            )
             lines.append(f"| {name} | {c['last']} | {interval(e)} | {interval(a)} |")
         lines += ["", "![A learned vector field](figures/growth_vfnn.png)", ""]
     if "generic-bound" in m:
         g = m["generic-bound"]
         lines += [
             f"**The generic bound attained.** f(x) = x learned as x + δ, δ = {g['delta']}, Euler's "
-            f"steps to T = {g['time']:g} from x = 0.", "",
+            f"steps to T = {g['time']:g} from x = 0.",
+            "",
             "| h | error | bound | error/bound | rate of growth (bound: L = 1) |",
             "|---" * 5 + "|",
-        ]  # fmt: skip
+        ]
         lines += [
             f"| {number(r['h'])} | {r['error']:.4g} | {r['bound']:.4g} | {r['ratio']:.3f} | "
-            f"{r['rate']:.3f} |" for r in g["rows"]
-        ]  # fmt: skip
+            f"{r['rate']:.3f} |"
+            for r in g["rows"]
+        ]
     return "\n".join(lines).rstrip()
 
 
@@ -398,8 +441,9 @@ def draw(found: dict[str, Numbers]) -> None:
         if name in m
     }
     if points:
-        ax: Any = figures.proportionality(points, r"one-step error $\varepsilon$ (RMS)",
-                                          "position error at step 100")  # fmt: skip
+        ax: Any = figures.proportionality(
+            points, r"one-step error $\varepsilon$ (RMS)", "position error at step 100"
+        )
         figures.save(ax.figure, FIGURES / "growth_proportionality.png")
     if "two-body" in m:
         curves = {

@@ -59,9 +59,10 @@ SCENES: dict[str, tuple[Callable[[], Scene], dict]] = {
     "pendulum-1": (functools.partial(driven_pendulum, 1), {}),
     "henon-heiles": (functools.partial(henon_heiles, energy=1 / 12), {}),
     "henon-heiles-law": (
-        functools.partial(henon_heiles, energy=1 / 12), {"learn": "hamiltonian"},
+        functools.partial(henon_heiles, energy=1 / 12),
+        {"learn": "hamiltonian"},
     ),
-}  # fmt: skip
+}
 
 
 def measured(quick: bool, name: str) -> Numbers:
@@ -134,9 +135,19 @@ def by_heyoka(name: str, error: float) -> float | None:
     return min(p["single"] for p in exact or points[-1:])
 
 
-HEADS = ["map", "one-step RMS", "C, kB", "`cc`, s", "agrees to", "C, µs", "C, `-march=native`",
-         "ours, 1 lane in a rollout", "ours, one `map.step`", "ours, a lane of 1,000",
-         "heyoka, 1 lane"]  # fmt: skip
+HEADS = [
+    "map",
+    "one-step RMS",
+    "C, kB",
+    "`cc`, s",
+    "agrees to",
+    "C, µs",
+    "C, `-march=native`",
+    "ours, 1 lane in a rollout",
+    "ours, one `map.step`",
+    "ours, a lane of 1,000",
+    "heyoka, 1 lane",
+]
 
 
 def row(name: str, m: Numbers) -> list[str]:
@@ -144,11 +155,17 @@ def row(name: str, m: Numbers) -> list[str]:
     same = "" if plain["same_status"] else ", statuses differ"
     return [
         f"{name}: {m['chart']} {m['label']}" + (", base map" if m["base_map"] else ""),
-        number(m["one_step_rms"]), number(m["kilobytes"]), number(plain["compile_seconds"]),
-        number(plain["difference"]) + same, number(plain["microseconds"]),
-        number(native["microseconds"]), number(m["lanes_one"]), number(m["one_call"]),
-        number(m["lanes_many"]), number(by_heyoka(name, m["one_step_rms"])),
-    ]  # fmt: skip
+        number(m["one_step_rms"]),
+        number(m["kilobytes"]),
+        number(plain["compile_seconds"]),
+        number(plain["difference"]) + same,
+        number(plain["microseconds"]),
+        number(native["microseconds"]),
+        number(m["lanes_one"]),
+        number(m["one_call"]),
+        number(m["lanes_many"]),
+        number(by_heyoka(name, m["one_step_rms"])),
+    ]
 
 
 def tables() -> None:

@@ -83,8 +83,15 @@ def with_masses(z, magnetic: float = 0.0):
 
 def masses_of(magnetic: float) -> dict[str, float]:
     b = magnetic
-    found = {"q1²": 0.5, "q2²": 0.5 + 0.5 * b**2, "p1²": 0.5, "p2²": 0.5, "q1² q2": 1.0,
-             "q2³": -1 / 3 + 0.2 * b**2, "q2 p1²": 0.2}  # fmt: skip
+    found = {
+        "q1²": 0.5,
+        "q2²": 0.5 + 0.5 * b**2,
+        "p1²": 0.5,
+        "p2²": 0.5,
+        "q1² q2": 1.0,
+        "q2³": -1 / 3 + 0.2 * b**2,
+        "q2 p1²": 0.2,
+    }
     return found | ({"q2 p1": b, "q2² p1": 0.4 * b} if b else {})
 
 
@@ -107,11 +114,21 @@ def swings(rng, count: int):
 NONE = (0, 0)
 RODS = Lagrangian(
     Terms.of(
-        [((2, 0), NONE, NONE, 0.0), ((0, 2), NONE, NONE, 0.0), ((1, 1), NONE, (1, -1), 0.0),
-         (NONE, NONE, (1, 0), 0.0), (NONE, NONE, (0, 1), 0.0)], 2,
+        [
+            ((2, 0), NONE, NONE, 0.0),
+            ((0, 2), NONE, NONE, 0.0),
+            ((1, 1), NONE, (1, -1), 0.0),
+            (NONE, NONE, (1, 0), 0.0),
+            (NONE, NONE, (0, 1), 0.0),
+        ],
+        2,
     ),
-    np.array([1.0, 0.5, 1.0, 2.0, 1.0]), Friction.of([], 2), np.zeros(0), 0.0, np.zeros((2, 0)),
-)  # fmt: skip
+    np.array([1.0, 0.5, 1.0, 2.0, 1.0]),
+    Friction.of([], 2),
+    np.zeros(0),
+    0.0,
+    np.zeros((2, 0)),
+)
 
 
 def rods(z):
@@ -129,25 +146,35 @@ UNIFORM = partial(System, loss="uniform")
 FORCED = partial(System, loss="velocities")
 SYSTEMS = {
     "pendulum": UNIFORM(
-        lambda z: np.array([z[1], -np.sin(z[0])]), swings, 0.3, {"cos(q1)": -1.0, "p1²": 0.5},
-        ANGLE, rate=0.07,
+        lambda z: np.array([z[1], -np.sin(z[0])]),
+        swings,
+        0.3,
+        {"cos(q1)": -1.0, "p1²": 0.5},
+        ANGLE,
+        rate=0.07,
     ),
     "henon-heiles": UNIFORM(henon_heiles, box(0.3, 2), 0.5, HENON_HEILES, rate=0.01),
     "double-pendulum": UNIFORM(
-        rods, rods_swinging, 0.2,
-        {"v1²": 1, "v2²": 0.5, "v1 v2 cos(q1 - q2)": 1, "cos(q1)": 2, "cos(q2)": 1}, ANGLES,
+        rods,
+        rods_swinging,
+        0.2,
+        {"v1²": 1, "v2²": 0.5, "v1 v2 cos(q1 - q2)": 1, "cos(q1)": 2, "cos(q2)": 1},
+        ANGLES,
         rate=0.01,
     ),
     "kepler": UNIFORM(
-        kepler, near_circles, 0.1,
+        kepler,
+        near_circles,
+        0.1,
         {"1/sqrt(q1**2 + q2**2)": -1.0, "p1²": 0.5, "p2²": 0.5},
-        {"terms": ["1/sqrt(q1**2 + q2**2)"]}, rate=0.001,
+        {"terms": ["1/sqrt(q1**2 + q2**2)"]},
+        rate=0.001,
     ),
     "masses": FORCED(with_masses, box(0.3, 2), 0.3, masses_of(0.0), rate=0.05),
     "magnetic": FORCED(
         partial(with_masses, magnetic=0.3), box(0.3, 2), 0.3, masses_of(0.3), rate=0.05
     ),
-}  # fmt: skip
+}
 # Systems that keep their energy, some at a dt or a size that leaves a library more over.
 TWINS = {
     "pendulum": SYSTEMS["pendulum"],
@@ -159,9 +186,11 @@ TWINS = {
     "magnetic": SYSTEMS["magnetic"],
     "quartic": System(
         lambda z: np.array([z[2], z[3], -z[0] - z[0] * z[1] ** 2, -z[1] - z[1] * z[0] ** 2]),
-        box(0.6, 2), 0.5, {},
+        box(0.6, 2),
+        0.5,
+        {},
     ),
-}  # fmt: skip
+}
 
 
 def rate_of(system: System, z):
@@ -188,10 +217,16 @@ def fitted(system: System, noise: float = 0.0):
     image = image + noise * rng.normal(size=image.shape)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
-        done = once(lambda: gfnn.fit(
-            gfnn.Pairs(z, image, system.dt), tolerance=TOLERANCE, learn="hamiltonian",
-            max_seconds=None, seed=SEED, **(system.options or {}),
-        ))  # fmt: skip
+        done = once(
+            lambda: gfnn.fit(
+                gfnn.Pairs(z, image, system.dt),
+                tolerance=TOLERANCE,
+                learn="hamiltonian",
+                max_seconds=None,
+                seed=SEED,
+                **(system.options or {}),
+            )
+        )
     return done.out, fresh, done.processor_seconds
 
 
@@ -235,26 +270,41 @@ def twins(quick: bool) -> Numbers:
     for name, system in list(TWINS.items())[: 2 if quick else None]:
         for noise in NOISES:
             fit, *_ = fitted(system._replace(loss="", rate=0.0), noise)
-            cases.append({
-                "case": name, "noise": noise, "label": fit.chosen.label,
-                "friction": {t.term: t.coefficient for t in fit.hamiltonian.friction},
-                "multiplier": fit.map.multiplier() and float(fit.map.multiplier()),
-            })  # fmt: skip
+            cases.append(
+                {
+                    "case": name,
+                    "noise": noise,
+                    "label": fit.chosen.label,
+                    "friction": {t.term: t.coefficient for t in fit.hamiltonian.friction},
+                    "multiplier": fit.map.multiplier() and float(fit.map.multiplier()),
+                }
+            )
     return {"cases": cases, "reported": sum(bool(c["friction"]) for c in cases)}
 
 
 PIECES = {
-    **{name: partial(with_friction, name) for name in SYSTEMS}, "twins": twins,
-    "which": friction_kinds.which, "none": friction_kinds.none,
-}  # fmt: skip
+    **{name: partial(with_friction, name) for name in SYSTEMS},
+    "twins": twins,
+    "which": friction_kinds.which,
+    "none": friction_kinds.none,
+}
 
 
 def tables() -> None:
     """The table of RESULTS.md."""
     found = results(PIECES, "friction")
     apart, which, none = (found.pop(name, None) for name in ("twins", "which", "none"))
-    heads = ("system", "law", "coefficients", "friction", "one-step RMS", "μ", "defect",
-             "energy, 1,000 steps", "fit, CPU s")  # fmt: skip
+    heads = (
+        "system",
+        "law",
+        "coefficients",
+        "friction",
+        "one-step RMS",
+        "μ",
+        "defect",
+        "energy, 1,000 steps",
+        "fit, CPU s",
+    )
     before, after = (
         ("coefficient_error", "friction_error", "one_step_rms"),
         ("symplecticity_defect", "energy_error", "processor_seconds"),
@@ -280,10 +330,15 @@ def tables() -> None:
 def kinds_found(which: Numbers, none: Numbers) -> str:
     """A table of the recordings with each kind of friction, and a sentence."""
     rows = [
-        [c["system"], "+".join(c["true"]), "+".join(c["found"]) or "none",
-         number(c["standard_errors"]), number(c["processor_seconds"])]
+        [
+            c["system"],
+            "+".join(c["true"]),
+            "+".join(c["found"]) or "none",
+            number(c["standard_errors"]),
+            number(c["processor_seconds"]),
+        ]
         for c in which["cases"]
-    ]  # fmt: skip
+    ]
     heads = ("recording", "friction put in", "found", "coefficients, standard errors", "fit, CPU s")
     return (
         f"{markdown(heads, rows)}\n\nOf {len(which['cases'])} recordings the kinds of "

@@ -42,16 +42,24 @@ def _chain_force(q, v):
 
 SYSTEMS = {
     "pendulum": Swings(
-        lambda q: np.eye(1), lambda q, v: -2 * np.sin(q), np.eye(1),
+        lambda q: np.eye(1),
+        lambda q, v: -2 * np.sin(q),
+        np.eye(1),
         {"linear": (0.03,), "quadratic": (0.03,), "dry": (0.015,)},
-        ((1.4, 0.0), (0.6, 0.3)), 40.0, 0.05,
+        ((1.4, 0.0), (0.6, 0.3)),
+        40.0,
+        0.05,
     ),
     "double-pendulum": Swings(
-        _chain_masses, _chain_force, np.array([[1.0, 0.0], [-1.0, 1.0]]),
+        _chain_masses,
+        _chain_force,
+        np.array([[1.0, 0.0], [-1.0, 1.0]]),
         {"linear": (0.06, 0.03), "quadratic": (0.02, 0.01), "dry": (0.1, 0.05)},
-        ((1.5, -0.6, 0.0, 0.0), (-0.8, 1.2, 0.0, 1.0), (0.5, 0.5, 0.0, 0.0)), 10.0, 0.02,
+        ((1.5, -0.6, 0.0, 0.0), (-0.8, 1.2, 0.0, 1.0), (0.5, 0.5, 0.0, 0.0)),
+        10.0,
+        0.02,
     ),
-}  # fmt: skip
+}
 
 
 def recording(system: Swings, kinds: tuple[str, ...], seed: int, share: float) -> gfnn.Recording:
@@ -98,13 +106,17 @@ def case(system: str, kinds: tuple[str, ...], seed: int) -> Numbers:
         joint = "2 - omega1" if "omega2 - omega1" in term else "1" if "omega2" not in term else ""
         errors.append(abs(coefficient - expected.get((kind, joint), 0.0)) / std)
     return {
-        "system": system, "true": list(kinds), "seed": seed,
-        "found": list(fit.which_friction.kinds), "odds": fit.which_friction.odds,
-        "limits": fit.which_friction.limits, "text": str(fit.which_friction),
+        "system": system,
+        "true": list(kinds),
+        "seed": seed,
+        "found": list(fit.which_friction.kinds),
+        "odds": fit.which_friction.odds,
+        "limits": fit.which_friction.limits,
+        "text": str(fit.which_friction),
         "standard_errors": max(errors, default=None),
         "friction": {t.term: [t.coefficient, t.std] for t in fit.friction.terms},
         "processor_seconds": done.processor_seconds,
-    }  # fmt: skip
+    }
 
 
 def which(quick: bool) -> Numbers:

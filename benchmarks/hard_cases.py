@@ -26,7 +26,7 @@ from harness import (
     number,
     provenance,
     results,
-)  # fmt: skip
+)
 from harness import main as run_pieces
 
 # isort: split
@@ -74,9 +74,16 @@ def table(result: Numbers) -> str:
     rows = []
     for case in result["measured"]["cases"]:
         silent = "no" if not case["silent"] else f"**{case['wrong'] or 'yes'}**"
-        cells = [case["name"], *(number(case[k]) if case[k] is None else f"{case[k]:.1f}"
-                                 for k in ("digits", "asked")),
-                 case["flagged"] or "–", case["failed"] or "–", silent]  # fmt: skip
+        cells = [
+            case["name"],
+            *(
+                number(case[k]) if case[k] is None else f"{case[k]:.1f}"
+                for k in ("digits", "asked")
+            ),
+            case["flagged"] or "–",
+            case["failed"] or "–",
+            silent,
+        ]
         rows.append([cell.replace("|", "/") for cell in cells])
     return markdown(heads, rows)
 

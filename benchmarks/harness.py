@@ -251,8 +251,9 @@ def main(
     parser.add_argument("--quick", action="store_true", help="small sizes; writes no tables")
     parser.add_argument("--overwrite", action="store_true", help="measure finished pieces again")
     parser.add_argument("--tables", action="store_true", help="only make tables and figures again")
-    parser.add_argument(PROCESSOR_TIME, action="store_true",
-                        help="seconds of the processor in place of the wall's")  # fmt: skip
+    parser.add_argument(
+        PROCESSOR_TIME, action="store_true", help="seconds of the processor in place of the wall's"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
     arguments = parser.parse_args(argv)
     every = quick_pieces if arguments.quick and quick_pieces else pieces
@@ -269,8 +270,10 @@ def main(
         started = time.perf_counter()
         measured = pieces[name](arguments.quick)
         seconds = time.perf_counter() - started
-        write(path, {"piece": name, "quick": arguments.quick, "measured": measured,
-                     "seconds": seconds})  # fmt: skip
+        write(
+            path,
+            {"piece": name, "quick": arguments.quick, "measured": measured, "seconds": seconds},
+        )
         print(f"{prefix} {name}: {seconds:.0f} s", flush=True)
         jax.clear_caches()  # a process may map only so many compiled programs
     if folder == RESULTS:

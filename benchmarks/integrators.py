@@ -28,11 +28,17 @@ COMPOSITIONS = {
     "leapfrog": (1.0,),
     "Yoshida 4": (_YOSHIDA, 1 - 2 * _YOSHIDA),
     "Kahan–Li 8": (
-        0.13020248308889008087881763, 0.56116298177510838456196441, -0.38947496264484728640807860,
-        0.15884190655515560089621075, -0.39590389413323757733623154, 0.18453964097831570709183254,
-        0.25837438768632204729397911, 0.29501172360931029887096624, -0.60550853383003451169892108,
+        0.13020248308889008087881763,
+        0.56116298177510838456196441,
+        -0.38947496264484728640807860,
+        0.15884190655515560089621075,
+        -0.39590389413323757733623154,
+        0.18453964097831570709183254,
+        0.25837438768632204729397911,
+        0.29501172360931029887096624,
+        -0.60550853383003451169892108,
     ),
-}  # fmt: skip
+}
 ORDERS = {"leapfrog": 2, "Yoshida 4": 4, "Kahan–Li 8": 8}
 DIFFRAX = {"Tsit5": diffrax.Tsit5, "Dopri5": diffrax.Dopri5, "Dopri8": diffrax.Dopri8}
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
@@ -93,10 +99,17 @@ def _runge_kutta(scene: Scene, name: str) -> Runner:
 
     def lane(z, time, tolerance):
         solution = diffrax.diffeqsolve(
-            term, DIFFRAX[name](), 0.0, time, None, z,
+            term,
+            DIFFRAX[name](),
+            0.0,
+            time,
+            None,
+            z,
             stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
-            adjoint=diffrax.ForwardMode(), max_steps=MOST_STEPS, throw=False,
-        )  # fmt: skip
+            adjoint=diffrax.ForwardMode(),
+            max_steps=MOST_STEPS,
+            throw=False,
+        )
         assert solution.ys is not None
         return jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys[-1], jnp.nan)
 
@@ -117,9 +130,14 @@ def _dop853(scene: Scene) -> Runner:
             return field(*z)
 
         solved = solve_ivp(
-            scalar_rate if len(z0) == 1 else rate, (0, time), np.asarray(z0).T.ravel(),
-            method="DOP853", rtol=tolerance, atol=tolerance, t_eval=[time],
-        )  # fmt: skip
+            scalar_rate if len(z0) == 1 else rate,
+            (0, time),
+            np.asarray(z0).T.ravel(),
+            method="DOP853",
+            rtol=tolerance,
+            atol=tolerance,
+            t_eval=[time],
+        )
         if not solved.success:
             return np.full(z0.shape, np.nan)
         return solved.y[:, -1].reshape(shape).T
@@ -207,8 +225,9 @@ def _labelled(tolerances: Sequence[float]) -> dict[str, float]:
 
 def runners(scene: Scene, separable: bool) -> Iterator[tuple[str, Runner | str]]:
     """(name, Runner or why there is none) of every integrator."""
-    names: dict[str, Callable[[], Any]] = {f"diffrax {n}": lambda n=n: _runge_kutta(scene, n)
-                                           for n in DIFFRAX}  # fmt: skip
+    names: dict[str, Callable[[], Any]] = {
+        f"diffrax {n}": lambda n=n: _runge_kutta(scene, n) for n in DIFFRAX
+    }
     names |= {"SciPy DOP853": lambda: _dop853(scene), "heyoka": lambda: _taylor(scene)}
     names |= {n: lambda n=n: _composition(scene, n) for n in COMPOSITIONS}
     for name, make in names.items():

@@ -49,9 +49,17 @@ def interrupted(family: str, quick: bool) -> Numbers:
     with tempfile.TemporaryDirectory() as folder:
         data, states = data_of(Path(folder))
         command = [
-            sys.executable, "-m", "gfnn_jax", "fit", str(data), "--max-seconds", str(MAX_SECONDS),
-            "--resume", *OPTIONS[family], "--out",
-        ]  # fmt: skip
+            sys.executable,
+            "-m",
+            "gfnn_jax",
+            "fit",
+            str(data),
+            "--max-seconds",
+            str(MAX_SECONDS),
+            "--resume",
+            *OPTIONS[family],
+            "--out",
+        ]
         started = time.perf_counter()
         subprocess.run([*command, f"{folder}/whole"], check=True, capture_output=True)
         seconds = time.perf_counter() - started
@@ -100,9 +108,12 @@ def stopped(command: Sequence[str], name: str, delay: float) -> Numbers | None:
     sent = time.perf_counter()
     _, told = process.communicate()
     return {
-        "signal": name, "after_seconds": delay, "obeyed_in_seconds": time.perf_counter() - sent,
-        "exit_status": process.returncode, "told": told.strip().splitlines()[-3:],
-    }  # fmt: skip
+        "signal": name,
+        "after_seconds": delay,
+        "obeyed_in_seconds": time.perf_counter() - sent,
+        "exit_status": process.returncode,
+        "told": told.strip().splitlines()[-3:],
+    }
 
 
 PIECES = {family: partial(interrupted, family) for family in OPTIONS}
@@ -118,15 +129,28 @@ def tables() -> None:
             if not of:
                 continue
             obeyed = [one["obeyed_in_seconds"] for one in of]
-            rows.append([
-                family, name, str(len(of)), number(float(np.median(obeyed))), number(max(obeyed)),
-                str(sum(one["published"] for one in of)), str(sum(not one["usable"] for one in of)),
-                str(sum(not one["same_map_in_the_end"] for one in of)),
-            ])  # fmt: skip
+            rows.append(
+                [
+                    family,
+                    name,
+                    str(len(of)),
+                    number(float(np.median(obeyed))),
+                    number(max(obeyed)),
+                    str(sum(one["published"] for one in of)),
+                    str(sum(not one["usable"] for one in of)),
+                    str(sum(not one["same_map_in_the_end"] for one in of)),
+                ]
+            )
     heads = (
-        "family", "signal", "times", "obeyed in (median, s)", "at most, s", "best map published",
-        "damaged", "another map in the end",
-    )  # fmt: skip
+        "family",
+        "signal",
+        "times",
+        "obeyed in (median, s)",
+        "at most, s",
+        "best map published",
+        "damaged",
+        "another map in the end",
+    )
     between_markers(TABLES, "interruptions", markdown(heads, rows))
 
 

@@ -69,17 +69,17 @@ def measure(quick: bool) -> Numbers:
     fit = gfnn.fit(pairs, scene, chart="midpoint", absolute_tolerance=1e-4 if quick else 1e-10)
     many = gfnn.sample_pairs(scene, 2_000 if quick else NUM_NETWORK_PAIRS, keys[1])
     sequences = Sequences(np.stack([many.z0, many.z1], axis=1), scene.dt)
-    network = METHODS["vfnn"].learn(
-        sequences, Budget(keys[2], 1.0 if quick else TRAINING_SECONDS)
-    )  # fmt: skip
+    network = METHODS["vfnn"].learn(sequences, Budget(keys[2], 1.0 if quick else TRAINING_SECONDS))
     z0, exact = gfnn.sample_test_states(scene, NUM_ORBITS, keys[3]), yoshida(scene.dt)
     last = 2_000 if quick else NUM_STEPS
     rolls = {
-        NETWORK: (lambda n, k: rollout(network.step, z0, n, save_every=k),
-                  min(last, NUM_NETWORK_STEPS)),
+        NETWORK: (
+            lambda n, k: rollout(network.step, z0, n, save_every=k),
+            min(last, NUM_NETWORK_STEPS),
+        ),
         INTEGRATOR: (lambda n, k: rollout(exact, z0, n, save_every=k), last),
         LEARNED: (lambda n, k: fit.map.rollout(z0, n, save_every=k)[0], last),
-    }  # fmt: skip
+    }
     methods = {}
     for name, (roll, steps_rolled) in rolls.items():
         steps, states = saved(roll, steps_rolled)
@@ -94,22 +94,26 @@ def measure(quick: bool) -> Numbers:
         )
         shown = np.unique(np.searchsorted(steps, np.geomspace(1, steps[-1], 60)))
         methods[name] = {
-            "num_steps": steps_rolled, "microseconds_per_step": microseconds,
-            "error_end": float(np.mean(error[:, -1])), "axis_end": float(np.mean(axis[:, -1])),
+            "num_steps": steps_rolled,
+            "microseconds_per_step": microseconds,
+            "error_end": float(np.mean(error[:, -1])),
+            "axis_end": float(np.mean(axis[:, -1])),
             "exponent": metrics.growth_exponent(steps, error).value,
             "curve": {
                 "steps": steps[shown].tolist(),
                 "error": [[float(f"{e:.3e}") for e in lane] for lane in error[:, shown]],
             },
-        }  # fmt: skip
+        }
         print(
             f"{name}: {microseconds:.1f} µs, {methods[name]['error_end']:.1e} at the end",
             flush=True,
         )
     methods[LEARNED] |= {
-        "pairs": len(pairs), "num_parameters": fit.chosen.num_parameters,
-        "fit_seconds": fit.chosen.fit_seconds, "symplecticity_defect": fit.symplecticity_defect,
-    }  # fmt: skip
+        "pairs": len(pairs),
+        "num_parameters": fit.chosen.num_parameters,
+        "fit_seconds": fit.chosen.fit_seconds,
+        "symplecticity_defect": fit.symplecticity_defect,
+    }
     methods[NETWORK] |= {"pairs": len(many), "num_parameters": network.num_parameters}
     return {"num_orbits": NUM_ORBITS, "methods": methods}
 

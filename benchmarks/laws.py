@@ -31,7 +31,7 @@ from harness import (
     provenance,
     results,
     timed,
-)  # fmt: skip
+)
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
@@ -170,12 +170,15 @@ def drift(fit, scene) -> Numbers:
     (of_size, of_walk), deviations = exponents(error).tolist(), np.std(again, axis=0).tolist()
     end = error[:, -1]
     return {
-        "drift_orbits": len(error), "drift_exponent": of_size,
-        "drift_exponent_deviation": deviations[0], "walk_exponent": of_walk,
+        "drift_orbits": len(error),
+        "drift_exponent": of_size,
+        "drift_exponent_deviation": deviations[0],
+        "walk_exponent": of_walk,
         "walk_exponent_deviation": deviations[1],
-        "energy_error_end": float(np.abs(end).mean()), "energy_bias_end": float(end.mean()),
+        "energy_error_end": float(np.abs(end).mean()),
+        "energy_bias_end": float(end.mean()),
         "energy_bias_deviation": float(end.std() / np.sqrt(len(end))),
-    }  # fmt: skip
+    }
 
 
 def drift_of_law(quick: bool) -> Numbers:
@@ -202,9 +205,11 @@ def three_bodies(quick: bool) -> Numbers:
     closest, lost = closest_approaches(scene, orbits(scene, ORBITS)), rolled["lost_orbits"]
     kept = np.delete(closest, lost)
     return {
-        **found, **rolled, "closest_of_lost": closest[lost].tolist(),
+        **found,
+        **rolled,
+        "closest_of_lost": closest[lost].tolist(),
         "closest_of_kept": float(kept.min()),
-    }  # fmt: skip
+    }
 
 
 def closest_approaches(scene, z0) -> np.ndarray:
@@ -289,8 +294,9 @@ def kicked_pendulum(quick: bool) -> Numbers:
 
     def kicked(pairs):
         z1 = np.asarray(pairs.z1)
-        return gfnn.Pairs(pairs.z0, z1 + np.stack([0 * z1[:, 0], 0.2 * np.sin(3 * z1[:, 0])], 1),
-                          pairs.dt)  # fmt: skip
+        return gfnn.Pairs(
+            pairs.z0, z1 + np.stack([0 * z1[:, 0], 0.2 * np.sin(3 * z1[:, 0])], 1), pairs.dt
+        )
 
     pairs, fresh = (kicked(p) for p in pairs_by_flow(hamiltonian, draw, 2_000, 0.5))
     options = {"angles": (0,), "tolerance": 1e-12}
@@ -334,14 +340,17 @@ def accelerated(name: str, quick: bool) -> Numbers:
     begun = np.resize(np.asarray(fresh.z0), (BATCH, fresh.z0.shape[1]))
     rolled = timed(lambda: fast.map.rollout(begun, 100, save_every=100)[0], 3)
     return {
-        **found, "label": fast.chosen.label, "chosen": "map of the law",
+        **found,
+        "label": fast.chosen.label,
+        "chosen": "map of the law",
         "law_one_step_rms": found["one_step_rms"],
         "law_microseconds": found["microseconds_per_step"],
-        "num_terms": fast.chosen.num_parameters, "fit_seconds": seconds,
+        "num_terms": fast.chosen.num_parameters,
+        "fit_seconds": seconds,
         "one_step_rms": float(np.sqrt(np.mean(error**2))),
         "microseconds_per_step": 1e6 * rolled.seconds / (100 * BATCH),
         "symplecticity_defect": fast.symplecticity_defect,
-    }  # fmt: skip
+    }
 
 
 def derivative_matching(task: str, quick: bool) -> Numbers:
@@ -365,9 +374,12 @@ def derivative_matching(task: str, quick: bool) -> Numbers:
     exact = dict.fromkeys(family.term_names, 0.0) | exact
     off = [abs(v - exact[n]) for n, v in zip(family.term_names, c, strict=True)]
     return {
-        "pairs": len(pairs), "chosen": "derivative matching", "num_terms": len(c),
-        "one_step_rms": float(np.sqrt(np.mean(error**2))), "coefficient_error": max(off),
-    }  # fmt: skip
+        "pairs": len(pairs),
+        "chosen": "derivative matching",
+        "num_terms": len(c),
+        "one_step_rms": float(np.sqrt(np.mean(error**2))),
+        "coefficient_error": max(off),
+    }
 
 
 # Hard cases: what is kept and what is said
@@ -476,12 +488,17 @@ def of_others(task: str, method: str, quick: bool) -> Numbers:
         last = gfnn.metrics.position_error(np.asarray(rollout(step, z0, STEPS)), reference)[:, -1]
         median = float(np.median(np.where(np.isfinite(last), last, np.inf)))
     return {
-        "pairs": len(pairs), "chosen": METHODS[method].title, "label": found.label,
-        "num_terms": found.num_parameters, "one_step_rms": float(np.sqrt(np.mean(error**2))),
-        "error_median": median, "fit_seconds": training.seconds,
-        "compile_seconds": training.compile_seconds, "stopped_because": training.stopped_because,
+        "pairs": len(pairs),
+        "chosen": METHODS[method].title,
+        "label": found.label,
+        "num_terms": found.num_parameters,
+        "one_step_rms": float(np.sqrt(np.mean(error**2))),
+        "error_median": median,
+        "fit_seconds": training.seconds,
+        "compile_seconds": training.compile_seconds,
+        "stopped_because": training.stopped_because,
         "microseconds_per_step": 1e6 * rolled.seconds / (10 * BATCH),
-    }  # fmt: skip
+    }
 
 
 PIECES = {
@@ -497,36 +514,60 @@ PIECES = {
     **{f"two-body-{m}": partial(of_others, "two-body-cartesian", m) for m in OTHERS},
     "kicked-pendulum": kicked_pendulum,
     "network-pendulum": network_pendulum,
-    **{f"map-of-law-{name}": partial(accelerated, name)
-       for name in ("henon-heiles-regular", "two-body")},
+    **{
+        f"map-of-law-{name}": partial(accelerated, name)
+        for name in ("henon-heiles-regular", "two-body")
+    },
     **{
         f"double-pendulum-{dt:g}{'-term' if terms else ''}": partial(double_pendulum, dt, terms)
         for dt in (0.05, 0.2)
         for terms in ((), RATIONAL)
     },
     "hard": hard,
-}  # fmt: skip
+}
 
 
 def tables() -> None:
     """The table of RESULTS.md."""
     heads = (
-        "system", "pairs", "chosen", "terms", "one-step RMS", "coefficients", "step 1,000",
-        "lost", "fit, s", "µs a step", "defect",
-    )  # fmt: skip
+        "system",
+        "pairs",
+        "chosen",
+        "terms",
+        "one-step RMS",
+        "coefficients",
+        "step 1,000",
+        "lost",
+        "fit, s",
+        "µs a step",
+        "defect",
+    )
     rows = []
     found = results(PIECES, "laws")
     hard_ones = found.pop("hard", None)
     for name, result in found.items():
         m = result["measured"]
-        rows.append([
-            name, number(m["pairs"]), m["chosen"], number(m.get("num_terms")),
-            *(number(m.get(key)) for key in ("one_step_rms", "coefficient_error", "error_median")),
-            lost(m),
-            *(number(m.get(key)) for key in (
-                "fit_seconds", "microseconds_per_step", "symplecticity_defect",
-            )),
-        ])  # fmt: skip
+        rows.append(
+            [
+                name,
+                number(m["pairs"]),
+                m["chosen"],
+                number(m.get("num_terms")),
+                *(
+                    number(m.get(key))
+                    for key in ("one_step_rms", "coefficient_error", "error_median")
+                ),
+                lost(m),
+                *(
+                    number(m.get(key))
+                    for key in (
+                        "fit_seconds",
+                        "microseconds_per_step",
+                        "symplecticity_defect",
+                    )
+                ),
+            ]
+        )
     text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
     between_markers(TABLES, "laws", text)
     if hard_ones is not None:
@@ -547,11 +588,16 @@ def lost(m: Numbers) -> str:
 def hard_table(cases: list[Numbers]) -> str:
     """Table of a row per case: the model, its accuracy, the messages."""
     rows = [
-        [c["case"], number(c["pairs"]), c["chosen"] + (f": {c['label']}" if "label" in c else ""),
-         number(c.get("one_step_rms")), "yes" if c.get("met") else "no",
-         "<br>".join(c["messages"]).replace("|", "\\|") or "–"]
+        [
+            c["case"],
+            number(c["pairs"]),
+            c["chosen"] + (f": {c['label']}" if "label" in c else ""),
+            number(c.get("one_step_rms")),
+            "yes" if c.get("met") else "no",
+            "<br>".join(c["messages"]).replace("|", "\\|") or "–",
+        ]
         for c in cases
-    ]  # fmt: skip
+    ]
     heads = ("case", "pairs", "chosen", "one-step RMS", "tolerance met", "said")
     return markdown(heads, rows)
 

@@ -29,7 +29,7 @@ from harness import (
     provenance,
     results,
     timed,
-)  # fmt: skip
+)
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
@@ -63,9 +63,17 @@ def moved(law, z, dt: float, steps: int = 1) -> np.ndarray:
 
 
 def judged(
-    law, pairs: gfnn.Pairs, structure: str, fresh, exact, num_steps: int, *, parts: int = 1,
-    tolerance: float = 1e-12, apart: Mapping[str, float] | None = None,
-) -> Numbers:  # fmt: skip
+    law,
+    pairs: gfnn.Pairs,
+    structure: str,
+    fresh,
+    exact,
+    num_steps: int,
+    *,
+    parts: int = 1,
+    tolerance: float = 1e-12,
+    apart: Mapping[str, float] | None = None,
+) -> Numbers:
     """A fit of these pairs, and its errors from fresh states (B, 2d). exact: their images, and
     where they are after all steps. parts: of a step of the rollout. apart: the law's coefficients
     where what is alike has terms of its own."""
@@ -87,18 +95,25 @@ def judged(
     wrong = max(abs(coefficients.get(t, 0.0) - c) / abs(c) for t, c in exact_ones.items())
     energy = np.asarray(fit.map.hamiltonian(states[:, -1])) / fit.map.hamiltonian(fresh) - 1
     return {
-        "structure": structure, "dim": family.dim, "dt": dt, "pairs": len(pairs),
-        "formula": fit.formula, "terms": fit.chosen.num_parameters, "fit_seconds": seconds,
+        "structure": structure,
+        "dim": family.dim,
+        "dt": dt,
+        "pairs": len(pairs),
+        "formula": fit.formula,
+        "terms": fit.chosen.num_parameters,
+        "fit_seconds": seconds,
         "one_step_rms": float(np.sqrt(np.mean((np.asarray(fit.map.step(fresh)[0]) - one) ** 2))),
-        "coefficients_off": wrong, "steps": num_steps,
-        "error_median": float(np.median(off)), "error_90": float(np.sort(off)[int(0.9 * len(off))]),
+        "coefficients_off": wrong,
+        "steps": num_steps,
+        "error_median": float(np.median(off)),
+        "error_90": float(np.sort(off)[int(0.9 * len(off))]),
         "error_mean_absolute": float(np.abs(error).mean()),
         "error_mean_square": float(np.mean(error**2)),
         "energy_off": float(np.nanmedian(np.abs(energy))),
         "symplecticity_defect": fit.symplecticity_defect,
         "microseconds_per_step_alone": 1e6 * alone.seconds / 100,
         "gigabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
-    }  # fmt: skip
+    }
 
 
 def fitted_to(pairs: gfnn.Pairs, structure: str, tolerance: float = 1e-12) -> gfnn.Fit:
@@ -174,10 +189,16 @@ def froeschle(quick: bool) -> Numbers:
     """A ring of 64 coupled standard maps, 100 pairs: a map without a flow, judged modulo 2π."""
     scene = gfnn.scenes.froeschle()
     pairs = gfnn.sample_pairs(scene, 110, jax.random.key(SEED))
-    fit, seconds, _ = once(lambda: gfnn.fit(
-        gfnn.Pairs(pairs.z0[:100], pairs.z1[:100], 1.0), structure="ring", learn="map",
-        angles=scene.coordinates.angles, tolerance=1e-12, max_seconds=None,
-    ))  # fmt: skip
+    fit, seconds, _ = once(
+        lambda: gfnn.fit(
+            gfnn.Pairs(pairs.z0[:100], pairs.z1[:100], 1.0),
+            structure="ring",
+            learn="map",
+            angles=scene.coordinates.angles,
+            tolerance=1e-12,
+            max_seconds=None,
+        )
+    )
     fresh, steps = pairs.z0[100:], 10
     exact = np.asarray(gfnn.reference_trajectories(scene, fresh, steps))
     states = np.asarray(fit.map.rollout(fresh, steps)[0])
@@ -188,16 +209,22 @@ def froeschle(quick: bool) -> Numbers:
     kicks = {"p_i²": 0.5, "cos(q_i)": 0.5, "cos(q_{i+1} - q_i)": -0.1}
     found = dict(zip(piece.family.term_names, np.asarray(piece.params).tolist(), strict=True))
     return {
-        "structure": "ring", "dim": 64, "dt": 1.0, "pairs": 100, "formula": None,
-        "terms": fit.chosen.num_parameters, "fit_seconds": seconds,
+        "structure": "ring",
+        "dim": 64,
+        "dt": 1.0,
+        "pairs": 100,
+        "formula": None,
+        "terms": fit.chosen.num_parameters,
+        "fit_seconds": seconds,
         "one_step_rms": float(np.sqrt(np.mean(error[:, 1] ** 2))),
         "coefficients_off": max(abs(found.get(t, 0.0) - c) / abs(c) for t, c in kicks.items()),
-        "steps": steps, "error_median": float(np.median(off)),
+        "steps": steps,
+        "error_median": float(np.median(off)),
         "error_90": float(np.sort(off)[int(0.9 * len(off))]),
         "symplecticity_defect": fit.symplecticity_defect,
         "microseconds_per_step_alone": 1e6 * alone.seconds / 100,
         "gigabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
-    }  # fmt: skip
+    }
 
 
 def three_bodies(quick: bool) -> Numbers:
@@ -228,9 +255,16 @@ def three_bodies(quick: bool) -> Numbers:
     # DOP853 itself is off by 1e-12 after a close passage.
     names = body_terms(3, 2, (-1,), alike=False).term_names
     return judged(
-        law, pairs, "bodies:3", fresh[:, 0], exact, steps, parts=CLOSE, tolerance=1e-11,
+        law,
+        pairs,
+        "bodies:3",
+        fresh[:, 0],
+        exact,
+        steps,
+        parts=CLOSE,
+        tolerance=1e-11,
         apart=dict(zip(names, [0.5] * 3 + [-1.0] * 3, strict=True)),
-    )  # fmt: skip
+    )
 
 
 def four_bodies(quick: bool) -> Numbers:
@@ -259,24 +293,34 @@ def energy(quick: bool) -> Numbers:
     lags = np.unique(np.geomspace(1, off.shape[1] // 4, 20).astype(int))
     rms = [float(np.sqrt(np.mean((off[:, n:] - off[:, :-n]) ** 2))) for n in lags]
     return {
-        "dim": 1_000, "steps": steps, "lanes": len(off), "seconds": seconds,
-        "lags": (every * lags).tolist(), "rms": rms,
+        "dim": 1_000,
+        "steps": steps,
+        "lanes": len(off),
+        "seconds": seconds,
+        "lags": (every * lags).tolist(),
+        "rms": rms,
         "exponent": float(np.polyfit(np.log(lags), np.log(rms), 1)[0]),
         "drift_per_step": growth.energy_drift(every * np.arange(off.shape[1]), off).value,
         "largest": float(np.abs(off).max()),
-    }  # fmt: skip
+    }
 
 
 PIECES = {
     **{f"fput-{dim}": partial(fput, dim) for dim in SIZES},
-    "toda": toda, "froeschle": froeschle, "three-bodies": three_bodies,
-    "four-bodies": four_bodies, "leapfrog": leapfrog, "energy": energy,
-}  # fmt: skip
+    "toda": toda,
+    "froeschle": froeschle,
+    "three-bodies": three_bodies,
+    "four-bodies": four_bodies,
+    "leapfrog": leapfrog,
+    "energy": energy,
+}
 _TITLES = {
     **{f"fput-{dim}": f"FPUT-β ring, d = {dim:,}" for dim in SIZES},
-    "toda": "Toda's ring, d = 32", "froeschle": "64 coupled standard maps",
-    "three-bodies": "three equal bodies in the plane", "four-bodies": "four bodies in space",
-}  # fmt: skip
+    "toda": "Toda's ring, d = 32",
+    "froeschle": "64 coupled standard maps",
+    "three-bodies": "three equal bodies in the plane",
+    "four-bodies": "four bodies in space",
+}
 # (piece, what is measured, its key, the best published figure that this project knows of for such a
 # task), from Hamiltonian networks on data of their own. Nothing of them was run here.
 _PUBLISHED = (
@@ -293,15 +337,36 @@ _BESIDE = (
 def tables() -> None:
     """The table of RESULTS.md."""
     found = results(PIECES, "many")
-    heads = ("task", "dt", "pairs", "fit s", "terms", "coefficients off by", "one-step RMS",
-             "at step", "error, median", "error, 90 %", "µs per step alone", "GB")  # fmt: skip
+    heads = (
+        "task",
+        "dt",
+        "pairs",
+        "fit s",
+        "terms",
+        "coefficients off by",
+        "one-step RMS",
+        "at step",
+        "error, median",
+        "error, 90 %",
+        "µs per step alone",
+        "GB",
+    )
     rows = []
     for name, title in _TITLES.items():
         if name not in found:
             continue
         m = found[name]["measured"]
-        keys = ("fit_seconds", "terms", "coefficients_off", "one_step_rms", "steps", "error_median",
-                "error_90", "microseconds_per_step_alone", "gigabytes")  # fmt: skip
+        keys = (
+            "fit_seconds",
+            "terms",
+            "coefficients_off",
+            "one_step_rms",
+            "steps",
+            "error_median",
+            "error_90",
+            "microseconds_per_step_alone",
+            "gigabytes",
+        )
         rows.append((title, f"{m['dt']:g}", str(m["pairs"]), *(number(m[key]) for key in keys)))
     text = markdown(heads, rows)
     if "leapfrog" in found:

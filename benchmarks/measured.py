@@ -99,19 +99,33 @@ def tables() -> None:
     for name, result in found.items():
         for third, m in result["measured"].items():
             ahead = [
-                f"{t} s {e:.3g}" + (f" (≤ {m['asked'][t]:g})" if t in m["asked"] else "")
+                f"{t} s {e:.3g}"
+                + (f" (≤ {m['asked'][t]:g})" if t in m["asked"] else "")
                 + f" [{m['within_two_deviations'][t]:.0%}]"
-                for t, e in m["median"].items() if e is not None
-            ]  # fmt: skip
+                for t, e in m["median"].items()
+                if e is not None
+            ]
             rest = ", ".join(f"{r:.3g}" for r in m["rest"][:3])
             rest += " …" if len(m["rest"]) > 3 else ""
             rest += f" (≤ {m['asked']['rest']:g})" if "rest" in m["asked"] else ""
-            rows.append([
-                name, THIRDS[int(third)], "; ".join(ahead), rest,
-                m["which_friction"], f"{m['seconds']:.0f} (≤ {m['most_seconds']})",
-            ])  # fmt: skip
-    heads = ("record", "third held out", "median error ahead (asked) [within 2 σ]",
-             "rest of a part, RMS", "friction", "CPU s")  # fmt: skip
+            rows.append(
+                [
+                    name,
+                    THIRDS[int(third)],
+                    "; ".join(ahead),
+                    rest,
+                    m["which_friction"],
+                    f"{m['seconds']:.0f} (≤ {m['most_seconds']})",
+                ]
+            )
+    heads = (
+        "record",
+        "third held out",
+        "median error ahead (asked) [within 2 σ]",
+        "rest of a part, RMS",
+        "friction",
+        "CPU s",
+    )
     between_markers(TABLES, "measured", f"{markdown(heads, rows)}\n\n{provenance(found)}")
     draw(found)
 
@@ -121,9 +135,12 @@ def draw(found: dict[str, Numbers]) -> None:
     for what was asked."""
     with figures.style():
         grid, axes = plt.subplots(
-            2, -(-len(found) // 2), figsize=(2.4 * -(-len(found) // 2), 4.6), squeeze=False,
+            2,
+            -(-len(found) // 2),
+            figsize=(2.4 * -(-len(found) // 2), 4.6),
+            squeeze=False,
             layout="constrained",
-        )  # fmt: skip
+        )
     for ax in axes.ravel()[len(found) :]:
         ax.axis("off")
     for ax, (name, result) in zip(axes.ravel(), found.items(), strict=False):
@@ -147,8 +164,11 @@ def measure(name: str, path: Path, fold: int, told: Any = None) -> dict[str, Any
     """Fit two thirds of a record, and judge forecasts of the rest."""
     columns: dict[str, Any] = {"inputs": ["u"], "positions": ["y"]} if name == "silverbox" else {}
     if name == "robot_arm":
-        columns = {"positions": ["theta1", "theta2"], "inputs": ["tau1", "tau2"],
-                   "angles": ["theta1", "theta2"]}  # fmt: skip
+        columns = {
+            "positions": ["theta1", "theta2"],
+            "inputs": ["tau1", "tau2"],
+            "angles": ["theta1", "theta2"],
+        }
     recording = gfnn.read(path, **columns)
     training, held = split(recording, fold)
     started = time.process_time()
@@ -158,10 +178,14 @@ def measure(name: str, path: Path, fold: int, told: Any = None) -> dict[str, Any
     errors, within = forecasts(fit.map, held, times)
     rest = rest_of_record(fit.map, held)
     return {
-        "formula": fit.formula, "friction": fit.friction.formula, "text": fit.table.split("\n")[:2],
+        "formula": fit.formula,
+        "friction": fit.friction.formula,
+        "text": fit.table.split("\n")[:2],
         "which_friction": "+".join(fit.which_friction.kinds) or "none",
         "odds": fit.which_friction.odds,
-        "seconds": seconds, "most_seconds": most, "unit": unit,
+        "seconds": seconds,
+        "most_seconds": most,
+        "unit": unit,
         "asked": {str(k): v for k, v in asked.items()},
         "median": {
             str(t): None if e is None else e * unit for t, e in zip(times, errors, strict=True)
@@ -169,8 +193,9 @@ def measure(name: str, path: Path, fold: int, told: Any = None) -> dict[str, Any
         "within_two_deviations": {str(t): w for t, w in zip(times, within, strict=True)},
         "rest": [r * unit for r in rest],
         "residual": {k: v * unit for k, v in fit.residual.items()},
-        "horizon": [h._asdict() for h in fit.horizon], "num_training": len(training),
-    }  # fmt: skip
+        "horizon": [h._asdict() for h in fit.horizon],
+        "num_training": len(training),
+    }
 
 
 def split(recording: Any, fold: int) -> tuple[Any, list[Any]]:
@@ -215,8 +240,12 @@ def held_windows(
     the samples at ``times`` (m,) s later, and what was measured there (n, m, channels), NaN where
     the part ends before."""
     parts = [s for recording in held for s in stretches(recording)]
-    ends = [(s, k) for s in parts for k in range(SAMPLES - 1, len(s.t) - 1)
-            if s.t[k] + times[0] <= s.t[-1]]  # fmt: skip
+    ends = [
+        (s, k)
+        for s in parts
+        for k in range(SAMPLES - 1, len(s.t) - 1)
+        if s.t[k] + times[0] <= s.t[-1]
+    ]
     ends = ends[:: max(1, len(ends) // WINDOWS)]
     ahead, measured = [], []
     for s, k in ends:
@@ -277,10 +306,12 @@ def rest_of_record(map_: Any, held: list[Any]) -> list[float]:
 
 def line(name: str, m: dict[str, Any]) -> str:
     told = [
-        f"{t} s {e:.3g}" + (f" (≤ {m['asked'][t]:g})" if t in m["asked"] else "")
+        f"{t} s {e:.3g}"
+        + (f" (≤ {m['asked'][t]:g})" if t in m["asked"] else "")
         + f" [{m['within_two_deviations'][t]:.0%}]"
-        for t, e in m["median"].items() if e is not None
-    ]  # fmt: skip
+        for t, e in m["median"].items()
+        if e is not None
+    ]
     rest = ", ".join(f"{r:.3g}" for r in m["rest"])
     limit = f" (≤ {m['asked']['rest']:g})" if "rest" in m["asked"] else ""
     return (

@@ -50,9 +50,11 @@ def pieces() -> list[tuple[str, int]]:
     """List (scene, seed), each scene's first seed before any second one."""
     most = max(len(seeds) for seeds, _ in SCENES.values())
     return [
-        (name, seeds[i]) for i in range(most) for name, (seeds, _) in SCENES.items()
+        (name, seeds[i])
+        for i in range(most)
+        for name, (seeds, _) in SCENES.items()
         if i < len(seeds)
-    ]  # fmt: skip
+    ]
 
 
 def result_path(folder: Path, name: str, seed: int) -> Path:
@@ -113,17 +115,25 @@ def scene_table(name: str, reports: list[Numbers]) -> str:
         training = mean("fit", "seconds") + (
             " (cap)" if m["fit"]["capped"] else " (diverged)" if "finite" in stopped else ""
         )
-        cells = [m["title"], f"{m['model']['num_parameters']:,}", f"{m['data']['num_pairs']:,}",
-                 training, mean("fit", "compile_seconds"),
-                 mean("rollout", "microseconds_per_step"),
-                 mean("fit", "validation_rms")]  # fmt: skip
+        cells = [
+            m["title"],
+            f"{m['model']['num_parameters']:,}",
+            f"{m['data']['num_pairs']:,}",
+            training,
+            mean("fit", "compile_seconds"),
+            mean("rollout", "microseconds_per_step"),
+            mean("fit", "validation_rms"),
+        ]
         if not chaotic:
             cells += [mean("rollout", "error", str(n)) for n in (10, 100, 1000)]
             cells += [mean("rollout", "error_median", "1000")]
             cells += ["–" if growth is None else f"{growth:.2f}"]
         unsolved = max(r["methods"][method]["map"].get("unsolved", 0.0) for r in reports)
-        cells += [mean("rollout", "energy_drift"), mean("map", "symplecticity_defect")
-                  + (f" ({100 * unsolved:.0f} % unsolved)" if unsolved else "")]  # fmt: skip
+        cells += [
+            mean("rollout", "energy_drift"),
+            mean("map", "symplecticity_defect")
+            + (f" ({100 * unsolved:.0f} % unsolved)" if unsolved else ""),
+        ]
         cells += [mean("kl", label) for label in labels]
         rows.append(cells)
     return markdown(heads, rows)
@@ -184,9 +194,10 @@ def claims(found: dict[str, list[Numbers]]) -> list[str]:
     if "standard-map-regular" in found:
         reports = found["standard-map-regular"]
         small = [
-            reports[0]["methods"][m]["title"] for m in reports[0]["methods"]
+            reports[0]["methods"][m]["title"]
+            for m in reports[0]["methods"]
             if (over_seeds(reports, m, "rollout", "error_median", "100") or math.inf) < 0.3
-        ]  # fmt: skip
+        ]
         said.append(
             "standard-map-regular, *only GFNN jumps between the two islands as the map does*: "
             f"methods whose median error at step 100 is below 0.3: {', '.join(small) or 'none'}."
@@ -203,11 +214,15 @@ def section(found: dict[str, list[Numbers]]) -> str:
         seeds = ", ".join(str(r["seed"]) for r in reports)
         caps = sorted({r["cap"] for r in reports})
         lines += [
-            "", f"### {name} ({figure})", "",
+            "",
+            f"### {name} ({figure})",
+            "",
             f"`gfnn compare {name} --cap {caps[0]:g}`, seed {seeds}; "
             f"{first['methods'][PAPER_GFNN]['rollout']['num_trajectories']} test states.",
-            "", scene_table(name, reports), "",
-        ]  # fmt: skip
+            "",
+            scene_table(name, reports),
+            "",
+        ]
         for path in sorted(FIGURES.glob(f"{name}-*.png")):
             lines.append(f"![{path.stem}](figures/compare/{path.name})")
     loads = [r["machine"]["load"] for reports in found.values() for r in reports]
@@ -244,8 +259,11 @@ def draw(name: str, methods: Numbers) -> None:
         figures.save(error.figure, FIGURES / f"{name}-error.png")
     if all(m["elements"] for m in methods.values()):
         axis, shape = (curves(methods, "elements", k) for k in ("axis", "eccentricity"))
-        both = {n: (axis[n][0], axis[n][1], shape[n][1]) for n in axis
-                if axis[n][1].shape == shape[n][1].shape}  # fmt: skip
+        both = {
+            n: (axis[n][0], axis[n][1], shape[n][1])
+            for n in axis
+            if axis[n][1].shape == shape[n][1].shape
+        }
         elements: Any = figures.element_errors(both)[0]
         figures.save(elements.figure, FIGURES / f"{name}-elements.png")
 
@@ -264,14 +282,25 @@ def tables() -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("scenes", nargs="*", choices=[[], *SCENES], metavar="SCENE",
-                        help=", ".join(SCENES))  # fmt: skip
+    parser.add_argument(
+        "scenes", nargs="*", choices=[[], *SCENES], metavar="SCENE", help=", ".join(SCENES)
+    )
     parser.add_argument("--only", metavar="SCENE-SEED", help="one of a scene's seeds")
     parser.add_argument("--quick", action="store_true", help="two bodies only, small sizes")
-    parser.add_argument("--cap", type=float, metavar="SECONDS", default=CAP,
-                        help="most training of a method (default %(default)g)")  # fmt: skip
-    parser.add_argument("--work", type=Path, default=WORK, metavar="DIR",
-                        help="where comparisons are made (default %(default)s)")  # fmt: skip
+    parser.add_argument(
+        "--cap",
+        type=float,
+        metavar="SECONDS",
+        default=CAP,
+        help="most training of a method (default %(default)g)",
+    )
+    parser.add_argument(
+        "--work",
+        type=Path,
+        default=WORK,
+        metavar="DIR",
+        help="where comparisons are made (default %(default)s)",
+    )
     parser.add_argument("--overwrite", action="store_true", help="compare again what is finished")
     parser.add_argument("--tables", action="store_true", help="only make the tables again")
     arguments = parser.parse_args(argv)

@@ -89,40 +89,90 @@ def _over(scale: float, terms: dict[str, float]) -> dict[str, float]:
 
 
 _CART = Family(
-    _cart, "m", MASSES, lambda k: (0.8,), 20.0, 0.05, ("x",), (),
-    _over(0.75, {"v**2": 0.25, "v**2*m": 0.5, "x**2": -1.5}), _over(0.75, {"v**2": 0.025}),
-)  # fmt: skip
+    _cart,
+    "m",
+    MASSES,
+    lambda k: (0.8,),
+    20.0,
+    0.05,
+    ("x",),
+    (),
+    _over(0.75, {"v**2": 0.25, "v**2*m": 0.5, "x**2": -1.5}),
+    _over(0.75, {"v**2": 0.025}),
+)
 FAMILIES = {
     "pendulum, its length": Family(
-        _pendulum, "l", LENGTHS, lambda k: (1.2 - 0.1 * k,), 12.0, 0.03, ("theta",), ("theta",),
-        {"omega**2": 0.5, "cos(theta)/l": G}, {"omega**2": 0.05},
+        _pendulum,
+        "l",
+        LENGTHS,
+        lambda k: (1.2 - 0.1 * k,),
+        12.0,
+        0.03,
+        ("theta",),
+        ("theta",),
+        {"omega**2": 0.5, "cos(theta)/l": G},
+        {"omega**2": 0.05},
     ),
     "cart on a spring, an added mass": _CART,
     "the same, driven": _CART._replace(end=30.0, gain=0.7 / 0.75),
     "two carts, mass on the first": Family(
-        partial(_two_carts, 0), "m", MASSES, lambda k: (0.3, 0.1 * k - 0.1), 8.0, 0.02,
-        ("x1", "x2"), (),
-        _over(0.75, {"v1**2": 0.25, "v1**2*m": 0.5, "v2**2": 0.4} | SPRINGS), {},
+        partial(_two_carts, 0),
+        "m",
+        MASSES,
+        lambda k: (0.3, 0.1 * k - 0.1),
+        8.0,
+        0.02,
+        ("x1", "x2"),
+        (),
+        _over(0.75, {"v1**2": 0.25, "v1**2*m": 0.5, "v2**2": 0.4} | SPRINGS),
+        {},
     ),
     "two carts, mass on the second": Family(
-        partial(_two_carts, 1), "m", MASSES, lambda k: (0.3, 0.1 * k - 0.1), 8.0, 0.02,
-        ("x1", "x2"), (),
-        _over(0.5, {"v1**2": 0.25, "v2**2": 0.4, "v2**2*m": 0.5} | SPRINGS), {},
+        partial(_two_carts, 1),
+        "m",
+        MASSES,
+        lambda k: (0.3, 0.1 * k - 0.1),
+        8.0,
+        0.02,
+        ("x1", "x2"),
+        (),
+        _over(0.5, {"v1**2": 0.25, "v2**2": 0.4, "v2**2*m": 0.5} | SPRINGS),
+        {},
     ),
     "double pendulum, its lower length": Family(
-        _double_pendulum, "l", (0.15, 0.2, 0.3, 0.4), lambda k: (1.0, 0.2 * k - 0.6), 4.0, 0.01,
-        ("theta1", "theta2"), ("theta1", "theta2"),
-        _over(0.03125, {"omega1**2": 0.015625, "omega1*omega2*cos(theta1 - theta2)*l": 0.05,
-                        "omega2**2*l**2": 0.1, "cos(theta1)": 0.125 * G,
-                        "cos(theta2)*l": 0.2 * G}),
+        _double_pendulum,
+        "l",
+        (0.15, 0.2, 0.3, 0.4),
+        lambda k: (1.0, 0.2 * k - 0.6),
+        4.0,
+        0.01,
+        ("theta1", "theta2"),
+        ("theta1", "theta2"),
+        _over(
+            0.03125,
+            {
+                "omega1**2": 0.015625,
+                "omega1*omega2*cos(theta1 - theta2)*l": 0.05,
+                "omega2**2*l**2": 0.1,
+                "cos(theta1)": 0.125 * G,
+                "cos(theta2)*l": 0.2 * G,
+            },
+        ),
         _over(0.03125, {"omega1**2": 5e-4, "omega2**2": 2.5e-4}),
     ),
     "pendulums of one length": Family(
-        lambda q, v, u, unused: _pendulum(q, v, u, 1.0), "l", LENGTHS,
-        lambda k: (1.2 - 0.1 * k,), 12.0, 0.03, ("theta",), ("theta",),
-        {"omega**2": 0.5, "cos(theta)": G}, {"omega**2": 0.05},
+        lambda q, v, u, unused: _pendulum(q, v, u, 1.0),
+        "l",
+        LENGTHS,
+        lambda k: (1.2 - 0.1 * k,),
+        12.0,
+        0.03,
+        ("theta",),
+        ("theta",),
+        {"omega**2": 0.5, "cos(theta)": G},
+        {"omega**2": 0.05},
     ),
-}  # fmt: skip
+}
 
 
 @cache
@@ -137,11 +187,18 @@ def orbits(name: str, values: tuple[float, ...]) -> tuple[np.ndarray, ...]:
 
     return tuple(
         solve_ivp(
-            rate, (0, t[-1]), [*family.start(k), *np.zeros(d)], t_eval=t, args=(value,),
-            method="DOP853", rtol=1e-11, atol=1e-11, max_step=0.05,
+            rate,
+            (0, t[-1]),
+            [*family.start(k), *np.zeros(d)],
+            t_eval=t,
+            args=(value,),
+            method="DOP853",
+            rtol=1e-11,
+            atol=1e-11,
+            max_step=0.05,
         ).y[:d]
         for k, value in enumerate(values)
-    )  # fmt: skip
+    )
 
 
 def recording(name: str, values: tuple[float, ...], noise: float, seed: int) -> gfnn.Recording:
@@ -158,9 +215,12 @@ def recording(name: str, values: tuple[float, ...], noise: float, seed: int) -> 
         columns |= {"u": force(t)} if family.gain else {}
         tables.append({"run": np.full(len(t), str(k)), "t": t, **columns})
     return gfnn.Recording(
-        tables, positions=family.names, angles=family.angles, parameters=[family.parameter],
+        tables,
+        positions=family.names,
+        angles=family.angles,
+        parameters=[family.parameter],
         inputs=["u"] if family.gain else None,
-    )  # fmt: skip
+    )
 
 
 def case(name: str, noise: float, draw: int) -> Numbers:
@@ -192,10 +252,15 @@ def case(name: str, noise: float, draw: int) -> Numbers:
         )
     }
     return {
-        "noise": noise, "draw": draw, "same": same, "standard_errors": off, "formula": fit.formula,
-        "friction": fit.friction.formula, "forecasts": ahead,
+        "noise": noise,
+        "draw": draw,
+        "same": same,
+        "standard_errors": off,
+        "formula": fit.formula,
+        "friction": fit.friction.formula,
+        "forecasts": ahead,
         "processor_seconds": done.processor_seconds,
-    }  # fmt: skip
+    }
 
 
 def forecast(name: str, fit: Any, value: float, noise: float, seed: int) -> Numbers:
@@ -221,9 +286,11 @@ def measured(name: str, quick: bool) -> Numbers:
             cases.append(case(name, noise, draw))
             c = cases[-1]
             worst = max(c["standard_errors"].items(), key=lambda item: item[1], default=("", 0))
-            print(f"  {noise:g}: {c['same']}, {worst[0]} off by {worst[1]:.1f}; {c['formula']} | "
-                  f"{c['friction']}; {c['forecasts']}; {c['processor_seconds']:.1f} s",
-                  flush=True)  # fmt: skip
+            print(
+                f"  {noise:g}: {c['same']}, {worst[0]} off by {worst[1]:.1f}; {c['formula']} | "
+                f"{c['friction']}; {c['forecasts']}; {c['processor_seconds']:.1f} s",
+                flush=True,
+            )
     return {"cases": cases}
 
 
@@ -247,17 +314,31 @@ def tables() -> None:
                 )
                 for place in ("between", "beyond")
             }
-            rows.append([
-                NAMES[name], f"{noise:g}",
-                *(f"{sum(c['same'][k] for c in cases)} of {len(cases)}"
-                  for k in ("lagrangian", "friction")),
-                f"{sum(z <= WITHIN for z in off)} of {len(off)}", number(max(off)),
-                *(f"{error:.2f}, {within:.0%}" for error, within in ahead.values()),
-                number(np.mean([c["processor_seconds"] for c in cases])),
-            ])  # fmt: skip
-    heads = ("systems", "noise ÷ spread", "terms of L exact", "friction exact",
-             f"within {WITHIN:g} standard errors", "largest", "forecast between", "and beyond",
-             "CPU s")  # fmt: skip
+            rows.append(
+                [
+                    NAMES[name],
+                    f"{noise:g}",
+                    *(
+                        f"{sum(c['same'][k] for c in cases)} of {len(cases)}"
+                        for k in ("lagrangian", "friction")
+                    ),
+                    f"{sum(z <= WITHIN for z in off)} of {len(off)}",
+                    number(max(off)),
+                    *(f"{error:.2f}, {within:.0%}" for error, within in ahead.values()),
+                    number(np.mean([c["processor_seconds"] for c in cases])),
+                ]
+            )
+    heads = (
+        "systems",
+        "noise ÷ spread",
+        "terms of L exact",
+        "friction exact",
+        f"within {WITHIN:g} standard errors",
+        "largest",
+        "forecast between",
+        "and beyond",
+        "CPU s",
+    )
     between_markers(TABLES, "parameters", markdown(heads, rows))
 
 

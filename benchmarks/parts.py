@@ -67,8 +67,12 @@ def _named(body: list[ast.stmt]) -> Iterator[tuple[str, ast.stmt]]:
             yield node.name, node
         elif isinstance(node, (ast.Assign, ast.AnnAssign)):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            names = [one.id for target in targets for one in ast.walk(target)
-                     if isinstance(one, ast.Name)]  # fmt: skip
+            names = [
+                one.id
+                for target in targets
+                for one in ast.walk(target)
+                if isinstance(one, ast.Name)
+            ]
             for name in names or [""]:
                 yield name, node
         elif not isinstance(node, _FUNCTIONS) and not _is_text(node) and not _for_types(node):
@@ -96,8 +100,9 @@ def _alone(node: ast.AST) -> ast.AST:
         methods = isinstance(one, ast.ClassDef)
         one.body = [  # pyright: ignore[reportAttributeAccessIssue]
             ast.Expr(ast.Constant(inner.name)) if isinstance(inner, _FUNCTIONS) else inner
-            for inner in body if methods or not isinstance(inner, _FUNCTIONS)
-        ]  # fmt: skip
+            for inner in body
+            if methods or not isinstance(inner, _FUNCTIONS)
+        ]
     return copy
 
 
@@ -105,6 +110,8 @@ def _used(named: dict[str, list[ast.AST]]) -> set[str]:
     """Names that parts read, but for the one whose part it is."""
     return {
         inner.id
-        for name, nodes in named.items() for node in nodes for inner in ast.walk(node)
+        for name, nodes in named.items()
+        for node in nodes
+        for inner in ast.walk(node)
         if isinstance(inner, ast.Name) and inner.id != name
-    }  # fmt: skip
+    }

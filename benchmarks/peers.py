@@ -102,10 +102,12 @@ def double_pendulum(c: Any, q: jax.Array, v: jax.Array) -> jax.Array:
     pivot, joint = jnp.asarray(friction[:2]) * speeds
     if len(friction) == 4:
         pivot, joint = jnp.array([pivot, joint]) + jnp.asarray(friction[2:]) * speeds * abs(speeds)
-    force = jnp.array([
-        -b * v[1] ** 2 * jnp.sin(difference) - g1 * jnp.sin(q[0]) - pivot + joint,
-        b * v[0] ** 2 * jnp.sin(difference) - g2 * jnp.sin(q[1]) - joint,
-    ])  # fmt: skip
+    force = jnp.array(
+        [
+            -b * v[1] ** 2 * jnp.sin(difference) - g1 * jnp.sin(q[0]) - pivot + joint,
+            b * v[0] ** 2 * jnp.sin(difference) - g2 * jnp.sin(q[1]) - joint,
+        ]
+    )
     return jnp.linalg.solve(mass, force)
 
 
@@ -121,10 +123,17 @@ def _double_pendulum_library(q: Any, v: Any) -> tuple[Any, ...]:
     """The terms of the solved equations; 1/(1 − k cos² Δ), k unknown, by its harmonics of Δ."""
     d = q[0] - q[1]
     terms = (
-        jnp.sin(q[0]), jnp.sin(q[1]), jnp.sin(q[0] - 2 * q[1]), jnp.sin(2 * q[0] - q[1]),
-        v[0] ** 2 * jnp.sin(d), v[1] ** 2 * jnp.sin(d),
-        v[0] ** 2 * jnp.sin(2 * d), v[1] ** 2 * jnp.sin(2 * d), v[0], v[1],
-    )  # fmt: skip
+        jnp.sin(q[0]),
+        jnp.sin(q[1]),
+        jnp.sin(q[0] - 2 * q[1]),
+        jnp.sin(2 * q[0] - q[1]),
+        v[0] ** 2 * jnp.sin(d),
+        v[1] ** 2 * jnp.sin(d),
+        v[0] ** 2 * jnp.sin(2 * d),
+        v[1] ** 2 * jnp.sin(2 * d),
+        v[0],
+        v[1],
+    )
     return tuple(term * jnp.cos(2 * k * d) for k in range(4) for term in terms)
 
 
@@ -134,24 +143,39 @@ def _angles(q: jax.Array) -> jax.Array:
 
 SYSTEMS = {
     "pendulum": System(
-        pendulum, (5.0, 0.01, 0.0), _pendulum_library, _angles, 0.06,
+        pendulum,
+        (5.0, 0.01, 0.0),
+        _pendulum_library,
+        _angles,
+        0.06,
         "θ̈ = −k sin θ − c θ̇; sin, cos, ω, ω abs(ω)",
     ),
     "two_carts": System(
-        carts, (10.0, 5.0, 0.0, 0.1, 5.0, 10.0, 0.0, 0.1), _cart_library, lambda q: q / 50, 0.034,
+        carts,
+        (10.0, 5.0, 0.0, 0.1, 5.0, 10.0, 0.0, 0.1),
+        _cart_library,
+        lambda q: q / 50,
+        0.034,
         "two masses, three springs, linear friction; 1, x, v",
     ),
     "double_pendulum": System(
-        double_pendulum, (0.2, 0.4, 60.0, 20.0, 0.01, 0.01), _double_pendulum_library, _angles,
-        0.011, "the textbook's Lagrangian; the 40 terms of its solved equations",
+        double_pendulum,
+        (0.2, 0.4, 60.0, 20.0, 0.01, 0.01),
+        _double_pendulum_library,
+        _angles,
+        0.011,
+        "the textbook's Lagrangian; the 40 terms of its solved equations",
     ),
     "arm2": System(
-        double_pendulum, (0.2, 0.4, -60.0, -20.0, 0.01, 0.01, 0.0, 0.0), _double_pendulum_library,
-        _angles, 0.01,
+        double_pendulum,
+        (0.2, 0.4, -60.0, -20.0, 0.01, 0.01, 0.0, 0.0),
+        _double_pendulum_library,
+        _angles,
+        0.01,
         "the textbook's Lagrangian, linear and quadratic friction; the 40 terms of its solved "
         "equations",
     ),
-}  # fmt: skip
+}
 
 
 # Integration, shared by all
@@ -171,9 +195,18 @@ def positions(
 
     def one(x0: jax.Array, t: jax.Array) -> jax.Array:
         solved = diffrax.diffeqsolve(
-            diffrax.ODETerm(field), diffrax.Tsit5(), 0.0, t[-1], step, x0, params,
-            saveat=diffrax.SaveAt(ts=t), adjoint=adjoint, throw=False, max_steps=4096,
-        )  # fmt: skip
+            diffrax.ODETerm(field),
+            diffrax.Tsit5(),
+            0.0,
+            t[-1],
+            step,
+            x0,
+            params,
+            saveat=diffrax.SaveAt(ts=t),
+            adjoint=adjoint,
+            throw=False,
+            max_steps=4096,
+        )
         assert solved.ys is not None  # times were asked for
         return solved.ys[:, :dim]
 
@@ -220,9 +253,14 @@ def by_hand(system: System, arcs: Arcs, quick: bool) -> tuple[Acceleration, Any]
     jacobian = jax.jit(jax.jacfwd(residual))
     start = np.concatenate([_constants(system, arcs), arcs.x0.ravel()])
     found = least_squares(
-        residual, start, jac=lambda x: np.asarray(jacobian(x)), x_scale="jac", loss="soft_l1",  # pyright: ignore[reportArgumentType]
-        f_scale=0.01, max_nfev=10 if quick else 60,
-    )  # fmt: skip
+        residual,
+        start,
+        jac=lambda x: np.asarray(jacobian(x)),
+        x_scale="jac",
+        loss="soft_l1",  # pyright: ignore[reportArgumentType]
+        f_scale=0.01,
+        max_nfev=10 if quick else 60,
+    )
     return system.body, jnp.asarray(found.x[:num])
 
 
@@ -233,9 +271,11 @@ def _constants(system: System, arcs: Arcs) -> np.ndarray:
     q, v, a = (np.concatenate([getattr(s, name)[2:-2] for s in parts]) for name in "qva")
     body = jax.jit(jax.vmap(system.body, in_axes=(None, 0, 0)))
     found = least_squares(
-        lambda c: (np.asarray(body(c, q, v)) - a).ravel() / a.std(), system.constants,
-        loss="soft_l1", f_scale=0.1,
-    )  # fmt: skip
+        lambda c: (np.asarray(body(c, q, v)) - a).ravel() / a.std(),
+        system.constants,
+        loss="soft_l1",
+        f_scale=0.1,
+    )
     return found.x
 
 
@@ -359,9 +399,10 @@ def _weak_form(
 
     count = len(system.library(np.ones((dim, 1)), np.ones((dim, 1))))
     terms = ps.CustomLibrary(
-        [term(k) for k in range(count)], [lambda *_, k=k: f"f{k}" for k in range(count)],
+        [term(k) for k in range(count)],
+        [lambda *_, k=k: f"f{k}" for k in range(count)],
         interaction_only=True,
-    )  # fmt: skip
+    )
 
     def regression(sparse: Any) -> np.ndarray:
         # PySINDy draws its domains from the global generator.
@@ -427,8 +468,9 @@ def measure(name: str, quick: bool) -> Numbers:
     """Fit ours and each peer to the first two thirds of a record, and judge the forecasts of its
     last."""
     record = gfnn.records.RECORDS[name]
-    recording = gfnn.read(gfnn.records.path(name), positions=list(record.positions),
-                          angles=list(record.angles))  # fmt: skip
+    recording = gfnn.read(
+        gfnn.records.path(name), positions=list(record.positions), angles=list(record.angles)
+    )
     training, held = split(recording, 2)
     system = SYSTEMS[name]
     arcs = arcs_of(list(stretches(training)))
@@ -445,8 +487,11 @@ def measure(name: str, quick: bool) -> Numbers:
             print(f"{peer} is not installed", flush=True)
             continue
         seconds = time.process_time() - started
-        found[peer] = {"median": judged(name, a, params, held), "seconds": seconds,
-                       "num_parameters": sum(p.size for p in jax.tree.leaves(params))}  # fmt: skip
+        found[peer] = {
+            "median": judged(name, a, params, held),
+            "seconds": seconds,
+            "num_parameters": sum(p.size for p in jax.tree.leaves(params)),
+        }
         print(f"{name}, {peer}: {found[peer]}", flush=True)
     return found
 
@@ -477,8 +522,11 @@ def tables() -> None:
         body, library = m["told"].split("; ")
         angles = "which columns are angles" if gfnn.records.RECORDS[name].angles else "positions"
         told = {"rigid body by hand": body, "PySINDy": library}
-        rows += [[name, method, told.get(method, angles), *_cells(m[method])]
-                 for method in (OURS, *PEERS) if method in m]  # fmt: skip
+        rows += [
+            [name, method, told.get(method, angles), *_cells(m[method])]
+            for method in (OURS, *PEERS)
+            if method in m
+        ]
     heads = ("record", "method", "told", "median error ahead", "CPU s")
     between_markers(TABLES, "peers", f"{markdown(heads, rows)}\n\n{provenance(found)}")
 

@@ -74,9 +74,14 @@ def flow_of_henon_heiles(number: int, steps: int, seed: int) -> np.ndarray:
         return np.concatenate([px, py, -x - 2 * x * y, -y - x**2 + y**2])
 
     solution = solve_ivp(
-        field, (0, 0.5 * steps), np.array(starts).T.ravel(), method="DOP853", rtol=1e-13,
-        atol=1e-15, t_eval=0.5 * np.arange(steps + 1),
-    )  # fmt: skip
+        field,
+        (0, 0.5 * steps),
+        np.array(starts).T.ravel(),
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-15,
+        t_eval=0.5 * np.arange(steps + 1),
+    )
     return solution.y.reshape(4, number, -1).transpose(1, 2, 0)
 
 
@@ -90,10 +95,17 @@ def recorded(q: np.ndarray, dt: float, angles: bool) -> gfnn.Recording:
 
 
 def measured(
-    quick: bool, *, sample: Callable, triples: int, last: int, dt: float = 1.0,
-    angles: bool = False, wrapped: bool = False, structure: str | None = None,
+    quick: bool,
+    *,
+    sample: Callable,
+    triples: int,
+    last: int,
+    dt: float = 1.0,
+    angles: bool = False,
+    wrapped: bool = False,
+    structure: str | None = None,
     tolerance: float = 1e-12,
-) -> Numbers:  # fmt: skip
+) -> Numbers:
     """A fit to so many triples, and its rollouts to step ``last`` from two positions."""
     triples = triples // 4 if quick else triples
     given, test = sample(triples, 2, SEED), sample(40, last, SEED + 1)
@@ -103,21 +115,28 @@ def measured(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
         fit = gfnn.fit(
-            recorded(given, dt, angles), learn="map", structure=structure, tolerance=tolerance,
+            recorded(given, dt, angles),
+            learn="map",
+            structure=structure,
+            tolerance=tolerance,
             max_seconds=None,
-        )  # fmt: skip
+        )
     seconds = time.process_time() - started
     states, _ = fit.map.rollout(positions=(test[:, 0], test[:, 1]), num_steps=last)
     error = np.asarray(states)[..., : test.shape[2]] - test
     error = nearest_image(error, tuple(range(test.shape[2])) if angles else ())
     size = np.linalg.norm(error, axis=-1)
     found = {
-        "triples": triples, "terms": fit.chosen.num_parameters, "rank": fit.chosen.rank,
+        "triples": triples,
+        "terms": fit.chosen.num_parameters,
+        "rank": fit.chosen.rank,
         "symmetric": fit.positions is not None and fit.positions.symmetric,
-        "one_step": float(np.sqrt(np.mean(error[:, 2] ** 2))), "last": last,
-        "median_at_last": float(np.median(size[:, last])), "defect": fit.symplecticity_defect,
+        "one_step": float(np.sqrt(np.mean(error[:, 2] ** 2))),
+        "last": last,
+        "median_at_last": float(np.median(size[:, last])),
+        "defect": fit.symplecticity_defect,
         "cpu_seconds": seconds,
-    }  # fmt: skip
+    }
     if test.shape[2] == 2:
         z = flow_of_henon_heiles(400, 1, SEED + 2)
         beside = beside_flow(fit.map, gfnn.Pairs(z[:, 0], z[:, 1], dt))
@@ -154,14 +173,20 @@ def noisy(quick: bool, *, sets: int = 5, triples: int = 3_000, noise: float = NO
         held.append(np.abs(values - read[:, begun + leads]) < 2 * std)
         inside.append(errors[-1] < 2 * own)
     return {
-        "triples": triples, "terms": fit.chosen.num_parameters, "noise": fit.positions.noise,
+        "triples": triples,
+        "terms": fit.chosen.num_parameters,
+        "noise": fit.positions.noise,
         "one_step": float(np.sqrt(np.mean(np.square(errors), axis=(0, 1, 3))[0])),
-        "last": int(leads[-1]), "median_at_last": float(np.median(np.array(errors)[:, :, -1])),
-        "defect": fit.symplecticity_defect, "cpu_seconds": float(np.mean(seconds)),
-        "mass_ratio": masses[0], "mass_ratios": masses, "leads": leads.tolist(),
+        "last": int(leads[-1]),
+        "median_at_last": float(np.median(np.array(errors)[:, :, -1])),
+        "defect": fit.symplecticity_defect,
+        "cpu_seconds": float(np.mean(seconds)),
+        "mass_ratio": masses[0],
+        "mass_ratios": masses,
+        "leads": leads.tolist(),
         "held_of_read": np.mean(held, axis=(0, 1, 3)).tolist(),
         "held_of_true": np.mean(inside, axis=(0, 1, 3)).tolist(),
-    }  # fmt: skip
+    }
 
 
 def cell(quick: bool, *, noise: float, tolerance: float) -> Numbers:
@@ -210,13 +235,19 @@ def cell(quick: bool, *, noise: float, tolerance: float) -> Numbers:
     ]
     off = (following[:, 2, :2] - fresh[:, 2]) / spread
     return {
-        "particles": 20, "turns": turns, "noise": noise, "triples": fit.num_pairs,
+        "particles": 20,
+        "turns": turns,
+        "noise": noise,
+        "triples": fit.num_pairs,
         "terms": fit.chosen.num_parameters,
         "next_reading": float(np.sqrt(np.mean(off**2))),
-        "tunes": float(np.abs(theirs - found).max()), "detuning": detuning,
+        "tunes": float(np.abs(theirs - found).max()),
+        "detuning": detuning,
         "detuning_error": float(np.max(np.abs(np.array(detuning[1]) / np.array(detuning[0]) - 1))),
-        "sigma": fit.positions.noise, "cpu_seconds": seconds, "defect": fit.symplecticity_defect,
-    }  # fmt: skip
+        "sigma": fit.positions.noise,
+        "cpu_seconds": seconds,
+        "defect": fit.symplecticity_defect,
+    }
 
 
 def mass_ratio(fit: gfnn.Fit) -> float:
@@ -238,25 +269,44 @@ PIECES = {
     "henon-heiles": partial(measured, sample=henon_heiles, triples=3_000, last=300, dt=0.5),
     "henon-heiles-noise": noisy,
     "ring-64": partial(
-        measured, sample=ring, triples=200, last=10, angles=True, wrapped=True, structure="ring",
+        measured,
+        sample=ring,
+        triples=200,
+        last=10,
+        angles=True,
+        wrapped=True,
+        structure="ring",
         tolerance=1e-10,
     ),
-}  # fmt: skip
+}
 
 
 def tables() -> None:
     found = results(PIECES, "positions")
     rows = [
         [
-            name, number(m["triples"]), number(m["terms"]), number(m["one_step"]),
-            f"{number(m['median_at_last'])} (step {m['last']})", number(m["defect"]),
-            f"{m['mass_ratio']:.4f}" if "mass_ratio" in m else "–", number(m["cpu_seconds"]),
+            name,
+            number(m["triples"]),
+            number(m["terms"]),
+            number(m["one_step"]),
+            f"{number(m['median_at_last'])} (step {m['last']})",
+            number(m["defect"]),
+            f"{m['mass_ratio']:.4f}" if "mass_ratio" in m else "–",
+            number(m["cpu_seconds"]),
         ]
         for name, m in ((name, result["measured"]) for name, result in found.items())
         if "one_step" in m
-    ]  # fmt: skip
-    heads = ("from positions alone", "triples", "terms of S", "one step, RMS", "median error",
-             "‖MᵀJM − J‖", "mass ratio", "CPU s")  # fmt: skip
+    ]
+    heads = (
+        "from positions alone",
+        "triples",
+        "terms of S",
+        "one step, RMS",
+        "median error",
+        "‖MᵀJM − J‖",
+        "mass ratio",
+        "CPU s",
+    )
     text = markdown(heads, rows)
     beside = found.get("henon-heiles", {}).get("measured", {}).get("beside_flow")
     if beside is not None:
@@ -283,15 +333,24 @@ def tables() -> None:
         )
     rows = [
         [
-            f"{1e6 * m['noise']:g} µm", number(m["terms"]), number(m["next_reading"]),
-            number(m["tunes"]), f"{100 * m['detuning_error']:.1f} %", number(m["cpu_seconds"]),
+            f"{1e6 * m['noise']:g} µm",
+            number(m["terms"]),
+            number(m["next_reading"]),
+            number(m["tunes"]),
+            f"{100 * m['detuning_error']:.1f} %",
+            number(m["cpu_seconds"]),
         ]
         for m in (found[name]["measured"] for name in ("cell", "cell-noise") if name in found)
-    ]  # fmt: skip
+    ]
     if rows:
-        heads = ("a cell of a storage ring from x, y at one place, noise", "terms of S",
-                 "next reading ÷ spread", "tunes, largest difference", "amplitude detuning",
-                 "CPU s")  # fmt: skip
+        heads = (
+            "a cell of a storage ring from x, y at one place, noise",
+            "terms of S",
+            "next reading ÷ spread",
+            "tunes, largest difference",
+            "amplitude detuning",
+            "CPU s",
+        )
         text += f"\n\n{markdown(heads, rows)}"
     text += f"\n\n{provenance(found)}"
     between_markers(TABLES, "positions", text)

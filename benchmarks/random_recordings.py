@@ -121,16 +121,25 @@ def _solved(force: Force, masses, start: np.ndarray, angles: tuple[int, ...] = (
 
 
 SYSTEMS = {
-    "pendulum": pendulum, "spring": spring, "trap": trap, "two pendulums": two_pendulums,
-    "carts": carts, "Hénon–Heiles": henon_heiles, "double pendulum": double_pendulum,
+    "pendulum": pendulum,
+    "spring": spring,
+    "trap": trap,
+    "two pendulums": two_pendulums,
+    "carts": carts,
+    "Hénon–Heiles": henon_heiles,
+    "double pendulum": double_pendulum,
     "pendulum on a cart": pendulum_on_a_cart,
-}  # fmt: skip
+}
 
 
 def friction(kind: str, size: float, v: np.ndarray) -> np.ndarray:
     """Force of friction on each coordinate."""
-    of_speed = {"none": 0 * v, "linear": v, "quadratic": v * np.abs(v),
-                "dry": 0.3 * np.tanh(v / _SMOOTH)}  # fmt: skip
+    of_speed = {
+        "none": 0 * v,
+        "linear": v,
+        "quadratic": v * np.abs(v),
+        "dry": 0.3 * np.tanh(v / _SMOOTH),
+    }
     return -size * of_speed[kind]
 
 
@@ -199,9 +208,13 @@ def case(name: str, draw: int) -> Numbers:
         {"t": t, **columns}, positions=names, angles=[names[i] for i in system.angles]
     )
     found: Numbers = {
-        "draw": draw, "friction": kind, "samples": float(samples), "count": count,
-        "noise": float(noise), "step": float(step),
-    }  # fmt: skip
+        "draw": draw,
+        "friction": kind,
+        "samples": float(samples),
+        "count": count,
+        "noise": float(noise),
+        "step": float(step),
+    }
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", gfnn.FitWarning)  # kept in fit.messages
@@ -221,11 +234,14 @@ def case(name: str, draw: int) -> Numbers:
             errors.append(np.inf)
     error = float(np.median(errors))
     return found | {
-        "formula": fit.formula, "rubs": fit.friction.formula,
-        "error": error if np.isfinite(error) else None, "right": error < max(RIGHT, noise),
+        "formula": fit.formula,
+        "rubs": fit.friction.formula,
+        "error": error if np.isfinite(error) else None,
+        "right": error < max(RIGHT, noise),
         "said": bool(fit.messages) or fit.horizon[-1].measured < period,
-        "messages": list(fit.messages), "processor_seconds": done.processor_seconds,
-    }  # fmt: skip
+        "messages": list(fit.messages),
+        "processor_seconds": done.processor_seconds,
+    }
 
 
 def measured(name: str, quick: bool) -> Numbers:
@@ -248,8 +264,10 @@ def _piece(name: str) -> Callable[[bool], Numbers]:
     return lambda quick: measured(name, quick)
 
 
-PIECES = {name.lower().replace("é", "e").replace("–", "-").replace(" ", "-"): _piece(name)
-          for name in SYSTEMS}  # fmt: skip
+PIECES = {
+    name.lower().replace("é", "e").replace("–", "-").replace(" ", "-"): _piece(name)
+    for name in SYSTEMS
+}
 
 
 def tables() -> None:
@@ -264,14 +282,30 @@ def tables() -> None:
             laws = [c for c in cases if "formula" in c]
             errors = [np.inf if c["error"] is None else c["error"] for c in laws if c["right"]]
             wrong = [c for c in laws if not c["right"]]
-            rows.append([
-                name, label, str(len(cases)), str(len(errors)), str(len(cases) - len(laws)),
-                str(sum(c["said"] for c in wrong)), str(sum(not c["said"] for c in wrong)),
-                number(np.median(errors)) if errors else "–",
-                number(np.mean([c["processor_seconds"] for c in laws])) if laws else "–",
-            ])  # fmt: skip
-    heads = ("system", "samples a period", "recordings", "right", "refused", "wrong, and said",
-             "wrong, not said", "median error of the right, a period ahead", "CPU s")  # fmt: skip
+            rows.append(
+                [
+                    name,
+                    label,
+                    str(len(cases)),
+                    str(len(errors)),
+                    str(len(cases) - len(laws)),
+                    str(sum(c["said"] for c in wrong)),
+                    str(sum(not c["said"] for c in wrong)),
+                    number(np.median(errors)) if errors else "–",
+                    number(np.mean([c["processor_seconds"] for c in laws])) if laws else "–",
+                ]
+            )
+    heads = (
+        "system",
+        "samples a period",
+        "recordings",
+        "right",
+        "refused",
+        "wrong, and said",
+        "wrong, not said",
+        "median error of the right, a period ahead",
+        "CPU s",
+    )
     between_markers(TABLES, "random-recordings", f"{markdown(heads, rows)}\n\n{provenance(found)}")
 
 

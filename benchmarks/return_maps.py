@@ -33,7 +33,7 @@ from harness import (
     provenance,
     results,
     timed,
-)  # fmt: skip
+)
 from harness import main as run_pieces
 
 # isort: split
@@ -77,9 +77,7 @@ def curve(name: str, tool: Tool, z0, reference, end: float, sizes: Sizes) -> lis
         errors = {}
         for i, iterations in enumerate((1, ITERATIONS)):
             if iterate is tool.single:
-                ended = np.concatenate(
-                    [iterate(z[None], iterations, precision)[0] for z in states]
-                )  # fmt: skip
+                ended = np.concatenate([iterate(z[None], iterations, precision)[0] for z in states])
             else:
                 ended = iterate(states, iterations, precision)[0]
             errors[f"error_{iterations}"] = distance(ended, reference[: len(ended), i])
@@ -87,8 +85,14 @@ def curve(name: str, tool: Tool, z0, reference, end: float, sizes: Sizes) -> lis
         batch = None
         if tool.batch is not None:
             batch = seconds(tool.batch, z0, 1 if slow else 4, precision, sizes.repeats)
-        points.append({"tolerance": tolerance, **errors, "single": 1e6 * single,
-                       "batch": None if batch is None else 1e6 * batch})  # fmt: skip
+        points.append(
+            {
+                "tolerance": tolerance,
+                **errors,
+                "single": 1e6 * single,
+                "batch": None if batch is None else 1e6 * batch,
+            }
+        )
         print(f"  {name} {tolerance:.0e}: {time.perf_counter() - started:.0f} s")
     return points
 
@@ -117,21 +121,30 @@ def maps(scene: Scene, z0, reference, sizes: Sizes, times: int = 1) -> Numbers:
             ).seconds
             return 1e6 * times * seconds / num_steps / len(lanes.status)
 
-        found.append({
-            "tolerance": tolerance, "met": fit.met,
-            "chart": about["chart"], "label": about["label"], "base_map": fit.base_map,
-            "times": times,
-            "num_parameters": about["num_parameters"],
-            "one_step_rms": one_step_rms(map_, fresh),
-            **errors,
-            "defect": float(np.max(map_.defect(fresh.z0[:200]))),
-            "status_counts": report.status_counts(info.status),
-            "single": taking(map_.start(z0[:1]), 10 * sizes.steps),
-            "batch": taking(map_.start(z0), sizes.steps),
-        })  # fmt: skip
+        found.append(
+            {
+                "tolerance": tolerance,
+                "met": fit.met,
+                "chart": about["chart"],
+                "label": about["label"],
+                "base_map": fit.base_map,
+                "times": times,
+                "num_parameters": about["num_parameters"],
+                "one_step_rms": one_step_rms(map_, fresh),
+                **errors,
+                "defect": float(np.max(map_.defect(fresh.z0[:200]))),
+                "status_counts": report.status_counts(info.status),
+                "single": taking(map_.start(z0[:1]), 10 * sizes.steps),
+                "batch": taking(map_.start(z0), sizes.steps),
+            }
+        )
         print(f"  {about['label']}: {found[-1]['single']:.1f}, {found[-1]['batch']:.1f} µs")
-    return {"pairs": len(pairs), "fit_seconds": sum(fit.seconds for fit in fits), "maps": found,
-            "determinants": {n: j.low for n, j in fits[0].determinants.items()}}  # fmt: skip
+    return {
+        "pairs": len(pairs),
+        "fit_seconds": sum(fit.seconds for fit in fits),
+        "maps": found,
+        "determinants": {n: j.low for n, j in fits[0].determinants.items()},
+    }
 
 
 def compared(
@@ -159,8 +172,13 @@ def compared(
         name: curve(name, tool, np.asarray(z0), reference, scene.dt, sizes)
         for name, tool in found.items()
     }
-    return {**ours, "refused": refused, "lanes": len(z0), "judged": len(reference),
-            "curves": curves}  # fmt: skip
+    return {
+        **ours,
+        "refused": refused,
+        "lanes": len(z0),
+        "judged": len(reference),
+        "curves": curves,
+    }
 
 
 def section(quick: bool) -> Numbers:
@@ -199,13 +217,19 @@ def iterated(scene: Scene, num: int, lanes: int, most: int, seen: int, quick: bo
     curves = metrics_of_curves(states, exact) if scene.section is not None else None
     shown = exact[:, 1 :: most // points]
     return {
-        "label": about["label"], "chart": about["chart"], "one_step_rms": about["one_step_rms"],
-        "iterations": num, "lanes": lanes, "seconds": ours,
+        "label": about["label"],
+        "chart": about["chart"],
+        "one_step_rms": about["one_step_rms"],
+        "iterations": num,
+        "lanes": lanes,
+        "seconds": ours,
         "status_counts": report.status_counts(info.status),
-        "reference_iterations": most, "reference_lanes": seen, "reference_seconds": theirs,
+        "reference_iterations": most,
+        "reference_lanes": seen,
+        "reference_seconds": theirs,
         "distance_from_curves": curves,
         "points": {"map": rounded(states), "reference": rounded(shown)},
-    }  # fmt: skip
+    }
 
 
 def metrics_of_curves(states, exact) -> float:
@@ -216,10 +240,12 @@ def metrics_of_curves(states, exact) -> float:
         x = (z - np.array(FIXED_POINT)) * np.array([1.0, 1.8])
         return np.stack([np.arctan2(x[..., 1], x[..., 0]), np.hypot(x[..., 0], x[..., 1])], axis=-1)
 
-    return float(max(
-        metrics.curve_distance(polar(a), polar(b), 32).max()
-        for a, b in zip(states, exact, strict=True)
-    ))  # fmt: skip
+    return float(
+        max(
+            metrics.curve_distance(polar(a), polar(b), 32).max()
+            for a, b in zip(states, exact, strict=True)
+        )
+    )
 
 
 def rounded(states) -> list:
@@ -251,8 +277,10 @@ def tables() -> None:
     if "iterations" in found:
         for name, m in found["iterations"].items():
             points = {}
-            for title, key, most in (("reference", "reference", "reference_iterations"),
-                                     ("learned map", "map", "iterations")):  # fmt: skip
+            for title, key, most in (
+                ("reference", "reference", "reference_iterations"),
+                ("learned map", "map", "iterations"),
+            ):
                 shown = m["points"][key]
                 every = m[most] * m["reference_lanes"] // len(shown[0])
                 points[f"{title}, every {every:,}th of {m[most]:,}"] = shown

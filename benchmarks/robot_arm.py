@@ -72,9 +72,12 @@ def main() -> None:
         add(f"… {name}", zeros, extra)
     add("… all of these at once", zeros, *EXTRAS.values())
     result: Numbers = {
-        "piece": "robot_arm", "windows": LENGTHS, "rms": rows, "zeros": zeros[-1].tolist(),
+        "piece": "robot_arm",
+        "windows": LENGTHS,
+        "rms": rows,
+        "zeros": zeros[-1].tolist(),
         "torque": float(np.sqrt(np.mean(np.concatenate([r.tau for r in runs]) ** 2))),
-    }  # fmt: skip
+    }
     write(RESULTS / "robot-arm-residuals.json", result)
     draw(runs, zeros[-1])
     table(result)

@@ -109,8 +109,11 @@ def measure(quick: bool, *, learns: str) -> Numbers:
         flags = f"--xla_force_host_platform_device_count={devices}"
         done = subprocess.run(
             ran.python("gfnn_jax", __file__, "--here", learns, 20 if quick else STEPS),
-            env={**os.environ, "XLA_FLAGS": flags}, stdout=subprocess.PIPE, text=True, check=True,
-        )  # fmt: skip
+            env={**os.environ, "XLA_FLAGS": flags},
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+        )
         rows.append(json.loads(done.stdout.splitlines()[-1]))
         print(f"  {devices}: {rows[-1]['microseconds']:.2f} µs")
     same = len({row["digest"] for row in rows}) == 1
@@ -146,9 +149,14 @@ def problem(task: str, quick: bool) -> Callable[[], Any]:
 
     def trained():
         result = levenberg_marquardt_together(
-            network, starts, w[held:], target[held:], validation=(w[:held], target[:held]),
-            shares=np.ones((size, len(w) - held)), limits=Limits(2 if quick else 5),
-        )  # fmt: skip
+            network,
+            starts,
+            w[held:],
+            target[held:],
+            validation=(w[:held], target[:held]),
+            shares=np.ones((size, len(w) - held)),
+            limits=Limits(2 if quick else 5),
+        )
         return np.concatenate([np.ravel(a) for a in jax.tree.leaves(result.params)])
 
     return trained
@@ -164,9 +172,10 @@ def on_devices_here(count: int, quick: bool) -> Numbers:
             work()
             best = min((once(work) for _ in range(3)), key=lambda one: one.seconds)
         found[task] = {
-            "seconds": best.seconds, "processor_seconds": best.processor_seconds,
+            "seconds": best.seconds,
+            "processor_seconds": best.processor_seconds,
             "digest": hashlib.sha256(np.ascontiguousarray(best.out).tobytes()).hexdigest(),
-        }  # fmt: skip
+        }
     return found
 
 
@@ -177,14 +186,21 @@ def measure_fits_on_devices(quick: bool) -> Numbers:
         flags = f"--xla_force_host_platform_device_count={max(count, 1)}"
         done = subprocess.run(
             ran.python("gfnn_jax", __file__, "--fits-here", count, int(quick)),
-            env={**os.environ, "XLA_FLAGS": flags}, stdout=subprocess.PIPE, text=True, check=True,
-        )  # fmt: skip
+            env={**os.environ, "XLA_FLAGS": flags},
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+        )
         rows.append(json.loads(done.stdout.splitlines()[-1]))
         print(f"  {count}: " + ", ".join(f"{t} {rows[-1][t]['seconds']:.2f} s" for t in SHARED))
     if any(len({row[task]["digest"] for row in rows[1:]}) > 1 for task in SHARED):
         raise SystemExit("the bits depend on the number of devices")
-    return {"pairs": {t: n // (10 if quick else 1) for t, (n, _) in SHARED.items()},
-            "cores": cores(), "same_bits": True, "rows": rows}  # fmt: skip
+    return {
+        "pairs": {t: n // (10 if quick else 1) for t, (n, _) in SHARED.items()},
+        "cores": cores(),
+        "same_bits": True,
+        "rows": rows,
+    }
 
 
 def measure_accelerator(quick: bool) -> Numbers:
@@ -249,9 +265,11 @@ def in_group(task: str, file: str) -> Numbers:
     else:
         help_refit(group.broadcast(), chunks, group)
     found |= {
-        "seconds": time.perf_counter() - started, "sent": group.sent, "before": before,
+        "seconds": time.perf_counter() - started,
+        "sent": group.sent,
+        "before": before,
         "peak": peak_bytes(),
-    }  # fmt: skip
+    }
     processes.wait_for_all()
     return found
 
@@ -275,11 +293,12 @@ def run_group(task: str, file: Path, count: int) -> list[Numbers]:
     running = [
         subprocess.Popen(
             ran.python("gfnn_jax", __file__, "--group", task, file),
-            stdout=subprocess.PIPE, text=True,
+            stdout=subprocess.PIPE,
+            text=True,
             env={"OPENBLAS_NUM_THREADS": "1", **os.environ, **told, "JAX_PROCESS_ID": str(i)},
         )
         for i in range(count)
-    ]  # fmt: skip
+    ]
     outs = [process.communicate()[0] for process in running]
     if any(process.returncode for process in running):
         raise SystemExit("a process failed")
@@ -302,11 +321,15 @@ def measure_group(quick: bool, *, task: str) -> Numbers:
             first = found[0]
             if "digest_states" in first:
                 states.append(np.array(first.pop("digest_states")))
-            rows.append({
-                "processes": count, "seconds": max(f["seconds"] for f in found),
-                "sent": sum(f["sent"] for f in found), "parameters": first.get("parameters"),
-                "more_memory": max(f["peak"] - f["before"] for f in found),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "processes": count,
+                    "seconds": max(f["seconds"] for f in found),
+                    "sent": sum(f["sent"] for f in found),
+                    "parameters": first.get("parameters"),
+                    "more_memory": max(f["peak"] - f["before"] for f in found),
+                }
+            )
             print(f"  {rows[-1]}")
     apart = max((float(np.abs(s - states[0]).max()) for s in states), default=None)
     return {"pairs": number, "file_bytes": size, "cores": cores(), "apart": apart, "rows": rows}
@@ -326,42 +349,65 @@ PIECES = ROLLOUTS | ON_DEVICES | ACCELERATOR | GROUPS
 def tables() -> None:
     """The table of RESULTS.md."""
     heads = (
-        "learned", "cores", "one batch, no blocks", *(f"1 device, blocks of {b}" for b in BLOCKS),
-        *(f"{n} devices" for n in DEVICES[1:]), "same bits",
-    )  # fmt: skip
+        "learned",
+        "cores",
+        "one batch, no blocks",
+        *(f"1 device, blocks of {b}" for b in BLOCKS),
+        *(f"{n} devices" for n in DEVICES[1:]),
+        "same bits",
+    )
     rows, found = [], results(ROLLOUTS, "scaling")
     for name, result in found.items():
         m = result["measured"]
         one = m["rows"][0]
-        rows.append([
-            name, str(m["cores"]), number(one["whole_batch"]),
-            *(number(one[f"block_{b}"]) for b in BLOCKS),
-            *(number(row["microseconds"]) for row in m["rows"][1:]),
-            "yes" if m["same_bits"] else "no",
-        ])  # fmt: skip
+        rows.append(
+            [
+                name,
+                str(m["cores"]),
+                number(one["whole_batch"]),
+                *(number(one[f"block_{b}"]) for b in BLOCKS),
+                *(number(row["microseconds"]) for row in m["rows"][1:]),
+                "yes" if m["same_bits"] else "no",
+            ]
+        )
     text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
     between_markers(TABLES, "scaling", text)
-    heads = ("a part of a fit", "pairs", "cores", "devices", "seconds", "processor seconds",
-             "same bits")  # fmt: skip
+    heads = (
+        "a part of a fit",
+        "pairs",
+        "cores",
+        "devices",
+        "seconds",
+        "processor seconds",
+        "same bits",
+    )
     rows, found = [], results(ON_DEVICES, "scaling")
     for result in found.values():
         m = result["measured"]
         rows += [
             [
-                task, f"{m['pairs'][task]:,}", str(m["cores"]), str(row["devices"] or "none told"),
-                number(row[task]["seconds"]), number(row[task]["processor_seconds"]),
+                task,
+                f"{m['pairs'][task]:,}",
+                str(m["cores"]),
+                str(row["devices"] or "none told"),
+                number(row[task]["seconds"]),
+                number(row[task]["processor_seconds"]),
                 "yes" if m["same_bits"] and row["devices"] else "–",
             ]
             for task in SHARED
             for row in m["rows"]
-        ]  # fmt: skip
+        ]
     if found:
         text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
         between_markers(TABLES, "scaling-fit-devices", text)
     heads = (
-        "accelerator", "fit there, s", "fit on the processor, s", "step of a state there, µs",
-        "on the processor, µs", "states apart by",
-    )  # fmt: skip
+        "accelerator",
+        "fit there, s",
+        "fit on the processor, s",
+        "step of a state there, µs",
+        "on the processor, µs",
+        "states apart by",
+    )
     rows, found = [], results(ACCELERATOR, "scaling")
     for result in found.values():
         m = result["measured"]
@@ -370,29 +416,47 @@ def tables() -> None:
             rows.append(["no accelerator", *["–"] * 5])
             continue
         on = m["on_accelerator"]
-        rows.append([
-            there, number(on["fit_seconds"]), number(here["fit_seconds"]),
-            number(on["microseconds"]), number(here["microseconds"]), f"{m['states_apart']:.1e}",
-        ])  # fmt: skip
+        rows.append(
+            [
+                there,
+                number(on["fit_seconds"]),
+                number(here["fit_seconds"]),
+                number(on["microseconds"]),
+                number(here["microseconds"]),
+                f"{m['states_apart']:.1e}",
+            ]
+        )
     if found:
         text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
         between_markers(TABLES, "scaling-accelerator", text)
     heads = (
-        "all rows", "pairs", "file, MB", "coefficients", "processes", "seconds", "sent, MB",
-        "memory beside the start, MB", "maps apart by",
-    )  # fmt: skip
+        "all rows",
+        "pairs",
+        "file, MB",
+        "coefficients",
+        "processes",
+        "seconds",
+        "sent, MB",
+        "memory beside the start, MB",
+        "maps apart by",
+    )
     rows, found = [], results(GROUPS, "scaling")
     for name, result in found.items():
         m = result["measured"]
         rows += [
             [
-                name, f"{m['pairs']:,}", f"{m['file_bytes'] / 1e6:.0f}",
-                str(row["parameters"] or "–"), str(row["processes"]), number(row["seconds"]),
-                f"{row['sent'] / 1e6:.3g}", f"{row['more_memory'] / 1e6:.0f}",
+                name,
+                f"{m['pairs']:,}",
+                f"{m['file_bytes'] / 1e6:.0f}",
+                str(row["parameters"] or "–"),
+                str(row["processes"]),
+                number(row["seconds"]),
+                f"{row['sent'] / 1e6:.3g}",
+                f"{row['more_memory'] / 1e6:.0f}",
                 "–" if m["apart"] is None else f"{m['apart']:.1e}",
             ]
             for row in m["rows"]
-        ]  # fmt: skip
+        ]
     text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
     between_markers(TABLES, "scaling-fits", text)
 

@@ -24,13 +24,22 @@ from speeds.start import START, start, startup
 from speeds.step import STEPS, step
 from speeds.training import training
 
-TARGETS = {"evaluations": 3.5, "defect": 1e-12, "against_newton": 4.0, "training_rate": 0.6,
-           "torch": {"original": 4.0, "careful": 2.0}}  # fmt: skip
+TARGETS = {
+    "evaluations": 3.5,
+    "defect": 1e-12,
+    "against_newton": 4.0,
+    "training_rate": 0.6,
+    "torch": {"original": 4.0, "careful": 2.0},
+}
 
 
 PIECES = {
-    "start": start, "step": step, "training": training, "startup": startup, "scaling": scaling,
-}  # fmt: skip
+    "start": start,
+    "step": step,
+    "training": training,
+    "startup": startup,
+    "scaling": scaling,
+}
 
 
 # Tables
@@ -46,19 +55,31 @@ def met(value, limit, *, least: bool = False) -> str:
 
 
 def step_table(measured: Numbers) -> str:
-    heads = ["scene", "map", "one-step RMS", "∇S evaluations per step", "defect",
-             "µs per step, 1,000 lanes", "µs per step, one lane",
-             "times as fast as Newton with fresh Jacobians",
-             "times as fast as with all lanes waiting for the last"]  # fmt: skip
+    heads = [
+        "scene",
+        "map",
+        "one-step RMS",
+        "∇S evaluations per step",
+        "defect",
+        "µs per step, 1,000 lanes",
+        "µs per step, one lane",
+        "times as fast as Newton with fresh Jacobians",
+        "times as fast as with all lanes waiting for the last",
+    ]
     rows = []
     for name, m in measured.items():
         _, _, batch, single = STEPS[name]
-        cells = [name, f"{m['chart']} {m['label']}", number(m["one_step_rms"]),
-                 met(m["evaluations"], TARGETS["evaluations"]),
-                 met(m["defect"], TARGETS["defect"]), met(m["microseconds_batch"], batch),
-                 met(m["microseconds_single"], single),
-                 met(m["against_newton"], TARGETS["against_newton"], least=True),
-                 number(m["against_waiting"])]  # fmt: skip
+        cells = [
+            name,
+            f"{m['chart']} {m['label']}",
+            number(m["one_step_rms"]),
+            met(m["evaluations"], TARGETS["evaluations"]),
+            met(m["defect"], TARGETS["defect"]),
+            met(m["microseconds_batch"], batch),
+            met(m["microseconds_single"], single),
+            met(m["against_newton"], TARGETS["against_newton"], least=True),
+            number(m["against_waiting"]),
+        ]
         rows.append(cells)
     return markdown(heads, rows)
 
@@ -72,10 +93,13 @@ def start_table(m: Numbers) -> str:
             value, cpu = value / m["libraries"], m[f"{key}_cpu"] / m["libraries_cpu"]
         rows.append([title, before, met(value, most), number(cpu)])
     seconds = ", ".join(
-        f"{name} {number(m[key])} ({number(m[f'{key}_cpu'])})" for name, key in (
-            ("libraries", "libraries"), ("the command warm", "run_warm"), ("cold", "run_cold"),
+        f"{name} {number(m[key])} ({number(m[f'{key}_cpu'])})"
+        for name, key in (
+            ("libraries", "libraries"),
+            ("the command warm", "run_warm"),
+            ("cold", "run_cold"),
         )
-    )  # fmt: skip
+    )
     return (
         markdown(["", "release before", "now", "the same in processor time"], rows)
         + f"\n\nSeconds, and processor seconds of all threads: {seconds}."
@@ -87,8 +111,10 @@ def beside_torch(m: Numbers) -> str:
     if m["torch"] is None:
         return "PyTorch was not there to compare with."
     ratios = {name: m["torch"][name] / m["microseconds"] for name in TARGETS["torch"]}
-    shown = [f"{number(m['torch'][name])} µs, {met(r, TARGETS['torch'][name], least=True)} times "
-             "as long" for name, r in ratios.items()]  # fmt: skip
+    shown = [
+        f"{number(m['torch'][name])} µs, {met(r, TARGETS['torch'][name], least=True)} times as long"
+        for name, r in ratios.items()
+    ]
     return (
         f"PyTorch {m['torch']['version']} on as many threads ({m['torch']['threads']}): a loop in "
         f"the style of the paper's original (DataLoader, double backward, Adam) {shown[0]}; a "
@@ -119,18 +145,23 @@ def tables() -> None:
             f"{number(m['microseconds'])} µs, {number(m['gflops'])} GFLOP/s; plain products of its "
             f"sizes {number(m['gflops_of_products'])} GFLOP/s; ratio "
             f"{met(m['training_rate'], TARGETS['training_rate'], least=True)}. "
-            + beside_torch(m) + several_models(m)
-        )  # fmt: skip
+            + beside_torch(m)
+            + several_models(m)
+        )
     if "startup" in found:
         m = found["startup"]["measured"]
         rows = [[f"`{name}`", number(value)] for name, value in m.items()]
         parts.append("### The start\n\n" + markdown(["a fresh process", "seconds"], rows))
     if "scaling" in found:
         rows = [
-            [name, ", ".join(number(int(size)) for size in m["size"]),
-             ", ".join(map(number, m["measured"])), number(m["slope_of_largest"])]
+            [
+                name,
+                ", ".join(number(int(size)) for size in m["size"]),
+                ", ".join(map(number, m["measured"])),
+                number(m["slope_of_largest"]),
+            ]
             for name, m in found["scaling"]["measured"].items()
-        ]  # fmt: skip
+        ]
         heads = ["", "sizes", "measured", "slope of the largest three"]
         parts.append("### Growth with the size\n\n" + markdown(heads, rows))
     if found:

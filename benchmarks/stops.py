@@ -46,10 +46,13 @@ def recording(starts: Sequence[tuple[float, float]], seed: int) -> gfnn.Recordin
     """A run from each start, its positions with noise."""
     rng, t = np.random.default_rng(seed), np.arange(0, END, DT)
     tables = [
-        {"run": np.full(len(t), str(k)), "t": t,
-         "x": block(*start, t) + NOISE * rng.normal(size=len(t))}
+        {
+            "run": np.full(len(t), str(k)),
+            "t": t,
+            "x": block(*start, t) + NOISE * rng.normal(size=len(t)),
+        }
         for k, start in enumerate(starts)
-    ]  # fmt: skip
+    ]
     return gfnn.Recording(tables, positions=["x"])
 
 
@@ -71,11 +74,17 @@ def case(draw: int) -> Numbers:
         }
     rests = [message for message in fit.messages if "at rest" in message]
     return {
-        "kinds": fit.which_friction.kinds, "friction": str(fit.friction), "rests": rests,
-        "standard_errors": {"dry": abs(dry.coefficient - HELD) / dry.std,
-                            "spring": abs(spring.coefficient + 0.5) / spring.std},
-        "std": dry.std, "ahead": ahead, "processor_seconds": done.processor_seconds,
-    }  # fmt: skip
+        "kinds": fit.which_friction.kinds,
+        "friction": str(fit.friction),
+        "rests": rests,
+        "standard_errors": {
+            "dry": abs(dry.coefficient - HELD) / dry.std,
+            "spring": abs(spring.coefficient + 0.5) / spring.std,
+        },
+        "std": dry.std,
+        "ahead": ahead,
+        "processor_seconds": done.processor_seconds,
+    }
 
 
 def measured(quick: bool) -> Numbers:
@@ -96,14 +105,22 @@ def tables() -> None:
     rows = []
     for k, c in enumerate(found["block"]["measured"]["cases"]):
         z = c["standard_errors"]
-        rows.append([
-            str(k), c["friction"].replace("|", r"\|"), f"{z['dry']:.1f}, {z['spring']:.1f}",
-            *(f"{1e3 * a['largest']:.2f}, {a['within']:.0%}" for a in c["ahead"].values()),
-            number(c["processor_seconds"]),
-        ])  # fmt: skip
-    heads = ("draw", "R found (0.1 put in)", "ρ and spring off, standard errors",
-             *(f"from {begin:g} s: largest error, mm; within 2 σ" for begin in FROM),
-             "fit, CPU s")  # fmt: skip
+        rows.append(
+            [
+                str(k),
+                c["friction"].replace("|", r"\|"),
+                f"{z['dry']:.1f}, {z['spring']:.1f}",
+                *(f"{1e3 * a['largest']:.2f}, {a['within']:.0%}" for a in c["ahead"].values()),
+                number(c["processor_seconds"]),
+            ]
+        )
+    heads = (
+        "draw",
+        "R found (0.1 put in)",
+        "ρ and spring off, standard errors",
+        *(f"from {begin:g} s: largest error, mm; within 2 σ" for begin in FROM),
+        "fit, CPU s",
+    )
     between_markers(TABLES, "stops", f"{markdown(heads, rows)}\n\n{provenance(found)}")
 
 

@@ -22,9 +22,15 @@ from rings.tunes import tunes
 from rings.turn import turn
 
 PIECES = {
-    "turn": turn, "tunes": tunes, "long": long, "aperture": aperture, "deviation": deviation,
-    "small-deviation": small_deviation, "deviation-sectors": sectors, "frequencies": frequencies,
-}  # fmt: skip
+    "turn": turn,
+    "tunes": tunes,
+    "long": long,
+    "aperture": aperture,
+    "deviation": deviation,
+    "small-deviation": small_deviation,
+    "deviation-sectors": sectors,
+    "frequencies": frequencies,
+}
 OF_DELTA = ("deviation", "small-deviation", "deviation-sectors")
 
 
@@ -37,36 +43,66 @@ def tables() -> None:
         tracking = m["tracking_microseconds_per_turn"]
         rows = [
             [
-                row["map"], row["label"], number(row["one_turn"]), number(row["after_turns"]),
-                str(row["lost"]), number(row.get("defect")), number(row.get("fit_seconds")),
+                row["map"],
+                row["label"],
+                number(row["one_turn"]),
+                number(row["after_turns"]),
+                str(row["lost"]),
+                number(row.get("defect")),
+                number(row.get("fit_seconds")),
                 number(row.get("microseconds_per_turn")),
                 number(tracking / row["microseconds_per_turn"])
-                if "microseconds_per_turn" in row else "–",
+                if "microseconds_per_turn" in row
+                else "–",
             ]
             for row in m["rows"]
-        ]  # fmt: skip
+        ]
         heads = (
-            "`err.mat`, one turn", "largest", "one turn ÷ spread", f"after {m['turns']} turns",
-            "lost", "defect", "fit, all in, CPU s", "CPU µs a turn", "times faster than tracking",
-        )  # fmt: skip
+            "`err.mat`, one turn",
+            "largest",
+            "one turn ÷ spread",
+            f"after {m['turns']} turns",
+            "lost",
+            "defect",
+            "fit, all in, CPU s",
+            "CPU µs a turn",
+            "times faster than tracking",
+        )
         text.append(markdown(heads, rows))
     if "deviation" in found:
         parts = [found[name]["measured"] for name in OF_DELTA if name in found]
         rows = [
             [
-                f"{1e3 * row['amplitude']:g} mm", str(row.get("pieces", 1)), f"{m['num_pairs']:,}",
-                row["label"], f"{row['terms']:,}",
-                number(row["one_turn"]), number(row["one_turn_median"]),
-                number(row["after_turns"]), str(row["lost"]), number(row["defect"]),
-                number(row["fit_seconds"]), number(row["microseconds_per_turn"]),
+                f"{1e3 * row['amplitude']:g} mm",
+                str(row.get("pieces", 1)),
+                f"{m['num_pairs']:,}",
+                row["label"],
+                f"{row['terms']:,}",
+                number(row["one_turn"]),
+                number(row["one_turn_median"]),
+                number(row["after_turns"]),
+                str(row["lost"]),
+                number(row["defect"]),
+                number(row["fit_seconds"]),
+                number(row["microseconds_per_turn"]),
             ]
-            for m in parts for row in m["rows"]
-        ]  # fmt: skip
+            for m in parts
+            for row in m["rows"]
+        ]
         heads = (
-            "`err.mat`, δ in ±1 %, within", "pieces", "pairs", "largest", "terms",
-            "one turn ÷ spread", "median", f"after {parts[0]['turns']} turns", "lost", "defect",
-            "fit, all in, CPU s", "CPU µs a turn",
-        )  # fmt: skip
+            "`err.mat`, δ in ±1 %, within",
+            "pieces",
+            "pairs",
+            "largest",
+            "terms",
+            "one turn ÷ spread",
+            "median",
+            f"after {parts[0]['turns']} turns",
+            "lost",
+            "defect",
+            "fit, all in, CPU s",
+            "CPU µs a turn",
+        )
         text.append(markdown(heads, rows))
     heads, rows = ("what", "measured", "asked"), []
     if "tunes" in found:
@@ -76,33 +112,47 @@ def tables() -> None:
     if "deviation" in found:
         told = ", ".join(
             f"{m['rows'][0].get('pieces', 1)} generated {number(m['largest_tune_difference'])}"
-            for name in ("deviation", "deviation-sectors") if name in found
+            for name in ("deviation", "deviation-sectors")
+            if name in found
             for m in [found[name]["measured"]]
-        )  # fmt: skip
+        )
         rows.append(["tunes against δ in ±1 %, largest difference", told, "1e-6"])
     if "frequencies" in found:
         m = found["frequencies"]["measured"]
-        rows.append([
-            f"frequency map of `hmba.mat`, {m['side']}² orbits of {2 * m['turns']:,} passages "
-            f"({m['label']}, one turn {number(m['one_turn'])}): median difference of log₁₀ of the "
-            "tunes' change", f"{number(m['median_difference'])} ({m['kept_by_one_only']} orbits "
-            "lost by one of the two only)", "–",
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"frequency map of `hmba.mat`, {m['side']}² orbits of {2 * m['turns']:,} passages "
+                f"({m['label']}, one turn {number(m['one_turn'])}): median difference of log₁₀ of "
+                f"the "
+                "tunes' change",
+                f"{number(m['median_difference'])} ({m['kept_by_one_only']} orbits "
+                "lost by one of the two only)",
+                "–",
+            ]
+        )
     if "long" in found:
         m = found["long"]["measured"]
-        rows.append([
-            f"{m['particles']} particles, {m['turns']:,} turns: drift exponent of the mean action",
-            f"{number(m['drift_exponent'])} (change {number(m['change_at_the_end'])} of itself; "
-            f"{m['status'][0]} stayed in the domain; {number(m['seconds'])} s)", "0.6",
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"{m['particles']} particles, {m['turns']:,} turns: drift exponent of the mean "
+                f"action",
+                f"{number(m['drift_exponent'])} (change {number(m['change_at_the_end'])} of "
+                f"itself; "
+                f"{m['status'][0]} stayed in the domain; {number(m['seconds'])} s)",
+                "0.6",
+            ]
+        )
     if "aperture" in found:
         m = found["aperture"]["measured"]
-        rows.append([
-            f"dynamic aperture of `hmba.mat`, {m['turns']:,} passages, nine rays: largest "
-            "difference",
-            f"{100 * m['largest_difference']:.1f} % ({number(m['seconds'])} s; tracking "
-            f"{number(m['tracking_seconds'])} s)", "5 %",
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"dynamic aperture of `hmba.mat`, {m['turns']:,} passages, nine rays: largest "
+                "difference",
+                f"{100 * m['largest_difference']:.1f} % ({number(m['seconds'])} s; tracking "
+                f"{number(m['tracking_seconds'])} s)",
+                "5 %",
+            ]
+        )
     if rows:
         text.append(markdown(heads, rows))
     if text:

@@ -118,8 +118,10 @@ LINES: list[tuple[str, Callable[[], str], str, bool]] = [
 
 
 def main() -> None:
-    rows = [([claim, figure(), f"`python -m benchmarks {study}`"], shown)
-            for claim, figure, study, shown in LINES]  # fmt: skip
+    rows = [
+        ([claim, figure(), f"`python -m benchmarks {study}`"], shown)
+        for claim, figure, study, shown in LINES
+    ]
     heads = ["claim", "measured", "command"]
     between_markers(TABLES, "summary", markdown(heads, [cells for cells, _ in rows]))
     between_markers(README, "five", markdown(heads, [cells for cells, shown in rows if shown]))

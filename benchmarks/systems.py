@@ -36,9 +36,14 @@ def disc(key, num, radius=1.0):
 
 def pendulum_scene(dt: float, radius: float = 1.0) -> Scene:
     return Scene(
-        name="pendulum", purpose="hard cases", dim=1, dt=dt, hamiltonian=pendulum,
-        sampling=DrawnFrom(functools.partial(disc, radius=radius)), reversor=(1, -1),
-    )  # fmt: skip
+        name="pendulum",
+        purpose="hard cases",
+        dim=1,
+        dt=dt,
+        hamiltonian=pendulum,
+        sampling=DrawnFrom(functools.partial(disc, radius=radius)),
+        reversor=(1, -1),
+    )
 
 
 def oscillator_scene(dt: float) -> Scene:
@@ -47,9 +52,14 @@ def oscillator_scene(dt: float) -> Scene:
         return jnp.stack([c * z[0] + s * z[1], c * z[1] - s * z[0]])
 
     return Scene(
-        name="oscillator", purpose="hard cases", dim=1, dt=dt, flow=flow,
-        sampling=DrawnFrom(disc), reversor=(1, -1),
-    )  # fmt: skip
+        name="oscillator",
+        purpose="hard cases",
+        dim=1,
+        dt=dt,
+        flow=flow,
+        sampling=DrawnFrom(disc),
+        reversor=(1, -1),
+    )
 
 
 def well(dt: float) -> Scene:

@@ -35,7 +35,7 @@ from harness import (
     one_step_rms,
     provenance,
     results,
-)  # fmt: skip
+)
 
 # isort: split
 import jax
@@ -291,13 +291,21 @@ def table(found: dict[str, Numbers], *, full: bool) -> str:
             inside = f"{number(m['error_median_inside'])} of those that stayed where the data are"
             error = f"{error} median; {inside}" if full else f"{error} median"
         cells = [
-            row.title, number(m["pairs"]), against(m, row, "one_step_rms"), error,
+            row.title,
+            number(m["pairs"]),
+            against(m, row, "one_step_rms"),
+            error,
             against(m, row, "fit_seconds"),
             f"{m['chart']} {m['label']}".strip() + (", base map" if m.get("base_map") else ""),
-        ]  # fmt: skip
+        ]
         if full:
-            keys = ("num_parameters", "microseconds_per_step", "symplecticity_defect",
-                    "compile_seconds", "total_seconds")  # fmt: skip
+            keys = (
+                "num_parameters",
+                "microseconds_per_step",
+                "symplecticity_defect",
+                "compile_seconds",
+                "total_seconds",
+            )
             cells += [number(m.get(key)) for key in keys]
         rows.append([*cells, verdict(m, row)])
     return markdown(heads, rows)

@@ -58,9 +58,13 @@ def fitted(law: Law, pairs: gfnn.Pairs, tolerance: float) -> tuple[gfnn.Fit, Num
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
         fit = gfnn.fit(
-            pairs, tolerance=tolerance, angles=law.angles, seed=SEED, max_seconds=BUDGET,
+            pairs,
+            tolerance=tolerance,
+            angles=law.angles,
+            seed=SEED,
+            max_seconds=BUDGET,
             clock=time.process_time,
-        )  # fmt: skip
+        )
     busy = time.process_time() - busy
     fresh = law.pairs(FRESH, SEED + 1)
     t0 = {} if law.period is None else {"t0": fresh.t0}
@@ -104,8 +108,10 @@ def gradient_error(flow: Flow, law: Law) -> float | None:
         )
     except (ValueError, IndexError):  # with friction, or of something else than states
         return None
-    return float(np.sqrt(np.mean((np.asarray(found)[..., : 2 * law.dim] - true) ** 2))
-                 / np.sqrt(np.mean(true**2)))  # fmt: skip
+    return float(
+        np.sqrt(np.mean((np.asarray(found)[..., : 2 * law.dim] - true) ** 2))
+        / np.sqrt(np.mean(true**2))
+    )
 
 
 def measured(name: str, quick: bool) -> Numbers:
@@ -126,8 +132,12 @@ def kepler_few(quick: bool) -> Numbers:
     reference = law.followed(z0, STEPS)
     states = np.asarray(fit.map.rollout(z0, STEPS, save_every=STEPS)[0])[:, -1]
     error = np.linalg.norm((states - reference)[:, :2], axis=1)
-    return {**found, "steps": STEPS, "error_median": float(np.median(error)),
-            "error_worst": float(error.max())}  # fmt: skip
+    return {
+        **found,
+        "steps": STEPS,
+        "error_median": float(np.median(error)),
+        "error_worst": float(error.max()),
+    }
 
 
 # Of noisy sequences
@@ -161,9 +171,11 @@ def true_numbers(found, law: Law) -> tuple[np.ndarray, float] | None:
         size = np.linalg.norm(true)
         near = least_squares(
             lambda c: (np.asarray(family.gradient(c, z)) - true).ravel() / size,
-            np.array([term.coefficient for term in found.terms]), xtol=1e-15, ftol=1e-15,
+            np.array([term.coefficient for term in found.terms]),
+            xtol=1e-15,
+            ftol=1e-15,
             gtol=1e-15,
-        )  # fmt: skip
+        )
         return near.x, float(np.linalg.norm(near.fun))
     if not isinstance(family, Terms):
         return None
@@ -184,9 +196,16 @@ def true_numbers(found, law: Law) -> tuple[np.ndarray, float] | None:
 
     constants = start
     if len(start):
-        constants = least_squares(
-            lambda x: solved(x * start)[1], np.ones(len(start)), xtol=1e-15, ftol=1e-15, gtol=1e-15
-        ).x * start  # fmt: skip
+        constants = (
+            least_squares(
+                lambda x: solved(x * start)[1],
+                np.ones(len(start)),
+                xtol=1e-15,
+                ftol=1e-15,
+                gtol=1e-15,
+            ).x
+            * start
+        )
     c, left = solved(constants)
     return np.concatenate([c, constants]), float(np.linalg.norm(left))
 
@@ -200,15 +219,32 @@ def noisy_tables() -> None:
     for name, r in found.items():
         m = r["measured"]
         off = m["standard_errors"]
-        rows.append([
-            name, m["kind"], str(m["dim"]),
-            "exact" if m["found"] else "another" if m["chosen"] == "hamiltonian" else "a map",
-            number(m["gradient_error"]), str(m["terms"] or "–"), str(m["true_terms"]),
-            "–" if off is None else number(float(np.max(np.abs(off)))),
-            number(m["one_step_rms"]), number(m["processor_seconds"]),
-        ])  # fmt: skip
-    heads = ("law", "kind", "d", "structure", "∇H off by", "terms", "true terms",
-             "worst number ÷ its standard error", "one-step RMS", "CPU s")  # fmt: skip
+        rows.append(
+            [
+                name,
+                m["kind"],
+                str(m["dim"]),
+                "exact" if m["found"] else "another" if m["chosen"] == "hamiltonian" else "a map",
+                number(m["gradient_error"]),
+                str(m["terms"] or "–"),
+                str(m["true_terms"]),
+                "–" if off is None else number(float(np.max(np.abs(off)))),
+                number(m["one_step_rms"]),
+                number(m["processor_seconds"]),
+            ]
+        )
+    heads = (
+        "law",
+        "kind",
+        "d",
+        "structure",
+        "∇H off by",
+        "terms",
+        "true terms",
+        "worst number ÷ its standard error",
+        "one-step RMS",
+        "CPU s",
+    )
     of_laws = [r["measured"] for r in found.values()]
     off = np.concatenate([np.abs(m["standard_errors"]) for m in of_laws if m["standard_errors"]])
     counted = (
@@ -236,11 +272,30 @@ def tables() -> None:
         m = r["measured"]
         chosen = m["chosen"] == "hamiltonian"
         verdict = "exact" if m["found"] else "approximate" if chosen else "a map"
-        rows.append([name, m["kind"], str(m["dim"]), verdict, number(m["gradient_error"]),
-                     str(m["terms"] or "–"), str(m["true_terms"]), number(m["one_step_rms"]),
-                     number(m["processor_seconds"])])  # fmt: skip
-    heads = ("law", "kind", "d", "verdict", "∇H off by", "terms", "true terms", "one-step RMS",
-             "CPU s")  # fmt: skip
+        rows.append(
+            [
+                name,
+                m["kind"],
+                str(m["dim"]),
+                verdict,
+                number(m["gradient_error"]),
+                str(m["terms"] or "–"),
+                str(m["true_terms"]),
+                number(m["one_step_rms"]),
+                number(m["processor_seconds"]),
+            ]
+        )
+    heads = (
+        "law",
+        "kind",
+        "d",
+        "verdict",
+        "∇H off by",
+        "terms",
+        "true terms",
+        "one-step RMS",
+        "CPU s",
+    )
     of_laws = [r["measured"] for n, r in found.items() if n in LAWS]
     outside = [r["measured"] for n, r in found.items() if n in OUTSIDE]
     false = sum(m["chosen"] == "hamiltonian" for m in outside)

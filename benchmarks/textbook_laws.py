@@ -24,8 +24,13 @@ _DRAWS = 40  # of so many orbits as are wanted, among which enough are bound
 _SUBSTEPS = 8  # of a step of a noisy orbit
 # What a law consists of, by which the results are counted.
 POLYNOMIAL, CONSTANTS, MASSES, LATTICE, DRIVEN, MODES = (
-    "polynomial", "constants or roots", "mass matrix", "lattice or bodies", "driven", "modes"
-)  # fmt: skip
+    "polynomial",
+    "constants or roots",
+    "mass matrix",
+    "lattice or bodies",
+    "driven",
+    "modes",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,11 +105,15 @@ class Law:
         span = (0.0, num_steps * self.dt)
         solved = [
             solve_ivp(
-                lambda t, y: apply_j(self.gradient(y[None]))[0], span, y0, "DOP853",
-                rtol=_PRECISE, atol=_PRECISE,
+                lambda t, y: apply_j(self.gradient(y[None]))[0],
+                span,
+                y0,
+                "DOP853",
+                rtol=_PRECISE,
+                atol=_PRECISE,
             )
             for y0 in z
-        ]  # fmt: skip
+        ]
         return np.stack([s.y[:, -1] for s in solved])
 
     def sequences(self, count: int, states: int, noise: float, seed: int) -> gfnn.Pairs:
@@ -141,12 +150,18 @@ class Law:
         run = np.repeat(np.arange(count), states - 1)
         drive = {}
         if self.period is not None:
-            drive = {"t0": (times[:, None] + self.dt * np.arange(states - 1)).ravel(),
-                     "period": self.period}  # fmt: skip
+            drive = {
+                "t0": (times[:, None] + self.dt * np.arange(states - 1)).ravel(),
+                "period": self.period,
+            }
         return gfnn.Pairs(
-            orbits[:, :-1].reshape(-1, 2 * self.dim), orbits[:, 1:].reshape(-1, 2 * self.dim),
-            self.dt, run=run, place=np.tile(np.arange(states - 1), count), **drive,
-        )  # fmt: skip
+            orbits[:, :-1].reshape(-1, 2 * self.dim),
+            orbits[:, 1:].reshape(-1, 2 * self.dim),
+            self.dt,
+            run=run,
+            place=np.tile(np.arange(states - 1), count),
+            **drive,
+        )
 
     def _stepped(self, z, t=None) -> np.ndarray:
         """The states (n, 2d) after dt by the classical Runge–Kutta method, to far below 1e-3."""
@@ -213,108 +228,208 @@ def _bodies(masses: tuple[float, ...]) -> Law:
 
 
 LAWS: dict[str, Law] = {
-    "kepler": Law(
-        {**_kinetic(2), f"1/{_R}": -1.0}, *_box(2, 2, 1, 1), 0.1, CONSTANTS, _RING
-    ),
+    "kepler": Law({**_kinetic(2), f"1/{_R}": -1.0}, *_box(2, 2, 1, 1), 0.1, CONSTANTS, _RING),
     "kepler-radial": Law(
         {**_kinetic(1), "1/q1**2": 0.32, "1/q1": -1.0}, (0.6, -0.5), (2.5, 0.5), 0.1, CONSTANTS
     ),
     "morse": Law(
         {"p1**2": 0.5, "exp(-1.3*q1)": -1.6, "exp(-2.6*q1)": 0.8},
-        (-0.5, -0.8), (1.8, 0.8), 0.1, CONSTANTS,
+        (-0.5, -0.8),
+        (1.8, 0.8),
+        0.1,
+        CONSTANTS,
     ),
     "yukawa": Law(
         {**_kinetic(2), f"exp(-0.7*{_R})/{_R}": -1.5}, *_box(2, 2, 1, 1), 0.1, CONSTANTS, _RING
     ),
-    "relativistic": Law(
-        {"sqrt(1 + p1**2)": 1.0, "q1**2": 0.5}, *_box(2, 2), 0.1, CONSTANTS
-    ),
+    "relativistic": Law({"sqrt(1 + p1**2)": 1.0, "q1**2": 0.5}, *_box(2, 2), 0.1, CONSTANTS),
     "exponential-springs": Law(
-        {"p1**2": 0.5, "p2**2": 0.35, "exp(-1.1*(q2 - q1))": 0.9, "q1": -1.3, "q2": 1.3,
-         "q1**2": 0.4}, *_box(1, 1, 1, 1), 0.1, CONSTANTS,
+        {
+            "p1**2": 0.5,
+            "p2**2": 0.35,
+            "exp(-1.1*(q2 - q1))": 0.9,
+            "q1": -1.3,
+            "q2": 1.3,
+            "q1**2": 0.4,
+        },
+        *_box(1, 1, 1, 1),
+        0.1,
+        CONSTANTS,
     ),
     "field-and-quartic-well": Law(
-        {"p1**2": 0.5, "p2**2": 0.5, "q2*p1": 0.6, "q1*p2": -0.6, "q1**2": 0.3, "q2**2": 0.3,
-         "q1**4": 0.25, "q1**2*q2**2": 0.5, "q2**4": 0.25}, *_box(1, 1, 1, 1), 0.1, POLYNOMIAL,
+        {
+            "p1**2": 0.5,
+            "p2**2": 0.5,
+            "q2*p1": 0.6,
+            "q1*p2": -0.6,
+            "q1**2": 0.3,
+            "q2**2": 0.3,
+            "q1**4": 0.25,
+            "q1**2*q2**2": 0.5,
+            "q2**4": 0.25,
+        },
+        *_box(1, 1, 1, 1),
+        0.1,
+        POLYNOMIAL,
     ),
     "three-duffings": Law(
-        {**_kinetic(3), "q1**2": 0.65, "q2**2": 0.8, "q3**2": 0.65, "q1*q2": -0.3, "q2*q3": -0.3,
-         "q1**4": 0.25, "q2**4": 0.25, "q3**4": 0.25}, *_box(1, 1, 1, 1, 1, 1), 0.1, POLYNOMIAL,
+        {
+            **_kinetic(3),
+            "q1**2": 0.65,
+            "q2**2": 0.8,
+            "q3**2": 0.65,
+            "q1*q2": -0.3,
+            "q2*q3": -0.3,
+            "q1**4": 0.25,
+            "q2**4": 0.25,
+            "q3**4": 0.25,
+        },
+        *_box(1, 1, 1, 1, 1, 1),
+        0.1,
+        POLYNOMIAL,
     ),
     "schwarzschild": Law(
         {"p1**2": 0.5, "1/q1": -1.0, "1/q1**2": 8.0, "1/q1**3": -16.0},
-        (5.0, -0.15), (20.0, 0.15), 2.0, CONSTANTS,
+        (5.0, -0.15),
+        (20.0, 0.15),
+        2.0,
+        CONSTANTS,
     ),
     "two-vortices": Law(
-        {"log((q1 - q2)**2 + (p1 - p2)**2)": -0.5}, *_box(1, 1, 1, 1), 0.1, CONSTANTS,
+        {"log((q1 - q2)**2 + (p1 - p2)**2)": -0.5},
+        *_box(1, 1, 1, 1),
+        0.1,
+        CONSTANTS,
         {"(q1 - q2)**2 + (p1 - p2)**2": (0.3, 8.0)},
     ),
     "cart": Law(
-        {"(0.3*p1**2 - 0.6*cos(q2)*p1*p2 + p2**2)/(1 - 0.3*cos(q2)**2)": 0.5, "cos(q2)": -1.0,
-         "q1**2": 0.2}, (-1.0, -2.5, -1.0, -1.0), (1.0, 2.5, 1.0, 1.0), 0.1, MASSES,
-        angles=(1,), size=5,
+        {
+            "(0.3*p1**2 - 0.6*cos(q2)*p1*p2 + p2**2)/(1 - 0.3*cos(q2)**2)": 0.5,
+            "cos(q2)": -1.0,
+            "q1**2": 0.2,
+        },
+        (-1.0, -2.5, -1.0, -1.0),
+        (1.0, 2.5, 1.0, 1.0),
+        0.1,
+        MASSES,
+        angles=(1,),
+        size=5,
     ),
     "anisotropic-oscillator": Law(
         {**_kinetic(2), "q1**2": 0.5, "q2**2": 1.1}, *_box(1, 1, 1, 1), 0.1, POLYNOMIAL
     ),
-    "pendulum": Law(
-        {"p1**2": 0.5, "cos(q1)": -1.0}, *_box(2.8, 1.5), 0.1, MODES, angles=(0,)
-    ),
-    "duffing": Law(
-        {"p1**2": 0.5, "q1**2": -0.5, "q1**4": 0.25}, *_box(1.6, 1), 0.1, POLYNOMIAL
-    ),
+    "pendulum": Law({"p1**2": 0.5, "cos(q1)": -1.0}, *_box(2.8, 1.5), 0.1, MODES, angles=(0,)),
+    "duffing": Law({"p1**2": 0.5, "q1**2": -0.5, "q1**4": 0.25}, *_box(1.6, 1), 0.1, POLYNOMIAL),
     "henon-heiles": Law(
         {**_kinetic(2), "q1**2": 0.5, "q2**2": 0.5, "q1**2*q2": 1.0, "q2**3": -1 / 3},
-        *_box(0.5, 0.5, 0.4, 0.4), 0.1, POLYNOMIAL,
+        *_box(0.5, 0.5, 0.4, 0.4),
+        0.1,
+        POLYNOMIAL,
     ),
     "lennard-jones": Law(
         {**_kinetic(2), "1/(q1 - q2)**12": 4.0, "1/(q1 - q2)**6": -4.0},
-        (0.5, -0.5, -0.8, -0.8), (1.8, 0.3, 0.8, 0.8), 0.02, CONSTANTS, {"q1 - q2": (0.98, 2.2)},
+        (0.5, -0.5, -0.8, -0.8),
+        (1.8, 0.3, 0.8, 0.8),
+        0.02,
+        CONSTANTS,
+        {"q1 - q2": (0.98, 2.2)},
     ),
     "toda-3": Law(
-        {**_kinetic(3), **_ring(3, "exp(q{i} - q{j})", 1.0)}, *_box(1, 1, 1, 1, 1, 1), 0.1,
+        {**_kinetic(3), **_ring(3, "exp(q{i} - q{j})", 1.0)},
+        *_box(1, 1, 1, 1, 1, 1),
+        0.1,
         LATTICE,
     ),
     "magnetic-field": Law(
-        {"p1**2": 0.5, "p2**2": 0.5, "q2*p1": 0.35, "q1*p2": -0.35, "q1**2": 0.06125,
-         "q2**2": 0.06125}, *_box(1, 1, 1, 1), 0.1, POLYNOMIAL,
+        {
+            "p1**2": 0.5,
+            "p2**2": 0.5,
+            "q2*p1": 0.35,
+            "q1*p2": -0.35,
+            "q1**2": 0.06125,
+            "q2**2": 0.06125,
+        },
+        *_box(1, 1, 1, 1),
+        0.1,
+        POLYNOMIAL,
     ),
     "penning-trap": Law(
         {**_kinetic(3), "q2*p1": 0.8, "q1*p2": -0.8, "q1**2": 0.12, "q2**2": 0.12, "q3**2": 0.2},
-        *_box(1, 1, 1, 1, 1, 1), 0.1, POLYNOMIAL,
+        *_box(1, 1, 1, 1, 1, 1),
+        0.1,
+        POLYNOMIAL,
     ),
     "paul-trap": Law(
-        {**_kinetic(2), "q1**2": 0.1, "q2**2": -0.1, "q1**2*cos(2*t)": 0.6,
-         "q2**2*cos(2*t)": -0.6}, *_box(1, 1, 1, 1), 0.1, DRIVEN, period=np.pi,
+        {**_kinetic(2), "q1**2": 0.1, "q2**2": -0.1, "q1**2*cos(2*t)": 0.6, "q2**2*cos(2*t)": -0.6},
+        *_box(1, 1, 1, 1),
+        0.1,
+        DRIVEN,
+        period=np.pi,
     ),
     "three-vortices": Law(
-        {"log((q1 - q2)**2 + (p1 - p2)**2)": -0.5, "log((q1 - q3)**2 + (p1 - p3)**2)": -0.5,
-         "log((q2 - q3)**2 + (p2 - p3)**2)": -0.5}, *_box(1, 1, 1, 1, 1, 1), 0.1, CONSTANTS,
+        {
+            "log((q1 - q2)**2 + (p1 - p2)**2)": -0.5,
+            "log((q1 - q3)**2 + (p1 - p3)**2)": -0.5,
+            "log((q2 - q3)**2 + (p2 - p3)**2)": -0.5,
+        },
+        *_box(1, 1, 1, 1, 1, 1),
+        0.1,
+        CONSTANTS,
         {f"(q{i} - q{j})**2 + (p{i} - p{j})**2": (0.3, 8.0) for i, j in ((1, 2), (1, 3), (2, 3))},
     ),
     "double-pendulum": Law(
-        {"(p1**2 - 2*cos(q1 - q2)*p1*p2 + 2*p2**2)/(2 - cos(q1 - q2)**2)": 0.5, "cos(q1)": -2.0,
-         "cos(q2)": -1.0}, *_box(2.5, 2.5, 1, 1), 0.1, MASSES, angles=(0, 1), size=5,
+        {
+            "(p1**2 - 2*cos(q1 - q2)*p1*p2 + 2*p2**2)/(2 - cos(q1 - q2)**2)": 0.5,
+            "cos(q1)": -2.0,
+            "cos(q2)": -1.0,
+        },
+        *_box(2.5, 2.5, 1, 1),
+        0.1,
+        MASSES,
+        angles=(0, 1),
+        size=5,
     ),
     "elastic-pendulum-polar": Law(
         {**_kinetic(1), "p2**2/q1**2": 0.5, "q1**2": 4.0, "q1": -8.0, "q1*cos(q2)": -1.0},
-        (0.7, -1.2, -0.5, -0.7), (1.6, 1.2, 0.5, 0.7), 0.1, MASSES, angles=(1,),
+        (0.7, -1.2, -0.5, -0.7),
+        (1.6, 1.2, 0.5, 0.7),
+        0.1,
+        MASSES,
+        angles=(1,),
     ),
     "elastic-pendulum": Law(
         {**_kinetic(2), "q1**2": 4.0, "q2**2": 4.0, _R: -8.0, "q2": 1.0},
-        *_box(1.6, 1.6, 0.7, 0.7), 0.1, CONSTANTS, {_R: (0.6, 1.7)},
+        *_box(1.6, 1.6, 0.7, 0.7),
+        0.1,
+        CONSTANTS,
+        {_R: (0.6, 1.7)},
     ),
     "spherical-pendulum": Law(
         {**_kinetic(1), "p2**2/sin(q1)**2": 0.5, "cos(q1)": -1.0},
-        (0.5, -3.0, -1.0, -1.0), (2.6, 3.0, 1.0, 1.0), 0.1, MASSES, angles=(0, 1),
+        (0.5, -3.0, -1.0, -1.0),
+        (2.6, 3.0, 1.0, 1.0),
+        0.1,
+        MASSES,
+        angles=(0, 1),
     ),
     "restricted-three-bodies": Law(
-        {**_kinetic(2), "q2*p1": 1.0, "q1*p2": -1.0, "1/sqrt((q1 + 0.2)**2 + q2**2)": -0.8,
-         "1/sqrt((q1 - 0.8)**2 + q2**2)": -0.2}, *_box(1.6, 1.6, 1, 1), 0.05, CONSTANTS,
+        {
+            **_kinetic(2),
+            "q2*p1": 1.0,
+            "q1*p2": -1.0,
+            "1/sqrt((q1 + 0.2)**2 + q2**2)": -0.8,
+            "1/sqrt((q1 - 0.8)**2 + q2**2)": -0.2,
+        },
+        *_box(1.6, 1.6, 1, 1),
+        0.05,
+        CONSTANTS,
         {"sqrt((q1 + 0.2)**2 + q2**2)": (0.5, 3.0), "sqrt((q1 - 0.8)**2 + q2**2)": (0.4, 3.0)},
     ),
     "josephson-dimer": Law(
-        {"p1**2": 1.2, "sqrt(1 - p1**2)*cos(q1)": -1.0}, *_box(3.0, 0.8), 0.1, CONSTANTS,
+        {"p1**2": 1.2, "sqrt(1 - p1**2)*cos(q1)": -1.0},
+        *_box(3.0, 0.8),
+        0.1,
+        CONSTANTS,
         angles=(0,),
     ),
     "lotka-volterra": Law(
@@ -322,27 +437,43 @@ LAWS: dict[str, Law] = {
     ),
     "heavy-top": Law(  # Euler angles: precession, nutation, spin
         {"p2**2": 0.5, "(p1 - p3*cos(q2))**2/sin(q2)**2": 0.5, "p3**2": 0.8, "cos(q2)": 1.5},
-        (-3.0, 0.5, -3.0, -1.0, -1.0, -1.0), (3.0, 2.6, 3.0, 1.0, 1.0, 1.0), 0.05, MASSES,
-        angles=(0, 1, 2), size=7,
+        (-3.0, 0.5, -3.0, -1.0, -1.0, -1.0),
+        (3.0, 2.6, 3.0, 1.0, 1.0, 1.0),
+        0.05,
+        MASSES,
+        angles=(0, 1, 2),
+        size=7,
     ),
     "toda-32": Law(
-        {**_kinetic(32), **_ring(32, "exp(q{i} - q{j})", 1.0)}, *_box(*[0.6] * 64), 0.1, LATTICE,
+        {**_kinetic(32), **_ring(32, "exp(q{i} - q{j})", 1.0)},
+        *_box(*[0.6] * 64),
+        0.1,
+        LATTICE,
         size=2,
     ),
     "four-bodies": _bodies((1.0, 0.7, 0.5, 0.3)),
     "frenkel-kontorova": Law(
-        {**_kinetic(8), **_ring(8, "(q{i} - q{j})**2", 0.5),
-         **{f"cos(q{i + 1})": -0.8 for i in range(8)}}, *_box(*[1.5] * 8, *[0.8] * 8), 0.1,
-        LATTICE, size=3,
+        {
+            **_kinetic(8),
+            **_ring(8, "(q{i} - q{j})**2", 0.5),
+            **{f"cos(q{i + 1})": -0.8 for i in range(8)},
+        },
+        *_box(*[1.5] * 8, *[0.8] * 8),
+        0.1,
+        LATTICE,
+        size=3,
     ),
     "soft-coulomb": Law(
         {**_kinetic(2), "1/sqrt(0.53 + q1**2 + q2**2)": -1.0}, *_box(1.5, 1.5, 1, 1), 0.1, CONSTANTS
     ),
     "kepler-quadrupole": Law(
         {**_kinetic(2), f"1/{_R}": -1.0, f"1/{_R}**3": -0.05, f"q2**2/{_R}**5": 0.15},
-        *_box(2, 2, 1, 1), 0.1, CONSTANTS, _RING,
+        *_box(2, 2, 1, 1),
+        0.1,
+        CONSTANTS,
+        _RING,
     ),
-}  # fmt: skip
+}
 
 # Laws that no library holds: a formula for one of these is false.
 OUTSIDE: dict[str, Law] = {
@@ -350,19 +481,28 @@ OUTSIDE: dict[str, Law] = {
         {**_kinetic(1), "sin(q1**2)*exp(-0.3*q1)": 0.7, "q1**2": 0.5}, *_box(1.8, 1), 0.1, "outside"
     ),
     "arctangent": Law(
-        {**_kinetic(1), "q1*arctan(2.3*q1)": 0.8, "log(1 + exp(1.7*q1))": 0.4}, *_box(2, 1), 0.1,
+        {**_kinetic(1), "q1*arctan(2.3*q1)": 0.8, "log(1 + exp(1.7*q1))": 0.4},
+        *_box(2, 1),
+        0.1,
         "outside",
     ),
     "nested": Law(
-        {"sqrt(1 + p1**2 + 0.3*exp(sin(q1)))": 1.0, "tanh(q1*p1)": 0.2}, *_box(1.5, 1), 0.1,
+        {"sqrt(1 + p1**2 + 0.3*exp(sin(q1)))": 1.0, "tanh(q1*p1)": 0.2},
+        *_box(1.5, 1),
+        0.1,
         "outside",
     ),
     "two-ranges": Law(
         {**_kinetic(2), f"1/({_R} + 0.3*{_R}**2.3)": -1.0, f"exp(-q1**2*{_R})": 0.2},
-        *_box(2, 2, 1, 1), 0.1, "outside", _RING,
+        *_box(2, 2, 1, 1),
+        0.1,
+        "outside",
+        _RING,
     ),
     "saturating": Law(
         {"log(1 + exp(p1**2))": 0.5, "log(1 + q1**4)": 0.5, "sin(q1 + exp(0.4*p1))": 0.1},
-        *_box(1.5, 1.5), 0.1, "outside",
+        *_box(1.5, 1.5),
+        0.1,
+        "outside",
     ),
-}  # fmt: skip
+}

@@ -165,8 +165,15 @@ def tables() -> None:
     for name, r in found.items():
         theirs = [cell(r["measured"][k]["exact"], r["measured"][k]["field_error"]) for k in kinds]
         rows.append([name, own(ours, name), *theirs[:2], own(noisy, name), *theirs[2:]])
-    heads = ("law", "pairs: ours, told nothing", "PySINDy by hand", "its default",
-             "noise: ours, told nothing", "PySINDy by hand", "its default")  # fmt: skip
+    heads = (
+        "law",
+        "pairs: ours, told nothing",
+        "PySINDy by hand",
+        "its default",
+        "noise: ours, told nothing",
+        "PySINDy by hand",
+        "its default",
+    )
     exact = [sum(r["measured"][k]["exact"] for r in found.values()) for k in kinds]
     counted = (
         f"Structures that are exact, of {len(found)}: PySINDy by hand {exact[0]} of pairs and "

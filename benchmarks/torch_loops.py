@@ -83,8 +83,9 @@ def measure(
     torch.manual_seed(0)
     rows = [torch.tensor(a, dtype=torch.float32) for a in (w, target_gradient)]
     loops: dict[str, tuple[Callable, bool]] = {
-        "original": (_loaded, False), "careful": (_indexed, True)
-    }  # fmt: skip
+        "original": (_loaded, False),
+        "careful": (_indexed, True),
+    }
     microseconds = {
         name: 1e6 * _seconds(batches(*rows, batch_size), widths, weight, runs, length, fused=fused)
         for name, (batches, fused) in loops.items()

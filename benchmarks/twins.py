@@ -120,40 +120,83 @@ TWO, THREE = ("theta1", "theta2"), ("theta1", "theta2", "theta3")
 TWINS = {
     "pendulum": Twin(
         along(lambda q, v, u: -1.357 * np.sin(q) - 0.012 * v),
-        ((1.45, 0.0),), 57.0, 1 / 6, ("theta",), ("theta",),
-        {"omega**2": 0.5, "cos(theta)": 1.357}, {"omega**2": 0.006},
+        ((1.45, 0.0),),
+        57.0,
+        1 / 6,
+        ("theta",),
+        ("theta",),
+        {"omega**2": 0.5, "cos(theta)": 1.357},
+        {"omega**2": 0.006},
     ),
     "air_track": Twin(
-        along(lambda q, v, u: -6.22 * q - 0.014 * v), ((100.0, 0.0),), 17.4, 1 / 30, ("x",), (),
-        {"v**2": 0.5, "x**2": -3.11}, {"v**2": 0.007},
+        along(lambda q, v, u: -6.22 * q - 0.014 * v),
+        ((100.0, 0.0),),
+        17.4,
+        1 / 30,
+        ("x",),
+        (),
+        {"v**2": 0.5, "x**2": -3.11},
+        {"v**2": 0.007},
     ),
     "two_carts": Twin(
-        along(_carts, (1.0, 2.44)), ((60.0, -40.0, 0.0, 150.0),), 9.9, 1 / 30, ("x1", "x2"), (),
-        {"v1**2": 0.5, "v2**2": 1.22, "x1**2": -42.8, "x1*x2": 77.8, "x2**2": -42.7}, {},
+        along(_carts, (1.0, 2.44)),
+        ((60.0, -40.0, 0.0, 150.0),),
+        9.9,
+        1 / 30,
+        ("x1", "x2"),
+        (),
+        {"v1**2": 0.5, "v2**2": 1.22, "x1**2": -42.8, "x1*x2": 77.8, "x2**2": -42.7},
+        {},
     ),
     "double_pendulum": Twin(
         links(
-            np.array([[1.0, 0.407], [0.407, 0.316]]), np.array([62.2, 23.0]),
+            np.array([[1.0, 0.407], [0.407, 0.316]]),
+            np.array([62.2, 23.0]),
             lambda v: joints(v, [lambda s: 0.02 * s, lambda s: 0.008 * s]),
         ),
-        ((1.3, -1.2, 0.0, 8.0), (-1.0, 0.4, 3.0, 0.0)), 2.6, 0.01, TWO, TWO,
-        {"omega1**2": 0.5, "omega1*omega2*cos(theta1 - theta2)": 0.407, "omega2**2": 0.158,
-         "cos(theta1)": 62.2, "cos(theta2)": 23.0},
+        ((1.3, -1.2, 0.0, 8.0), (-1.0, 0.4, 3.0, 0.0)),
+        2.6,
+        0.01,
+        TWO,
+        TWO,
+        {
+            "omega1**2": 0.5,
+            "omega1*omega2*cos(theta1 - theta2)": 0.407,
+            "omega2**2": 0.158,
+            "cos(theta1)": 62.2,
+            "cos(theta2)": 23.0,
+        },
         {"omega1**2": 0.01, "(omega2 - omega1)**2": 0.004},
     ),
     "arm1": Twin(
         along(lambda q, v, u: 64.0 * np.sin(q) - 0.0047 * v * abs(v), dry=(0.13,)),
-        ((4.7, 0.0), (4.2, 0.0)), 9.0, 0.004, ("theta",), ("theta",),
-        {"omega**2": 0.5, "cos(theta)": -64.0}, {"abs(omega)**3": 0.0047 / 3, "abs(omega)": 0.13},
+        ((4.7, 0.0), (4.2, 0.0)),
+        9.0,
+        0.004,
+        ("theta",),
+        ("theta",),
+        {"omega**2": 0.5, "cos(theta)": -64.0},
+        {"abs(omega)**3": 0.0047 / 3, "abs(omega)": 0.13},
     ),
     "arm2": Twin(
         links(
-            np.array([[1.0, 0.4914], [0.4914, 0.5563]]), np.array([-58.9, -27.83]),
-            lambda v: -np.array([0.003, 0.002]) * v * abs(v), (0.0, 0.056),
+            np.array([[1.0, 0.4914], [0.4914, 0.5563]]),
+            np.array([-58.9, -27.83]),
+            lambda v: -np.array([0.003, 0.002]) * v * abs(v),
+            (0.0, 0.056),
         ),
-        swings(16, 2, 1.0, 4.0, about=np.pi), 2.667, 0.001, TWO, TWO,
-        {"omega1**2": 0.5, "omega1*omega2*cos(theta1 - theta2)": 0.4914, "omega2**2": 0.27815,
-         "cos(theta1)": -58.9, "cos(theta2)": -27.83},
+        swings(16, 2, 1.0, 4.0, about=np.pi),
+        2.667,
+        0.001,
+        TWO,
+        TWO,
+        {
+            "omega1**2": 0.5,
+            "omega1*omega2*cos(theta1 - theta2)": 0.4914,
+            "omega2**2": 0.27815,
+            "cos(theta1)": -58.9,
+            "cos(theta2)": -27.83,
+        },
         {"abs(omega1)**3": 0.001, "abs(omega2)**3": 0.002 / 3, "abs(omega2 - omega1)": 0.056},
     ),
     "arm3": Twin(
@@ -163,40 +206,79 @@ TWINS = {
             lambda v: joints(v, [lambda s: 0.0, lambda s: 0.0, lambda s: 0.0006 * s * abs(s)]),
             (0.033, 0.027),
         ),
-        swings(12, 3, 0.5, 2.0, about=np.pi), 1.539, 0.001, THREE, THREE,
-        {"omega1**2": 0.5, "omega1*omega2*cos(theta1 - theta2)": 0.778,
-         "omega1*omega3*cos(theta1 - theta3)": 0.2, "omega2**2": 0.483,
-         "omega2*omega3*cos(theta2 - theta3)": 0.265, "omega3**2": 0.11,
-         "cos(theta1)": -58.0, "cos(theta2)": -44.0, "cos(theta3)": -11.3},
+        swings(12, 3, 0.5, 2.0, about=np.pi),
+        1.539,
+        0.001,
+        THREE,
+        THREE,
+        {
+            "omega1**2": 0.5,
+            "omega1*omega2*cos(theta1 - theta2)": 0.778,
+            "omega1*omega3*cos(theta1 - theta3)": 0.2,
+            "omega2**2": 0.483,
+            "omega2*omega3*cos(theta2 - theta3)": 0.265,
+            "omega3**2": 0.11,
+            "cos(theta1)": -58.0,
+            "cos(theta2)": -44.0,
+            "cos(theta3)": -11.3,
+        },
         {"abs(omega3 - omega2)**3": 0.0002, "abs(omega1)": 0.033, "abs(omega2 - omega1)": 0.027},
     ),
     "video_double_pendulum": Twin(
         links(
-            np.array([[1.0, 0.35], [0.35, 0.27]]), np.array([105.0, 38.0]),
+            np.array([[1.0, 0.35], [0.35, 0.27]]),
+            np.array([105.0, 38.0]),
             lambda v: joints(v, [lambda s: 0.03 * s, lambda s: 0.004 * s]),
         ),
-        ((1.95, -0.08, 0.0, 0.0), (2.3, 0.1, 0.0, 0.0)), 20.0, 0.0025, TWO, TWO,
-        {"omega1**2": 0.5, "omega1*omega2*cos(theta1 - theta2)": 0.35, "omega2**2": 0.135,
-         "cos(theta1)": 105.0, "cos(theta2)": 38.0},
-        {"omega1**2": 0.015, "(omega2 - omega1)**2": 0.002}, wrapped=True,
+        ((1.95, -0.08, 0.0, 0.0), (2.3, 0.1, 0.0, 0.0)),
+        20.0,
+        0.0025,
+        TWO,
+        TWO,
+        {
+            "omega1**2": 0.5,
+            "omega1*omega2*cos(theta1 - theta2)": 0.35,
+            "omega2**2": 0.135,
+            "cos(theta1)": 105.0,
+            "cos(theta2)": 38.0,
+        },
+        {"omega1**2": 0.015, "(omega2 - omega1)**2": 0.002},
+        wrapped=True,
     ),
     "robot_arm": Twin(
         Body(_robot_masses, _robot_force, np.eye(2), np.array([1.4, 0.8])),
-        ((0.0,) * 4,) * 3, 10.0, 0.002, TWO, TWO,
-        {"omega1**2": _ROD, "omega1**2*cos(theta2)": _REACH, "omega1*omega2*cos(theta2)": _REACH,
-         "omega1*omega2": 2 * _FAR, "omega2**2": _FAR, "cos(theta1)": 14.0,
-         "cos(theta1 + theta2)": 10.5},
+        ((0.0,) * 4,) * 3,
+        10.0,
+        0.002,
+        TWO,
+        TWO,
+        {
+            "omega1**2": _ROD,
+            "omega1**2*cos(theta2)": _REACH,
+            "omega1*omega2*cos(theta2)": _REACH,
+            "omega1*omega2": 2 * _FAR,
+            "omega2**2": _FAR,
+            "cos(theta1)": 14.0,
+            "cos(theta1 + theta2)": 10.5,
+        },
         {"abs(omega1)": 1.4, "abs(omega2)": 0.8},
-        {"tau1": (10.0, 0.0), "tau2": (0.0, 10.0)}, multisine(0.2, 2.5, 12, (0.4, 0.3)),
+        {"tau1": (10.0, 0.0), "tau2": (0.0, 10.0)},
+        multisine(0.2, 2.5, 12, (0.4, 0.3)),
         ("omega1**2", "omega1**2*cos(theta2)"),
     ),
     "silverbox": Twin(
         along(lambda q, v, u: -184_200 * q - 734_000 * q**3 - 41 * v + 180_000 * u),
-        ((0.0, 0.0),), 20.0, 1 / 610.35, ("y",), (),
-        {"y_dot**2": 0.5, "y**2": -92_100.0, "y**4": -183_500.0}, {"y_dot**2": 20.5},
-        {"u": (180_000.0,)}, multisine(1.0, 200.0, 400, (0.022,)),
+        ((0.0, 0.0),),
+        20.0,
+        1 / 610.35,
+        ("y",),
+        (),
+        {"y_dot**2": 0.5, "y**2": -92_100.0, "y**4": -183_500.0},
+        {"y_dot**2": 20.5},
+        {"u": (180_000.0,)},
+        multisine(1.0, 200.0, 400, (0.022,)),
     ),
-}  # fmt: skip
+}
 
 
 @cache
@@ -227,8 +309,10 @@ def recording(name: str, noise: float, draw: int) -> gfnn.Recording:
         seen = q + noise * spread[:, None] * rng.normal(size=q.shape)
         if twin.wrapped:
             seen = np.pi - (np.pi - seen) % (2 * np.pi)
-        columns = {**dict(zip(twin.names, seen, strict=True)),
-                   **dict(zip(twin.inputs, u.T, strict=True))}  # fmt: skip
+        columns = {
+            **dict(zip(twin.names, seen, strict=True)),
+            **dict(zip(twin.inputs, u.T, strict=True)),
+        }
         tables.append({"run": np.full(len(t), str(run)), "t": t, **columns})
     return gfnn.Recording(
         tables, positions=twin.names, angles=twin.angles, inputs=tuple(twin.inputs)
@@ -274,10 +358,14 @@ def case(name: str, noise: float, draw: int) -> Numbers:
             off[f"gain of {u} on {q}"] = abs(gain - scale * force) / std
     off |= {f"zero of {name}": abs(zero) / std for name, (zero, std) in fit.zeros.items()}
     return {
-        "noise": noise, "draw": draw, "same": same, "standard_errors": off,
-        "formula": fit.formula, "friction": fit.friction.formula,
+        "noise": noise,
+        "draw": draw,
+        "same": same,
+        "standard_errors": off,
+        "formula": fit.formula,
+        "friction": fit.friction.formula,
         "processor_seconds": done.processor_seconds,
-    }  # fmt: skip
+    }
 
 
 def measured(name: str, quick: bool) -> Numbers:
@@ -287,8 +375,11 @@ def measured(name: str, quick: bool) -> Numbers:
             cases.append(case(name, noise, draw))
             c = cases[-1]
             worst = max(c["standard_errors"].items(), key=lambda item: item[1], default=("", 0))
-            print(f"  {noise:g}: {c['same']}, {worst[0]} off by {worst[1]:.1f}; {c['formula']} | "
-                  f"{c['friction']}; {c['processor_seconds']:.1f} s", flush=True)  # fmt: skip
+            print(
+                f"  {noise:g}: {c['same']}, {worst[0]} off by {worst[1]:.1f}; {c['formula']} | "
+                f"{c['friction']}; {c['processor_seconds']:.1f} s",
+                flush=True,
+            )
     return {"cases": cases}
 
 
@@ -307,15 +398,26 @@ def tables() -> None:
             cases = [c for c in result["measured"]["cases"] if c["noise"] == noise]
             off = [z for c in cases for z in c["standard_errors"].values()]
             seconds = np.mean([c["processor_seconds"] for c in cases])
-            rows.append([
-                name, f"{noise:g}",
-                f"{sum(c['same']['lagrangian'] for c in cases)} of {len(cases)}",
-                f"{sum(c['same']['friction'] for c in cases)} of {len(cases)}",
-                f"{sum(z <= WITHIN for z in off)} of {len(off)}", number(max(off)),
-                number(seconds),
-            ])  # fmt: skip
-    heads = ("twin", "noise ÷ spread", "terms of L exact", "friction exact",
-             f"within {WITHIN:g} standard errors", "largest", "CPU s")  # fmt: skip
+            rows.append(
+                [
+                    name,
+                    f"{noise:g}",
+                    f"{sum(c['same']['lagrangian'] for c in cases)} of {len(cases)}",
+                    f"{sum(c['same']['friction'] for c in cases)} of {len(cases)}",
+                    f"{sum(z <= WITHIN for z in off)} of {len(off)}",
+                    number(max(off)),
+                    number(seconds),
+                ]
+            )
+    heads = (
+        "twin",
+        "noise ÷ spread",
+        "terms of L exact",
+        "friction exact",
+        f"within {WITHIN:g} standard errors",
+        "largest",
+        "CPU s",
+    )
     between_markers(TABLES, "twins", markdown(heads, rows))
 
 

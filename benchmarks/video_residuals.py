@@ -31,10 +31,15 @@ from gfnn_jax.solve.latent_arcs import SOFT_L1, fit_arcs
 
 NAME = "video_double_pendulum"
 TERMS = (
-    "omega1**2", "omega1*omega2*cos(theta1 - theta2)", "omega2**2", "cos(theta1)",
-    "cos(theta2)", "R: abs(omega1)", "R: abs(omega2 - omega1)",
+    "omega1**2",
+    "omega1*omega2*cos(theta1 - theta2)",
+    "omega2**2",
+    "cos(theta1)",
+    "cos(theta2)",
+    "R: abs(omega1)",
+    "R: abs(omega2 - omega1)",
     "R: abs(omega2)**3",
-)  # fmt: skip
+)
 LENGTHS, ARCS = (0.15, 0.25), 240  # s of an arc, arcs
 HARMONICS = ((1, 0), (0, 1), (1, -1), (1, 1), (2, 0), (0, 2), (2, -1), (1, -2))
 
@@ -49,8 +54,15 @@ def main() -> None:
     print(fit.formula, fit.friction.formula, sep="\n")
     found = {f"{seconds:g}": causes(law_of(fit.map), recording, seconds) for seconds in LENGTHS}
     out = arguments.out / "video-residuals.json"
-    write(out, {"piece": "residuals", "formula": fit.formula, "friction": fit.friction.formula,
-                "arcs": found})  # fmt: skip
+    write(
+        out,
+        {
+            "piece": "residuals",
+            "formula": fit.formula,
+            "friction": fit.friction.formula,
+            "arcs": found,
+        },
+    )
     rows = [
         [cause, *(f"{found[s]['left'][cause]:.2f}" for s in found)]
         for cause in next(iter(found.values()))["left"]
@@ -71,10 +83,12 @@ def causes(law: Law, recording: Any, seconds: float) -> dict[str, Any]:
     places = places[:: max(1, len(places) // ARCS)]
     t = np.array([s.t[k : k + size] for s, k in places])
     y = np.array([s.y[k : k + size] for s, k in places])
-    start = np.array([
-        np.concatenate(smooth(s.t, s.q, scales.half, np.arange(k, k + size))[0][:2], axis=1)
-        for s, k in places
-    ])  # fmt: skip
+    start = np.array(
+        [
+            np.concatenate(smooth(s.t, s.q, scales.half, np.arange(k, k + size))[0][:2], axis=1)
+            for s, k in places
+        ]
+    )
     run = np.array([recording.runs.index(s.run) for s, _ in places])
     h, plain = np.diff(t, axis=1), Observation.plain(recording.positions)
     u = np.zeros((*h.shape, 1, 6, 0))
@@ -135,10 +149,13 @@ def causes(law: Law, recording: Any, seconds: float) -> dict[str, Any]:
     ]
     signs = [np.tanh(2 * f) for f in (v1, joint)]
     base = np.concatenate(
-        [moved(steps.by_coefficients, np.zeros((len(x), 4, len(every)))), seen(0, one),
-         seen(1, one)],
+        [
+            moved(steps.by_coefficients, np.zeros((len(x), 4, len(every)))),
+            seen(0, one),
+            seen(1, one),
+        ],
         axis=-1,
-    )  # fmt: skip
+    )
     per_run = np.concatenate([base * (run == k)[:, None, None, None] for k in range(1, 4)], axis=-1)
     second = (v1 * v1, v1 * v2, v2 * v2)
     along_1, along_2 = (  # of ω₁ ω₂ sin(θ₁ − θ₂): ∂/∂θ − d/dt ∂/∂ω
@@ -200,11 +217,17 @@ def causes(law: Law, recording: Any, seconds: float) -> dict[str, Any]:
     z = np.clip(z, -4, 4)
     alike = np.mean(z[1:] * z[:-1], axis=0) / np.mean(z * z, axis=0)
     return {
-        "law": p.tolist(), "left": figures, "sigma": sigma.tolist(), "helped": both,
-        "torque": {"spread": spread.tolist(), "error": error.tolist(),
-                   "share of gravity": (spread / gravity).tolist(),
-                   "correlation of neighbours": alike.tolist()},
-    }  # fmt: skip
+        "law": p.tolist(),
+        "left": figures,
+        "sigma": sigma.tolist(),
+        "helped": both,
+        "torque": {
+            "spread": spread.tolist(),
+            "error": error.tolist(),
+            "share of gravity": (spread / gravity).tolist(),
+            "correlation of neighbours": alike.tolist(),
+        },
+    }
 
 
 def held_out(rows: np.ndarray, free: int) -> float:

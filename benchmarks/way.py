@@ -19,9 +19,19 @@ import climbs
 import jax
 
 CARRIERS = (
-    "Request", "Dataset", "Diagnosis", "LinearSweep", "LeastSquaresFit", "Found",
-    "LearnedHamiltonian", "Searched", "Chosen", "Stated", "Conclusion", "Fit",
-)  # fmt: skip
+    "Request",
+    "Dataset",
+    "Diagnosis",
+    "LinearSweep",
+    "LeastSquaresFit",
+    "Found",
+    "LearnedHamiltonian",
+    "Searched",
+    "Chosen",
+    "Stated",
+    "Conclusion",
+    "Fit",
+)
 
 
 class Way:

@@ -101,9 +101,9 @@ class Bench:
         states = np.array(states, dtype=float)
         if lost is not None:
             states[lost] = np.nan
-        error = np.asarray(
-            metrics.position_error(states, self.reference, angles_of(self.scene))
-        )[self.stays]  # fmt: skip
+        error = np.asarray(metrics.position_error(states, self.reference, angles_of(self.scene)))[
+            self.stays
+        ]
         num_lost = int(np.sum(~np.isfinite(error)))
         return {
             "error_median": float(np.median(np.where(np.isfinite(error), error, np.inf))),
@@ -143,8 +143,9 @@ def map_point(bench: Bench, map_, *, alone: bool) -> Numbers:
     left = int(np.sum(status[bench.stays] == LEFT_DOMAIN))
     return {
         **bench.judged(states[:, -1], lost=status > LEFT_DOMAIN),
-        "num_left_domain": left, **times,
-    }  # fmt: skip
+        "num_left_domain": left,
+        **times,
+    }
 
 
 def front_of(cost, error) -> list[int]:
@@ -185,9 +186,15 @@ def our_maps(bench: Bench, num_pairs: int, quick: bool, omit) -> Iterator[Number
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", gfnn.FitWarning)
                 return gfnn.fit(
-                    pairs, scene, learn="map", chart=chart, family=family, seed=SEED,
-                    tolerance=tolerance, max_iterations=MLP_ITERATIONS,
-                )  # fmt: skip
+                    pairs,
+                    scene,
+                    learn="map",
+                    chart=chart,
+                    family=family,
+                    seed=SEED,
+                    tolerance=tolerance,
+                    max_iterations=MLP_ITERATIONS,
+                )
 
         try:
             sweep = fitted(1e-3 if quick else UNREACHABLE)
@@ -210,11 +217,15 @@ def our_maps(bench: Bench, num_pairs: int, quick: bool, omit) -> Iterator[Number
                 continue
             shown.add(candidate.label)
             about = {
-                "group": OURS, "method": f"{chart} {candidate.label.rsplit(maxsplit=1)[0]}",
-                "label": candidate.label, "chart": chart,
-                "num_parameters": candidate.num_parameters, "base_map": fit.base_map,
-                "one_step_rms": candidate.validation_rms, "fit_seconds": candidate.fit_seconds,
-            }  # fmt: skip
+                "group": OURS,
+                "method": f"{chart} {candidate.label.rsplit(maxsplit=1)[0]}",
+                "label": candidate.label,
+                "chart": chart,
+                "num_parameters": candidate.num_parameters,
+                "base_map": fit.base_map,
+                "one_step_rms": candidate.validation_rms,
+                "fit_seconds": candidate.fit_seconds,
+            }
             yield {**about, "dtype": "float64", **map_point(bench, fit.map, alone=True)}
             if not at_floor:
                 single = in_float32(fit.map)
@@ -229,8 +240,9 @@ def our_laws(bench: Bench, quick: bool) -> Iterator[Numbers]:
     pairs, fresh = drawn(scene, num_pairs, quick=True)
     shown: set[str] = set()
     for tolerance in LAW_TOLERANCES[-1:] if quick else LAW_TOLERANCES:
-        law = gfnn.fit(pairs, scene, learn="hamiltonian", terms=terms, seed=SEED,
-                       tolerance=0.1 * tolerance)  # fmt: skip
+        law = gfnn.fit(
+            pairs, scene, learn="hamiltonian", terms=terms, seed=SEED, tolerance=0.1 * tolerance
+        )
         assert law.hamiltonian is not None
         flow = law.hamiltonian.flow
         print(f"  law: {flow.stages} stages in {flow.substeps} substeps", flush=True)
@@ -247,12 +259,18 @@ def our_laws(bench: Bench, quick: bool) -> Iterator[Numbers]:
                 continue
             shown.add(f"{method} {label}")
             yield {
-                "group": OURS, "method": method, "label": label, "chart": fit.chosen.chart,
-                "num_parameters": fit.chosen.num_parameters, "base_map": fit.base_map,
+                "group": OURS,
+                "method": method,
+                "label": label,
+                "chart": fit.chosen.chart,
+                "num_parameters": fit.chosen.num_parameters,
+                "base_map": fit.base_map,
                 "one_step_rms": one_step_rms(fit.map, fresh, angles_of(scene)),
-                "fit_seconds": fit.seconds - fit.compile_seconds, "dtype": "float64",
-                "pairs": num_pairs, **map_point(bench, fit.map, alone=True),
-            }  # fmt: skip
+                "fit_seconds": fit.seconds - fit.compile_seconds,
+                "dtype": "float64",
+                "pairs": num_pairs,
+                **map_point(bench, fit.map, alone=True),
+            }
 
 
 def integrated(bench: Bench, quick: bool, omit) -> Iterator[Numbers]:
@@ -275,10 +293,15 @@ def integrated(bench: Bench, quick: bool, omit) -> Iterator[Numbers]:
                 omit(f"{name}, {label}", f"{judged['num_lost']} trajectories fail")
                 continue
             yield {
-                "group": KNOWN, "method": name, "label": label, "dtype": "float64",
-                "arrangement": runner.arrangement, **judged, **times,
+                "group": KNOWN,
+                "method": name,
+                "label": label,
+                "dtype": "float64",
+                "arrangement": runner.arrangement,
+                **judged,
+                **times,
                 **bench.alone(functools.partial(runner.run, one, longer, precision)),
-            }  # fmt: skip
+            }
 
 
 def scene_piece(name: str) -> Callable[[bool], Numbers]:
@@ -291,17 +314,24 @@ def scene_piece(name: str) -> Callable[[bool], Numbers]:
 
         scene = gfnn.scenes.make(name)
         bench = Bench(scene, num_steps, lanes, quick)
-        points = [*our_maps(bench, 1_000 if quick else num_pairs, quick, omit),
-                  *integrated(bench, quick, omit)]  # fmt: skip
+        points = [
+            *our_maps(bench, 1_000 if quick else num_pairs, quick, omit),
+            *integrated(bench, quick, omit),
+        ]
         try:
             extra = {"heyoka": importlib.metadata.version("heyoka")}
         except importlib.metadata.PackageNotFoundError:
             extra = {}
         return {
-            "dt": scene.dt, "horizon_steps": num_steps, "horizon": num_steps * scene.dt,
-            "lanes": len(bench.z0), "pairs": num_pairs, "points": points, "omitted": omitted,
+            "dt": scene.dt,
+            "horizon_steps": num_steps,
+            "horizon": num_steps * scene.dt,
+            "lanes": len(bench.z0),
+            "pairs": num_pairs,
+            "points": points,
+            "omitted": omitted,
             "versions": extra,
-        }  # fmt: skip
+        }
 
     return measure
 
@@ -333,14 +363,17 @@ def others(name: str, result: Numbers) -> list[Numbers]:
     step = str(measured["horizon_steps"])
     return [
         {
-            "group": OTHERS, "method": m["title"], "label": m["model"]["label"],
+            "group": OTHERS,
+            "method": m["title"],
+            "label": m["model"]["label"],
             "error_median": m["rollout"]["error_median"][step],
             "microseconds_batch": m["rollout"]["microseconds_per_step"] / measured["dt"],
-            "num_parameters": m["model"]["num_parameters"], "num_lost": m["rollout"]["num_lost"],
+            "num_parameters": m["model"]["num_parameters"],
+            "num_lost": m["rollout"]["num_lost"],
         }
         for method, m in json.loads(path.read_text(encoding="utf-8"))["methods"].items()
         if method != "gfnn"
-    ]  # fmt: skip
+    ]
 
 
 def panel(points: list[Numbers], time_of: str) -> Numbers:
@@ -361,12 +394,14 @@ def panel(points: list[Numbers], time_of: str) -> Numbers:
 def draw(name: str, result: Numbers) -> None:
     m = result["measured"]
     points = [*m["points"], *others(name, result)]
-    panels = {f"{m['lanes']:,} trajectories together": panel(points, "microseconds_batch"),
-              "one trajectory alone": panel(points, "microseconds_single")}  # fmt: skip
+    panels = {
+        f"{m['lanes']:,} trajectories together": panel(points, "microseconds_batch"),
+        "one trajectory alone": panel(points, "microseconds_single"),
+    }
     label = f"median position error after {m['horizon_steps']} steps"
     figures.save(
         figures.work_precision_panels(panels, label), FIGURES / f"work_precision_{name}.png"
-    )  # fmt: skip
+    )
 
 
 def within(
@@ -408,10 +443,12 @@ def advice(name: str, result: Numbers) -> str:
         if known_all:
             row |= {
                 "fastest that is told H: together, alone": " and ".join(
-                    dict.fromkeys(p["method"] for p in (known, alone) if p)) or "none",
+                    dict.fromkeys(p["method"] for p in (known, alone) if p)
+                )
+                or "none",
                 "its µs": pair_of(known, alone),
                 "times faster than the map": pair_of(known, alone, ours) if ours else "–",
-            }  # fmt: skip
+            }
         row["fastest other learned method, µs"] = (
             f"{other['method']}, {number(other['microseconds_batch'])}" if other else "none"
         )
@@ -481,10 +518,17 @@ def failures(name: str, result: Numbers) -> str:
 def law_table(result: Numbers) -> str:
     """Table of the learned laws, the largest error first."""
     rows = [
-        [p["method"], p["label"], number(p["num_parameters"]), number(p["pairs"]),
-         number(p["one_step_rms"]), number(p["error_median"]), pair_of(p, p)]
+        [
+            p["method"],
+            p["label"],
+            number(p["num_parameters"]),
+            number(p["pairs"]),
+            number(p["one_step_rms"]),
+            number(p["error_median"]),
+            pair_of(p, p),
+        ]
         for p in sorted(result["measured"]["points"], key=lambda p: -p["error_median"])
-    ]  # fmt: skip
+    ]
     heads = (
         "learned",
         "size",
@@ -518,8 +562,11 @@ def tables() -> None:
             f"{advice(name, result)}\n\n{failures(name, result)}"
             + (f"\n\nLaws, and maps made from them:\n\n{law_table(law)}" if law else "")
         )
-    versions = {k: v for r in found.values() for k, v in
-                {**r["versions"], **r["measured"]["versions"]}.items()}  # fmt: skip
+    versions = {
+        k: v
+        for r in found.values()
+        for k, v in {**r["versions"], **r["measured"]["versions"]}.items()
+    }
     names = ("jaxlib", "diffrax", "scipy", "numpy", "heyoka")
     shown = ", ".join(f"{k} {versions[k]}" for k in names if k in versions)
     parts.append(f"{provenance(found | laws)} Also {shown}.")

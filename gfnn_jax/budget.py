@@ -84,10 +84,13 @@ class Budget:
     """
 
     def __init__(
-        self, max_seconds: float | None = None, max_operations: int | None = None,
-        clock: Callable[[], float] = time.perf_counter, dim: int | None = None,
+        self,
+        max_seconds: float | None = None,
+        max_operations: int | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+        dim: int | None = None,
         spent: float = 0.0,
-    ):  # fmt: skip
+    ):
         self.max_seconds, self.max_operations = max_seconds, max_operations
         self.ended, self.operations, self.left_out = "", 0, list[str]()
         self._clock, self._started = clock, clock() - spent
@@ -125,9 +128,14 @@ class Budget:
 
     @contextlib.contextmanager
     def unit(
-        self, name: str, kind: str, operations: float, *, then: tuple[str, float] | None = None,
+        self,
+        name: str,
+        kind: str,
+        operations: float,
+        *,
+        then: tuple[str, float] | None = None,
         made: Callable[[], float] | None = None,
-    ) -> Iterator[None]:  # fmt: skip
+    ) -> Iterator[None]:
         """One unit of work of the search. Raises OutOfTime where it does not fit.
 
         operations: that it is predicted to take. then: kind and operations of what must follow
@@ -158,9 +166,14 @@ class Budget:
 
     @contextlib.contextmanager
     def last(
-        self, name: str, kind: str, operations: float, *, decides: bool = False,
+        self,
+        name: str,
+        kind: str,
+        operations: float,
+        *,
+        decides: bool = False,
         made: Callable[[], float] | None = None,
-    ) -> Iterator[None]:  # fmt: skip
+    ) -> Iterator[None]:
         """A unit after the search, which the search's end is no reason to leave out. Raises
         OutOfTime where there is no time for it, and then for those after it too.
 

@@ -94,8 +94,10 @@ def _records(arguments: argparse.Namespace) -> None:
     from gfnn_jax.records import RECORDS, path
 
     for name, record in RECORDS.items():
-        print(f"{name:16} {record.what}; positions {', '.join(record.positions)}\n"
-              f"{'':16} {path(name)}")  # fmt: skip
+        print(
+            f"{name:16} {record.what}; positions {', '.join(record.positions)}\n"
+            f"{'':16} {path(name)}"
+        )
     print("gfnn run NAME learns the law of two thirds of a record and forecasts the last third")
 
 
@@ -121,10 +123,15 @@ def _run(arguments: argparse.Namespace) -> None:
 
     with progress.on_stderr() as shown:
         ran = run(
-            arguments.scene, out=out, quick=arguments.quick, dt=arguments.dt,
-            overwrite=arguments.overwrite, resume=arguments.resume, progress=shown,
+            arguments.scene,
+            out=out,
+            quick=arguments.quick,
+            dt=arguments.dt,
+            overwrite=arguments.overwrite,
+            resume=arguments.resume,
+            progress=shown,
             **fit_options(arguments),
-        )  # fmt: skip
+        )
     print_summary(ran, out)
     _hold_to(arguments.strict, out / "model")
 
@@ -148,8 +155,10 @@ def _run_record(arguments: argparse.Namespace) -> None:
     for name, errors in ran.forecasts.median.items():
         sizes = ", ".join(f"{error:.3g}" for error in errors)
         unit = f" {ran.held_out.unit(name)}".rstrip()
-        print(f"the last third, which no fit has seen: {name} errs by {sizes}{unit} after {ahead} "
-              "s (medians)")  # fmt: skip
+        print(
+            f"the last third, which no fit has seen: {name} errs by {sizes}{unit} after {ahead} "
+            "s (medians)"
+        )
     print(f"{ran.forecasts.within:.0%} of it lies within two standard deviations (95 % expected)")
     print(f"written to {arguments.out}")
 
@@ -220,17 +229,24 @@ def _fit_law(
 
     with progress.on_stderr() as shown:
         learned = fit_recording(
-            arguments.data, out=arguments.out, columns=columns, mass=masses(arguments),
-            despite=arguments.despite, progress=shown, **options,
-        )  # fmt: skip
+            arguments.data,
+            out=arguments.out,
+            columns=columns,
+            mass=masses(arguments),
+            despite=arguments.despite,
+            progress=shown,
+            **options,
+        )
     print(learned.fit.table)
     print(f"written to {arguments.out}")
     inputs_ahead = " --inputs FILE" if learned.fit.gains else ""
     ahead = f" --num-steps 1000{inputs_ahead}"
     if "stop" in columns:  # what no fit has seen is in the file
         ahead, inputs_ahead = f" --to {columns['stop']:g} --compare {arguments.data[0]}", ""
-    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]}{ahead} --out "
-          "forecast.csv")  # fmt: skip
+    print(
+        f"next: gfnn predict {arguments.out} --initial {arguments.data[0]}{ahead} --out "
+        "forecast.csv"
+    )
     if inputs_ahead:
         print(f"      FILE holds {', '.join(learned.fit.gains)} at the times of the forecast")
 
@@ -244,12 +260,18 @@ def _fit_positions(
 
     with progress.on_stderr() as shown:
         ran = fit_positions(
-            arguments.data, out=arguments.out, columns=columns, despite=arguments.despite,
-            progress=shown, **options,
-        )  # fmt: skip
+            arguments.data,
+            out=arguments.out,
+            columns=columns,
+            despite=arguments.despite,
+            progress=shown,
+            **options,
+        )
     print_summary(ran, arguments.out)
-    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
-          "--out prediction.npz")  # fmt: skip
+    print(
+        f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
+        "--out prediction.npz"
+    )
     _hold_to(arguments.strict, arguments.out)
 
 
@@ -260,10 +282,16 @@ def _fit_and_report(
 
     with progress.on_stderr() as shown:
         ran = fit(
-            arguments.data, out=arguments.out, dt=arguments.dt, scene_name=arguments.scene,
-            overwrite=arguments.overwrite, resume=arguments.resume, group=group, progress=shown,
+            arguments.data,
+            out=arguments.out,
+            dt=arguments.dt,
+            scene_name=arguments.scene,
+            overwrite=arguments.overwrite,
+            resume=arguments.resume,
+            group=group,
+            progress=shown,
             **options,
-        )  # fmt: skip
+        )
     if group is not None:
         processes.wait_for_all()
         if not group.first:
@@ -271,8 +299,10 @@ def _fit_and_report(
             print(f"process {group.share.index} of {group.share.count}: {sent}")
             return
     print_summary(ran, arguments.out)
-    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
-          "--out prediction.npz")  # fmt: skip
+    print(
+        f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
+        "--out prediction.npz"
+    )
     _hold_to(arguments.strict, arguments.out)
 
 
@@ -296,9 +326,19 @@ def _hold_to(strict: bool, model: Path) -> None:
 # Options of `gfnn fit` that the law of a recording has not; options of `gfnn predict` for steps of
 # a map, and for the forecast of a recording.
 _OF_MAPS = (
-    "tolerance", "absolute_tolerance", "strict", "family", "chart", "ensemble", "scene", "devices",
-    "max_seconds", "max_operations", "resume", "distributed",
-)  # fmt: skip
+    "tolerance",
+    "absolute_tolerance",
+    "strict",
+    "family",
+    "chart",
+    "ensemble",
+    "scene",
+    "devices",
+    "max_seconds",
+    "max_operations",
+    "resume",
+    "distributed",
+)
 _OF_STEPS = ("dt", "samples", "horizon", "outside", "devices", "distributed", "resume")
 _OF_FORECAST = ("stop", "estimate_from", "inputs", "compare")
 
@@ -351,11 +391,17 @@ def _forecast(arguments: argparse.Namespace) -> None:
     from gfnn_jax.jobs.forecast import forecast_recording
 
     found, unit, compared = forecast_recording(
-        arguments.model, arguments.initial, out=arguments.out, num_steps=arguments.num_steps,
-        save_every=arguments.save_every, stop=arguments.stop,
-        estimate_from=arguments.estimate_from, inputs=arguments.inputs, compare=arguments.compare,
+        arguments.model,
+        arguments.initial,
+        out=arguments.out,
+        num_steps=arguments.num_steps,
+        save_every=arguments.save_every,
+        stop=arguments.stop,
+        estimate_from=arguments.estimate_from,
+        inputs=arguments.inputs,
+        compare=arguments.compare,
         overwrite=arguments.overwrite,
-    )  # fmt: skip
+    )
     times = [f.times[-1] for f in found.values()]
     runs = "1 run" if len(found) == 1 else f"{len(found)} runs"
     print(f"{arguments.out}: forecasts of {runs}, up to t = {max(times):g} {unit}")
@@ -364,9 +410,11 @@ def _forecast(arguments: argparse.Namespace) -> None:
     if compared is not None:
         for name, (rms, median, within) in compared.columns.items():
             unit = f" {compared.units[name]}" if compared.units[name] else ""
-            print(f"{name}: RMS error {rms:.4g}{unit}, median of its size {median:.4g}{unit}; "
-                  f"{within:.0%} of {compared.num_samples} samples within two standard deviations "
-                  "(95 % expected)")  # fmt: skip
+            print(
+                f"{name}: RMS error {rms:.4g}{unit}, median of its size {median:.4g}{unit}; "
+                f"{within:.0%} of {compared.num_samples} samples within two standard deviations "
+                "(95 % expected)"
+            )
 
 
 def _predict_and_report(arguments: argparse.Namespace, share: processes.Share | None) -> None:
@@ -374,26 +422,41 @@ def _predict_and_report(arguments: argparse.Namespace, share: processes.Share | 
 
     with progress.on_stderr() as shown:
         predicted = predict(
-            arguments.model, arguments.initial, num_steps=arguments.num_steps,
-            save_every=arguments.save_every, out=arguments.out, dt=arguments.dt,
-            samples=arguments.samples, horizon_size=arguments.horizon,
-            stop_outside=arguments.outside == "stop", devices=arguments.devices, share=share,
-            overwrite=arguments.overwrite, resume=arguments.resume, progress=shown,
-        )  # fmt: skip
+            arguments.model,
+            arguments.initial,
+            num_steps=arguments.num_steps,
+            save_every=arguments.save_every,
+            out=arguments.out,
+            dt=arguments.dt,
+            samples=arguments.samples,
+            horizon_size=arguments.horizon,
+            stop_outside=arguments.outside == "stop",
+            devices=arguments.devices,
+            share=share,
+            overwrite=arguments.overwrite,
+            resume=arguments.resume,
+            progress=shown,
+        )
     num_lanes = len(predicted.status)
     if share is not None and share.index:
-        print(f"process {share.index} of {share.count}: {num_lanes} trajectories, "
-              f"{predicted.seconds:.1f} s")  # fmt: skip
+        print(
+            f"process {share.index} of {share.count}: {num_lanes} trajectories, "
+            f"{predicted.seconds:.1f} s"
+        )
         return
     back = " backwards" if arguments.num_steps < 0 else ""
-    print(f"{arguments.out}: {num_lanes} trajectories of {abs(arguments.num_steps)} steps{back}, "
-          f"{predicted.seconds:.1f} s")  # fmt: skip
+    print(
+        f"{arguments.out}: {num_lanes} trajectories of {abs(arguments.num_steps)} steps{back}, "
+        f"{predicted.seconds:.1f} s"
+    )
     print_status(predicted.status, predicted.left_at)
     if predicted.horizon is not None:
         passed = predicted.horizon[predicted.horizon >= 0]
         first = f", the first at step {passed.min()}" if passed.size else ""
-        print(f"the band of the position (2 σ) exceeds {arguments.horizon:g} in {passed.size} of "
-              f"{num_lanes} trajectories{first}")  # fmt: skip
+        print(
+            f"the band of the position (2 σ) exceeds {arguments.horizon:g} in {passed.size} of "
+            f"{num_lanes} trajectories{first}"
+        )
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -417,10 +480,16 @@ def _compare(arguments: argparse.Namespace) -> None:
 
     with progress.on_stderr() as shown:
         compared = compare(
-            arguments.scene, methods=arguments.methods, out=out, quick=arguments.quick,
-            seed=arguments.seed, cap=arguments.cap, overwrite=arguments.overwrite,
-            resume=arguments.resume, progress=shown,
-        )  # fmt: skip
+            arguments.scene,
+            methods=arguments.methods,
+            out=out,
+            quick=arguments.quick,
+            seed=arguments.seed,
+            cap=arguments.cap,
+            overwrite=arguments.overwrite,
+            resume=arguments.resume,
+            progress=shown,
+        )
     if compared is None:
         print(f"{out}: already holds the result of this job")
         return
@@ -429,6 +498,12 @@ def _compare(arguments: argparse.Namespace) -> None:
 
 
 _COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
-    "scenes": _scenes, "records": _records, "run": _run, "look": _look, "fit": _fit,
-    "predict": _predict, "export": _export, "compare": _compare,
-}  # fmt: skip
+    "scenes": _scenes,
+    "records": _records,
+    "run": _run,
+    "look": _look,
+    "fit": _fit,
+    "predict": _predict,
+    "export": _export,
+    "compare": _compare,
+}

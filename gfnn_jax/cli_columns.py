@@ -22,23 +22,33 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
     for role in ROLES:
         group.add_argument(f"--{role}", type=_names, metavar="A,B", help=f"columns of {role}")
     group.add_argument(
-        "--angles", type=_names_or_indices, metavar="A,B",
+        "--angles",
+        type=_names_or_indices,
+        metavar="A,B",
         help="positions with period 2π; of canonical states indices in z, as 0,2",
-    )  # fmt: skip
+    )
     group.add_argument("--degrees", type=_names, metavar="A,B", help="columns in degrees")
     group.add_argument(
-        "--columns", type=_names, metavar="A,B",
+        "--columns",
+        type=_names,
+        metavar="A,B",
         help="columns to read; names of all of them where the file has none",
-    )  # fmt: skip
+    )
     group.add_argument("--time-unit", choices=tuple(SECONDS), help="of the times (default s)")
     group.add_argument(
-        "--std", type=_sigmas, action="append", metavar="NAME=σ",
+        "--std",
+        type=_sigmas,
+        action="append",
+        metavar="NAME=σ",
         help="noise of a column, known: a number, or the column that holds it for each value",
-    )  # fmt: skip
+    )
     group.add_argument(
-        "--mass", type=_numbers, action="append", metavar="NAME=m",
+        "--mass",
+        type=_numbers,
+        action="append",
+        metavar="NAME=m",
         help="known mass, or moment of inertia, of one position, which gives L its unit",
-    )  # fmt: skip
+    )
     group.add_argument(
         "--offset", type=_names, metavar="A,B", help="columns whose offset is fitted with the law"
     )
@@ -46,17 +56,25 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
         "--scale", type=_names, metavar="A,B", help="columns whose scale is fitted with the law"
     )
     group.add_argument(
-        "--observe", type=_formula, action="append", metavar="COLUMN=TEXT",
+        "--observe",
+        type=_formula,
+        action="append",
+        metavar="COLUMN=TEXT",
         help="what a sensor shows, as 'px = x0 + R*sin(theta + tilt)': its parameters are fitted",
-    )  # fmt: skip
+    )
     group.add_argument(
-        "--guess", type=_guesses, action="append", metavar="NAME=X",
+        "--guess",
+        type=_guesses,
+        action="append",
+        metavar="NAME=X",
         help="start values of the parameters of --observe",
-    )  # fmt: skip
+    )
     group.add_argument(
-        "--coordinates", type=_names, metavar="A,B",
+        "--coordinates",
+        type=_names,
+        metavar="A,B",
         help="names of coordinates that --observe is written in, where no column measures them",
-    )  # fmt: skip
+    )
     group.add_argument(
         "--from",
         dest="start",
@@ -72,8 +90,19 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
 
 def column_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """The options that were given, as keywords of `gfnn_jax.read`; ``mass`` is none of them."""
-    names = (*ROLES, "angles", "degrees", "columns", "time_unit", "offset", "scale", "start",
-             "stop", "every", "coordinates")  # fmt: skip
+    names = (
+        *ROLES,
+        "angles",
+        "degrees",
+        "columns",
+        "time_unit",
+        "offset",
+        "scale",
+        "start",
+        "stop",
+        "every",
+        "coordinates",
+    )
     given = {name: getattr(arguments, name) for name in names}
     for name in ("std", "observe", "guess"):
         given[name] = dict(pair for pairs in getattr(arguments, name) or () for pair in pairs)

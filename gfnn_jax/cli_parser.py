@@ -62,9 +62,11 @@ def parser() -> argparse.ArgumentParser:
     """Make the parser; what it parses has the command's name as ``command``."""
     plain: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
     found = _Parser(
-        prog="gfnn", description="Learn exactly symplectic maps, predict with them.",
-        epilog=f"{EXIT_STATUS}\n{DISTRIBUTED_STATUS}", **plain,
-    )  # fmt: skip
+        prog="gfnn",
+        description="Learn exactly symplectic maps, predict with them.",
+        epilog=f"{EXIT_STATUS}\n{DISTRIBUTED_STATUS}",
+        **plain,
+    )
     found.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = found.add_subparsers(required=True, metavar="COMMAND")
     fitting: dict[str, Any] = {"epilog": f"{WORDS}\n\n{EXIT_STATUS}", **plain}
@@ -76,27 +78,31 @@ def parser() -> argparse.ArgumentParser:
     command.set_defaults(command="records")
 
     command = commands.add_parser(
-        "run", help="a scene from reference data to figures, or a measured record to forecasts",
+        "run",
+        help="a scene from reference data to figures, or a measured record to forecasts",
         description="Reference data of a scene, fit, rollouts, metrics, figures, report.json. Of a "
         "measured record, or of your own recording: the law of its first two thirds, and forecasts "
         "of its last third.",
         **fitting,
-    )  # fmt: skip
+    )
     command.set_defaults(command="run")
     command.add_argument(
-        "scene", metavar="SCENE",
+        "scene",
+        metavar="SCENE",
         help="a name that `gfnn scenes` or `gfnn records` lists, or the file of a recording",
-    )  # fmt: skip
+    )
     command.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/SCENE)")
     command.add_argument("--quick", action="store_true", help="fewer pairs and rollouts")
     command.add_argument("--dt", type=_positive, metavar="H", help="another time step")
     _add_fit_options(command, tolerance="the scene's own, close to the best attainable")
 
     command = commands.add_parser(
-        "look", help="what a recording holds, before anything is learned",
+        "look",
+        help="what a recording holds, before anything is learned",
         description="Runs, rates, gaps, noise, friction and mistakes of a recording, found in the "
-        "file itself: .csv and other text, .npz, .npy.", **others,
-    )  # fmt: skip
+        "file itself: .csv and other text, .npz, .npy.",
+        **others,
+    )
     command.set_defaults(command="look")
     command.add_argument("data", type=Path, metavar="FILE", nargs="+", help="one file or several")
     add_column_options(command)
@@ -111,11 +117,12 @@ def parser() -> argparse.ArgumentParser:
     )
 
     command = commands.add_parser(
-        "fit", help="learn from your own recording, or from states q, p",
+        "fit",
+        help="learn from your own recording, or from states q, p",
         description="Learn from a recording (positions over time: a law with friction and inputs) "
         "or from states q, p (a symplectic map, or H). The columns decide which of them a file is.",
         **_with_status(fitting),
-    )  # fmt: skip
+    )
     command.set_defaults(command="fit")
     command.add_argument(
         "data", type=Path, metavar="DATA", nargs="+", help="one file or several, of one kind"
@@ -123,47 +130,61 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--out", type=Path, metavar="MODEL", required=True, help="folder to write")
     command.add_argument("--dt", type=_positive, metavar="H", help="time step, if DATA has none")
     command.add_argument(
-        "--scene", metavar="NAME",
+        "--scene",
+        metavar="NAME",
         help="scene whose coordinates and features are used; features assume the scene's units",
-    )  # fmt: skip
+    )
     _add_fit_options(command)
     add_column_options(command)
     command.add_argument(
-        "--despite", type=_kinds, metavar="KIND", default=(),
+        "--despite",
+        type=_kinds,
+        metavar="KIND",
+        default=(),
         help="of a recording: fit although gfnn look finds these mistakes, by kind (in brackets "
         "after the word wrong), joined by commas",
-    )  # fmt: skip
+    )
     command.add_argument(
-        "--distributed", action="store_true",
+        "--distributed",
+        action="store_true",
         help="this is one of several processes that srun or another launcher has started: each "
         "reads its own rows of DATA, or its own files",
-    )  # fmt: skip
+    )
 
     command = commands.add_parser(
-        "predict", help="predict with a learned map",
+        "predict",
+        help="predict with a learned map",
         description="Predict from initial states (.npy, .npz with z0, a trajectory file), or "
         "forecast from the end of a recording.",
         **_with_status(others),
-    )  # fmt: skip
+    )
     command.set_defaults(command="predict")
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
     command.add_argument(
-        "--initial", type=Path, metavar="FILE", required=True,
+        "--initial",
+        type=Path,
+        metavar="FILE",
+        required=True,
         help="initial states; or a trajectory file, whose sequences continue from their last "
         "states; or a recording, whose runs continue from the states estimated at their ends (of a "
         "map of positions, from their last two positions)",
-    )  # fmt: skip
+    )
     command.add_argument(
-        "--to", dest="stop", type=finite, metavar="T",
+        "--to",
+        dest="stop",
+        type=finite,
+        metavar="T",
         help="of a recording: forecast from time T, in the file's unit, as if it ended there",
-    )  # fmt: skip
+    )
     command.add_argument(
         "--num-steps", type=_steps, metavar="N", help="steps to predict, backwards where N < 0"
     )
     command.add_argument(
-        "--estimate-from", type=_count, metavar="K",
+        "--estimate-from",
+        type=_count,
+        metavar="K",
         help="of a recording: estimate the state at its end from the last K samples",
-    )  # fmt: skip
+    )
     command.add_argument(
         "--inputs",
         type=Path,
@@ -171,67 +192,89 @@ def parser() -> argparse.ArgumentParser:
         help="of a recording: file of the inputs after its end, at the times of the forecast",
     )
     command.add_argument(
-        "--compare", type=Path, metavar="FILE",
+        "--compare",
+        type=Path,
+        metavar="FILE",
         help="of a recording: file of what was measured after its end; prints the errors",
-    )  # fmt: skip
+    )
     command.add_argument(
-        "--save-every", type=_count, metavar="K", default=1,
+        "--save-every",
+        type=_count,
+        metavar="K",
+        default=1,
         help="save the state of every K-th step (default %(default)s)",
-    )  # fmt: skip
+    )
     command.add_argument(
-        "--dt", type=_positive, metavar="H",
+        "--dt",
+        type=_positive,
+        metavar="H",
         help="time step, for a model that serves others than that of its data: H, or S of pairs "
         "with several time steps",
-    )  # fmt: skip
+    )
     command.add_argument(
-        "--out", type=Path, metavar="FILE", required=True,
+        "--out",
+        type=Path,
+        metavar="FILE",
+        required=True,
         help="file to write: .npz, or for the forecast of a recording .npz or .csv",
-    )  # fmt: skip
+    )
     command.add_argument(
-        "--samples", type=_count, metavar="N",
+        "--samples",
+        type=_count,
+        metavar="N",
         help="maps drawn from the model's posterior: adds std and quantiles to FILE",
-    )  # fmt: skip
+    )
     command.add_argument(
-        "--horizon", type=_positive, metavar="SIZE",
+        "--horizon",
+        type=_positive,
+        metavar="SIZE",
         help="with --samples: adds the first step at which the band of the position (two standard "
         "deviations of its distance) exceeds SIZE, in the data's unit",
-    )  # fmt: skip
+    )
     command.add_argument(
-        "--outside", choices=("continue", "stop"),
+        "--outside",
+        choices=("continue", "stop"),
         help="what to do where a trajectory leaves the data's domain (default continue)",
-    )  # fmt: skip
+    )
     command.add_argument(
-        "--devices", type=_devices, metavar="all|N",
+        "--devices",
+        type=_devices,
+        metavar="all|N",
         help="number of devices that share the trajectories; on a CPU these are its cores",
-    )  # fmt: skip
+    )
     command.add_argument(
-        "--distributed", action="store_true",
+        "--distributed",
+        action="store_true",
         help="this is one of several processes that srun or another launcher has started",
-    )  # fmt: skip
+    )
     _add_output_options(command)
 
     command = commands.add_parser(
-        "export", help="write a learned map for other programs",
+        "export",
+        help="write a learned map for other programs",
         description="One file: step, inverse and status of a learned map, in C or as StableHLO.",
         **others,
-    )  # fmt: skip
+    )
     command.set_defaults(command="export")
     command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
     command.add_argument(
-        "--to", choices=EXPORTS, required=True,
+        "--to",
+        choices=EXPORTS,
+        required=True,
         help="c: C99 for one state at a time, of polynomials, Fourier harmonics and formulas; "
         "stablehlo: batches by jax.export, of any map",
-    )  # fmt: skip
+    )
     command.add_argument(
         "--out", type=Path, metavar="FILE", help="default: beside MODEL, of its name"
     )
     command.add_argument("--overwrite", action="store_true", help="replace an existing output")
 
     command = commands.add_parser(
-        "compare", help="the same data through other methods",
+        "compare",
+        help="the same data through other methods",
         description="A scene learned by GFNN and by the methods that the paper compares with.",
         **others,
-    )  # fmt: skip
+    )
     command.set_defaults(command="compare")
     command.add_argument("scene", metavar="SCENE", help="a name that `gfnn scenes` lists")
     command.add_argument(
@@ -241,9 +284,11 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--quick", action="store_true", help="fewer pairs, a cap of 2 s")
     command.add_argument("--seed", type=_seed, default=0, metavar="N")
     command.add_argument(
-        "--cap", type=_positive, metavar="SECONDS",
+        "--cap",
+        type=_positive,
+        metavar="SECONDS",
         help="most training of a method, counted in operations, 4e10 a second (default 60)",
-    )  # fmt: skip
+    )
     _add_output_options(command)
     return found
 
@@ -262,9 +307,12 @@ def _add_fit_options(command: argparse.ArgumentParser, **defaults: str) -> None:
         given |= {"type": _reader(about.kind), "metavar": about.metavar} if about.metavar else {}
         command.add_argument(f"--{name.replace('_', '-')}", help=shown, **given)
     command.add_argument(
-        "--scalar", dest="family", choices=OPTIONS["family"].kind.choices,
-        default=argparse.SUPPRESS, help=argparse.SUPPRESS,  # the old name of --family
-    )  # fmt: skip
+        "--scalar",
+        dest="family",
+        choices=OPTIONS["family"].kind.choices,
+        default=argparse.SUPPRESS,
+        help=argparse.SUPPRESS,  # the old name of --family
+    )
     command.add_argument(
         "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
     )
@@ -300,8 +348,9 @@ def _kinds(text: str) -> tuple[str, ...]:
 
 _STEPS = Kind(
     f"{COUNT.words}, or its negative",
-    lambda value: COUNT.holds(abs(value)), int,
-)  # fmt: skip
+    lambda value: COUNT.holds(abs(value)),
+    int,
+)
 _positive, _count, _seed, _devices, _steps = (
     _reader(kind) for kind in (POSITIVE, COUNT, SEED, DEVICES, _STEPS)
 )

@@ -9,9 +9,10 @@ from typing import Any
 
 _FEW_TERMS = 15  # of a law with noise that is shown as H
 _MEANS = {
-    "left the domain": " (extrapolated from there)", "not converged": " (NaN from there)",
+    "left the domain": " (extrapolated from there)",
+    "not converged": " (NaN from there)",
     "non-finite": " (NaN from there)",
-}  # fmt: skip
+}
 
 
 def law_line(report: dict[str, Any]) -> str:

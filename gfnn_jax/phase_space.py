@@ -250,9 +250,15 @@ class Pairs:
         run, place = (None if of is None else of[rows] for of in (self.run, self.place))
         std = self.std[rows] if np.ndim(self.std) == 2 else self.std
         return Pairs(
-            self.z0[rows], self.z1[rows], dt, args, period=self.period, run=run, place=place,
+            self.z0[rows],
+            self.z1[rows],
+            dt,
+            args,
+            period=self.period,
+            run=run,
+            place=place,
             std=std,
-        )  # fmt: skip
+        )
 
 
 def _named(args: Any, count: int) -> dict[str, Any]:

@@ -52,10 +52,13 @@ def map_of(piece, data, *, coordinates=CARTESIAN, around=(), scale=None):
     """A map with this piece whose domain is that of the data (N, 2d), in inner coordinates."""
     width = data.shape[1]
     return SymplecticMap(
-        (*around, piece, *around), coordinates, covering(data, ignore=coordinates.angles),
+        (*around, piece, *around),
+        coordinates,
+        covering(data, ignore=coordinates.angles),
         np.ones(width) if scale is None else np.asarray(scale),
-        np.zeros(len(coordinates.angles)), piece.dt,
-    )  # fmt: skip
+        np.zeros(len(coordinates.angles)),
+        piece.dt,
+    )
 
 
 def rotated(z, angle):

@@ -53,8 +53,17 @@ def gfnn(*arguments):
 
 
 def predict(model, out, *more, num_steps=50):
-    return gfnn("predict", model, "--initial", model.parent / "z0.npy", "--num-steps", num_steps,
-                "--out", out, *more)  # fmt: skip
+    return gfnn(
+        "predict",
+        model,
+        "--initial",
+        model.parent / "z0.npy",
+        "--num-steps",
+        num_steps,
+        "--out",
+        out,
+        *more,
+    )
 
 
 def files(folder):

@@ -30,9 +30,10 @@ SOON_COMPILED = (
 
 def pytest_addoption(parser):
     parser.addoption(
-        "--typecheck", action="store_true",
+        "--typecheck",
+        action="store_true",
         help="check the types and shapes of the package's annotations at run time: slow to trace",
-    )  # fmt: skip
+    )
 
 
 def pytest_configure(config):
@@ -45,9 +46,11 @@ def pytest_configure(config):
     if "XLA_FLAGS" not in os.environ:  # which JAX reads when it is first used
         # XLA ends a process that asks for what it does not know: that of another release might.
         tried = subprocess.run(
-            [sys.executable, "-c", "import jax; jax.devices()"], capture_output=True, check=False,
+            [sys.executable, "-c", "import jax; jax.devices()"],
+            capture_output=True,
+            check=False,
             env={**os.environ, "XLA_FLAGS": SOON_COMPILED},
-        )  # fmt: skip
+        )
         os.environ["XLA_FLAGS"] = SOON_COMPILED if tried.returncode == 0 else ""
     shared = {
         "jax_compilation_cache_dir": str(config.cache.mkdir("compiled")),
@@ -115,8 +118,10 @@ def _own_draws(request, monkeypatch):
 @pytest.fixture
 def as_a_user():
     """A user's session: JAX as it comes, but for float64."""
-    before = {name: getattr(jax.config, name) for name in
-              ("jax_numpy_rank_promotion", "jax_numpy_dtype_promotion")}  # fmt: skip
+    before = {
+        name: getattr(jax.config, name)
+        for name in ("jax_numpy_rank_promotion", "jax_numpy_dtype_promotion")
+    }
     jax.config.update("jax_numpy_rank_promotion", "allow")
     jax.config.update("jax_numpy_dtype_promotion", "standard")
     yield

@@ -27,16 +27,21 @@ def draw(key, num):
 
 def double_well(dt=0.3):
     return gfnn.Scene(
-        name="double-well", purpose="two wells", dim=1, dt=dt,
-        sampling=gfnn.scenes.DrawnFrom(draw), hamiltonian=hamiltonian,
-    )  # fmt: skip
+        name="double-well",
+        purpose="two wells",
+        dim=1,
+        dt=dt,
+        sampling=gfnn.scenes.DrawnFrom(draw),
+        hamiltonian=hamiltonian,
+    )
 
 
 @gfnn.register
 @partial(
-    jax.tree_util.register_dataclass, data_fields=("inputs",),
+    jax.tree_util.register_dataclass,
+    data_fields=("inputs",),
     meta_fields=("num_parameters", "width"),
-)  # fmt: skip
+)
 @dataclasses.dataclass(frozen=True, eq=False)
 class RadialBumps:
     """S(c, w) = Σ c_j exp(−|x − a_j|²/2s²), x the variables of w scaled to [−1, 1]."""

@@ -265,9 +265,13 @@ def test_any_loss_of_a_batch():
     rows = np.random.default_rng(3).standard_normal((40, 3))
     result = minimise(
         lambda centre, rows: jnp.mean(jnp.sum((rows - centre[None, :]) ** 2, axis=-1)),
-        jnp.zeros(3), (rows,), (rows,), components=3, key=jax.random.key(0),
+        jnp.zeros(3),
+        (rows,),
+        (rows,),
+        components=3,
+        key=jax.random.key(0),
         recipe=Recipe(40, epochs=40, epoch_length=10, rate=0.1, schedule="cosine", dtype="float64"),
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(result.params, rows.mean(axis=0), atol=1e-4)
     expected = np.sqrt(np.mean(rows.var(axis=0)))
     assert result.validation_rms == pytest.approx(expected, rel=1e-6)
@@ -279,9 +283,14 @@ def test_a_second_fit_of_the_same_shapes_compiles_nothing(compilations):
     key, other, data = jax.random.key(11), start(seed=4), gradient_data(330, 5)
     with compilations() as found:
         result = adam(
-            Network(amplitude=2.0), other, data, VALIDATION, WEIGHT,
-            recipe=SHORT, key=key,
-        )  # fmt: skip
+            Network(amplitude=2.0),
+            other,
+            data,
+            VALIDATION,
+            WEIGHT,
+            recipe=SHORT,
+            key=key,
+        )
     assert result.epochs == 6
     assert found.count == 0
     assert result.compile_seconds < 0.1
@@ -355,7 +364,10 @@ def test_batches_shared_out_among_devices(tmp_path):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     ran = subprocess.run(
-        [sys.executable, "-c", ON_DEVICES, str(tmp_path / "kept")], capture_output=True, text=True,
-        check=False, env={**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path},
-    )  # fmt: skip
+        [sys.executable, "-c", ON_DEVICES, str(tmp_path / "kept")],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path},
+    )
     assert ran.returncode == 0, ran.stderr

@@ -19,9 +19,13 @@ def few():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
         fit = gfnn.fit(
-            pairs.take(rows[:190]), tolerance=1e-14, learn="map", chart="midpoint",
-            family="polynomial", max_seconds=None,
-        )  # fmt: skip
+            pairs.take(rows[:190]),
+            tolerance=1e-14,
+            learn="map",
+            chart="midpoint",
+            family="polynomial",
+            max_seconds=None,
+        )
     return fit, pairs.take(rows[190:])
 
 
@@ -48,8 +52,9 @@ def without(fit, *parts):
 
 def test_the_coefficients_are_of_training_and_test_pairs(few):
     fit, _ = few
-    assert fit.stated_by.endswith("took no part in the fit or its choices; the map is fitted to "
-                                  "them too")  # fmt: skip
+    assert fit.stated_by.endswith(
+        "took no part in the fit or its choices; the map is fitted to them too"
+    )
     (piece,) = fit.map.pieces
     z = np.asarray(fit.test_pairs.z0)
     found = piece.family.gradient(piece.params, z)

@@ -16,8 +16,9 @@ from gfnn_jax.models.lagrangians.search import SearchOptions, search, to_longer_
 
 GIVEN = given_terms(
     ["w1**2 + w1*w2*cos(q1 - q2) + w2**2 + cos(q1) + cos(q2)", "R: w1**2 + w2**2"],
-    ("q1", "q2"), ("w1", "w2"),
-)  # fmt: skip
+    ("q1", "q2"),
+    ("w1", "w2"),
+)
 MASS, COUPLED, PULLS, DT, NOISE = 0.5, 0.4, (20.0, 8.0), 0.02, 1e-3
 
 
@@ -47,10 +48,14 @@ def swung(torque, seed=0, runs=4, end=12.0):
             x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3, push))
     q = np.array(shown) + NOISE * rng.normal(size=(len(shown), runs, 2))
     tables = [
-        {"run": np.full(len(q), str(k)), "t": DT * np.arange(len(q)), "theta1": q[:, k, 0],
-         "theta2": q[:, k, 1]}
+        {
+            "run": np.full(len(q), str(k)),
+            "t": DT * np.arange(len(q)),
+            "theta1": q[:, k, 0],
+            "theta2": q[:, k, 1],
+        }
         for k in range(runs)
-    ]  # fmt: skip
+    ]
     names = ["theta1", "theta2"]
     return gfnn.Recording(tables, positions=names, angles=names)
 

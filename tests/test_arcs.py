@@ -64,8 +64,10 @@ def test_arcs_are_chains_within_their_sequences_and_their_set():
     assert len(every) == len(pairs)
     np.testing.assert_array_equal(pairs.z1[first + k - 1], of.z1)
     assert (first // 59 == (first + k - 1) // 59).all()  # 59 pairs of a sequence
-    for rows, own in ((found.data.training, data.training),
-                      (found.data.validation, data.validation)):  # fmt: skip
+    for rows, own in (
+        (found.data.training, data.training),
+        (found.data.validation, data.validation),
+    ):
         assert np.isin(first[rows][:, None] + np.arange(k), own).all()
     goes_on = np.all(of.z1[:-1] == of.z0[1:], axis=1)
     assert goes_on.mean() > 0.3  # the noise that neighbours share is known

@@ -75,9 +75,14 @@ def test_images_of_lanes_are_those_of_each_lane_alone():
     together = images(LENGTH, c, z, dt, Steps(4, 1), args=length[:, None], derivatives=True)
     for i in range(len(z)):
         alone = images(
-            LENGTH, c, z[i : i + 1], float(dt[i]), Steps(4, 1), args=length[i : i + 1, None],
+            LENGTH,
+            c,
+            z[i : i + 1],
+            float(dt[i]),
+            Steps(4, 1),
+            args=length[i : i + 1, None],
             derivatives=True,
-        )  # fmt: skip
+        )
         for found, expected in zip(together, alone, strict=True):
             np.testing.assert_allclose(found[i], expected[0], rtol=1e-11, atol=1e-12)
 
@@ -403,8 +408,9 @@ def write_csv(path, parameter=True):
     rows = np.array(rows)
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     header = "sequence,t,q1,p1" + ",l" * parameter
-    np.savetxt(path, rows[:, : 4 + parameter], delimiter=",", header=header, comments="",
-               fmt="%.17g")  # fmt: skip
+    np.savetxt(
+        path, rows[:, : 4 + parameter], delimiter=",", header=header, comments="", fmt="%.17g"
+    )
     return rows
 
 
@@ -425,8 +431,9 @@ def test_a_csv_with_uneven_times_and_a_column_more(tmp_path, capsys):
     np.testing.assert_array_equal(predicted["params"][:, 0], length)
     assert predicted["dt"] == 0.05
     assert predicted["param_names"].tolist() == ["l"]
-    np.testing.assert_allclose(predicted["trajectories"][:, 1], image(last, length, 0.05),
-                               atol=1e-10)  # fmt: skip
+    np.testing.assert_allclose(
+        predicted["trajectories"][:, 1], image(last, length, 0.05), atol=1e-10
+    )
     capsys.readouterr()
     write_csv(tmp_path / "without.csv", parameter=False)
     predict[-1] = str(tmp_path / "other.npz")

@@ -11,9 +11,14 @@ import as_a_user as benchmark
 
 # Cases of a second or two; the others take up to their budget of two minutes, or are much alike.
 SHORT = {
-    "single-orbit", "twenty-pairs", "friction", "degrees", "wrapped-angle", "copies",
+    "single-orbit",
+    "twenty-pairs",
+    "friction",
+    "degrees",
+    "wrapped-angle",
+    "copies",
     *benchmark.REFUSED,
-}  # fmt: skip
+}
 
 
 def long_ones_slow(name):
@@ -38,8 +43,17 @@ def test_the_quick_cases_write_their_result(tmp_path, monkeypatch):
 
 
 MEASURED = {
-    "seconds": 1.0, "in_time": True, "budget": 10.0,
-    "pairs": 9, "model": "midpoint polynomial 2", "claimed": 1e-7,
-    "true_error": 1e-7, "met": True, "messages": [], "noise_ratio": [1.0, 1.04],
-    "ended": "the tolerance is met", "truthful": False, "wrong": ["met"],
-}  # fmt: skip
+    "seconds": 1.0,
+    "in_time": True,
+    "budget": 10.0,
+    "pairs": 9,
+    "model": "midpoint polynomial 2",
+    "claimed": 1e-7,
+    "true_error": 1e-7,
+    "met": True,
+    "messages": [],
+    "noise_ratio": [1.0, 1.04],
+    "ended": "the tolerance is met",
+    "truthful": False,
+    "wrong": ["met"],
+}

@@ -229,8 +229,10 @@ def test_residual_of_s_moves_with_the_states_as_its_derivatives_say():
         found = sweep.by_states(family, params, chart.evaluation_point(y0, y1))
         off = 1e-5 * np.diag(scale)
         for j in range(4):
-            by = [(residual(y0 + off[j], y1) - residual(y0 - off[j], y1)) / 2e-5,
-                  (residual(y0, y1 + off[j]) - residual(y0, y1 - off[j])) / 2e-5]  # fmt: skip
+            by = [
+                (residual(y0 + off[j], y1) - residual(y0 - off[j], y1)) / 2e-5,
+                (residual(y0, y1 + off[j]) - residual(y0, y1 - off[j])) / 2e-5,
+            ]
             for whole, column in zip(found, by, strict=True):
                 np.testing.assert_allclose(whole[:, :, j], column, rtol=0, atol=1e-7)
 
@@ -242,8 +244,9 @@ def test_bands_compare_angles_modulo_turns():
     turned = off + [2 * np.pi, 0.0] * rng.integers(-2, 3, size=(4_000, 1, 1, 1))
     found = bands(states + turned, states, angles=(0,))
     np.testing.assert_allclose(found.std, 0.1, rtol=0.05)
-    np.testing.assert_allclose(found.quantiles[:, 0, 0] - states[0, 0],
-                               np.outer([-0.1645, 0, 0.1645], [1, 1]), atol=0.01)  # fmt: skip
+    np.testing.assert_allclose(
+        found.quantiles[:, 0, 0] - states[0, 0], np.outer([-0.1645, 0, 0.1645], [1, 1]), atol=0.01
+    )
 
 
 def test_horizon_is_the_first_step_beyond():
@@ -267,9 +270,14 @@ def test_predictions_hold_bands(noisy, tmp_path, monkeypatch):
 
     def predicted(initial, out, **options):
         predict(
-            tmp_path / "model", tmp_path / initial, num_steps=20, out=tmp_path / out, samples=8,
-            horizon_size=0.02, **options,
-        )  # fmt: skip
+            tmp_path / "model",
+            tmp_path / initial,
+            num_steps=20,
+            out=tmp_path / out,
+            samples=8,
+            horizon_size=0.02,
+            **options,
+        )
         with np.load(tmp_path / out) as file:
             return dict(file)
 

@@ -332,9 +332,12 @@ def test_a_faster_clock_ends_at_an_earlier_unit_which_operations_reproduce(learn
     for tick in (1e-3, 4.0, 12.0, 1e4):
         looks = itertools.count()
         fit = gfnn.fit(
-            pairs, tolerance=1e-9, learn=learn, max_seconds=100.0,
+            pairs,
+            tolerance=1e-9,
+            learn=learn,
+            max_seconds=100.0,
             clock=lambda looks=looks, tick=tick: tick * next(looks),
-        )  # fmt: skip
+        )
         found.append(fit)
         again = gfnn.fit(
             pairs, tolerance=1e-9, learn=learn, max_seconds=None, max_operations=fit.operations
@@ -359,9 +362,11 @@ def test_where_the_budget_does_not_pay_for_all_pairs_a_sample_is_fitted(monkeypa
         looks = itertools.count()
         options = {"tolerance": 1e-9, "learn": "map"}
         fit = gfnn.fit(
-            pairs, max_seconds=allowed * seconds,
-            clock=lambda looks=looks, tick=tick: tick * next(looks), **options,
-        )  # fmt: skip
+            pairs,
+            max_seconds=allowed * seconds,
+            clock=lambda looks=looks, tick=tick: tick * next(looks),
+            **options,
+        )
         again = gfnn.fit(pairs, max_operations=fit.max_operations, **options)
         assert fit.num_pairs == again.num_pairs == num_pairs
         same_bits(fit, again)
@@ -421,8 +426,9 @@ def test_ended_names_the_clock_where_the_maps_ended_by_themselves(monkeypatch):
 
 @QUIETLY
 def test_the_words_of_a_search_that_was_cut_off():
-    fit = gfnn.fit(kepler(), learn="hamiltonian", tolerance=1e-9, max_seconds=None,
-                   max_operations=30 * 10**7)  # fmt: skip
+    fit = gfnn.fit(
+        kepler(), learn="hamiltonian", tolerance=1e-9, max_seconds=None, max_operations=30 * 10**7
+    )
     said = " ".join([*fit.messages, fit.ended])
     assert "promised" not in said
     assert "no operations for more after step" in said

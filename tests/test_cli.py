@@ -45,8 +45,9 @@ def kepler(a, e, mean_anomaly, orientation):
     rate, b = a**-1.5 / (1 - e * np.cos(x)), a * np.sqrt(1 - e**2)
     q = np.stack([a * (np.cos(x) - e), b * np.sin(x)])
     p = np.stack([-a * np.sin(x) * rate, b * np.cos(x) * rate])
-    turn = np.array([[np.cos(orientation), -np.sin(orientation)],
-                     [np.sin(orientation), np.cos(orientation)]])  # fmt: skip
+    turn = np.array(
+        [[np.cos(orientation), -np.sin(orientation)], [np.sin(orientation), np.cos(orientation)]]
+    )
     return np.vstack([np.einsum("ijn,jn->in", turn, v) for v in (q, p)]).T
 
 
@@ -115,10 +116,19 @@ def test_help(command, capsys):
 
 
 def test_a_line_of_progress_says_where_its_error_comes_from():
-    known = {"label": "polynomial 4", "family": "polynomial", "chart": "midpoint",
-             "num_parameters": 69, "operations": 1e3, "validation_rms": 1e-5,
-             "validation_relative": 2e-5, "validation_bound": 3e-5, "deviations": np.zeros(2),
-             "train_rms": 1e-5, "fit_seconds": 0.1}  # fmt: skip
+    known = {
+        "label": "polynomial 4",
+        "family": "polynomial",
+        "chart": "midpoint",
+        "num_parameters": 69,
+        "operations": 1e3,
+        "validation_rms": 1e-5,
+        "validation_relative": 2e-5,
+        "validation_bound": 3e-5,
+        "deviations": np.zeros(2),
+        "train_rms": 1e-5,
+        "fit_seconds": 0.1,
+    }
     for steps, error in ((False, "first estimated at 2.00e-05"), (True, "error 2.00e-05")):
         assert error in search.line(Candidate(**known, validated=steps))
 
@@ -171,8 +181,10 @@ BAD_USAGE = [
     (("fit", "{data}", "--out", "{new}", "--family", "features"), "needs a scene that declares"),
     (("fit", "{data}", "--out", "{new}", "--terms", "p1**"), "p1"),
     (("fit", "{data}", "--out", "{new}", "--max-seconds", "0"), "expected a finite number > 0"),
-    (("fit", "{data}", "--out", "{new}", "--tolerance", "1", "--absolute-tolerance", "1"),
-     "expected --tolerance or --absolute-tolerance, not both"),
+    (
+        ("fit", "{data}", "--out", "{new}", "--tolerance", "1", "--absolute-tolerance", "1"),
+        "expected --tolerance or --absolute-tolerance, not both",
+    ),
     (("predict", "{model}"), "required: --initial, --out"),
     (("predict", "{tmp}/none", "{to}"), "no such file or folder"),
     (("predict", "{folder}", "{to}"), "holds no model.json"),
@@ -186,16 +198,24 @@ BAD_USAGE = [
     (("predict", "{model}", "{to}", "--outside", "maybe"), "invalid choice: 'maybe'"),
     (("predict", "{model}", "{to}", "--out", "{data}"), "exists already"),
     (("predict", "{model}", "{to}", "--out", "{new}.csv"), "is written as .npz"),
-    (("fit", "{data}", "--out", "{new}", "--max-seconds", "None"),
-     "expected a finite number > 0, in seconds, got None"),
-    (("fit", "{data}", "--out", "{new}", "--max-operations", "None"),
-     "expected a whole number of operations, got None"),
-    (("predict", "{model}", "{to}", "--inputs", "{data}", "--estimate-from", "3"),
-     "--estimate-from, --inputs: only for the forecast of a recording by its law"),
-    (("fit", "{swing}", "--out", "{new}", "--tolerance", "1e-3", "--strict"),
-     "--tolerance, --strict: not for the law of a recording"),
+    (
+        ("fit", "{data}", "--out", "{new}", "--max-seconds", "None"),
+        "expected a finite number > 0, in seconds, got None",
+    ),
+    (
+        ("fit", "{data}", "--out", "{new}", "--max-operations", "None"),
+        "expected a whole number of operations, got None",
+    ),
+    (
+        ("predict", "{model}", "{to}", "--inputs", "{data}", "--estimate-from", "3"),
+        "--estimate-from, --inputs: only for the forecast of a recording by its law",
+    ),
+    (
+        ("fit", "{swing}", "--out", "{new}", "--tolerance", "1e-3", "--strict"),
+        "--tolerance, --strict: not for the law of a recording",
+    ),
     (("fit", "{swing}", "--out", "{new}", "--despite", "sgin"), "different systems, got 'sgin'"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(
@@ -218,15 +238,21 @@ def test_refusals(arguments, message, tmp_path, model, capsys, monkeypatch):
     np.save(tmp_path / "z0.npy", np.zeros((3, 2)))
     to = f"--initial {tmp_path / 'z0.npy'} --num-steps 10 --out {tmp_path / 'new.npz'}".split()
     places = {
-        "tmp": tmp_path, "new": tmp_path / "new", "folder": tmp_path / "folder", "model": model,
-        "file": tmp_path / "file.txt", "empty": tmp_path / "empty.npz",
-        "wide": tmp_path / "wide.npy", "nodt": tmp_path / "nodt.npz",
-        "data": pairs_file(tmp_path / "data.npz"), "nan": pairs_file(tmp_path / "nan.npz", broken),
+        "tmp": tmp_path,
+        "new": tmp_path / "new",
+        "folder": tmp_path / "folder",
+        "model": model,
+        "file": tmp_path / "file.txt",
+        "empty": tmp_path / "empty.npz",
+        "wide": tmp_path / "wide.npy",
+        "nodt": tmp_path / "nodt.npz",
+        "data": pairs_file(tmp_path / "data.npz"),
+        "nan": pairs_file(tmp_path / "nan.npz", broken),
         "few": pairs_file(tmp_path / "few.npz", z[:2]),
         "sixteen": pairs_file(tmp_path / "sixteen.npz", z[:7]),
         "odd": pairs_file(tmp_path / "odd.npz", np.ones((9, 2, 3))),
         "swing": recording_file(tmp_path / "swing.csv"),
-    }  # fmt: skip
+    }
     before = files(tmp_path)
     expanded = [b for a in arguments for b in (to if a == "{to}" else [a.format(**places)])]
     assert gfnn(*expanded) == 2
@@ -257,21 +283,61 @@ def test_usage_is_refused_in_a_moment():
 
 
 REPORT_KEYS = {
-    "": {"scene", "dt", "seed", "dtype", "device", "versions", "data", "model", "fit", "map",
-         "hamiltonian", "rollout", "candidates"},
+    "": {
+        "scene",
+        "dt",
+        "seed",
+        "dtype",
+        "device",
+        "versions",
+        "data",
+        "model",
+        "fit",
+        "map",
+        "hamiltonian",
+        "rollout",
+        "candidates",
+    },
     "data": {"num_pairs"},
     "model": {"learns", "family", "chart", "num_parameters", "label"},
-    "fit": {"seconds", "total_seconds", "compile_seconds", "train_rms", "validation_rms",
-            "validation_relative", "tolerance", "tolerance_met", "ended", "operations",
-            "max_operations"},
+    "fit": {
+        "seconds",
+        "total_seconds",
+        "compile_seconds",
+        "train_rms",
+        "validation_rms",
+        "validation_relative",
+        "tolerance",
+        "tolerance_met",
+        "ended",
+        "operations",
+        "max_operations",
+    },
     "map": {"symplecticity_defect", "chart_determinant_min", "newton_iterations_max"},
-    "rollout": {"num_trajectories", "num_excluded", "num_steps", "seconds",
-                "microseconds_per_step", "status_counts", "error", "error_median",
-                "growth_exponent", "energy_drift"},
-}  # fmt: skip
-CANDIDATE_KEYS = {"learns", "family", "chart", "num_parameters", "validation_rms",
-                  "validation_relative", "microseconds_per_step", "fit_seconds",
-                  "chosen"}  # fmt: skip
+    "rollout": {
+        "num_trajectories",
+        "num_excluded",
+        "num_steps",
+        "seconds",
+        "microseconds_per_step",
+        "status_counts",
+        "error",
+        "error_median",
+        "growth_exponent",
+        "energy_drift",
+    },
+}
+CANDIDATE_KEYS = {
+    "learns",
+    "family",
+    "chart",
+    "num_parameters",
+    "validation_rms",
+    "validation_relative",
+    "microseconds_per_step",
+    "fit_seconds",
+    "chosen",
+}
 
 
 def read_report(folder):
@@ -332,8 +398,21 @@ def test_pairs_from_plain_numpy(suffix, num_pairs, tolerance, num_steps, tmp_pat
 
     orbits = kepler_orbits(20, DT * np.arange(num_steps + 1), seed=1)
     np.save(tmp_path / "z0.npy", orbits[:, 0])
-    assert gfnn("predict", tmp_path / "m", "--initial", tmp_path / "z0.npy", "--num-steps",
-                num_steps, "--save-every", 5, "--out", tmp_path / "p.npz") == 0  # fmt: skip
+    assert (
+        gfnn(
+            "predict",
+            tmp_path / "m",
+            "--initial",
+            tmp_path / "z0.npy",
+            "--num-steps",
+            num_steps,
+            "--save-every",
+            5,
+            "--out",
+            tmp_path / "p.npz",
+        )
+        == 0
+    )
     with np.load(tmp_path / "p.npz") as predicted:
         assert predicted["dt"] == pytest.approx(DT, rel=1e-13)  # of text: the mean of many steps
         np.testing.assert_array_equal(predicted["steps"], np.arange(0, num_steps + 1, 5))
@@ -470,8 +549,14 @@ def test_a_forecast_takes_no_options_of_steps(model, tmp_path, capsys, monkeypat
     ],
 )
 def test_an_error_is_told_beside_what_it_is_held_to(relative, met, end):
-    fit = {"validation_rms": 2e-6, "validation_relative": 1e-6, "validation_bound": 3e-6,
-           "tolerance": 1e-6, "tolerance_is_relative": relative, "tolerance_met": met}  # fmt: skip
+    fit = {
+        "validation_rms": 2e-6,
+        "validation_relative": 1e-6,
+        "validation_bound": 3e-6,
+        "tolerance": 1e-6,
+        "tolerance_is_relative": relative,
+        "tolerance_met": met,
+    }
     assert cli_summary.error_line(fit).endswith(f"; 95 % bound 3.00e-06, tolerance {end}")
 
 
@@ -604,6 +689,7 @@ def test_a_law_that_has_met_nothing_is_not_printed_as_h(met, noise, terms, line)
     report = {
         "fit": {"tolerance_met": met, "validation_relative": 0.02},
         "hamiltonian": {"formula": "q1²", "terms": [{}] * terms},
-        "model": {"learns": "hamiltonian"}, "data": {"noise": noise},
-    }  # fmt: skip
+        "model": {"learns": "hamiltonian"},
+        "data": {"noise": noise},
+    }
     assert cli_summary.law_line(report) == line

@@ -11,9 +11,12 @@ from gfnn_jax.flows.motion import NODES, Form
 
 # Two unit masses between three springs.
 TERMS = [
-    ((2, 0), (0, 0), (0, 0), 0.0), ((0, 2), (0, 0), (0, 0), 0.0), ((0, 0), (2, 0), (0, 0), 0.0),
-    ((0, 0), (0, 2), (0, 0), 0.0), ((0, 0), (1, 1), (0, 0), 0.0),
-]  # fmt: skip
+    ((2, 0), (0, 0), (0, 0), 0.0),
+    ((0, 2), (0, 0), (0, 0), 0.0),
+    ((0, 0), (2, 0), (0, 0), 0.0),
+    ((0, 0), (0, 2), (0, 0), 0.0),
+    ((0, 0), (1, 1), (0, 0), 0.0),
+]
 SPRINGS = np.array([0.5, 0.5, -1.0, -1.0, 1.0])
 
 
@@ -47,9 +50,14 @@ def test_bodies_that_stick_together_and_to_the_ground():
     wide, p = blocks([(*row, 3e-5) for row in directions], losses)
     law = wide.lagrangian(p)
     expected = scipy.integrate.solve_ivp(
-        lambda _, x: np.concatenate([x[2:], law.acceleration(x[:2], x[2:])]), (0, h * count),
-        start, "Radau", h * np.arange(1, count + 1), rtol=1e-6, atol=1e-8,
-    ).y.T  # fmt: skip
+        lambda _, x: np.concatenate([x[2:], law.acceleration(x[:2], x[2:])]),
+        (0, h * count),
+        start,
+        "Radau",
+        h * np.arange(1, count + 1),
+        rtol=1e-6,
+        atol=1e-8,
+    ).y.T
     np.testing.assert_allclose(found[:, :2], expected[:, :2], atol=3e-4)  # it creeps
     ways = {tuple(map(int, m != 0)) for m in modes}
     assert ways == {(1, 1), (0, 1), (1, 0), (0, 0)}  # sliding, either one stuck, both
@@ -87,10 +95,12 @@ def test_bodies_are_held_where_frictions_together_can_hold_them():
     form, p = blocks(rows, losses, 0.0, terms, np.append(SPRINGS, 0.3))
     q = rng.uniform(-0.3, 0.3, (300, 2))
     bounds = np.stack([-losses, losses], axis=1)
-    held = np.array([
-        scipy.optimize.linprog(np.zeros(3), A_eq=c.T, b_eq=force, bounds=bounds).success
-        for force in q @ [[-2.0, 1.0], [1.0, -2.0]]
-    ])  # fmt: skip
+    held = np.array(
+        [
+            scipy.optimize.linprog(np.zeros(3), A_eq=c.T, b_eq=force, bounds=bounds).success
+            for force in q @ [[-2.0, 1.0], [1.0, -2.0]]
+        ]
+    )
     assert 0.2 < held.mean() < 0.8
     for speed in (0.0, 1e-18, 1e-17):
         x = np.concatenate([q, speed * rng.normal(size=q.shape)], axis=1)
@@ -145,8 +155,10 @@ def test_derivatives_across_turns_and_stops():
     e = 1e-6
 
     def slope(vary, count):
-        both = [[coulomb.step(form, *vary(s * e * row), h, u)[0].states for s in (1, -1)]
-                for row in np.eye(count)]  # fmt: skip
+        both = [
+            [coulomb.step(form, *vary(s * e * row), h, u)[0].states for s in (1, -1)]
+            for row in np.eye(count)
+        ]
         return np.stack([(up - down) / (2 * e) for up, down in both], axis=-1)
 
     by_state = slope(lambda change: (p, x + change), 4)

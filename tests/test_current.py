@@ -53,7 +53,7 @@ def test_a_result_is_old_where_a_function_changed_that_it_ran(tmp_path, monkeypa
         "def other():\n    return pi * _HALF",
         "idle": "def g(x):\n    return x",
         "limits": "MOST = 3\ndef h():\n    return MOST",
-    }  # fmt: skip
+    }
     for name, text in files.items():
         (package / f"{name}.py").write_text(f"{text}\n")
     study.write_text("import noted_package\n")
@@ -129,12 +129,16 @@ print(X)
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("Doc.", "Docs."), ("a import T\n", "a import S\n"), ("return inner, _z", "return 1"),
-        ("return c\n        return", "return b\n        return"), ("b, c", "b, c, d"),
+        ("Doc.", "Docs."),
+        ("a import T\n", "a import S\n"),
+        ("return inner, _z", "return 1"),
+        ("return c\n        return", "return b\n        return"),
+        ("b, c", "b, c, d"),
         ("_z = 2", "_z = 3"),
-        ("print(X)", "print(X)  # shows it"), ("def _f():", "def g():\n    pass\ndef _f():"),
+        ("print(X)", "print(X)  # shows it"),
+        ("def _f():", "def g():\n    pass\ndef _f():"),
     ],
-)  # fmt: skip
+)
 def test_parts_that_a_result_did_not_run(old, new):
     assert old in MODULE
     assert parts(MODULE.replace(old, new)) >= parts(MODULE, {"C.one"})
@@ -143,11 +147,16 @@ def test_parts_that_a_result_did_not_run(old, new):
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("print(X)", "print(2)"), ("size = 2", "size = 3"), ("two", "three"), ("b(1)", "b(2)"),
-        ("import b", "import e as b"), ("return _y", "return 1"), ("X: int = 3", "X: int = 4"),
+        ("print(X)", "print(2)"),
+        ("size = 2", "size = 3"),
+        ("two", "three"),
+        ("b(1)", "b(2)"),
+        ("import b", "import e as b"),
+        ("return _y", "return 1"),
+        ("X: int = 3", "X: int = 4"),
         ("shown", "e as shown"),
     ],
-)  # fmt: skip
+)
 def test_parts_that_a_result_ran_or_that_the_module_shows(old, new):
     assert not parts(MODULE.replace(old, new)) >= parts(MODULE, {"C.one"})
 
@@ -172,17 +181,22 @@ def test_what_is_old_is_measured_again(tmp_path, monkeypatch):
     study.write_text(STUDY.format(out=str(tmp_path), code="new"))
     monkeypatch.setattr(current, "_digest", lambda path: "new")
     for name, date, code in (
-        ("new", "2026-11-20", "new"), ("young", "2026-11-22", "old"), ("old", "2026-11-21", "old"),
+        ("new", "2026-11-20", "new"),
+        ("young", "2026-11-22", "old"),
+        ("old", "2026-11-21", "old"),
         ("broken", "2026-11-22", None),
-    ):  # fmt: skip
+    ):
         of = code and {"tries.py": code}
         result = {"date": date, "code": of, "seconds": 9.0, "measured": {"rms": 1.0}}
         (tmp_path / f"tries-{name}.json").write_text(json.dumps(result))
     assert current.check(["tries"], tmp_path, only_tell=True, say=said.append) == 0
     assert said[0] == "1 of 4 results are of current code"
     assert [line.split(":")[0] for line in said[1:]] == [
-        "tries-old.json", "tries-young.json", "tries-broken.json", "all of them again"
-    ]  # fmt: skip
+        "tries-old.json",
+        "tries-young.json",
+        "tries-broken.json",
+        "all of them again",
+    ]
     assert said[1].endswith(": changed since: tries.py (2026-11-21, 9 s)")
     assert "which files it ran is not recorded" in said[3]
     said.clear()
@@ -262,9 +276,11 @@ def test_what_another_python_runs_counts(tmp_path, how):
     package.mkdir()
     (package / "__init__.py").write_text("")
     (package / "idle.py").write_text("def g(x):\n    return x\n")
-    (package / "works.py").write_text("import sys, counted.idle\ndef f(x):\n    print(x)\n"
-                                      "if __name__ == '__main__':\n    import counted.works\n"
-                                      "    counted.works.f(*sys.argv[1:])\n")  # fmt: skip
+    (package / "works.py").write_text(
+        "import sys, counted.idle\ndef f(x):\n    print(x)\n"
+        "if __name__ == '__main__':\n    import counted.works\n"
+        "    counted.works.f(*sys.argv[1:])\n"
+    )
     text = "import sys\nfrom counted.works import f\nf(*sys.argv[1:])"
     (tmp_path / "script.py").write_text(text)
     words = {"script": [tmp_path / "script.py"], "-m": ["-m", "counted.works"], "-c": ["-c", text]}
@@ -280,6 +296,11 @@ print({{path.name: names for path, names in ran.functions("counted").items()}})
 ran.python("counted", "-c", "")
 print(ran.functions("counted"))
 """)
-    done = subprocess.run([sys.executable, study], capture_output=True, text=True, check=False,
-                          env=os.environ | {"PYTHONPATH": str(tmp_path)})  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, study],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+    )
     assert done.stdout.splitlines() == ["heard", "{'works.py': {'f'}}", "None"], done.stderr

@@ -204,9 +204,9 @@ def test_a_damped_driven_pendulum_by_its_period():
             q, p = np.split(y, 2)
             return np.concatenate([p, -np.sin(q) - rate * p + 0.15 * np.cos(t)])
 
-        end = solve_ivp(
-            field, (0, period), z.T.ravel(), method="DOP853", rtol=1e-13, atol=1e-14
-        ).y[:, -1]  # fmt: skip
+        end = solve_ivp(field, (0, period), z.T.ravel(), method="DOP853", rtol=1e-13, atol=1e-14).y[
+            :, -1
+        ]
         return Pairs(z, end.reshape(2, -1).T, period)
 
     learned, test = gfnn.fit(pairs_of(3_000), tolerance=1e-10), pairs_of(300)

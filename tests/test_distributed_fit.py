@@ -78,9 +78,7 @@ def image(z):
     terms itself."""
     q, p = z.T
     p = p - 0.1 * q**2
-    return np.stack(
-        [np.cos(DT) * q + np.sin(DT) * p, np.cos(DT) * p - np.sin(DT) * q], axis=1
-    )  # fmt: skip
+    return np.stack([np.cos(DT) * q + np.sin(DT) * p, np.cos(DT) * p - np.sin(DT) * q], axis=1)
 
 
 def flow(z):
@@ -114,9 +112,10 @@ def fits():
         pairs = noisy(function)
         few = pairs.take(slice(100, 300))
         found[name] = (
-            pairs, pairs.take(slice(100)),
+            pairs,
+            pairs.take(slice(100)),
             gfnn.fit(few, learn=name, tolerance=2e-3, **options),
-        )  # fmt: skip
+        )
     return found
 
 
@@ -156,8 +155,13 @@ def files(folder):
     np.savez(folder / "sequences.npz", trajectories=states, lengths=lengths, dt=DT)
     np.savez_compressed(folder / "packed.npz", trajectories=states, dt=DT)
     np.save(folder / "one.npy", states.reshape(-1, 2).astype(np.float32))
-    np.savez(folder / "pairs.npz", z0=states[:, 0], z1=states[:, 1], dt=np.linspace(1, 2, 40),
-             params=np.arange(40.0))  # fmt: skip
+    np.savez(
+        folder / "pairs.npz",
+        z0=states[:, 0],
+        z1=states[:, 1],
+        dt=np.linspace(1, 2, 40),
+        params=np.arange(40.0),
+    )
     return ("sequences.npz", "packed.npz", "one.npy", "pairs.npz")
 
 
@@ -313,9 +317,12 @@ def test_files_of_several_dt_are_all_taken(tmp_path):
         own = pairs.take(slice(200 * i, 200 * (i + 1)))
         np.savez(tmp_path / f"{i}.npz", z0=own.z0, z1=own.z1, dt=dt)
     ran = fit_job.fit(
-        [tmp_path / "0.npz", tmp_path / "1.npz"], out=tmp_path / "m", learn="hamiltonian",
-        terms=("p1**2", "q1**4"), tolerance=0.1,
-    )  # fmt: skip
+        [tmp_path / "0.npz", tmp_path / "1.npz"],
+        out=tmp_path / "m",
+        learn="hamiltonian",
+        terms=("p1**2", "q1**4"),
+        tolerance=0.1,
+    )
     assert ran.fit.num_pairs == 400
     assert not any("is kept" in message for message in ran.fit.messages)
 
@@ -329,9 +336,10 @@ def test_a_network_is_that_of_the_sample_and_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(network_sweep, "_MLP_HIDDEN", (3,))
     train = searches.NetworkSweep._trained
     monkeypatch.setattr(
-        searches.NetworkSweep, "_trained",
+        searches.NetworkSweep,
+        "_trained",
         lambda self, **options: train(self, **{**options, "max_iterations": 1}),
-    )  # fmt: skip
+    )
     names = in_files(tmp_path, noisy(image).take(slice(300)), 2)
     with pytest.warns(gfnn.FitWarning, match="is fitted to a sample of 300 pairs, not to all"):
         ran = fit_job.fit(names, out=tmp_path / "m", family="mlp", chart="midpoint")
@@ -352,14 +360,29 @@ def started(out, *more, count):
     kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_") or "CACHE" in k}
     return [
         subprocess.Popen(
-            [sys.executable, "-m", "gfnn_jax", "fit", *map(str, more), "--out", str(out),
-             "--distributed"],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            env={**kept, "PYTHONPATH": os.pathsep.join(sys.path), "JAX_PROCESS_ID": str(i),
-                 "JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": str(count)},
+            [
+                sys.executable,
+                "-m",
+                "gfnn_jax",
+                "fit",
+                *map(str, more),
+                "--out",
+                str(out),
+                "--distributed",
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={
+                **kept,
+                "PYTHONPATH": os.pathsep.join(sys.path),
+                "JAX_PROCESS_ID": str(i),
+                "JAX_COORDINATOR_ADDRESS": address,
+                "JAX_NUM_PROCESSES": str(count),
+            },
         )
         for i in range(count)
-    ]  # fmt: skip
+    ]
 
 
 def ended(running):
@@ -380,8 +403,14 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def undisturbed(data):
     """The fit of one process."""
-    return fit_job.fit(data / "pairs.npz", out=data / "one", learn="map", chart="midpoint",
-                       tolerance=3e-3, group=Group()).fit  # fmt: skip
+    return fit_job.fit(
+        data / "pairs.npz",
+        out=data / "one",
+        learn="map",
+        chart="midpoint",
+        tolerance=3e-3,
+        group=Group(),
+    ).fit
 
 
 def moved_alike(one, other):

@@ -8,11 +8,43 @@ import gfnn_jax
 
 PACKAGE = Path(gfnn_jax.__file__).parent
 FRAGMENTS = {
-    "as", "before", "between", "but", "by", "for", "from", "how", "if", "in", "its", "no",
-    "none", "not", "of", "on", "or", "so", "some", "than", "that", "their", "these", "this",
-    "those", "to", "what", "when", "where", "whether", "which", "who", "whose", "why", "with",
+    "as",
+    "before",
+    "between",
+    "but",
+    "by",
+    "for",
+    "from",
+    "how",
+    "if",
+    "in",
+    "its",
+    "no",
+    "none",
+    "not",
+    "of",
+    "on",
+    "or",
+    "so",
+    "some",
+    "than",
+    "that",
+    "their",
+    "these",
+    "this",
+    "those",
+    "to",
+    "what",
+    "when",
+    "where",
+    "whether",
+    "which",
+    "who",
+    "whose",
+    "why",
+    "with",
     "without",
-}  # fmt: skip
+}
 
 
 def openings():

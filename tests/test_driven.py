@@ -86,11 +86,11 @@ def test_the_stages_stand_at_their_times():
         return [z[1], -np.sin(z[0]) * (1 + 0.15 * np.cos(RATE * t))]
 
     expected = [
-        scipy.integrate.solve_ivp(
-            field, (t, t + h), y, method="DOP853", rtol=1e-13, atol=1e-15
-        ).y[:, -1]
+        scipy.integrate.solve_ivp(field, (t, t + h), y, method="DOP853", rtol=1e-13, atol=1e-15).y[
+            :, -1
+        ]
         for y, t, h in zip(z, t0, dt, strict=True)
-    ]  # fmt: skip
+    ]
     np.testing.assert_allclose(image(z, t0, dt), expected, atol=1e-13)
     for newton in (False, True):
         flow = Flow(LAW, C, dt, np.ones(2), 8, 2, newton)
@@ -104,10 +104,12 @@ def test_derivatives_in_the_coefficients_and_in_the_time():
     z, t0 = states(3)
     found = images(LAW, C, z, DT, FINE, args=t0[:, None], derivatives=True)
     for j, e in enumerate(1e-5 * np.eye(3)):
-        ahead, behind = (images(LAW, C + s * e, z, DT, FINE, args=t0[:, None]).states
-                         for s in (1, -1))  # fmt: skip
-        np.testing.assert_allclose(found.by_coefficient[:, :, j], (ahead - behind) / 2e-5,
-                                   atol=1e-9)  # fmt: skip
+        ahead, behind = (
+            images(LAW, C + s * e, z, DT, FINE, args=t0[:, None]).states for s in (1, -1)
+        )
+        np.testing.assert_allclose(
+            found.by_coefficient[:, :, j], (ahead - behind) / 2e-5, atol=1e-9
+        )
     flow = Flow(LAW, C, DT, np.ones(2), 6, 2)
     slope = jax.jit(jax.jacfwd(lambda t: flow.step(z[:1], t)[0][0]))(t0[:1, None])
     ahead, behind = (image(z[:1], t0[:1] + s) for s in (1e-5, -1e-5))
@@ -316,8 +318,14 @@ def test_files_of_pairs_and_of_trajectories(tmp_path):
     np.savez(tmp_path / "u.npz", trajectories=rows, times=times, period=PERIOD)
     sequence = np.repeat(np.arange(60), 4)
     table = np.column_stack([sequence, times.ravel(), rows.reshape(-1, 2), 0 * sequence + PERIOD])
-    np.savetxt(tmp_path / "c.csv", table, delimiter=",", header="sequence,t,q1,p1,period",
-               comments="", fmt="%.17g")  # fmt: skip
+    np.savetxt(
+        tmp_path / "c.csv",
+        table,
+        delimiter=",",
+        header="sequence,t,q1,p1,period",
+        comments="",
+        fmt="%.17g",
+    )
     for name in ("t.npz", "u.npz", "c.csv"):
         data = read_trajectories(tmp_path / name)
         assert data.period == data.pairs().period == PERIOD

@@ -65,16 +65,26 @@ def test_members_are_trained_as_they_are_alone():
 
     options, together = {"validation": held, "chunk": 40}, []
     levenberg_marquardt_together(
-        family, starts, w, target, shares=np.ones((3, 90)),
-        limits=Limits(3, reports=(together.append,)), resume=begun(theta, np.full(3, 1e3)),
+        family,
+        starts,
+        w,
+        target,
+        shares=np.ones((3, 90)),
+        limits=Limits(3, reports=(together.append,)),
+        resume=begun(theta, np.full(3, 1e3)),
         **options,
-    )  # fmt: skip
+    )
     for i, start in enumerate(starts):
         alone = []
         levenberg_marquardt(
-            family, start, w, target, limits=Limits(3, reports=(alone.append,)),
-            resume=begun(theta[i], 1e3), **options,
-        )  # fmt: skip
+            family,
+            start,
+            w,
+            target,
+            limits=Limits(3, reports=(alone.append,)),
+            resume=begun(theta[i], 1e3),
+            **options,
+        )
         for ours, its in zip(together, alone, strict=True):
             np.testing.assert_allclose(ours.theta[i], its.theta, rtol=1e-6, atol=1e-9)
             assert ours.damping[i] == pytest.approx(its.damping)
@@ -92,15 +102,18 @@ def test_shares_are_the_weights_of_the_pairs():
     other = levenberg_marquardt_together(
         family, [start], w[rows], target[rows], shares=np.ones((1, len(rows))), **options
     )
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), found.params,
-                 other.params)  # fmt: skip
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), found.params, other.params
+    )
     assert found.validation_rms == pytest.approx(other.validation_rms, rel=1e-6)
 
 
 def test_the_map_is_the_mean_and_its_samples_are_symplectic(fit):
     piece, z = fit.map.pieces[0], states(5, 3)
-    one = [piece.family.network.gradient(jax.tree.map(lambda a, i=i: a[i], piece.family.members),
-                                         z) for i in range(4)]  # fmt: skip
+    one = [
+        piece.family.network.gradient(jax.tree.map(lambda a, i=i: a[i], piece.family.members), z)
+        for i in range(4)
+    ]
     np.testing.assert_allclose(
         piece.family.gradient(np.asarray(piece.params), z), np.mean(one, 0), rtol=1e-12
     )
@@ -166,8 +179,9 @@ def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypat
         run(tmp_path / "part", 3)
     assert list((tmp_path / "part").glob("step_*"))
     resumed = run(tmp_path / "part", 99)
-    for one, other in zip(*(jax.tree.leaves(f.map.pieces[0].family) for f in (whole, resumed)),
-                          strict=True):  # fmt: skip
+    for one, other in zip(
+        *(jax.tree.leaves(f.map.pieces[0].family) for f in (whole, resumed)), strict=True
+    ):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(whole.map.posterior.root, resumed.map.posterior.root)
 

@@ -82,8 +82,16 @@ def turning(dim):
 
 
 def law(stages=4, substeps=2):
-    texts = ["p1**2", "p2**2", "q1**2", "q2**2*p1", "cos(q1)", "exp(-q2)",
-             "1/sqrt(q1**2 + q2**2 + 1)", "(q1 + 2*q2)**1.5*0.1 + sin(2*q1)"]  # fmt: skip
+    texts = [
+        "p1**2",
+        "p2**2",
+        "q1**2",
+        "q2**2*p1",
+        "cos(q1)",
+        "exp(-q2)",
+        "1/sqrt(q1**2 + q2**2 + 1)",
+        "(q1 + 2*q2)**1.5*0.1 + sin(2*q1)",
+    ]
     z, unit = 0.3 + 0.2 * states(2), np.full(4, SIZE)
     piece = Flow(given_terms(2, texts), np.linspace(0.2, 0.6, 8), DT, unit, stages, substeps)
     return map_of(piece, z, scale=unit), z
@@ -112,13 +120,23 @@ def two_rods():
     """A double pendulum by its Lagrangian."""
     none = (0, 0)
     terms = lagrangian.Terms.of(
-        [((2, 0), none, none, 0.0), ((0, 2), none, none, 0.0), ((1, 1), none, (1, -1), 0.0),
-         (none, none, (1, 0), 0.0), (none, (0, 2), none, 0.0)], 2,
-    )  # fmt: skip
+        [
+            ((2, 0), none, none, 0.0),
+            ((0, 2), none, none, 0.0),
+            ((1, 1), none, (1, -1), 0.0),
+            (none, none, (1, 0), 0.0),
+            (none, (0, 2), none, 0.0),
+        ],
+        2,
+    )
     law = lagrangian.Lagrangian(
-        terms, np.array([1.0, 0.5, 1.0, 2.0, -0.5]), lagrangian.Friction.of([], 2), np.zeros(0),
-        0.0, np.zeros((2, 0)),
-    )  # fmt: skip
+        terms,
+        np.array([1.0, 0.5, 1.0, 2.0, -0.5]),
+        lagrangian.Friction.of([], 2),
+        np.zeros(0),
+        0.0,
+        np.zeros((2, 0)),
+    )
     z = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 4))
     return map_of_law(law, z, 0.05, tolerance=1e-13), z
 
@@ -157,15 +175,17 @@ MAPS = {
     "positions": lambda: of_positions(0.5, False),
     "type 1": lambda: map_in(TYPE1, 1, 4, predicted=False),
     "midpoint": lambda: map_in(MIDPOINT, 2, 3),
-    **{f"{name}, d = 2": lambda chart=chart: map_in(chart, 2, 4, predicted=chart is not TYPE1)
-       for name, chart in CHARTS.items()},
+    **{
+        f"{name}, d = 2": lambda chart=chart: map_in(chart, 2, 4, predicted=chart is not TYPE1)
+        for name, chart in CHARTS.items()
+    },
     "type 2": lambda: map_in(TYPE2, 1, 3),
     "midpoint, d = 3": lambda: map_in(MIDPOINT, 3, 3),
     "an angle": lambda: map_in(MIDPOINT, 2, 3, angles=(0,)),
     "base map": lambda: map_in(TYPE3, 2, 3, around=(turning(2),)),
     "features": featured,
     "polar": in_polar,
-}  # fmt: skip
+}
 
 
 def compiled(path, *flags):
@@ -239,9 +259,13 @@ def with_length(kind):
         none = (0,)
         law = lagrangian.Lagrangian(
             lagrangian.Terms.of([((2,), none, none, 0.0), (none, none, (1,), 0.0)], 1),
-            np.array([0.5, 1.0]), lagrangian.Friction.of([((1,), lagrangian.LINEAR, 0.0)], 1),
-            np.array([0.1]), 0.0, np.zeros((1, 0)), ((0,), (-1,), (1,)),
-        )  # fmt: skip
+            np.array([0.5, 1.0]),
+            lagrangian.Friction.of([((1,), lagrangian.LINEAR, 0.0)], 1),
+            np.array([0.1]),
+            0.0,
+            np.zeros((1, 0)),
+            ((0,), (-1,), (1,)),
+        )
         return map_of_law(law, z, DT, parameters=names, args=lengths), z, lengths
     if kind == "law":
         family = given_terms(1, ["p1**2/l**2", "l*cos(q1)", "T3(q1)*l"], names)
@@ -323,17 +347,30 @@ def pushed(hold, delay=0.0, uniform=0.0, stiff=False):
     hold: the rule between samples; None: no input."""
     none = (0, 0)
     terms = lagrangian.Terms.of(
-        [((2, 0), none, none, 0.0), ((0, 2), none, none, 0.0), ((1, 1), none, (1, -1), 0.0),
-         (none, none, (1, 0), 0.0), (none, (0, 2), none, 0.0)], 2,
-    )  # fmt: skip
-    rows = [((1, 0), lagrangian.LINEAR, 0.0), ((1, -1), lagrangian.QUADRATIC, 0.0),
-            ((0, 1), lagrangian.DRY, 1e-4 if stiff else 0.3)]  # fmt: skip
+        [
+            ((2, 0), none, none, 0.0),
+            ((0, 2), none, none, 0.0),
+            ((1, 1), none, (1, -1), 0.0),
+            (none, none, (1, 0), 0.0),
+            (none, (0, 2), none, 0.0),
+        ],
+        2,
+    )
+    rows = [
+        ((1, 0), lagrangian.LINEAR, 0.0),
+        ((1, -1), lagrangian.QUADRATIC, 0.0),
+        ((0, 1), lagrangian.DRY, 1e-4 if stiff else 0.3),
+    ]
     friction = lagrangian.Friction.of(rows, 2)
     gains = np.zeros((2, 0)) if hold is None else np.array([[1.0], [0.5]])
     law = lagrangian.Lagrangian(
-        terms, np.array([1.0, 0.5, 1.0, 2.0, -0.5]), friction, np.array([0.1, 0.2, 0.05]), uniform,
+        terms,
+        np.array([1.0, 0.5, 1.0, 2.0, -0.5]),
+        friction,
+        np.array([0.1, 0.2, 0.05]),
+        uniform,
         gains,
-    )  # fmt: skip
+    )
     z = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 4))
     signals = None if hold is None else Signals(("F",), hold, delay)
     return map_of_law(law, z, 0.05, tolerance=1e-12, signals=signals), z
@@ -353,9 +390,14 @@ def test_c_of_a_map_with_friction(tmp_path):
 @needs_cc
 @pytest.mark.parametrize(
     ("hold", "delay"),
-    [("linear", 0.013), *(pytest.param(h, d, marks=pytest.mark.slow)
-                          for h, d in (("hold", 0.0), ("hold", 0.02), ("band", 0.013)))],
-)  # fmt: skip
+    [
+        ("linear", 0.013),
+        *(
+            pytest.param(h, d, marks=pytest.mark.slow)
+            for h, d in (("hold", 0.0), ("hold", 0.02), ("band", 0.013))
+        ),
+    ],
+)
 def test_c_of_a_map_with_inputs(hold, delay, tmp_path):
     """Steps of one state under samples of a force are a rollout, and the inverse undoes each."""
     map_, z = pushed(hold, delay, uniform=0.2)
@@ -410,8 +452,16 @@ def test_the_file_tells_where_it_comes_from_and_keeps_nothing(tmp_path):
     plain.save(tmp_path / "mine", record={"fit": {"tolerance": 1e-6}, "data": {"source": "*/ x"}})
     text = gfnn.export(tmp_path / "mine", "c").read_text()
     comment, code = text.split("*/", 1)
-    for told in ("dt = 0.3 in", "q1 0.6, p1 0.6", "0 ok; 1 left", "cc -O3 -std=c99", "1e-06",
-                 "SHA-256", "gfnn_jax 0", "* / x"):  # fmt: skip
+    for told in (
+        "dt = 0.3 in",
+        "q1 0.6, p1 0.6",
+        "0 ok; 1 left",
+        "cc -O3 -std=c99",
+        "1e-06",
+        "SHA-256",
+        "gfnn_jax 0",
+        "* / x",
+    ):
         assert told in comment
     assert "malloc" not in code
     assert not re.search(r"^static (?!const)\w+ \w+(\[|;| =)", code, re.M)  # no state that changes
@@ -461,9 +511,13 @@ def test_what_has_no_c_is_refused(tmp_path):
     for bad, why in ((network, "one of a function"), (single, "not of float64")):
         with pytest.raises(gfnn.InputError, match=rf"{why}.*use --to stablehlo"):
             gfnn.export(bad, "c", tmp_path / "a.c")
-    for to, out, why in (("c", "a.txt", "is written as .c"), ("c", "a-1.c", "C functions are"),
-                         ("c", "double.c", "C functions are"), ("onnx", "a", "c or stablehlo"),
-                         ("c", None, "expected a file")):  # fmt: skip
+    for to, out, why in (
+        ("c", "a.txt", "is written as .c"),
+        ("c", "a-1.c", "C functions are"),
+        ("c", "double.c", "C functions are"),
+        ("onnx", "a", "c or stablehlo"),
+        ("c", None, "expected a file"),
+    ):
         with pytest.raises(gfnn.InputError, match=why):
             gfnn.export(map_, to, None if out is None else tmp_path / out)
     assert not list(tmp_path.iterdir())
@@ -492,8 +546,12 @@ def test_polynomials_are_arranged_anew():
     map_, z = map_in(TYPE2, 2, 3, angles=(1,), predicted=True)
     model = jax.tree.map(np.asarray, map_.pieces[0].predictor.forward)
     x = model.family.inputs(z)
-    within = [np.clip(x[:, 0], -model.reach[0], model.reach[0]), np.cos(x[:, 1]), np.sin(x[:, 1]),
-              *np.clip(x[:, 2:].T, -model.reach[2], model.reach[2])]  # fmt: skip
+    within = [
+        np.clip(x[:, 0], -model.reach[0], model.reach[0]),
+        np.cos(x[:, 1]),
+        np.sin(x[:, 1]),
+        *np.clip(x[:, 2:].T, -model.reach[2], model.reach[2]),
+    ]
     terms = polynomials.in_powers(model)
     for k, expected in enumerate(model(z).T):
         found = polynomials.horner({n: c[k] for n, c in terms.items()}, within)
@@ -518,25 +576,48 @@ def test_symbols_leave_no_arithmetic_with_zeros_and_do_nothing_twice():
         "    out[2] = t5;",
         "    out[3] = t5;",
         "}",
-    ]  # fmt: skip
+    ]
 
 
 @needs_cc
 def test_every_function_of_formulas_has_its_c(tmp_path):
-    texts = ["sin(q1)", "cos(3*q1)", "tan(q1)", "exp(q1)", "log(q1)", "sqrt(q1)", "sinh(q1)",
-             "cosh(q1)", "tanh(q1)", "arctan(q1)", "q1**-3", "q1**0.3", "T5(q1)", "q1 - (p1 - q1)",
-             "q1/(p1/q1)", "-(q1 + p1)*-q1", "2 - q1", "q1/p1"]  # fmt: skip
+    texts = [
+        "sin(q1)",
+        "cos(3*q1)",
+        "tan(q1)",
+        "exp(q1)",
+        "log(q1)",
+        "sqrt(q1)",
+        "sinh(q1)",
+        "cosh(q1)",
+        "tanh(q1)",
+        "arctan(q1)",
+        "q1**-3",
+        "q1**0.3",
+        "T5(q1)",
+        "q1 - (p1 - q1)",
+        "q1/(p1/q1)",
+        "-(q1 + p1)*-q1",
+        "2 - q1",
+        "q1/p1",
+    ]
     trees = [parse(text, 1) for text in texts]
     tape = Tape()
     z = tape.inputs("z", 2)
-    entries = [v for jet in jets(trees, z, 2)
-               for v in (jet.value, *jet.slope.values(), *jet.curvature.values())]  # fmt: skip
+    entries = [
+        v
+        for jet in jets(trees, z, 2)
+        for v in (jet.value, *jet.slope.values(), *jet.curvature.values())
+    ]
     path = tmp_path / "f.c"
     text = tape.function("all_of", {"out": [np.ravel(np.asarray(e, object))[0] for e in entries]})
     path.write_text("#include <math.h>\n" + text.removeprefix("static "))
     at, pointer = np.array([[0.7, 0.4]]), ctypes.POINTER(ctypes.c_double)
     out = np.empty(len(entries))
     compiled(path).all_of(at.ctypes.data_as(pointer), out.ctypes.data_as(pointer))
-    expected = [v for jet in jets(trees, at, 2)
-                for v in (jet.value, *jet.slope.values(), *jet.curvature.values())]  # fmt: skip
+    expected = [
+        v
+        for jet in jets(trees, at, 2)
+        for v in (jet.value, *jet.slope.values(), *jet.curvature.values())
+    ]
     np.testing.assert_allclose(out, [np.ravel(e)[0] for e in expected], rtol=1e-14)

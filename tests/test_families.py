@@ -198,9 +198,10 @@ def test_what_was_compiled_for_some_data_serves_others():
             inputs = box_inputs(data, angles=(0,))
             family = kind(inputs) if kind.__class__ is functools.partial else kind(inputs, 3)
             params = (
-                family.init(jax.random.key(0), np.float64) if isinstance(family, Mlp)
+                family.init(jax.random.key(0), np.float64)
+                if isinstance(family, Mlp)
                 else family.unflatten(np.ones(family.num_parameters))
-            )  # fmt: skip
+            )
             value(family, params, W)
         assert len(traces) == 1
 

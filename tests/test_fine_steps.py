@@ -57,8 +57,10 @@ def test_errors_of_steps_do_not_move_coefficients(noise):
 
 
 def test_less_noise_asks_for_shorter_steps_and_much_noise_for_none():
-    counts = [with_fine_steps(*fitted(noise)[:2], print)[0].inputs.substeps
-              for noise in (1e-6, 1e-4, 3e-2)]  # fmt: skip
+    counts = [
+        with_fine_steps(*fitted(noise)[:2], print)[0].inputs.substeps
+        for noise in (1e-6, 1e-4, 3e-2)
+    ]
     assert counts[0] > counts[1] > counts[2] == 1
     bench, fit, _ = fitted(3e-2)
     assert with_fine_steps(bench, fit, print) == (bench, fit)

@@ -296,9 +296,12 @@ def test_a_tolerance_out_of_reach_gives_the_best_and_says_so():
     kept = []
     with pytest.warns(gfnn.FitWarning, match=r"no candidate meets.*The search ended because"):
         fit = gfnn.fit(
-            pendulum_pairs(60), chart="midpoint", family="polynomial", tolerance=1e-18,
+            pendulum_pairs(60),
+            chart="midpoint",
+            family="polynomial",
+            tolerance=1e-18,
             on_better=lambda *kind: kept.append(kind),
-        )  # fmt: skip
+        )
     assert not fit.met
     # As it was chosen by: what is stated of it is of other pairs. A few per cent are not worth a
     # larger model.
@@ -491,9 +494,13 @@ def test_a_base_map_is_found_where_it_is_needed():
         return z[1] ** 2 / 2 - jnp.cos(z[0]) * (1 + 0.15 * jnp.cos(1.8 * t))
 
     scene = Scene(
-        name="driven", purpose="", dim=1, dt=2 * math.pi / 1.8, hamiltonian=hamiltonian,
+        name="driven",
+        purpose="",
+        dim=1,
+        dt=2 * math.pi / 1.8,
+        hamiltonian=hamiltonian,
         sampling=DrawnFrom(lambda key, num: jnp.asarray(disc(num, 0.8, int(key[-1])))),
-    )  # fmt: skip
+    )
     data = gfnn.sample_pairs(scene, 600, np.array([0, 5]))
     fresh = gfnn.sample_pairs(scene, 200, np.array([0, 6]))
     fit = quiet_fit(data, absolute_tolerance=1e-6)

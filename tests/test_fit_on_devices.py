@@ -92,9 +92,12 @@ def test_the_same_bits_on_any_number_of_devices(kind):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=3"
     path = os.pathsep.join([os.path.dirname(__file__), *sys.path])
     ran = subprocess.run(
-        [sys.executable, "-c", FITS, kind], capture_output=True, text=True, check=False,
+        [sys.executable, "-c", FITS, kind],
+        capture_output=True,
+        text=True,
+        check=False,
         env={**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path},
-    )  # fmt: skip
+    )
     assert ran.returncode == 0, ran.stderr
 
 
@@ -172,9 +175,13 @@ def test_operations_are_spent_as_by_one(count, sharing):
     for devices in (0, 1, count):
         budget = Counted(np.inf)
         problem = gauss_newton.Problem(
-            pairs.z0, pairs.z1, DT, np.ones(2), allowance=Allowance(cap=budget),
+            pairs.z0,
+            pairs.z1,
+            DT,
+            np.ones(2),
+            allowance=Allowance(cap=budget),
             options=gauss_newton.GaussNewtonOptions(block_bytes=2**20, part_bytes=2**20),
-        )  # fmt: skip
+        )
         with sharing(devices):
             found = problem.linearised(family, c, Steps(4, 1), np.arange(5_000))
             size = problem.residuals(family, c, Steps(4, 1), np.arange(5_000))
@@ -246,8 +253,9 @@ def test_rows_go_to_an_accelerator_where_there_is_one(monkeypatch):
     put = jax.device_put
     monkeypatch.setattr(jax, "device_put", lambda tree, device: put(tree))
     with row_blocks.on_devices([Named(0), Named(1)]):
-        found = least_squares.reduce(family, [(w[:9_999], target[:9_999]), (w[9_999:],
-                                     target[9_999:])], weight)  # fmt: skip
+        found = least_squares.reduce(
+            family, [(w[:9_999], target[:9_999]), (w[9_999:], target[9_999:])], weight
+        )
     assert found.rows == plain.rows
     assert len(shapes) == 1
     same_factor(found.factor, plain.factor)

@@ -18,9 +18,10 @@ from gfnn_jax.phase_space import symplectic_form
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK
 
 FAMILY = Terms(
-    2, ("q1", "q2", "p1", "p2"),
+    2,
+    ("q1", "q2", "p1", "p2"),
     ((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, 2, 0), (0, 0, 0, 2), (2, 1, 0, 0), (0, 3, 0, 0)),
-)  # fmt: skip
+)
 C = np.array([0.5, 0.5, 0.5, 0.5, 1.0, -1 / 3])
 Z = np.random.default_rng(0).uniform(-0.2, 0.2, (24, 4))
 

@@ -17,10 +17,18 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 # Hénon–Heiles with a mass that depends on the position.
 H = Terms(
-    2, ("q1", "q2", "p1", "p2"),
-    ((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, 2, 0), (0, 0, 0, 2), (2, 1, 0, 0), (0, 3, 0, 0),
-     (0, 1, 2, 0)),
-)  # fmt: skip
+    2,
+    ("q1", "q2", "p1", "p2"),
+    (
+        (2, 0, 0, 0),
+        (0, 2, 0, 0),
+        (0, 0, 2, 0),
+        (0, 0, 0, 2),
+        (2, 1, 0, 0),
+        (0, 3, 0, 0),
+        (0, 1, 2, 0),
+    ),
+)
 C = np.array([0.5, 0.5, 0.5, 0.5, 1.0, -1 / 3, 0.4])
 GAMMA = 0.3
 Z = np.random.default_rng(0).uniform(-0.2, 0.2, (12, 4))
@@ -49,10 +57,12 @@ def exact(gamma, forced):
         return np.concatenate([v, push])
 
     options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-15}
-    return np.stack([
-        scipy.integrate.solve_ivp(field, (0, 1), z, args=(u,), **options).y[:, -1]
-        for z, u in zip(Z, INPUTS, strict=True)
-    ])  # fmt: skip
+    return np.stack(
+        [
+            scipy.integrate.solve_ivp(field, (0, 1), z, args=(u,), **options).y[:, -1]
+            for z, u in zip(Z, INPUTS, strict=True)
+        ]
+    )
 
 
 DAMPED = exact(GAMMA, forced=False)

@@ -59,17 +59,33 @@ def predicted(folder, initial, inputs, capsys, steps=AHEAD):
     """(exit status, rows of the forecast or None, what stood on standard error)."""
     out = folder / "f.csv"
     out.unlink(missing_ok=True)
-    status = main(["predict", str(folder / "model"), "--initial", str(folder / initial), "--inputs",
-                   str(folder / inputs), "--num-steps", str(steps), "--out", str(out)])  # fmt: skip
+    status = main(
+        [
+            "predict",
+            str(folder / "model"),
+            "--initial",
+            str(folder / initial),
+            "--inputs",
+            str(folder / inputs),
+            "--num-steps",
+            str(steps),
+            "--out",
+            str(out),
+        ]
+    )
     rows = np.genfromtxt(out, delimiter=",", names=True) if out.exists() else None
     return status, rows, capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("initial", "inputs", "unit"),
-    [("ms.csv", "u_ms.csv", 1e3), ("ms.csv", "u_s.csv", 1e3), ("bare.csv", "u_s.csv", 1e3),
-     ("s.csv", "u_ms.csv", 1.0)],
-)  # fmt: skip
+    [
+        ("ms.csv", "u_ms.csv", 1e3),
+        ("ms.csv", "u_s.csv", 1e3),
+        ("bare.csv", "u_s.csv", 1e3),
+        ("s.csv", "u_ms.csv", 1.0),
+    ],
+)
 def test_times_are_in_the_unit_of_each_files_header(motion, folder, initial, inputs, unit, capsys):
     """A file that names none is in the unit of the law's recording; times are written in that of
     the recording that is gone on from."""
@@ -85,12 +101,15 @@ def test_times_are_in_the_unit_of_each_files_header(motion, folder, initial, inp
     [
         ("metres.csv", "u_s.csv", "expected x in mm, in which the model was learned, got m"),
         ("ms.csv", "u_mV.csv", "expected u in V, in which the model was learned, got mV"),
-        ("ms.csv", "u_short.csv", "needs inputs from 19.95 to 22.95 s, and there are none from "
-         "21.45 to 22.95 s"),
+        (
+            "ms.csv",
+            "u_short.csv",
+            "needs inputs from 19.95 to 22.95 s, and there are none from 21.45 to 22.95 s",
+        ),
         ("ms.csv", "u_later.csv", "there are none from 19.95 to 21 s"),
         ("ms.csv", "u_before.csv", "there are none from 19.95 to 22.95 s"),
     ],
-)  # fmt: skip
+)
 def test_other_units_and_inputs_that_end_early_are_refused(folder, initial, inputs, told, capsys):
     status, rows, errors = predicted(folder, initial, inputs, capsys)
     assert status == 2
@@ -116,8 +135,18 @@ def test_inputs_ahead_may_be_coarse_or_lack_values(motion, folder, plan, capsys)
 
 def test_a_comparison_may_be_in_another_unit_of_time(folder, capsys):
     out = folder / "c.csv"
-    arguments = ["predict", str(folder / "model"), "--initial", str(folder / "s.csv"), "--to", "18",
-                 "--compare", str(folder / "ms.csv"), "--out", str(out)]  # fmt: skip
+    arguments = [
+        "predict",
+        str(folder / "model"),
+        "--initial",
+        str(folder / "s.csv"),
+        "--to",
+        "18",
+        "--compare",
+        str(folder / "ms.csv"),
+        "--out",
+        str(out),
+    ]
     assert main(arguments) == 0
     told = capsys.readouterr().out
     assert "up to t = 19.95 s" in told
@@ -137,16 +166,38 @@ def swings(tmp_path_factory):
     """Files of a damped swing in degrees and in radians, and models of the first part of each."""
     rng, folder = np.random.default_rng(1), tmp_path_factory.mktemp("swings")
     t = DT * np.arange(SEEN)
-    swing = solve_ivp(lambda _, x: [x[1], -9 * np.sin(x[0]) - 0.1 * x[1]], (0, t[-1]), [0.8, 0],
-                      t_eval=t, rtol=1e-9, atol=1e-9)  # fmt: skip
+    swing = solve_ivp(
+        lambda _, x: [x[1], -9 * np.sin(x[0]) - 0.1 * x[1]],
+        (0, t[-1]),
+        [0.8, 0],
+        t_eval=t,
+        rtol=1e-9,
+        atol=1e-9,
+    )
     theta = swing.y[0] + 1e-4 * rng.normal(size=SEEN)
     for unit, factor in (("deg", 180 / np.pi), ("rad", 1.0), ("mrad", 1e3)):
-        np.savetxt(folder / f"{unit}.csv", np.stack([t, factor * theta], axis=1), delimiter=",",
-                   header=f"t [s],theta [{unit}]", comments="")  # fmt: skip
+        np.savetxt(
+            folder / f"{unit}.csv",
+            np.stack([t, factor * theta], axis=1),
+            delimiter=",",
+            header=f"t [s],theta [{unit}]",
+            comments="",
+        )
     for unit in ("deg", "rad"):
         with contextlib.redirect_stderr(io.StringIO()):
-            assert main(["fit", str(folder / f"{unit}.csv"), "--to", "15", "--out",
-                         str(folder / f"model-{unit}")]) == 0  # fmt: skip
+            assert (
+                main(
+                    [
+                        "fit",
+                        str(folder / f"{unit}.csv"),
+                        "--to",
+                        "15",
+                        "--out",
+                        str(folder / f"model-{unit}"),
+                    ]
+                )
+                == 0
+            )
     return folder
 
 
@@ -154,10 +205,21 @@ def swings(tmp_path_factory):
 @pytest.mark.parametrize(("initial", "compare"), [("deg", "rad"), ("rad", "deg")])
 def test_degrees_and_radians_go_together(swings, model, initial, compare, capsys):
     """What is compared is in the unit of the file that is compared with."""
-    status = main(["predict", str(swings / f"model-{model}"), "--initial",
-                   str(swings / f"{initial}.csv"), "--to", "15", "--compare",
-                   str(swings / f"{compare}.csv"), "--out", str(swings / "f.csv"),
-                   "--overwrite"])  # fmt: skip
+    status = main(
+        [
+            "predict",
+            str(swings / f"model-{model}"),
+            "--initial",
+            str(swings / f"{initial}.csv"),
+            "--to",
+            "15",
+            "--compare",
+            str(swings / f"{compare}.csv"),
+            "--out",
+            str(swings / "f.csv"),
+            "--overwrite",
+        ]
+    )
     assert status == 0
     told = capsys.readouterr().out
     rms, unit = told.split("theta: RMS error ")[1].split(",")[0].split(" ")
@@ -167,9 +229,18 @@ def test_degrees_and_radians_go_together(swings, model, initial, compare, capsys
 
 @pytest.mark.parametrize("model", ["deg", "rad"])
 def test_parts_of_a_radian_are_refused(swings, model, capsys):
-    status = main(["predict", str(swings / f"model-{model}"), "--initial",
-                   str(swings / "mrad.csv"), "--num-steps", "5", "--out",
-                   str(swings / "m.csv")])  # fmt: skip
+    status = main(
+        [
+            "predict",
+            str(swings / f"model-{model}"),
+            "--initial",
+            str(swings / "mrad.csv"),
+            "--num-steps",
+            "5",
+            "--out",
+            str(swings / "m.csv"),
+        ]
+    )
     assert status == 2
     assert f"expected theta in {model}, in which the model was learned, got mrad" in (
         capsys.readouterr().err
@@ -181,13 +252,28 @@ def test_a_velocity_in_another_unit_is_not_left_out_in_silence(tmp_path, capsys)
     x, v = np.exp(-0.05 * t) * np.stack([np.cos(3 * t), -3 * np.sin(3 * t) - 0.05 * np.cos(3 * t)])
     x, v = x + 1e-2 * rng.normal(size=SEEN), v + 1e-2 * rng.normal(size=SEEN)
     for name, unit, factor in (("both", "m/s", 1.0), ("other", "mm/s", 1e3)):
-        np.savetxt(tmp_path / f"{name}.csv", np.stack([t, x, factor * v], axis=1), delimiter=",",
-                   header=f"t [s],x [m],v [{unit}]", comments="")  # fmt: skip
+        np.savetxt(
+            tmp_path / f"{name}.csv",
+            np.stack([t, x, factor * v], axis=1),
+            delimiter=",",
+            header=f"t [s],x [m],v [{unit}]",
+            comments="",
+        )
     columns = ["--positions", "x", "--velocities", "v"]
     model = str(tmp_path / "model")
     assert main(["fit", str(tmp_path / "both.csv"), *columns, "--out", model]) == 0
-    status = main(["predict", model, "--initial", str(tmp_path / "other.csv"), "--num-steps", "5",
-                   "--out", str(tmp_path / "f.csv")])  # fmt: skip
+    status = main(
+        [
+            "predict",
+            model,
+            "--initial",
+            str(tmp_path / "other.csv"),
+            "--num-steps",
+            "5",
+            "--out",
+            str(tmp_path / "f.csv"),
+        ]
+    )
     assert status == 2
     assert "expected v in m/s, in which the model was learned, got mm/s" in capsys.readouterr().err
 

@@ -175,13 +175,23 @@ def double_pendulum(gamma, count=200, dt=0.2):
     z0 = np.random.default_rng(0).uniform(-1, 1, (count, 4)) * [1.5, 1.5, 0.7, 0.7]
     none = (0, 0)
     terms = Terms.of(
-        [((2, 0), none, none, 0.0), ((0, 2), none, none, 0.0), ((1, 1), none, (1, -1), 0.0),
-         (none, none, (1, 0), 0.0), (none, none, (0, 1), 0.0)], 2,
-    )  # fmt: skip
+        [
+            ((2, 0), none, none, 0.0),
+            ((0, 2), none, none, 0.0),
+            ((1, 1), none, (1, -1), 0.0),
+            (none, none, (1, 0), 0.0),
+            (none, none, (0, 1), 0.0),
+        ],
+        2,
+    )
     law = Lagrangian(
-        terms, np.array([1.0, 0.5, 1.0, 2.0, 1.0]), Friction.of([], 2), np.zeros(0), gamma,
+        terms,
+        np.array([1.0, 0.5, 1.0, 2.0, 1.0]),
+        Friction.of([], 2),
+        np.zeros(0),
+        gamma,
         np.zeros((2, 0)),
-    )  # fmt: skip
+    )
 
     def field(_, y):
         return np.concatenate([y[2:], law.acceleration(y[None, :2], y[None, 2:])[0]])
@@ -194,9 +204,12 @@ def double_pendulum(gamma, count=200, dt=0.2):
 @pytest.mark.slow
 def test_a_double_pendulum_is_a_lagrangian_of_five_terms():
     fit = gfnn.fit(
-        double_pendulum(0.01), tolerance=1e-10, angles=(0, 1), learn="hamiltonian",
+        double_pendulum(0.01),
+        tolerance=1e-10,
+        angles=(0, 1),
+        learn="hamiltonian",
         max_seconds=None,
-    )  # fmt: skip
+    )
     expected = {"v1²": 1, "v2²": 0.5, "v1 v2 cos(q1 - q2)": 1, "cos(q1)": 2, "cos(q2)": 1}
     assert law_of(fit) == pytest.approx(expected, rel=1e-11)
     assert fit.hamiltonian.friction[0].coefficient == pytest.approx(0.01, abs=1e-12)

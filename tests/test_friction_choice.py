@@ -100,10 +100,14 @@ def test_friction_that_falls_below_zero_by_longer_arcs_is_dropped():
     def fit(structure, *_):
         p = np.array(of[structure.friction])
         return SimpleNamespace(
-            structure=structure, p=p, values=dict(zip(structure.keys(), p, strict=True)),
-            covariance=lambda: np.diag(np.full(len(p), 1e-4)), arcs=Arcs(*5 * [None]), sigma=None,
+            structure=structure,
+            p=p,
+            values=dict(zip(structure.keys(), p, strict=True)),
+            covariance=lambda: np.diag(np.full(len(p), 1e-4)),
+            arcs=Arcs(*5 * [None]),
+            sigma=None,
             fitted=SimpleNamespace(cost=1.0, x=None),
-        )  # fmt: skip
+        )
 
     plain = SimpleNamespace(coordinates=("x",), speeds=("v",))
     bench = SimpleNamespace(fit=fit, systems=None, observation=plain)
@@ -125,12 +129,15 @@ def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():
         friction = tuple(((1,), kind, 0.0) for kind in range(len(losses)))
         values = {("loss", row): loss for row, loss in zip(friction, losses, strict=True)}
         return SimpleNamespace(
-            values=values, structure=SimpleNamespace(friction=friction), p=np.array(losses),
-            correlation=2.0, arcs=SimpleNamespace(y=x[..., :1]),
+            values=values,
+            structure=SimpleNamespace(friction=friction),
+            p=np.array(losses),
+            correlation=2.0,
+            arcs=SimpleNamespace(y=x[..., :1]),
             fitted=SimpleNamespace(
                 residuals=size * noise / sigma, cost=cost, sigma=np.array([sigma])
             ),
-        )  # fmt: skip
+        )
 
     bench = SimpleNamespace(observation=SimpleNamespace(loss=SOFT_L1))
     drives, lost, two = fit(0.5, [0.3, -0.1]), fit(0.4, [0.1], cost=np.inf), fit(1.0, [0.2, 0.1])

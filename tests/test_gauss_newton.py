@@ -20,9 +20,10 @@ from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.phase_space import Pairs
 
 HENON_HEILES = Terms(
-    2, ("q1", "q2", "p1", "p2"),
+    2,
+    ("q1", "q2", "p1", "p2"),
     ((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, 2, 0), (0, 0, 0, 2), (2, 1, 0, 0), (0, 3, 0, 0)),
-)  # fmt: skip
+)
 TRUE = np.array([0.5, 0.5, 0.5, 0.5, 1.0, -1 / 3])
 
 

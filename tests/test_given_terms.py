@@ -25,12 +25,17 @@ def test_terms_are_read_as_they_are_written():
         "R: abs(omega2 - omega1)**3 + sqrt(omega2**2 + 0.04) + abs(omega1)",
     )
     assert found.terms == (
-        V1, ((1, 1), (0, 0), (1, -1), 0.1), ((0, 2), (0, 0), (0, 0), 0.0),
+        V1,
+        ((1, 1), (0, 0), (1, -1), 0.1),
+        ((0, 2), (0, 0), (0, 0), 0.0),
         ((0, 0), (2, 1), (0, 2), -np.pi / 2),
-    )  # fmt: skip
+    )
     assert found.friction == (
-        ((1, 0), LINEAR, 0.0), ((-1, 1), QUADRATIC, 0.0), ((0, 1), DRY, 0.2), ((1, 0), DRY, 0.0)
-    )  # fmt: skip
+        ((1, 0), LINEAR, 0.0),
+        ((-1, 1), QUADRATIC, 0.0),
+        ((0, 1), DRY, 0.2),
+        ((1, 0), DRY, 0.0),
+    )
 
 
 def test_masses_are_there_without_being_said():

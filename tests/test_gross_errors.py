@@ -60,9 +60,10 @@ def test_states_at_the_rim_are_kept_where_the_map_of_the_others_is_lost_there(
     )
     data = Data(pairs=Pairs(z, z, 0.1), user_angles=(), spread=np.ones(2))
     found = types.SimpleNamespace(
-        data=data, tolerance=types.SimpleNamespace(relative=True),
+        data=data,
+        tolerance=types.SimpleNamespace(relative=True),
         found=types.SimpleNamespace(ranking=[entry]),
-    )  # fmt: skip
+    )
 
     def stepped(map_, z0, dt, args, timed):
         failed = np.isin(np.arange(len(z0)), unsolved)

@@ -38,8 +38,15 @@ def learned(pairs, tolerance, terms=(), angles=(0,)):
 
 def test_growth_follows_the_difference_of_two_angles():
     """Of the modes of order 4 the box holds none; they are found along m₁ + m₂ = 0 alone."""
-    terms = ["p1**2", "p2**2", "cos(q2)", "cos(q1 - q2)*p1*p2", "cos(2*q1 - 2*q2)",
-             "cos(4*q1 - 4*q2)*p1**2", "sin(5*q1 - 5*q2)*p1*p2"]  # fmt: skip
+    terms = [
+        "p1**2",
+        "p2**2",
+        "cos(q2)",
+        "cos(q1 - q2)*p1*p2",
+        "cos(2*q1 - 2*q2)",
+        "cos(4*q1 - 4*q2)*p1**2",
+        "sin(5*q1 - 5*q2)*p1*p2",
+    ]
     coefficients = [0.5, 0.5, -1.0, -0.5, 0.3, 0.1, 0.05]
     pairs = pairs_of(terms, coefficients, 250, 0.05)
     problem = Problem(pairs.z0, pairs.z1, pairs.dt, np.ones(4))

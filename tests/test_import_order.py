@@ -14,15 +14,49 @@ PACKAGE = Path(gfnn_jax.__file__).parent
 
 # A module imports only from rooms before its own; the modules of a room share its place.
 ORDER = (
-    "arrays", "errors", "phase_space", "coordinates", "compiling", "threads", "processes", "budget",
-    "storage", "signals", "data", "records", "scenes", "families", "solve", "generating", "flows",
-    "maps", "dataset", "exports", "fitting", "candidates", "diagnosis",
-    "models.model", "models.parameters", "models.positions", "models.lagrangians",
-    "models.textbook", "models.generating_functions", "models.hamiltonians",
-    "search", "models.maps_of_laws",
-    "learn", "baselines", "evaluate", "jobs", "cli_columns", "cli_parser", "cli_process",
-    "cli_summary", "cli", "__main__",
-)  # fmt: skip
+    "arrays",
+    "errors",
+    "phase_space",
+    "coordinates",
+    "compiling",
+    "threads",
+    "processes",
+    "budget",
+    "storage",
+    "signals",
+    "data",
+    "records",
+    "scenes",
+    "families",
+    "solve",
+    "generating",
+    "flows",
+    "maps",
+    "dataset",
+    "exports",
+    "fitting",
+    "candidates",
+    "diagnosis",
+    "models.model",
+    "models.parameters",
+    "models.positions",
+    "models.lagrangians",
+    "models.textbook",
+    "models.generating_functions",
+    "models.hamiltonians",
+    "search",
+    "models.maps_of_laws",
+    "learn",
+    "baselines",
+    "evaluate",
+    "jobs",
+    "cli_columns",
+    "cli_parser",
+    "cli_process",
+    "cli_summary",
+    "cli",
+    "__main__",
+)
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
     ("maps.symplectic_map", f"maps.{name}")
@@ -115,9 +149,10 @@ def test_fitting_never_solves():
         if name.startswith("fitting"):
             of_steps = ("newton", "fixed_point", "krylov")
             steps = (
-                "gfnn_jax.generating.generated", "gfnn_jax.maps.symplectic",
+                "gfnn_jax.generating.generated",
+                "gfnn_jax.maps.symplectic",
                 *(f"gfnn_jax.solve.{name}" for name in of_steps),
-            )  # fmt: skip
+            )
             assert not [i for i in imports(tree) if i.startswith(steps)], name
 
 
@@ -178,9 +213,11 @@ def models_told_apart():
             continue
         of_models = {
             alias.asname or alias.name
-            for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)
-            and (node.module or "").startswith("gfnn_jax.models.") for alias in node.names
-        }  # fmt: skip
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom)
+            and (node.module or "").startswith("gfnn_jax.models.")
+            for alias in node.names
+        }
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance":
                 classes = {n.id for n in ast.walk(node.args[1]) if isinstance(n, ast.Name)}

@@ -53,9 +53,13 @@ def states(count=5):
 def derivatives_of_the_plain_sum(q, v):
     by_v = jax.grad(plain, 1)
     return (
-        plain(q, v), jax.grad(plain)(q, v), by_v(q, v), jax.hessian(plain)(q, v),
-        jax.jacfwd(by_v)(q, v), jax.hessian(plain, 1)(q, v),
-    )  # fmt: skip
+        plain(q, v),
+        jax.grad(plain)(q, v),
+        by_v(q, v),
+        jax.hessian(plain)(q, v),
+        jax.jacfwd(by_v)(q, v),
+        jax.hessian(plain, 1)(q, v),
+    )
 
 
 @pytest.mark.parametrize("xp", [np, jnp])
@@ -109,9 +113,13 @@ def test_padding_moves_nothing():
     q, v = states()
     model = law()
     longer = Lagrangian(
-        model.terms.padded(12), np.pad(THETA, (0, 5)), model.friction.padded(6),
-        np.pad(RHO, (0, 3)), 0.03, GAINS,
-    )  # fmt: skip
+        model.terms.padded(12),
+        np.pad(THETA, (0, 5)),
+        model.friction.padded(6),
+        np.pad(RHO, (0, 3)),
+        0.03,
+        GAINS,
+    )
     np.testing.assert_allclose(longer.acceleration(q, v), model.acceleration(q, v), rtol=1e-13)
 
 

@@ -58,8 +58,9 @@ def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
     monkeypatch.setattr(fit_job, "_LARGE_BYTES", 0)
     few = functools.partial(read_sample, num_pairs=200)
     monkeypatch.setattr(fit_job, "read_sample", few)
-    ran = fit_job.fit(file, out=tmp_path / "m", scene_name="standard-map-regular", tolerance=1e-3,
-                       chart="type2")  # fmt: skip
+    ran = fit_job.fit(
+        file, out=tmp_path / "m", scene_name="standard-map-regular", tolerance=1e-3, chart="type2"
+    )
     assert ran is not None
     assert ran.report["data"]["num_pairs"] == 3_000
     scene = gfnn.scenes.make("standard-map-regular")
@@ -82,8 +83,14 @@ def test_a_refit_that_does_not_fit_into_the_budget_is_left_out(file, tmp_path, m
     monkeypatch.setattr(fit_job, "read_sample", functools.partial(read_sample, num_pairs=200))
     monkeypatch.setattr(fit_job, "work_of_refit", lambda *given: 1e6)
     with pytest.warns(gfnn.FitWarning, match="a sample of 200 pairs, not to all of them: no time"):
-        ran = fit_job.fit(file, out=tmp_path / "m", scene_name="standard-map-regular",
-                          tolerance=1e-3, chart="type2", max_seconds=600.0)  # fmt: skip
+        ran = fit_job.fit(
+            file,
+            out=tmp_path / "m",
+            scene_name="standard-map-regular",
+            tolerance=1e-3,
+            chart="type2",
+            max_seconds=600.0,
+        )
     assert ran is not None
     assert ran.report["data"]["num_pairs"] == 200
 

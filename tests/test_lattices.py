@@ -81,10 +81,17 @@ def test_a_sum_is_what_is_written_out(ends):
 def test_terms_stand_in_the_shortest_window():
     family = site_terms(8, "ring", 1, 2, ("exp(q1 - q3)",))
     assert family.term_names == (
-        "q_i", "p_i", "q_i²", "p_i²", "q_i p_i",
-        "q_{i+1} - q_i", "(q_{i+1} - q_i)²", "q_i (q_{i+1} - q_i)", "p_i (q_{i+1} - q_i)",
+        "q_i",
+        "p_i",
+        "q_i²",
+        "p_i²",
+        "q_i p_i",
+        "q_{i+1} - q_i",
+        "(q_{i+1} - q_i)²",
+        "q_i (q_{i+1} - q_i)",
+        "p_i (q_{i+1} - q_i)",
         "exp(q_i - q_{i+2})",
-    )  # fmt: skip
+    )
     assert family.take([3, 9]).term_names == ("p_i²", "exp(q_i - q_{i+2})")
 
 
@@ -175,8 +182,10 @@ def test_terms_of_a_site_that_a_user_knows():
     fit = gfnn.fit(pairs, structure="ring", terms=["1/(1 + q1**2)"], tolerance=1e-12)
     assert fit.met
     assert {term for term, *_ in fit.hamiltonian.terms} == {
-        "1/(1 + q_i**2)", "p_i²", "(q_{i+1} - q_i)²",
-    }  # fmt: skip
+        "1/(1 + q_i**2)",
+        "p_i²",
+        "(q_{i+1} - q_i)²",
+    }
 
 
 @pytest.mark.slow
@@ -207,9 +216,13 @@ def test_two_fields_at_every_site(tmp_path, structure):
         gfnn.Pairs(z0[:12], z1[:12], 0.1), structure=structure, terms=["q1*q2**2"], tolerance=1e-12
     )
     assert {term: round(c, 9) for term, c, _ in fit.hamiltonian.terms} == {
-        "p1_i²": 0.5, "p2_i²": 0.25, "q2_i²": 0.3, "q1_i*q2_i**2": 0.2, "(q1_{i+1} - q1_i)²": 0.5,
+        "p1_i²": 0.5,
+        "p2_i²": 0.25,
+        "q2_i²": 0.3,
+        "q1_i*q2_i**2": 0.2,
+        "(q1_{i+1} - q1_i)²": 0.5,
         "(q2_{i+1} - q2_i)²": 0.1,
-    }  # fmt: skip
+    }
     fit.map.save(tmp_path / "model")
     found, _ = gfnn.load(tmp_path / "model").step(z0[12:])
     np.testing.assert_allclose(found, z1[12:], atol=1e-13)
@@ -308,10 +321,15 @@ def test_bodies_of_a_species_share_their_coefficients(tmp_path):
     assert cli.main([*given, "--structure", "bodies:4:abba"]) == 0
     report = json.loads((model / "report.json").read_text(encoding="utf-8"))
     found = {term["term"]: term["coefficient"] for term in report["hamiltonian"]["terms"]}
-    assert found == pytest.approx({
-        "Σ_{i∈a} |p_i|²": 0.5, "Σ_{i∈b} |p_i|²": 0.25, "Σ_{i∈a,j∈b} 1/|q_i - q_j|": -2.0,
-        "1/|q_1 - q_4|": -1.0, "1/|q_2 - q_3|": -4.0,
-    })  # fmt: skip
+    assert found == pytest.approx(
+        {
+            "Σ_{i∈a} |p_i|²": 0.5,
+            "Σ_{i∈b} |p_i|²": 0.25,
+            "Σ_{i∈a,j∈b} 1/|q_i - q_j|": -2.0,
+            "1/|q_1 - q_4|": -1.0,
+            "1/|q_2 - q_3|": -4.0,
+        }
+    )
     np.testing.assert_allclose(gfnn.load(model).step(z0[:5])[0], z1[:5], atol=1e-13)
 
 

@@ -106,9 +106,18 @@ def test_the_misfit_is_in_proportion_to_the_motion_where_its_errors_are(relative
     amplitude = np.exp(-phase / 20)
     x = np.stack([amplitude * np.cos(phase) + 2 * np.pi, -amplitude * np.sin(phase)], axis=1)
     sensors = Sensors(
-        ("theta",), (), ("theta",), 1e-3 * np.ones(1), 1.0, 1.0, "hold", 0.0, np.ones(1),
-        np.ones((1, 1)), middle=np.zeros(1),
-    )  # fmt: skip
+        ("theta",),
+        (),
+        ("theta",),
+        1e-3 * np.ones(1),
+        1.0,
+        1.0,
+        "hold",
+        0.0,
+        np.ones(1),
+        np.ones((1, 1)),
+        middle=np.zeros(1),
+    )
     reach = np.sqrt(np.mean(sensors.distances(x) ** 2, axis=0))
     sensors = dataclasses.replace(sensors, reach=reach)
     errors = 0.01 * rng.normal(size=(400, 3, 1)) * (amplitude[:, None, None] if relative else 0.5)

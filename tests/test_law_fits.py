@@ -40,9 +40,13 @@ def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):
     """θ̈ = −2 sin θ − γ θ̇, by SciPy."""
     t = np.arange(0, end, dt)
     found = solve_ivp(
-        lambda _, x: [x[1], -2 * np.sin(x[0]) - gamma * x[1]], (0, end), [amplitude, 0.0],
-        t_eval=t, rtol=1e-10, atol=1e-12,
-    )  # fmt: skip
+        lambda _, x: [x[1], -2 * np.sin(x[0]) - gamma * x[1]],
+        (0, end),
+        [amplitude, 0.0],
+        t_eval=t,
+        rtol=1e-10,
+        atol=1e-12,
+    )
     return t, found.y[0] + noise * np.random.default_rng(0).normal(size=len(t))
 
 
@@ -125,11 +129,19 @@ def test_rows_of_arcs_tell_the_residuals_of_other_coefficients():
 
 
 def test_steps_have_the_derivatives_of_finite_differences():
-    rows = [((2, 0), (0, 0), (0, 0), 0.0), ((1, 1), (0, 0), (1, -1), 0.0),
-            ((0, 2), (1, 1), (0, 0), 0.0), ((0, 2), (0, 0), (0, 0), 0.0),
-            ((0, 0), (0, 0), (1, 0), 0.2)]  # fmt: skip
-    friction = [((1, 0), LINEAR, 0), ((-1, 1), QUADRATIC, 0), ((0, 1), DRY, 0.2),
-                ((0, 0), UNIFORM, 0)]  # fmt: skip
+    rows = [
+        ((2, 0), (0, 0), (0, 0), 0.0),
+        ((1, 1), (0, 0), (1, -1), 0.0),
+        ((0, 2), (1, 1), (0, 0), 0.0),
+        ((0, 2), (0, 0), (0, 0), 0.0),
+        ((0, 0), (0, 0), (1, 0), 0.2),
+    ]
+    friction = [
+        ((1, 0), LINEAR, 0),
+        ((-1, 1), QUADRATIC, 0),
+        ((0, 1), DRY, 0.2),
+        ((0, 0), UNIFORM, 0),
+    ]
     friction = Friction.of(friction, 2)
     form = Form(Terms.of(rows, 2), np.zeros(5), np.eye(5), friction, 1)
     p = np.array([0.5, 0.2, 0.02, 0.4, 2.0, 0.1, 0.05, 0.1, 0.05, 1.0, -0.5])
@@ -137,10 +149,14 @@ def test_steps_have_the_derivatives_of_finite_differences():
     x, u, h = rng.normal(size=(3, 4)), rng.normal(size=(3, 2, 6, 1)), np.full(3, 0.1)
     step = form.step(p, x, h, u)
     e = 1e-6
-    by_state = [form.step(p, x + e * d, h, u).states - form.step(p, x - e * d, h, u).states
-                for d in np.eye(4)]  # fmt: skip
-    by_p = [form.step(p + e * d, x, h, u).states - form.step(p - e * d, x, h, u).states
-            for d in np.eye(len(p))]  # fmt: skip
+    by_state = [
+        form.step(p, x + e * d, h, u).states - form.step(p, x - e * d, h, u).states
+        for d in np.eye(4)
+    ]
+    by_p = [
+        form.step(p + e * d, x, h, u).states - form.step(p - e * d, x, h, u).states
+        for d in np.eye(len(p))
+    ]
     np.testing.assert_allclose(step.by_state, np.stack(by_state, -1) / (2 * e), atol=1e-8)
     np.testing.assert_allclose(step.by_coefficients, np.stack(by_p, -1) / (2 * e), atol=1e-8)
 
@@ -302,8 +318,15 @@ def test_a_driven_mass_has_a_law_of_one_term():
     """ẍ = u − ẋ/2: no coefficient of L is free."""
     t = 0.02 * np.arange(1000)
     u = np.sin(1.3 * t) + 0.5 * np.sin(2.9 * t + 1)
-    x = solve_ivp(lambda s, z: [z[1], np.interp(s, t, u) - 0.5 * z[1]], (0, t[-1]), [0, 0],
-                  t_eval=t, rtol=1e-9, atol=1e-11, max_step=0.02).y[0]  # fmt: skip
+    x = solve_ivp(
+        lambda s, z: [z[1], np.interp(s, t, u) - 0.5 * z[1]],
+        (0, t[-1]),
+        [0, 0],
+        t_eval=t,
+        rtol=1e-9,
+        atol=1e-11,
+        max_step=0.02,
+    ).y[0]
     x += 1e-5 * np.random.default_rng(0).normal(size=len(t))
     fit = gfnn.fit(gfnn.Recording({"t": t, "x": x, "u": u}, positions=["x"], inputs=["u"]))
     assert fit.lagrangian.formula == "0.5*v**2"
@@ -482,8 +505,14 @@ def test_a_known_mass_scales_the_law():
 
 
 def test_a_lagrangian_of_the_search_is_a_pytree():
-    law = Lagrangian(Terms.of([((2,), (0,), (0,), 0.0)], 1), np.ones(1), Friction.of([], 1),
-                     np.zeros(0), 0.0, np.zeros((1, 0)))  # fmt: skip
+    law = Lagrangian(
+        Terms.of([((2,), (0,), (0,), 0.0)], 1),
+        np.ones(1),
+        Friction.of([], 1),
+        np.zeros(0),
+        0.0,
+        np.zeros((1, 0)),
+    )
     assert jax.tree.map(np.shape, law).coefficients == (1,)
 
 
@@ -656,8 +685,9 @@ def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs(tmp_path):
         assert abs(gain - value) < 4 * std < 0.05, name
     assert len(fit.messages) == 1
     assert fit.friction.terms[0].coefficient == pytest.approx(0.1, rel=0.05)
-    ahead = gfnn.Recording({k: v[500:] for k, v in table.items()}, positions=["x"],
-                           inputs=["u", "w"])  # fmt: skip
+    ahead = gfnn.Recording(
+        {k: v[500:] for k, v in table.items()}, positions=["x"], inputs=["u", "w"]
+    )
     found = fit.map.forecast(recording.slice(20.0, 24.95), t[501:], ahead)
     assert np.abs(found.values["x"][0] - x[501:]).max() < 0.02
     delay, std = fit.delay
@@ -676,9 +706,12 @@ def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs(tmp_path):
         (tmp_path / f"{name}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     out = tmp_path / "out.csv"
     forecast_recording(
-        tmp_path / "model", tmp_path / "past.csv", inputs=tmp_path / "ahead.csv", num_steps=99,
+        tmp_path / "model",
+        tmp_path / "past.csv",
+        inputs=tmp_path / "ahead.csv",
+        num_steps=99,
         out=out,
-    )  # fmt: skip
+    )
     rows = np.genfromtxt(out, delimiter=",", names=True)
     assert np.abs(rows["x"] - x[500:599]).max() < 0.02
 

@@ -17,9 +17,13 @@ from gfnn_jax.maps.sensors import Sensors
 # A pendulum whose pivot is driven by a motor.
 TERMS = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (0,), (1,), 0.0)], 1)
 LAW = Lagrangian(
-    TERMS, np.array([0.5, 9.0]), Friction.of([((1,), LINEAR, 0.0), ((1,), DRY, 0.3)], 1),
-    np.array([0.2, 0.1]), 0.0, np.array([[1.5]]),
-)  # fmt: skip
+    TERMS,
+    np.array([0.5, 9.0]),
+    Friction.of([((1,), LINEAR, 0.0), ((1,), DRY, 0.3)], 1),
+    np.array([0.2, 0.1]),
+    0.0,
+    np.array([[1.5]]),
+)
 DT, STEPS = 0.05, 30
 RNG = np.random.default_rng(0)
 Z = np.stack([RNG.uniform(-1, 1, 200), RNG.normal(size=200)], axis=1)
@@ -79,8 +83,9 @@ def test_delayed_inputs_keep_their_momentum(hold, delay):
     fine = np.arange(0, 200, 0.01) + 0.005 - delay
     inside = {
         "hold": u[np.clip(np.floor(fine).astype(int), 0, 199), 0],
-        "linear": np.interp(fine, np.arange(200), u[:, 0]), "band": np.cos(0.4 * fine + 1),
-    }  # fmt: skip
+        "linear": np.interp(fine, np.arange(200), u[:, 0]),
+        "band": np.cos(0.4 * fine + 1),
+    }
     expected = 0.1 * inside[hold].reshape(200, 100).mean(axis=1)
     np.testing.assert_allclose(found[40:-40], expected[40:-40], atol=1e-5)
 
@@ -200,12 +205,17 @@ def test_a_forecast_and_its_band_across_a_stop():
     it stops, and how sure that is, are those of the exact motion."""
     time, turn, friction, errors = 0.1 * np.arange(201), 0.42, 0.05, np.array([2e-3, 3e-4])
     law = Lagrangian(
-        SPRING, np.array([0.5, -0.5]), Friction.of([((1,), DRY, 1e-6)], 1), np.array([friction]),
-        0.0, np.zeros((1, 0)),
-    )  # fmt: skip
+        SPRING,
+        np.array([0.5, -0.5]),
+        Friction.of([((1,), DRY, 1e-6)], 1),
+        np.array([friction]),
+        0.0,
+        np.zeros((1, 0)),
+    )
     sigma, ends = np.array([1e-5]), np.array([20.0])
-    sensors = Sensors(("x",), (), (), sigma, 1.0, 1.0, "hold", 0.0, ends, np.zeros((1, 1)),
-                      creep=1e-6)  # fmt: skip
+    sensors = Sensors(
+        ("x",), (), (), sigma, 1.0, 1.0, "hold", 0.0, ends, np.zeros((1, 1)), creep=1e-6
+    )
     root, covariance = np.diag([0.0, 0.0, errors[1]]), np.diag([errors[0] ** 2, 0.0])
     used = law_in_use(law, root, sensors)
     window = Window(time[:1], np.full((1, 1), turn), np.zeros(0), np.zeros((0, 0)))
@@ -216,8 +226,11 @@ def test_a_forecast_and_its_band_across_a_stop():
     assert abs(stop) < friction  # it has stopped, and not where the spring is slack
     np.testing.assert_allclose(found.values[0, :, 0], expected[1:], atol=1e-8)
     e = 1e-5
-    slopes = [block(turn + e * a, friction + e * b, time)[0] - block(turn - e * a, friction - e * b,
-              time)[0] for a, b in np.eye(2)]  # fmt: skip
+    slopes = [
+        block(turn + e * a, friction + e * b, time)[0]
+        - block(turn - e * a, friction - e * b, time)[0]
+        for a, b in np.eye(2)
+    ]
     spread = np.linalg.norm(np.stack(slopes) / (2 * e) * errors[:, None], axis=0)
     np.testing.assert_allclose(found.std[0, :, 0], np.hypot(spread[1:], sigma), rtol=1e-3)
     assert found.covariances[0, -1, 1, 1] < 1e-20  # it stands still
@@ -228,9 +241,13 @@ def test_a_forecast_across_a_stop():
     """Against the exact motion, with the map of the narrow law."""
     friction, dt, count = 0.05, 0.1, 300
     wide = Lagrangian(
-        SPRING, np.array([0.5, -0.5]), Friction.of([((1,), DRY, 0.05)], 1), np.array([friction]),
-        0.0, np.zeros((1, 0)),
-    )  # fmt: skip
+        SPRING,
+        np.array([0.5, -0.5]),
+        Friction.of([((1,), DRY, 0.05)], 1),
+        np.array([friction]),
+        0.0,
+        np.zeros((1, 0)),
+    )
     law = sticking(wide, noise=1e-3, duration=dt * count)
     z = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
     map_ = map_of_law(law, z, dt)

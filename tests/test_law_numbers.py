@@ -35,10 +35,14 @@ def told(dim, law, angles=()):
         (2, {"p1**2": 0.5, "p2**2": 0.5, "q2*p1": 1, "q1*p2": -1}, "rotation", "reversal of time"),
         (2, {"p1**2": 0.5, "p2**2/sin(q1)**2": 0.5}, "translation of q2", "exchange"),
         (1, {"p1**2": 0.5, "q1**2": 0.5}, "q1² + p1² conserved", "translation"),
-        (3, {"p1**2": 1, "p3**2": 1, "p2**2": 2, "q1*q3": 1}, "exchange of degrees of freedom 1 "
-         "and 3", "rotation in (q1, q2)"),
+        (
+            3,
+            {"p1**2": 1, "p3**2": 1, "p2**2": 2, "q1*q3": 1},
+            "exchange of degrees of freedom 1 and 3",
+            "rotation in (q1, q2)",
+        ),
     ],
-)  # fmt: skip
+)
 def test_symmetries_are_told(dim, law, expected, absent):
     found = "; ".join(told(dim, law))
     assert expected in found
@@ -109,9 +113,14 @@ def test_diffrax_takes_the_vector_field_of_a_law():
     z1 = np.stack([cos * z0[:, 0] + sin * z0[:, 1], cos * z0[:, 1] - sin * z0[:, 0]], axis=1)
     law = gfnn.fit(gfnn.Pairs(z0, z1, 0.3), learn="hamiltonian", tolerance=1e-9).hamiltonian
     solved = diffrax.diffeqsolve(
-        diffrax.ODETerm(law.vector_field), diffrax.Dopri8(), 0.0, 2.0, 0.1, jnp.array([1.0, 0.0]),
+        diffrax.ODETerm(law.vector_field),
+        diffrax.Dopri8(),
+        0.0,
+        2.0,
+        0.1,
+        jnp.array([1.0, 0.0]),
         stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-10),
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(solved.ys[-1], [np.cos(2.0), -np.sin(2.0)], atol=1e-8)
     assert law._repr_latex_() == "$H = 0.5 p_{1}^{2} + 0.5 q_{1}^{2}$"
     assert any("q1² + p1² conserved" in text for text in law.symmetries)

@@ -100,9 +100,12 @@ def test_a_map_asked_for_is_a_map(pairs):
 
 def candidate(operations, error, bound=None, num_parameters=3):
     return types.SimpleNamespace(
-        operations=operations, validation_bound=error if bound is None else bound,
-        validation_relative=error, validation_rms=error, num_parameters=num_parameters,
-    )  # fmt: skip
+        operations=operations,
+        validation_bound=error if bound is None else bound,
+        validation_relative=error,
+        validation_rms=error,
+        num_parameters=num_parameters,
+    )
 
 
 @pytest.mark.parametrize(
@@ -158,10 +161,18 @@ def pendulum_pairs(num, reach, sigma):
     """States of |q1| and |p1| up to ``reach`` and 0.2 later, by another solver; noise on both."""
     rng = np.random.default_rng(0)
     q, p = z0 = rng.uniform(-1, 1, (2, num)) * np.array(reach)[:, None]
-    found = solve_ivp(
-        lambda t, z: np.concatenate([z[num:], -np.sin(z[:num])]), (0, 0.2),
-        np.concatenate([q, p]), method="DOP853", rtol=1e-12, atol=1e-12,
-    ).y[:, -1].reshape(2, num)  # fmt: skip
+    found = (
+        solve_ivp(
+            lambda t, z: np.concatenate([z[num:], -np.sin(z[:num])]),
+            (0, 0.2),
+            np.concatenate([q, p]),
+            method="DOP853",
+            rtol=1e-12,
+            atol=1e-12,
+        )
+        .y[:, -1]
+        .reshape(2, num)
+    )
     return gfnn.Pairs(*(z.T + sigma * rng.normal(size=(num, 2)) for z in (z0, found)), 0.2)
 
 
@@ -336,10 +347,18 @@ def test_a_known_law_leaves_little_to_learn(tmp_path):
     def kicked(num, seed):
         rng = np.random.default_rng(seed)
         z0 = np.column_stack([rng.uniform(-np.pi, np.pi, num), rng.uniform(-1.5, 1.5, num)])
-        half = solve_ivp(
-            lambda _, y: np.concatenate([y[num:], -np.sin(y[:num])]), (0, 1.0), z0.T.ravel(),
-            method="DOP853", rtol=1e-13, atol=1e-13,
-        ).y[:, -1].reshape(2, num)  # fmt: skip
+        half = (
+            solve_ivp(
+                lambda _, y: np.concatenate([y[num:], -np.sin(y[:num])]),
+                (0, 1.0),
+                z0.T.ravel(),
+                method="DOP853",
+                rtol=1e-13,
+                atol=1e-13,
+            )
+            .y[:, -1]
+            .reshape(2, num)
+        )
         z1 = np.column_stack([half[0], half[1] + 0.5 * np.sin(3 * half[0])])
         return gfnn.Pairs(z0, z1, 1.0)
 

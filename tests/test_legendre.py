@@ -12,16 +12,27 @@ from gfnn_jax.flows.legendre import Legendre, family_of, law_of
 # A double pendulum with a spring, and a term linear in v, as of a magnetic field.
 NONE = (0, 0)
 TERMS = Terms.of(
-    [((2, 0), NONE, NONE, 0.0), ((0, 2), NONE, NONE, 0.0), ((1, 1), NONE, (1, -1), 0.0),
-     (NONE, NONE, (1, 0), 0.0), (NONE, NONE, (0, 1), 0.0), (NONE, (0, 2), NONE, 0.0),
-     ((1, 0), (0, 1), NONE, 0.0)], 2,
-)  # fmt: skip
+    [
+        ((2, 0), NONE, NONE, 0.0),
+        ((0, 2), NONE, NONE, 0.0),
+        ((1, 1), NONE, (1, -1), 0.0),
+        (NONE, NONE, (1, 0), 0.0),
+        (NONE, NONE, (0, 1), 0.0),
+        (NONE, (0, 2), NONE, 0.0),
+        ((1, 0), (0, 1), NONE, 0.0),
+    ],
+    2,
+)
 THETA = np.array([1.0, 0.5, 1.0, 19.6, 9.8, -0.4, 0.7])
 W = np.random.default_rng(0).normal(size=(5, 4))
 LAW = Lagrangian(
-    TERMS, THETA, Friction.of([((1, 0), LINEAR, 0.0), ((1, -1), DRY, 0.3)], 2),
-    np.array([0.2, 0.1]), 0.1, np.array([[1.0], [0.5]]),
-)  # fmt: skip
+    TERMS,
+    THETA,
+    Friction.of([((1, 0), LINEAR, 0.0), ((1, -1), DRY, 0.3)], 2),
+    np.array([0.2, 0.1]),
+    0.1,
+    np.array([[1.0], [0.5]]),
+)
 
 
 def slopes(function, x, e=1e-5):
@@ -40,8 +51,10 @@ def test_derivatives():
     np.testing.assert_array_equal(hessian, np.swapaxes(hessian, 1, 2))
     np.testing.assert_allclose(
         family.parameter_gradients(THETA, W),
-        slopes(lambda theta: family.gradient(theta, W), THETA), rtol=1e-6, atol=1e-7,
-    )  # fmt: skip
+        slopes(lambda theta: family.gradient(theta, W), THETA),
+        rtol=1e-6,
+        atol=1e-7,
+    )
     both = jax.jit(lambda w: family.gradient_and_hessian(THETA, w))(W)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), both, (gradient, hessian)
@@ -55,12 +68,14 @@ def test_the_flow_obeys_the_equations_of_motion():
     def field(t, y, u):
         return np.concatenate([y[2:], LAW.acceleration(y[None, :2], y[None, 2:], u[None])[0]])
 
-    there = np.stack([
-        scipy.integrate.solve_ivp(
-            field, (0, 0.1), y, args=(one,), method="DOP853", rtol=1e-13, atol=1e-14
-        ).y[:, -1]
-        for y, one in zip(W, u, strict=True)
-    ])  # fmt: skip
+    there = np.stack(
+        [
+            scipy.integrate.solve_ivp(
+                field, (0, 0.1), y, args=(one,), method="DOP853", rtol=1e-13, atol=1e-14
+            ).y[:, -1]
+            for y, one in zip(W, u, strict=True)
+        ]
+    )
     family, params = family_of(LAW)
     state = Legendre(TERMS).state
     piece = Flow(family, params, 0.1, np.ones(4), 8, 4)

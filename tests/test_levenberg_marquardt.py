@@ -68,9 +68,14 @@ TRAINING, VALIDATION = gradient_data(pendulum, 130, 0), gradient_data(pendulum, 
 def fit_pendulum(*, chunk=40, resume=None, **limits):
     """13 hidden units; 130 pairs in chunks of 40 need padding."""
     return levenberg_marquardt(
-        NETWORK, network_params(2, 13), *TRAINING, validation=VALIDATION, chunk=chunk,
-        resume=resume, limits=Limits(**{"max_iterations": 12, **limits}),
-    )  # fmt: skip
+        NETWORK,
+        network_params(2, 13),
+        *TRAINING,
+        validation=VALIDATION,
+        chunk=chunk,
+        resume=resume,
+        limits=Limits(**{"max_iterations": 12, **limits}),
+    )
 
 
 def test_recovers_an_exactly_representable_function_to_roundoff():
@@ -154,9 +159,14 @@ def test_a_second_fit_of_the_same_shapes_compiles_nothing(compilations):
     start = network_params(5, 13)
     with compilations() as found:
         result = levenberg_marquardt(
-            Network(amplitude=2.0), start, w, target, validation=VALIDATION,
-            limits=Limits(2), chunk=40,
-        )  # fmt: skip
+            Network(amplitude=2.0),
+            start,
+            w,
+            target,
+            validation=VALIDATION,
+            limits=Limits(2),
+            chunk=40,
+        )
     assert found.count == 0
     assert result.compile_seconds < 0.1
     assert result.iterations == 2

@@ -130,8 +130,12 @@ def test_columns_that_are_odd_are_named(tmp_path, change, kind):
 
 def test_names_with_blanks_are_quoted_for_the_shell():
     t = np.arange(400) * 0.02
-    table = {"t": t, "the angle": np.cos(t), "its rate": -2.5 * np.sin(t),
-             "other angle": np.mod(90 * t, 360)}  # fmt: skip
+    table = {
+        "t": t,
+        "the angle": np.cos(t),
+        "its rate": -2.5 * np.sin(t),
+        "other angle": np.mod(90 * t, 360),
+    }
     roles = {"positions": ["the angle", "other angle"], "velocities": ["its rate"]}
     said = " ".join(map(str, gfnn.Recording(table, **roles).summary().faults))
     assert "--scale 'its rate'" in said
@@ -212,8 +216,12 @@ def test_a_million_rows_in_ten_seconds_and_a_gigabyte(tmp_path):
     np.savetxt(tmp_path / "r.csv", np.stack(columns, 1), "%.7g", ",", header=header, comments="")
     code = f"from gfnn_jax.cli import main; raise SystemExit(main(['look', '{tmp_path}/r.csv']))"
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False,
-                          env={"PYTHONPATH": str(Path(__file__).parent.parent)})  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        check=False,
+        env={"PYTHONPATH": str(Path(__file__).parent.parent)},
+    )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert done.returncode == 0
     assert after.ru_utime - before.ru_utime < 10

@@ -183,9 +183,10 @@ def test_base_map_around_a_generated_piece():
 
 
 @partial(
-    jax.tree_util.register_dataclass, data_fields=("matrix", "centre", "shift"),
+    jax.tree_util.register_dataclass,
+    data_fields=("matrix", "centre", "shift"),
     meta_fields=("known",),
-)  # fmt: skip
+)
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scaling(Affine):
     """As an affine map whose matrix need not be symplectic, and a multiplier that it claims."""

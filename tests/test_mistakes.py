@@ -23,8 +23,12 @@ PAIRS = gfnn.Pairs(Z0, Z1, DT)
 SCENE = gfnn.scenes.make("two-body")
 KEY = jax.random.key(0)
 OF_NUMPY = dataclasses.replace(
-    SCENE, flow=None, step=None, section=None, hamiltonian=lambda z, t=0.0: np.sum(np.cos(z)),
-)  # fmt: skip
+    SCENE,
+    flow=None,
+    step=None,
+    section=None,
+    hamiltonian=lambda z, t=0.0: np.sum(np.cos(z)),
+)
 LENGTH = RNG.uniform(0.5, 2, 200)
 
 
@@ -45,13 +49,17 @@ MISTAKES = {
     "transposed": (lambda: fit(Z0.T, Z1.T), "a row is a state; are the arrays transposed?"),
     "the same state all over": (lambda: fit(0 * Z0, 0 * Z1), "at least 8 different pairs"),
     "the same columns twice": (
-        lambda: fit(Z0, Z0), "z1 = z0 in every pair: is H = 0, or are these the same columns"),
+        lambda: fit(Z0, Z0),
+        "z1 = z0 in every pair: is H = 0, or are these the same columns",
+    ),
     "seven pairs": (lambda: fit(Z0[:7], Z1[:7]), "at least 8 different pairs for d = 1, got 7"),
     "complex numbers": (lambda: fit(Z0 + 0j), "z0 of real numbers, got complex128"),
     "numbers as text": (lambda: fit(Z0, Z1.astype(str)), "z1 of real numbers, got <U"),
     "objects": (lambda: fit(Z0.astype(object)), "z0 of real numbers, got object"),
     "a state that is not finite": (
-        lambda: fit(np.where(np.arange(200)[:, None] == 5, np.nan, Z0)), "the first is row 5"),
+        lambda: fit(np.where(np.arange(200)[:, None] == 5, np.nan, Z0)),
+        "the first is row 5",
+    ),
     "the array instead of pairs": (lambda: gfnn.fit(Z0), "gfnn.Pairs(z0, z1, dt), got ndarray"),
     "a tuple instead of pairs": (lambda: gfnn.fit((Z0, Z1, DT)), "(z0, z1, dt), got tuple"),
     "the file instead of pairs": (lambda: gfnn.fit("data.npz"), "gfnn.Pairs(z0, z1, dt), got str"),
@@ -65,9 +73,13 @@ MISTAKES = {
     "parameters without names or shape": (lambda: fit(Z0, Z1, DT, [1, 2]), "name -> (200,)"),
     "a parameter called q1": (lambda: fit(Z0, Z1, DT, {"q1": LENGTH}), "'q1' cannot name"),
     "a drive without its period": (
-        lambda: gfnn.fit(gfnn.Pairs(Z0, Z1, DT, t0=LENGTH)), "together with its period"),
+        lambda: gfnn.fit(gfnn.Pairs(Z0, Z1, DT, t0=LENGTH)),
+        "together with its period",
+    ),
     "a drive of period < 0": (
-        lambda: gfnn.fit(gfnn.Pairs(Z0, Z1, DT, t0=LENGTH, period=-1.0)), "drive's period, got -1"),
+        lambda: gfnn.fit(gfnn.Pairs(Z0, Z1, DT, t0=LENGTH, period=-1.0)),
+        "drive's period, got -1",
+    ),
     # What is asked for.
     "tolerance as text": (lambda: fit(tolerance="1e-6"), "number > 0 as tolerance, got '1e-6'"),
     "tolerance = 0": (lambda: fit(tolerance=0), "expected a finite number > 0 as tolerance, got 0"),
@@ -90,19 +102,26 @@ MISTAKES = {
     "a seed as text": (lambda: fit(seed="a"), "from 0 to 2**32 - 1 as seed, got 'a'"),
     # Drawing from scenes, loading.
     "a scene by a wrong name": (
-        lambda: gfnn.scenes.make("twobody"), "unknown scene 'twobody', did you mean 'two-body'?"),
+        lambda: gfnn.scenes.make("twobody"),
+        "unknown scene 'twobody', did you mean 'two-body'?",
+    ),
     "a name to draw from": (
-        lambda: gfnn.sample_pairs("two-body", 10, KEY), "e.g. gfnn.scenes.make('two-body'), got"),
+        lambda: gfnn.sample_pairs("two-body", 10, KEY),
+        "e.g. gfnn.scenes.make('two-body'), got",
+    ),
     "a Hamiltonian of NumPy": (
-        lambda: gfnn.sample_pairs(OF_NUMPY, 10, KEY), "the hamiltonian of the scene two-body"),
+        lambda: gfnn.sample_pairs(OF_NUMPY, 10, KEY),
+        "the hamiltonian of the scene two-body",
+    ),
     "a flow of NumPy": (
         lambda: gfnn.sample_pairs(dataclasses.replace(OF_NUMPY, flow=OF_NUMPY.hamiltonian), 9, KEY),
-        "expected the flow of the scene two-body written with jax.numpy"),
+        "expected the flow of the scene two-body written with jax.numpy",
+    ),
     "no pairs": (lambda: gfnn.sample_pairs(SCENE, 0, KEY), "number of states ≥ 1, got 0"),
     "a number as key": (lambda: gfnn.sample_pairs(SCENE, 10, 0), "e.g. jax.random.key(0), got 0"),
     "a folder that is not there": (lambda: gfnn.load("nowhere"), "nowhere: no such folder"),
     "a file instead of the folder": (lambda: gfnn.load(__file__), "no such folder"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
@@ -124,17 +143,21 @@ WITH_A_MAP = {
     "states of another d": (lambda m: m.rollout(np.ones((3, 4)), 9), "(2,) or (B, 2), got (3, 4)"),
     "transposed states": (lambda m: m.rollout(Z0[:5].T, 9), "(2,) or (B, 2), got (2, 5)"),
     "steps that are no whole number": (
-        lambda m: m.rollout(Z0[:3], 1e3), "whole number as num_steps"),
+        lambda m: m.rollout(Z0[:3], 1e3),
+        "whole number as num_steps",
+    ),
     "the inverse of no state": (lambda m: m.inverse(), "map.inverse(z); the inverse map itself is"),
     "nothing saved": (lambda m: m.rollout(Z0[:3], 9, save_every=0), "save_every >= 1"),
     "dt < 0": (lambda m: m.rollout(Z0[:3], 9, dt=-DT), "give rollout a negative num_steps"),
     "another dt": (lambda m: m.rollout(Z0[:3], 9, dt=0.2), "a map of dt = 0.1 only"),
     "parameters that it has not": (
-        lambda m: m.rollout(Z0[:3], 9, params={"l": 1.0}), "learned without"),
+        lambda m: m.rollout(Z0[:3], 9, params={"l": 1.0}),
+        "learned without",
+    ),
     "the time of no drive": (lambda m: m.rollout(Z0[:3], 9, t0=np.zeros(3)), "without a drive"),
     "no samples": (lambda m: m.sample(KEY, 0), "a number of samples above 0"),
     "more devices than there are": (lambda m: m.sharded(99), "all that exist here; got 99"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("mistake", WITH_A_MAP)

@@ -19,9 +19,10 @@ from gfnn_jax.phase_space import apply_j, symplectic_form
 DATA = np.random.default_rng(0).uniform(-1, 1, (400, 2))
 Z = DATA[:20]
 HENON_HEILES = Terms(
-    2, ("q1", "q2", "p1", "p2"),
+    2,
+    ("q1", "q2", "p1", "p2"),
     ((2, 0, 0, 0), (0, 2, 0, 0), (0, 0, 2, 0), (0, 0, 0, 2), (2, 1, 0, 0), (0, 3, 0, 0)),
-)  # fmt: skip
+)
 C = np.array([0.5, 0.5, 0.5, 0.5, 1.0, -1 / 3])
 WELL = np.random.default_rng(0).uniform(-0.25, 0.25, (50, 4))
 
@@ -99,9 +100,9 @@ def test_the_series_of_the_midpoint_rule():
     # It is what 100 steps keep, where S varies by 2e-4; and the error says how well.
     map_ = map_of(generated(HENON_HEILES, C, MIDPOINT, 0.4, 2), WELL)
     states = np.asarray(map_.rollout(z[:4], 100, save_every=10)[0])
-    value, error = (np.asarray(a).reshape(4, -1) for a in map_.modified_hamiltonian(
-        states.reshape(-1, 4)
-    ))  # fmt: skip
+    value, error = (
+        np.asarray(a).reshape(4, -1) for a in map_.modified_hamiltonian(states.reshape(-1, 4))
+    )
     assert np.ptp(HENON_HEILES.value(C, states), axis=1).min() > 1e-5
     drift = np.abs(value - value.mean(axis=1, keepdims=True))
     assert drift.max() < 1e-11

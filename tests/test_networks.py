@@ -24,9 +24,12 @@ def moved(z, dt=DT):
 def fit():
     z = states(400, 0)
     return gfnn.fit(
-        gfnn.Pairs(z, moved(z), DT), angles=(0,), learn="hamiltonian", family="mlp",
+        gfnn.Pairs(z, moved(z), DT),
+        angles=(0,),
+        learn="hamiltonian",
+        family="mlp",
         tolerance=TOLERANCE,
-    )  # fmt: skip
+    )
 
 
 def test_the_flow_of_the_network_is_that_of_the_pendulum(fit):

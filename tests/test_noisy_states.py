@@ -172,7 +172,7 @@ def test_derivatives_in_the_states_count_a_base_map():
     np.testing.assert_allclose(states @ of_point.T, MIDPOINT.evaluation_point(z0, y1), atol=1e-12)
     np.testing.assert_allclose(
         states @ of_target.T, MIDPOINT.target_gradient(z0, y1, DT), atol=1e-12
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
@@ -202,8 +202,9 @@ def test_noisy_pairs_are_fitted_to_their_nearest_states(monkeypatch):
 
     def error() -> float:
         with pytest.warns(gfnn.FitWarning):
-            fit = gfnn.fit(gfnn.Pairs(z0, z1, scene.dt), learn="map", family="polynomial",
-                           chart="type2")  # fmt: skip
+            fit = gfnn.fit(
+                gfnn.Pairs(z0, z1, scene.dt), learn="map", family="polynomial", chart="type2"
+            )
         np.testing.assert_allclose(fit.noise / spread, 0.03, rtol=0.12)
         return float(np.sqrt(np.mean((np.asarray(fit.map.rollout(test, 50)[0]) - reference) ** 2)))
 

@@ -49,9 +49,12 @@ def noisy(z, part, seed=1):
 def pairs_of(z, dt=0.1):
     count, states, width = z.shape
     return gfnn.Pairs(
-        z[:, :-1].reshape(-1, width), z[:, 1:].reshape(-1, width), dt,
-        run=np.repeat(np.arange(count), states - 1), place=np.tile(np.arange(states - 1), count),
-    )  # fmt: skip
+        z[:, :-1].reshape(-1, width),
+        z[:, 1:].reshape(-1, width),
+        dt,
+        run=np.repeat(np.arange(count), states - 1),
+        place=np.tile(np.arange(states - 1), count),
+    )
 
 
 def morse_orbits(count=20):

@@ -34,9 +34,11 @@ def test_runs(path, tmp_path, monkeypatch):
         read(path), timeout=600, kernel_name="python3", resources={"metadata": {"path": tmp_path}}
     )
     outputs = [
-        output for cell in client.execute().cells if cell.cell_type == "code"
+        output
+        for cell in client.execute().cells
+        if cell.cell_type == "code"
         for output in cell.outputs
-    ]  # fmt: skip
+    ]
     drawn = [output for output in outputs if output.output_type != "stream"]
     assert drawn
     assert all("image/png" in output.data for output in drawn)
@@ -50,9 +52,11 @@ def test_uses_public_names_only(path):
         name
         for node in ast.walk(ast.parse(re.sub(r"^%.*$", "", code, flags=re.M)))
         for name in (
-            [node.attr] if isinstance(node, ast.Attribute)
-            else [alias.name for alias in node.names] if isinstance(node, ast.ImportFrom)
+            [node.attr]
+            if isinstance(node, ast.Attribute)
+            else [alias.name for alias in node.names]
+            if isinstance(node, ast.ImportFrom)
             else []
         )
-    }  # fmt: skip
+    }
     assert not {name for name in names if name.startswith("_")}

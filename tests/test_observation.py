@@ -42,8 +42,9 @@ def angle(name="theta", **options):
 def test_channels_have_the_derivatives_of_finite_differences():
     g = angle(
         observe={**CAMERA, "omega": lambda theta, omega, k=0.9, b=0.1: k * omega + b * theta**2},
-        guess=GUESS, columns=["px", "py", "omega"],
-    )  # fmt: skip
+        guess=GUESS,
+        columns=["px", "py", "omega"],
+    )
     rng, e = np.random.default_rng(0), 1e-6
     x, c = rng.normal(size=(5, 2)), g.values + rng.normal(size=len(g.values))
     seen = g(x, c)

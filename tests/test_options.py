@@ -21,13 +21,32 @@ def test_each_is_a_keyword_of_the_fit_with_its_default():
 
 
 def test_the_command_line_reads_what_python_takes():
-    given = ["--tolerance", "1e-3", "--terms", "p1**2; cos(q1)", "--seed", "7", "--devices", "all",
-             "--max-seconds", "5", "--max-operations", "9", "--structure", "ring:2"]  # fmt: skip
+    given = [
+        "--tolerance",
+        "1e-3",
+        "--terms",
+        "p1**2; cos(q1)",
+        "--seed",
+        "7",
+        "--devices",
+        "all",
+        "--max-seconds",
+        "5",
+        "--max-operations",
+        "9",
+        "--structure",
+        "ring:2",
+    ]
     arguments = cli_parser.parser().parse_args(["fit", "data.npz", "--out", "model", *given])
     assert gfnn.FitOptions(**cli_parser.fit_options(arguments)) == gfnn.FitOptions(
-        tolerance=1e-3, terms=("p1**2", "cos(q1)"), seed=7, devices="all", max_seconds=5.0,
-        max_operations=9, structure="ring:2",
-    )  # fmt: skip
+        tolerance=1e-3,
+        terms=("p1**2", "cos(q1)"),
+        seed=7,
+        devices="all",
+        max_seconds=5.0,
+        max_operations=9,
+        structure="ring:2",
+    )
     of_run = cli_parser.parser().parse_args(["run", "two-body", "--family", "mlp"])
     assert cli_parser.fit_options(of_run) == {"family": "mlp"}
 

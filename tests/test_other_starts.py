@@ -16,9 +16,13 @@ def recorded(acceleration, start, names, end=40.0, samples=2_000, noise=1e-4, **
     """Positions of q̈ = acceleration(q, v) from ``start`` (2d,), by SciPy, with noise."""
     d, t = len(start) // 2, np.linspace(0, end, samples)
     z = solve_ivp(
-        lambda _, z: np.concatenate([z[d:], acceleration(z[:d], z[d:])]), (0, end), start,
-        t_eval=t, rtol=1e-10, atol=1e-12,
-    ).y.T  # fmt: skip
+        lambda _, z: np.concatenate([z[d:], acceleration(z[:d], z[d:])]),
+        (0, end),
+        start,
+        t_eval=t,
+        rtol=1e-10,
+        atol=1e-12,
+    ).y.T
     q = z[:, :d] + noise * np.random.default_rng(0).normal(size=(samples, d))
     columns = dict(zip(names, q.T, strict=True))
     return gfnn.Recording({"t": t, **columns}, positions=names, **roles)
@@ -43,9 +47,11 @@ def test_a_trap_whose_axes_are_not_coupled_has_its_law():
 
 def test_two_pendulums_in_one_file_have_their_laws():
     both = recorded(
-        lambda q, v: -np.array([1.0, 2.3]) * np.sin(q) - 0.01 * v, [1, 1.7, 0, 0], ["a", "b"],
+        lambda q, v: -np.array([1.0, 2.3]) * np.sin(q) - 0.01 * v,
+        [1, 1.7, 0, 0],
+        ["a", "b"],
         angles=["a", "b"],
-    )  # fmt: skip
+    )
     found = coefficients(gfnn.fit(both).lagrangian)
     assert found["cos(a)"] == pytest.approx(1.0, rel=1e-4)
     assert found["cos(b)"] == pytest.approx(2.3, rel=1e-4)
@@ -70,9 +76,7 @@ def test_henon_and_heiles_potential_from_positions(start):
 
 def test_a_quartic_spring_of_five_periods_is_seen():
     """Its own misfit is correlated over a third of a period; what it leaves over is not."""
-    spring = recorded(
-        lambda q, v: -q - 0.87 * q**3 - 0.01 * v, [0.65, 0], ["x"], 34.0, 431, 4e-6
-    )  # fmt: skip
+    spring = recorded(lambda q, v: -q - 0.87 * q**3 - 0.01 * v, [0.65, 0], ["x"], 34.0, 431, 4e-6)
     found = coefficients(gfnn.fit(spring).lagrangian)
     assert found["x**4"] == pytest.approx(-0.2175, rel=1e-3)
 
@@ -82,7 +86,7 @@ def test_an_encoder_that_was_switched_on_anywhere(zero):
     """Of a pendulum: 2 cos(theta − zero), whichever of cos and sin has the smaller phase."""
     swings = recorded(
         lambda q, v: -2 * np.sin(q - zero) - 0.02 * v, [zero + 1, 0], ["theta"], angles=["theta"]
-    )  # fmt: skip
+    )
     _, potential = gfnn.fit(swings).lagrangian.terms
     law = sp.sympify(str(potential.coefficient)) * sp.sympify(potential.term)
     at = np.linspace(-3, 3, 7)
@@ -101,9 +105,14 @@ def test_two_encoders_that_were_switched_on_anywhere():
         return np.linalg.solve([[1.0, c], [c, 0.5]], force - 0.02 * v)
 
     pair = recorded(
-        acceleration, [2.2, -1.3, 0, 0], ["theta1", "theta2"], 12.0, 1_200, 1e-3,
+        acceleration,
+        [2.2, -1.3, 0, 0],
+        ["theta1", "theta2"],
+        12.0,
+        1_200,
+        1e-3,
         angles=["theta1", "theta2"],
-    )  # fmt: skip
+    )
     terms = gfnn.fit(pair).lagrangian.terms
     sizes = sorted(abs(term.coefficient) for term in terms)
     assert sizes == pytest.approx([0.25, 0.4, 0.5, 8.0, 20.0], rel=2e-3)
@@ -134,8 +143,13 @@ def test_a_part_that_nothing_couples_has_its_mean_inertia_given():
     rubbing = apart.plus([("loss", ((-1, 1), 0, 0.0))])
     assert rubbing.uncoupled == ((0, 1),)
     # Without its coupling a law moves as it did, its second part by another scale.
-    known = {("term", MASSES[1]): 1.7, ("term", SPRINGS[0]): -0.4, ("term", SPRINGS[1]): -2.1,
-             ("loss", FRICTION[0]): 0.03, ("loss", FRICTION[1]): 0.05}  # fmt: skip
+    known = {
+        ("term", MASSES[1]): 1.7,
+        ("term", SPRINGS[0]): -0.4,
+        ("term", SPRINGS[1]): -2.1,
+        ("loss", FRICTION[0]): 0.03,
+        ("loss", FRICTION[1]): 0.05,
+    }
     v, u = q[::-1] * 0.3, np.zeros((50, 0))
     accelerations = []
     for structure in (together, apart):
@@ -153,9 +167,20 @@ def test_a_state_whose_derivatives_overflow_is_not_known():
     empty = np.zeros(0)
     triangles = np.array([[[2.0, 0.0], [0.0, 4.0]], [[np.inf, 0.0], [0.0, 1.0]]])
     fitted = Fitted(
-        empty, empty, empty, empty, empty, empty, empty, triangles, np.tile(np.eye(2), (2, 1, 1)),
-        empty, 0.0, 0, True,
-    )  # fmt: skip
+        empty,
+        empty,
+        empty,
+        empty,
+        empty,
+        empty,
+        empty,
+        triangles,
+        np.tile(np.eye(2), (2, 1, 1)),
+        empty,
+        0.0,
+        0,
+        True,
+    )
     known, unknown = fitted.last_covariance()
     np.testing.assert_allclose(known, np.diag([0.25, 0.0625]))
     np.testing.assert_array_equal(unknown, 1e100 * np.eye(2))

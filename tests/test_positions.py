@@ -44,8 +44,9 @@ def recorded(q, names, angles=(), dt=1.0):
     table = {"run": np.repeat(np.arange(runs), steps), "t": np.tile(dt * np.arange(steps), runs)}
     return Recording(
         table | {name: q[..., i].ravel() for i, name in enumerate(names)},
-        positions=names, angles=angles,
-    )  # fmt: skip
+        positions=names,
+        angles=angles,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -122,9 +123,14 @@ def flow_of_henon_heiles(number, steps, seed):
         return np.concatenate([px, py, -x - 2 * x * y, -y - x**2 + y**2])
 
     solution = solve_ivp(
-        field, (0, 0.5 * steps), np.array(starts).T.ravel(), method="DOP853", rtol=1e-13,
-        atol=1e-15, t_eval=0.5 * np.arange(steps + 1),
-    )  # fmt: skip
+        field,
+        (0, 0.5 * steps),
+        np.array(starts).T.ravel(),
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-15,
+        t_eval=0.5 * np.arange(steps + 1),
+    )
     return solution.y.reshape(4, number, -1).transpose(1, 2, 0)
 
 
@@ -373,8 +379,14 @@ def test_a_forecast_is_compared_with_what_was_read(of_noisy, tmp_path):
     run, turn = np.indices(read.shape)
     rows = np.stack([run, turn, read], axis=-1)
     for name, part in (("begun.csv", rows[:, :11]), ("read.csv", rows)):
-        np.savetxt(tmp_path / name, part.reshape(-1, 3), delimiter=",", header="run,t,theta",
-                   comments="", fmt="%.17g")  # fmt: skip
+        np.savetxt(
+            tmp_path / name,
+            part.reshape(-1, 3),
+            delimiter=",",
+            header="run,t,theta",
+            comments="",
+            fmt="%.17g",
+        )
     of_noisy.map.save(tmp_path / "model")
     files = {"out": tmp_path / "on.csv", "compare": tmp_path / "read.csv"}
     found, _, judged = forecast_recording(tmp_path / "model", tmp_path / "begun.csv", **files)
@@ -392,9 +404,9 @@ def test_positions_in_a_file_are_fitted_and_continued(tmp_path, monkeypatch, cap
 
     def written(name, read):
         runs, steps = read.shape[:2]
-        rows = np.column_stack([
-            np.repeat(np.arange(runs), steps), np.tile(np.arange(steps), runs), read.ravel()
-        ])  # fmt: skip
+        rows = np.column_stack(
+            [np.repeat(np.arange(runs), steps), np.tile(np.arange(steps), runs), read.ravel()]
+        )
         np.savetxt(name, rows, delimiter=",", header="run,t,theta", comments="", fmt="%.17g")
 
     read = np.mod(turns(300, 7, 5), 2 * np.pi)[..., 0]
@@ -428,9 +440,7 @@ def test_what_no_map_can_be_learned_from_is_refused():
         gfnn.fit(recorded(read, ["x"]), learn="map")
     with pytest.raises(gfnn.FitError, match="three rows in succession"):
         gfnn.fit(recorded(read[:, :2], ["x"]), learn="map")
-    uneven = Recording(
-        {"t": [0.0, 1.0, 2.5, 3.0, 4.0], "x": np.arange(5.0)}, positions=["x"]
-    )  # fmt: skip
+    uneven = Recording({"t": [0.0, 1.0, 2.5, 3.0, 4.0], "x": np.arange(5.0)}, positions=["x"])
     with pytest.raises(gfnn.FitError, match="even times"):
         gfnn.fit(uneven, learn="map")
 

@@ -20,13 +20,20 @@ from gfnn_jax.flows.quadratic import Quadratic
 from gfnn_jax.solve.linear import inverses
 
 ANGLES = [
-    ((2, 0), (0, 0), (0, 0), 0.0), ((1, 1), (0, 0), (1, -1), 0.3), ((0, 2), (0, 0), (0, 2), 0.0),
-    ((0, 1), (0, 0), (1, 0), -np.pi / 2), ((0, 0), (0, 0), (1, 1), 0.1),
-]  # fmt: skip
+    ((2, 0), (0, 0), (0, 0), 0.0),
+    ((1, 1), (0, 0), (1, -1), 0.3),
+    ((0, 2), (0, 0), (0, 2), 0.0),
+    ((0, 1), (0, 0), (1, 0), -np.pi / 2),
+    ((0, 0), (0, 0), (1, 1), 0.1),
+]
 MIXED = [
-    ((2, 0), (0, 2), (0, 0), 0.0), ((1, 1), (1, 0), (0, 1), 0.3), ((0, 2), (0, 0), (0, 0), 0.0),
-    ((1, 0), (0, 3), (0, 0), 0.0), ((0, 0), (2, 1), (0, 0), 0.0), ((0, 0), (1, 0), (0, 1), -1.1),
-]  # fmt: skip
+    ((2, 0), (0, 2), (0, 0), 0.0),
+    ((1, 1), (1, 0), (0, 1), 0.3),
+    ((0, 2), (0, 0), (0, 0), 0.0),
+    ((1, 0), (0, 3), (0, 0), 0.0),
+    ((0, 0), (2, 1), (0, 0), 0.0),
+    ((0, 0), (1, 0), (0, 1), -1.1),
+]
 
 
 @pytest.mark.parametrize("own", ["one law", "each state its own"])
@@ -85,8 +92,9 @@ def test_friction_is_that_of_the_family_and_uniform_friction_is_left_out():
 
 def law_of(d, plain, rng):
     """A Lagrangian of d coordinates with friction of each kind and two inputs, masses positive."""
-    rows = [((2 * np.eye(d, dtype=int)[i]), np.zeros(d, int), np.zeros(d, int), 0.0)
-            for i in range(d)]  # fmt: skip
+    rows = [
+        ((2 * np.eye(d, dtype=int)[i]), np.zeros(d, int), np.zeros(d, int), 0.0) for i in range(d)
+    ]
     for i in range(1, d):
         ends = np.eye(d, dtype=int)[i - 1], np.eye(d, dtype=int)[i]
         rows.append((ends[0] + ends[1], np.zeros(d, int), ends[1] - ends[0], 0.3))
@@ -94,12 +102,23 @@ def law_of(d, plain, rng):
     rows += [(last, np.zeros(d, int), last, 0.2), (0 * last, np.zeros(d, int), last, 0.0)]
     if not plain:
         rows += [(0 * last, 2 * last, 0 * last, 0.0), (2 * last, 2 * last, 0 * last, 0.0)]
-    friction = [(last, DRY, 0.0), (last, DRY, 0.3), (last, LINEAR, 0.0), (last, QUADRATIC, 0.0),
-                (last, UNIFORM, 0.0)]  # fmt: skip
+    friction = [
+        (last, DRY, 0.0),
+        (last, DRY, 0.3),
+        (last, LINEAR, 0.0),
+        (last, QUADRATIC, 0.0),
+        (last, UNIFORM, 0.0),
+    ]
     terms = Terms.of(rows, d)
     form = Form(terms, np.zeros(len(rows)), np.eye(len(rows)), Friction.of(friction, d), 2)
-    p = np.concatenate([np.full(d, 3.0), rng.uniform(0.2, 0.5, len(rows) - d),
-                        rng.uniform(0.1, 0.3, 5), rng.normal(size=2 * d)])  # fmt: skip
+    p = np.concatenate(
+        [
+            np.full(d, 3.0),
+            rng.uniform(0.2, 0.5, len(rows) - d),
+            rng.uniform(0.1, 0.3, 5),
+            rng.normal(size=2 * d),
+        ]
+    )
     return form, p
 
 
@@ -140,8 +159,13 @@ def test_rates_are_those_of_the_lagrangian_and_their_derivatives_finite_differen
 
 def test_a_form_without_free_terms_and_one_without_states():
     """As of one mass whose L is the unit, and where nothing is asked."""
-    form = Form(Terms.of([((2,), (0,), (0,), 0.0)], 1), np.full(1, 0.5), np.zeros((1, 0)),
-                Friction.of([((1,), LINEAR, 0.0)], 1), 1)  # fmt: skip
+    form = Form(
+        Terms.of([((2,), (0,), (0,), 0.0)], 1),
+        np.full(1, 0.5),
+        np.zeros((1, 0)),
+        Friction.of([((1,), LINEAR, 0.0)], 1),
+        1,
+    )
     p, one = np.array([0.3, 2.0]), np.ones((1, 1))
     found = form.accelerate(form.lagrangian(p), one, one, one)
     np.testing.assert_allclose(found.a, [[2.0 - 0.3]], rtol=1e-14)
@@ -154,9 +178,10 @@ def test_other_terms_and_other_friction_are_those_of_a_form_made_from_another():
     form, p = law_of(2, True, np.random.default_rng(0))
     q, v, u = np.ones((1, 2)), np.ones((1, 2)), np.zeros((1, 2))
     other = dataclasses.replace(
-        form, terms=dataclasses.replace(form.terms, modes=2 * form.terms.modes),
+        form,
+        terms=dataclasses.replace(form.terms, modes=2 * form.terms.modes),
         friction=dataclasses.replace(form.friction, kinds=np.full(5, LINEAR)),
-    )  # fmt: skip
+    )
     law = other.lagrangian(p)
     found = other.accelerate(law, q, v, u).a
     np.testing.assert_allclose(found, law.acceleration(q, v, u), rtol=1e-12)

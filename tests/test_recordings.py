@@ -66,7 +66,9 @@ TEXTS = {
     "a separator at the end": "t;theta;omega;\n"
     + rows(T, THETA, OMEGA, separator=";").replace("\n", ";\n"),
     "decimal commas in quotes": '"t","theta","omega"\n'
-    + '"' + rows(T, THETA, OMEGA, separator='","', decimal=",")[:-1].replace("\n", '"\n"') + '"\n',
+    + '"'
+    + rows(T, THETA, OMEGA, separator='","', decimal=",")[:-1].replace("\n", '"\n"')
+    + '"\n',
     "a title": "mass A\nt\ttheta\tomega\n" + rows(T, THETA, OMEGA, separator="\t"),
     "a title as wide": "mass A\t\t\t\nt\ttheta\tomega\t\n" + rows(T, THETA, OMEGA, separator="\t"),
     "names with a run": "Time (s) Run #1,theta (rad) Run #1,omega (rad/s) Run #1\n"
@@ -75,7 +77,7 @@ TEXTS = {
     + rows(T, THETA, OMEGA),
     "milliseconds by name": "millis,theta,omega\n" + rows(1e3 * T, THETA, OMEGA),
     "another order": "omega,t,theta\n" + rows(OMEGA, T, THETA),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", TEXTS)
@@ -299,7 +301,7 @@ REFUSED = {
     "t,x,v1,v2\n0,1,2,3\n1,2,3,4\n": "v1, v2 are velocities and only x positions",
     "": "expected rows of numbers",
     "x\n1\n": "at least two columns",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("text", REFUSED)
@@ -356,9 +358,14 @@ def test_options_of_the_command_line_are_keywords_of_read():
     )
     options = column_options(parser.parse_args(typed.split()))
     assert options == {
-        "positions": ("theta1", "theta2"), "angles": ("theta1",), "degrees": ("theta1",),
-        "time_unit": "ms", "std": {"theta1": 0.01}, "start": 2.0, "every": 3,
-    }  # fmt: skip
+        "positions": ("theta1", "theta2"),
+        "angles": ("theta1",),
+        "degrees": ("theta1",),
+        "time_unit": "ms",
+        "std": {"theta1": 0.01},
+        "start": 2.0,
+        "every": 3,
+    }
     assert column_options(parser.parse_args(as_typed(options).split())) == options
     assert names_roles(options)
     assert not names_roles(column_options(parser.parse_args(["--angles", "0,2"])))

@@ -28,10 +28,13 @@ def record(seed=0):
     """Three runs, more than half of which the block stands still, where it has come to rest."""
     rng, t = np.random.default_rng(seed), np.arange(0, 36, DT)
     tables = [
-        {"run": np.full(len(t), str(k)), "t": t,
-         "x": block(*start, t) + NOISE * rng.normal(size=len(t))}
+        {
+            "run": np.full(len(t), str(k)),
+            "t": t,
+            "x": block(*start, t) + NOISE * rng.normal(size=len(t)),
+        }
         for k, start in enumerate(((1.0, 0.0), (0.7, 0.2), (-0.8, 0.5)))
-    ]  # fmt: skip
+    ]
     return gfnn.Recording(tables, positions=["x"])
 
 

@@ -117,10 +117,13 @@ def test_two_body_law():
 @pytest.mark.parametrize(
     "name",
     [
-        "two-body", "henon-heiles-regular", "pcr3bp", "driven-pendulum",
+        "two-body",
+        "henon-heiles-regular",
+        "pcr3bp",
+        "driven-pendulum",
         pytest.param("henon-heiles-printed", marks=pytest.mark.slow),
     ],
-)  # fmt: skip
+)
 def test_reversor(name):
     """ρᵀJρ = −J, and H∘ρ = H in the inner coordinates, so that φ∘ρ∘φ = ρ; features keep or flip."""
     scene = scenes.make(name)
@@ -230,8 +233,13 @@ def exponents(scene, states):
 
 
 LONG = (
-    "henon-heiles-printed", "henon-heiles-regular", "henon-heiles-chaotic", "pcr3bp", "toda", "fput"
-)  # fmt: skip
+    "henon-heiles-printed",
+    "henon-heiles-regular",
+    "henon-heiles-chaotic",
+    "pcr3bp",
+    "toda",
+    "fput",
+)
 
 
 @pytest.mark.parametrize(

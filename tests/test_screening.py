@@ -70,9 +70,7 @@ def pairs_of(states, dt=DT):
 def named(pairs, angles=()):
     """Rows that are named, with nothing left out before."""
     data = Dataset.of(pairs, Coordinates("cartesian", angles=angles))
-    return gross_errors(
-        data, steps_between(identified(pairs).pairs) > 0, np.zeros(len(data), bool)
-    )  # fmt: skip
+    return gross_errors(data, steps_between(identified(pairs).pairs) > 0, np.zeros(len(data), bool))
 
 
 @pytest.mark.parametrize("size", ["box", "noise"])

@@ -42,9 +42,18 @@ class Sweep:
     def estimate(self, size, budget, on_progress):
         self.judged.append(size.operations)
         return Candidate(
-            f"{self.family} {size.operations:g}", self.family, self.chart, 3, size.operations,
-            size.estimate, size.estimate, size.estimate, np.ones(2), size.estimate, 0.0,
-        )  # fmt: skip
+            f"{self.family} {size.operations:g}",
+            self.family,
+            self.chart,
+            3,
+            size.operations,
+            size.estimate,
+            size.estimate,
+            size.estimate,
+            np.ones(2),
+            size.estimate,
+            0.0,
+        )
 
     def at(self, order):
         return f"{self.family} {order:g}"
@@ -52,9 +61,12 @@ class Sweep:
     def validate(self, size, judged, budget, say):
         self.validated.append(size.operations)
         return dataclasses.replace(
-            judged, validation_rms=size.error, validation_relative=size.error,
-            validation_bound=size.error, validated=True,
-        )  # fmt: skip
+            judged,
+            validation_rms=size.error,
+            validation_relative=size.error,
+            validation_bound=size.error,
+            validated=True,
+        )
 
 
 def found_in(*sweeps, bound=1e-6, budget=None, told=None, on_validated=None):
@@ -129,9 +141,7 @@ def test_a_sweep_that_another_keeps_beating_is_left():
     assert len(worse.judged) <= 4
     assert found.ranking[0].sweep is better
     # Of other functions, which may gain faster later, only where far better ones are as cheap.
-    later = Sweep(
-        [(10.0 + n, 10.0 ** -(2.5 + 0.5 * n)) for n in range(12)], family="sines"
-    )  # fmt: skip
+    later = Sweep([(10.0 + n, 10.0 ** -(2.5 + 0.5 * n)) for n in range(12)], family="sines")
     better = Sweep([(10.0 + n, 10.0 ** -(3 + 0.5 * n)) for n in range(12)])
     found_in(better, later, bound=1e-8)
     assert len(later.judged) > 8

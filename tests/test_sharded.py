@@ -111,9 +111,12 @@ def environment(**more):
 def test_the_same_bits_on_any_number_of_devices(folder):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=3"
     ran = subprocess.run(
-        [sys.executable, "-c", ON_DEVICES, str(folder)], capture_output=True, text=True,
-        check=False, env=environment(XLA_FLAGS=flags),
-    )  # fmt: skip
+        [sys.executable, "-c", ON_DEVICES, str(folder)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment(XLA_FLAGS=flags),
+    )
     assert ran.returncode == 0, ran.stderr
 
 
@@ -121,8 +124,9 @@ def test_parameters_go_with_their_lanes():
     """Compare one block and a part of the next with the map's own rollout."""
     rng = np.random.default_rng(1)
     z, args = rng.uniform(-1, 1, (300, 2)), rng.uniform(0.5, 1.5, (300, 1))
-    piece = Flow(Terms(1, ("p1", "q1", "k"), ((2, 0, 0), (0, 2, 1)), ("k",)), np.full(2, 0.5), DT,
-                 np.ones(2))  # fmt: skip
+    piece = Flow(
+        Terms(1, ("p1", "q1", "k"), ((2, 0, 0), (0, 2, 1)), ("k",)), np.full(2, 0.5), DT, np.ones(2)
+    )
     map_ = dataclasses.replace(map_of(piece, z), parameters=sampled(("k",), args))
     states, info = map_.sharded().rollout(z, 5, params=args[:, 0])
     expected, how = map_.rollout(z, 5, params=args[:, 0])
@@ -156,15 +160,33 @@ def started(folder, out, *more, num_steps=STEPS, count=2, **flags):
     address = f"127.0.0.1:{port()}"
     return [
         subprocess.Popen(
-            [sys.executable, "-m", "gfnn_jax", "predict", str(folder / "m"), "--initial",
-             str(folder / "z0.npy"), "--num-steps", str(num_steps), "--out", str(out),
-             "--distributed", *more],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            env=environment(JAX_COORDINATOR_ADDRESS=address, JAX_NUM_PROCESSES=str(count),
-                            JAX_PROCESS_ID=str(i), **flags),
+            [
+                sys.executable,
+                "-m",
+                "gfnn_jax",
+                "predict",
+                str(folder / "m"),
+                "--initial",
+                str(folder / "z0.npy"),
+                "--num-steps",
+                str(num_steps),
+                "--out",
+                str(out),
+                "--distributed",
+                *more,
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment(
+                JAX_COORDINATOR_ADDRESS=address,
+                JAX_NUM_PROCESSES=str(count),
+                JAX_PROCESS_ID=str(i),
+                **flags,
+            ),
         )
         for i in range(count)
-    ]  # fmt: skip
+    ]
 
 
 def ended(running):
@@ -175,10 +197,23 @@ def ended(running):
 
 @pytest.fixture(scope="module")
 def alone(folder):
-    assert main(
-        ["predict", str(folder / "m"), "--initial", str(folder / "z0.npy"), "--num-steps",
-         str(STEPS), "--out", str(folder / "alone.npz"), "--devices", "all"]
-    ) == 0  # fmt: skip
+    assert (
+        main(
+            [
+                "predict",
+                str(folder / "m"),
+                "--initial",
+                str(folder / "z0.npy"),
+                "--num-steps",
+                str(STEPS),
+                "--out",
+                str(folder / "alone.npz"),
+                "--devices",
+                "all",
+            ]
+        )
+        == 0
+    )
     return (folder / "alone.npz").read_bytes()
 
 
@@ -235,8 +270,13 @@ def test_a_killed_job_resumes_to_the_same_bits(folder, alone, monkeypatch):
         patch.setattr(job, "_CHUNK_LANE_STEPS", 3_500)
         patch.setattr(PredictionWriter, "append", stopping)
         with pytest.raises(KeyboardInterrupt):
-            job.predict(folder / "m", folder / "z0.npy", num_steps=STEPS,
-                        out=folder / "again.npz", share=Share(0, 2))  # fmt: skip
+            job.predict(
+                folder / "m",
+                folder / "z0.npy",
+                num_steps=STEPS,
+                out=folder / "again.npz",
+                share=Share(0, 2),
+            )
     found = ended(started(folder, folder / "again.npz", "--resume"))
     assert [status for status, *_ in found] == [0, 0], found
     assert (folder / "again.npz").read_bytes() == alone
@@ -250,12 +290,17 @@ def test_parts_of_everything_that_a_prediction_can_hold(tmp_path):
 
     def written(path, lanes, identity):
         writer = PredictionWriter(
-            path, shape=(len(range(5)[lanes]), 2), identity=identity, params=(("a",), z0[lanes]),
-            drive=(z0[lanes, 0], 2.0), **job,
-        )  # fmt: skip
+            path,
+            shape=(len(range(5)[lanes]), 2),
+            identity=identity,
+            params=(("a",), z0[lanes]),
+            drive=(z0[lanes, 0], 2.0),
+            **job,
+        )
         writer.append(states[lanes], {})
-        writer.finish(np.arange(5)[lanes], np.arange(5)[lanes], band="model",
-                      horizon=np.arange(5)[lanes])  # fmt: skip
+        writer.finish(
+            np.arange(5)[lanes], np.arange(5)[lanes], band="model", horizon=np.arange(5)[lanes]
+        )
         return path
 
     whole = written(tmp_path / "whole.npz", slice(0, 5), {"m": 1})
@@ -283,8 +328,18 @@ def test_nobody_says_where_the_others_are(told, line, monkeypatch):
 
 
 def test_more_devices_than_cores(folder, capsys):
-    command = ["predict", folder / "m", "--initial", folder / "z0.npy", "--num-steps", 5, "--out",
-               folder / "s.npz", "--devices", 10_000]  # fmt: skip
+    command = [
+        "predict",
+        folder / "m",
+        "--initial",
+        folder / "z0.npy",
+        "--num-steps",
+        5,
+        "--out",
+        folder / "s.npz",
+        "--devices",
+        10_000,
+    ]
     assert main([str(part) for part in command]) == 2
     assert "--devices: expected 1 to 1 devices" in capsys.readouterr().err
 
@@ -306,8 +361,16 @@ def test_samples_of_any_number_of_processes(sampled_folder):
     from gfnn_jax.jobs import predict as job
 
     def predicted(name, **more):
-        job.predict(sampled_folder / "m", sampled_folder / "z0.npz", num_steps=20, save_every=10,
-                    out=sampled_folder / name, samples=3, horizon_size=1e-3, **more)  # fmt: skip
+        job.predict(
+            sampled_folder / "m",
+            sampled_folder / "z0.npz",
+            num_steps=20,
+            save_every=10,
+            out=sampled_folder / name,
+            samples=3,
+            horizon_size=1e-3,
+            **more,
+        )
         return sampled_folder / name
 
     whole = predicted("whole.npz", devices=1)

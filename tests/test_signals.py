@@ -149,8 +149,8 @@ def falling_to_rest():
 CLEAN = {
     "rest": lambda: np.where(np.abs(T - 6) < 3, np.cos(np.pi * (T - 6) / 3), -1.0),
     "counts": lambda: 0.02 * np.round(swing(T)[0] / 0.02),
-    "counts with noise": lambda: 2e-3 * np.round(
-        (swing(T)[0] + 1e-3 * RNG.standard_normal(len(T))) / 2e-3
+    "counts with noise": lambda: (
+        2e-3 * np.round((swing(T)[0] + 1e-3 * RNG.standard_normal(len(T))) / 2e-3)
     ),
     "dry friction": falling_to_rest,
     "stick and slip": stick_slip,
@@ -162,7 +162,7 @@ CLEAN = {
     "long tails": lambda: swing(T)[0] + 1e-3 * RNG.laplace(size=len(T)),
     "no noise": lambda: swing(T)[0],
     "few samples a period": lambda: np.sin(1.3 * np.arange(900.0)) + np.sin(0.9 * np.arange(900)),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CLEAN)
@@ -202,8 +202,15 @@ def test_differences_are_recognised():
 
 
 def motion(force, start, t, sigma=1e-4):
-    z = solve_ivp(lambda _, z: [*z[len(z) // 2 :], *force(z)], (0, t[-1]), start, "DOP853", t,
-                  rtol=1e-10, atol=1e-12).y  # fmt: skip
+    z = solve_ivp(
+        lambda _, z: [*z[len(z) // 2 :], *force(z)],
+        (0, t[-1]),
+        start,
+        "DOP853",
+        t,
+        rtol=1e-10,
+        atol=1e-12,
+    ).y
     q = z[: len(z) // 2]
     fits = local_fits([t], q + sigma * RNG.standard_normal(q.shape), 21, 4)
     period = energy.mean_period(fits, 1)
@@ -211,8 +218,11 @@ def motion(force, start, t, sigma=1e-4):
 
 
 def friction(kind, c):
-    rates = {"linear": lambda v: c * v, "dry": lambda v: c * np.tanh(v / 1e-3),
-             "quadratic": lambda v: c * v * abs(v)}  # fmt: skip
+    rates = {
+        "linear": lambda v: c * v,
+        "dry": lambda v: c * np.tanh(v / 1e-3),
+        "quadratic": lambda v: c * v * abs(v),
+    }
     return rates[kind]
 
 

@@ -43,9 +43,7 @@ EXCHANGE = "exchange of degrees of freedom 1 and 2"
 def test_a_round_well_is_turned_exchanged_and_reversed():
     z0 = np.random.default_rng(0).uniform(-1, 1, (400, 4))
     found = told(data_of(quartic(np.array([0.5, 0.5])), z0))
-    assert set(found) == {
-        ROTATION, EXCHANGE, "reversal of time", "reflection of all coordinates"
-    }  # fmt: skip
+    assert set(found) == {ROTATION, EXCHANGE, "reversal of time", "reflection of all coordinates"}
     assert found[ROTATION] < 1e-12
 
 
@@ -76,8 +74,9 @@ def test_a_magnetic_field_is_not_reversed():
 
     field = np.array([[0, 0.5, 1, 0], [-0.5, 0, 0, 1], [-2.25, 0, 0, 0.5], [0, -0.25, -0.5, 0]])
     z0 = np.random.default_rng(0).uniform(-1, 1, (400, 4))
-    pairs = gfnn.Pairs(z0, z0 @ expm(0.1 * field).T, 0.1, run=np.arange(400),
-                       place=np.zeros(400, int))  # fmt: skip
+    pairs = gfnn.Pairs(
+        z0, z0 @ expm(0.1 * field).T, 0.1, run=np.arange(400), place=np.zeros(400, int)
+    )
     found = told(Dataset.of(pairs, Coordinates("cartesian")).divided(0))
     assert set(found) == {"reflection of all coordinates"}
 

@@ -23,19 +23,28 @@ LENGTHS = (0.5, 0.8, 1.0, 1.4, 2.0)
 NONE = (0, 0)
 LAW = Lagrangian(
     Terms.of(
-        [((2, 0), NONE, NONE, 0.0), ((0, 2), NONE, NONE, 0.0), ((1, 1), NONE, (1, -1), 0.0),
-         (NONE, NONE, (1, 0), 0.0), (NONE, (0, 2), NONE, 0.0)], 2,
+        [
+            ((2, 0), NONE, NONE, 0.0),
+            ((0, 2), NONE, NONE, 0.0),
+            ((1, 1), NONE, (1, -1), 0.0),
+            (NONE, NONE, (1, 0), 0.0),
+            (NONE, (0, 2), NONE, 0.0),
+        ],
+        2,
     ),
     np.array([0.5, 0.4, 0.2, 2.0, -0.5]),
-    Friction.of([((1, 0), LINEAR, 0.0), ((1, -1), DRY, 0.3)], 2), np.array([0.2, 0.1]), 0.05,
+    Friction.of([((1, 0), LINEAR, 0.0), ((1, -1), DRY, 0.3)], 2),
+    np.array([0.2, 0.1]),
+    0.05,
     np.array([[1.0], [0.5]]),
     ((0, 0), (1, 0), (0, -1), (-1, 2), (0, 0), (1, 0), (0, 0), (0, 0), (0, 1)),
-)  # fmt: skip
+)
 ARGS = np.random.default_rng(0).uniform(0.5, 2.0, (40, 2))
 
 
-def recorded(rate, starts, parameters, name, positions, angles=(), inputs=None, end=12.0, dt=0.03,
-             noise=1e-3):  # fmt: skip
+def recorded(
+    rate, starts, parameters, name, positions, angles=(), inputs=None, end=12.0, dt=0.03, noise=1e-3
+):
     """Positions of a run of each parameter, by SciPy from its own equations of motion."""
     rng, t, tables = np.random.default_rng(0), np.arange(0, end, dt), []
     for number, (start, value) in enumerate(zip(starts, parameters, strict=True)):
@@ -47,9 +56,12 @@ def recorded(rate, starts, parameters, name, positions, angles=(), inputs=None, 
         columns |= {} if inputs is None else {"u": inputs(t)}
         tables.append({"run": np.full(len(t), str(number)), "t": t, **columns})
     return gfnn.Recording(
-        tables, positions=positions, angles=angles, parameters=[name],
+        tables,
+        positions=positions,
+        angles=angles,
+        parameters=[name],
         inputs=None if inputs is None else ["u"],
-    )  # fmt: skip
+    )
 
 
 def swing(_, x, length):
@@ -158,8 +170,10 @@ def test_coefficients_of_a_run_are_linear_in_those_of_the_law():
 
 def seen_of(args, coefficients, errors):
     """What runs of each value would tell of these coefficients (V, n)."""
-    return [Seen(np.atleast_1d(a), c, np.diag(1 / errors)) for a, c in
-            zip(args, coefficients, strict=True)]  # fmt: skip
+    return [
+        Seen(np.atleast_1d(a), c, np.diag(1 / errors))
+        for a, c in zip(args, coefficients, strict=True)
+    ]
 
 
 @pytest.mark.parametrize("on_first", [True, False])
@@ -201,8 +215,9 @@ def test_a_third_of_a_few_systems_has_a_part_of_each():
     arcs = arcs_of(nodes, length)
     third = thirds_of(arcs, systems)
     for k in range(3):
-        assert {i for i, own in zip((i for i, _, _ in arcs.home), third, strict=True) if own == k} \
-            == {0, 1, 2, 3}  # fmt: skip
+        assert {
+            i for i, own in zip((i for i, _, _ in arcs.home), third, strict=True) if own == k
+        } == {0, 1, 2, 3}
 
 
 @pytest.fixture(scope="module")
@@ -260,10 +275,13 @@ def test_the_formula_can_be_given_again(of_lengths):
 def test_a_column_that_does_not_matter_changes_nothing():
     runs = [swings((1.0,), end=9.0) for _ in range(3)]
     tables = [
-        {"run": np.full(len(one.times("0")), str(k)), "t": one.times("0"),
-         "theta": one.values("theta", "0") + 1e-3 * np.random.default_rng(k).normal(size=300)}
+        {
+            "run": np.full(len(one.times("0")), str(k)),
+            "t": one.times("0"),
+            "theta": one.values("theta", "0") + 1e-3 * np.random.default_rng(k).normal(size=300),
+        }
         for k, one in enumerate(runs)
-    ]  # fmt: skip
+    ]
     options = {"positions": ["theta"], "angles": ["theta"]}
     without = gfnn.fit(gfnn.Recording(tables, **options))
     with_it = [{**table, "mass": np.full(300, 0.1 * k)} for k, table in enumerate(tables)]
@@ -279,8 +297,10 @@ def test_a_column_that_does_not_matter_changes_nothing():
 def test_a_mass_on_one_of_two_carts(on):
     fit = gfnn.fit(carts((0.0, 0.2, 0.4, 0.8), on))
     scale = 0.5 + 0.35 if on == 0 else 0.5  # the mean inertia of the first cart
-    masses = {0: {"v1**2": 0.25, "v1**2*m": 0.5, "v2**2": 0.4},
-              1: {"v1**2": 0.25, "v2**2": 0.4, "v2**2*m": 0.5}}[on]  # fmt: skip
+    masses = {
+        0: {"v1**2": 0.25, "v1**2*m": 0.5, "v2**2": 0.4},
+        1: {"v1**2": 0.25, "v2**2": 0.4, "v2**2*m": 0.5},
+    }[on]
     springs = {"x1**2": -17.5, "x1*x2": 15.0, "x2**2": -12.5}
     within(fit.lagrangian.terms, {k: v / scale for k, v in (masses | springs).items()})
     assert fit.friction.terms == ()
@@ -321,17 +341,23 @@ def added(masses, **options):
     starts = [(0.8, 0.0)] * len(masses)
     options = {"end": 20.0, "dt": 0.05, **options}
     return recorded(
-        lambda _, x, m: [x[1], (-3 * x[0] - 0.05 * x[1]) / (0.5 + m)], starts, masses, "m", ("x",),
+        lambda _, x, m: [x[1], (-3 * x[0] - 0.05 * x[1]) / (0.5 + m)],
+        starts,
+        masses,
+        "m",
+        ("x",),
         **options,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.slow
 def test_two_values_do_not_tell_two_functions_and_that_is_said():
     with pytest.warns(gfnn.FitWarning, match="2 functions of m, and the runs are of 2 values"):
         fit = gfnn.fit(added((0.05, 0.4)))
-    within(fit.lagrangian.terms, {k: v / 0.725 for k, v in
-                                  {"v**2": 0.25, "v**2*m": 0.5, "x**2": -1.5}.items()})  # fmt: skip
+    within(
+        fit.lagrangian.terms,
+        {k: v / 0.725 for k, v in {"v**2": 0.25, "v**2*m": 0.5, "x**2": -1.5}.items()},
+    )
     one = gfnn.fit(swings((0.6, 1.7)))  # of one function a second value is a test
     within(one.lagrangian.terms, {"omega**2": 0.5, "cos(theta)/l": G})
     assert one.messages == ()

@@ -122,9 +122,7 @@ def top(z):
     sin, cos, none = np.sin(q), np.cos(q), np.zeros(len(z))
     turned = (p1 - p3 * cos) / sin
     force = turned * p3 - turned**2 * cos / sin - 1.5 * sin
-    return np.stack(
-        [none, force, none, turned / sin, p2, 1.6 * p3 - turned * cos / sin], axis=1
-    )  # fmt: skip
+    return np.stack([none, force, none, turned / sin, p2, 1.6 * p3 - turned * cos / sin], axis=1)
 
 
 def read(law):
@@ -310,9 +308,11 @@ def test_centres_beside_the_origin_are_found_told_nothing():
     problem = Problem(pairs.z0, pairs.z1, pairs.dt, sizes(pairs.z0))
     found = read(Textbook(problem, np.arange(250)).law(centres=True))
     expected = {
-        "p1²": 0.5, "p2²": 0.5, "1/sqrt((q1 + 0.2)**2 + q2**2)": -0.8,
+        "p1²": 0.5,
+        "p2²": 0.5,
+        "1/sqrt((q1 + 0.2)**2 + q2**2)": -0.8,
         "1/sqrt((q1 - 0.7)**2 + (q2 - 0.4)**2)": -0.3,
-    }  # fmt: skip
+    }
     assert found == pytest.approx(expected, abs=1e-12)
 
 
@@ -323,9 +323,13 @@ def test_a_heavy_top_in_eulers_angles_is_found_told_nothing():
     problem = Problem(pairs.z0, pairs.z1, pairs.dt, sizes(pairs.z0))
     found = read(Textbook(problem, np.arange(200), angles=(0, 1, 2)).law(products=True))
     expected = {
-        "p2²": 0.5, "p3²": 0.3, "cos(q2)": 1.5, "p1**2/sin(q2)**2": 0.5, "p3**2/sin(q2)**2": 0.5,
+        "p2²": 0.5,
+        "p3²": 0.3,
+        "cos(q2)": 1.5,
+        "p1**2/sin(q2)**2": 0.5,
+        "p3**2/sin(q2)**2": 0.5,
         "p1*p3*cos(q2)/sin(q2)**2": -1.0,
-    }  # fmt: skip
+    }
     assert found == pytest.approx(expected, abs=1e-12)
 
 

@@ -19,9 +19,13 @@ INTEGRATED = ("henon-heiles-regular", "henon-heiles-printed", "pcr3bp")
 # Each like another, but for the energy, a term of H or the parameters, or drawn by other tests:
 # and long to compile.
 ALIKE = (
-    "henon-heiles-printed", "henon-heiles-chaotic", "pcr3bp", "driven-pendulum", "fput",
+    "henon-heiles-printed",
+    "henon-heiles-chaotic",
+    "pcr3bp",
+    "driven-pendulum",
+    "fput",
     "henon-heiles-section",
-)  # fmt: skip
+)
 
 
 def long_ones_slow(names):
@@ -46,9 +50,13 @@ def test_flow_agrees_with_another_solver(name):
     field = jax.jit(hamiltonian_vector_field(scene.hamiltonian))
     for lane in range(3):
         other = solve_ivp(
-            lambda t, y: np.asarray(field(y)), (0, 10 * scene.dt), z0[lane],
-            method="DOP853", rtol=3e-14, atol=1e-14,
-        )  # fmt: skip
+            lambda t, y: np.asarray(field(y)),
+            (0, 10 * scene.dt),
+            z0[lane],
+            method="DOP853",
+            rtol=3e-14,
+            atol=1e-14,
+        )
         np.testing.assert_allclose(z[lane, -1], other.y[:, -1], atol=3e-13, rtol=0)
 
 
@@ -58,9 +66,14 @@ def test_the_stroboscopic_map_agrees_with_another_solver_and_starts_at_time_0_ev
     z = tr.reference_trajectories(scene, z0, 2)
     for start, path in zip(z0, z, strict=True):
         other = solve_ivp(
-            lambda t, y: [y[1], -np.sin(y[0]) * (1 + 0.15 * np.cos(t))], (0, 2 * scene.dt), start,
-            t_eval=[scene.dt, 2 * scene.dt], method="DOP853", rtol=3e-14, atol=1e-15,
-        )  # fmt: skip
+            lambda t, y: [y[1], -np.sin(y[0]) * (1 + 0.15 * np.cos(t))],
+            (0, 2 * scene.dt),
+            start,
+            t_eval=[scene.dt, 2 * scene.dt],
+            method="DOP853",
+            rtol=3e-14,
+            atol=1e-15,
+        )
         np.testing.assert_allclose(path[1:], other.y.T, atol=1e-12, rtol=0)
     np.testing.assert_array_equal(tr.reference_trajectories(scene, z[:, 1], 2)[:, 1], z[:, 2])
     assert 0 < tr.reference_error(scene, z0, 2) < 1e-12
@@ -78,9 +91,15 @@ def returned(z):
     crossing.direction = 1.0
     start = [0.0, z[0], np.sqrt(0.2 - z[1] ** 2 - z[0] ** 2 + 2 / 3 * z[0] ** 3), z[1]]
     found = solve_ivp(
-        field, (0, 9), start, events=crossing, method="DOP853", rtol=3e-14, atol=1e-15,
+        field,
+        (0, 9),
+        start,
+        events=crossing,
+        method="DOP853",
+        rtol=3e-14,
+        atol=1e-15,
         max_step=0.05,
-    )  # fmt: skip
+    )
     return next(x for t, x in zip(*found.t_events, *found.y_events, strict=True) if t > 1)[[1, 3]]
 
 

@@ -13,9 +13,13 @@ from gfnn_jax.cli import main
 def swing(end=16.0, dt=0.04):
     t, rng = np.arange(0, end, dt), np.random.default_rng(3)
     found = solve_ivp(
-        lambda _, z: [z[1], -4 * np.sin(z[0]) - 0.05 * z[1]], (0, end), [1.4, 0.0], t_eval=t,
-        rtol=1e-10, atol=1e-12,
-    )  # fmt: skip
+        lambda _, z: [z[1], -4 * np.sin(z[0]) - 0.05 * z[1]],
+        (0, end),
+        [1.4, 0.0],
+        t_eval=t,
+        rtol=1e-10,
+        atol=1e-12,
+    )
     return t, *found.y, lambda size: size * rng.normal(size=len(t))
 
 

@@ -48,13 +48,27 @@ def test_whitened_noise_is_white(rng):
 def free_body(sigma, wander):
     """A law without forces, known exactly, q = q0 + v t; residuals of any size count in full."""
     law = Lagrangian(
-        Terms.of([((2,), (0,), (0,), 0.0)], 1), np.array([0.5]), Friction.of([], 1), np.zeros(0),
-        0.0, np.zeros((1, 0)),
-    )  # fmt: skip
+        Terms.of([((2,), (0,), (0,), 0.0)], 1),
+        np.array([0.5]),
+        Friction.of([], 1),
+        np.zeros(0),
+        0.0,
+        np.zeros((1, 0)),
+    )
     sensors = Sensors(
-        ("x",), (), (), np.array([sigma]), 1.0, 10.0, "hold", 0.0, np.array([1.0]),
-        np.zeros((1, 1)), dataclasses.replace(Observation.plain(["x"]), loss=SoftL1(1e6)), wander,
-    )  # fmt: skip
+        ("x",),
+        (),
+        (),
+        np.array([sigma]),
+        1.0,
+        10.0,
+        "hold",
+        0.0,
+        np.array([1.0]),
+        np.zeros((1, 1)),
+        dataclasses.replace(Observation.plain(["x"]), loss=SoftL1(1e6)),
+        wander,
+    )
     return law_in_use(law, None, sensors)
 
 

@@ -69,8 +69,9 @@ def test_rows_of_S_are_weighted_by_the_coordinate_that_they_change():
     channel = np.sqrt(np.mean(own**2, axis=0))[::-1] / np.asarray(data.scale)[::-1]
     expected = np.linalg.lstsq(
         (slopes * channel[:, None]).reshape(-1, family.num_parameters),
-        (target / unit * channel).ravel(), rcond=None,
-    )[0]  # fmt: skip
+        (target / unit * channel).ravel(),
+        rcond=None,
+    )[0]
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
 
 

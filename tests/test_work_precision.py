@@ -37,9 +37,7 @@ def test_a_composition_has_its_order(name, order):
     runner = dict(integrators.runners(scene, True))[name]
     stages = 2 * len(integrators.COMPOSITIONS[name]) - 1
     exact = gfnn.reference_trajectories(scene, z0, 4)[:, -1]
-    errors = [
-        np.linalg.norm(runner.run(z0, 4 * scene.dt, n * stages) - exact) for n in (1.0, 2.0)
-    ]  # fmt: skip
+    errors = [np.linalg.norm(runner.run(z0, 4 * scene.dt, n * stages) - exact) for n in (1.0, 2.0)]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.5)
 
 

@@ -33,21 +33,35 @@ def chaos(quick: bool) -> tuple[list[Case], Numbers]:
         z0 = TWO_PI * rng.uniform(size=(num, 2))
         predicted, info = fit.map.rollout(z0, length)
         exact = gfnn.reference_trajectories(scene, jnp.asarray(z0), length)
-        ours, theirs = (metrics.diffusion_coefficient(np.asarray(z)[:, :, 1])
-                        for z in (predicted, exact))  # fmt: skip
+        ours, theirs = (
+            metrics.diffusion_coefficient(np.asarray(z)[:, :, 1]) for z in (predicted, exact)
+        )
         both = math.hypot(ours.standard_error, theirs.standard_error)
         differ = abs(ours.value - theirs.value) / both
         said = f"D = {ours.value:.4g}, exact map {theirs.value:.4g}, {differ:.1f} σ apart"
-        cases.append(Case(f"standard map, K = {k:g}: diffusion", None, None,
-                          "; ".join(p for p in (said, counts(info.status)) if p),
-                          wrong=int(differ > 4)))  # fmt: skip
+        cases.append(
+            Case(
+                f"standard map, K = {k:g}: diffusion",
+                None,
+                None,
+                "; ".join(p for p in (said, counts(info.status)) if p),
+                wrong=int(differ > 4),
+            )
+        )
         few, long = (10, 500) if quick else (50, 20_000)
         ours, theirs = (lyapunov(step, z0[:few], long) for step in (fit.map.step, scene.step))
         scatter = math.hypot(*(np.std(x) / math.sqrt(few) for x in (ours, theirs)))
         differ = abs(ours.mean() - theirs.mean()) / scatter
         said = f"λ = {ours.mean():.4f}, exact map {theirs.mean():.4f}, {differ:.1f} σ apart"
-        cases.append(Case(f"standard map, K = {k:g}: Lyapunov exponent", None, None, said,
-                          wrong=int(differ > 4)))  # fmt: skip
+        cases.append(
+            Case(
+                f"standard map, K = {k:g}: Lyapunov exponent",
+                None,
+                None,
+                said,
+                wrong=int(differ > 4),
+            )
+        )
     more, found = near_escape(quick)
     return cases + more, measured | found
 
@@ -93,20 +107,36 @@ def near_escape(quick: bool) -> tuple[list[Case], Numbers]:
     name = f"Hénon–Heiles, E = 1/6 − 0.001, {len(ours):,} crossings"
     cases = [
         case,
-        Case(f"{name}: in islands that the reference's {len(theirs):,} never enter", None, None,
-             f"{inside} crossings; {counts(info.status)}", wrong=inside),
-        Case(f"{name}: law of q₂", None, None,
-             f"divergence {divergence:.1e} (halves of the reference: {floor:.1e})",
-             wrong=int(divergence > 3 * floor)),
-    ]  # fmt: skip
+        Case(
+            f"{name}: in islands that the reference's {len(theirs):,} never enter",
+            None,
+            None,
+            f"{inside} crossings; {counts(info.status)}",
+            wrong=inside,
+        ),
+        Case(
+            f"{name}: law of q₂",
+            None,
+            None,
+            f"divergence {divergence:.1e} (halves of the reference: {floor:.1e})",
+            wrong=int(divergence > 3 * floor),
+        ),
+    ]
     few, long = (4, 500) if quick else (32, 10_000)
     mine = lyapunov(fit.map.step, z0[:few], long) / scene.dt
     theirs_rate = lyapunov_by_shadow(scene, z0[:few], long) / scene.dt
     scatter = math.hypot(*(np.std(x) / math.sqrt(few) for x in (mine, theirs_rate)))
     differ = abs(mine.mean() - theirs_rate.mean()) / scatter
     said = f"λ = {mine.mean():.4f}, reference {theirs_rate.mean():.4f}, {differ:.1f} σ apart"
-    cases.append(Case("Hénon–Heiles, E = 1/6 − 0.001: Lyapunov exponent", None, None, said,
-                      wrong=int(differ > 4)))  # fmt: skip
+    cases.append(
+        Case(
+            "Hénon–Heiles, E = 1/6 − 0.001: Lyapunov exponent",
+            None,
+            None,
+            said,
+            wrong=int(differ > 4),
+        )
+    )
     return cases, {"crossings": len(ours), "inside": inside, "divergence": divergence}
 
 

@@ -39,8 +39,14 @@ def large_steps(quick: bool) -> tuple[list[Case], Numbers]:
             for dt in steps[::2] if quick else steps:
                 scene = make(dt)
                 data, fresh = drawn(scene, 400 if scene.dim == 1 else 2_000, True)
-                case, fit = tried(f"{system}, dt = {dt:.3g}, {chart}", data, scene, fresh,
-                                  chart=chart, family="polynomial")  # fmt: skip
+                case, fit = tried(
+                    f"{system}, dt = {dt:.3g}, {chart}",
+                    data,
+                    scene,
+                    fresh,
+                    chart=chart,
+                    family="polynomial",
+                )
                 if fit is not None:
                     if chart == "auto":
                         kept[dt] = fit

@@ -52,28 +52,59 @@ def long_times(quick: bool) -> tuple[list[Case], Numbers]:
         assert exponent is not None
         low, high = exponent.interval
         said = f"drift exponent {exponent.value:.2f} (95 %: {low:.2f} to {high:.2f})"
-        cases.append(Case(f"{name}, {lanes} × {num_steps:,} steps: energy, {said}",
-                          digits_of(rms[-1]), 10, counts(info.status),
-                          wrong=int(low > MOST_EXPONENT)))  # fmt: skip
-        measured[name] = {"exponent": exponent.value, "interval": [low, high],
-                          "elapsed": elapsed[1:].tolist(), "rms": rms[1:].tolist()}  # fmt: skip
+        cases.append(
+            Case(
+                f"{name}, {lanes} × {num_steps:,} steps: energy, {said}",
+                digits_of(rms[-1]),
+                10,
+                counts(info.status),
+                wrong=int(low > MOST_EXPONENT),
+            )
+        )
+        measured[name] = {
+            "exponent": exponent.value,
+            "interval": [low, high],
+            "elapsed": elapsed[1:].tolist(),
+            "rms": rms[1:].tolist(),
+        }
         forward, first = fit.map.rollout(z0, back, save_every=back)
         returned, second = fit.map.reversed().rollout(forward[:, -1], back, save_every=back)
         error = np.asarray(returned[:, -1]) - z0
         worst = float(np.abs(error / np.asarray(fit.map.scale)).max())
-        cases.append(Case(f"{name}, {back:,} steps and back", digits_of(worst), 8,
-                          counts([first.status, second.status])))  # fmt: skip
+        cases.append(
+            Case(
+                f"{name}, {back:,} steps and back",
+                digits_of(worst),
+                8,
+                counts([first.status, second.status]),
+            )
+        )
         single = in_float32(fit.map)
         few = min(num_steps, 100_000)
         exponent, info, elapsed, rms = drift_of(single, scene, z0[:16], few, 20, 50)
-        cases.append(Case(f"{name} in float32, {few:,} steps: energy", digits_of(rms[-1]), 3,
-                          counts(info.status)))  # fmt: skip
-        measured[name]["float32"] = {"elapsed": elapsed[1:].tolist(), "rms": rms[1:].tolist(),
-                                     "exponent": exponent.value if exponent else None}  # fmt: skip
+        cases.append(
+            Case(
+                f"{name} in float32, {few:,} steps: energy",
+                digits_of(rms[-1]),
+                3,
+                counts(info.status),
+            )
+        )
+        measured[name]["float32"] = {
+            "elapsed": elapsed[1:].tolist(),
+            "rms": rms[1:].tolist(),
+            "exponent": exponent.value if exponent else None,
+        }
         if not quick and name == "henon-heiles-regular":
             _, info, elapsed, rms = drift_of(fit.map, scene, z0[:1], SINGLE, 200, 50)
-            cases.append(Case(f"{name}, 1 × {SINGLE:,} steps: energy", digits_of(rms[-1]), 10,
-                              counts(info.status)))  # fmt: skip
+            cases.append(
+                Case(
+                    f"{name}, 1 × {SINGLE:,} steps: energy",
+                    digits_of(rms[-1]),
+                    10,
+                    counts(info.status),
+                )
+            )
             measured[name]["single"] = {"elapsed": elapsed[1:].tolist(), "rms": rms[1:].tolist()}
     case, curve = on_invariant_curve(200_000 if quick else MAP_STEPS)
     return [*cases, case], measured | {"standard map": curve}
@@ -96,7 +127,11 @@ def on_invariant_curve(num_steps: int) -> tuple[Case, Numbers]:
         lanes, _ = fit.map.advance(lanes, 1, save_every=num_steps // num_blocks)
         reached.append(np.asarray(lanes.y)[0] % TWO_PI)
     away = metrics.curve_distance(np.array(reached), curve)
-    case = Case(f"standard map, K = 0.6, 1 × {num_steps:,} steps: distance from its curve",
-                digits_of(float(away[-20:].max())), 10, counts(lanes.status))  # fmt: skip
+    case = Case(
+        f"standard map, K = 0.6, 1 × {num_steps:,} steps: distance from its curve",
+        digits_of(float(away[-20:].max())),
+        10,
+        counts(lanes.status),
+    )
     steps = num_steps // num_blocks * np.arange(1, num_blocks + 1)
     return case, {"steps": steps.tolist(), "distance": away.tolist()}

@@ -55,20 +55,33 @@ def precision(quick: bool) -> tuple[list[Case], Numbers]:
         spread = float(np.std(np.asarray(fresh.z1), axis=0).max())
         error = nearest_image(error, angles_of(scene))
         rms = float(np.sqrt(np.mean(error**2))) / spread
-        cases.append(Case(f"{name}, the same map in float32", digits_of(rms), 6,
-                          counts(info.status)))  # fmt: skip
+        cases.append(
+            Case(f"{name}, the same map in float32", digits_of(rms), 6, counts(info.status))
+        )
         many, info = single.rollout(np.asarray(fresh.z0)[:50], 1_000, save_every=1_000)
         same, _ = fit.map.rollout(np.asarray(fresh.z0)[:50], 1_000, save_every=1_000)
         error = metrics.position_error(np.asarray(many, float), np.asarray(same), angles_of(scene))
-        cases.append(Case(f"{name}, in float32, 1,000 steps", digits_of(np.median(error[:, -1])),
-                          3, counts(info.status)))  # fmt: skip
-    code = ("import gfnn_jax as g, numpy as n; z = n.random.rand(100, 2); "
-            "g.fit(g.Pairs(z, z, 1.0))")  # fmt: skip
+        cases.append(
+            Case(
+                f"{name}, in float32, 1,000 steps",
+                digits_of(np.median(error[:, -1])),
+                3,
+                counts(info.status),
+            )
+        )
+    code = "import gfnn_jax as g, numpy as n; z = n.random.rand(100, 2); g.fit(g.Pairs(z, z, 1.0))"
     command = ran.python("gfnn_jax", "-c", code)
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=x64_off())
     line = done.stderr.strip().splitlines()[-1] if done.stderr else ""
-    cases.append(Case("float64 switched off", None, None, failed=line,
-                      wrong=int(done.returncode == 0 or "float64" not in line)))  # fmt: skip
+    cases.append(
+        Case(
+            "float64 switched off",
+            None,
+            None,
+            failed=line,
+            wrong=int(done.returncode == 0 or "float64" not in line),
+        )
+    )
     mine, version = fingerprint(quick), jax.__version__
     before = RESULTS / "hard-precision.json"
     others = json.loads(before.read_text("utf-8"))["measured"] if before.exists() else {}

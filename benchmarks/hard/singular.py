@@ -81,9 +81,11 @@ def moon_polar() -> Coordinates:
     inner = polar(cyclic=False)
     shift = np.array([1 - MU, 0.0, 0.0, 1 - MU])
     return Coordinates(
-        "polar around the smaller body", angles=(1,),
-        forward=lambda z: inner.forward(z - shift), inverse=lambda y: inner.inverse(y) + shift,
-    )  # fmt: skip
+        "polar around the smaller body",
+        angles=(1,),
+        forward=lambda z: inner.forward(z - shift),
+        inverse=lambda y: inner.inverse(y) + shift,
+    )
 
 
 def rolled(case: Case, fit, scene, num_steps: int = 100) -> Case:
@@ -113,22 +115,36 @@ def singular(quick: bool) -> tuple[list[Case], Numbers]:
                 kepler, sampling=law, coordinates=coordinates, reversor=reversor
             )
             data, fresh = drawn(scene, 1_000 if quick else 8_000, quick)
-            case, fit = tried(f"Kepler, e in ({low:g}, {high:g}), dt = 0.1, {label}", data, scene,
-                              fresh, tolerance=1e-8, family="polynomial")  # fmt: skip
+            case, fit = tried(
+                f"Kepler, e in ({low:g}, {high:g}), dt = 0.1, {label}",
+                data,
+                scene,
+                fresh,
+                tolerance=1e-8,
+                family="polynomial",
+            )
             cases.append(case)
             if fit is not None:
                 cases.append(rolled(case, fit, scene))
             print(f"  {cases[-1]}")
     for dt in (0.02,) if quick else (0.02, 0.05, 0.1):
         close = dataclasses.replace(
-            pcr3bp(dt), sampling=DrawnFrom(moon_states), coordinates=moon_polar(), features=None,
+            pcr3bp(dt),
+            sampling=DrawnFrom(moon_states),
+            coordinates=moon_polar(),
+            features=None,
             reversor=None,
-        )  # fmt: skip
+        )
         plain = dataclasses.replace(pcr3bp(dt), sampling=DrawnFrom(moon_states))
         for label, scene in {"features 1/r₁, 1/r₂": plain, "polar around it": close}.items():
             data, fresh = drawn(scene, 1_000 if quick else 8_000, quick)
-            case, fit = tried(f"three bodies, around the smaller one, dt = {dt:g}, {label}", data,
-                              scene, fresh, tolerance=1e-7)  # fmt: skip
+            case, fit = tried(
+                f"three bodies, around the smaller one, dt = {dt:g}, {label}",
+                data,
+                scene,
+                fresh,
+                tolerance=1e-7,
+            )
             cases.append(case)
             if fit is not None:
                 cases.append(rolled(case, fit, scene))

@@ -104,12 +104,14 @@ def solver(quick: bool) -> tuple[list[Case], Numbers]:
             ok = np.asarray(info.status) <= 1
             worst = residuals(map_, z[ok], np.asarray(image)[ok]).max(initial=0.0)
             name = f"random network, weights × {strength:g}, {chart.name}"
-            cases.append(Case(f"{name}: equation of ok lanes", digits_of(worst), 12,
-                              counts(info.status)))  # fmt: skip
+            cases.append(
+                Case(f"{name}: equation of ok lanes", digits_of(worst), 12, counts(info.status))
+            )
             changed, looked = branch_changes(map_, *((1, 200) if quick else (10, 500)))
             flagged = "" if changed else "none, or flagged in between"
-            cases.append(Case(f"{name}: branch between neighbours", None, None, flagged,
-                              wrong=changed))  # fmt: skip
+            cases.append(
+                Case(f"{name}: branch between neighbours", None, None, flagged, wrong=changed)
+            )
             measured[f"{chart.name} {strength:g}"] = {"changed": changed, "neighbours": looked}
     scene = gfnn.scenes.make("henon-heiles-regular")
     data, fresh = drawn(scene, 1_000, True)
@@ -117,8 +119,15 @@ def solver(quick: bool) -> tuple[list[Case], Numbers]:
     good = np.asarray(gfnn.sample_test_states(scene, 200, jax.random.key(SEED)))
     for factor in (3.0, 1e150) if quick else (3.0, 10.0, 1e3, 1e6, 1e150):
         _, info = fit.map.rollout(factor * good[:50], 20)
-        cases.append(Case(f"start at {factor:g} × the data", None, None, counts(info.status),
-                          wrong=int(np.sum(np.asarray(info.status) == OK))))  # fmt: skip
+        cases.append(
+            Case(
+                f"start at {factor:g} × the data",
+                None,
+                None,
+                counts(info.status),
+                wrong=int(np.sum(np.asarray(info.status) == OK)),
+            )
+        )
     mixed = np.concatenate([good, 1e3 * good[:2]])
     alone, together = (
         timed(lambda: fit.map.rollout(z, 200, save_every=200)[0], 1 if quick else 5)  # noqa: B023
@@ -126,9 +135,17 @@ def solver(quick: bool) -> tuple[list[Case], Numbers]:
     )
     same = np.array_equal(alone.out, together.out[: len(good)])
     measured["seconds"] = {
-        "good lanes alone": alone.seconds, "with 1 % far outside": together.seconds
-    }  # fmt: skip
+        "good lanes alone": alone.seconds,
+        "with 1 % far outside": together.seconds,
+    }
     said = f"time × {together.seconds / alone.seconds:.2g}"
-    cases.append(Case("good lanes beside 1 % far outside: bits and updates the same", None, None,
-                      said, wrong=int(not same)))  # fmt: skip
+    cases.append(
+        Case(
+            "good lanes beside 1 % far outside: bits and updates the same",
+            None,
+            None,
+            said,
+            wrong=int(not same),
+        )
+    )
     return cases, measured

@@ -102,9 +102,9 @@ def errors_and_bands(fit, z0, reference, seed: int, angles) -> tuple[np.ndarray,
 
     def between(a, b):
         difference = a - b
-        return nearest_image(
-            difference.reshape(-1, difference.shape[-1]), angles
-        ).reshape(difference.shape)  # fmt: skip
+        return nearest_image(difference.reshape(-1, difference.shape[-1]), angles).reshape(
+            difference.shape
+        )
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of states that do not go so far
@@ -114,7 +114,7 @@ def errors_and_bands(fit, z0, reference, seed: int, angles) -> tuple[np.ndarray,
 
 def calibrated(
     make, quick: bool, *, sigma: float, lend: bool, data_sets=DATA_SETS, **options
-) -> Numbers:  # fmt: skip
+) -> Numbers:
     """Coverage and width for every number of pairs. lend: whether fits are given the scene.
     options: of `gfnn.fit`."""
     scene = make()
@@ -171,11 +171,12 @@ def pooled(found: list[tuple[np.ndarray, np.ndarray]], spread) -> Numbers:
             float(np.std(c, ddof=1) / np.sqrt(sets)) if sets > 1 else None for c in by_set
         ],
         "width": (np.nanmedian(band, axis=(0, 1, 3)) / rms).tolist(),
-        "rms": rms.tolist(), "relative": relative.tolist(),
+        "rms": rms.tolist(),
+        "relative": relative.tolist(),
         "lost": [
             int(np.sum(~np.isfinite(error[:, :n, k]).all(axis=-1))) for k, n in enumerate(states)
         ],
-    }  # fmt: skip
+    }
 
 
 # What a result says
@@ -217,7 +218,7 @@ def cells(row: dict[str, Any]) -> list[Cell | str]:
         for values in zip(
             STEPS, *(row[k] for k in ("coverage", "coverage_error", "width", "rms")), strict=True
         )
-    ]  # fmt: skip
+    ]
     last = row["relative"][-1]
     if last is None or not last < SMALL:
         found[-1] = "large"

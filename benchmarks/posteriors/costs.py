@@ -36,8 +36,11 @@ def cost(quick: bool) -> Numbers:
         taken = _in_turn({"samples": (drawn, z0), "lanes": (fit.map, all_lanes)}, blocks, length)
         found[learn] = {
             "label": f"{fit.chosen.chart} {fit.chosen.label}",
-            "samples": samples, "lanes": lanes, "steps": blocks * length, **taken,
-        }  # fmt: skip
+            "samples": samples,
+            "lanes": lanes,
+            "steps": blocks * length,
+            **taken,
+        }
         print(f"  {learn}: {found[learn]}", flush=True)
     return found
 
@@ -72,5 +75,9 @@ def together(quick: bool) -> Numbers:
         for count in (1, NETWORKS["ensemble"])
     }
     per_second = {count: int(count) / seconds for count, seconds in found.items()}
-    return {"pairs": 500, "iterations": options["max_iterations"], "seconds": found,
-            "models_per_second": per_second}  # fmt: skip
+    return {
+        "pairs": 500,
+        "iterations": options["max_iterations"],
+        "seconds": found,
+        "models_per_second": per_second,
+    }

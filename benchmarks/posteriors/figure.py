@@ -34,10 +34,16 @@ def figure(rows: dict[str, list[dict[str, Any]]]) -> None:
                     panel.errorbar(
                         np.clip(cell.width, WIDTHS[0], WIDTHS[-1]),
                         max(100 * cell.coverage, LEAST),
-                        100 * (cell.coverage_error or 0.0), marker=marker, color=color, ms=7,
-                        mfc=color if "law" in name else "white", elinewidth=0.7,
-                        linestyle="none", clip_on=False, alpha=0.85,
-                    )  # fmt: skip
+                        100 * (cell.coverage_error or 0.0),
+                        marker=marker,
+                        color=color,
+                        ms=7,
+                        mfc=color if "law" in name else "white",
+                        elinewidth=0.7,
+                        linestyle="none",
+                        clip_on=False,
+                        alpha=0.85,
+                    )
         panel.set(xscale="log", xlim=(WIDTHS[0], WIDTHS[-1]), ylim=(LEAST, 101))
         panel.set_title(f"step {step:,}")
         panel.set_xticks(WIDTHS, [f"{w:g}" for w in WIDTHS])
@@ -47,14 +53,21 @@ def figure(rows: dict[str, list[dict[str, Any]]]) -> None:
     for panel in panels[:, 0]:
         panel.set_ylabel("true errors inside, %")
     cases = [
-        Line2D([], [], marker=marker, color="0.3", linestyle="none", label=name,
-               mfc="0.3" if "law" in name else "white")
+        Line2D(
+            [],
+            [],
+            marker=marker,
+            color="0.3",
+            linestyle="none",
+            label=name,
+            mfc="0.3" if "law" in name else "white",
+        )
         for name, marker in zip(rows, MARKERS, strict=False)
-    ]  # fmt: skip
+    ]
     noise = [
         Line2D([], [], marker="s", color=COLORS[sigma], linestyle="none", label=f"noise {name}")
         for name, sigma in SIGMAS.items()
-    ]  # fmt: skip
+    ]
     drawn.legend(handles=[*cases, *noise], loc="outside lower center", ncols=6, fontsize=8)
     drawn.tight_layout(rect=(0, 0.07, 1, 1))
     drawn.savefig(FIGURES / "bands.png", dpi=110)

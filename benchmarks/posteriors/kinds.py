@@ -104,9 +104,12 @@ def parameter(seed: int) -> Kind:
     z, k, ahead = draw(1_000, seed), rng.uniform(0.5, 2.0, 1_000), rng.uniform(0.6, 1.9, STATES)
     z0, z1 = (with_noise(x, rng) for x in (z, flow(partial(pendulum, stiffness=k), z, 0.2)))
     return Kind(
-        gfnn.Pairs(z0, z1, 0.2, args={"k": k}), partial(pendulum, stiffness=ahead),
-        staying(seed, ahead), options={"angles": (0,)}, ahead={"params": ahead[:, None]},
-    )  # fmt: skip
+        gfnn.Pairs(z0, z1, 0.2, args={"k": k}),
+        partial(pendulum, stiffness=ahead),
+        staying(seed, ahead),
+        options={"angles": (0,)},
+        ahead={"params": ahead[:, None]},
+    )
 
 
 def drive(seed: int) -> Kind:
@@ -115,8 +118,9 @@ def drive(seed: int) -> Kind:
     z, t0, begin = draw(1_000, seed), rng.uniform(0, 2 * np.pi, 1_000), np.zeros(STATES)
     z0, z1 = (with_noise(x, rng) for x in (z, _driven(z, t0, 0.2)))
     pairs = gfnn.Pairs(z0, z1, 0.2, args={"t": t0}, period=2 * np.pi)
-    return Kind(pairs, _with_time, 0.8 * staying(seed), options={"angles": (0,)},
-                ahead={"t0": begin})  # fmt: skip
+    return Kind(
+        pairs, _with_time, 0.8 * staying(seed), options={"angles": (0,)}, ahead={"t0": begin}
+    )
 
 
 def _driven(z: np.ndarray, t0: np.ndarray, dt: float) -> np.ndarray:
@@ -136,8 +140,9 @@ def sites(seed: int) -> Kind:
     rng, draw = np.random.default_rng(seed), box([0.5] * 16)
     z = draw(100, seed)
     z0, z1 = (with_noise(x, rng) for x in (z, flow(fput, z, 0.2)))
-    return Kind(gfnn.Pairs(z0, z1, 0.2), fput, draw(STATES, 1_000 + seed),
-                options={"structure": "chain"})  # fmt: skip
+    return Kind(
+        gfnn.Pairs(z0, z1, 0.2), fput, draw(STATES, 1_000 + seed), options={"structure": "chain"}
+    )
 
 
 KINDS: dict[str, Callable[[int], Kind]] = {
@@ -183,14 +188,21 @@ def of_kind(name: str, quick: bool) -> Numbers:
         inside.append(np.mean(error <= band, axis=(0, 2)))
         widths.append(np.sqrt(np.nanmean(band**2, axis=(0, 2))))
         errors.append(np.sqrt(np.nanmean(error**2, axis=(0, 2))))
-        print(f"  {name} {seed}: {fit.chosen.label}, inside {inside[-1].round(2)}, width "
-              f"{(widths[-1] / errors[-1]).round(2)}, rms {errors[-1]}", flush=True)  # fmt: skip
+        print(
+            f"  {name} {seed}: {fit.chosen.label}, inside {inside[-1].round(2)}, width "
+            f"{(widths[-1] / errors[-1]).round(2)}, rms {errors[-1]}",
+            flush=True,
+        )
     found = np.stack(inside)
     rms, width = (np.sqrt(np.mean(np.square(each), axis=0)) for each in (errors, widths))
     chance = np.std(found, axis=0, ddof=1) / np.sqrt(len(found)) if len(found) > 1 else None
     return {
-        "kind": name, "steps": STEPS, "labels": dict(labels.most_common()),
-        "data_sets": len(found), "coverage": found.mean(axis=0).tolist(),
+        "kind": name,
+        "steps": STEPS,
+        "labels": dict(labels.most_common()),
+        "data_sets": len(found),
+        "coverage": found.mean(axis=0).tolist(),
         "coverage_error": None if chance is None else chance.tolist(),
-        "width": (width / rms).tolist(), "rms": rms.tolist(),
-    }  # fmt: skip
+        "width": (width / rms).tolist(),
+        "rms": rms.tolist(),
+    }

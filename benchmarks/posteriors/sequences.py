@@ -41,11 +41,14 @@ def sequences(dt: float, quick: bool) -> Numbers:
         fit = quietly(pairs, learn="hamiltonian", seed=seed)
         error, band = errors_and_bands(fit, test, reference, seed, ())
         found.append((error[:STATES], band[:STATES]))
-        runs.append({
-            "terms": fit.chosen.num_parameters, "formula": fit.formula,
-            "noise": None if fit.noise is None else fit.noise.tolist(),
-            "rms_of_all": np.sqrt(np.nanmean(error**2, axis=(0, 2))).tolist(),
-        })  # fmt: skip
+        runs.append(
+            {
+                "terms": fit.chosen.num_parameters,
+                "formula": fit.formula,
+                "noise": None if fit.noise is None else fit.noise.tolist(),
+                "rms_of_all": np.sqrt(np.nanmean(error**2, axis=(0, 2))).tolist(),
+            }
+        )
         print(f"  {dt:g} {seed}: {runs[-1]}", flush=True)
     bands = pooled(found, np.std(test, axis=0))
     return {"dt": dt, "steps": STEPS, "runs": runs, **bands}

@@ -50,16 +50,24 @@ class Sheet:
 
 def _pendulum(rng):
     w, c = rng.uniform(3, 12), rng.choice([0.0, 0.05, 0.2])
-    return ("theta",), ("omega",), True, lambda t, z: [z[1], -w * np.sin(z[0]) - c * z[1]], (
-        lambda: [rng.uniform(0.4, 2.4), 0.0]
-    )  # fmt: skip
+    return (
+        ("theta",),
+        ("omega",),
+        True,
+        lambda t, z: [z[1], -w * np.sin(z[0]) - c * z[1]],
+        (lambda: [rng.uniform(0.4, 2.4), 0.0]),
+    )
 
 
 def _cart(rng):
     w, k, c = rng.uniform(2, 20), rng.choice([0.0, 3.0]), rng.choice([0.0, 0.1])
-    return ("x",), ("v",), False, lambda t, z: [z[1], -w * z[0] - k * z[0] ** 3 - c * z[1]], (
-        lambda: [rng.uniform(0.3, 1.5), rng.uniform(-1, 1)]
-    )  # fmt: skip
+    return (
+        ("x",),
+        ("v",),
+        False,
+        lambda t, z: [z[1], -w * z[0] - k * z[0] ** 3 - c * z[1]],
+        (lambda: [rng.uniform(0.3, 1.5), rng.uniform(-1, 1)]),
+    )
 
 
 def _two_carts(rng):
@@ -260,4 +268,4 @@ MISTAKES: dict[str, tuple[tuple[str, ...], Callable[[int], tuple[Sheet, bool]]]]
     "two systems": (("different systems",), lambda s: (sheet(s, s % 3, runs=3, stiffer=1.5), True)),
     "clipped": (("clipped",), lambda s: (_clipped(sheet(s, s % 5)), True)),
     "drifting clock": (("drifting clock",), lambda s: (_drifting(sheet(s)), True)),
-}  # fmt: skip
+}

@@ -16,20 +16,35 @@ from gfnn_jax.evaluate import figures
 
 TOLERANCES = (1e-4, 1e-7, 1e-10)
 ASKED = 10.0  # times as fast as SciPy and diffrax
-GROUPS = {"DOP853": ("SciPy DOP853",), "diffrax": tuple(f"diffrax {s}" for s in SOLVERS),
-          "heyoka": ("heyoka",)}  # fmt: skip
-HEADS = ["asked for", "map", "one-step RMS", "error after 1", "after 100", "µs, one lane",
-         "µs, 1,000 lanes", "DOP853", "diffrax", "heyoka", "diffrax, lanes",
-         "heyoka, lanes"]  # fmt: skip
+GROUPS = {
+    "DOP853": ("SciPy DOP853",),
+    "diffrax": tuple(f"diffrax {s}" for s in SOLVERS),
+    "heyoka": ("heyoka",),
+}
+HEADS = [
+    "asked for",
+    "map",
+    "one-step RMS",
+    "error after 1",
+    "after 100",
+    "µs, one lane",
+    "µs, 1,000 lanes",
+    "DOP853",
+    "diffrax",
+    "heyoka",
+    "diffrax, lanes",
+    "heyoka, lanes",
+]
 
 
 def time_at(points: Sequence[Numbers], error: float, key: str, arrangement: str) -> float | None:
     """Time at which an integrator has this error, between its precisions by powers; None where its
     most precise one is not as accurate. Where all are more accurate, the cheapest one's."""
     rows = sorted(
-        (p[key], p[arrangement]) for p in points
+        (p[key], p[arrangement])
+        for p in points
         if p[arrangement] is not None and p[key] is not None and p[key] > 0
-    )  # fmt: skip
+    )
     front: list[tuple[float, float]] = []  # by rising error, falling time
     for row in rows:
         if not front or row[1] < front[-1][1]:
@@ -46,8 +61,9 @@ def ratios(measured: Numbers, ours: Numbers, key: str, arrangement: str) -> dict
     for group, members in GROUPS.items():
         times = [
             time_at(measured["curves"][m], ours[key], key, arrangement)
-            for m in members if m in measured["curves"]
-        ]  # fmt: skip
+            for m in members
+            if m in measured["curves"]
+        ]
         times = [t for t in times if t is not None]
         found[group] = min(times) / ours[arrangement] if times else None
     return found
@@ -59,12 +75,18 @@ def row(measured: Numbers, ours: Numbers, key: str) -> list[str]:
     asked = number(ours["tolerance"]) + ("" if ours["met"] else " (not met)")
     return [
         asked,
-        f"{ours['chart']} {ours['label']}" + (", base map" if ours["base_map"] else "")
+        f"{ours['chart']} {ours['label']}"
+        + (", base map" if ours["base_map"] else "")
         + (f", {ours['times']} steps" if ours["times"] > 1 else ""),
-        number(ours["one_step_rms"]), number(ours["error_1"]), number(ours[f"error_{ITERATIONS}"]),
-        number(ours["single"]), number(ours["batch"]),
-        *(number(single[g]) for g in GROUPS), number(batch["diffrax"]), number(batch["heyoka"]),
-    ]  # fmt: skip
+        number(ours["one_step_rms"]),
+        number(ours["error_1"]),
+        number(ours[f"error_{ITERATIONS}"]),
+        number(ours["single"]),
+        number(ours["batch"]),
+        *(number(single[g]) for g in GROUPS),
+        number(batch["diffrax"]),
+        number(batch["heyoka"]),
+    ]
 
 
 def fastest(measured: Numbers, ours: Numbers, arrangement: str) -> float | None:
@@ -115,14 +137,16 @@ def counted(periods: int) -> str:
 
 def pendulum_text(found: dict[int, Numbers]) -> str:
     rows = [
-        [str(n), *row(measured, ours, "error_1")] for n, measured in found.items()
+        [str(n), *row(measured, ours, "error_1")]
+        for n, measured in found.items()
         for ours in measured["maps"]
-    ]  # fmt: skip
+    ]
     first = next(iter(found.values()))
     refused = [
         f"{counted(n)}: {m['refused']}. There the maps of a part are taken several times.\n\n"
-        for n, m in found.items() if m["refused"]
-    ]  # fmt: skip
+        for n, m in found.items()
+        if m["refused"]
+    ]
     return (
         "### Driven pendulum, stroboscopic map\n\n"
         f"{first['pairs']:,} pairs each; ratios at equal error after one iteration; the one-step "
@@ -161,8 +185,9 @@ def iterations_text(found: Numbers) -> str:
 def draw_curves(measured: Numbers, key: str, arrangement: str, name: str) -> None:
     curves = {
         tool: ([p[arrangement] for p in points], [p[key] for p in points])
-        for tool, points in measured["curves"].items() if points[0][arrangement] is not None
-    }  # fmt: skip
+        for tool, points in measured["curves"].items()
+        if points[0][arrangement] is not None
+    }
     ours = measured["maps"]
     curves = {"learned maps": ([m[arrangement] for m in ours], [m[key] for m in ours]), **curves}
     axes: Any = figures.work_precision(

@@ -73,9 +73,14 @@ def section_by_scipy(z0, iterations, precision):
     for lane in range(len(z)):
         for _ in range(iterations):
             solved = solve_ivp(
-                rate, (0, 20), lifted(z[lane]), method="DOP853", events=crossing, rtol=tolerance,
+                rate,
+                (0, 20),
+                lifted(z[lane]),
+                method="DOP853",
+                events=crossing,
+                rtol=tolerance,
                 atol=tolerance,
-            )  # fmt: skip
+            )
             z[lane] = solved.y_events[0][-1][[1, 3]]
     return z, len(z) * iterations
 
@@ -95,19 +100,30 @@ def pendulum_by_scipy(z0, iterations, precision):
     z = np.array(z0).T.ravel()
     for _ in range(iterations):
         z = solve_ivp(
-            rate if len(z0) == 1 else stacked_rate, (0, end), z, method="DOP853", rtol=tolerance,
-            atol=tolerance, t_eval=[end],
-        ).y[:, -1]  # fmt: skip
+            rate if len(z0) == 1 else stacked_rate,
+            (0, end),
+            z,
+            method="DOP853",
+            rtol=tolerance,
+            atol=tolerance,
+            t_eval=[end],
+        ).y[:, -1]
     return z.reshape(2, -1).T, len(z0) * iterations
 
 
 def _diffeqsolve(solver, field, start, end, z, tolerance, until=None):
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, z, _: field(t, z)), solver, start, end, None, z,
+        diffrax.ODETerm(lambda t, z, _: field(t, z)),
+        solver,
+        start,
+        end,
+        None,
+        z,
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
         event=None if until is None else diffrax.Event(lambda t, y, args, **_: until(t, y)),
-        max_steps=100_000, throw=False,
-    )  # fmt: skip
+        max_steps=100_000,
+        throw=False,
+    )
     assert solution.ys is not None
     return solution.ys[-1]
 

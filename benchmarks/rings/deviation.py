@@ -28,9 +28,12 @@ def sectors(quick: bool) -> Numbers:
 
 
 def of_region(
-    amplitude: float, quick: bool, pieces: int = 1, num_pairs: int = DELTA_PAIRS,
+    amplitude: float,
+    quick: bool,
+    pieces: int = 1,
+    num_pairs: int = DELTA_PAIRS,
     tolerance: float = 3e-6,
-) -> Numbers:  # fmt: skip
+) -> Numbers:
     """Measure one turn within an amplitude, by so many pieces whose errors add up in the mean
     square to the tolerance, from so many pairs."""
     err = ring("err.mat")
@@ -42,9 +45,11 @@ def of_region(
     few = ellipsoid(0.9 * half, 3 if quick else ORBITS, 5)
     own = {"delta": delta[: len(few)]}
     orbits = err.track(few, turns=turns, delta=own["delta"])[-1, 0]
-    (map_, fits), _, seconds = once(lambda: learned(
-        ends, 1e-2 if quick else tolerance / np.sqrt(pieces), count, delta, family="polynomial"
-    ))  # fmt: skip
+    (map_, fits), _, seconds = once(
+        lambda: learned(
+            ends, 1e-2 if quick else tolerance / np.sqrt(pieces), count, delta, family="polynomial"
+        )
+    )
     spread, first = z.std(axis=0), slice(0, min(BATCH, count))
     ours, info = map_.step(z[count:], {"delta": delta[count:]})
     one = (np.asarray(ours) - ends[-1][count:]) / spread
@@ -52,26 +57,31 @@ def of_region(
     far = (np.asarray(last)[:, -1] - orbits) / spread
     largest = max(fits, key=lambda fit: fit.chosen.num_parameters).chosen
     row = {
-        "amplitude": amplitude, "pieces": pieces, "label": largest.label,
+        "amplitude": amplitude,
+        "pieces": pieces,
+        "label": largest.label,
         "terms": largest.num_parameters,
         "one_turn": float(np.sqrt(np.mean(one**2))),
         "one_turn_median": float(np.median(np.sqrt(np.mean(one**2, axis=1)))),
         "after_turns": float(np.sqrt(np.nanmedian(np.mean(far**2, axis=1)))),
         "lost": int(np.isnan(far).any(axis=1).sum()),
         "failed": int(np.sum(np.asarray(info.status) > 1)),
-        "defect": float(np.max(np.asarray(map_.defect(few, own)))), "fit_seconds": seconds,
+        "defect": float(np.max(np.asarray(map_.defect(few, own)))),
+        "fit_seconds": seconds,
         "microseconds_per_turn": of_a_turn(map_, z[first], 20, {"delta": delta[first]}),
-    }  # fmt: skip
+    }
     grid = np.linspace(-DEVIATION, DEVIATION, 3 if quick else 9)
     start, turns = np.zeros((len(grid), 4)), 64 if quick else 512
     start[:, :2] = 1e-4
     tracked = np.concatenate([start[None], err.track(start, turns=turns, delta=grid)[:, 0]])
     states, _ = map_.rollout(start, num_steps=turns, params={"delta": grid})
-    theirs, ours = (
-        tunes_of(err, a) for a in (tracked, np.asarray(states).transpose(1, 0, 2))
-    )  # fmt: skip
+    theirs, ours = (tunes_of(err, a) for a in (tracked, np.asarray(states).transpose(1, 0, 2)))
     return {
-        "rows": [row], "num_pairs": count, "turns": TURNS, "delta": grid.tolist(),
-        "tracked": theirs.tolist(), "learned": ours.tolist(),
+        "rows": [row],
+        "num_pairs": count,
+        "turns": TURNS,
+        "delta": grid.tolist(),
+        "tracked": theirs.tolist(),
+        "learned": ours.tolist(),
         "largest_tune_difference": float(np.abs(ours - theirs).max()),
-    }  # fmt: skip
+    }

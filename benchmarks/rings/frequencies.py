@@ -46,14 +46,18 @@ def frequencies(quick: bool) -> Numbers:
     sections = {
         name: np.round(1e6 * found[: 20 if quick else 300, side * side :][..., [0, 2]], 2)
         for name, found in (("tracking", tracked), ("map", states))
-    }  # fmt: skip
+    }
     return {
-        "label": fit.chosen.label, "one_turn": fit.chosen.validation_relative, "side": side,
-        "turns": turns, "tracking": _listed(theirs), "map": _listed(ours),
+        "label": fit.chosen.label,
+        "one_turn": fit.chosen.validation_relative,
+        "side": side,
+        "turns": turns,
+        "tracking": _listed(theirs),
+        "map": _listed(ours),
         "median_difference": float(np.median(np.abs(theirs - ours)[both])),
         "kept_by_one_only": int(np.sum(np.isfinite(theirs) != np.isfinite(ours))),
         "sections_micro": {name: found.tolist() for name, found in sections.items()},
-    }  # fmt: skip
+    }
 
 
 def _listed(found: np.ndarray) -> list[float | None]:

@@ -28,11 +28,14 @@ def long(quick: bool) -> Numbers:
     size, step = np.median(change, axis=0), every * block * np.arange(1, count)
     exponent = float(np.polyfit(np.log(step), np.log(size), 1)[0])
     return {
-        "turns": turns, "particles": particles, "seconds": seconds,
+        "turns": turns,
+        "particles": particles,
+        "seconds": seconds,
         "status": np.bincount(np.asarray(info.status), minlength=5).tolist(),
-        "drift_exponent": exponent, "change_at_the_end": float(size[-count // 10 :].mean()),
+        "drift_exponent": exponent,
+        "change_at_the_end": float(size[-count // 10 :].mean()),
         "oscillation": float(np.median(action.std(axis=1) / action.mean(axis=1))),
-    }  # fmt: skip
+    }
 
 
 def aperture(quick: bool) -> Numbers:
@@ -67,9 +70,13 @@ def aperture(quick: bool) -> Numbers:
 
     of_map, of_tracking = border(lost), border(np.isnan(tracked).any(axis=1))
     return {
-        "angles": angles.tolist(), "map": of_map.tolist(), "tracking": of_tracking.tolist(),
+        "angles": angles.tolist(),
+        "map": of_map.tolist(),
+        "tracking": of_tracking.tolist(),
         "turns": turns,
         "largest_difference": float(np.max(np.abs(of_map / of_tracking - 1))),
-        "label": fit.chosen.label, "one_turn": fit.chosen.validation_relative,
-        "seconds": info.seconds, "tracking_seconds": theirs,
-    }  # fmt: skip
+        "label": fit.chosen.label,
+        "one_turn": fit.chosen.validation_relative,
+        "seconds": info.seconds,
+        "tracking_seconds": theirs,
+    }

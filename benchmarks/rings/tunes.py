@@ -76,9 +76,11 @@ def tunes(quick: bool) -> Numbers:
         states = np.asarray(map_.rollout(start, num_steps=turns)[0]).transpose(1, 0, 2)
         rows[f"{len(fits)} generated"] = found(states)
     return {
-        "amplitudes": amplitudes.tolist(), "tracked": theirs.tolist(), "turns": turns,
+        "amplitudes": amplitudes.tolist(),
+        "tracked": theirs.tolist(),
+        "turns": turns,
         "learned": {name: ours.tolist() for name, ours in rows.items()},
         "largest_difference": {
             name: float(np.abs(ours - theirs).max()) for name, ours in rows.items()
         },
-    }  # fmt: skip
+    }

@@ -19,9 +19,12 @@ ROWS = ((1e-4, (0, 4)), (1e-5, (0, 4)), (3e-7, (0, 4)), (1e-7, (0, 2, 4)))
 
 
 def learned(
-    sectors: list[np.ndarray], tolerance: float = 1e-9, count: int = NUM_PAIRS, delta=None,
+    sectors: list[np.ndarray],
+    tolerance: float = 1e-9,
+    count: int = NUM_PAIRS,
+    delta=None,
     **options: str,
-) -> tuple[SymplecticMap, list[gfnn.Fit]]:  # fmt: skip
+) -> tuple[SymplecticMap, list[gfnn.Fit]]:
     """The map of the sectors' maps in a row, from ``count`` states at their ends (K + 1, N, 4).
 
     delta: (N,), a parameter of the map.
@@ -87,9 +90,11 @@ def turn(quick: bool) -> Numbers:
     def errors(step, rollout) -> Numbers:
         one = (step(z[fresh]) - ends[-1][fresh]) / spread
         far = (rollout(few) - orbits[-1]) / spread
-        return {"one_turn": float(np.sqrt(np.mean(one**2))),
-                "after_turns": float(np.sqrt(np.nanmedian(np.mean(far**2, axis=1)))),
-                "lost": int(np.isnan(far).any(axis=1).sum())}  # fmt: skip
+        return {
+            "one_turn": float(np.sqrt(np.mean(one**2))),
+            "after_turns": float(np.sqrt(np.nanmedian(np.mean(far**2, axis=1)))),
+            "lost": int(np.isnan(far).any(axis=1).sum()),
+        }
 
     rows: list[Numbers] = []
     for tolerance, cuts in ROWS[1:2] if quick else ROWS:
@@ -101,12 +106,17 @@ def turn(quick: bool) -> Numbers:
             lambda x, m=map_: np.asarray(m.step(x)[0]),
             lambda x, m=map_: np.asarray(m.rollout(x, num_steps=turns, save_every=turns)[0])[:, -1],
         )
-        rows.append({
-            "map": f"{len(fits)} generated", "label": fits[0].chosen.label, **found,
-            "tolerance": tolerance,
-            "fit_seconds": seconds, "microseconds_per_turn": of_a_turn(map_, batch, 30),
-            "defect": float(np.max(np.asarray(map_.defect(few)))),
-        })  # fmt: skip
+        rows.append(
+            {
+                "map": f"{len(fits)} generated",
+                "label": fits[0].chosen.label,
+                **found,
+                "tolerance": tolerance,
+                "fit_seconds": seconds,
+                "microseconds_per_turn": of_a_turn(map_, batch, 30),
+                "defect": float(np.max(np.asarray(map_.defect(few)))),
+            }
+        )
     degree = 3 if quick else 9  # as many digits of a Taylor series as S of degree 10
     explicit = polynomial(z[:NUM_PAIRS], ends[-1][:NUM_PAIRS], degree)
 
@@ -116,10 +126,14 @@ def turn(quick: bool) -> Numbers:
                 x = explicit(x)
         return x
 
-    rows.append({"map": "explicit polynomial", "label": f"degree {degree}",
-                 **errors(explicit, repeated)})  # fmt: skip
+    rows.append(
+        {"map": "explicit polynomial", "label": f"degree {degree}", **errors(explicit, repeated)}
+    )
     return {
-        "rows": rows, "num_pairs": min(count, NUM_PAIRS), "turns": turns,
+        "rows": rows,
+        "num_pairs": min(count, NUM_PAIRS),
+        "turns": turns,
         "tracking_microseconds_per_turn": tracking * 1e6,
-        "num_elements": len(err.lattice), "spread": spread.tolist(),
-    }  # fmt: skip
+        "num_elements": len(err.lattice),
+        "spread": spread.tolist(),
+    }

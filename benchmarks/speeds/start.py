@@ -23,18 +23,24 @@ import gfnn_jax as gfnn
 
 # row -> (title, the release before, as its issue was filed, the most it may be)
 START: dict[str, tuple[str, str, float]] = {
-    "run_warm": ("`gfnn run two-body --quick`, compile cache warm: time ÷ time of importing its "
-                 "libraries", "16–20", 5),
+    "run_warm": (
+        "`gfnn run two-body --quick`, compile cache warm: time ÷ time of importing its libraries",
+        "16–20",
+        5,
+    ),
     "run_cold": ("the same, compile cache empty", "60", 10),
     "run_compilations": ("XLA compilations in it", "392", 60),
     "run_calls": ("Python calls in it (cProfile), millions", "47", 12),
     "fit_command": ("`gfnn fit` of 4,000 pairs, d = 2, tolerance 1e-7, warm, seconds", "30–100", 8),
-    "first_fit": ("first `gfnn.fit` of 2,000 pairs, d = 2, in Python without a compile cache, "
-                  "seconds", "76–170", 12),
+    "first_fit": (
+        "first `gfnn.fit` of 2,000 pairs, d = 2, in Python without a compile cache, seconds",
+        "76–170",
+        12,
+    ),
     "second_fit": ("second `gfnn.fit` of the same shapes in one process, seconds", "2", 1),
     "second_compilations": ("compilations in it", "3", 3),
     "first_rollout": ("first `map.rollout` of 1,000 steps after a fit, seconds", "11–19", 3),
-}  # fmt: skip
+}
 
 # What the command imports, and nothing of its own work.
 LIBRARIES = """
@@ -108,8 +114,9 @@ def process(arguments: Sequence[str], cache: Path | None) -> Process:
         env["JAX_COMPILATION_CACHE_DIR"] = str(cache)
         env["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     started, before = time.perf_counter(), os.times()
-    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, env=env,
-                          check=False)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, *arguments], capture_output=True, text=True, env=env, check=False
+    )
     seconds, after = time.perf_counter() - started, os.times()
     if done.returncode:
         raise RuntimeError(f"{arguments[:4]} failed: {done.stderr.strip().splitlines()[-1:]}")

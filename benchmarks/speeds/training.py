@@ -32,10 +32,15 @@ def training(quick: bool) -> Numbers:
     recipe = dataclasses.replace(PAPER, epochs=runs + 1, epoch_length=length)
     ends = []
     adam(
-        family, family.init(jax.random.key(SEED), jnp.float32), (w, target), (w[:10], target[:10]),
-        scene.dt * np.ones(4), recipe=recipe, key=jax.random.key(SEED),
+        family,
+        family.init(jax.random.key(SEED), jnp.float32),
+        (w, target),
+        (w[:10], target[:10]),
+        scene.dt * np.ones(4),
+        recipe=recipe,
+        key=jax.random.key(SEED),
         on_epoch=lambda *_: ends.append(time.perf_counter()),
-    )  # fmt: skip
+    )
     seconds = float(np.diff(ends).min()) / length
     weights = [jnp.ones(shape, jnp.float32) for shape in pairwise((4, *PAPER_HIDDEN, 1))]
     # Two products make ∇S, one each way; its slope in the weights takes each of them twice more.

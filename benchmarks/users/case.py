@@ -70,10 +70,15 @@ def flow(field: Field, z: np.ndarray, duration: float) -> np.ndarray:
     largest = np.maximum(np.abs(z).max(axis=0), 1e-10)  # SciPy divides by it
     floor = np.broadcast_to(1e-15 * largest[:, None], shape).ravel()
     done = solve_ivp(
-        lambda _, flat: field(flat.reshape(shape)).ravel(), (0.0, duration), z.T.ravel(),
-        method="DOP853", rtol=1e-13, atol=floor, t_eval=[duration],
+        lambda _, flat: field(flat.reshape(shape)).ravel(),
+        (0.0, duration),
+        z.T.ravel(),
+        method="DOP853",
+        rtol=1e-13,
+        atol=floor,
+        t_eval=[duration],
         max_step=duration / 8,
-    )  # fmt: skip
+    )
     return done.y[:, -1].reshape(shape).T
 
 

@@ -38,8 +38,9 @@ def low_orbits(highest: float, num: int, seed: int) -> np.ndarray:
     f = rng.uniform(0, 2 * np.pi, num)
     r, speed = axis * (1 - e**2) / (1 + e * np.cos(f)), np.sqrt(EARTH / (axis * (1 - e**2)))
     zero = np.zeros(num)
-    turns = np.stack([rng.uniform(0, 360, num), rng.uniform(50, 56, num),
-                      rng.uniform(0, 360, num)], axis=1)  # fmt: skip
+    turns = np.stack(
+        [rng.uniform(0, 360, num), rng.uniform(50, 56, num), rng.uniform(0, 360, num)], axis=1
+    )
     turn = Rotation.from_euler("ZXZ", turns, degrees=True)
     q = turn.apply(np.stack([r * np.cos(f), r * np.sin(f), zero], axis=1))
     p = turn.apply(np.stack([-speed * np.sin(f), speed * (e + np.cos(f)), zero], axis=1))
@@ -105,8 +106,9 @@ def noisy_file() -> Case:
     states = recorded(pendulum, [1.0, 1.0], 1e-3)
     lines = [
         f"{n},{0.2 * i:.1f},{q:.9f},{p:.9f}"
-        for n, orbit in enumerate(states) for i, (q, p) in enumerate(orbit)
-    ]  # fmt: skip
+        for n, orbit in enumerate(states)
+        for i, (q, p) in enumerate(orbit)
+    ]
     text = "\n".join(["sequence,t,q1,p1", *lines, ""])
     return dataclasses.replace(data, tolerance=1e-4, csv=text)
 
@@ -118,9 +120,12 @@ def hidden_parameter() -> Case:
     states, fresh = (sequences(law, box([1.0, 1.0])(40, s), 0.2, 50) for s in (1, 2))
     words = ("differs? between (the )?sequences",)
     return Case(
-        in_sequence(states, 0.2), in_sequence(fresh, 0.2), meets=False, words=words,
+        in_sequence(states, 0.2),
+        in_sequence(fresh, 0.2),
+        meets=False,
+        words=words,
         never=("noise, or a structure",),
-    )  # fmt: skip
+    )
 
 
 def twenty_pairs() -> Case:
@@ -162,9 +167,13 @@ def wrapped_angle() -> Case:
 
     data, fresh = (changed(pairs, wrap) for pairs in drawn(pendulum, draw, 0.1, 1_000))
     return Case(
-        data, fresh, max_seconds=20.0, meets=False, words=("jumps of 2π", "--angles 0"),
+        data,
+        fresh,
+        max_seconds=20.0,
+        meets=False,
+        words=("jumps of 2π", "--angles 0"),
         never=("noise", "contradict", "gross"),
-    )  # fmt: skip
+    )
 
 
 def interleaved() -> Case:
@@ -185,9 +194,13 @@ def noisy(law: Field, half: Sequence[float], sigma: float) -> Case:
     """Forty sequences of fifty steps with noise on every state, from a box."""
     fresh = in_sequence(sequences(law, box(half)(20, 2), 0.2, 50), 0.2)
     return Case(
-        in_sequence(recorded(law, half, sigma), 0.2), fresh, tolerance=1e-8, meets=False,
-        words=("noise of about",), sigma=sigma,
-    )  # fmt: skip
+        in_sequence(recorded(law, half, sigma), 0.2),
+        fresh,
+        tolerance=1e-8,
+        meets=False,
+        words=("noise of about",),
+        sigma=sigma,
+    )
 
 
 SIGMAS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)

@@ -80,4 +80,4 @@ REFUSED: dict[str, Callable[[], Refused]] = {
     "numpy-scene": lambda: Refused(
         lambda: gfnn.sample_pairs(by_numpy(), 10, jax.random.key(SEED)), "jax.numpy"
     ),
-}  # fmt: skip
+}

@@ -104,9 +104,9 @@ def double_pendulum(z):
     den = 1 + s**2
     kinetic = (pa**2 + 2 * pb**2 - 2 * pa * pb * c) / (2 * den)
     turn = pa * pb * s / den - 2 * s * c * kinetic / den
-    return np.stack([
-        (pa - pb * c) / den, (2 * pb - pa * c) / den, -turn - 2 * np.sin(a), turn - np.sin(b)
-    ])  # fmt: skip
+    return np.stack(
+        [(pa - pb * c) / den, (2 * pb - pa * c) / den, -turn - 2 * np.sin(a), turn - np.sin(b)]
+    )
 
 
 def fput(z, beta: float = 0.3):

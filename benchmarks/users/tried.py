@@ -51,8 +51,9 @@ def kepler(max_seconds: float) -> Case:
         a, e, turn = rng.uniform(0.8, 1.2, num), rng.uniform(0, 0.4, num), rng.uniform(0, 6.28, num)
         far = np.stack([a * (1 + e), 0 * a, 0 * a, np.sqrt((1 - e) / (a * (1 + e)))], axis=1)
         field, c, s = of_energy(KEPLER, 2), np.cos(turn), np.sin(turn)
-        q, p = np.split(np.concatenate(
-            [flow(field, far[i::8], 0.8 * (i + 1)) for i in range(8)]), 2, axis=1)  # fmt: skip
+        q, p = np.split(
+            np.concatenate([flow(field, far[i::8], 0.8 * (i + 1)) for i in range(8)]), 2, axis=1
+        )
         c, s = c[: len(q)], s[: len(q)]
         q, p = (np.stack([c * x - s * y, s * x + c * y], axis=1) for x, y in (q.T, p.T))
         return np.concatenate([q, p], axis=1)
@@ -136,8 +137,14 @@ def rubbing() -> Case:
     record = sequences(partial(dry_pendulum, friction=0.01), start, 0.1, 600)
     fresh = sequences(partial(dry_pendulum, friction=0.01), np.array([[1.1, 0.0]]), 0.1, 300)
     pairs = in_sequence(record, 0.1)
-    return Case(pairs, in_sequence(fresh, 0.1), meets=None, words=("friction", "dry"),
-                never=(*_CLEAN, *_SMOOTH), max_seconds=30.0)  # fmt: skip
+    return Case(
+        pairs,
+        in_sequence(fresh, 0.1),
+        meets=None,
+        words=("friction", "dry"),
+        never=(*_CLEAN, *_SMOOTH),
+        max_seconds=30.0,
+    )
 
 
 def rubbing_with_noise() -> Case:
@@ -148,16 +155,27 @@ def rubbing_with_noise() -> Case:
     states = states + 1e-4 * np.random.default_rng([SEED, 15]).normal(size=states.shape)
     pairs = gfnn.Pairs(states[:-1], states[1:], 0.1)
     return dataclasses.replace(
-        case, pairs=pairs, words=("friction",), never=(*_SMOOTH, _BETWEEN), sigma=1e-4,
-        noise_measured=False, volume_change=-7e-4,
-    )  # fmt: skip
+        case,
+        pairs=pairs,
+        words=("friction",),
+        never=(*_SMOOTH, _BETWEEN),
+        sigma=1e-4,
+        noise_measured=False,
+        volume_change=-7e-4,
+    )
 
 
 def resisted(law: Field, kind: str) -> Case:
     """Pairs that stand alone of a pendulum whose friction is not linear: it is named."""
     pairs, fresh = drawn(law, box([1.0, 1.0]), 0.1, 1_000)
-    return Case(pairs, fresh, meets=None, words=("friction", kind), never=(*_CLEAN, *_SMOOTH),
-                max_seconds=30.0)  # fmt: skip
+    return Case(
+        pairs,
+        fresh,
+        meets=None,
+        words=("friction", kind),
+        never=(*_CLEAN, *_SMOOTH),
+        max_seconds=30.0,
+    )
 
 
 # Laws and words
@@ -270,16 +288,29 @@ def single_noisy_pairs() -> Case:
     exact, fresh = swings(2_000)
     rng = np.random.default_rng([SEED, 9])
     z0, z1 = (z + 1e-3 * rng.normal(size=z.shape) for z in (exact.z0, exact.z1))
-    return Case(gfnn.Pairs(z0, z1, 0.2), fresh, tolerance=1e-8, meets=False, sigma=1e-3,
-                words=("noise of about",), never=(_BETWEEN,))  # fmt: skip
+    return Case(
+        gfnn.Pairs(z0, z1, 0.2),
+        fresh,
+        tolerance=1e-8,
+        meets=False,
+        sigma=1e-3,
+        words=("noise of about",),
+        never=(_BETWEEN,),
+    )
 
 
 def rounded() -> Case:
     """Sequences whose numbers are given to three digits behind the point."""
     states = np.round(sequences(pendulum, box([1.0, 1.0])(40, 1), 0.2, 50), 3)
     fresh = in_sequence(sequences(pendulum, box([1.0, 1.0])(20, 2), 0.2, 50), 0.2)
-    return Case(in_sequence(states, 0.2), fresh, tolerance=1e-6, meets=False,
-                words=("noise of about",), sigma=1e-3 / np.sqrt(12))  # fmt: skip
+    return Case(
+        in_sequence(states, 0.2),
+        fresh,
+        tolerance=1e-6,
+        meets=False,
+        words=("noise of about",),
+        sigma=1e-3 / np.sqrt(12),
+    )
 
 
 def single_precision() -> Case:
@@ -360,8 +391,15 @@ def one_record() -> Case:
     exact = sequences(henon_heiles, start, 0.2, 600)
     noise = np.random.default_rng([SEED, 13]).normal(size=exact.shape)
     fresh = sequences(henon_heiles, exact[:, 300] * 1.0, 0.2, 100)
-    return Case(in_sequence(exact + 1e-3 * noise, 0.2), in_sequence(fresh, 0.2), tolerance=1e-8,
-                meets=False, sigma=1e-3, words=("noise of about",), never=(_BETWEEN,))  # fmt: skip
+    return Case(
+        in_sequence(exact + 1e-3 * noise, 0.2),
+        in_sequence(fresh, 0.2),
+        tolerance=1e-8,
+        meets=False,
+        sigma=1e-3,
+        words=("noise of about",),
+        never=(_BETWEEN,),
+    )
 
 
 def noisy_wrapped() -> Case:
@@ -371,16 +409,29 @@ def noisy_wrapped() -> Case:
     states += 1e-3 * np.random.default_rng([SEED, 14]).normal(size=states.shape)
     states[..., 0] = np.remainder(states[..., 0] + np.pi, 2 * np.pi) - np.pi
     pairs = in_sequence(states, 0.1)
-    return Case(pairs, pairs, max_seconds=20.0, meets=False, words=("jumps of 2π", "--angles 0"),
-                never=("noise", "contradict", "gross"))  # fmt: skip
+    return Case(
+        pairs,
+        pairs,
+        max_seconds=20.0,
+        meets=False,
+        words=("jumps of 2π", "--angles 0"),
+        never=("noise", "contradict", "gross"),
+    )
 
 
 def noisy_friction() -> Case:
     """A damped pendulum, forty sequences with noise."""
     law = partial(pendulum, friction=0.1)
     fresh = in_sequence(sequences(law, box([1.0, 1.0])(20, 2), 0.2, 50), 0.2)
-    return Case(in_sequence(recorded(law, [1.0, 1.0], 1e-3), 0.2), fresh, tolerance=1e-8,
-                meets=False, sigma=1e-3, words=("friction",), never=(_BETWEEN,))  # fmt: skip
+    return Case(
+        in_sequence(recorded(law, [1.0, 1.0], 1e-3), 0.2),
+        fresh,
+        tolerance=1e-8,
+        meets=False,
+        sigma=1e-3,
+        words=("friction",),
+        never=(_BETWEEN,),
+    )
 
 
 TRIED: dict[str, Callable[[], Case]] = {
@@ -406,9 +457,7 @@ TRIED: dict[str, Callable[[], Case]] = {
     "kepler-file": lambda: as_file(kepler(20.0)),
     "partial-law": partial_law,
     "velocities": velocities,
-    "quartic-wells": partial(
-        of_box, WELLS, 3, 1.2, 0.1, 2_000, never=("cos", "sin", *_CLEAN)
-    ),
+    "quartic-wells": partial(of_box, WELLS, 3, 1.2, 0.1, 2_000, never=("cos", "sin", *_CLEAN)),
     "told-angle": told_angle,
     "noisy-wrapped": noisy_wrapped,
     **{f"twenty-pairs-{seed}": partial(few, seed) for seed in (1, 2)},
@@ -427,4 +476,4 @@ TRIED: dict[str, Callable[[], Case]] = {
     "told-chain": ring,
     "long-step": long_step,
     "one-record": one_record,
-}  # fmt: skip
+}

@@ -101,10 +101,16 @@ def train(
     """
     held = min(HELD, len(rows[0]) // 10)
     trained = minimise(
-        loss, params, tuple(r[held:] for r in rows), tuple(r[:held] for r in rows),
-        components=components, recipe=recipe, key=budget.key, cap=budget.cap,
+        loss,
+        params,
+        tuple(r[held:] for r in rows),
+        tuple(r[:held] for r in rows),
+        components=components,
+        recipe=recipe,
+        key=budget.key,
+        cap=budget.cap,
         on_epoch=lambda epoch, _, rms: budget.on_progress(f"epoch {epoch}: error {rms:.1e}"),
-    )  # fmt: skip
+    )
     return in_float64(trained.params), trained
 
 

@@ -50,13 +50,18 @@ def paper_gfnn(pairs: Sequences, budget: Budget) -> PaperGfnn:
     iterations = recipe.epochs * (len(w) // recipe.batch_size)
     recipe = dataclasses.replace(recipe, epochs=max(1, iterations // _PART), epoch_length=_PART)
     training = adam(
-        family, family.init(budget.key, jnp.float32), (w[held:], target[held:]),
-        (w[:held], target[:held]), pairs.dt * np.ones(2 * pairs.dim), recipe=recipe,
-        key=budget.key, cap=budget.cap,
+        family,
+        family.init(budget.key, jnp.float32),
+        (w[held:], target[held:]),
+        (w[:held], target[:held]),
+        pairs.dt * np.ones(2 * pairs.dim),
+        recipe=recipe,
+        key=budget.key,
+        cap=budget.cap,
         on_epoch=lambda epoch, _, rms: budget.on_progress(
             f"{epoch * _PART} iterations: error {rms:.1e}"
         ),
-    )  # fmt: skip
+    )
     scale = sizes(z0)
     generated = Generated(family, in_float64(training.params), TYPE2, pairs.dt, scale)
     coordinates = Coordinates("cartesian", angles=pairs.angles)

@@ -46,9 +46,11 @@ def srnn(sequences: Sequences, budget: Budget) -> Learned:
         others = tuple(i for i in range(2 * dim) if i not in columns)
         chosen = list(columns)
         return Mlp(
-            box_inputs(z, angles=q_angles(sequences), cyclic=others), HIDDEN, ACTIVATION,
+            box_inputs(z, angles=q_angles(sequences), cyclic=others),
+            HIDDEN,
+            ACTIVATION,
             amplitude_of(z[:, chosen], gradient[:, chosen]),
-        )  # fmt: skip
+        )
 
     if sequences.separable:
         kinetic, potential = family(p), family(q)

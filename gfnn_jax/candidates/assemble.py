@@ -56,10 +56,11 @@ def measured(
     images = np.where(steps.failed[:, None], np.nan, steps.images)
     error = measured_error(data, tolerance, images)
     candidate = dataclasses.replace(
-        with_error(candidate, error), map=map_,
+        with_error(candidate, error),
+        map=map_,
         newton_iterations_max=int(steps.iterations.max()),
         microseconds_per_step=steps.microseconds_per_step,
-    )  # fmt: skip
+    )
     return Assembled(candidate, steps.compile_seconds, failed=int(steps.failed.sum()))
 
 
@@ -73,10 +74,15 @@ def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:
     coordinates, args = data.coordinates, data.given(rows[solved])[1]
     features = getattr(getattr(generated.family, "inputs", None), "features", None)
     fitted = fit_predictors(
-        generated.chart, data.y0[rows][solved], images[solved],
+        generated.chart,
+        data.y0[rows][solved],
+        images[solved],
         of_lanes(data.given(rows)[0], solved),
-        angles=coordinates.angles, cyclic=coordinates.cyclic, features=features, args=args,
-    )  # fmt: skip
+        angles=coordinates.angles,
+        cyclic=coordinates.cyclic,
+        features=features,
+        args=args,
+    )
     chosen = affordable(fitted, generated.family)
     return dataclasses.replace(generated, predictor=chosen.predictor)
 

@@ -93,6 +93,10 @@ def validated(
 
 def with_error(candidate: Candidate, error: OneStepError) -> Candidate:
     return dataclasses.replace(
-        candidate, validation_rms=error.rms, validation_relative=error.relative,
-        validation_bound=error.bound, deviations=error.deviations, validated=True,
-    )  # fmt: skip
+        candidate,
+        validation_rms=error.rms,
+        validation_relative=error.relative,
+        validation_bound=error.bound,
+        deviations=error.deviations,
+        validated=True,
+    )

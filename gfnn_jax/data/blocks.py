@@ -27,9 +27,18 @@ ARC = 50
 # What flipped bits and cuts in files made zipfile, its decompressors, NumPy and the decoding of
 # text raise; a flipped bit in a header may ask for an unknown compression or for a password.
 _OF_DAMAGE = (
-    zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, ValueError,
-    tokenize.TokenError, SyntaxError, NotImplementedError, RuntimeError, MemoryError,
-)  # fmt: skip
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    OSError,
+    EOFError,
+    ValueError,
+    tokenize.TokenError,
+    SyntaxError,
+    NotImplementedError,
+    RuntimeError,
+    MemoryError,
+)
 
 
 class DataWarning(UserWarning):
@@ -50,10 +59,12 @@ class Block:
 
     def rows(self, index: np.ndarray) -> Block:
         return Block(
-            self.states[index], self.sequence[index], self.place[index],
+            self.states[index],
+            self.sequence[index],
+            self.place[index],
             lambda r, c: self.locate(int(index[r]), c),
             None if self.own is None else self.own[index],
-        )  # fmt: skip
+        )
 
     def checked(self, path) -> Block:
         """Itself, if every number is finite and not too large; else InputError."""

@@ -68,9 +68,13 @@ def roles_of(
 
 
 def angles_of(
-    source: str, roles: Mapping[str, tuple[str, ...]], given: tuple[str, ...],
-    degrees: tuple[str, ...], by_names: bool, units: Mapping[str, str],
-) -> tuple[tuple[str, ...], set[str]]:  # fmt: skip
+    source: str,
+    roles: Mapping[str, tuple[str, ...]],
+    given: tuple[str, ...],
+    degrees: tuple[str, ...],
+    by_names: bool,
+    units: Mapping[str, str],
+) -> tuple[tuple[str, ...], set[str]]:
     """(angles in the order of the positions, columns in degrees)."""
     known = (*roles["positions"], *roles["velocities"])
     check_known(source, "angles", given, roles["positions"])
@@ -84,9 +88,10 @@ def angles_of(
     if by_names:
         units_of_angles = ("deg", "°", "rad")
         angles |= {
-            n for n in roles["positions"]
+            n
+            for n in roles["positions"]
             if (is_angle(n) and not _unit(units, n)) or _unit(units, n).startswith(units_of_angles)
-        }  # fmt: skip
+        }
     return tuple(n for n in roles["positions"] if n in angles), in_degrees
 
 

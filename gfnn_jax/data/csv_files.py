@@ -83,8 +83,9 @@ def open_csv(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
     if moving:  # no parameters: an energy, say
         warnings.warn(
             f"{path}: columns ignored: {', '.join(moving)} (not constant in a sequence)",
-            DataWarning, stacklevel=4,
-        )  # fmt: skip
+            DataWarning,
+            stacklevel=4,
+        )
     period = None
     if "period" in further and not initial:
         if "t" not in names:

@@ -28,8 +28,9 @@ _RIDGE = 1e-8
 def different_systems(traits: Traits) -> list[str]:
     """Names of runs that move by another law than the rest does; none where that cannot be told."""
     recording = traits.recording
-    varied = any(np.nanmin(traits.columns[p]) < np.nanmax(traits.columns[p])
-                 for p in recording.parameters)  # fmt: skip
+    varied = any(
+        np.nanmin(traits.columns[p]) < np.nanmax(traits.columns[p]) for p in recording.parameters
+    )
     if len(recording.runs) < 2 or not recording.positions or recording.dim > 3 or varied:
         return []
     # Second derivatives want narrower windows than values do.

@@ -103,9 +103,14 @@ class TrajectoryData:
         starts[np.cumsum(self.lengths) - 1] = False
         rows = np.flatnonzero(starts)
         return Pairs(
-            self.states[rows], self.states[rows + 1], self.dt, self.args, period=self.period,
-            run=self.run, place=self.place,
-        )  # fmt: skip
+            self.states[rows],
+            self.states[rows + 1],
+            self.dt,
+            self.args,
+            period=self.period,
+            run=self.run,
+            place=self.place,
+        )
 
     def last_states(self) -> np.ndarray:
         """The last state of each sequence, (M, 2d)."""
@@ -142,9 +147,17 @@ def read_trajectories(
     _warn_of_odd_columns(path, states, sequence)
     identities = (None, None) if source.of_pairs_alone else (labels(sequence[going]), place[going])
     return TrajectoryData(
-        states, lengths, dt, str(path), digest_of(path), source.precision, source.units, args,
-        source.period, *identities,
-    )  # fmt: skip
+        states,
+        lengths,
+        dt,
+        str(path),
+        digest_of(path),
+        source.precision,
+        source.units,
+        args,
+        source.period,
+        *identities,
+    )
 
 
 def labels(sequence: np.ndarray) -> np.ndarray:
@@ -212,9 +225,13 @@ def iterate_pairs(
                         pair, run = run, _arcs_of_pairs(run, z0, z1, *last_arc)
                         along, last_arc = pair - run, (int(run[-1]), z1[-1])
                     yield Pairs(
-                        z0, z1, *given, period=source.period, run=run + number * FILE_STEP,
+                        z0,
+                        z1,
+                        *given,
+                        period=source.period,
+                        run=run + number * FILE_STEP,
                         place=along,
-                    )  # fmt: skip
+                    )
                 last_state, last_sequence, last_place = states[-1:], sequence[-1:], place[-1:]
                 last_own = [None if beside is None else beside[-1:]]
 

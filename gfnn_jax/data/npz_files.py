@@ -32,9 +32,19 @@ _HEADERS = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 _READ = {
-    "z0", "z1", "z0_std", "trajectories", "lengths", "steps", "dt", "times", "t0", "period",
-    "params", "param_names",
-}  # fmt: skip
+    "z0",
+    "z1",
+    "z0_std",
+    "trajectories",
+    "lengths",
+    "steps",
+    "dt",
+    "times",
+    "t0",
+    "period",
+    "params",
+    "param_names",
+}
 _OF_HEADERS = (TypeError,)  # NumPy sorts the keys of a header, which may be text and bytes
 
 
@@ -147,8 +157,9 @@ def open_npz(path: Path, stream, dt, initial: bool, driven: bool) -> Source:
     if further and "job" not in further:  # other arrays of a prediction are about it
         warnings.warn(
             f"{path}: arrays ignored: {', '.join(further)} (parameters are in params)",
-            DataWarning, stacklevel=4,
-        )  # fmt: skip
+            DataWarning,
+            stacklevel=4,
+        )
     found, own_dt, period = None, None, None
     if "period" in names and not initial:
         period = check_dt(member("period").whole(), f"{path}: period")
@@ -299,9 +310,15 @@ def _stride(path, shape: tuple[int, ...], steps: np.ndarray) -> float:
 
 
 def _pairs_source(
-    path, z0: _StoredArray, z1: _StoredArray, dt: float, own_dt=None, params=None, t0=None,
+    path,
+    z0: _StoredArray,
+    z1: _StoredArray,
+    dt: float,
+    own_dt=None,
+    params=None,
+    t0=None,
     period: float | None = None,
-) -> Source:  # fmt: skip
+) -> Source:
     """z0, z1 as sequences of two states. own_dt: of each pair; params: names and values; t0 (N,):
     the time of the drive at z0."""
     if len(z0.shape) != 2 or z0.shape != z1.shape:
@@ -337,24 +354,43 @@ def _pairs_source(
             sequence = np.repeat(np.arange(pair, pair + len(a)), 2)
             beside = None if own is None else own[2 * pair : 2 * (pair + len(a))]
             yield Block(
-                states, sequence, np.tile([0, 1], len(a)),
-                lambda r, c, n=pair: f"z{r % 2}[{n + r // 2}, {c}]", beside,
-            )  # fmt: skip
+                states,
+                sequence,
+                np.tile([0, 1], len(a)),
+                lambda r, c, n=pair: f"z{r % 2}[{n + r // 2}, {c}]",
+                beside,
+            )
             pair += len(a)
 
     precision = str(np.result_type(z0.dtype, z1.dtype))
     called = () if params is None else params[0]
     uneven = own_dt is not None
     return Source(
-        dim, dt, precision, {}, True, blocks, called, uneven, period, t0 is not None,
+        dim,
+        dt,
+        precision,
+        {},
+        True,
+        blocks,
+        called,
+        uneven,
+        period,
+        t0 is not None,
         of_pairs_alone=True,
-    )  # fmt: skip
+    )
 
 
 def _array_source(
-    path, array: _StoredArray, lengths: np.ndarray | None, dt: float, *, each_row: bool = False,
-    times: np.ndarray | None = None, params=None, period: float | None = None,
-) -> Source:  # fmt: skip
+    path,
+    array: _StoredArray,
+    lengths: np.ndarray | None,
+    dt: float,
+    *,
+    each_row: bool = False,
+    times: np.ndarray | None = None,
+    params=None,
+    period: float | None = None,
+) -> Source:
     """(L, 2d) or (M, L, 2d); with ``each_row`` every row is a sequence of its own."""
     shape = array.shape
     if len(shape) not in (2, 3) or (each_row and len(shape) != 2):

@@ -21,9 +21,15 @@ from gfnn_jax.storage.outputs import atomic_file, failures_as_work_errors
 
 # The axis of the lanes, of the arrays that have one.
 _LANES = {
-    "trajectories": 0, "std": 0, "quantiles": 1, "status": 0, "left_at": 0, "params": 0, "t0": 0,
+    "trajectories": 0,
+    "std": 0,
+    "quantiles": 1,
+    "status": 0,
+    "left_at": 0,
+    "params": 0,
+    "t0": 0,
     "horizon": 0,
-}  # fmt: skip
+}
 _COPIED_BYTES = 16 * 2**20  # at a time
 
 

@@ -36,9 +36,14 @@ _BAND_PARTS = 4  # beside a state: its std and three quantiles
 
 
 def job_of(
-    identity: dict[str, Any], shape: tuple[int, int], *, num_steps: int, save_every: int = 1,
-    dt: float, bands: bool = False,
-) -> dict[str, Any]:  # fmt: skip
+    identity: dict[str, Any],
+    shape: tuple[int, int],
+    *,
+    num_steps: int,
+    save_every: int = 1,
+    dt: float,
+    bands: bool = False,
+) -> dict[str, Any]:
     """Request of a prediction, as a file can hold it; the arguments are those of
     `PredictionWriter`."""
     job = {

@@ -94,14 +94,27 @@ class Recording:
     _sigmas: dict[str, str]  # name -> the column of σ of its values
 
     def __init__(
-        self, table: Any, *, positions: Names = None, velocities: Names = None,
-        momenta: Names = None, inputs: Names = None, parameters: Names = None,
-        angles: Names = None, degrees: Names = None, time_unit: str | None = None,
-        std: Mapping[str, Any] | None = None, columns: Names = None, dt: float | None = None,
-        offset: Names = None, scale: Names = None, sensors: Names = None,
-        coordinates: Names = None, observe: Mapping[str, Any] | None = None,
+        self,
+        table: Any,
+        *,
+        positions: Names = None,
+        velocities: Names = None,
+        momenta: Names = None,
+        inputs: Names = None,
+        parameters: Names = None,
+        angles: Names = None,
+        degrees: Names = None,
+        time_unit: str | None = None,
+        std: Mapping[str, Any] | None = None,
+        columns: Names = None,
+        dt: float | None = None,
+        offset: Names = None,
+        scale: Names = None,
+        sensors: Names = None,
+        coordinates: Names = None,
+        observe: Mapping[str, Any] | None = None,
         guess: Mapping[str, float] | None = None,
-    ):  # fmt: skip
+    ):
         """The recording of a table in memory; of files: `read`.
 
         table:   a DataFrame, a dict of arrays (T,), or a list of these, one run each (or several,
@@ -125,10 +138,13 @@ class Recording:
         Raises InputError where names, times or values do not fit.
         """
         given = {
-            "positions": listed(positions), "velocities": listed(velocities),
-            "momenta": listed(momenta), "inputs": listed(inputs),
-            "parameters": listed(parameters), "sensors": listed(sensors),
-        }  # fmt: skip
+            "positions": listed(positions),
+            "velocities": listed(velocities),
+            "momenta": listed(momenta),
+            "inputs": listed(inputs),
+            "parameters": listed(parameters),
+            "sensors": listed(sensors),
+        }
         tables = [from_memory(t) for t in (table if isinstance(table, (list, tuple)) else [table])]
         if not tables:
             raise InputError("expected at least one table, got none")
@@ -348,9 +364,14 @@ class Recording:
 
 
 def read(
-    paths: str | Path | Sequence[str | Path], *, start: float = -np.inf, stop: float = np.inf,
-    every: int = 1, columns: Names = None, **options: Any,
-) -> Recording:  # fmt: skip
+    paths: str | Path | Sequence[str | Path],
+    *,
+    start: float = -np.inf,
+    stop: float = np.inf,
+    every: int = 1,
+    columns: Names = None,
+    **options: Any,
+) -> Recording:
     """The recording that a file holds, or several files, one run each or more.
 
     paths:    ``.csv`` and other text (separated by commas, semicolons, tabs or blanks; decimal

@@ -155,13 +155,18 @@ def summarise(recording: Recording, options: Mapping[str, Any] | None = None) ->
     between = steps[steps < longest] if len(steps) else np.array([np.nan])
     period, loss = _motion(known)
     return RecordingSummary(
-        recording.source, counts,
+        recording.source,
+        counts,
         (float(between.min()), known.step, float(between.max())),
         tuple((recording.runs[r], a, b) for r, a, b in holes),
         tuple(_column(known, name) for name in known.columns),
-        period, _coarsest(known), loss, bool(recording.inputs), found,
+        period,
+        _coarsest(known),
+        loss,
+        bool(recording.inputs),
+        found,
         _command(recording, found, options or {}),
-    )  # fmt: skip
+    )
 
 
 def refuse_mistakes(recording: Recording, despite: Sequence[str] = ()) -> None:
@@ -188,9 +193,11 @@ def _motion(known: Traits) -> tuple[float | None, energy.Loss | None]:
         return None, None
     places = [known.moving.index(name) for name in recording.positions]
     fits = dataclasses.replace(
-        local.slopes, values=local.slopes.values[places], slopes=local.slopes.slopes[places],
+        local.slopes,
+        values=local.slopes.values[places],
+        slopes=local.slopes.slopes[places],
         curvatures=local.slopes.curvatures[places],
-    )  # fmt: skip
+    )
     if not np.isfinite(fits.slopes).all(axis=0).any() or not np.any(np.nanstd(fits.slopes, axis=1)):
         return None, None
     middle = known.sound[fits.rows[:, fits.rows.shape[1] // 2]]
@@ -218,16 +225,22 @@ def _column(known: Traits, name: str) -> Column:
     given = recording.std.get(name)
     sigma = given if given is not None else noise.sigma if noise else None
     return Column(
-        name, role, recording.unit(name),
+        name,
+        role,
+        recording.unit(name),
         float(np.nanmin(values)) / factor if have else np.nan,
         float(np.nanmax(values)) / factor if have else np.nan,
         None if resolution is None else resolution / factor,
         None if sigma is None else sigma / factor,
-        noise is None or noise.white, name in recording.angles, of,
-        None if relation is None else relation.factor, None if relation is None else relation.lag,
+        noise is None or noise.white,
+        name in recording.angles,
+        of,
+        None if relation is None else relation.factor,
+        None if relation is None else relation.lag,
         tuple(dominant_frequencies(known.times, _turning(known, name))) if noise and have else (),
-        int(np.sum(~np.isfinite(values))), *_counts(known.wrong.get(name, ())),
-    )  # fmt: skip
+        int(np.sum(~np.isfinite(values))),
+        *_counts(known.wrong.get(name, ())),
+    )
 
 
 def _counts(wrong: Sequence[WrongValues]) -> tuple[int, int]:

@@ -9,15 +9,38 @@ from collections.abc import Iterable
 
 ROLES = ("positions", "velocities", "momenta", "inputs", "parameters", "sensors")
 TIMES = (
-    "t", "time", "times", "timestamp", "timestamps", "date", "datetime", "elapsed", "clock", "sec",
-    "seconds", "millis", "micros", "zeit", "temps", "tiempo", "tempo",
-)  # fmt: skip
+    "t",
+    "time",
+    "times",
+    "timestamp",
+    "timestamps",
+    "date",
+    "datetime",
+    "elapsed",
+    "clock",
+    "sec",
+    "seconds",
+    "millis",
+    "micros",
+    "zeit",
+    "temps",
+    "tiempo",
+    "tempo",
+)
 RUNS = ("run", "trial", "sequence", "seq", "episode", "experiment", "trajectory")
 
 _GREEK = {
-    "α": "alpha", "β": "beta", "γ": "gamma", "θ": "theta", "φ": "phi", "ϕ": "phi", "ψ": "psi",
-    "ϑ": "theta", "ω": "omega", "τ": "tau",
-}  # fmt: skip
+    "α": "alpha",
+    "β": "beta",
+    "γ": "gamma",
+    "θ": "theta",
+    "φ": "phi",
+    "ϕ": "phi",
+    "ψ": "psi",
+    "ϑ": "theta",
+    "ω": "omega",
+    "τ": "tau",
+}
 _ANGLES = (
     "theta",
     "phi",
@@ -36,9 +59,18 @@ _WORDS = {
     "velocities": ("v", "omega", "velocity", "vel", "speed", "qdot", "qd", "gyro", "dq"),
     "momenta": ("p", "momentum"),
     "inputs": (
-        "u", "tau", "torque", "force", "input", "voltage", "current", "motor", "drive", "command",
+        "u",
+        "tau",
+        "torque",
+        "force",
+        "input",
+        "voltage",
+        "current",
+        "motor",
+        "drive",
+        "command",
     ),
-}  # fmt: skip
+}
 _ROLE_OF = {word: role for role, words in _WORDS.items() for word in words}
 # A word, perhaps an index (a number or the letter of an axis) after it.
 _INDEXED = re.compile(r"([a-z]+?)_?(\d+|[xyz])?")

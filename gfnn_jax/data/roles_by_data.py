@@ -65,7 +65,7 @@ def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tupl
         return []
     related = {
         (a, b): local.relation(a, b) for a, b in itertools.permutations(range(len(names)), 2)
-    }  # fmt: skip
+    }
     like = {pair: r.likeness for pair, r in related.items() if r is not None}
     found, used = [], set()
     for (a, b), likeness in sorted(like.items(), key=lambda item: -item[1]):

@@ -17,7 +17,7 @@ _MOST_MOVED = 3  # rows in a row that are taken to be out of place; more are a r
 
 def runs_of(
     tables: list[Table], names: list[str], second: float, dt: float | None
-) -> dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]:  # fmt: skip
+) -> dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Run -> times (n,) in seconds and columns (n,) by name, in order of appearance."""
     found: dict[str, tuple[np.ndarray, dict[str, np.ndarray]]] = {}
     stems = [Path(table.source).stem for table in tables]

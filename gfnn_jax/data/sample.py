@@ -28,9 +28,13 @@ _MORE = 10  # standard deviations of the number of pairs that fall below a bound
 
 
 def read_sample(
-    paths, *, dt: float | None = None, num_pairs: int = 200_000, seed: int = 0,
+    paths,
+    *,
+    dt: float | None = None,
+    num_pairs: int = 200_000,
+    seed: int = 0,
     group: Group | None = None,
-) -> TrajectoryData:  # fmt: skip
+) -> TrajectoryData:
     """Read a random sample of the pairs of data larger than memory, as `read_trajectories` would.
 
     paths: a file, or several. group: the processes that each read their own pairs of them, as
@@ -76,9 +80,19 @@ def read_sample(
     args = {n.removeprefix(_ARG): v for n, v in found.items() if n.startswith(_ARG)}
     each = float(found["dt"][0]) if same and len(states) else found["dt"]
     return TrajectoryData(
-        states, np.full(len(found["pairs"]), 2), each, named(paths), digest, precision, units,
-        args or None, period, found["run"], found["place"], int(total),
-    )  # fmt: skip
+        states,
+        np.full(len(found["pairs"]), 2),
+        each,
+        named(paths),
+        digest,
+        precision,
+        units,
+        args or None,
+        period,
+        found["run"],
+        found["place"],
+        int(total),
+    )
 
 
 def _table(pairs: Any, seed: int) -> dict[str, np.ndarray]:

@@ -63,9 +63,12 @@ def check_sigmas(source: str, sigmas: Mapping[str, str], values: Mapping[str, An
 
 
 def typical(
-    std: Mapping[str, Any], sigmas: Mapping[str, str], names: Sequence[str],
-    factors: Mapping[str, float], values: Mapping[str, Any],
-) -> dict[str, float | None]:  # fmt: skip
+    std: Mapping[str, Any],
+    sigmas: Mapping[str, str],
+    names: Sequence[str],
+    factors: Mapping[str, float],
+    values: Mapping[str, Any],
+) -> dict[str, float | None]:
     """σ of each column: as given, the median of those of its values, or None."""
     found: dict[str, float | None] = dict.fromkeys(names)
     for name in names:

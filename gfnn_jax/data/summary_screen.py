@@ -98,11 +98,17 @@ def _columns(summary: RecordingSummary) -> Table:
         table.add_column(head, justify="right" if head in ("from", "to", "noise σ") else "left")
     for column in summary.columns[: 2 * _MOST]:
         table.add_row(
-            column.name, column.role, f"{column.low:.4g}", f"{column.high:.4g}",
-            column.unit, _short(column.resolution),
-            _short(column.sigma), " ".join(f"{f:.3g}" for f in column.frequencies),
-            _remarks(column), style="dim" if column.role == "ignored" else None,
-        )  # fmt: skip
+            column.name,
+            column.role,
+            f"{column.low:.4g}",
+            f"{column.high:.4g}",
+            column.unit,
+            _short(column.resolution),
+            _short(column.sigma),
+            " ".join(f"{f:.3g}" for f in column.frequencies),
+            _remarks(column),
+            style="dim" if column.role == "ignored" else None,
+        )
     return table
 
 

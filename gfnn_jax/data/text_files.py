@@ -51,9 +51,13 @@ class _Format:
 
 
 def from_text(
-    path: Path, columns: Sequence[str] = (), *, start: float = -np.inf, stop: float = np.inf,
+    path: Path,
+    columns: Sequence[str] = (),
+    *,
+    start: float = -np.inf,
+    stop: float = np.inf,
     every: int = 1,
-) -> Table:  # fmt: skip
+) -> Table:
     """The columns of a text file, of which rows between the times ``start`` and ``stop`` (in the
     file's unit), every so many of them, are kept.
 
@@ -95,11 +99,19 @@ def _blocks(path: Path, form: _Format, wanted: list[str]) -> Iterator[dict[str, 
     words = [n for n in names if n not in wanted or n in form.text or is_run(n)]
     types = {n: str if n in words else np.float64 for n in names}
     options: dict[str, Any] = {
-        "sep": form.separator, "decimal": form.decimal, "comment": form.comment, "header": None,
-        "names": names, "dtype": types, "skiprows": form.first,
-        "chunksize": BLOCK_ROWS, "na_values": list(_MISSING), "skipinitialspace": True,
-        "encoding": "utf-8-sig", "index_col": False,
-    }  # fmt: skip
+        "sep": form.separator,
+        "decimal": form.decimal,
+        "comment": form.comment,
+        "header": None,
+        "names": names,
+        "dtype": types,
+        "skiprows": form.first,
+        "chunksize": BLOCK_ROWS,
+        "na_values": list(_MISSING),
+        "skipinitialspace": True,
+        "encoding": "utf-8-sig",
+        "index_col": False,
+    }
     last, begin = form.names[-1], None
     try:
         with pd.read_csv(path, **options) as blocks:
@@ -270,9 +282,10 @@ def _sniffed(path: Path, columns: Sequence[str]) -> _Format:
     if missing:
         raise InputError(f"{path}: no column {', '.join(missing)}, found {', '.join(names)}")
     words = tuple(
-        name for i, name in enumerate(names)
+        name
+        for i, name in enumerate(names)
         if not is_run(name) and not any(_is_number(r[i], decimal) for r in rows if i < len(r))
-    )  # fmt: skip
+    )
     before = plain[first][0] - 1
     return _Format(separator, decimal, comment, before, tuple(names), units, words, notes)
 
@@ -282,9 +295,15 @@ def _separator(path: Path, lines: list[str]) -> tuple[str, str]:
     sample = lines[-1:] if len(lines) == 1 else lines[max(1, len(lines) - 20) :]
     good = []
     for separator, decimal in (
-        (";", "."), (";", ","), ("\t", "."), ("\t", ","), (",", "."), (",", ","), (r"\s+", "."),
+        (";", "."),
+        (";", ","),
+        ("\t", "."),
+        ("\t", ","),
+        (",", "."),
+        (",", ","),
+        (r"\s+", "."),
         (r"\s+", ","),
-    ):  # fmt: skip
+    ):
         rows = [_cells(line, separator) for line in sample]
         widths = {len(row) for row in rows}
         numbers = sum(_is_number(cell, decimal) for row in rows for cell in row)

@@ -93,9 +93,18 @@ def traits(recording: Recording) -> Traits:
         table = np.stack([columns[n][sound] for n in moving])
         local = derivatives(sound_times, table, size, sigmas)
     return Traits(
-        recording, times, columns, wrong, seen, sound, noises, steps, moving, local,
+        recording,
+        times,
+        columns,
+        wrong,
+        seen,
+        sound,
+        noises,
+        steps,
+        moving,
+        local,
         median_step(times),
-    )  # fmt: skip
+    )
 
 
 def of_rows(times: list[np.ndarray], rows: np.ndarray) -> list[np.ndarray]:

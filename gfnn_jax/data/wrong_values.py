@@ -67,9 +67,7 @@ def wrong_values_of(recording: Recording) -> dict[str, tuple[WrongValues, ...]]:
     return found
 
 
-def _joined(
-    one: Sequence[WrongValues], other: Sequence[WrongValues]
-) -> tuple[WrongValues, ...]:  # fmt: skip
+def _joined(one: Sequence[WrongValues], other: Sequence[WrongValues]) -> tuple[WrongValues, ...]:
     """Both, without stretches of the second that share a sample with one of the first."""
     known = {int(row) for wrong in one for row in wrong.rows}
     more = [wrong for wrong in other if known.isdisjoint(wrong.rows.tolist())]

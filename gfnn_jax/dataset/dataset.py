@@ -58,9 +58,12 @@ class Dataset:
 
     @classmethod
     def of(
-        cls, pairs: Pairs, coordinates: Coordinates, structure: Structure | None = None,
+        cls,
+        pairs: Pairs,
+        coordinates: Coordinates,
+        structure: Structure | None = None,
         row: np.ndarray | None = None,
-    ) -> Dataset:  # fmt: skip
+    ) -> Dataset:
         """The pairs in both coordinates, all of them for training.
 
         row: (N,) the user's row of each; None: their order. Raises FitError where states have no
@@ -80,9 +83,18 @@ class Dataset:
         nowhere = covering(y0[:0], ignore=tuple(range(y0.shape[1])))
         row = np.arange(len(pairs)) if row is None else row
         return cls(
-            pairs, row, y0, y1, Split.of_training(np.arange(len(pairs)), len(pairs)),
-            np.ones(y0.shape[1]), nowhere, coordinates, centres, whole, structure=structure,
-        )._measured()  # fmt: skip
+            pairs,
+            row,
+            y0,
+            y1,
+            Split.of_training(np.arange(len(pairs)), len(pairs)),
+            np.ones(y0.shape[1]),
+            nowhere,
+            coordinates,
+            centres,
+            whole,
+            structure=structure,
+        )._measured()
 
     def __len__(self) -> int:
         return len(self.y0)
@@ -221,9 +233,13 @@ class Dataset:
     def take(self, rows: np.ndarray) -> Dataset:
         """Take these rows alone, each in its part; sizes and domain are theirs."""
         return dataclasses.replace(
-            self, pairs=self.pairs.take(rows), row=self.row[rows], y0=self.y0[rows],
-            y1=self.y1[rows], split=self.split.take(rows),
-        )._measured()  # fmt: skip
+            self,
+            pairs=self.pairs.take(rows),
+            row=self.row[rows],
+            y0=self.y0[rows],
+            y1=self.y1[rows],
+            split=self.split.take(rows),
+        )._measured()
 
     def lifted_anew(self, rows: np.ndarray) -> Dataset:
         """Take these rows alone, their angles lifted among themselves, nothing factored out and all

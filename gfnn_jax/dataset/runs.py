@@ -55,9 +55,15 @@ def identified(pairs: Pairs) -> Identified:
 def _numbered(pairs: Pairs, run: np.ndarray, place: np.ndarray) -> Pairs:
     """The pairs with these runs and places."""
     return Pairs(
-        pairs.z0, pairs.z1, pairs.dt, pairs.args, period=pairs.period, run=run, place=place,
+        pairs.z0,
+        pairs.z1,
+        pairs.dt,
+        pairs.args,
+        period=pairs.period,
+        run=run,
+        place=place,
         std=pairs.std,
-    )  # fmt: skip
+    )
 
 
 def _chains(run: np.ndarray, z0: np.ndarray, z1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

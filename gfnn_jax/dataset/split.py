@@ -88,9 +88,10 @@ def _apart(goes_on: np.ndarray, part: np.ndarray, gap: int) -> np.ndarray:
     for border in np.flatnonzero(goes_on & (part[1:] != part[:-1])):
         low, high = part[border], part[border + 1]
         side = (
-            slice(border - gap + 1, border + 1) if low < high
+            slice(border - gap + 1, border + 1)
+            if low < high
             else slice(border + 1, border + 1 + gap)
-        )  # fmt: skip
+        )
         rows = np.arange(max(side.start, 0), min(side.stop, len(part)))
         own = run[border] if low < high else run[border + 1]
         apart[rows[(run[rows] == own) & (part[rows] == min(low, high))]] = False

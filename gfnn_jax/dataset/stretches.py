@@ -115,10 +115,11 @@ class Arcs:
 
 
 def stretches(
-    recording: Recording, channels: Sequence[str] | None = None,
+    recording: Recording,
+    channels: Sequence[str] | None = None,
     coordinates_of: Callable[[np.ndarray], np.ndarray] | None = None,
     parameters: Sequence[str] = (),
-) -> list[Stretch]:  # fmt: skip
+) -> list[Stretch]:
     """The stretches of all runs.
 
     channels: columns that are seen, the positions unless given. coordinates_of: (n, k) channels ->
@@ -150,9 +151,15 @@ def stretches(
 
 
 def pieces(
-    run: str, t: np.ndarray, y: np.ndarray, u: np.ndarray, q: np.ndarray, noise: np.ndarray,
-    args: np.ndarray, gap: float = GAP,
-) -> list[Stretch]:  # fmt: skip
+    run: str,
+    t: np.ndarray,
+    y: np.ndarray,
+    u: np.ndarray,
+    q: np.ndarray,
+    noise: np.ndarray,
+    args: np.ndarray,
+    gap: float = GAP,
+) -> list[Stretch]:
     """A run cut at its gaps."""
     steps = np.diff(t)
     cuts = np.flatnonzero(steps > gap * np.median(steps)) + 1 if len(steps) else []

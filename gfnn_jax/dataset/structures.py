@@ -31,13 +31,24 @@ from gfnn_jax.phase_space import sizes
 _ENDS = {"ring": ("ring",), "chain": ("free", "fixed")}
 # (reach, degree, whether functions are tried too) of the libraries, by rising size.
 _LIBRARIES = (
-    (1, 2, False), (1, 4, False), (1, 2, True), (2, 2, False), (2, 4, False), (1, 6, False),
+    (1, 2, False),
+    (1, 4, False),
+    (1, 2, True),
+    (2, 2, False),
+    (2, 4, False),
+    (1, 6, False),
     (1, 8, False),
-)  # fmt: skip
+)
 _FUNCTIONS = (
-    "cos(q1)", "sin(q1)", "exp(q1)", "exp(-q1)",
-    "cos(q2 - q1)", "sin(q2 - q1)", "exp(q2 - q1)", "exp(q1 - q2)",
-)  # fmt: skip
+    "cos(q1)",
+    "sin(q1)",
+    "exp(q1)",
+    "exp(-q1)",
+    "cos(q2 - q1)",
+    "sin(q2 - q1)",
+    "exp(q2 - q1)",
+    "exp(q1 - q2)",
+)
 # (degree, whether products of p, of modes of q and of modes of the difference are tried) of the
 # libraries where q is an angle, by rising size.
 _FOURIER = ((2, False), (4, False), (2, True), (6, False), (3, True), (4, True))
@@ -108,8 +119,9 @@ class Sites:
                 Terms((k + 1) * self.fields, names, _units(len(names))),
                 Windows(ends, k, self.fields),
             )
-            for k, names in enumerate((alone, bonds)) if names
-        )  # fmt: skip
+            for k, names in enumerate((alone, bonds))
+            if names
+        )
         return ranges_of(Sums(dim, parts), z)
 
 

@@ -129,9 +129,15 @@ def _without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
         for name in still
     ]
     varied = Pairs(
-        pairs.z0, pairs.z1, one, kept or None, period=period, run=pairs.run, place=pairs.place,
+        pairs.z0,
+        pairs.z1,
+        one,
+        kept or None,
+        period=period,
+        run=pairs.run,
+        place=pairs.place,
         std=pairs.std,
-    )  # fmt: skip
+    )
     return varied, own_time + messages
 
 

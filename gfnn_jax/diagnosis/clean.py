@@ -16,9 +16,11 @@ _MOST_OUTLIERS = 0.05  # of the pairs may be left out
 
 
 def clean(
-    found: Identified, coordinates: Coordinates, structure: Structure | None = None,
+    found: Identified,
+    coordinates: Coordinates,
+    structure: Structure | None = None,
     jumps: bool = False,
-) -> tuple[Dataset, list[str]]:  # fmt: skip
+) -> tuple[Dataset, list[str]]:
     """The data set without copies, without gross errors that are certain, and, where they are few,
     without outliers; and warnings about what was left out. jumps: whether an angle is wrapped that
     was not named: pairs contradict their neighbours where it jumps, and none is an error.

@@ -121,9 +121,13 @@ def area_factors(jacobians, scale) -> np.ndarray:
 
 
 def learn_damping(
-    data: Dataset, jacobians, error: float, chart: str, reversor,
+    data: Dataset,
+    jacobians,
+    error: float,
+    chart: str,
+    reversor,
     most_operations: float = _MOST_OPERATIONS,
-) -> LearnedDamping | None:  # fmt: skip
+) -> LearnedDamping | None:
     """The D_b behind these pairs; None where areas are kept, or no D_b explains what is lost.
 
     data: without a base map. jacobians: (n, 2d, 2d) local ones, known to the error.
@@ -262,9 +266,13 @@ class _Problem:
                 np.asarray(factor[0]), np.asarray(std[0]), np.asarray(found.shift[0])
             )
         return LearnedDamping(
-            factor, std, found.shift, found.functions, self.data.parameters,
+            factor,
+            std,
+            found.shift,
+            found.functions,
+            self.data.parameters,
             (np.asarray(b.min(axis=0)), np.asarray(b.max(axis=0))),
-        )  # fmt: skip
+        )
 
     def _families(self, spread, factor) -> Iterator[Products]:
         """Families by rising degree, those that the training rows determine in reasonable time."""
@@ -272,9 +280,11 @@ class _Problem:
         rows = self.data.training
         w = rows_of(undamped, self.chart, rows)[0][0]
         inputs = box_inputs(
-            w, angles=tuple(self._angles), cyclic=undamped.coordinates.cyclic,
+            w,
+            angles=tuple(self._angles),
+            cyclic=undamped.coordinates.cyclic,
             args=undamped.given(rows)[1],
-        )  # fmt: skip
+        )
         for degree in _DEGREES:
             family = Products(inputs, degree)
             terms = family.num_parameters
@@ -285,9 +295,12 @@ class _Problem:
             yield family
 
     def fitted(
-        self, family: Products, functions: FunctionsOfArgs | None, spread: np.ndarray,
+        self,
+        family: Products,
+        functions: FunctionsOfArgs | None,
+        spread: np.ndarray,
         factor: np.ndarray,
-    ) -> _Fitted:  # fmt: skip
+    ) -> _Fitted:
         """b, c and S by Gauss–Newton, from this b, as far as it has these functions, and c = 0."""
         values, k = self._values(functions), len(spread)
         t, a = values.shape[1], len(self._angles)
@@ -321,13 +334,14 @@ class _Problem:
 
     def _columns(
         self, family: Products, solved, undamped: Dataset, spread, values, b, c
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         """(n, t (k + a)): the derivatives of the residuals of ∇S in the coefficients of b and c,
         which move the momenta of D_b⁻¹Z = (Q, (P − c)/b)."""
         dim, chart, dt, rows = self.data.dim, self.chart, undamped.dt, self.data.training
         (w, _, *args), weight = rows_of(undamped, chart, rows)
-        b, c, values = (np.broadcast_to(x, (len(self.data), x.shape[-1]))[rows] for x in
-                        (b, c, values))  # fmt: skip
+        b, c, values = (
+            np.broadcast_to(x, (len(self.data), x.shape[-1]))[rows] for x in (b, c, values)
+        )
         p = (split(self.data.y1[rows])[1] - c) / b
         each, angles = values[:, :, None, None], np.eye(dim)[self._angles]
         by_factor = -(p / b)[:, None, None, :] * each * spread

@@ -94,9 +94,7 @@ class ChartDeterminant(NamedTuple):
         return self.low > SINGULAR
 
 
-def local_jacobians(
-    y0, y1, scale, given=None, *, seed: int = 0
-) -> tuple[np.ndarray, float]:  # fmt: skip
+def local_jacobians(y0, y1, scale, given=None, *, seed: int = 0) -> tuple[np.ndarray, float]:
     """Jacobians of y0 -> y1 at 50 to 400 of the states, (n, 2d, 2d), and the error of their entries
     in coordinates of unit size, infinite where most are not known in all directions.
 

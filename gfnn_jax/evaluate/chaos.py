@@ -83,9 +83,7 @@ def curve_distance(z, curve, harmonics: int = 64):
 
     def design(theta):
         angle = theta[..., None] * k
-        return np.concatenate(
-            [np.ones((*theta.shape, 1)), np.cos(angle), np.sin(angle)], axis=-1
-        )  # fmt: skip
+        return np.concatenate([np.ones((*theta.shape, 1)), np.cos(angle), np.sin(angle)], axis=-1)
 
     coefficients = np.linalg.lstsq(design(curve[:, 0]), curve[:, 1], rcond=None)[0]
     constant, even, odd = np.split(coefficients, [1, 1 + harmonics])

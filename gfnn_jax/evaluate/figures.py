@@ -146,9 +146,15 @@ def _shaded(ax, steps, upper):
     ax.plot(steps[shown], upper[shown], color=REFERENCE, linewidth=0.8, alpha=0.5, label="_band")
     low = min(ax.get_ylim()[0], float(upper[shown].min()))
     ax.fill_between(
-        steps[shown], low, upper[shown], color="0.5", alpha=0.15, linewidth=0, zorder=0,
+        steps[shown],
+        low,
+        upper[shown],
+        color="0.5",
+        alpha=0.15,
+        linewidth=0,
+        zorder=0,
         label=r"two $\sigma$ of the posterior",
-    )  # fmt: skip
+    )
     ax.set_ylim(bottom=low)
 
 

@@ -159,8 +159,15 @@ def work_precision_panels(panels: Mapping, ylabel) -> Figure:
             look = look_of(place[name]) | {"linestyle": "none", "ms": 5.5}
             ax.plot(*points[:2], label=name, **look)
             for cost, error, size in zip(*points, strict=True):
-                ax.annotate(size, (cost, error), (5, 3), textcoords="offset points", fontsize=6,
-                            color=look["color"], path_effects=HALO)  # fmt: skip
+                ax.annotate(
+                    size,
+                    (cost, error),
+                    (5, 3),
+                    textcoords="offset points",
+                    fontsize=6,
+                    color=look["color"],
+                    path_effects=HALO,
+                )
             if name in groups["float32"]:
                 ax.plot(*groups["float32"][name][:2], mfc="white", **look)
         if groups["float32"]:
@@ -201,9 +208,14 @@ def _front(ax, curves):
     """Draw the staircase through the points that no other beats in both cost and error."""
     cost, error = (np.concatenate([np.ravel(c[i]) for c in curves]) for i in (0, 1))
     ax.step(
-        *_unbeaten(cost, error), where="post", color=COLOURS[5], lw=4, alpha=0.45,
-        label="best of our maps", zorder=1.5,
-    )  # fmt: skip
+        *_unbeaten(cost, error),
+        where="post",
+        color=COLOURS[5],
+        lw=4,
+        alpha=0.45,
+        label="best of our maps",
+        zorder=1.5,
+    )
 
 
 @style()
@@ -248,8 +260,13 @@ def digits_against_step_size(sweeps: Mapping, axes=None) -> list[Axes]:
             ax.plot(dt, digits, label=name, **look)
             lost = np.isnan(digits)
             # Crosses of charts that fail alike stand above each other.
-            ax.plot(dt[lost], np.full(lost.sum(), -0.4 * place), ls="none", marker="x",
-                    color=look["color"])  # fmt: skip
+            ax.plot(
+                dt[lost],
+                np.full(lost.sum(), -0.4 * place),
+                ls="none",
+                marker="x",
+                color=look["color"],
+            )
         ax.set(title=system, xlabel="time step $dt$")
     axes[0].set_ylabel("digits kept in one step")
     axes[0].plot([], [], ls="none", marker="x", color=REFERENCE, label="fit refused")

@@ -22,9 +22,12 @@ def law_figure(fit: LearnedLaw, recording: Recording, path: Path) -> Path:
     """Write the figure of a law and the recording that it was learned from, in the file's units."""
     channels = list(fit.whiteness)[:_MOST_CHANNELS]
     figure, axes = plt.subplots(
-        len(channels) + 1, 3, figsize=(14, 2.6 * (len(channels) + 1)), squeeze=False,
+        len(channels) + 1,
+        3,
+        figsize=(14, 2.6 * (len(channels) + 1)),
+        squeeze=False,
         layout="constrained",
-    )  # fmt: skip
+    )
     run = max(recording.runs, key=lambda name: np.ptp(recording.times(name)))
     for row, name in zip(axes, channels, strict=False):
         _forecast(row[0], fit, recording, run, name)
@@ -49,9 +52,13 @@ def forecasts_figure(found: Forecasts, recording: Recording, path: Path) -> Path
     names = list(found.median)[:_MOST_CHANNELS]
     shown = [found.each[k] for k in sorted({0, len(found.each) // 2, len(found.each) - 1})]
     figure, axes = plt.subplots(
-        2 * len(names), len(shown), figsize=(3.6 * len(shown), 3.6 * len(names)), squeeze=False,
-        sharey="row", layout="constrained",
-    )  # fmt: skip
+        2 * len(names),
+        len(shown),
+        figsize=(3.6 * len(shown), 3.6 * len(names)),
+        squeeze=False,
+        sharey="row",
+        layout="constrained",
+    )
     for column, one in zip(axes.T, shown, strict=True):
         for above, below, name in zip(column[::2], column[1::2], names, strict=True):
             missed = one.values[name] - one.measured[name]

@@ -89,9 +89,12 @@ def space_time(times, reference, predicted, angles: str = "") -> Figure:
     figure.colorbar(drawn, ax=panels[:2], label="$p_i$", location="bottom", shrink=0.6)
     worst = max(float(np.nanmax(off)), 10 * _ROUNDOFF)
     drawn = panels[2].imshow(
-        np.maximum(off, _ROUNDOFF), norm=LogNorm(_ROUNDOFF, worst), cmap="viridis",
-        interpolation="nearest", **box,
-    )  # fmt: skip
+        np.maximum(off, _ROUNDOFF),
+        norm=LogNorm(_ROUNDOFF, worst),
+        cmap="viridis",
+        interpolation="nearest",
+        **box,
+    )
     figure.colorbar(drawn, ax=panels[2], label="difference", location="bottom")
     panels[2].set(title="difference", xlabel="site")
     panels[0].set(ylabel="t")
@@ -128,7 +131,9 @@ def orbits(times, reference, predicted, bodies: int) -> Figure:
     panels[0].set(ylabel="$q$" if on_a_line else "$q_y$")
     panels[2].set(title="difference", xlabel="t", ylabel="distance", yscale="log")
     figure.legend(
-        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=bodies,
+        *panels[0].get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=bodies,
         frameon=False,
-    )  # fmt: skip
+    )
     return figure

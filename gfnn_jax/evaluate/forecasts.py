@@ -61,14 +61,20 @@ def forecasts_along(map_: SymplecticMap, recording: Recording, ahead: Sequence[f
     names = list(each[0].values)
     median = {
         name: tuple(
-            float(np.nanmedian([
-                np.interp(one.begin + s, one.t, np.abs(one.values[name] - one.measured[name]))
-                for one in each
-            ]))
+            float(
+                np.nanmedian(
+                    [
+                        np.interp(
+                            one.begin + s, one.t, np.abs(one.values[name] - one.measured[name])
+                        )
+                        for one in each
+                    ]
+                )
+            )
             for s in ahead
         )
         for name in names
-    }  # fmt: skip
+    }
     inside = [
         np.abs(one.values[n] - one.measured[n]) <= 2 * one.std[n] for one in each for n in names
     ]

@@ -69,7 +69,9 @@ def beside_flow(map_: SymplecticMap, pairs: Pairs, degree: int = _DEGREE) -> Bes
         return float(np.sqrt(np.mean(x**2)))
 
     return BesideFlow(
-        float(found[0]), relative(of_state[..., 1:] @ found[1:] / unit),
-        relative((momenta - of_state @ found) / unit), relative(moved / spread),
+        float(found[0]),
+        relative(of_state[..., 1:] @ found[1:] / unit),
+        relative((momenta - of_state @ found) / unit),
+        relative(moved / spread),
         relative(turned / unit),
-    )  # fmt: skip
+    )

@@ -126,9 +126,11 @@ def _damping(fit: Fit) -> dict[str, Any] | None:
     if damping.functions is not None:
         low, high = (values.tolist() for values in damping.extremes)
         found |= {
-            "parameters": damping.names, "degrees": damping.functions.degrees, "low": low,
+            "parameters": damping.names,
+            "degrees": damping.functions.degrees,
+            "low": low,
             "high": high,
-        }  # fmt: skip
+        }
     return found
 
 

@@ -89,7 +89,9 @@ def _explicit(name: str, piece: Any, width: int, more: int) -> list[str]:
     tape = Tape()
     z, args = _with_args(tape, "z", width, more)
     image = tape.function(f"{name}_image", {"Z": piece.image(z, args)[0]})
-    return [image, f"""\
+    return [
+        image,
+        f"""\
 static int {name}(double *z)
 {{
     double Z[{width}];
@@ -97,7 +99,8 @@ static int {name}(double *z)
     memcpy(z, Z, sizeof Z);
     return OK;
 }}
-"""]  # fmt: skip
+""",
+    ]
 
 
 class _Given:

@@ -18,17 +18,50 @@ from gfnn_jax.storage.outputs import atomic_write, ensure_new
 
 SUFFIXES = {"c": ".c", "stablehlo": ".zip"}
 _NO_NAMES = {
-    "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else",
-    "enum", "extern", "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict",
-    "return", "short", "signed", "sizeof", "static", "struct", "switch", "typedef", "union",
-    "unsigned", "void", "volatile", "while",
-}  # fmt: skip
+    "auto",
+    "break",
+    "case",
+    "char",
+    "const",
+    "continue",
+    "default",
+    "do",
+    "double",
+    "else",
+    "enum",
+    "extern",
+    "float",
+    "for",
+    "goto",
+    "if",
+    "inline",
+    "int",
+    "long",
+    "register",
+    "restrict",
+    "return",
+    "short",
+    "signed",
+    "sizeof",
+    "static",
+    "struct",
+    "switch",
+    "typedef",
+    "union",
+    "unsigned",
+    "void",
+    "volatile",
+    "while",
+}
 
 
 def export(
-    map_: SymplecticMap | str | Path, to: str, out: str | Path | None = None, *,
+    map_: SymplecticMap | str | Path,
+    to: str,
+    out: str | Path | None = None,
+    *,
     overwrite: bool = False,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write a map as one file, and return its path.
 
     map_: a map, or the folder of a saved one, whose record then goes into the file.

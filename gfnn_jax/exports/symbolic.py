@@ -24,9 +24,7 @@ def as_latex(text: str) -> str:
     return sympy.latex(as_sympy(text))
 
 
-def hamiltonian(
-    mass: Mapping[tuple[int, int], Sequence[str]], potential: str, dim: int
-) -> Any:  # fmt: skip
+def hamiltonian(mass: Mapping[tuple[int, int], Sequence[str]], potential: str, dim: int) -> Any:
     """½ pᵀ M⁻¹ p + V in p1, …, pd: of the summands of the entries (i, j), i <= j, of M, and V."""
     import sympy
 

@@ -20,9 +20,17 @@ _SUM, _PRODUCT, _ATOM = range(3)  # how tightly an operation binds
 _BINDS = {"+": _SUM, "-": _SUM, "*": _PRODUCT, "/": _PRODUCT}
 # NumPy's names of functions, which it calls as methods of objects, and those of C.
 _FUNCTIONS = {
-    "cos": "cos", "sin": "sin", "tan": "tan", "exp": "exp", "log": "log", "sqrt": "sqrt",
-    "sinh": "sinh", "cosh": "cosh", "tanh": "tanh", "arctan": "atan",
-}  # fmt: skip
+    "cos": "cos",
+    "sin": "sin",
+    "tan": "tan",
+    "exp": "exp",
+    "log": "log",
+    "sqrt": "sqrt",
+    "sinh": "sinh",
+    "cosh": "cosh",
+    "tanh": "tanh",
+    "arctan": "atan",
+}
 
 
 class Symbol:
@@ -158,8 +166,11 @@ class Tape:
         given = [f"const double {n}[{size}]" for n, size in self._inputs.items()]
         taken = [f"double {n}[{size}]" for n, size in sizes.items()]
         uses = self._uses(results.values())
-        used = {s.operands[0].partition("[")[0] for s in self._made
-                if s.operation == "input" and s.number in uses}  # fmt: skip
+        used = {
+            s.operands[0].partition("[")[0]
+            for s in self._made
+            if s.operation == "input" and s.number in uses
+        }
         lines = [f"(void)({n});" for n in self._inputs if n not in used] + self.lines(results)
         body = [f"    {line}" for line in lines]
         return "\n".join([f"static void {name}({', '.join([*given, *taken])})", "{", *body, "}\n"])

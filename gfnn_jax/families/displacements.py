@@ -77,10 +77,12 @@ class OfDisplacement:
 
     def gradient(self, params, w, args=None):
         """∂S/∂w (..., 2d)."""
-        return self._mean([
-            self._turned(self._outer(self.family.gradient(params, self._inner(v), args), -1), k)
-            for k, v in enumerate(self._ways(w))
-        ])  # fmt: skip
+        return self._mean(
+            [
+                self._turned(self._outer(self.family.gradient(params, self._inner(v), args), -1), k)
+                for k, v in enumerate(self._ways(w))
+            ]
+        )
 
     def gradient_and_hessian(self, params, w, args=None):
         """∂S/∂w (..., 2d) and ∂²S/∂w² (..., 2d, 2d)."""
@@ -94,10 +96,12 @@ class OfDisplacement:
 
     def term_gradients(self, w, args=None):
         """Gradient of every term at w (..., 2d): (..., 2d, N). NumPy."""
-        return self._mean([
-            self._turned(self._outer(self.family.term_gradients(self._inner(v)), -2), k, -2)
-            for k, v in enumerate(self._ways(w))
-        ])  # fmt: skip
+        return self._mean(
+            [
+                self._turned(self._outer(self.family.term_gradients(self._inner(v)), -2), k, -2)
+                for k, v in enumerate(self._ways(w))
+            ]
+        )
 
     def curvatures(self, params, w, args=None) -> list:
         """Curvatures that ``hessian_product`` takes: those of F, one way or both."""

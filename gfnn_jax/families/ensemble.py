@@ -19,9 +19,7 @@ from gfnn_jax.families.family import DifferentiatedByJax
 from gfnn_jax.families.mlp import Mlp
 
 
-@partial(
-    jax.tree_util.register_dataclass, data_fields=("network", "members"), meta_fields=()
-)  # fmt: skip
+@partial(jax.tree_util.register_dataclass, data_fields=("network", "members"), meta_fields=())
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ensemble(DifferentiatedByJax):
     """Ensemble of E networks of one shape; the params of the family are their weights (E,).

@@ -36,7 +36,7 @@ DERIVATIVES: dict[str, tuple[Callable, Callable, Callable]] = {
         lambda xp, v, y: 1 / (1 + v * v),
         lambda xp, v, y: -2 * v / _squared(xp, 1 + v * v),
     ),
-}  # fmt: skip
+}
 CHEBYSHEV = re.compile(r"T\d{1,2}")
 CIRCULAR = ("sin", "cos")  # which share their values
 FUNCTIONS = (*CIRCULAR, *DERIVATIVES)

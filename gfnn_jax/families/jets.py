@@ -77,8 +77,9 @@ def _jet_of(tree: Expression, w, order, known) -> Jet:
     if operation == "+":
         return Jet(
             first.value + second.value,
-            _added(first.slope, second.slope), _added(first.curvature, second.curvature),
-        )  # fmt: skip
+            _added(first.slope, second.slope),
+            _added(first.curvature, second.curvature),
+        )
     if operation == "/":
         inverse = 1.0 / second.value
         slope = -inverse * inverse if order else 0.0
@@ -97,8 +98,9 @@ def _chebyshev(x: Jet, part: Expression, n: int, order: int, known) -> Jet:
         less = _multiplied(Jet(-1.0, {}, {}), before, order)
         known["T", part, n] = Jet(
             twice.value + less.value,
-            _added(twice.slope, less.slope), _added(twice.curvature, less.curvature),
-        )  # fmt: skip
+            _added(twice.slope, less.slope),
+            _added(twice.curvature, less.curvature),
+        )
     return known["T", part, n]
 
 
@@ -183,8 +185,10 @@ def _composed(inner: Jet, order, value, slope, curvature) -> Jet:
     bent = {k: slope * c for k, c in inner.curvature.items()}
     outer = {
         (i, j): curvature * a * b
-        for i, a in inner.slope.items() for j, b in inner.slope.items() if i <= j
-    }  # fmt: skip
+        for i, a in inner.slope.items()
+        for j, b in inner.slope.items()
+        if i <= j
+    }
     return Jet(value, slopes, _added(bent, outer))
 
 

@@ -280,9 +280,12 @@ class Lagrangian:
         last = first + self.friction.count
         of_gains = weights[..., last:].reshape(*weights.shape[:-1], *self.gains.shape)
         return dataclasses.replace(
-            self, coefficients=self.coefficients * weights[..., :first],
-            losses=self.losses * weights[..., first:last], gains=self.gains * of_gains, powers=None,
-        )  # fmt: skip
+            self,
+            coefficients=self.coefficients * weights[..., :first],
+            losses=self.losses * weights[..., first:last],
+            gains=self.gains * of_gains,
+            powers=None,
+        )
 
     def derivatives(self, q: Any, v: Any) -> Derivatives:
         """L and its first and second derivatives at q, v (..., d)."""
@@ -384,8 +387,11 @@ def functions_of(powers: Powers, args: Any) -> Any:
 
 
 def _friction_named(direction: tuple[int, ...], kind: int) -> str:
-    parts = [f"{'-' if c < 0 else '+'} {abs(c) if abs(c) > 1 else ''}v{i + 1}"
-             for i, c in enumerate(direction) if c]  # fmt: skip
+    parts = [
+        f"{'-' if c < 0 else '+'} {abs(c) if abs(c) > 1 else ''}v{i + 1}"
+        for i, c in enumerate(direction)
+        if c
+    ]
     speed = " ".join(parts).removeprefix("+ ")
     if kind == LINEAR:
         return f"½ ({speed})²" if len(parts) > 1 else f"½ {speed}²"

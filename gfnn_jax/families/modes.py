@@ -89,8 +89,12 @@ class Modes:
         waves = list(dict.fromkeys(m.wave for m in known))
         products = list(dict.fromkeys(m.powers for m in known))
         short = [w for w in waves if any(w) and max(map(abs, w)) <= _ORDER]
-        sums = {_directed(tuple(a + s * b for a, b in zip(w, g, strict=True)))
-                for w in waves for g in short for s in (1, -1)}  # fmt: skip
+        sums = {
+            _directed(tuple(a + s * b for a, b in zip(w, g, strict=True)))
+            for w in waves
+            for g in short
+            for s in (1, -1)
+        }
         higher = {
             (*a[:k], a[k] + 1, *a[k + 1 :]) for a in products for k in range(len(self.others))
         }

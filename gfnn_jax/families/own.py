@@ -15,9 +15,16 @@ from gfnn_jax.families.inputs import Inputs
 
 # The members of `families.family.LinearFamily`.
 _NEEDED = (
-    "name", "label", "operations", "num_parameters", "value", "gradient", "gradient_and_hessian",
-    "term_gradients", "unflatten",
-)  # fmt: skip
+    "name",
+    "label",
+    "operations",
+    "num_parameters",
+    "value",
+    "gradient",
+    "gradient_and_hessian",
+    "term_gradients",
+    "unflatten",
+)
 
 
 def own_families(given: Any, inputs: Inputs) -> Iterator[Any]:

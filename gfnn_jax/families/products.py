@@ -122,9 +122,11 @@ class _Half:
         for angle in self.is_angle:
             count = 2 * self.degree + 1 if angle else self.degree + 1
             terms = [
-                (*t, k) for t in terms for k in range(count)
+                (*t, k)
+                for t in terms
+                for k in range(count)
                 if self._harmonic(k) + self._order(t) <= self.degree
-            ]  # fmt: skip
+            ]
         terms = [t for t in terms if not self.only_even or self._parity(t) > 0]
         terms.sort(key=self._order)
         return np.array(terms, dtype=np.int32).reshape(len(terms), len(self.is_angle))
@@ -199,9 +201,8 @@ class _Half:
         if order > 1:
             upper = {(i, j): product(i, j) for i in range(n) for j in range(i, n)}
             rows = [
-                xp.stack([upper[min(i, j), max(i, j)] for j in range(n)], axis=-2)
-                for i in range(n)
-            ]  # fmt: skip
+                xp.stack([upper[min(i, j), max(i, j)] for j in range(n)], axis=-2) for i in range(n)
+            ]
             tables.append(xp.stack(rows, axis=-3))
         return tables
 

@@ -107,10 +107,14 @@ class _Sums(ast.NodeTransformer):
         if not _calls(node, "Sum"):
             return self.generic_visit(node)
         over = node.args[1] if len(node.args) == 2 else None
-        if not (isinstance(over, ast.Tuple) and len(over.elts) == 3
-                and isinstance(over.elts[0], ast.Name)):  # fmt: skip
-            raise InputError("expected a sum over sites as Sum(p(i)**2, (i, 1, 8)), got "
-                             f"'{ast.unparse(node)}'")  # fmt: skip
+        if not (
+            isinstance(over, ast.Tuple)
+            and len(over.elts) == 3
+            and isinstance(over.elts[0], ast.Name)
+        ):
+            raise InputError(
+                f"expected a sum over sites as Sum(p(i)**2, (i, 1, 8)), got '{ast.unparse(node)}'"
+            )
         sites = self._sites(*(_whole(bound, {}) for bound in over.elts[1:]))
         if not 0 < len(sites) <= _MOST_SITES:
             raise InputError(f"expected a sum over 1 to {_MOST_SITES:,} sites, got {len(sites):,}")

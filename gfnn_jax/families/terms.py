@@ -261,8 +261,9 @@ class Terms:
         zero = xp.zeros_like(w[..., 0])
         full = [
             _like(entries.get((min(i, j), max(i, j)), zero), zero, xp)
-            for i in range(width) for j in range(width)
-        ]  # fmt: skip
+            for i in range(width)
+            for j in range(width)
+        ]
         hessian = xp.stack(full, axis=-1).reshape(*w.shape, width)
         return self._stacked(_pulled_back(variables, slopes), w), hessian
 
@@ -362,9 +363,7 @@ def polynomial_terms(
     else:
         trees = [coordinate(i) for i in range(2 * dim) if i not in cyclic]
     odd = _odd(trees, dim, reversor)
-    rows = tuple(
-        row for row in exponents(len(trees), degree) if sum(row[k] for k in odd) % 2 == 0
-    )  # fmt: skip
+    rows = tuple(row for row in exponents(len(trees), degree) if sum(row[k] for k in odd) % 2 == 0)
     return Terms(dim, tuple(to_text(tree, dim) for tree in trees), rows)
 
 

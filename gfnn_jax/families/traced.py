@@ -27,17 +27,32 @@ def traced(function: Callable, dim: int) -> list[Expression]:
 
 
 _ELEMENTWISE: dict[str, Callable] = {
-    "add": lambda a, b: a + b, "add_any": lambda a, b: a + b, "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b, "div": lambda a, b: a / b, "neg": lambda a: -a,
-    "square": lambda a: power(a, 2), "rsqrt": lambda a: 1.0 / call("sqrt", a),
-    "sqrt": lambda a: power(a, 0.5), "atan": lambda a: call("arctan", a),
-    "copy": lambda a: a, "copy_p": lambda a: a, "stop_gradient": lambda a: a,
+    "add": lambda a, b: a + b,
+    "add_any": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "neg": lambda a: -a,
+    "square": lambda a: power(a, 2),
+    "rsqrt": lambda a: 1.0 / call("sqrt", a),
+    "sqrt": lambda a: power(a, 0.5),
+    "atan": lambda a: call("arctan", a),
+    "copy": lambda a: a,
+    "copy_p": lambda a: a,
+    "stop_gradient": lambda a: a,
     **{name: (lambda a, name=name: call(name, a)) for name in FUNCTIONS if name != "sqrt"},
-}  # fmt: skip
+}
 _REARRANGE = {
-    "slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "rev", "gather",
-    "dynamic_slice", "expand_dims",
-}  # fmt: skip
+    "slice",
+    "squeeze",
+    "reshape",
+    "broadcast_in_dim",
+    "transpose",
+    "rev",
+    "gather",
+    "dynamic_slice",
+    "expand_dims",
+}
 
 
 def _trees(values):

@@ -158,10 +158,20 @@ def adam(
     train, validation = ((np.asarray(w), np.asarray(target)) for w, target in (train, validation))
     _check(train, validation, weight)
     return _minimise(
-        _gradient_loss, (family, weight), params, train, validation, components=weight.size,
-        recipe=recipe, key=key, on_epoch=on_epoch, checkpoint=checkpoint, resume=resume, cap=cap,
+        _gradient_loss,
+        (family, weight),
+        params,
+        train,
+        validation,
+        components=weight.size,
+        recipe=recipe,
+        key=key,
+        on_epoch=on_epoch,
+        checkpoint=checkpoint,
+        resume=resume,
+        cap=cap,
         devices=devices,
-    )  # fmt: skip
+    )
 
 
 def _gradient_loss(given, params, w, target_gradient):
@@ -249,15 +259,35 @@ def minimise(
                 next call with this very ``loss`` and shapes.
     """
     return _minimise(
-        _LossOfRows(loss), None, params, train, validation, components=components, recipe=recipe,
-        key=key, on_epoch=on_epoch, cap=cap,
-    )  # fmt: skip
+        _LossOfRows(loss),
+        None,
+        params,
+        train,
+        validation,
+        components=components,
+        recipe=recipe,
+        key=key,
+        on_epoch=on_epoch,
+        cap=cap,
+    )
 
 
 def _minimise(
-    loss, given, params, train, validation, *, components, recipe, key, on_epoch, cap,
-    checkpoint=None, resume=None, devices=(),
-) -> AdamFit:  # fmt: skip
+    loss,
+    given,
+    params,
+    train,
+    validation,
+    *,
+    components,
+    recipe,
+    key,
+    on_epoch,
+    cap,
+    checkpoint=None,
+    resume=None,
+    devices=(),
+) -> AdamFit:
     """`minimise` of ``loss(given, params, *batch)``: what is given, a pytree, may change without
     another compilation."""
     if recipe.dtype == "float64":

@@ -99,9 +99,17 @@ class Problem:
     """
 
     def __init__(
-        self, z0, z1, dt, scale, *, args=None, weight=None, options: GaussNewtonOptions = OPTIONS,
+        self,
+        z0,
+        z1,
+        dt,
+        scale,
+        *,
+        args=None,
+        weight=None,
+        options: GaussNewtonOptions = OPTIONS,
         allowance: Allowance = UNBOUNDED,
-    ):  # fmt: skip
+    ):
         self.z0, self.z1, self.dt, self.scale, self.args = z0, z1, dt, scale, args
         self.weight, self.options, self.allowance = weight, options, allowance
 
@@ -119,9 +127,16 @@ class Problem:
         along = (options.get("along") or family) if options.get("derivatives") else None
         self.allowance.spend(len(rows) * operations(family, self.z0.shape[1], steps, along))
         return images(
-            family, coefficients, self.z0[rows], dt, steps, args=args, scale=self.scale,
-            on_substep=self.allowance.check, **options,
-        )  # fmt: skip
+            family,
+            coefficients,
+            self.z0[rows],
+            dt,
+            steps,
+            args=args,
+            scale=self.scale,
+            on_substep=self.allowance.check,
+            **options,
+        )
 
     def residuals(self, family, coefficients, steps: Steps, rows) -> np.ndarray:
         """(Φ(z₀) − z₁) ÷ scale of these rows (n, 2d); not finite where the flow fails."""
@@ -150,8 +165,9 @@ class Problem:
         own = self._unpaid()
         found = row_blocks.tree(
             lambda part, device: own._folded(family, coefficients, steps, part),
-            self._parts(blocks, family, steps), lambda one, other, device: one.merge(other),
-        )  # fmt: skip
+            self._parts(blocks, family, steps),
+            lambda one, other, device: one.merge(other),
+        )
         return Triangle.empty(family.num_parameters) if found is None else found
 
     def _folded(self, family, coefficients, steps: Steps, blocks) -> Triangle:
@@ -203,9 +219,15 @@ class Problem:
             yield rows[first : first + size]
 
     def fit(
-        self, family, start, rows=None, *, rounds: bool = True, steps: Steps | None = None,
+        self,
+        family,
+        start,
+        rows=None,
+        *,
+        rounds: bool = True,
+        steps: Steps | None = None,
         on_progress: Callable[[str], Any] = lambda message: None,
-    ) -> FlowFit:  # fmt: skip
+    ) -> FlowFit:
         """Levenberg–Marquardt from ``start`` (terms,) over these rows.
 
         rounds: quiet pairs first, with coarse steps; else all at once, from a start that is known
@@ -287,9 +309,15 @@ class Problem:
         def truncation_error(block) -> np.ndarray:
             dt, args = self.given(block)
             return truncation(
-                family, c, self.z0[block], dt, steps, args=args, scale=self.scale,
+                family,
+                c,
+                self.z0[block],
+                dt,
+                steps,
+                args=args,
+                scale=self.scale,
                 on_substep=self.allowance.check,
-            )  # fmt: skip
+            )
 
         if row_blocks.devices() and len(rows):
             blocks = self._blocks(rows, 0, matrix_free(family))

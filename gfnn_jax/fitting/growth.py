@@ -74,7 +74,7 @@ class Grown(NamedTuple):
 
 def grow(
     problem: Problem, basis: Modes, rows: np.ndarray, goal: float, most: int
-) -> Iterator[Grown]:  # fmt: skip
+) -> Iterator[Grown]:
     """The modes that these rows ask for, round by round, each better than the one before, until the
     residual is within ``goal`` or none gains.
 
@@ -103,8 +103,9 @@ def grow(
             (steps,) = problem.fine_steps(family, c, some, (_RESOLVED * resolved,))
         looked = _Linearised(problem, basis, present, steps, some)
         if not looked.rms <= _WORSE * best.rms:
-            present = {m: 0.5 * (before.get(m, 0.0) + present.get(m, 0.0))
-                       for m in before | present}  # fmt: skip
+            present = {
+                m: 0.5 * (before.get(m, 0.0) + present.get(m, 0.0)) for m in before | present
+            }
             idle += 1
             continue
         idle = 0 if looked.rms < _GAINED * best.rms else idle + 1

@@ -146,9 +146,7 @@ def _pairs_of(num_parameters: int, width: int, least: int) -> int:
     return max(1, max(_FEWEST_ROWS, _BLOCK_BYTES // (8 * (num_parameters + 1)), least) // width)
 
 
-def residuals(
-    train: Triangle, held: Triangle, sizes: Sequence[int]
-) -> list[tuple[float, float]]:  # fmt: skip
+def residuals(train: Triangle, held: Triangle, sizes: Sequence[int]) -> list[tuple[float, float]]:
     """(train_rms, validation_rms) of the leading ``size`` terms, for each of these sizes.
 
     Of the plain solution, by one triangular solve, where the training rows determine it well; else

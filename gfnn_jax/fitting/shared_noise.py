@@ -15,9 +15,12 @@ from gfnn_jax.fitting.triangle import Triangle
 
 
 def scores(
-    slopes: np.ndarray, residual: np.ndarray, first: np.ndarray, second: np.ndarray,
+    slopes: np.ndarray,
+    residual: np.ndarray,
+    first: np.ndarray,
+    second: np.ndarray,
     goes_on: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """(k, m): what one deviation of each state's each coordinate adds to Aᵀ r; the sum of the rows'
     squares is the covariance of Aᵀ r.
 

@@ -270,9 +270,19 @@ def folded(factor: np.ndarray, rows: np.ndarray, *, triangular: bool = False) ->
     )
     table, work = np.empty((panel, n), order="F"), np.empty(panel * n)
     _tpqrt()(
-        rows_, columns, zeros, panel_, factor.ctypes.data, of_factor, rows.ctypes.data, of_rows,
-        table.ctypes.data, of_table, work.ctypes.data, status,
-    )  # fmt: skip
+        rows_,
+        columns,
+        zeros,
+        panel_,
+        factor.ctypes.data,
+        of_factor,
+        rows.ctypes.data,
+        of_rows,
+        table.ctypes.data,
+        of_table,
+        work.ctypes.data,
+        status,
+    )
     if numbers[-1]:
         raise ValueError(f"LAPACK's dtpqrt refuses its argument {-numbers[-1]}")
     return factor

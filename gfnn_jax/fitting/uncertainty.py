@@ -61,9 +61,15 @@ def misfit(explained: float, terms: int, variance: float) -> float:
 
 
 def root(
-    train: Triangle, size: int, sample: np.ndarray, residual: np.ndarray, *,
-    noise: float | None, ridge: float = 0.0, scores: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+    train: Triangle,
+    size: int,
+    sample: np.ndarray,
+    residual: np.ndarray,
+    *,
+    noise: float | None,
+    ridge: float = 0.0,
+    scores: np.ndarray | None = None,
+) -> np.ndarray:
     """(size, size): rootᵀ root is the covariance of the coefficients of the leading terms.
 
     sample, residual: rows of A (n, size) among those of ``train``, and of what is left over (n,).

@@ -57,9 +57,18 @@ def of_lanes(value, lanes):
 
 
 def images(
-    family, params, z, dt, steps: Steps, *, args=None, derivatives: bool = False,
-    along: Any = None, scale=None, on_substep: Callable[[], Any] = lambda: None,
-):  # fmt: skip
+    family,
+    params,
+    z,
+    dt,
+    steps: Steps,
+    *,
+    args=None,
+    derivatives: bool = False,
+    along: Any = None,
+    scale=None,
+    on_substep: Callable[[], Any] = lambda: None,
+):
     """Images of the states z (B, 2d) after dt, in NumPy. Lanes that fail are not finite.
 
     dt: a number, or one of each lane (B,). args: of each lane, (B, k), or None; the time among
@@ -239,9 +248,16 @@ def solve(matrix, rhs):
 
 
 def truncation(
-    family, params, z, dt, steps: Steps, *, args=None, scale=None,
+    family,
+    params,
+    z,
+    dt,
+    steps: Steps,
+    *,
+    args=None,
+    scale=None,
     on_substep: Callable[[], Any] = lambda: None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Differences of the images of states z (B, 2d) from those of twice the substeps, (B, 2d): not
     finite where one of them fails."""
     finer = dataclasses.replace(steps, substeps=2 * steps.substeps)

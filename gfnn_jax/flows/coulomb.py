@@ -38,9 +38,14 @@ _APART = NODES[:, None] - _OTHERS
 
 
 def step(
-    form: Form, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray, order: int = 2,
+    form: Form,
+    p: np.ndarray,
+    x: np.ndarray,
+    h: np.ndarray,
+    u: np.ndarray,
+    order: int = 2,
     modes: np.ndarray | None = None,
-) -> tuple[Step, np.ndarray]:  # fmt: skip
+) -> tuple[Step, np.ndarray]:
     """`Form.step` of laws with dry friction of any kind, and the modes (N, F) in which it ends:
     which directions without a width slide forward, 1, or backward, −1, and which stick, 0.
     ``modes``: those in which it begins, by default those of the states."""
@@ -140,8 +145,9 @@ class _Motion:
                 last = self.rates(lanes[open_], new[open_], mode[open_], now[open_, -1])
                 along = (left * h[lanes])[open_, None] * mode[open_]
                 slopes = [along * (a @ self.directions.T) for a in (first.a[open_], last.a)]
-                spare = [self.losses(lanes[open_]) - np.abs(k)
-                         for k in (first.held[open_], last.held)]  # fmt: skip
+                spare = [
+                    self.losses(lanes[open_]) - np.abs(k) for k in (first.held[open_], last.held)
+                ]
                 shares, event = _first(mode[open_], *(s[open_] for s in speeds), *slopes, *spare)
                 part[open_] = shares
                 cut, event = open_[shares < 1], event[shares < 1]

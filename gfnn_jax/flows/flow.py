@@ -319,9 +319,12 @@ def _fixed_point(stages: int, shared, z, args):
     if matrix_free(family):
         nothing = jnp.zeros((len(z), 0), z.dtype)
         x, _, info = fixed_point.newton_krylov(
-            StageEquation(stages), shared, (z, args), (_flat(slopes), nothing, info),
+            StageEquation(stages),
+            shared,
+            (z, args),
+            (_flat(slopes), nothing, info),
             _flat(begun[0]),
-        )  # fmt: skip
+        )
         slopes = _of_stages(x, stages)
     return slopes, info
 

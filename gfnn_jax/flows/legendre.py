@@ -143,8 +143,9 @@ def _named(speeds, powers, mode, phase: float) -> str:
     if any(mode):
         sign = "".join(
             f" {'-' if m < 0 else '+'} {'' if abs(m) == 1 else f'{abs(m)} '}q{i}"
-            for i, m in enumerate(mode, 1) if m
-        )  # fmt: skip
+            for i, m in enumerate(mode, 1)
+            if m
+        )
         angle = sign[3:] if sign.startswith(" +") else "-" + sign[3:]
         parts.append(f"{'cos' if phase == 0 else 'sin'}({angle})")
     return " ".join(parts)

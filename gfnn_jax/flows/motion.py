@@ -31,14 +31,16 @@ from gfnn_jax.solve.linear import among, inverses
 
 # Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19: the solution of order 5.
 NODES = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
-_A = np.array([
-    [0, 0, 0, 0, 0, 0],
-    [1 / 5, 0, 0, 0, 0, 0],
-    [3 / 40, 9 / 40, 0, 0, 0, 0],
-    [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
-    [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
-    [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
-])  # fmt: skip
+_A = np.array(
+    [
+        [0, 0, 0, 0, 0, 0],
+        [1 / 5, 0, 0, 0, 0, 0],
+        [3 / 40, 9 / 40, 0, 0, 0, 0],
+        [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
+    ]
+)
 WEIGHTS = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
 
 
@@ -139,9 +141,14 @@ class Form:
         return form, weights * whole, weights[..., None] * turn
 
     def accelerate(
-        self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, order: int = 2,
+        self,
+        law: Lagrangian,
+        q: np.ndarray,
+        v: np.ndarray,
+        u: np.ndarray,
+        order: int = 2,
         modes: np.ndarray | None = None,
-    ) -> Rates:  # fmt: skip
+    ) -> Rates:
         """The rates, with derivatives in the states (``order`` 1) and in the coefficients (2).
         modes: (N, F) of the dry friction without a width, 1 or −1 where it slides, 0 where it
         sticks."""
@@ -149,9 +156,14 @@ class Form:
         return Rates(a.T, by.transpose(2, 0, 1), held)
 
     def _rates(
-        self, law: Lagrangian, q: np.ndarray, v: np.ndarray, u: np.ndarray, order: int,
+        self,
+        law: Lagrangian,
+        q: np.ndarray,
+        v: np.ndarray,
+        u: np.ndarray,
+        order: int,
         modes: np.ndarray | None,
-    ) -> Rates:  # fmt: skip
+    ) -> Rates:
         """`accelerate` of q, v (d, N) and u (inputs, N): a (d, N), by (d, 2d + n, N), held (N, F).
 
         With the momentum p = M v + w the equation of motion is M a + (∂p/∂q) v − ∂L/∂q = force.
@@ -211,9 +223,16 @@ class Form:
         return Rates(a, by, held)
 
     def _by_coefficients(
-        self, by: np.ndarray, L: Parts, v: np.ndarray, a: np.ndarray, u: np.ndarray,
-        pull: np.ndarray, gamma: np.ndarray, momentum: np.ndarray,
-    ) -> None:  # fmt: skip
+        self,
+        by: np.ndarray,
+        L: Parts,
+        v: np.ndarray,
+        a: np.ndarray,
+        u: np.ndarray,
+        pull: np.ndarray,
+        gamma: np.ndarray,
+        momentum: np.ndarray,
+    ) -> None:
         """The residuals (d, n, N) of each coefficient alone, into ``by``."""
         d, own, num = self.dim, self.basis.shape[1], v.shape[1]
         rows = self.quadratic.residuals(L, v, a)
@@ -249,9 +268,15 @@ class Form:
         return np.tile(self.identity[:, :width], (num, 1, 1))
 
     def substep(
-        self, law: Lagrangian, x: np.ndarray, D: np.ndarray, h: np.ndarray, u: np.ndarray,
-        order: int = 2, modes: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray, Rates]:  # fmt: skip
+        self,
+        law: Lagrangian,
+        x: np.ndarray,
+        D: np.ndarray,
+        h: np.ndarray,
+        u: np.ndarray,
+        order: int = 2,
+        modes: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, Rates]:
         """States x (N, 2d) and their derivatives D (N, 2d, n) a time h (N,) later, with inputs u
         (N, 6, inputs) at its nodes, and the rates at its begin; ``order`` and ``modes`` as of
         `accelerate`."""

@@ -65,10 +65,16 @@ class Quadratic:
         slopes = -weights[:, None] * modes.T
         curvatures = slopes[:, :, None] * modes.T
         return cls(
-            terms, np.ascontiguousarray(weights), slopes.reshape(-1, count),
-            curvatures.reshape(-1, count), modes, not np.any(terms.powers),
-            A.reshape(count * d, d), b[..., None], c[:, None],
-        )  # fmt: skip
+            terms,
+            np.ascontiguousarray(weights),
+            slopes.reshape(-1, count),
+            curvatures.reshape(-1, count),
+            modes,
+            not np.any(terms.powers),
+            A.reshape(count * d, d),
+            b[..., None],
+            c[:, None],
+        )
 
     def is_of(self, terms: Terms) -> bool:
         """Return whether these are the terms, of any phases."""
@@ -107,9 +113,15 @@ class Quadratic:
             curved = curved.reshape(len(sums), d, d, num)
             by_two = (curved[M].reshape(d, d, d, d, num), curved[w], curved[-1])
         return Parts(
-            sums[M].reshape(d, d, num), sums[w], steep[M].reshape(d, d, d, num), steep[w],
-            steep[-1], *by_two, f, slopes,
-        )  # fmt: skip
+            sums[M].reshape(d, d, num),
+            sums[w],
+            steep[M].reshape(d, d, d, num),
+            steep[w],
+            steep[-1],
+            *by_two,
+            f,
+            slopes,
+        )
 
     def residuals(self, parts: Parts, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """d/dt ∂ℓ_j/∂v − ∂ℓ_j/∂q (P, d, N) of each term ℓ_j along motion with velocities v and

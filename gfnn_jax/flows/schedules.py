@@ -21,9 +21,14 @@ _BRIDGED = 4  # median steps from sample to sample, up to which samples count as
 
 
 def at_stages(
-    t: np.ndarray, u: np.ndarray, start: np.ndarray, end: np.ndarray, substeps: int, hold: str,
+    t: np.ndarray,
+    u: np.ndarray,
+    start: np.ndarray,
+    end: np.ndarray,
+    substeps: int,
+    hold: str,
     delay: float = 0.0,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """u(· − delay) (..., substeps, 6, k) at the stages of steps from ``start`` to ``end`` (...), of
     samples u (n, k) at times t (n,).
 

@@ -90,9 +90,7 @@ class PolynomialModel:
         return namespace(u).sum(by_row * u[..., None, :], axis=-1)
 
 
-@partial(
-    jax.tree_util.register_dataclass, data_fields=("forward", "backward"), meta_fields=()
-)  # fmt: skip
+@partial(jax.tree_util.register_dataclass, data_fields=("forward", "backward"), meta_fields=())
 @dataclasses.dataclass(frozen=True, eq=False)
 class Predictor:
     """First guesses for the solves of a map (forward) and of its inverse (backward)."""
@@ -113,9 +111,16 @@ class Fitted(NamedTuple):
 
 
 def fit_predictors(
-    chart: AnyChart, y0, y1, dt: Any, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
-    features=None, args=None,
-) -> list[Fitted]:  # fmt: skip
+    chart: AnyChart,
+    y0,
+    y1,
+    dt: Any,
+    *,
+    angles: Sequence[int] = (),
+    cyclic: Sequence[int] = (),
+    features=None,
+    args=None,
+) -> list[Fitted]:
     """Fit predictors of a chart's map and of its inverse, by rising degree.
 
     y0, y1: (N, 2d) states and images, NumPy, angles lifted. dt: a number, or one per pair (N,), of
@@ -133,9 +138,12 @@ def fit_predictors(
         unknown = chart.evaluation_point(given, other)[:, free]
         known = chart.first_guess(given)[:, free]
         inputs = box_inputs(
-            given, angles=tuple(a for a in angles if a < dim), cyclic=tuple(cyclic),
-            features=features, args=args,
-        )  # fmt: skip
+            given,
+            angles=tuple(a for a in angles if a < dim),
+            cyclic=tuple(cyclic),
+            features=features,
+            args=args,
+        )
         return _by_degree(inputs, inputs(given, args), unknown - known, sizes(unknown))
 
     forward, backward = fitted(chart, y0, y1, args), fitted(chart.reverse(dt)[0], y1, y0, back)
@@ -158,9 +166,8 @@ def affordable(fitted: list[Fitted], family) -> Fitted:
     gradient, with_hessian = family.operations
     cheap = [f for f in fitted if f.predictor.forward.operations <= 0.5 * gradient] or fitted[:1]
     close = [
-        f for f in fitted
-        if f.error <= CLOSE and f.predictor.forward.operations <= 5 * with_hessian
-    ]  # fmt: skip
+        f for f in fitted if f.error <= CLOSE and f.predictor.forward.operations <= 5 * with_hessian
+    ]
     return close[-1] if close and cheap[-1].error > CLOSE else cheap[-1]
 
 

@@ -70,9 +70,13 @@ def compare(
     cap = (QUICK_CAP if quick else CAP) if cap is None else cap
     chosen = chosen_methods(methods, scene)
     job = {
-        "command": "compare", "scene": name, "seed": seed, "quick": quick, "cap": cap,
+        "command": "compare",
+        "scene": name,
+        "seed": seed,
+        "quick": quick,
+        "cap": cap,
         "version": versions()["gfnn_jax"],
-    }  # fmt: skip
+    }
     if resume and _already_done(out, job, chosen):
         return None
     with unfinished(out, job, what="comparison", overwrite=overwrite, resume=resume) as kept_in:
@@ -100,13 +104,22 @@ def compare(
             rollouts = without_runaways(rollouts, data.reference)
             measured[TITLES[method]] = m = measure(rollouts, scene, data.reference)
             reported[method] = {
-                "title": TITLES[method], **part, "rollout": m.report, "curve": _curve(m.error),
+                "title": TITLES[method],
+                **part,
+                "rollout": m.report,
+                "curve": _curve(m.error),
                 "kl": chaos.divergences(scene, m.predicted, data.reference),
                 "elements": _elements(scene, m.predicted, data.reference),
-            }  # fmt: skip
+            }
         result = {
-            "scene": name, "dt": scene.dt, "seed": seed, "dtype": "float64",
-            "device": report.device(), "versions": versions(), "quick": quick, "cap": cap,
+            "scene": name,
+            "dt": scene.dt,
+            "seed": seed,
+            "dtype": "float64",
+            "device": report.device(),
+            "versions": versions(),
+            "quick": quick,
+            "cap": cap,
             "data": {
                 "source": "reference data of the scene",
                 "num_pairs": data.num_pairs,
@@ -115,7 +128,7 @@ def compare(
             "kl_bins": chaos.BINS,
             "job": job,
             "methods": reported,
-        }  # fmt: skip
+        }
         with atomic_folder(out) as folder:
             for file, figure in draw(scene, measured, data.reference).items():
                 figures.save(figure, folder / f"{file}.png")
@@ -150,9 +163,11 @@ def _curve(error) -> dict[str, Any]:
     statistics = metrics.error_statistics(error)
     return {
         "steps": steps.tolist(),
-        **{name: [float(f"{v:.4e}") for v in getattr(statistics, name)[steps]]
-           for name in ("mean", "std", "median")},
-    }  # fmt: skip
+        **{
+            name: [float(f"{v:.4e}") for v in getattr(statistics, name)[steps]]
+            for name in ("mean", "std", "median")
+        },
+    }
 
 
 # Finished methods: a .json and a .npz for each, written whole or not at all.

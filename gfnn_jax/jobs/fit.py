@@ -91,19 +91,26 @@ def fit(
     for line in summary(trajectories):
         progress.line(line)
     job = {
-        "command": "fit", "data": trajectories.digest,
-        "dt": None if np.ndim(trajectories.dt) else trajectories.dt, "scene": scene_name,
+        "command": "fit",
+        "data": trajectories.digest,
+        "dt": None if np.ndim(trajectories.dt) else trajectories.dt,
+        "scene": scene_name,
         **asked.deciding,
-    }  # fmt: skip
+    }
     if already_done(out, job, resume):
         group.broadcast({})
         return None
     with unfinished(out, job, what="fit", overwrite=overwrite, resume=resume) as kept_in:
         try:
             fitted = search(
-                trajectories.pairs(), scene, asked, progress=progress, spent=reading,
-                kept_in=kept_in, job=job,
-            )  # fmt: skip
+                trajectories.pairs(),
+                scene,
+                asked,
+                progress=progress,
+                spent=reading,
+                kept_in=kept_in,
+                job=job,
+            )
             if large and can_be_refitted(fitted.map):
                 assert trajectories.sampled is not None
                 seconds = work_of_refit(fitted, trajectories.sampled, reading)
@@ -112,9 +119,13 @@ def fit(
                         progress.status("fitting the chosen model to all pairs")
                         with failures_of_arithmetic(), row_blocks.on_devices(own):
                             fitted = refit(
-                                fitted, pairs, fitted.validation_pairs, test=fitted.test_pairs,
-                                scene=scene, group=group,
-                            )  # fmt: skip
+                                fitted,
+                                pairs,
+                                fitted.validation_pairs,
+                                test=fitted.test_pairs,
+                                scene=scene,
+                                group=group,
+                            )
                 except OutOfTime:
                     group.broadcast({})
                     fitted = not_refitted(fitted, f"no time, it would take about {seconds:.2g} s")
@@ -124,7 +135,10 @@ def fit(
             progress.status("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
             result = report.assemble(
-                fitted, scene=scene_name, dt=float(np.asarray(fitted.map.dt)), seed=asked.seed,
+                fitted,
+                scene=scene_name,
+                dt=float(np.asarray(fitted.map.dt)),
+                seed=asked.seed,
                 rollout=None,
                 data={
                     "source": trajectories.source,
@@ -134,7 +148,7 @@ def fit(
                     "dt": _range(trajectories.dt),
                     "params": {n: _range(v) for n, v in (trajectories.args or {}).items()},
                 },
-            )  # fmt: skip
+            )
         except KeyboardInterrupt as stop:
             if note := publish(kept_in / BEST, out):
                 stop.add_note(note)

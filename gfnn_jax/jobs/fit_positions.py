@@ -21,9 +21,14 @@ from gfnn_jax.storage.outputs import atomic_folder
 
 
 def fit_positions(
-    data: Sequence[Path], *, out: Path, columns: dict[str, Any], despite: Sequence[str] = (),
-    progress: Progress = SILENT, **options: Any,
-) -> Ran:  # fmt: skip
+    data: Sequence[Path],
+    *,
+    out: Path,
+    columns: dict[str, Any],
+    despite: Sequence[str] = (),
+    progress: Progress = SILENT,
+    **options: Any,
+) -> Ran:
     """Learn the map of recordings of positions, and write it with its report into the folder out.
 
     columns: keywords of `gfnn_jax.read`. despite: kinds of mistakes that the files may show.
@@ -35,19 +40,29 @@ def fit_positions(
     refuse_mistakes(recording, despite)
     with refusals(), failures_of_arithmetic():
         fitted = learn_fit(
-            recording, options=asked, on_progress=progress.status,
+            recording,
+            options=asked,
+            on_progress=progress.status,
             on_candidate=lambda candidate: progress.line(line(candidate)),
-        )  # fmt: skip
+        )
     progress.status("the report: the derivative of a step")
     fitted = fitted.settled()
     result = report.assemble(
-        fitted, scene=None, dt=float(np.asarray(fitted.map.dt)), seed=asked.seed, rollout=None,
+        fitted,
+        scene=None,
+        dt=float(np.asarray(fitted.map.dt)),
+        seed=asked.seed,
+        rollout=None,
         data={"source": recording.source, "positions": list(recording.positions)},
-    )  # fmt: skip
+    )
     job = {
-        "command": "fit", "data": recording.source, "positions": list(recording.positions),
-        **asked.deciding, "angles": list(recording.angles), **units_of(recording),
-    }  # fmt: skip
+        "command": "fit",
+        "data": recording.source,
+        "positions": list(recording.positions),
+        **asked.deciding,
+        "angles": list(recording.angles),
+        **units_of(recording),
+    }
     with atomic_folder(out) as folder:
         write(folder, folder, fitted, result, job)
     return Ran(fitted, out, result)

@@ -32,9 +32,14 @@ class Learned(NamedTuple):
 
 
 def fit_recording(
-    data: Sequence[Path], *, out: Path, columns: dict[str, Any], despite: Sequence[str] = (),
-    progress: Progress = SILENT, **options: Any,
-) -> Learned:  # fmt: skip
+    data: Sequence[Path],
+    *,
+    out: Path,
+    columns: dict[str, Any],
+    despite: Sequence[str] = (),
+    progress: Progress = SILENT,
+    **options: Any,
+) -> Learned:
     """Learn the law of recordings (files), and write it with its report into the folder ``out``.
 
     columns: keywords of `gfnn_jax.read`. despite: kinds of mistakes that the files may show.
@@ -50,8 +55,11 @@ def fit_recording(
     result = law_report.assemble(fitted, source=recording.source, seed=asked.seed)
     kept = ("seed", "device", "data", "fit", "map", "lagrangian", "friction", "gauge")
     job = {
-        "command": "fit", "data": recording.source, **asked.deciding, **units_of(recording),
-    }  # fmt: skip
+        "command": "fit",
+        "data": recording.source,
+        **asked.deciding,
+        **units_of(recording),
+    }
     record = {"job": job, **report.finite({key: result[key] for key in kept})}
     with atomic_folder(out) as folder:
         saved.save(fitted.map, folder, record=record)

@@ -43,10 +43,19 @@ class Forecasts(NamedTuple):
 
 
 def forecast_recording(
-    model: Path, initial: Path, *, out: Path, num_steps: int | None = None, save_every: int = 1,
-    stop: float | None = None, estimate_from: int | None = None, inputs: Path | None = None,
-    compare: Path | None = None, columns: dict[str, Any] | None = None, overwrite: bool = False,
-) -> Forecasts:  # fmt: skip
+    model: Path,
+    initial: Path,
+    *,
+    out: Path,
+    num_steps: int | None = None,
+    save_every: int = 1,
+    stop: float | None = None,
+    estimate_from: int | None = None,
+    inputs: Path | None = None,
+    compare: Path | None = None,
+    columns: dict[str, Any] | None = None,
+    overwrite: bool = False,
+) -> Forecasts:
     """Forecast from the states at the ends of a recording's runs.
 
     num_steps: of the model's dt; saved every so many. stop: time, in the file's unit, at which the
@@ -135,8 +144,10 @@ def _roles(sensors: Sensors, channels: tuple[str, ...]) -> dict[str, Any]:
         "positions": tuple(n for n in channels if n in sensors.positions),
         "velocities": tuple(n for n in channels if n in speeds),
         "sensors": tuple(n for n in channels if n not in (*sensors.positions, *speeds)),
-        "inputs": sensors.inputs, "coordinates": sensors.positions, "angles": sensors.angles,
-    }  # fmt: skip
+        "inputs": sensors.inputs,
+        "coordinates": sensors.positions,
+        "angles": sensors.angles,
+    }
 
 
 def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> Forecast:
@@ -202,11 +213,11 @@ def _write(out: Path, names: tuple[str, ...], found: dict[str, Forecast]) -> Non
         runs=np.array(list(found)),
         columns=np.array(names),
         times=np.stack([padded(f.times) for f in found.values()]),
-        values=np.stack([
-            padded(np.stack([f.values[n][0] for n in names], axis=1)) for f in found.values()
-        ]),
-        std=np.stack([
-            padded(np.stack([f.std[n][0] for n in names], axis=1)) for f in found.values()
-        ]),
-    )  # fmt: skip
+        values=np.stack(
+            [padded(np.stack([f.values[n][0] for n in names], axis=1)) for f in found.values()]
+        ),
+        std=np.stack(
+            [padded(np.stack([f.std[n][0] for n in names], axis=1)) for f in found.values()]
+        ),
+    )
     atomic_write(out, stream.getvalue())

@@ -50,8 +50,6 @@ def _of_states(paths: Sequence[Path], options: Mapping[str, Any]) -> Recording:
     if max(data.lengths) < 3 or np.ndim(data.dt):
         raise InputError(f"{paths[0]}: expected runs of states at one time step, got pairs")
     steps = np.concatenate([np.arange(length) for length in data.lengths])
-    columns = {
-        "run": np.repeat(np.arange(len(data.lengths)), data.lengths), "t": data.dt * steps
-    }  # fmt: skip
+    columns = {"run": np.repeat(np.arange(len(data.lengths)), data.lengths), "t": data.dt * steps}
     names = [f"{letter}{i + 1}" for letter in "qp" for i in range(data.dim)]
     return Recording(columns | dict(zip(names, data.states.T, strict=True)))

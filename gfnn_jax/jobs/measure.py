@@ -47,10 +47,14 @@ def measure(rollouts: Rollouts, scene: Scene, reference: np.ndarray, params=None
     of_model = float(np.nanmean(error[:, 1])) > roundoff
     growth = metrics.growth_exponent(steps, error) if scene.regular and of_model else None
     part = report.rollout_part(
-        num_trajectories=len(predicted), num_steps=len(steps) - 1, seconds=rollouts.seconds,
-        status=rollouts.status, statistics=metrics.error_statistics(error), growth=growth,
+        num_trajectories=len(predicted),
+        num_steps=len(steps) - 1,
+        seconds=rollouts.seconds,
+        status=rollouts.status,
+        statistics=metrics.error_statistics(error),
+        growth=growth,
         drift=drift,
-    )  # fmt: skip
+    )
     return Measured(steps, predicted, error, energy, part)
 
 

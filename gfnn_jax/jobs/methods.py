@@ -63,7 +63,10 @@ def _baseline(method: str, data: SharedData, budget: Budget) -> tuple[dict[str, 
     )
     part = {
         "model": {
-            "learns": "map", "family": method, "label": learned.label, "chart": None,
+            "learns": "map",
+            "family": method,
+            "label": learned.label,
+            "chart": None,
             "num_parameters": learned.num_parameters,
         },
         "data": {"num_pairs": sequences.num_pairs, "sequence_length": chosen.length},
@@ -73,9 +76,10 @@ def _baseline(method: str, data: SharedData, budget: Budget) -> tuple[dict[str, 
         },
         "map": {
             "symplecticity_defect": float(defects.max()),
-            "chart_determinant_min": None, "newton_iterations_max": None,
+            "chart_determinant_min": None,
+            "newton_iterations_max": None,
         },
-    }  # fmt: skip
+    }
     return part, step_rollouts(learned.step, data.z0, data.num_steps)
 
 
@@ -110,7 +114,10 @@ def _papers(data: SharedData, budget: Budget) -> tuple[dict[str, Any], Rollouts]
     learned = paper_gfnn(pairs, budget)
     part = {
         "model": {
-            "learns": "map", "family": "mlp", "label": learned.family.label, "chart": "type2",
+            "learns": "map",
+            "family": "mlp",
+            "label": learned.family.label,
+            "chart": "type2",
             "num_parameters": learned.family.num_parameters,
         },
         "data": {"num_pairs": pairs.num_pairs, "sequence_length": 2},
@@ -119,7 +126,7 @@ def _papers(data: SharedData, budget: Budget) -> tuple[dict[str, Any], Rollouts]
             "validation_rms": _rms(data, learned.map.step(data.fresh.z0)[0]),
         },
         "map": _map_part(learned.map, data),
-    }  # fmt: skip
+    }
     return part, map_rollouts(learned.map, data.z0, data.num_steps)
 
 
@@ -133,25 +140,36 @@ def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollout
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)  # kept in fit.messages
         fit = search(
-            Pairs(z[:, 0], z[:, 1], scene.dt), scene,
-            FitOptions(tolerance=tolerance, learn="map", seed=data.seed), progress=progress,
-        )  # fmt: skip
+            Pairs(z[:, 0], z[:, 1], scene.dt),
+            scene,
+            FitOptions(tolerance=tolerance, learn="map", seed=data.seed),
+            progress=progress,
+        )
     chosen = fit.chosen
     part = {
         "model": {
-            "learns": chosen.learns, "family": chosen.family, "label": chosen.label,
-            "chart": chosen.chart, "num_parameters": chosen.num_parameters,
+            "learns": chosen.learns,
+            "family": chosen.family,
+            "label": chosen.label,
+            "chart": chosen.chart,
+            "num_parameters": chosen.num_parameters,
         },
         "data": {"num_pairs": fit.num_pairs, "sequence_length": 2},
         "fit": {
-            "seconds": chosen.fit_seconds, "compile_seconds": fit.compile_seconds,
-            "total_seconds": fit.seconds, "train_rms": chosen.train_rms,
+            "seconds": chosen.fit_seconds,
+            "compile_seconds": fit.compile_seconds,
+            "total_seconds": fit.seconds,
+            "train_rms": chosen.train_rms,
             "validation_rms": _rms(data, fit.map.step(data.fresh.z0)[0]),
-            "tolerance": tolerance, "tolerance_met": fit.met, "ended": fit.ended,
-            "cap": None, "capped": False, "messages": list(fit.messages),
+            "tolerance": tolerance,
+            "tolerance_met": fit.met,
+            "ended": fit.ended,
+            "cap": None,
+            "capped": False,
+            "messages": list(fit.messages),
         },
         "map": _map_part(fit.map, data) | {"chart_determinant_min": fit.model_determinant_min},
-    }  # fmt: skip
+    }
     return part, map_rollouts(fit.map, data.z0, data.num_steps)
 
 

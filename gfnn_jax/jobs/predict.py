@@ -151,9 +151,13 @@ def predict(
     if share is None or not isinstance(stepped, Sharded):
         return _written(request, out, z0, params, identity, drawn, progress)
     job = job_of(
-        identity, z0.shape, num_steps=num_steps, save_every=save_every, dt=dt,
+        identity,
+        z0.shape,
+        num_steps=num_steps,
+        save_every=save_every,
+        dt=dt,
         bands=drawn is not None,
-    )  # fmt: skip
+    )
     if not overwrite and resume and is_done(out, job):
         wait_for_all()
         return _finished(out, dt)
@@ -213,10 +217,18 @@ def _written(
             drive = params[:, -1], float(np.asarray(parameters.period))
             own = (names[:-1], params[:, :-1]) if len(names) > 1 else None
     writer = PredictionWriter(
-        out, shape=z0.shape, num_steps=request.num_steps, save_every=request.save_every, dt=dt,
-        identity=identity, params=own, drive=drive, bands=drawn is not None,
-        overwrite=request.overwrite, resume=request.resume,
-    )  # fmt: skip
+        out,
+        shape=z0.shape,
+        num_steps=request.num_steps,
+        save_every=request.save_every,
+        dt=dt,
+        identity=identity,
+        params=own,
+        drive=drive,
+        bands=drawn is not None,
+        overwrite=request.overwrite,
+        resume=request.resume,
+    )
     started = time.perf_counter()
     if writer.finished:
         return _finished(out, dt)

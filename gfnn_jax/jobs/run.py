@@ -70,9 +70,13 @@ def run(
         )
     num_trajectories = QUICK_TRAJECTORIES if quick else NUM_TRAJECTORIES
     job = {
-        "command": "run", "scene": name, "dt": scene.dt, "num_pairs": num_pairs, "quick": quick,
+        "command": "run",
+        "scene": name,
+        "dt": scene.dt,
+        "num_pairs": num_pairs,
+        "quick": quick,
         **asked.deciding,
-    }  # fmt: skip
+    }
     if already_done(out / MODEL, job, resume):
         return None
 
@@ -85,18 +89,20 @@ def run(
             "params": sample_params(scene, num_trajectories, key_test, test=True),
             "t0": sample_t0(scene, num_trajectories, key_test),
         }
-        fitted = search(
-            pairs, scene, asked, progress=progress, kept_in=kept_in, job=job
-        ).settled()  # fmt: skip
+        fitted = search(pairs, scene, asked, progress=progress, kept_in=kept_in, job=job).settled()
         progress.status(f"reference trajectories of {NUM_STEPS} steps")
         reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS, **given))
         progress.status(f"rollouts of {NUM_STEPS} steps")
         rollouts = map_rollouts(fitted.map, z0, **given)
         measured = measure(rollouts, scene, reference, given["params"])
         result = report.assemble(
-            fitted, scene=name, dt=scene.dt, seed=asked.seed, rollout=measured.report,
+            fitted,
+            scene=name,
+            dt=scene.dt,
+            seed=asked.seed,
+            rollout=measured.report,
             data={"source": "reference data of the scene", "digest": pairs_digest(pairs)},
-        )  # fmt: skip
+        )
         progress.status("figures")
         with atomic_folder(out) as folder:
             write(folder, folder / MODEL, fitted, result, job)
@@ -148,10 +154,13 @@ def _figures(fit: Fit, scene: Scene, measured: Measured, reference, band=None) -
     shown = [c for c in fit.candidates if np.isfinite(c.validation_relative)]
     if fit.chosen in shown:
         drawn["candidates"] = figures.speed_against_error(
-            [c.operations / 1e3 for c in shown], [c.validation_relative for c in shown],
-            [_labelled(c) for c in shown], shown.index(fit.chosen), fit.tolerance,
+            [c.operations / 1e3 for c in shown],
+            [c.validation_relative for c in shown],
+            [_labelled(c) for c in shown],
+            shown.index(fit.chosen),
+            fit.tolerance,
             estimated=[i for i, c in enumerate(shown) if not c.validated],
-        )  # fmt: skip
+        )
     if scene.name == "two-body":
         errors = [
             metrics.absolute_error(element(predicted), element(reference))
@@ -175,9 +184,12 @@ def _figures(fit: Fit, scene: Scene, measured: Measured, reference, band=None) -
     else:
         lane = int(np.argmax(np.isfinite(reference).all(axis=(1, 2))))
         drawn["portrait"] = figures.phase_portrait(
-            {n: (z[lane, :, 0], z[lane, :, 1]) for n, z in
-             (("reference", reference), ("GFNN", predicted))}, ("$q_1$", "$q_2$"),
-        )  # fmt: skip
+            {
+                n: (z[lane, :, 0], z[lane, :, 1])
+                for n, z in (("reference", reference), ("GFNN", predicted))
+            },
+            ("$q_1$", "$q_2$"),
+        )
     return {name: ax.figure for name, ax in drawn.items()}
 
 

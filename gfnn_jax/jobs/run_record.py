@@ -32,9 +32,13 @@ class Ran(NamedTuple):
 
 
 def run_record(
-    data: Path, *, out: Path, columns: Mapping[str, Any], progress: Progress = SILENT,
+    data: Path,
+    *,
+    out: Path,
+    columns: Mapping[str, Any],
+    progress: Progress = SILENT,
     **options: Any,
-) -> Ran:  # fmt: skip
+) -> Ran:
     """Write the model, its report and the figures of law and forecasts into the folder ``out``.
 
     columns: keywords of `gfnn_jax.read`. options: `FitOptions`. Raises InputError where the file is
@@ -46,9 +50,12 @@ def run_record(
     stop = end / SECONDS[whole.time_unit]
     with atomic_folder(out) as folder:
         learned = fit_recording(
-            [data], out=folder / "model", columns={**columns, "stop": stop}, progress=progress,
+            [data],
+            out=folder / "model",
+            columns={**columns, "stop": stop},
+            progress=progress,
             **options,
-        )  # fmt: skip
+        )
         map_ = learned.fit.map
         assert map_.sensors is not None
         progress.line("forecasting the last third, which no fit has seen")
@@ -60,10 +67,12 @@ def run_record(
         forecasts_figure(found, held_out, folder / FIGURE)
         result = learned.report | {
             "forecasts": {
-                "begin": end, "num": len(found.each), "ahead": list(found.ahead),
+                "begin": end,
+                "num": len(found.each),
+                "ahead": list(found.ahead),
                 "median": {name: list(of) for name, of in found.median.items()},
                 "within_two_deviations": found.within,
             }
-        }  # fmt: skip
+        }
         (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
     return Ran(learned, found, held_out)

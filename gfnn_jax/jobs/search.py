@@ -50,10 +50,16 @@ def search(
         on_better = partial(_keep, kept_in / BEST, scene, job)
     with refusals(), failures_of_arithmetic():
         return fit(
-            pairs, scene, options=options, spent=spent, checkpoints=checkpoints, factors=factors,
+            pairs,
+            scene,
+            options=options,
+            spent=spent,
+            checkpoints=checkpoints,
+            factors=factors,
             on_progress=progress.status,
-            on_candidate=lambda candidate: progress.line(line(candidate)), on_better=on_better,
-        )  # fmt: skip
+            on_candidate=lambda candidate: progress.line(line(candidate)),
+            on_better=on_better,
+        )
 
 
 def _keep(

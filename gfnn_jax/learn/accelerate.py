@@ -15,9 +15,16 @@ from gfnn_jax.models.maps_of_laws.draw import drawn
 
 
 def accelerated(
-    fitted: Fit, *, dt: float | None, region, tolerance: float | None, num_pairs: int, seed: int,
-    max_seconds: float | None, on_progress: Callable[[str], Any],
-) -> Fit:  # fmt: skip
+    fitted: Fit,
+    *,
+    dt: float | None,
+    region,
+    tolerance: float | None,
+    num_pairs: int,
+    seed: int,
+    max_seconds: float | None,
+    on_progress: Callable[[str], Any],
+) -> Fit:
     """Fit S to pairs of the law's flow, as `Fit.accelerate` says."""
     if fitted.hamiltonian is not None and fitted.hamiltonian.formula is None:
         raise FitError("accelerate: expected an H of terms to draw pairs from, got a network")
@@ -38,7 +45,12 @@ def accelerated(
         flow, coordinates, fitted.pairs.z0, dt, region=region, num_pairs=num_pairs, seed=seed
     )
     return fit(
-        pairs, fitted.scene, learn="map", seed=seed, max_seconds=max_seconds,
-        angles=() if fitted.scene is not None else coordinates.angles, on_progress=on_progress,
+        pairs,
+        fitted.scene,
+        learn="map",
+        seed=seed,
+        max_seconds=max_seconds,
+        angles=() if fitted.scene is not None else coordinates.angles,
+        on_progress=on_progress,
         tolerance=fitted.relative_tolerance if tolerance is None else tolerance,
-    )  # fmt: skip
+    )

@@ -47,9 +47,10 @@ def with_test_rows(
     params = jax.tree.map(np.asarray, size.family.unflatten(again.coefficients))
     pieces = tuple(
         dataclasses.replace(piece, params=jax.device_put(params))
-        if isinstance(piece, Generated) else piece
+        if isinstance(piece, Generated)
+        else piece
         for piece in candidate.map.pieces
-    )  # fmt: skip
+    )
     map_ = dataclasses.replace(candidate.map, pieces=pieces)
     candidate = dataclasses.replace(candidate, map=map_)
     return chosen._replace(candidate=candidate), error.words + _WORDS

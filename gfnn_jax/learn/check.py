@@ -48,9 +48,11 @@ def check_request(
             + ", ".join(LEARNS)
         )
     own_dt = bool(np.ndim(pairs.dt))
-    if not own_dt and not isinstance(pairs.dt, numbers.Real) and (
-        pairs.dt is None or isinstance(pairs.dt, str) or np.shape(pairs.dt) != ()
-    ):  # fmt: skip
+    if (
+        not own_dt
+        and not isinstance(pairs.dt, numbers.Real)
+        and (pairs.dt is None or isinstance(pairs.dt, str) or np.shape(pairs.dt) != ())
+    ):
         raise FitError(f"expected a number as time step, got {pairs.dt!r}")
     for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
         if np.dtype(z.dtype).kind not in "fiu":

@@ -208,7 +208,7 @@ class _Sample(NamedTuple):
 
 def _residuals_of_sample(
     candidate: Candidate, entry: Entry | None, searched: Searched, most: int = _RESIDUAL_PAIRS
-) -> _Sample:  # fmt: skip
+) -> _Sample:
     """The residuals of the entry's map, or of the candidate's where there is none."""
     data = searched.data if entry is None else entry.sweep.data
     rows = np.sort(data.training)[:most]
@@ -228,8 +228,9 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
             "that the states do not hold (a mass, a length, a field) differs. Give it as a "
             "parameter (a column of its own, args=), or fit the sequences of one value alone"
         )
-        return _LeftOver(None, [message], "a quantity that the states do not hold differs between "
-                         "the sequences")  # fmt: skip
+        return _LeftOver(
+            None, [message], "a quantity that the states do not hold differs between the sequences"
+        )
     if not stalled:
         return _LeftOver(None, [])
     change, error = volume_change(y0, residual)
@@ -282,8 +283,11 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     if known is not None:
         return known
     if data.noise_of_channels is None and _noise_by_neighbours(sample) is None:
-        return _LeftOver(None, [], "the pairs lie too far apart to distinguish noise from what "
-                         "these functions lack")  # fmt: skip
+        return _LeftOver(
+            None,
+            [],
+            "the pairs lie too far apart to distinguish noise from what these functions lack",
+        )
     rows, sequence = sample.rows, sample.sequence
     taken = candidate.num_parameters / (data.training.size * 2 * data.dim)
     noise = state_noise(candidate.map, data.pairs.take(rows[:_NOISE_PAIRS]), taken)

@@ -104,10 +104,14 @@ def fit(
             if options.learn == "map":
                 return fit_positions(pairs, options, clock, on_progress, on_candidate)
             law = fit_recording(
-                pairs, friction=options.friction, input_hold=options.input_hold,
-                mass=options.mass, terms=tuple(options.terms), loss=options.loss,
+                pairs,
+                friction=options.friction,
+                input_hold=options.input_hold,
+                mass=options.mass,
+                terms=tuple(options.terms),
+                loss=options.loss,
                 on_progress=on_progress,
-            )  # fmt: skip
+            )
         for message in law.messages:
             warnings.warn(message, FitWarning, stacklevel=2)
         return law
@@ -124,17 +128,25 @@ def fit(
 
     with row_blocks.on_devices(_devices(options.devices)):
         request = checked(
-            pairs, scene, options, budget=budget, checkpoints=checkpoints, factors=factors,
-            on_progress=on_progress, on_candidate=on_candidate,
-        )  # fmt: skip
+            pairs,
+            scene,
+            options,
+            budget=budget,
+            checkpoints=checkpoints,
+            factors=factors,
+            on_progress=on_progress,
+            on_candidate=on_candidate,
+        )
         warn(request.messages)
         taken = paid_for(identified(request.pairs), budget, options.seed)
         request = dataclasses.replace(request, pairs=taken.pairs)
         on_progress(f"estimating local Jacobians from {len(taken.pairs):,} pairs")
         data, about_pairs = clean(
-            taken, request.coordinates, request.structure,
+            taken,
+            request.coordinates,
+            request.structure,
             jumps=bool(wrapped(request.pairs, request.coordinates)),
-        )  # fmt: skip
+        )
         warn(about_pairs)
         looked_at = len(looked_for_errors(len(request.pairs)))
         if looked_at < len(request.pairs):
@@ -215,9 +227,12 @@ def _check_of_recording(scene: Scene | None, options: FitOptions) -> None:
 
 
 def fit_positions(
-    recording: Recording, options: FitOptions, clock: Callable[[], float],
-    on_progress: Callable[[str], Any], on_candidate: Callable[[Candidate], Any],
-) -> Fit:  # fmt: skip
+    recording: Recording,
+    options: FitOptions,
+    clock: Callable[[], float],
+    on_progress: Callable[[str], Any],
+    on_candidate: Callable[[Candidate], Any],
+) -> Fit:
     """Learn the map behind positions alone, at even times or by turns: S(q, Q) of chart type 1.
 
     recording: its positions, of one run or many; an angle's values that range over more than one
@@ -236,26 +251,41 @@ def fit_positions(
     recording, left_out = without_wrong_values(recording)
     budget = options.budget(clock, len(recording.positions) or None)
     found = learn_positions(
-        recording, tolerance=asked, structure=options.structure, seed=options.seed,
+        recording,
+        tolerance=asked,
+        structure=options.structure,
+        seed=options.seed,
         budget=budget,
-        on_progress=on_progress, on_candidate=on_candidate,
-    )  # fmt: skip
+        on_progress=on_progress,
+        on_candidate=on_candidate,
+    )
     messages = (*left_out, *found.messages)
     for message in messages:
         warnings.warn(message, FitWarning, stacklevel=3)
     test = found.states.take(found.test[: min(_STATES_MEASURED, block_of(2 * found.map.dim))])
     determinant = np.asarray(found.map.determinant(test.z0))
     return Fit(
-        map=found.map, candidates=found.candidates, asked=asked,
-        num_pairs=found.positions.num_triples, determinants={}, data_defect=float("nan"),
-        base_map=False, noise=None, messages=messages, ended=found.ended,
-        seconds=budget.seconds, compile_seconds=found.compile_seconds,
+        map=found.map,
+        candidates=found.candidates,
+        asked=asked,
+        num_pairs=found.positions.num_triples,
+        determinants={},
+        data_defect=float("nan"),
+        base_map=False,
+        noise=None,
+        messages=messages,
+        ended=found.ended,
+        seconds=budget.seconds,
+        compile_seconds=found.compile_seconds,
         test_states=np.asarray(test.z0),
         model_determinant_min=float(determinant[np.argmin(np.abs(determinant))]),
-        pairs=found.states, positions=found.positions, stated_by=found.stated_by,
+        pairs=found.states,
+        positions=found.positions,
+        stated_by=found.stated_by,
         validation_pairs=found.states.take(found.validation),
-        operations=budget.operations, budget=budget,
-    )  # fmt: skip
+        operations=budget.operations,
+        budget=budget,
+    )
 
 
 def _devices(devices: int | str | None) -> tuple[Any, ...]:
@@ -269,9 +299,10 @@ def _devices(devices: int | str | None) -> tuple[Any, ...]:
 def _all_candidates(chosen: Chosen, found: Searched) -> tuple[Candidate, ...]:
     """Every candidate by rising operations, the chosen one as its own steps showed it."""
     others = [
-        e.candidate for e in found.found.entries
+        e.candidate
+        for e in found.found.entries
         if chosen.entry is None or e.size is not chosen.entry.size
-    ]  # fmt: skip
+    ]
     if found.law is not None and chosen.candidate.learns == "map":
         others.append(found.law.candidate)
     candidates = [*others, dataclasses.replace(chosen.candidate, chosen=True)]

@@ -98,10 +98,16 @@ class Fit:
         )
 
     def accelerate(
-        self, *, dt: float | None = None, region=None, tolerance: float | None = None,
-        num_pairs: int = NUM_PAIRS, seed: int = 0, max_seconds: float | None = MAX_SECONDS,
+        self,
+        *,
+        dt: float | None = None,
+        region=None,
+        tolerance: float | None = None,
+        num_pairs: int = NUM_PAIRS,
+        seed: int = 0,
+        max_seconds: float | None = MAX_SECONDS,
         on_progress: Callable[[str], Any] = lambda message: None,
-    ) -> Fit:  # fmt: skip
+    ) -> Fit:
         """A generated map of the Hamiltonian that was learned, fitted to pairs drawn from its flow.
 
         dt: the time of its step; None: that of the data. region: (2, 2d), lowest and highest
@@ -114,9 +120,15 @@ class Fit:
         from gfnn_jax.learn import accelerate  # stands after this module: a shorthand
 
         return accelerate.accelerated(
-            self, dt=dt, region=region, tolerance=tolerance, num_pairs=num_pairs, seed=seed,
-            max_seconds=max_seconds, on_progress=on_progress,
-        )  # fmt: skip
+            self,
+            dt=dt,
+            region=region,
+            tolerance=tolerance,
+            num_pairs=num_pairs,
+            seed=seed,
+            max_seconds=max_seconds,
+            on_progress=on_progress,
+        )
 
     def settled(self) -> Fit:
         """Compute what a report and a saved model hold beside the map, as far as the budget goes:
@@ -143,9 +155,13 @@ class Fit:
             dataclasses.replace(c, map=map_) if c.chosen else c for c in self.candidates
         )
         found = dataclasses.replace(
-            self, map=map_, candidates=candidates, messages=(*self.messages, *messages),
-            defect_known=defect_known, seconds=self.budget.seconds,
-        )  # fmt: skip
+            self,
+            map=map_,
+            candidates=candidates,
+            messages=(*self.messages, *messages),
+            defect_known=defect_known,
+            seconds=self.budget.seconds,
+        )
         if defect_known:
             found.__dict__["symplecticity_defect"] = defect
         return found
@@ -245,9 +261,15 @@ def candidates_table(fit: Fit):
     for c in fit.candidates:
         sign = "" if c.validated else "~"
         table.add_row(
-            "→" if c.chosen else "", c.chart, c.label, str(c.num_parameters),
-            f"{sign}{c.validation_relative:.2e}", f"{sign}{c.validation_bound:.2e}",
-            number(c.outside, ".1e"), f"{c.operations / 1e3:.1f}",
-            number(c.microseconds_per_step, ".2f"), f"{c.fit_seconds:.2f}",
-        )  # fmt: skip
+            "→" if c.chosen else "",
+            c.chart,
+            c.label,
+            str(c.num_parameters),
+            f"{sign}{c.validation_relative:.2e}",
+            f"{sign}{c.validation_bound:.2e}",
+            number(c.outside, ".1e"),
+            f"{c.operations / 1e3:.1f}",
+            number(c.microseconds_per_step, ".2f"),
+            f"{c.fit_seconds:.2f}",
+        )
     return table

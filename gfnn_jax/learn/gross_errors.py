@@ -252,7 +252,7 @@ def _around(data: Dataset, size: np.ndarray, far: np.ndarray) -> np.ndarray:
 
 def _standing_alone(
     size: np.ndarray, far: np.ndarray, around: np.ndarray, ordinary: float
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Rows of ``far`` whose residual is far beyond ``around``, that of their neighbours.
 
     ordinary: times the median of all, that those neighbours' residuals stay below.

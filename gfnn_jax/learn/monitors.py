@@ -246,9 +246,13 @@ def _linear(matrix: np.ndarray | None, pairs: Pairs, like: SymplecticMap) -> Sym
     assert matrix is not None
     none = np.zeros(len(matrix))
     return SymplecticMap(
-        pieces=(Affine(matrix, none, none),), coordinates=like.coordinates,
-        domain=covering(pairs.z0), scale=sizes(pairs.z0), angle_centre=np.zeros(0), dt=pairs.dt,
-    )  # fmt: skip
+        pieces=(Affine(matrix, none, none),),
+        coordinates=like.coordinates,
+        domain=covering(pairs.z0),
+        scale=sizes(pairs.z0),
+        angle_centre=np.zeros(0),
+        dt=pairs.dt,
+    )
 
 
 def _turn_of(recording: Recording) -> float:

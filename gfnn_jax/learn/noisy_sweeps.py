@@ -150,9 +150,7 @@ def _corrected(rivals: list[Entry], request: Request) -> Entry:
     """The entry of smallest expected error, or the cheapest that is as good."""
     given = request.budget, request.on_progress
     most = [entry.sweep.largest_known for entry in rivals]
-    starts = [
-        best_size(e.sweep, e.size, m, *given).size for e, m in zip(rivals, most, strict=True)
-    ]  # fmt: skip
+    starts = [best_size(e.sweep, e.size, m, *given).size for e, m in zip(rivals, most, strict=True)]
     # The same for all, so that their distances have one unit.
     deviations = rivals[0].sweep.state_deviations(starts[0])
     estimated: list[tuple[NoisySweep, Expected]] = []
@@ -184,9 +182,7 @@ class NoisySweep(LinearSweep):
     (2d,) of the noise of each coordinate, ÷ its scale.
     """
 
-    def __init__(
-        self, plain: LinearSweep, near: LinearSweep, size: Size, deviations: np.ndarray
-    ):  # fmt: skip
+    def __init__(self, plain: LinearSweep, near: LinearSweep, size: Size, deviations: np.ndarray):
         self.__dict__.update(plain.__dict__)
         self.plain, self._kept, self._factors, self._solved = plain, None, {}, {}
         data, coefficients = self.data, near.solve(size, Budget(), _quiet)[0].coefficients
@@ -278,9 +274,13 @@ class NoisySweep(LinearSweep):
         noise = None if larger is None else part_of_noise(size, larger, left(size), left(larger))
         slopes = rows[:, :count]
         return uncertainty.root(
-            train, count, slopes, slopes @ solved.coefficients - rows[:, -1], noise=noise,
+            train,
+            count,
+            slopes,
+            slopes @ solved.coefficients - rows[:, -1],
+            noise=noise,
             ridge=solved.ridge,
-        )  # fmt: skip
+        )
 
 
 def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:

@@ -75,20 +75,25 @@ DEVICES = Kind(
     "all, or a whole number from 1 to 2**31 - 1",
     lambda v: v == "all" or _whole(1, 31).holds(v),
     lambda text: "all" if text == "all" else int(text),
-)  # fmt: skip
+)
 STRUCTURE = Kind(EXPECTED, names_structure)
 _SECONDS = Kind(
-    "a finite number > 0, or None for no limit", lambda v: v in ("auto", None) or _is_positive(v),
-    float, typed="a finite number > 0, in seconds",
-)  # fmt: skip
+    "a finite number > 0, or None for no limit",
+    lambda v: v in ("auto", None) or _is_positive(v),
+    float,
+    typed="a finite number > 0, in seconds",
+)
 _OPERATIONS = Kind(
     "a whole number of operations, or None for no limit",
-    lambda v: isinstance(v, Integral) and int(v) >= 0, int, typed="a whole number of operations",
-)  # fmt: skip
+    lambda v: isinstance(v, Integral) and int(v) >= 0,
+    int,
+    typed="a whole number of operations",
+)
 _TERMS = Kind(
     "a sequence of texts or functions of z, () for none",
-    lambda v: not isinstance(v, str) and _are(_is_text_or_function, Sequence)(v), _texts,
-)  # fmt: skip
+    lambda v: not isinstance(v, str) and _are(_is_text_or_function, Sequence)(v),
+    _texts,
+)
 _TEXT = Kind("text", lambda v: isinstance(v, str))
 _LAW = Kind("a Hamiltonian as text or a function of z", _is_text_or_function)
 _INDICES = Kind("a tuple of indices", _are(lambda i: isinstance(i, int), tuple, list))
@@ -118,9 +123,13 @@ class About(NamedTuple):
 
 
 def _about(
-    kind: Kind, help_: str, metavar: str | None = None, commands: tuple[str, ...] = RUN, *,
+    kind: Kind,
+    help_: str,
+    metavar: str | None = None,
+    commands: tuple[str, ...] = RUN,
+    *,
     decides: bool = True,
-) -> dict[str, About]:  # fmt: skip
+) -> dict[str, About]:
     return {"about": About(kind, help_, metavar, commands, decides)}
 
 
@@ -133,104 +142,197 @@ class FitOptions:
     exclude one another.
     """
 
-    tolerance: float = field(default=1e-6, metadata=_about(
-        POSITIVE,
-        "largest one-step error of a map of states, RMS over coordinates of error divided by "
-        "spread; its upper 95 % bound must not exceed it", "E",
-    ))  # fmt: skip
-    absolute_tolerance: float | None = field(default=None, metadata=_about(
-        POSITIVE,
-        "instead of the tolerance: largest RMS error per coordinate, in the data's units", "E", FIT,
-    ))  # fmt: skip
-    learn: str = field(default="auto", metadata=_about(
-        _one_of("auto", "map", "hamiltonian", "lagrangian"),
-        "what is learned: map (S, whose step is an implicit equation), hamiltonian (H, whose flow "
-        "is the map) or auto (both: H where it meets the tolerance at no more than four times the "
-        "cost of a step, for it holds outside the data and at any time step); of a recording its "
-        "law (lagrangian, auto) or the map of its positions (map)",
-    ))  # fmt: skip
-    terms: Sequence[str | Callable] = field(default=(), metadata=_about(
-        _TERMS,
-        'known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"; in Python also functions of z; of a '
-        'recording those of its law: "omega**2; V: cos(theta); R: omega**2"', "TEXT",
-    ))  # fmt: skip
-    base: str | Callable | None = field(default=None, metadata=_about(
-        _LAW,
-        'known part of H: "p1**2/2 - cos(q1)"; its flow is factored out, and S learns the '
-        "remainder", "TEXT",
-    ))  # fmt: skip
-    structure: str | None = field(default=None, metadata=_about(
-        STRUCTURE,
-        "structure of many degrees of freedom: H is a sum over equal sites, with terms in q1, p1 "
-        "of a site and q2, p2, … of the next ones (ring:2 has two q at every site, side by side); "
-        "or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike). Of a ring "
-        "or a chain S is learned instead where a map is asked for or no H meets the tolerance. "
-        "Default: that of the scene",
-        "|".join(STRUCTURES),
-    ))  # fmt: skip
-    family: Any = field(default="auto", metadata=_about(
-        _one_of("auto", "polynomial", "features", "sines", "mlp", or_holds=_is_family),
-        "family of the generating function: polynomial (Fourier in angles), features (the "
-        "scene's), sines, mlp (also of an H that is a network); in Python also a family of one's "
-        "own that is linear in its parameters, or a function of Inputs that gives such families",
-    ))  # fmt: skip
-    model: Any = field(default=None, metadata=_about(
-        _MODEL, "a model of one's own, which is then all that is learned", commands=()
-    ))  # fmt: skip
-    chart: str = field(default="auto", metadata=_about(
-        _one_of("auto", "type1", "type2", "type3", "midpoint"),
-        "chart that S is evaluated in",
-    ))  # fmt: skip
-    ensemble: int = field(default=1, metadata=_about(
-        COUNT,
-        "with family mlp: number of networks trained together; their mean is the map, their "
-        "spread its bands", "N",
-    ))  # fmt: skip
-    angles: Sequence[int] = field(default=(), metadata=_about(
-        _INDICES, "without a scene: indices in z of what has period 2π", commands=()
-    ))  # fmt: skip
-    seed: int = field(default=0, metadata=_about(
-        SEED, "seed of what is drawn at random", "N",
-    ))  # fmt: skip
-    max_seconds: float | Literal["auto"] | None = field(default="auto", metadata=_about(
-        _SECONDS,
-        "time for the fit in seconds, after which the best map so far is kept (default 120, or no "
-        "limit with a maximum of operations); in Python None: no limit, and the same map on a busy "
-        "machine and an idle one", "S", decides=False,
-    ))  # fmt: skip
-    max_operations: int | None = field(default=None, metadata=_about(
-        _OPERATIONS,
-        "counted operations for the fit: the value of fit.max_operations in a report gives the "
-        "same model again, also where time had ended that fit", "N", decides=False,
-    ))  # fmt: skip
-    max_iterations: int = field(default=250, metadata=_about(
-        COUNT, "iterations of a network's training", commands=(),
-    ))  # fmt: skip
-    friction: str = field(default="auto", metadata=_about(
-        _TEXT,
-        "of a recording, friction by its force: auto, none, linear (viscous, ∝ v), quadratic "
-        "(drag, "
-        "∝ v |v|), dry (Coulomb), uniform (R = γT); several joined by +", "KIND", FIT,
-    ))  # fmt: skip
-    input_hold: str = field(default="auto", metadata=_about(
-        _one_of("auto", "hold", "linear", "band"),
-        "of a recording, inputs between samples: hold (zero order), linear, band (band-limited), "
-        "or "
-        "auto, by held-out data", None, FIT,
-    ))  # fmt: skip
-    mass: Mapping[str, float] | None = field(default=None, metadata=_about(
-        _MASSES, "of a recording: the known mass of one position", commands=()
-    ))  # fmt: skip
-    loss: Any = field(default=None, metadata=_about(
-        _LOSS,
-        "of a recording whose law is learned: the loss of residuals in units of their noise, of "
-        "one's own", commands=()
-    ))  # fmt: skip
-    devices: int | str | None = field(default=None, metadata=_about(
-        DEVICES,
-        "number of devices that share the rows, and the networks of an ensemble; on a CPU these "
-        "are its cores; the same bits on any number", "all|N", FIT, decides=False,
-    ))  # fmt: skip
+    tolerance: float = field(
+        default=1e-6,
+        metadata=_about(
+            POSITIVE,
+            "largest one-step error of a map of states, RMS over coordinates of error divided by "
+            "spread; its upper 95 % bound must not exceed it",
+            "E",
+        ),
+    )
+    absolute_tolerance: float | None = field(
+        default=None,
+        metadata=_about(
+            POSITIVE,
+            "instead of the tolerance: largest RMS error per coordinate, in the data's units",
+            "E",
+            FIT,
+        ),
+    )
+    learn: str = field(
+        default="auto",
+        metadata=_about(
+            _one_of("auto", "map", "hamiltonian", "lagrangian"),
+            "what is learned: map (S, whose step is an implicit equation), hamiltonian (H, "
+            "whose flow "
+            "is the map) or auto (both: H where it meets the tolerance at no more than four "
+            "times the "
+            "cost of a step, for it holds outside the data and at any time step); of a "
+            "recording its "
+            "law (lagrangian, auto) or the map of its positions (map)",
+        ),
+    )
+    terms: Sequence[str | Callable] = field(
+        default=(),
+        metadata=_about(
+            _TERMS,
+            'known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"; in Python also functions of z; of a '
+            'recording those of its law: "omega**2; V: cos(theta); R: omega**2"',
+            "TEXT",
+        ),
+    )
+    base: str | Callable | None = field(
+        default=None,
+        metadata=_about(
+            _LAW,
+            'known part of H: "p1**2/2 - cos(q1)"; its flow is factored out, and S learns the '
+            "remainder",
+            "TEXT",
+        ),
+    )
+    structure: str | None = field(
+        default=None,
+        metadata=_about(
+            STRUCTURE,
+            "structure of many degrees of freedom: H is a sum over equal sites, with terms "
+            "in q1, p1 "
+            "of a site and q2, p2, … of the next ones (ring:2 has two q at every site, side "
+            "by side); "
+            "or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike). "
+            "Of a ring "
+            "or a chain S is learned instead where a map is asked for or no H meets the tolerance. "
+            "Default: that of the scene",
+            "|".join(STRUCTURES),
+        ),
+    )
+    family: Any = field(
+        default="auto",
+        metadata=_about(
+            _one_of("auto", "polynomial", "features", "sines", "mlp", or_holds=_is_family),
+            "family of the generating function: polynomial (Fourier in angles), features (the "
+            "scene's), sines, mlp (also of an H that is a network); in Python also a family "
+            "of one's "
+            "own that is linear in its parameters, or a function of Inputs that gives such "
+            "families",
+        ),
+    )
+    model: Any = field(
+        default=None,
+        metadata=_about(
+            _MODEL, "a model of one's own, which is then all that is learned", commands=()
+        ),
+    )
+    chart: str = field(
+        default="auto",
+        metadata=_about(
+            _one_of("auto", "type1", "type2", "type3", "midpoint"),
+            "chart that S is evaluated in",
+        ),
+    )
+    ensemble: int = field(
+        default=1,
+        metadata=_about(
+            COUNT,
+            "with family mlp: number of networks trained together; their mean is the map, their "
+            "spread its bands",
+            "N",
+        ),
+    )
+    angles: Sequence[int] = field(
+        default=(),
+        metadata=_about(
+            _INDICES, "without a scene: indices in z of what has period 2π", commands=()
+        ),
+    )
+    seed: int = field(
+        default=0,
+        metadata=_about(
+            SEED,
+            "seed of what is drawn at random",
+            "N",
+        ),
+    )
+    max_seconds: float | Literal["auto"] | None = field(
+        default="auto",
+        metadata=_about(
+            _SECONDS,
+            "time for the fit in seconds, after which the best map so far is kept (default "
+            "120, or no "
+            "limit with a maximum of operations); in Python None: no limit, and the same map "
+            "on a busy "
+            "machine and an idle one",
+            "S",
+            decides=False,
+        ),
+    )
+    max_operations: int | None = field(
+        default=None,
+        metadata=_about(
+            _OPERATIONS,
+            "counted operations for the fit: the value of fit.max_operations in a report gives the "
+            "same model again, also where time had ended that fit",
+            "N",
+            decides=False,
+        ),
+    )
+    max_iterations: int = field(
+        default=250,
+        metadata=_about(
+            COUNT,
+            "iterations of a network's training",
+            commands=(),
+        ),
+    )
+    friction: str = field(
+        default="auto",
+        metadata=_about(
+            _TEXT,
+            "of a recording, friction by its force: auto, none, linear (viscous, ∝ v), quadratic "
+            "(drag, "
+            "∝ v |v|), dry (Coulomb), uniform (R = γT); several joined by +",
+            "KIND",
+            FIT,
+        ),
+    )
+    input_hold: str = field(
+        default="auto",
+        metadata=_about(
+            _one_of("auto", "hold", "linear", "band"),
+            "of a recording, inputs between samples: hold (zero order), linear, band "
+            "(band-limited), "
+            "or "
+            "auto, by held-out data",
+            None,
+            FIT,
+        ),
+    )
+    mass: Mapping[str, float] | None = field(
+        default=None,
+        metadata=_about(_MASSES, "of a recording: the known mass of one position", commands=()),
+    )
+    loss: Any = field(
+        default=None,
+        metadata=_about(
+            _LOSS,
+            "of a recording whose law is learned: the loss of residuals in units of their "
+            "noise, of "
+            "one's own",
+            commands=(),
+        ),
+    )
+    devices: int | str | None = field(
+        default=None,
+        metadata=_about(
+            DEVICES,
+            "number of devices that share the rows, and the networks of an ensemble; on a "
+            "CPU these "
+            "are its cores; the same bits on any number",
+            "all|N",
+            FIT,
+            decides=False,
+        ),
+    )
 
     def __post_init__(self):
         for option in dataclasses.fields(self):
@@ -242,9 +344,11 @@ class FitOptions:
     def _refuse_contradictions(self) -> None:
         of_h, plain = self.learn == "hamiltonian", (self.family, self.chart) == ("auto", "auto")
         if self.model is not None and not (
-            plain and (self.learn, self.base) == ("auto", None)
-            and not self.terms and self.structure is None
-        ):  # fmt: skip
+            plain
+            and (self.learn, self.base) == ("auto", None)
+            and not self.terms
+            and self.structure is None
+        ):
             raise FitError(
                 "model: nothing else is learned beside it, expected no learn, terms, base, "
                 "structure, family or chart"
@@ -282,9 +386,7 @@ class FitOptions:
         values = {name: getattr(self, name) for name, about in OPTIONS.items() if about.decides}
         return {n: list(v) if isinstance(v, (tuple, list)) else v for n, v in values.items()}
 
-    def budget(
-        self, clock: Callable[[], float], dim: int | None, spent: float = 0.0
-    ) -> Budget:  # fmt: skip
+    def budget(self, clock: Callable[[], float], dim: int | None, spent: float = 0.0) -> Budget:
         """Start the budget of a fit whose map has ``dim`` degrees of freedom, ``spent`` seconds
         ago."""
         seconds = seconds_allowed(self.max_seconds, self.max_operations)

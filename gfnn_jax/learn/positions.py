@@ -96,10 +96,15 @@ class LearnedPositions(NamedTuple):
 
 
 def learn_positions(
-    recording: Recording, *, tolerance: Tolerance, budget: Budget, structure: str | None = None,
-    seed: int = 0, on_progress: Callable[[str], Any] = lambda message: None,
+    recording: Recording,
+    *,
+    tolerance: Tolerance,
+    budget: Budget,
+    structure: str | None = None,
+    seed: int = 0,
+    on_progress: Callable[[str], Any] = lambda message: None,
     on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
-) -> LearnedPositions:  # fmt: skip
+) -> LearnedPositions:
     """The map behind the positions of a recording, at even times or by turns.
 
     structure: "ring" or "chain" of equal sites. Raises FitError where the triples are too few for
@@ -112,9 +117,17 @@ def learn_positions(
     if len(triples) < _FEWEST:
         raise FitError(f"expected at least {_FEWEST} triples of positions, got {len(triples)}")
     sensors = Sensors(
-        recording.positions, (), recording.angles, np.zeros(triples.dim), 0.0,
-        _WINDOW * triples.dt, "hold", 0.0, np.array([triples.dt]), np.zeros((1, triples.dim)),
-    )  # fmt: skip
+        recording.positions,
+        (),
+        recording.angles,
+        np.zeros(triples.dim),
+        0.0,
+        _WINDOW * triples.dt,
+        "hold",
+        0.0,
+        np.array([triples.dt]),
+        np.zeros((1, triples.dim)),
+    )
     sweep = _Sweep(
         triples, sites, _split(triples, seed), tolerance, budget, on_progress, on_candidate, sensors
     )
@@ -241,9 +254,12 @@ class _Sweep:
         started = time.perf_counter()
         noise = tuple(map(float, found.fit.sigma))
         about = dataclasses.replace(
-            best.about, num_parameters=found.family.num_parameters, rank=found.solved.rank,
-            condition=found.solved.condition, noise=noise,
-        )  # fmt: skip
+            best.about,
+            num_parameters=found.family.num_parameters,
+            rank=found.solved.rank,
+            condition=found.solved.condition,
+            noise=noise,
+        )
         own = found.fit.coefficients, found.fit.root, found.fit.sigma
         return self._found(found.family, about, *own, started)
 
@@ -282,9 +298,14 @@ class _Sweep:
         return self._found(family, about, solved.coefficients, root, noise, started)
 
     def _found(
-        self, family: OfDisplacement, about: OfPositions, coefficients: np.ndarray,
-        root: np.ndarray, noise: np.ndarray, started: float,
-    ) -> _Found:  # fmt: skip
+        self,
+        family: OfDisplacement,
+        about: OfPositions,
+        coefficients: np.ndarray,
+        root: np.ndarray,
+        noise: np.ndarray,
+        started: float,
+    ) -> _Found:
         """A candidate, with the error of its steps from positions that were held out."""
         triples = self.triples
         training, held = (triples.take(r) for r in (self.split.training, self.split.validation))
@@ -295,14 +316,21 @@ class _Sweep:
         error = self.error_of(images_of(piece, held), self.split.validation)
         gradient, with_hessian = family.operations
         candidate = Candidate(
-            label=family.label, family=family.name, chart=TYPE1.name,
-            num_parameters=family.num_parameters, operations=float(gradient + with_hessian),
-            validation_rms=error.rms, validation_relative=error.relative,
-            validation_bound=error.bound, deviations=error.deviations,
-            train_rms=float(np.sqrt(np.mean(left**2))), validated=True,
-            fit_seconds=time.perf_counter() - started, condition=about.condition,
+            label=family.label,
+            family=family.name,
+            chart=TYPE1.name,
+            num_parameters=family.num_parameters,
+            operations=float(gradient + with_hessian),
+            validation_rms=error.rms,
+            validation_relative=error.relative,
+            validation_bound=error.bound,
+            deviations=error.deviations,
+            train_rms=float(np.sqrt(np.mean(left**2))),
+            validated=True,
+            fit_seconds=time.perf_counter() - started,
+            condition=about.condition,
             rank=about.rank,
-        )  # fmt: skip
+        )
         self.tried.append(candidate)
         self.on_candidate(candidate)
         return _Found(piece, candidate, about, root, noise)
@@ -323,11 +351,16 @@ class _Sweep:
         images = np.where(steps.failed[:, None], np.nan, steps.images)[:, : self.triples.dim]
         error = self.error_of(images, test)
         chosen = dataclasses.replace(
-            best.candidate, validation_rms=error.rms, validation_relative=error.relative,
-            validation_bound=error.bound, deviations=error.deviations, map=map_, chosen=True,
+            best.candidate,
+            validation_rms=error.rms,
+            validation_relative=error.relative,
+            validation_bound=error.bound,
+            deviations=error.deviations,
+            map=map_,
+            chosen=True,
             newton_iterations_max=int(steps.iterations.max()),
             microseconds_per_step=steps.microseconds_per_step,
-        )  # fmt: skip
+        )
         others = [c for c in self.tried if c is not best.candidate]
         met, messages = chosen.validation_bound <= self.tolerance.bound, []
         ended = MET if met else self.budget.ended or "larger S are no more accurate"
@@ -340,10 +373,17 @@ class _Sweep:
         on_progress(str(best.about))
         part = "took no part in the fit or its choices" if test is self.split.test else "also chose"
         return LearnedPositions(
-            map_, tuple(sorted([*others, chosen], key=lambda c: c.operations)), best.about, states,
-            self.split.validation, test, f"{len(test):,} triples that {part}", messages, ended,
+            map_,
+            tuple(sorted([*others, chosen], key=lambda c: c.operations)),
+            best.about,
+            states,
+            self.split.validation,
+            test,
+            f"{len(test):,} triples that {part}",
+            messages,
+            ended,
             steps.compile_seconds,
-        )  # fmt: skip
+        )
 
 
 def _split(triples: Triples, seed: int) -> Split:

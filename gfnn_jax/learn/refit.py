@@ -77,9 +77,14 @@ def work_of_refit(fitted: Fit, num_pairs: int, reading: float) -> float:
 
 
 def refit(
-    fitted: Fit, chunks: Iterable[Pairs], held: Pairs, *, test: Pairs | None = None,
-    scene: Scene | None = None, group: Group | None = None,
-) -> Fit:  # fmt: skip
+    fitted: Fit,
+    chunks: Iterable[Pairs],
+    held: Pairs,
+    *,
+    test: Pairs | None = None,
+    scene: Scene | None = None,
+    group: Group | None = None,
+) -> Fit:
     """The chosen map of a fit, of a linear family, with its coefficients from all of these pairs.
 
     fitted: of a sample of them. chunks: all of the pairs, which need never be in memory together;
@@ -156,9 +161,14 @@ def refit(
     candidates = tuple(chosen if c.chosen else c for c in fitted.candidates)
     seconds = fitted.seconds + time.perf_counter() - started
     return dataclasses.replace(
-        fitted, map=chosen.map, candidates=candidates, num_pairs=num_pairs, seconds=seconds,
-        hamiltonian=law, messages=tuple(messages),
-    )  # fmt: skip
+        fitted,
+        map=chosen.map,
+        candidates=candidates,
+        num_pairs=num_pairs,
+        seconds=seconds,
+        hamiltonian=law,
+        messages=tuple(messages),
+    )
 
 
 def _states_of(parts: Sequence[Pairs]) -> np.ndarray:

@@ -99,9 +99,13 @@ def checked(pairs: Pairs, scene: Scene | None, options: FitOptions, **others: An
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
     pairs = dataclasses.replace(pairs, z0=z0, z1=z1)
     pairs, learn, messages = as_varied(
-        pairs, learn=options.learn, family=options.family, chart=options.chart, base=options.base,
+        pairs,
+        learn=options.learn,
+        family=options.family,
+        chart=options.chart,
+        base=options.base,
         structure=structure,
-    )  # fmt: skip
+    )
     check_moves(pairs)
     if scene is not None and scene.features is not None and options.family in ("auto", "features"):
         messages += unlike_the_scene(pairs, scene)

@@ -119,13 +119,15 @@ def searched(
         on_progress("drawing pairs from the flow of H")
         drawn = search_of_law(
             law, data, tolerance, scene, dearest, budget, on_progress, on_candidate, options.seed
-        )  # fmt: skip
+        )
         if drawn is not None:
             found, charts = drawn
     elif (
-        law is not None and not met_by_law and data.args is None
+        law is not None
+        and not met_by_law
+        and data.args is None
         and law_explains_most(law, found, tolerance, budget)
-    ):  # fmt: skip
+    ):
         on_progress(f"learning the residual of the flow of {law.candidate.label}")
         around = search_around(
             law, data, tolerance, scene, budget, on_progress, on_candidate, better, options.seed
@@ -177,14 +179,26 @@ def _law(
         return None
     if request.of_network:
         law = learn_network(
-            data, request.tolerance, request.scene, seed=options.seed, budget=request.budget,
-            on_progress=request.on_progress, max_iterations=options.max_iterations,
-        )  # fmt: skip
+            data,
+            request.tolerance,
+            request.scene,
+            seed=options.seed,
+            budget=request.budget,
+            on_progress=request.on_progress,
+            max_iterations=options.max_iterations,
+        )
     else:
         law = law_of(
-            data, request.tolerance, request.scene, options.learn, options.terms, request.budget,
-            request.on_progress, dearest, request.partly,
-        )  # fmt: skip
+            data,
+            request.tolerance,
+            request.scene,
+            options.learn,
+            options.terms,
+            request.budget,
+            request.on_progress,
+            dearest,
+            request.partly,
+        )
     if law is not None:
         if better is not None:
             better.offer(law.candidate, lambda: composed(law.flow, data))
@@ -205,8 +219,14 @@ def _sweeps(request: Request, taken: Dataset, diagnosis: Diagnosis) -> list[Any]
         alone = data.structure is None and data.args is None
         return [sweep_of_dt(data, tolerance, request.scene, request.factors)] if alone else []
     if options.family == "mlp":
-        given = (data, tolerance, charts[0], options.max_iterations, options.seed,
-                 request.checkpoints)  # fmt: skip
+        given = (
+            data,
+            tolerance,
+            charts[0],
+            options.max_iterations,
+            options.seed,
+            request.checkpoints,
+        )
         count = options.ensemble
         return [NetworkSweep(*given) if count == 1 else EnsembleSweep(*given, count=count)]
     return list(sweeps_for(options.family, charts, data, tolerance, request.scene, request.factors))

@@ -16,7 +16,7 @@ from gfnn_jax.solve.status import OK, Info
 
 @partial(
     jax.tree_util.register_dataclass, data_fields=("matrix", "centre", "shift"), meta_fields=()
-)  # fmt: skip
+)
 @dataclasses.dataclass(frozen=True, eq=False)
 class Affine:
     """Map z -> centre + shift + E (z − centre), E a symplectic matrix: half a base map. A piece.

@@ -364,9 +364,13 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
 
 
 def _with_zeros(
-    x: np.ndarray, J: np.ndarray, last: np.ndarray, near: np.ndarray, variance: float,
+    x: np.ndarray,
+    J: np.ndarray,
+    last: np.ndarray,
+    near: np.ndarray,
+    variance: float,
     sigma: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """States x (B, m) with the zeros that the same samples tell, and the covariance of both.
 
     J, last: of `linearised`. near: (B, L, k) covariance of the rows' values with the zeros.
@@ -381,10 +385,12 @@ def _with_zeros(
     root, own = last[..., :m] @ np.linalg.pinv(R), Q.swapaxes(1, 2) @ c
     across = -root @ own * sigma
     open_ = variance * np.eye(k) - c.swapaxes(1, 2) @ c + own.swapaxes(1, 2) @ own
-    covariance = np.block([
-        [root @ root.swapaxes(1, 2), across],
-        [across.swapaxes(1, 2), sigma[:, None] * open_ * sigma],
-    ])  # fmt: skip
+    covariance = np.block(
+        [
+            [root @ root.swapaxes(1, 2), across],
+            [across.swapaxes(1, 2), sigma[:, None] * open_ * sigma],
+        ]
+    )
     return np.concatenate([x, (c.swapaxes(1, 2) @ r)[..., 0] * sigma], axis=1), covariance
 
 
@@ -444,18 +450,27 @@ class Orbits(NamedTuple):
 
 
 def propagate(
-    law: Law, windows: Sequence[Window], x: np.ndarray, covariance: np.ndarray, last: np.ndarray,
+    law: Law,
+    windows: Sequence[Window],
+    x: np.ndarray,
+    covariance: np.ndarray,
+    last: np.ndarray,
     times: np.ndarray,
-) -> Orbits:  # fmt: skip
+) -> Orbits:
     """Orbits from what `estimate_states` found, x (B, m) with its covariance, at times ``last``
     (B,), to times (B, n)."""
     return propagate_each([law], np.zeros(len(x), int), windows, x, covariance, last, times)
 
 
 def propagate_each(
-    laws: Sequence[Law], which: np.ndarray, windows: Sequence[Window], x: np.ndarray,
-    covariance: np.ndarray, last: np.ndarray, times: np.ndarray,
-) -> Orbits:  # fmt: skip
+    laws: Sequence[Law],
+    which: np.ndarray,
+    windows: Sequence[Window],
+    x: np.ndarray,
+    covariance: np.ndarray,
+    last: np.ndarray,
+    times: np.ndarray,
+) -> Orbits:
     """`propagate` of lanes of which each follows its own law, ``laws[which]``, which (B,).
 
     The laws differ in coefficients, phases, covariance and the parameters of their channels only;
@@ -484,9 +499,14 @@ def propagate_each(
 
 
 def _followed(
-    laws: Sequence[Law], which: np.ndarray, x: np.ndarray, root: np.ndarray, h: np.ndarray,
-    u: np.ndarray, asked: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    laws: Sequence[Law],
+    which: np.ndarray,
+    x: np.ndarray,
+    root: np.ndarray,
+    h: np.ndarray,
+    u: np.ndarray,
+    asked: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Orbits (B, M + 1, 2d) of the laws from states x (B, 2d), whose covariance is root rootᵀ, by
     steps h (B, M) with inputs u; and the roots (B, n, 2d, ·) of the covariances after the steps
     that are ``asked`` (n,), with that of the coefficients.
@@ -551,7 +571,9 @@ def substeps_of(sensors: Sensors, h: float) -> int:
 def _inputs(law: Law, windows: Sequence[Window], t: np.ndarray, substeps: int) -> np.ndarray:
     """Inputs (B, L − 1, substeps, 6, k) of the steps between times t (B, L)."""
     hold, delay = law.sensors.hold, law.sensors.delay
-    return np.stack([
-        at_stages(w.inputs_t, w.inputs, ends[:-1], ends[1:], substeps, hold, delay)
-        for w, ends in zip(windows, t, strict=True)
-    ])  # fmt: skip
+    return np.stack(
+        [
+            at_stages(w.inputs_t, w.inputs, ends[:-1], ends[1:], substeps, hold, delay)
+            for w, ends in zip(windows, t, strict=True)
+        ]
+    )

@@ -65,9 +65,14 @@ def begun(map_, z, args, stop_outside) -> Lanes:
     count = jnp.zeros(z.shape[0], jnp.result_type(int))
     left_at = jnp.where(inside | ~finite, count - 1, count)
     return Lanes(
-        y, compensation, turns.astype(count.dtype), status.astype(jnp.int32), left_at,
-        jnp.zeros(z.shape[0], jnp.int32), count,
-    )  # fmt: skip
+        y,
+        compensation,
+        turns.astype(count.dtype),
+        status.astype(jnp.int32),
+        left_at,
+        jnp.zeros(z.shape[0], jnp.int32),
+        count,
+    )
 
 
 start_lanes = compiled_sooner(begun, (3,))

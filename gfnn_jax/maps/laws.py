@@ -73,10 +73,16 @@ def map_of_law(
     flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, steps.newton)
     posterior = None if root is None else Posterior(0, np.asarray(root))
     return SymplecticMap(
-        (flow,), coordinates, covering(z, ignore=whole), scale, centre, float(dt),
-        parameters=sampled(parameters, args) if parameters else None, posterior=posterior,
+        (flow,),
+        coordinates,
+        covering(z, ignore=whole),
+        scale,
+        centre,
+        float(dt),
+        parameters=sampled(parameters, args) if parameters else None,
+        posterior=posterior,
         signals=signals,
-    )  # fmt: skip
+    )
 
 
 def smoothed(law: Lagrangian, width: float) -> Lagrangian:
@@ -115,10 +121,12 @@ def conformal(law: Lagrangian, covariance: np.ndarray) -> tuple[Lagrangian, np.n
     mass = 2 * sum(c for c, row in zip(law.coefficients, rows, strict=True) if any(row[0]))
     by = np.append(np.ones(law.terms.count), 1 / mass)
     even = dataclasses.replace(
-        law, friction=law.friction.take([]), losses=law.losses[:0],
+        law,
+        friction=law.friction.take([]),
+        losses=law.losses[:0],
         uniform=float(law.losses[0]) / mass,
         powers=None if law.powers is None else law.powers[: law.terms.count],
-    )  # fmt: skip
+    )
     return even, by[:, None] * covariance * by
 
 

@@ -121,16 +121,15 @@ class Observation:
             return y[:, [self.direct[i] for i in range(self.dim)]]
         d = self.dim
         still = [
-            k for k, tree in enumerate(self._trees)
+            k
+            for k, tree in enumerate(self._trees)
             if tree is None or not depends_on(tree) & set(range(d, 2 * d))
-        ]  # fmt: skip
+        ]
         q, best = np.zeros((len(y), d)), np.full(len(y), np.inf)
         scale = np.nanstd(y[:, still], axis=0) + 1e-300
         turns = np.arange(_TRIED) * 2 * np.pi / _TRIED
         own = [self.channels.index(n) if n in self.channels else None for n in self.coordinates]
-        choices = [
-            turns if i in angles and own[i] is None else np.zeros(1) for i in range(d)
-        ]  # fmt: skip
+        choices = [turns if i in angles and own[i] is None else np.zeros(1) for i in range(d)]
         for choice in product(*choices):
             x = np.zeros((len(y), 2 * d))
             for i, value in enumerate(choice):
@@ -181,9 +180,10 @@ class Observation:
         """Channels without which the coordinates are not told: those that show no velocity."""
         moving = set(range(self.dim, 2 * self.dim))
         return tuple(
-            name for name, tree in zip(self.channels, self._trees, strict=True)
+            name
+            for name, tree in zip(self.channels, self._trees, strict=True)
             if tree is None or not depends_on(tree) & moving
-        )  # fmt: skip
+        )
 
     def state_sigma(self, x: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         """σ (d,) of the coordinates, of that of the channels (k,), at states x (n, 2d)."""
@@ -230,10 +230,15 @@ class Observation:
 
 
 def observed(
-    observe: Mapping[str, Any], coordinates: Sequence[str], speeds: Sequence[str],
-    guess: Mapping[str, float], *, offsets: Sequence[str] = (), scales: Sequence[str] = (),
+    observe: Mapping[str, Any],
+    coordinates: Sequence[str],
+    speeds: Sequence[str],
+    guess: Mapping[str, float],
+    *,
+    offsets: Sequence[str] = (),
+    scales: Sequence[str] = (),
     columns: Sequence[str],
-) -> Observation:  # fmt: skip
+) -> Observation:
     """The observation of a recording with these columns.
 
     observe: column -> text, or a function whose arguments are coordinates, speeds and parameters by
@@ -261,9 +266,12 @@ def observed(
             raise InputError(f"observe: no column {name} among {', '.join(columns)}")
         formulas[name] = given if isinstance(given, str) else _text_of(given, starts)
     parameters = [
-        n for column, f in formulas.items() if f != column or column not in coordinates
-        for n in names_in(f) if n not in code.values()
-    ]  # fmt: skip
+        n
+        for column, f in formulas.items()
+        if f != column or column not in coordinates
+        for n in names_in(f)
+        if n not in code.values()
+    ]
     parameters = list(dict.fromkeys(parameters))
     unknown = [name for name in guess if name not in parameters]
     if unknown:
@@ -272,9 +280,13 @@ def observed(
         )
     values = np.array([starts.get(name, np.nan) for name in parameters])
     found = Observation(
-        tuple(formulas), tuple(formulas.values()), tuple(coordinates), tuple(speeds),
-        tuple(parameters), values,
-    )  # fmt: skip
+        tuple(formulas),
+        tuple(formulas.values()),
+        tuple(coordinates),
+        tuple(speeds),
+        tuple(parameters),
+        values,
+    )
     return dataclasses.replace(found, values=_started(found))
 
 

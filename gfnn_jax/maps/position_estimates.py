@@ -101,8 +101,10 @@ def _ends(map_: Any, piece: Any, recording: Recording) -> _Ends:
     """Fit an orbit of S through the last readings of every run."""
     sensors, dim = map_.sensors, map_.dim
     if sensors is None:
-        raise InputError("expected a map that knows its sensors, got one of an older release or of "
-                         "pairs: fit the recording again")  # fmt: skip
+        raise InputError(
+            "expected a map that knows its sensors, got one of an older release or of "
+            "pairs: fit the recording again"
+        )
     windows = [_window(map_, piece, recording, run) for run in recording.runs]
     arcs, sigma = _arcs(map_, piece), np.tile(sensors.sigma, 2)
     known = dataclasses.replace(arcs, basis=arcs.basis[:, :0])

@@ -30,9 +30,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 _TOGETHER = 256
 
 
-@partial(
-    jax.tree_util.register_dataclass, data_fields=("map", "params"), meta_fields=("piece",)
-)  # fmt: skip
+@partial(jax.tree_util.register_dataclass, data_fields=("map", "params"), meta_fields=("piece",))
 @dataclasses.dataclass(frozen=True, eq=False)
 class Samples:
     """Set of n maps that equal ``map`` but for the params (n, ...) of one piece."""
@@ -65,9 +63,15 @@ class Samples:
         return _start(self, z0, args, stop_outside, self._together(z0))
 
     def advance(
-        self, lanes: Lanes, num_saved: int, *, params=None, t0=None, save_every: int = 1,
+        self,
+        lanes: Lanes,
+        num_saved: int,
+        *,
+        params=None,
+        t0=None,
+        save_every: int = 1,
         stop_outside: bool = False,
-    ) -> tuple[Lanes, Any]:  # fmt: skip
+    ) -> tuple[Lanes, Any]:
         """Advance lanes as `SymplecticMap.advance` does; the states are (n, B, num_saved, 2d)."""
         args = self.map._args(params, lanes.y[0], t0)
         together = self._together(lanes.y)
@@ -99,9 +103,13 @@ class Samples:
         if num_steps < 0:
             require_no_inputs_backwards(inputs)
             return self.reversed().rollout(
-                z0, -num_steps, params=params, t0=t0, save_every=save_every,
+                z0,
+                -num_steps,
+                params=params,
+                t0=t0,
+                save_every=save_every,
                 stop_outside=stop_outside,
-            )  # fmt: skip
+            )
         z0, _ = self._given(z0, params, t0)
         args = self.map._schedule(params, self.map._states(z0[0]), t0, inputs, num_steps)
         return _rollout(
@@ -163,9 +171,7 @@ def _mapped(samples: Samples, function, each: tuple, together: int):
     each, count = (samples.params, *each), len(samples)
     if together == 1:  # no batch: a program takes one side of a branch
         return jax.lax.map(one, each)
-    parts = jax.tree.map(
-        lambda a: a.reshape(count // together, together, *a.shape[1:]), each
-    )  # fmt: skip
+    parts = jax.tree.map(lambda a: a.reshape(count // together, together, *a.shape[1:]), each)
     found = jax.lax.map(jax.vmap(one), parts)
     return jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), found)
 

@@ -59,13 +59,47 @@ from gfnn_jax.storage.outputs import ensure_new
 _TYPES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
-        SymplecticMap, Generated, Predictor, PolynomialModel, Affine, Chart, TypeOne, Domain,
-        Products, Sines, Mlp, Inputs, Flow, Terms, Parameters, OverPhases, Posterior, Sums, Part,
-        Windows, Groups, Ranges, OfTimeStep, Ensemble, Uniform, Forced, Legendre, Friction, Signals,
-        OfSystems, Sensors, Wander, Observation, SoftL1, Biweight, Damping, DampingOfArgs,
-        FunctionsOfArgs, OfDisplacement,
+        SymplecticMap,
+        Generated,
+        Predictor,
+        PolynomialModel,
+        Affine,
+        Chart,
+        TypeOne,
+        Domain,
+        Products,
+        Sines,
+        Mlp,
+        Inputs,
+        Flow,
+        Terms,
+        Parameters,
+        OverPhases,
+        Posterior,
+        Sums,
+        Part,
+        Windows,
+        Groups,
+        Ranges,
+        OfTimeStep,
+        Ensemble,
+        Uniform,
+        Forced,
+        Legendre,
+        Friction,
+        Signals,
+        OfSystems,
+        Sensors,
+        Wander,
+        Observation,
+        SoftL1,
+        Biweight,
+        Damping,
+        DampingOfArgs,
+        FunctionsOfArgs,
+        OfDisplacement,
     )
-} | {"LagrangianTerms": lagrangian.Terms}  # fmt: skip
+} | {"LagrangianTerms": lagrangian.Terms}
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 
 

@@ -66,9 +66,15 @@ class Sharded:
         return self._shared_out(start, *self._given(z0, params, t0))
 
     def advance(
-        self, lanes: Lanes, num_saved: int, *, params=None, t0=None, save_every: int = 1,
+        self,
+        lanes: Lanes,
+        num_saved: int,
+        *,
+        params=None,
+        t0=None,
+        save_every: int = 1,
         stop_outside: bool = False,
-    ) -> tuple[Lanes, Any]:  # fmt: skip
+    ) -> tuple[Lanes, Any]:
         """Advance by ``num_saved`` blocks of ``save_every`` steps: the lanes after them, and the
         saved states (B, num_saved, 2d)."""
         options = {"save_every": save_every, "stop_outside": stop_outside}
@@ -79,9 +85,15 @@ class Sharded:
         return self._shared_out(advance, lanes, self._args(params, lanes.y, t0))
 
     def rollout(
-        self, z0, num_steps: int, *, params=None, t0=None, save_every: int = 1,
+        self,
+        z0,
+        num_steps: int,
+        *,
+        params=None,
+        t0=None,
+        save_every: int = 1,
         stop_outside: bool = False,
-    ) -> tuple[Any, RolloutInfo]:  # fmt: skip
+    ) -> tuple[Any, RolloutInfo]:
         """Predict ``num_steps`` steps from z0 (B, 2d), back where the number is negative.
 
         Returns the states (B, 1 + |num_steps| // save_every, 2d) and a RolloutInfo. Raises

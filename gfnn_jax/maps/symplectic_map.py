@@ -209,9 +209,12 @@ class SymplecticMap:
         if self.dt_range is not None or other.dt_range is not None:
             dt_range = sum(m.dt if m.dt_range is None else m.dt_range for m in (self, other))
         return dataclasses.replace(
-            self, pieces=(*self.pieces, *other.pieces), dt=self.dt + other.dt, parameters=ours,
+            self,
+            pieces=(*self.pieces, *other.pieces),
+            dt=self.dt + other.dt,
+            parameters=ours,
             dt_range=dt_range,
-        )  # fmt: skip
+        )
 
     def reversed(self) -> SymplecticMap:
         """Make the inverse map."""
@@ -340,9 +343,16 @@ class SymplecticMap:
         return start_lanes(self, z0, self._args(params, z0, t0), stop_outside)
 
     def advance(
-        self, lanes: Lanes, num_saved: int, *, params=None, t0=None, inputs=None,
-        save_every: int = 1, stop_outside: bool = False,
-    ) -> tuple[Lanes, Any]:  # fmt: skip
+        self,
+        lanes: Lanes,
+        num_saved: int,
+        *,
+        params=None,
+        t0=None,
+        inputs=None,
+        save_every: int = 1,
+        stop_outside: bool = False,
+    ) -> tuple[Lanes, Any]:
         """Advance by ``num_saved`` blocks of ``save_every`` steps.
 
         Returns the lanes after them, and the saved states (B, num_saved, 2d). params, t0: those
@@ -352,10 +362,20 @@ class SymplecticMap:
         return advance_lanes(self, lanes, args, num_saved, save_every, stop_outside)
 
     def rollout(
-        self, z0=None, num_steps: int = 0, *, positions=None, params=None, t0=None, inputs=None,
+        self,
+        z0=None,
+        num_steps: int = 0,
+        *,
+        positions=None,
+        params=None,
+        t0=None,
+        inputs=None,
         dt=None,
-        save_every: int = 1, stop_outside: bool = False, samples: int | None = None, key=None,
-    ) -> tuple[Any, RolloutInfo]:  # fmt: skip
+        save_every: int = 1,
+        stop_outside: bool = False,
+        samples: int | None = None,
+        key=None,
+    ) -> tuple[Any, RolloutInfo]:
         """Predict ``num_steps`` steps from z0 (2d,) or (B, 2d), back by the inverse map where the
         number is negative.
 
@@ -385,9 +405,15 @@ class SymplecticMap:
             require_no_inputs_backwards(inputs)
             map_ = self if dt is None else self.over(dt, np.shape(z0)[:-1])
             return map_.reversed().rollout(
-                z0, -num_steps, params=params, t0=t0, save_every=save_every,
-                stop_outside=stop_outside, samples=samples, key=key,
-            )  # fmt: skip
+                z0,
+                -num_steps,
+                params=params,
+                t0=t0,
+                save_every=save_every,
+                stop_outside=stop_outside,
+                samples=samples,
+                key=key,
+            )
         if save_every > num_steps > 0:
             raise ValueError(
                 f"expected save_every <= num_steps, got {save_every} and {num_steps}: only the "

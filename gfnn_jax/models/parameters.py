@@ -51,9 +51,16 @@ _FAR_FROM_ZERO = 0.02  # of the largest value: nearer to it a parameter has no n
 
 
 def state_libraries(
-    dim: int, parameters: tuple[str, ...], *, angles: Sequence[int], cyclic: Sequence[int],
-    plain: tuple[str, ...], features, reversor, own: Terms | None,
-) -> list[Terms]:  # fmt: skip
+    dim: int,
+    parameters: tuple[str, ...],
+    *,
+    angles: Sequence[int],
+    cyclic: Sequence[int],
+    plain: tuple[str, ...],
+    features,
+    reversor,
+    own: Terms | None,
+) -> list[Terms]:
     """Libraries of the state alone, by rising size. angles: that enter H, plain: the names of the
     other coordinates. own: a user's terms, which stand in all of them, at first alone."""
     if angles and features is None:
@@ -70,9 +77,12 @@ def state_libraries(
 
 
 def functions_of_parameters(
-    dim: int, parameters: tuple[str, ...], args: np.ndarray, own: bool,
+    dim: int,
+    parameters: tuple[str, ...],
+    args: np.ndarray,
+    own: bool,
     period: float | None = None,
-) -> list[list[Terms]]:  # fmt: skip
+) -> list[list[Terms]]:
     """Rows of sets of functions of the parameters, whose values args are (N, k); in each row every
     set spans those before it. own: whether none at all is the first. period: of a drive, whose
     time is the last of them."""

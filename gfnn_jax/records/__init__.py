@@ -31,13 +31,15 @@ RECORDS = {
     "two_carts": Record("two carts between three springs", ("x1", "x2"), ()),
     "double_pendulum": Record(
         "a double pendulum, chaotic, with gaps of up to 0.19 s; angles from hanging down",
-        ("theta1", "theta2"), ("theta1", "theta2"),
+        ("theta1", "theta2"),
+        ("theta1", "theta2"),
     ),
     "arm2": Record(
         "an arm of two links on bearings, free swings in runs; angles from the upright",
-        ("theta1", "theta2"), ("theta1", "theta2"),
+        ("theta1", "theta2"),
+        ("theta1", "theta2"),
     ),
-}  # fmt: skip
+}
 
 
 def path(name: str) -> Path:

@@ -129,9 +129,12 @@ def sample_sequences(
 ) -> Float[np.ndarray, "num length phase"]:
     """Draw ``num`` reference sequences of ``length`` states, which start with the training law."""
     return reference_trajectories(
-        scene, sample_states(scene, num, key), length - 1, params=sample_params(scene, num, key),
+        scene,
+        sample_states(scene, num, key),
+        length - 1,
+        params=sample_params(scene, num, key),
         t0=sample_t0(scene, num, key),
-    )  # fmt: skip
+    )
 
 
 def sample_pairs(

@@ -11,7 +11,7 @@ from gfnn_jax.scenes.scene import Scene
 
 def driven_pendulum_phase(
     steps: int = 16, amplitude: float = 0.15, frequency: float = 1.0
-) -> Scene:  # fmt: skip
+) -> Scene:
     """The pendulum of `driven_pendulum`, ``steps`` steps a period, from any time of the drive.
 
     H(z, t) is learned, whose flow steps from any time on over any dt.

@@ -190,9 +190,10 @@ def _check_traceable(scene: Scene) -> None:
     z, t = jax.ShapeDtypeStruct((2 * scene.dim,), jnp.float64), 0.0
     given = tuple(jax.ShapeDtypeStruct((n,), jnp.float64) for n in [len(scene.parameters)] if n)
     for name, function, arguments in (
-        ("flow", scene.flow, (z, t)), ("step", scene.step, (z,)),
+        ("flow", scene.flow, (z, t)),
+        ("step", scene.step, (z,)),
         ("hamiltonian", scene.hamiltonian, (z, t, *given)),
-    ):  # fmt: skip
+    ):
         try:
             _ = None if function is None else jax.eval_shape(function, *arguments)
         except jax.errors.TracerArrayConversionError:

@@ -213,8 +213,9 @@ def _hopeless(
     error already, or has come as far and leads to the bound."""
     ends = {
         i: found.error_at(sweeps[i].sizes[-1].order)
-        for i, found in enumerate(_decays(errors, ratio)) if found is not None
-    }  # fmt: skip
+        for i, found in enumerate(_decays(errors, ratio))
+        if found is not None
+    }
     reached = _reached(errors, ratio)
 
     def better(j: int, i: int) -> bool:
@@ -264,9 +265,7 @@ def _calibrated(entry: Entry, ratio: float | None) -> Entry:
 
 def _finalists(entries: list[Entry]) -> list[Entry]:
     """The few best of these entries."""
-    best = sorted(
-        entries, key=lambda e: (e.candidate.validation_relative, e.candidate.train_rms)
-    )  # fmt: skip
+    best = sorted(entries, key=lambda e: (e.candidate.validation_relative, e.candidate.train_rms))
     # Of those that are as good as the best, the cheapest comes second.
     as_good = [e for e in best[1:] if _as_good(e, best[0])]
     second = sorted(as_good, key=lambda e: e.candidate.operations)[:1]

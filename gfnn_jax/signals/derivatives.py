@@ -77,9 +77,12 @@ class Derivatives:
         if factor == 0:
             return None
         return Relation(
-            float(factor), float(errors[0]), float(-minus_lag / factor),
-            float(errors[1] / abs(factor)), explained,
-        )  # fmt: skip
+            float(factor),
+            float(errors[0]),
+            float(-minus_lag / factor),
+            float(errors[1] / abs(factor)),
+            explained,
+        )
 
 
 def derivatives(

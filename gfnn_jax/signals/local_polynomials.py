@@ -63,9 +63,17 @@ def local_fits(
     powers = (inverse @ coefficients[..., None])[..., 0]
     gains = np.sqrt(np.sum(inverse**2, axis=2))  # (W, k), of the coefficient of each power
     return LocalFits(
-        rows, centres, run, powers[..., 0], powers[..., 1] / half, 2 * powers[..., 2] / half**2,
-        residuals, gains[:, 1] / half, 2 * gains[:, 2] / half**2, q,
-    )  # fmt: skip
+        rows,
+        centres,
+        run,
+        powers[..., 0],
+        powers[..., 1] / half,
+        2 * powers[..., 2] / half**2,
+        residuals,
+        gains[:, 1] / half,
+        2 * gains[:, 2] / half**2,
+        q,
+    )
 
 
 def _windows(times: Sequence[np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

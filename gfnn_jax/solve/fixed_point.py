@@ -83,9 +83,14 @@ def iterate(
     evaluation = equation.evaluate(shared, lanes, guess)
     start = floors(evaluation)
     begun = _Iterate(
-        guess, evaluation.residual, evaluation.aux, start, jnp.full_like(start, jnp.inf),
-        jnp.zeros(guess.shape[0], jnp.int32), start > 1.0,
-    )  # fmt: skip
+        guess,
+        evaluation.residual,
+        evaluation.aux,
+        start,
+        jnp.full_like(start, jnp.inf),
+        jnp.zeros(guess.shape[0], jnp.int32),
+        start > 1.0,
+    )
 
     def improve(state: _Iterate) -> _Iterate:
         x = state.x - unit * state.residual
@@ -98,9 +103,14 @@ def iterate(
             | (error < _SLOW ** iterations.astype(error.dtype) * start)
         )
         new = _Iterate(
-            x, evaluation.residual, evaluation.aux, error, state.error, iterations,
+            x,
+            evaluation.residual,
+            evaluation.aux,
+            error,
+            state.error,
+            iterations,
             further & fast & jnp.isfinite(error) & (iterations < most),
-        )  # fmt: skip
+        )
         return where(state.open, new, state)
 
     state = jax.lax.while_loop(lambda s: jnp.any(s.open), improve, begun)
@@ -121,9 +131,15 @@ def newton_krylov(
     _, aux, info = done
     most, infinite = info.iterations + _MOST_NEWTON, jnp.full_like(guess, jnp.inf)
     begun = _Damped(  # the first step is zero and leads to the guess
-        guess, infinite, aux, infinite[:, 0], jnp.zeros_like(guess), jnp.ones_like(guess[:, :1]),
-        info.iterations, (info.status != OK) & jnp.isfinite(largest(guess)),
-    )  # fmt: skip
+        guess,
+        infinite,
+        aux,
+        infinite[:, 0],
+        jnp.zeros_like(guess),
+        jnp.ones_like(guess[:, :1]),
+        info.iterations,
+        (info.status != OK) & jnp.isfinite(largest(guess)),
+    )
 
     def improve(state: _Damped) -> _Damped:
         x = state.x - state.part * state.step
@@ -135,9 +151,15 @@ def newton_krylov(
         rhs = jnp.where(further[:, None], evaluation.residual, 0.0)
         step = krylov.differentiable(equation.product(shared, lanes, x), rhs, _LINEAR)
         new = _Damped(
-            x, evaluation.residual, evaluation.aux, error, unit * step, jnp.ones_like(state.part),
-            iterations, further,
-        )  # fmt: skip
+            x,
+            evaluation.residual,
+            evaluation.aux,
+            error,
+            unit * step,
+            jnp.ones_like(state.part),
+            iterations,
+            further,
+        )
         # Close to the floor only the full step makes sense: what is left is roundoff.
         shortest = jnp.where(state.error <= settled, 1.0, _SHORTEST)
         halved = state._replace(part=0.5 * state.part, open=state.part[:, 0] > shortest)

@@ -64,9 +64,13 @@ def solve(product: Callable, rhs: Any, tolerance: float):
         here = (xp.arange(SPACE) == s.count).reshape(-1, 1, 1, 1)
         shrunk = (norm < _SHRUNK * s.norm)[:, None]
         return _Search(
-            s.x + moved[0], residual, norm, xp.where(shrunk, _unit(residual, norm), pair[1]),
-            xp.where(here, pair[None], s.pairs), s.count + 1,
-        )  # fmt: skip
+            s.x + moved[0],
+            residual,
+            norm,
+            xp.where(shrunk, _unit(residual, norm), pair[1]),
+            xp.where(here, pair[None], s.pairs),
+            s.count + 1,
+        )
 
     return _while(xp, goes_on, further, first).x
 
@@ -100,8 +104,10 @@ def solve_to_roundoff(product: Callable, rhs: Any):
             return (
                 jax.numpy.where(better[:, None], tried, x),
                 jax.numpy.where(better[:, None], left, residual),
-                jax.numpy.where(better, new, norm), norm, count + 1,
-            )  # fmt: skip
+                jax.numpy.where(better, new, norm),
+                norm,
+                count + 1,
+            )
 
         norm = norm_of(rhs)
         begun = (jax.numpy.zeros_like(rhs), rhs, norm, jax.numpy.full_like(norm, np.inf), 0)

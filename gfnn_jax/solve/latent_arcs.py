@@ -134,9 +134,14 @@ def fit_arcs(
 
 
 def eliminated_rows(
-    model: Model | Known, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
-    loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+    model: Model | Known,
+    p: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    sigma: np.ndarray,
+    loss: Loss = SOFT_L1,
+    whitening: np.ndarray | None = None,
+) -> np.ndarray:
     """Rows (R, n + 1) of [∂r/∂p, r] at p and x, without the states of each arc: what its own state
     does not explain."""
     (J, _), m = linearised(model, p, x, y, sigma, loss, whitening), x.shape[-1]
@@ -155,9 +160,14 @@ def last_by_coefficients(
 
 
 def rows_of_arcs(
-    model: Model | Known, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
-    loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+    model: Model | Known,
+    p: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    sigma: np.ndarray,
+    loss: Loss = SOFT_L1,
+    whitening: np.ndarray | None = None,
+) -> np.ndarray:
     """Rows (A, L, k, n + 1) of the coefficients and the residuals, weighted as robust loss has it,
     after each arc's own δx_0 was projected out: residuals − rows · δp are those of any other
     coefficients near p, each arc with the state that suits them best."""
@@ -167,9 +177,14 @@ def rows_of_arcs(
 
 
 def sensitivities(
-    model: Model | Known, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
-    loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+    model: Model | Known,
+    p: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    sigma: np.ndarray,
+    loss: Loss = SOFT_L1,
+    whitening: np.ndarray | None = None,
+) -> np.ndarray:
     """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
     rows = eliminated_rows(model, p, x, y, sigma, loss, whitening)
     factor = np.asarray(np.linalg.qr(rows, mode="r"))
@@ -177,9 +192,14 @@ def sensitivities(
 
 
 def linearised(
-    model: Model | Known, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray,
-    loss: Loss = SOFT_L1, whitening: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    model: Model | Known,
+    p: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    sigma: np.ndarray,
+    loss: Loss = SOFT_L1,
+    whitening: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Rows (A, L k, m + n + 1) of [δx_0, δp, r] of all arcs at p and x, weighted as robust loss has
     it, and δx_{L−1} (A, m, m + n + 1) by the same and by the defects before it."""
     measured, (defects, observed) = np.isfinite(y), evaluated(model, p, x)
@@ -321,13 +341,20 @@ class _AtStates:
         rows, m = _reduced(best), best.x.shape[-1]
         finite = np.isfinite(rows.factor).all()
         return Fitted(
-            best.p, best.x, np.where(measured, best.residuals, np.nan),
-            np.where(measured, best.white, np.nan), best.units.sigma,
-            rows.factor if finite else np.zeros_like(rows.factor), rows.scores,
-            rows.arcs[:, :, :m], rows.transports, best.open if finite else best.open + np.inf,
-            best.cost if self.closed(best) and finite else np.inf, iterations,
+            best.p,
+            best.x,
+            np.where(measured, best.residuals, np.nan),
+            np.where(measured, best.white, np.nan),
+            best.units.sigma,
+            rows.factor if finite else np.zeros_like(rows.factor),
+            rows.scores,
+            rows.arcs[:, :, :m],
+            rows.transports,
+            best.open if finite else best.open + np.inf,
+            best.cost if self.closed(best) and finite else np.inf,
+            iterations,
             converged and bool(finite),
-        )  # fmt: skip
+        )
 
 
 def _replaced(arcs: np.ndarray, every: np.ndarray, some: np.ndarray) -> np.ndarray:

@@ -133,14 +133,21 @@ def iterate(
     evaluation, matrix = equation.linearise(shared, lanes, guess)
     step, sign = solve_and_sign(matrix, evaluation.residual)
     first = _Iterate(
-        guess, evaluation.residual, evaluation.aux, floors(evaluation), sign, step, ones, zeros,
+        guess,
+        evaluation.residual,
+        evaluation.aux,
+        floors(evaluation),
+        sign,
+        step,
+        ones,
+        zeros,
         open=zeros < 1,
-    )  # fmt: skip
+    )
     x = guess - step
     evaluation = equation.evaluate(shared, lanes, x)
     second = first._replace(
         x=x, residual=evaluation.residual, aux=evaluation.aux, error=floors(evaluation)
-    )  # fmt: skip
+    )
 
     before, after = first.merit, second.merit
     smaller = after < before
@@ -218,9 +225,16 @@ def _newton(equation, shared, lanes, state: _Iterate, *, most, settled) -> _Iter
     likely = jnp.clip(bent, RULES.least_bent * RULES.bent, RULES.most_bent * RULES.bent)
     longer = RULES.longer * RULES.bent / likely * state.factor
     new = _Iterate(
-        x, residual, evaluation.aux, error, state.sign, step, jnp.minimum(longer, 1.0),
-        iterations, further,
-    )  # fmt: skip
+        x,
+        residual,
+        evaluation.aux,
+        error,
+        state.sign,
+        step,
+        jnp.minimum(longer, 1.0),
+        iterations,
+        further,
+    )
     # Close to the floor only the full step makes sense: what is left is roundoff.
     shortest = jnp.where(settled_here, 1.0, 0.5**RULES.halvings).astype(x.dtype)
     halved = state._replace(

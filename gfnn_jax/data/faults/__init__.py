@@ -13,10 +13,21 @@ from gfnn_jax.data.traits import Traits
 __all__ = ["WRONG", "Fault", "faults"]
 
 _CHECKS = (
-    sensors.constant, sensors.repeated, velocities.related, angles.units, angles.wraps,
-    angles.interpolated_jumps, sensors.clipped, times.units, times.drifting, times.systems,
-    sensors.missing, sensors.wrong, angles.coarse, times.reading,
-)  # fmt: skip
+    sensors.constant,
+    sensors.repeated,
+    velocities.related,
+    angles.units,
+    angles.wraps,
+    angles.interpolated_jumps,
+    sensors.clipped,
+    times.units,
+    times.drifting,
+    times.systems,
+    sensors.missing,
+    sensors.wrong,
+    angles.coarse,
+    times.reading,
+)
 
 
 def faults(traits: Traits) -> tuple[Fault, ...]:

@@ -100,8 +100,12 @@ def wraps(traits: Traits) -> Iterator[Fault]:
         if jump is not None:
             option = "degrees" if jump[0] == 360 else "angles"
             found = f"{name} jumps by {jump[0]:.3g} ({jump[1]} times)"
-            yield Fault("wrapped", found, f"Name it as an angle: --{option} {shlex.quote(name)}",
-                        {option: (name,)})  # fmt: skip
+            yield Fault(
+                "wrapped",
+                found,
+                f"Name it as an angle: --{option} {shlex.quote(name)}",
+                {option: (name,)},
+            )
 
 
 def interpolated_jumps(traits: Traits) -> Iterator[Fault]:
@@ -114,7 +118,7 @@ def interpolated_jumps(traits: Traits) -> Iterator[Fault]:
                 "interpolated jump",
                 f"{name} was resampled across its wraps: {jump} several samples",
                 "Unwrap the angle before resampling, or resample its sine and cosine",
-            )  # fmt: skip
+            )
 
 
 def _cuts(x: np.ndarray) -> int:

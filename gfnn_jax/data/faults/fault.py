@@ -7,13 +7,31 @@ from collections.abc import Mapping
 from typing import Any
 
 WRONG = (
-    "constant", "repeated", "order", "time unit", "no derivative", "degrees", "sign", "factor",
-    "wrapped", "interpolated jump", "clipped", "drifting clock", "different systems",
-)  # fmt: skip
+    "constant",
+    "repeated",
+    "order",
+    "time unit",
+    "no derivative",
+    "degrees",
+    "sign",
+    "factor",
+    "wrapped",
+    "interpolated jump",
+    "clipped",
+    "drifting clock",
+    "different systems",
+)
 NOTES = (
-    "constant", "coarse", "missing column", "missing", "outliers", "stuck", "difference",
-    "filtered", "reading",
-)  # fmt: skip
+    "constant",
+    "coarse",
+    "missing column",
+    "missing",
+    "outliers",
+    "stuck",
+    "difference",
+    "filtered",
+    "reading",
+)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,8 +26,9 @@ def constant(traits: Traits) -> Iterator[Fault]:
                 yield Fault(
                     "constant",
                     f"{name} is {shown:g} {recording.unit(name)}".rstrip() + " in all rows",
-                    f"Leave it out of --{role}", wrong=role != "inputs",
-                )  # fmt: skip
+                    f"Leave it out of --{role}",
+                    wrong=role != "inputs",
+                )
 
 
 def repeated(traits: Traits) -> Iterator[Fault]:
@@ -78,9 +79,10 @@ def missing(traits: Traits) -> Iterator[Fault]:
     recording = traits.recording
     for name in recording.columns:
         gone = [
-            run for run, x in zip(recording.runs, traits.by_run(name), strict=True)
+            run
+            for run, x in zip(recording.runs, traits.by_run(name), strict=True)
             if not np.isfinite(x).any()
-        ]  # fmt: skip
+        ]
         cells = int(np.sum(~np.isfinite(traits.columns[name])))
         if gone:
             found = f"{name} has no values in run {', '.join(gone[:8])}"

@@ -25,9 +25,7 @@ def units(traits: Traits) -> Iterator[Fault]:
 
 
 def drifting(traits: Traits) -> Iterator[Fault]:
-    drifts = {
-        run: drift(t) for run, t in zip(traits.recording.runs, traits.times, strict=True)
-    }  # fmt: skip
+    drifts = {run: drift(t) for run, t in zip(traits.recording.runs, traits.times, strict=True)}
     run = max(drifts, key=lambda name: abs(drifts[name]))
     if abs(drifts[run]) > _DRIFT:
         yield Fault(
@@ -41,9 +39,10 @@ def systems(traits: Traits) -> Iterator[Fault]:
     runs = different_systems(traits)
     if runs:
         yield Fault(
-            "different systems", f"runs {', '.join(runs[:8])} do not follow the law of the others",
+            "different systems",
+            f"runs {', '.join(runs[:8])} do not follow the law of the others",
             "Check their units and signs, name what differs (--parameters), or fit them apart",
-        )  # fmt: skip
+        )
 
 
 def reading(traits: Traits) -> Iterator[Fault]:

@@ -40,17 +40,22 @@ def related(traits: Traits) -> Iterator[Fault]:
         positions, velocities = zip(*other, strict=True)
         finding = ", ".join(f"{v} is the derivative of {x}" for x, v in other)
         yield Fault(
-            "order", f"the columns are in another order than their names say: {finding}",
+            "order",
+            f"the columns are in another order than their names say: {finding}",
             f"--positions {_typed(positions)} --velocities {_typed(velocities)}",
             {"positions": positions, "velocities": velocities},
-        )  # fmt: skip
+        )
         return
     factors = [relation.factor for relation in known.values()]
     second = _second(recording.time_unit, factors)
     if second is not None:
         finding = ", ".join(f"{v} is {r.factor:.4g} × d{x}/dt" for (x, v), r in known.items())
-        yield Fault("time unit", finding, f"The times are in {second}: --time-unit {second}",
-                    {"time_unit": second})  # fmt: skip
+        yield Fault(
+            "time unit",
+            finding,
+            f"The times are in {second}: --time-unit {second}",
+            {"time_unit": second},
+        )
         return
     for (x, v), relation in known.items():
         yield from _pair(traits, x, v, relation)
@@ -115,25 +120,35 @@ def _pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]
     finding = f"{v} is {factor:.4g} × d{x}/dt"
     if relation.explained < _DERIVATIVE:
         yield Fault(
-            "no derivative", f"{v} is not the derivative of {x}: d{x}/dt explains "
+            "no derivative",
+            f"{v} is not the derivative of {x}: d{x}/dt explains "
             f"{100 * relation.explained:.0f} % of its variance",
-            f"Name {v} as an input (--inputs {typed_v}), {without}", alone,
-        )  # fmt: skip
+            f"Name {v} as an input (--inputs {typed_v}), {without}",
+            alone,
+        )
     elif abs(factor * degree - 1) < _NEAR:
-        yield Fault("degrees", finding, f"The unit of {x} is degrees: --degrees {typed_x}",
-                    {"degrees": (x,)})  # fmt: skip
+        yield Fault(
+            "degrees",
+            finding,
+            f"The unit of {x} is degrees: --degrees {typed_x}",
+            {"degrees": (x,)},
+        )
     elif abs(factor / degree - 1) < _NEAR:
         yield Fault(
-            "degrees", finding, f"The unit of {v} is degrees per second: --degrees {typed_v}",
+            "degrees",
+            finding,
+            f"The unit of {v} is degrees per second: --degrees {typed_v}",
             {"degrees": (v,)},
-        )  # fmt: skip
+        )
     elif abs(factor + 1) < _NEAR:
         yield Fault("sign", finding, f"Change the sign of {v} in the file, {without}", alone)
     elif factor < 0 or abs(np.log(factor)) > _OFF:
         yield Fault(
-            "factor", finding,
-            f"Check its unit, fit its scale (--scale {typed_v}), {without}", alone,
-        )  # fmt: skip
+            "factor",
+            finding,
+            f"Check its unit, fit its scale (--scale {typed_v}), {without}",
+            alone,
+        )
     else:
         yield from _derived(traits, x, v, relation)
 
@@ -144,13 +159,22 @@ def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fau
     without = f"To ignore {v}: --positions {_typed(traits.recording.positions)}"
     kind = difference(traits.times, traits.columns[x], traits.columns[v])
     if kind is not None:
-        yield Fault("difference", f"{v} is the {kind} difference of {x} and adds no information",
-                    without, alone, wrong=False)  # fmt: skip
+        yield Fault(
+            "difference",
+            f"{v} is the {kind} difference of {x} and adds no information",
+            without,
+            alone,
+            wrong=False,
+        )
         return
     error = max(5 * relation.factor_error, _FILTERED)
     late = max(5 * relation.lag_error, _LATE * traits.step)
     if abs(relation.factor - 1) > error or abs(relation.lag) > late:
         yield Fault(
-            "filtered", f"{v} looks filtered: it is {relation.factor:.3g} × d{x}/dt with a lag of "
-            f"{1e3 * relation.lag:.2g} ms", without, alone, wrong=False,
-        )  # fmt: skip
+            "filtered",
+            f"{v} looks filtered: it is {relation.factor:.3g} × d{x}/dt with a lag of "
+            f"{1e3 * relation.lag:.2g} ms",
+            without,
+            alone,
+            wrong=False,
+        )

@@ -88,9 +88,14 @@ class CoefficientNoise(Generates):
         scores = shared_noise.scores(slopes, *states) if states else None
         noise = self._noise(size, larger, data, states) if larger is not None else None
         return uncertainty.root(
-            train, family.num_parameters, slopes.reshape(-1, family.num_parameters),
-            residual.ravel(), noise=noise, ridge=solved.ridge, scores=scores,
-        )  # fmt: skip
+            train,
+            family.num_parameters,
+            slopes.reshape(-1, family.num_parameters),
+            residual.ravel(),
+            noise=noise,
+            ridge=solved.ridge,
+            scores=scores,
+        )
 
     def error_by_noise(self, size: Size) -> float:
         """Error of the size's ∇S by noise, in the measure of train_rms: half of the
@@ -101,13 +106,15 @@ class CoefficientNoise(Generates):
         one, other = (
             least_squares.solve(
                 least_squares.reduce(
-                    self.in_rows(size.family), [tuple(a[half == i] for a in self._train)],
+                    self.in_rows(size.family),
+                    [tuple(a[half == i] for a in self._train)],
                     self._weight,
                 ),
-                held, count,
+                held,
+                count,
             ).coefficients
             for i in (0, 1)
-        )  # fmt: skip
+        )
         return train.image_norm(one - other) / (2 * np.sqrt(train.rows))
 
     def state_deviations(self, size: Size) -> np.ndarray:
@@ -155,9 +162,10 @@ class CoefficientNoise(Generates):
             """Mean square, the degrees of freedom that noise takes, and the rows."""
             count = of.family.num_parameters
             reduced = (
-                self._factors[of.group].train if larger.group in self._factors
+                self._factors[of.group].train
+                if larger.group in self._factors
                 else least_squares.reduce(self.in_rows(of.family), [data], self._weight)
-            )  # fmt: skip
+            )
             degrees = float(count)
             if states is not None:
                 slopes = self._slopes(of.family, data[0], *data[2:])

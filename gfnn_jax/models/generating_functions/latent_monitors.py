@@ -66,9 +66,11 @@ class LatentReadings:
 
 
 def latent_readings(
-    piece: Generated, ends: tuple[list[Any], list[Any]], turns: list[np.ndarray],
+    piece: Generated,
+    ends: tuple[list[Any], list[Any]],
+    turns: list[np.ndarray],
     on_progress: Callable[[str], Any] = lambda message: None,
-) -> LatentReadings | None:  # fmt: skip
+) -> LatentReadings | None:
     """The S that the readings ``turns``, (n, 2d) of each stretch of turns without a gap, ask for by
     Akaike's criterion; None where they are too few, or every larger S leaves less: what is left is
     no noise then.
@@ -104,7 +106,7 @@ def _families(family: Any) -> Iterator[Any]:
 
 def _fitted(
     piece: Generated, family: Any, ends: tuple[list[Any], list[Any]], arcs: np.ndarray
-) -> LatentReadings:  # fmt: skip
+) -> LatentReadings:
     """S of this family by Gauss–Newton over arcs (A, L, 2d)."""
     num, length, width = arcs.shape
     moves, dt = np.full((num, length - 1), True), float(np.asarray(piece.dt))

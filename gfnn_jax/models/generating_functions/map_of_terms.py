@@ -72,10 +72,15 @@ class _Tried(NamedTuple):
 
 
 def learn_map(
-    data: Dataset, tolerance: Tolerance, scene: Any = None, *, chart: str = "auto",
-    budget: Budget | None = None, on_progress: Callable[[str], Any] = lambda message: None,
+    data: Dataset,
+    tolerance: Tolerance,
+    scene: Any = None,
+    *,
+    chart: str = "auto",
+    budget: Budget | None = None,
+    on_progress: Callable[[str], Any] = lambda message: None,
     needed: bool = True,
-) -> LearnedMap:  # fmt: skip
+) -> LearnedMap:
     """The map of these pairs of one dt and several systems, or of many sites: of the first chart
     that meets the tolerance, else of the best. needed: whether the first library is fitted whatever
     the budget, because nothing else would be left.
@@ -105,9 +110,10 @@ def learn_map(
             "or take a smaller dt"
         )
     rivals = [
-        f for f in tried
+        f
+        for f in tried
         if f.piece.chart is best.piece.chart and f.error.relative <= _FLAT * best.error.relative
-    ]  # fmt: skip
+    ]
     stalled = len(rivals) > 1 and best.error.bound > tolerance.bound
     if data.structure is not None:
         data = _fewer(data)
@@ -119,21 +125,31 @@ def learn_map(
     piece = best.piece
     gradient, with_hessian = piece.family.operations
     candidate = Candidate(
-        label=f"S, {piece.family.num_parameters} terms", family=piece.family.name,
-        chart=piece.chart.name, num_parameters=piece.family.num_parameters,
-        operations=float(gradient + with_hessian), validation_rms=best.error.rms,
-        validation_relative=best.error.relative, validation_bound=best.error.bound,
-        deviations=best.error.deviations, train_rms=best.train_rms,
+        label=f"S, {piece.family.num_parameters} terms",
+        family=piece.family.name,
+        chart=piece.chart.name,
+        num_parameters=piece.family.num_parameters,
+        operations=float(gradient + with_hessian),
+        validation_rms=best.error.rms,
+        validation_relative=best.error.relative,
+        validation_bound=best.error.bound,
+        deviations=best.error.deviations,
+        train_rms=best.train_rms,
         fit_seconds=time.perf_counter() - started,
-    )  # fmt: skip
+    )
     covariance = partial(_covariance_root, piece, data)
     return LearnedMap(with_error(candidate, best.error), piece, given, covariance, stalled)
 
 
 def map_of(
-    data: Dataset, tolerance: Tolerance, scene: Any, chart: str, law: Any, budget: Budget,
+    data: Dataset,
+    tolerance: Tolerance,
+    scene: Any,
+    chart: str,
+    law: Any,
+    budget: Budget,
     on_progress: Callable[[str], Any],
-) -> LearnedMap | None:  # fmt: skip
+) -> LearnedMap | None:
     """Learn by `learn_map`; None where it finds none beside a law."""
     try:
         with np.errstate(all="ignore"):
@@ -204,17 +220,26 @@ def _of_chart(attempt: _Attempts, scene) -> Iterator[_Tried]:
         if i not in angles and i not in coordinates.cyclic
     )
     states = state_libraries(
-        dim, data.parameters, angles=angles, cyclic=coordinates.cyclic, plain=plain,
-        features=scene.features if scene is not None else None, reversor=None, own=None,
-    )  # fmt: skip
+        dim,
+        data.parameters,
+        angles=angles,
+        cyclic=coordinates.cyclic,
+        plain=plain,
+        features=scene.features if scene is not None else None,
+        reversor=None,
+        own=None,
+    )
     _, args = data.given(data.training)
     functions = functions_of_parameters(dim, data.parameters, args, own=False, period=data.period)
 
     yield from walked(
-        states, functions, attempt, lambda tried: tried.error.bound,
+        states,
+        functions,
+        attempt,
+        lambda tried: tried.error.bound,
         bound=tolerance.bound,
         most=min(len(data.training) * 2 * dim / ROWS_PER_TERM, _MOST_TERMS),
-    )  # fmt: skip
+    )
 
 
 def _fewer(data: Dataset) -> Dataset:

@@ -73,12 +73,19 @@ class ModelSweep:
         images = self._images_of_users(fitted, self.data.validation)
         error = measured_error(self.data, self.tolerance, images)
         return Candidate(
-            label=fitted.label, family=self.model.name, chart="model",
-            num_parameters=fitted.num_parameters, operations=float(fitted.operations),
-            validation_rms=error.rms, validation_relative=error.relative,
-            validation_bound=error.bound, deviations=error.deviations, train_rms=float("nan"),
-            fit_seconds=seconds, validated=True,
-        )  # fmt: skip
+            label=fitted.label,
+            family=self.model.name,
+            chart="model",
+            num_parameters=fitted.num_parameters,
+            operations=float(fitted.operations),
+            validation_rms=error.rms,
+            validation_relative=error.relative,
+            validation_bound=error.bound,
+            deviations=error.deviations,
+            train_rms=float("nan"),
+            fit_seconds=seconds,
+            validated=True,
+        )
 
     def validate(
         self, size: ModelSize, estimated: Candidate, budget: Budget, on_progress
@@ -127,6 +134,15 @@ def training_data(data: Dataset, rows: np.ndarray) -> TrainingData:
     dt, args = data.given(rows)
     coordinates, pairs = data.coordinates, data.pairs.take(rows)
     return TrainingData(
-        data.y0[rows], data.y1[rows], dt, args, data.parameters, data.scale,
-        coordinates.angles, coordinates.cyclic, pairs.run, pairs.place, pairs.std,
-    )  # fmt: skip
+        data.y0[rows],
+        data.y1[rows],
+        dt,
+        args,
+        data.parameters,
+        data.scale,
+        coordinates.angles,
+        coordinates.cyclic,
+        pairs.run,
+        pairs.place,
+        pairs.std,
+    )

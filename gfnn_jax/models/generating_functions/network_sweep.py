@@ -44,9 +44,10 @@ class NetworkSweep(Generates):
         (w, target), self._weight = rows_of(data, chart, data.training[:_MLP_PAIRS])
         coordinates = data.coordinates
         inputs = box_inputs(
-            w, angles=tuple(a for a in coordinates.angles if a < data.dim),
+            w,
+            angles=tuple(a for a in coordinates.angles if a < data.dim),
             cyclic=coordinates.cyclic,
-        )  # fmt: skip
+        )
         family = Mlp(inputs, _MLP_HIDDEN, _MLP_ACTIVATION, amplitude_of(w, target))
         self._train, self.sizes = (w, target), [Size(family, family, 0.0)]
         self._params: Any = None
@@ -101,20 +102,29 @@ class NetworkSweep(Generates):
             block=lambda count: budget.unit(
                 f"{count} iterations of {family.label}", NETWORK, count * self._work_of_iteration
             ),
-            target_rms=0.5 * self.tolerance.bound, reports=tuple(reports),
-        )  # fmt: skip
+            target_rms=0.5 * self.tolerance.bound,
+            reports=tuple(reports),
+        )
         result = self._trained(
-            validation=held, weight=self._weight, limits=limits,
+            validation=held,
+            weight=self._weight,
+            limits=limits,
             resume=resume[1] if resume else None,
-        )  # fmt: skip
+        )
         error = estimated_error(self.data, self.tolerance, result.validation_rms)
         return Candidate(
-            label=family.label, family=self.kind, chart=self.chart.name,
-            num_parameters=family.num_parameters, operations=size.operations,
-            validation_rms=error.rms, validation_relative=error.relative,
-            validation_bound=error.bound, deviations=error.deviations,
-            train_rms=result.train_rms, fit_seconds=result.seconds,
-        )  # fmt: skip
+            label=family.label,
+            family=self.kind,
+            chart=self.chart.name,
+            num_parameters=family.num_parameters,
+            operations=size.operations,
+            validation_rms=error.rms,
+            validation_relative=error.relative,
+            validation_bound=error.bound,
+            deviations=error.deviations,
+            train_rms=result.train_rms,
+            fit_seconds=result.seconds,
+        )
 
     def _like(self) -> LMState:
         """A state whose structure is that of this training's."""

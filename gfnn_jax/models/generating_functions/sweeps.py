@@ -67,7 +67,7 @@ def sweeps_for(
         for chart in charts:
             yield LinearSweep(
                 data, tolerance, chart, "own", None, None, own=lambda i: own_families(request, i)
-            )  # fmt: skip
+            )
         return
     features = scene.features if scene is not None else None
     polynomials = request in ("auto", "polynomial")
@@ -78,9 +78,7 @@ def sweeps_for(
         # Only the midpoint S inherits the parity.
         reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
         if polynomials:
-            yield LinearSweep(
-                data, tolerance, chart, "polynomial", None, reversor, factors, even
-            )  # fmt: skip
+            yield LinearSweep(data, tolerance, chart, "polynomial", None, reversor, factors, even)
         if request in ("auto", "features") and features is not None:
             yield LinearSweep(data, tolerance, chart, "features", features, reversor, factors)
         if request == "sines" or (request == "auto" and data.dim > 2):
@@ -104,9 +102,17 @@ class LinearSweep(CoefficientNoise):
     linear = True
 
     def __init__(
-        self, data: Dataset, tolerance: Tolerance, chart: AnyChart, kind: str, features, reversor,
-        factors=None, even=False, own: Callable[[Inputs], Iterable[Any]] | None = None,
-    ):  # fmt: skip
+        self,
+        data: Dataset,
+        tolerance: Tolerance,
+        chart: AnyChart,
+        kind: str,
+        features,
+        reversor,
+        factors=None,
+        even=False,
+        own: Callable[[Inputs], Iterable[Any]] | None = None,
+    ):
         reversor = (-1,) * 2 * data.dim if even else reversor
         self._kept, self._prefix = factors, "even " if even else ""
         self.data, self.tolerance, self.chart, self.kind = data, tolerance, chart, kind
@@ -119,10 +125,13 @@ class LinearSweep(CoefficientNoise):
         if data.own_dt is not None:
             of, args = _of_time_step, data.own_dt[data.training, None] ** 2
         inputs = box_inputs(
-            w, angles=tuple(a for a in coordinates.angles if a < data.dim),
-            cyclic=coordinates.cyclic, features=features, reversor=reversor,
+            w,
+            angles=tuple(a for a in coordinates.angles if a < data.dim),
+            cyclic=coordinates.cyclic,
+            features=features,
+            reversor=reversor,
             args=args,
-        )  # fmt: skip
+        )
         degrees = _EVEN_DEGREES if even else _DEGREES
         signs = None
         if kind != "sines" and own is None and reversor is not None:
@@ -141,8 +150,9 @@ class LinearSweep(CoefficientNoise):
         self._groups, self._determining = groups, rows
         self.sizes = [
             Size(family, group[-1], _extent(family))
-            for group in _determined(groups(), rows, ROWS_PER_TERM) for family in group
-        ]  # fmt: skip
+            for group in _determined(groups(), rows, ROWS_PER_TERM)
+            for family in group
+        ]
         # Else the last size is the largest there is, or the most terms are reached.
         self.short_of_pairs = len(self.sizes) < known and rows < ROWS_PER_TERM * _MOST_TERMS
         self._factors: dict[Any, Factors] = {}
@@ -194,9 +204,12 @@ class LinearSweep(CoefficientNoise):
                 factors.inner, factors.outer, [size.family.num_parameters]
             )
         candidate = dataclasses.replace(
-            estimated, train_rms=solved.train_rms, condition=solved.condition, rank=solved.rank,
+            estimated,
+            train_rms=solved.train_rms,
+            condition=solved.condition,
+            rank=solved.rank,
             outside=outside,
-        )  # fmt: skip
+        )
         candidate = validated(candidate, self.data, self.tolerance, self.chart, size.family, params)
         seconds = estimated.fit_seconds + time.perf_counter() - started
         return dataclasses.replace(candidate, fit_seconds=seconds)
@@ -257,7 +270,7 @@ class LinearSweep(CoefficientNoise):
 
     def _predicted(
         self, size: Size, train: Triangle, held: Triangle, rows: np.ndarray
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         data = self.data
         solved = least_squares.solve(train, held, size.family.num_parameters)
         params = size.family.unflatten(solved.coefficients)
@@ -325,14 +338,21 @@ class LinearSweep(CoefficientNoise):
         inner, outer, held = (
             least_squares.reduce(self.in_rows(group), [rows], self._weight, on_block=budget.check)
             for rows in (
-                tuple(a[~outermost] for a in train), tuple(a[outermost] for a in train), self._held
+                tuple(a[~outermost] for a in train),
+                tuple(a[outermost] for a in train),
+                self._held,
             )
-        )  # fmt: skip
+        )
         if self._kept is not None and time.perf_counter() - started > _WORTH_KEEPING:
             self._kept.save(
-                self._named(group), inner=inner.factor, inner_rows=inner.rows, outer=outer.factor,
-                outer_rows=outer.rows, held=held.factor, held_rows=held.rows,
-            )  # fmt: skip
+                self._named(group),
+                inner=inner.factor,
+                inner_rows=inner.rows,
+                outer=outer.factor,
+                outer_rows=outer.rows,
+                held=held.factor,
+                held_rows=held.rows,
+            )
         return Factors.of(inner, outer, held)
 
     def _named(self, group) -> str:
@@ -341,12 +361,18 @@ class LinearSweep(CoefficientNoise):
     def _candidate(self, size: Size, train_rms, held_rms, seconds) -> Candidate:
         error = estimated_error(self.data, self.tolerance, held_rms)
         return Candidate(
-            label=f"{self._prefix}{size.family.label}", family=self.kind, chart=self.chart.name,
-            num_parameters=size.family.num_parameters, operations=size.operations,
-            validation_rms=error.rms, validation_relative=error.relative,
-            validation_bound=error.bound, deviations=error.deviations, train_rms=train_rms,
+            label=f"{self._prefix}{size.family.label}",
+            family=self.kind,
+            chart=self.chart.name,
+            num_parameters=size.family.num_parameters,
+            operations=size.operations,
+            validation_rms=error.rms,
+            validation_relative=error.relative,
+            validation_bound=error.bound,
+            deviations=error.deviations,
+            train_rms=train_rms,
             fit_seconds=seconds,
-        )  # fmt: skip
+        )
 
 
 def _extent(family) -> float:
@@ -364,9 +390,10 @@ def trial_residual(data: Dataset) -> float:
         return float("inf")
     coordinates = data.coordinates
     inputs = box_inputs(
-        w, angles=tuple(a for a in coordinates.angles if a < data.dim),
+        w,
+        angles=tuple(a for a in coordinates.angles if a < data.dim),
         cyclic=coordinates.cyclic,
-    )  # fmt: skip
+    )
     trials = ([Products(inputs, degree)] for degree in _TRIAL)
     groups = list(_determined(trials, w.size // 2, ROWS_PER_TERM))
     family = groups[-1][0] if groups else Products(inputs, 1)

@@ -79,19 +79,25 @@ def _runs(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
 
 def _strided(data: Dataset, starts, lengths, length: int) -> Arcs | None:
     """The arcs of so many steps that are wholly in the training pairs, or in those held out."""
-    first = np.concatenate([
-        np.arange(begin + offset, begin + count - length + 1, length)
-        for begin, count in zip(starts, lengths, strict=True) for offset in range(length)
-    ])  # fmt: skip
+    first = np.concatenate(
+        [
+            np.arange(begin + offset, begin + count - length + 1, length)
+            for begin, count in zip(starts, lengths, strict=True)
+            for offset in range(length)
+        ]
+    )
     along = first[:, None] + np.arange(length)
     pairs, moved = data.pairs, data.y1 - data.y0
     last = first + length - 1
     # In chains of arcs that follow one another, one for each offset in a run.
     begin = np.repeat(starts, lengths)[first]
     strided = Pairs(
-        np.asarray(pairs.z0)[first], np.asarray(pairs.z1)[last], length * data.dt,
-        run=begin + (first - begin) % length, place=(first - begin) // length,
-    )  # fmt: skip
+        np.asarray(pairs.z0)[first],
+        np.asarray(pairs.z1)[last],
+        length * data.dt,
+        run=begin + (first - begin) % length,
+        place=(first - begin) // length,
+    )
     angles = np.isin(np.arange(moved.shape[1]), data.coordinates.angles)
     # Angles go on over turns; what is no angle is as measured, without a sum's rounding.
     y0 = data.y0[first]

@@ -70,9 +70,16 @@ def law_of(
     try:
         with np.errstate(all="ignore"):  # starts that run away are part of the search
             return learn_hamiltonian(
-                data, tolerance, scene, terms=terms, budget=budget, on_progress=on_progress,
-                options=options, dearest=np.inf if foremost else dearest, partly=partly,
-            )  # fmt: skip
+                data,
+                tolerance,
+                scene,
+                terms=terms,
+                budget=budget,
+                on_progress=on_progress,
+                options=options,
+                dearest=np.inf if foremost else dearest,
+                partly=partly,
+            )
     except OutOfTime:
         budget.leave_out("H", "no set of terms was fitted within the budget")
     except (FitError, np.linalg.LinAlgError) as error:

@@ -52,6 +52,10 @@ def covariance_root(found: FittedLaw, problem: Problem, data: Dataset, steps: St
     elif structure is not None and isinstance(family, Sums):
         noise = unexplained_of_sites(found, problem, data, rows, steps, slopes, left)
     return uncertainty.root(
-        fit.triangle, count, slopes.reshape(-1, count), np.hypot(left, NEAR_ROUNDOFF).ravel(),
-        noise=noise, scores=scores,
-    )  # fmt: skip
+        fit.triangle,
+        count,
+        slopes.reshape(-1, count),
+        np.hypot(left, NEAR_ROUNDOFF).ravel(),
+        noise=noise,
+        scores=scores,
+    )

@@ -82,10 +82,17 @@ class FlowOnArcs:
 
 
 def fit_flow(
-    model: FlowOnArcs, coefficients, arcs: Arcs, least, angles: tuple[int, ...] = (), *,
-    only_states: bool = False, relative: np.ndarray | float = 1.0,
-    gained: float = OPTIONS.gained, iterations: int = 30,
-) -> Fitted | None:  # fmt: skip
+    model: FlowOnArcs,
+    coefficients,
+    arcs: Arcs,
+    least,
+    angles: tuple[int, ...] = (),
+    *,
+    only_states: bool = False,
+    relative: np.ndarray | float = 1.0,
+    gained: float = OPTIONS.gained,
+    iterations: int = 30,
+) -> Fitted | None:
     """Coefficients, states and noise, from coefficients that are close, or with these as they are
     (``only_states``). None where the flow fails. gained: as of the options; iterations: at most.
 
@@ -100,9 +107,17 @@ def fit_flow(
         return None
     given, free = (Known(model, c), c[:0]) if only_states else (model, c)
     found = fit_arcs(
-        given, free, x, y, noise * relative, noise, max_iterations=iterations,
-        tolerance=gained, loss=BIWEIGHT, least=least,
-    )  # fmt: skip
+        given,
+        free,
+        x,
+        y,
+        noise * relative,
+        noise,
+        max_iterations=iterations,
+        tolerance=gained,
+        loss=BIWEIGHT,
+        least=least,
+    )
     if not np.isfinite(found.cost):
         return None
     return dataclasses.replace(found, p=c) if only_states else found

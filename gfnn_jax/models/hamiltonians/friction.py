@@ -55,9 +55,13 @@ def linear_in_velocities(family) -> Forced:
 
 
 def beside_friction(
-    problem: Problem, work: LawWork, before: Searched, data: Dataset, tolerance: Tolerance,
+    problem: Problem,
+    work: LawWork,
+    before: Searched,
+    data: Dataset,
+    tolerance: Tolerance,
     search: Search,
-) -> Searched:  # fmt: skip
+) -> Searched:
     """The best that ``search`` finds with friction, where H alone, ``before``, misses the tolerance
     and friction is certain and worth it; else ``before``."""
     best, bound, rows = before, tolerance.bound, data.training[:_LOOKED_AT]
@@ -104,9 +108,14 @@ def beside_friction(
 
 
 def _of_kinds(
-    problem: Problem, work: LawWork, before: Searched, best: Searched, data: Dataset,
-    tolerance: Tolerance, search: Search,
-) -> Searched | None:  # fmt: skip
+    problem: Problem,
+    work: LawWork,
+    before: Searched,
+    best: Searched,
+    data: Dataset,
+    tolerance: Tolerance,
+    search: Search,
+) -> Searched | None:
     """H with the kinds of friction that held-out pairs choose; None where these are those of
     ``best``, or not certain, or not worth it."""
     near = best[0]

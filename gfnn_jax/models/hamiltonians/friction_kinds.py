@@ -129,9 +129,13 @@ def followed(family, coefficients, data: Dataset, noise: float) -> Smoothed:
 
 
 def kinds_of_friction(
-    problem: Problem, family, coefficients, steps: Steps, data: Dataset,
+    problem: Problem,
+    family,
+    coefficients,
+    steps: Steps,
+    data: Dataset,
     odds: dict[tuple[int, ...], float],
-) -> WhichFriction | None:  # fmt: skip
+) -> WhichFriction | None:
     """The kinds that a law has, with odds where these were found, and upper limits of the others;
     None of a law with parameters or of many sites, and in coordinates other than the user's."""
     own, taken = without_forces(family), _rows_of(family)
@@ -154,9 +158,11 @@ def kinds_of_friction(
         limits = {} if table is None else table.limits(taken)
     sharp = {(c, kind, 0.0): limit for (c, kind, _), limit in limits.items()}
     return which_friction_line(
-        FrictionChoice(taken, odds, sharp, gains=False), 1.0, data.dim,
+        FrictionChoice(taken, odds, sharp, gains=False),
+        1.0,
+        data.dim,
         [f"v{i + 1}" for i in range(data.dim)],
-    )  # fmt: skip
+    )
 
 
 def _rows_of(family) -> tuple[Loss, ...]:

@@ -47,9 +47,14 @@ _NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
 
 
 def learned_from(
-    found: FittedLaw, problem, data: Dataset, tolerance: Tolerance, seconds: float,
-    options: LawOptions, of_arcs: Callable[[], np.ndarray] | None,
-) -> LearnedHamiltonian:  # fmt: skip
+    found: FittedLaw,
+    problem,
+    data: Dataset,
+    tolerance: Tolerance,
+    seconds: float,
+    options: LawOptions,
+    of_arcs: Callable[[], np.ndarray] | None,
+) -> LearnedHamiltonian:
     """Make the candidate of a fitted law, with the cheapest steps that are fine enough.
 
     of_arcs: makes the root, where the fit was not to these pairs but to arcs of them."""
@@ -73,21 +78,33 @@ def learned_from(
     scale = data.scale
     off = truncation(family, fit.coefficients, z, data.dt, steps, args=args, scale=scale) / scale
     flow = Flow(
-        family, fit.coefficients, data.dt, data.scale, steps.stages, steps.substeps,
+        family,
+        fit.coefficients,
+        data.dt,
+        data.scale,
+        steps.stages,
+        steps.substeps,
         by_newton,
-    )  # fmt: skip
+    )
     longest = flow.over(np.max(data.each_dt)).substeps
     of_all = dataclasses.replace(steps, substeps=longest)
     error = error_of_steps(family, fit.coefficients, of_all, data, tolerance)
     candidate = Candidate(
-        label=_label(family), family=family.name, chart="flow",
+        label=_label(family),
+        family=family.name,
+        chart="flow",
         num_parameters=family.num_parameters,
         operations=operations_of(family, 2 * family.dim, fastest, data.dt, steps),
-        validation_rms=error.rms, validation_relative=error.relative,
-        validation_bound=error.bound, deviations=error.deviations, train_rms=fit.rms,
-        fit_seconds=seconds, condition=fit.condition, rank=family.num_parameters,
+        validation_rms=error.rms,
+        validation_relative=error.relative,
+        validation_bound=error.bound,
+        deviations=error.deviations,
+        train_rms=fit.rms,
+        fit_seconds=seconds,
+        condition=fit.condition,
+        rank=family.num_parameters,
         learns="hamiltonian",
-    )  # fmt: skip
+    )
     terms = tuple(
         Term(*entry)
         for entry in zip(
@@ -107,23 +124,39 @@ def learned_from(
     if whole is not None:
         covariance = partial(np.asarray, whole.root)
     return LearnedHamiltonian(
-        with_error(candidate, error), flow, terms,
+        with_error(candidate, error),
+        flow,
+        terms,
         getattr(without_forces(family), "prefix", "") + formula(terms),
         float(np.abs(off).max()),
-        omega_h, contraction, fit.condition, found.null, left_out,
-        tuple(messages(error, omega_h, data, tolerance, found, left_out, int((~resolved).sum()),
-                        turns)),
+        omega_h,
+        contraction,
+        fit.condition,
+        found.null,
+        left_out,
+        tuple(
+            messages(
+                error, omega_h, data, tolerance, found, left_out, int((~resolved).sum()), turns
+            )
+        ),
         stalled=found.stalled,
-        covariance=covariance, noise=None if whole is None else whole.noise,
-        arcs=0 if whole is None else whole.arcs, misfit=whole is not None and whole.misfit,
-        dropped=found.dropped, unmet=unmet(error, omega_h, tolerance, found),
-        friction=friction, constants=found.constants, symmetries=symmetries,
-        proposals=found.proposals, rivals=found.rivals, widths=widths,
+        covariance=covariance,
+        noise=None if whole is None else whole.noise,
+        arcs=0 if whole is None else whole.arcs,
+        misfit=whole is not None and whole.misfit,
+        dropped=found.dropped,
+        unmet=unmet(error, omega_h, tolerance, found),
+        friction=friction,
+        constants=found.constants,
+        symmetries=symmetries,
+        proposals=found.proposals,
+        rivals=found.rivals,
+        widths=widths,
         turns=turns and found.error.bound <= tolerance.bound < error.bound,
         kinds=partial(
             kinds_of_friction, by_row, sharp, fit.coefficients, own_steps, data, found.odds or {}
         ),
-    )  # fmt: skip
+    )
 
 
 def _label(family) -> str:

@@ -36,9 +36,15 @@ def unmet(error: OneStepError, omega_h: float, tolerance, found: FittedLaw) -> s
 
 
 def messages(
-    error: OneStepError, omega_h: float, data, tolerance, found: FittedLaw, left_out: int,
-    unresolved: int, turns: bool,
-) -> Iterator[str]:  # fmt: skip
+    error: OneStepError,
+    omega_h: float,
+    data,
+    tolerance,
+    found: FittedLaw,
+    left_out: int,
+    unresolved: int,
+    turns: bool,
+) -> Iterator[str]:
     """Lines about a law: aliasing, misfit, terms that are not determined, pairs too fast for it."""
     if error.bound <= tolerance.bound and omega_h > FAST:
         yield (

@@ -34,9 +34,12 @@ _NULL = 1e-8  # of the largest singular value of the linear start
 
 
 def lagrangian_of(
-    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance,
+    problem: Problem,
+    work: LawWork,
+    data: Dataset,
+    tolerance: Tolerance,
     forces: Callable[[Any], Any] | None = None,
-) -> FittedLaw | None:  # fmt: skip
+) -> FittedLaw | None:
     """The law of all terms, with these forces, fitted to the training pairs; None where there are
     not several degrees of freedom with an angle among them, or the pairs are too few."""
     coordinates, dim = data.coordinates, data.dim
@@ -69,10 +72,17 @@ def library(dim: int, angles: tuple[int, ...]) -> Terms:
             waves.append(tuple(wave))
 
     def functions(degree: int) -> list[tuple]:
-        powers = [tuple(chosen.count(i) for i in range(dim)) for n in range(degree + 1)
-                  for chosen in combinations_with_replacement(lengths, n)]  # fmt: skip
-        return [(power, wave, phase) for power in powers for wave in waves
-                for phase in ((0.0, _SINE) if any(wave) else (0.0,))]  # fmt: skip
+        powers = [
+            tuple(chosen.count(i) for i in range(dim))
+            for n in range(degree + 1)
+            for chosen in combinations_with_replacement(lengths, n)
+        ]
+        return [
+            (power, wave, phase)
+            for power in powers
+            for wave in waves
+            for phase in ((0.0, _SINE) if any(wave) else (0.0,))
+        ]
 
     pairs = combinations_with_replacement(range(dim), 2)
     speeds = [tuple((i == a) + (i == b) for i in range(dim)) for a, b in pairs]

@@ -54,17 +54,23 @@ _FIRST_ROUND = 5e8  # operations that the first round of growth is expected to t
 
 
 def of_libraries(
-    problem, work: LawWork, basis: Modes | None, data: Dataset, tolerance: Tolerance, scene, terms,
-    options: LawOptions, on_progress, early: Sequence[FittedLaw],
-) -> tuple[FittedLaw, LawOptions]:  # fmt: skip
+    problem,
+    work: LawWork,
+    basis: Modes | None,
+    data: Dataset,
+    tolerance: Tolerance,
+    scene,
+    terms,
+    options: LawOptions,
+    on_progress,
+    early: Sequence[FittedLaw],
+) -> tuple[FittedLaw, LawOptions]:
     """The best library of terms of H, without friction or with it, and the options for fewer.
 
     early: the first libraries without friction, where these are fitted already.
     """
 
-    def search(
-        forces: Forces | None = None, data: Dataset = data
-    ) -> tuple[FittedLaw, LawOptions]:  # fmt: skip
+    def search(forces: Forces | None = None, data: Dataset = data) -> tuple[FittedLaw, LawOptions]:
         known = early if forces is None else ()
         return _searched(
             problem, work, data, tolerance, scene, terms, options, on_progress, forces, known
@@ -208,9 +214,13 @@ def _simplest_within_noise(
 
 
 def _libraries(
-    data: Dataset, tolerance: Tolerance, scene, terms, options: LawOptions,
+    data: Dataset,
+    tolerance: Tolerance,
+    scene,
+    terms,
+    options: LawOptions,
     forces: Forces | None = None,
-) -> tuple[list[Any], list[float]]:  # fmt: skip
+) -> tuple[list[Any], list[float]]:
     """Libraries by rising size, and the errors of those before them that are known to be hopeless
     without a fit."""
     known = libraries_of if forces is None else partial(libraries_with, forces)
@@ -225,9 +235,14 @@ def _libraries(
 
 
 def _beside_centrifugal(
-    problem, work: LawWork, before: tuple[FittedLaw, LawOptions], data: Dataset,
-    tolerance: Tolerance, options: LawOptions, on_progress,
-) -> tuple[FittedLaw, LawOptions]:  # fmt: skip
+    problem,
+    work: LawWork,
+    before: tuple[FittedLaw, LawOptions],
+    data: Dataset,
+    tolerance: Tolerance,
+    options: LawOptions,
+    on_progress,
+) -> tuple[FittedLaw, LawOptions]:
     """The best of libraries with centrifugal terms and their options, where ``before`` misses the
     tolerance, the pairs ask for such terms and these libraries are better; else ``before``."""
     best, _ = before
@@ -261,10 +276,15 @@ def _walked(
     own = own_terms(data, terms) if terms else None
     angles, plain = angles_and_others(data)
     states = state_libraries(
-        data.dim, data.parameters, angles=angles, cyclic=data.coordinates.cyclic,
-        plain=plain, features=scene.features if scene is not None else None,
-        reversor=scene.reversor if scene is not None else None, own=own,
-    )  # fmt: skip
+        data.dim,
+        data.parameters,
+        angles=angles,
+        cyclic=data.coordinates.cyclic,
+        plain=plain,
+        features=scene.features if scene is not None else None,
+        reversor=scene.reversor if scene is not None else None,
+        own=own,
+    )
     _, args = data.given(data.training)
     functions = functions_of_parameters(
         data.dim, data.parameters, args, own is not None, data.period
@@ -279,9 +299,13 @@ def _walked(
 
     try:
         for found in walked(
-            states, functions, attempt, lambda found: found.error.bound,
-            bound=tolerance.bound, most=min(most, options.most_terms),
-        ):  # fmt: skip
+            states,
+            functions,
+            attempt,
+            lambda found: found.error.bound,
+            bound=tolerance.bound,
+            most=min(most, options.most_terms),
+        ):
             tried.append(found)
             if best is None or found.error.relative < best.error.relative:
                 best = found

@@ -65,9 +65,15 @@ _RESOLVED = 0.1  # of the tolerance: what rounds may leave over of the gradient
 
 
 def learn_network(
-    data: Dataset, tolerance: Tolerance, scene: Scene | None, *, seed: int, max_iterations: int,
-    budget: Budget, on_progress: Callable[[str], Any] = lambda message: None,
-) -> LearnedHamiltonian:  # fmt: skip
+    data: Dataset,
+    tolerance: Tolerance,
+    scene: Scene | None,
+    *,
+    seed: int,
+    max_iterations: int,
+    budget: Budget,
+    on_progress: Callable[[str], Any] = lambda message: None,
+) -> LearnedHamiltonian:
     """The network H whose flow is nearest to these pairs. It has no formula and no posterior.
 
     data: without a base map. max_iterations: of all rounds. Raises FitError where the pairs are
@@ -85,9 +91,10 @@ def learn_network(
     w, wanted = MIDPOINT.evaluation_point(y0, y1), MIDPOINT.target_gradient(y0, y1, dt)
     coordinates = data.coordinates
     inputs = box_inputs(
-        w, angles=tuple(a for a in coordinates.angles if a < data.dim),
+        w,
+        angles=tuple(a for a in coordinates.angles if a < data.dim),
         cyclic=coordinates.cyclic,
-    )  # fmt: skip
+    )
     family = Mlp(inputs, OPTIONS.hidden, OPTIONS.activation, amplitude_of(w, wanted))
     params, label = family.init(jax.random.key(seed), np.float64), f"H, {family.label}"
     weight, target = residual_weight(MIDPOINT, scale, dt), wanted
@@ -96,14 +103,18 @@ def learn_network(
     idle = done = 0
     while idle < OPTIONS.idle and done < max_iterations and not budget.over:
         result = levenberg_marquardt(
-            family, params, w[:count], target[:count], validation=(w[count:], target[count:]),
+            family,
+            params,
+            w[:count],
+            target[:count],
+            validation=(w[count:], target[count:]),
             weight=weight,
             limits=Limits(
                 OPTIONS.iterations[done > 0],
                 block=lambda n: budget.unit(f"{n} iterations of {label}", NETWORK, n * work),
                 target_rms=_RESOLVED * tolerance.bound,
             ),
-        )  # fmt: skip
+        )
         params, done = jax.tree.map(np.asarray, result.params), done + max(result.iterations, 1)
         substeps = substeps_for(family, params, y0[:_STATES], dt, OPTIONS.reach)
         flow = Flow(family, params, dt, scale, OPTIONS.stages, substeps)
@@ -140,12 +151,19 @@ def _learned(
     fastest = rates(family, flow.params, y0[:_STATES])
     steps = Steps(flow.stages, flow.substeps)
     candidate = Candidate(
-        label=label, family=family.name, chart="flow", num_parameters=family.num_parameters,
-        operations=operations_of(family, y0.shape[1], fastest, dt, steps), validation_rms=error.rms,
-        validation_relative=error.relative, validation_bound=error.bound,
-        deviations=error.deviations, train_rms=best.train_rms, fit_seconds=seconds,
+        label=label,
+        family=family.name,
+        chart="flow",
+        num_parameters=family.num_parameters,
+        operations=operations_of(family, y0.shape[1], fastest, dt, steps),
+        validation_rms=error.rms,
+        validation_relative=error.relative,
+        validation_bound=error.bound,
+        deviations=error.deviations,
+        train_rms=best.train_rms,
+        fit_seconds=seconds,
         learns="hamiltonian",
-    )  # fmt: skip
+    )
     off = best.images - np.asarray(finer)[-len(best.images) :]
     truncation = float(np.abs(off / data.scale).max())
     omega_h = omega_h_of(family, flow.params, data, fastest)
@@ -156,10 +174,20 @@ def _learned(
             "with a smaller dt, or learn H as terms",
         )
     return LearnedHamiltonian(
-        with_error(candidate, error), flow, (), None, truncation, omega_h,
-        contraction_of(fastest, dt, steps), float("nan"), (), 0, messages, stalled=False,
+        with_error(candidate, error),
+        flow,
+        (),
+        None,
+        truncation,
+        omega_h,
+        contraction_of(fastest, dt, steps),
+        float("nan"),
+        (),
+        0,
+        messages,
+        stalled=False,
         covariance=None,
-    )  # fmt: skip
+    )
 
 
 @jax.jit

@@ -73,9 +73,13 @@ class _LawOfSequences(NamedTuple):
 
 
 def law_of_sequences(
-    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance,
-    on_progress: Callable[[str], Any], partly: OnPartial,
-) -> FittedLaw | None:  # fmt: skip
+    problem: Problem,
+    work: LawWork,
+    data: Dataset,
+    tolerance: Tolerance,
+    on_progress: Callable[[str], Any],
+    partly: OnPartial,
+) -> FittedLaw | None:
     """The law, or None where the pairs are no noisy sequences of one dt, or nothing in the
     dictionary leaves no more than their noise. partly: called with the three laws that come
     closest, where none does."""
@@ -136,9 +140,14 @@ def _noise_of(stretches: list[np.ndarray], scale: np.ndarray) -> np.ndarray | No
 
 
 def _chosen(
-    problem: Problem, formulas: list[Formula], data: Dataset, tolerance: Tolerance,
-    noise: np.ndarray, allowance: Allowance, partly: OnPartial,
-) -> FittedLaw | None:  # fmt: skip
+    problem: Problem,
+    formulas: list[Formula],
+    data: Dataset,
+    tolerance: Tolerance,
+    noise: np.ndarray,
+    allowance: Allowance,
+    partly: OnPartial,
+) -> FittedLaw | None:
     """The law of least description length, where it leaves no more than noise."""
     first = formulas[0]
     sequences = Sequences.along(
@@ -235,8 +244,9 @@ def _significant(sequences: Sequences, arcs: Measured, formula: Formula) -> _Law
     count = np.isfinite(found.residuals).sum(axis=(0, 1))
     length = float(
         np.sum(count * np.log(noise_of(found)))
-        + 0.5 * np.log(count.sum()) * len(found.p) + OPTIONS.penalty * formula.complexity
-    )  # fmt: skip
+        + 0.5 * np.log(count.sum()) * len(found.p)
+        + OPTIONS.penalty * formula.complexity
+    )
     return _LawOfSequences(formula, found, length)
 
 
@@ -296,14 +306,28 @@ def _law(
     fit = problem.fit(family, c, data.training, rounds=False)
     fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
     whole = SequenceFit(
-        tuple(range(terms)), fit, _covariance_root_of_coefficients(covariance, terms),
-        noise_of(fitted), len(fitted.x), about_outliers(fitted.residuals), lacks_terms(fitted),
-    )  # fmt: skip
+        tuple(range(terms)),
+        fit,
+        _covariance_root_of_coefficients(covariance, terms),
+        noise_of(fitted),
+        len(fitted.x),
+        about_outliers(fitted.residuals),
+        lacks_terms(fitted),
+    )
     error = validation_error(family, fit, data, tolerance)
     return FittedLaw(
-        family, fit, data.training, error, (), noisy=True, stalled=True, whole=whole,
-        constants=inner, symmetries=known.symmetries, proposals=near,
-    )  # fmt: skip
+        family,
+        fit,
+        data.training,
+        error,
+        (),
+        noisy=True,
+        stalled=True,
+        whole=whole,
+        constants=inner,
+        symmetries=known.symmetries,
+        proposals=near,
+    )
 
 
 def _covariance_root_of_coefficients(covariance: np.ndarray, terms: int) -> np.ndarray:

@@ -140,9 +140,17 @@ def learn_hamiltonian(
 
 
 def _best_law(
-    problem, work: LawWork, basis, data: Dataset, tolerance: Tolerance, scene, terms,
-    options: LawOptions, on_progress, partly: OnPartial,
-) -> tuple[FittedLaw, LawOptions]:  # fmt: skip
+    problem,
+    work: LawWork,
+    basis,
+    data: Dataset,
+    tolerance: Tolerance,
+    scene,
+    terms,
+    options: LawOptions,
+    on_progress,
+    partly: OnPartial,
+) -> tuple[FittedLaw, LawOptions]:
     """The law of the smallest polynomials, of physics, of a mechanical system or of the libraries,
     the first within the tolerance, else the best; and the options for fewer terms."""
     with_masses, best, early = None, None, list[FittedLaw]()
@@ -178,9 +186,16 @@ def _check_resolved(problem, best: FittedLaw, data: Dataset) -> None:
 
 
 def _simplified(
-    problem, work: LawWork, best: FittedLaw, data: Dataset, whole: Dataset, far: np.ndarray,
-    tolerance: Tolerance, options: LawOptions, on_progress,
-) -> tuple[FittedLaw, float | None]:  # fmt: skip
+    problem,
+    work: LawWork,
+    best: FittedLaw,
+    data: Dataset,
+    whole: Dataset,
+    far: np.ndarray,
+    tolerance: Tolerance,
+    options: LawOptions,
+    on_progress,
+) -> tuple[FittedLaw, float | None]:
     """The law without the terms that are noise or not asked for, fitted to all training pairs, as
     far as the budget goes; and its error at the outermost states, of a fit without them.
 

@@ -47,9 +47,10 @@ def symmetries_of(family: Terms, c: np.ndarray, z: np.ndarray, angles: Sequence[
 
 def _held(family: Terms, c: np.ndarray, z: np.ndarray, angles: Sequence[int]) -> list[Symmetry]:
     return [
-        s for s in _candidates(family, z[:_STATES], tuple(angles))
+        s
+        for s in _candidates(family, z[:_STATES], tuple(angles))
         if np.abs(s.rows @ c).max() <= _HOLDS * (np.abs(s.rows) @ np.abs(c)).max()
-    ]  # fmt: skip
+    ]
 
 
 def imposed(
@@ -68,9 +69,13 @@ def imposed(
 
 
 def restricted(
-    family: Terms, p: np.ndarray, covariance: np.ndarray, z: np.ndarray, angles: Sequence[int],
+    family: Terms,
+    p: np.ndarray,
+    covariance: np.ndarray,
+    z: np.ndarray,
+    angles: Sequence[int],
     rows: int,
-) -> Restricted:  # fmt: skip
+) -> Restricted:
     """The numbers p (n,), coefficients first, with every symmetry that shortens the description.
 
     A restriction of r coefficients raises half the misfit by ½χ² and saves ½ r ln(rows). It is the

@@ -40,9 +40,13 @@ _EXACT = 1e-9  # of the spread: the error of a law that is no approximation
 
 
 def law_of_physics(
-    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance,
-    on_progress: Callable[[str], Any], partly: OnPartial,
-) -> FittedLaw | None:  # fmt: skip
+    problem: Problem,
+    work: LawWork,
+    data: Dataset,
+    tolerance: Tolerance,
+    on_progress: Callable[[str], Any],
+    partly: OnPartial,
+) -> FittedLaw | None:
     """The law, or None where none is found, or the pairs are of no autonomous flow of a few degrees
     of freedom in plain coordinates and angles. partly: called with the three laws that come
     closest, where none is exact."""
@@ -54,11 +58,15 @@ def law_of_physics(
     own.allowance = dataclasses.replace(problem.allowance, cap=None)
     symmetric, search = (
         Textbook(
-            own, rows, angles=tuple(a for a in coordinates.angles if a < data.dim),
-            cyclic=coordinates.cyclic, on_progress=on_progress, symmetries=symmetries,
+            own,
+            rows,
+            angles=tuple(a for a in coordinates.angles if a < data.dim),
+            cyclic=coordinates.cyclic,
+            on_progress=on_progress,
+            symmetries=symmetries,
         )
         for symmetries in (symmetries_of_pairs(data), ())
-    )  # fmt: skip
+    )
     law = None
     for name, contents, operations in _DICTIONARIES:
         if law is not None or not operations[data.dim - 1]:

@@ -26,9 +26,14 @@ from gfnn_jax.phase_space import apply_j, symplectic_form
 
 
 def unexplained(
-    data: Dataset, rows, residual, taken: int, degree: int, states,
+    data: Dataset,
+    rows,
+    residual,
+    taken: int,
+    degree: int,
+    states,
     generators: Sequence[Terms] = (),
-) -> float | None:  # fmt: skip
+) -> float | None:
     """Part of the mean square of a law's residuals (n, 2d) on these rows that no generator K
     explains, residual = J∇K at the images: K of as high a degree as the rows tell.
     taken: coefficients that the law itself was given, degree: its own. states: the residual's
@@ -46,9 +51,10 @@ def unexplained(
     else:
         coordinates = data.coordinates
         inputs = box_inputs(
-            z, angles=tuple(a for a in coordinates.angles if a < data.dim),
+            z,
+            angles=tuple(a for a in coordinates.angles if a < data.dim),
             cyclic=coordinates.cyclic,
-        )  # fmt: skip
+        )
         degrees = sorted({*OPTIONS.generators, degree + OPTIONS.beyond})
         sizes = [Products(inputs, n) for n in degrees]
     most = min(len(rows) * width // OPTIONS.sampled_rows, OPTIONS.most_terms)
@@ -79,7 +85,7 @@ def unexplained(
 
 def unexplained_of_sites(
     found: FittedLaw, problem: Problem, data: Dataset, rows, steps: Steps, slopes, left
-) -> float | None:  # fmt: skip
+) -> float | None:
     """The part that `unexplained` tells, of a structure: what the next library's terms, small
     beside the law's, do not explain. slopes (n, 2d, terms), left (n, 2d): of the law."""
     assert data.structure is not None

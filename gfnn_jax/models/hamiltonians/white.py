@@ -39,9 +39,15 @@ def _with_args(data: Dataset, rows: np.ndarray) -> list[Terms]:
         return []
     angles, plain = angles_and_others(data)
     states = state_libraries(
-        data.dim, data.parameters, angles=angles, cyclic=data.coordinates.cyclic, plain=plain,
-        features=None, reversor=None, own=None,
-    )  # fmt: skip
+        data.dim,
+        data.parameters,
+        angles=angles,
+        cyclic=data.coordinates.cyclic,
+        plain=plain,
+        features=None,
+        reversor=None,
+        own=None,
+    )
     args = data.given(rows)[1]
     functions = functions_of_parameters(data.dim, data.parameters, args, False, data.period)
     every = (multiplied(state, own) for own in functions[0] for state in states)

@@ -70,9 +70,14 @@ class Sequences:
 
     @classmethod
     def along(
-        cls, problem: Problem, family, c: np.ndarray, how: Steps, data: Dataset,
+        cls,
+        problem: Problem,
+        family,
+        c: np.ndarray,
+        how: Steps,
+        data: Dataset,
         allowance: Allowance,
-    ) -> Sequences | None:  # fmt: skip
+    ) -> Sequences | None:
         """Cut them as long as a law with coefficients c that are close allows, by steps that
         resolve it. None where there are none of one dt in plain coordinates."""
         plain = data.coordinates.forward is CARTESIAN.forward and data.structure is None
@@ -113,9 +118,12 @@ class Sequences:
 
 
 def fitted_to_sequences(
-    problem: Problem, family, fit: FlowFit, data: Dataset,
+    problem: Problem,
+    family,
+    fit: FlowFit,
+    data: Dataset,
     allowance: Allowance,
-) -> SequenceFit | None:  # fmt: skip
+) -> SequenceFit | None:
     """The law of these pairs' fit, fitted to their sequences. None where they are none of one dt in
     plain coordinates, where noise soon grows beyond the linear, or where held-out sequences do not
     bear the law out."""
@@ -155,8 +163,12 @@ def fitted_to_sequences(
     return SequenceFit(
         kept,
         fit._replace(coefficients=found.p, standard_errors=np.linalg.norm(root, axis=0)),
-        root, noise_of(found), len(found.x), about_outliers(found.residuals), lacks_terms(found),
-    )  # fmt: skip
+        root,
+        noise_of(found),
+        len(found.x),
+        about_outliers(found.residuals),
+        lacks_terms(found),
+    )
 
 
 def has_rows_to_spare(found: Fitted, numbers: int) -> bool:
@@ -169,8 +181,9 @@ def noise_of(found: Fitted) -> np.ndarray:
     """(2d,): of noise of each value the root of the mean square over what was measured."""
     if found.sigma.ndim == 1:
         return found.sigma
-    return np.sqrt(np.nanmean(np.where(np.isfinite(found.residuals), found.sigma, np.nan) ** 2,
-                              axis=(0, 1)))  # fmt: skip
+    return np.sqrt(
+        np.nanmean(np.where(np.isfinite(found.residuals), found.sigma, np.nan) ** 2, axis=(0, 1))
+    )
 
 
 def triangle_of(found: Fitted) -> Triangle:

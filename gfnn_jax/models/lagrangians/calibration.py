@@ -192,9 +192,12 @@ def _starts(found: Sequence[Stretch], scales: Scales) -> list[tuple[int, int]]:
 
 
 def _forecasts(
-    thirds: Thirds, found: Sequence[Stretch], starts: Sequence[tuple[int, int]],
-    windows: np.ndarray, leads: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    thirds: Thirds,
+    found: Sequence[Stretch],
+    starts: Sequence[tuple[int, int]],
+    windows: np.ndarray,
+    leads: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Errors (B, n, k) of forecasts by the law without the third in which they start, NaN where the
     record ends before, their standard deviations, and the states (B, 2d) they start from; times are
     those of the samples nearest to the leads. windows: (B,) seconds from which each state is

@@ -194,8 +194,9 @@ class _Problem:
         for _ in range(_MOST):
             best = min(
                 (self.solved(sets, here) for sets in self._changed(here.sets)),
-                key=lambda one: one.score, default=here,
-            )  # fmt: skip
+                key=lambda one: one.score,
+                default=here,
+            )
             if not best.score < here.score:
                 break
             here = best

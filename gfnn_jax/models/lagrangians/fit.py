@@ -182,9 +182,16 @@ class Workbench:
         for _ in range(3 if rescale else 1):
             noise, scale = sigma * arcs.noise, self.state_scale(sigma)
             found = fit_arcs(
-                model, p, x, arcs.y, noise, scale, tolerance=1e-4 if rescale else 1e-3,
-                loss=self.observation.loss, whitening=whitening,
-            )  # fmt: skip
+                model,
+                p,
+                x,
+                arcs.y,
+                noise,
+                scale,
+                tolerance=1e-4 if rescale else 1e-3,
+                loss=self.observation.loss,
+                whitening=whitening,
+            )
             p, x = found.p, found.x
             change = np.nanmedian(np.abs(found.whitened), axis=(0, 1)) / 0.6745
             change = np.maximum(change, 1e-3)
@@ -201,9 +208,17 @@ class Workbench:
         noise, scale = fit.sigma * arcs.noise, self.state_scale(fit.sigma)
         loss = self.observation.loss
         found = fit_arcs(
-            model, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, 1e-3, loss,
+            model,
+            np.zeros(0),
+            arcs.x,
+            arcs.y,
+            noise,
+            scale,
+            15,
+            1e-3,
+            loss,
             whitening=self.whitening(arcs),
-        )  # fmt: skip
+        )
         lost = np.isfinite(arcs.y) & ~np.isfinite(found.residuals)
         if lost.any() or not np.isfinite(found.open).all():
             return np.full(len(arcs.home), np.inf)

@@ -119,9 +119,11 @@ def which_friction(
 
 
 def chosen(
-    table: Table, choose: bool = True, before: FrictionChoice | None = None,
+    table: Table,
+    choose: bool = True,
+    before: FrictionChoice | None = None,
     rows: Sequence[Loss] | None = None,
-) -> FrictionChoice:  # fmt: skip
+) -> FrictionChoice:
     """The choice among sets of the candidates' kinds, each with the directions that it needs; not
     to ``choose`` is to take as many of the kinds as there are. Among equals the kinds chosen
     ``before`` stay. rows: friction that has been taken, where only its odds are asked for. Odds are

@@ -31,10 +31,17 @@ from gfnn_jax.models.lagrangians.zeros_of_runs import with_zeros_of_runs
 
 
 def fit_given(
-    given: Given, nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
-    inputs: Mapping[str, ArcInputs], observation: Observation, on_progress: Callable[[str], object],
-    options: SearchOptions, parameters: tuple[str, ...] = (),
-) -> Found:  # fmt: skip
+    given: Given,
+    nodes: Sequence[Nodes],
+    scales: Scales,
+    angles: tuple[int, ...],
+    num_inputs: int,
+    inputs: Mapping[str, ArcInputs],
+    observation: Observation,
+    on_progress: Callable[[str], object],
+    options: SearchOptions,
+    parameters: tuple[str, ...] = (),
+) -> Found:
     """Fit exactly the terms that are given, with the result of `search.search`. parameters: in
     which the systems of the runs differ, and by which terms may be multiplied."""
     d = observation.dim

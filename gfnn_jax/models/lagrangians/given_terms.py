@@ -32,9 +32,11 @@ class Given(NamedTuple):
 
 
 def given_terms(
-    texts: Sequence[Any], positions: Sequence[str], speeds: Sequence[str],
+    texts: Sequence[Any],
+    positions: Sequence[str],
+    speeds: Sequence[str],
     parameters: Sequence[str] = (),
-) -> Given:  # fmt: skip
+) -> Given:
     """The terms that these texts name. ``parameters`` are those in which the systems of the
     runs differ.
 

@@ -117,13 +117,21 @@ class Record:
         x = np.concatenate([n.x for n in self.nodes])
         x[:, : observation.dim] += fit.zeros
         own = Sensors(
-            recording.coordinates, recording.inputs, recording.angles, noise, scales.omega,
-            scales.period, self.hold, self.delay, np.array([scales.period]),
+            recording.coordinates,
+            recording.inputs,
+            recording.angles,
+            noise,
+            scales.omega,
+            scales.period,
+            self.hold,
+            self.delay,
+            np.array([scales.period]),
             np.zeros((1, len(noise))),
-            None if plain else dataclasses.replace(observation, values=fit.sensors), wander,
+            None if plain else dataclasses.replace(observation, values=fit.sensors),
+            wander,
             float(np.min(bench.state_scale(noise)[: observation.dim]) / scales.period),
             x[:, : observation.dim].mean(axis=0),
-        )  # fmt: skip
+        )
         reach = np.sqrt(np.mean(own.distances(x) ** 2, axis=0))
         return dataclasses.replace(own, reach=np.maximum(reach, 1e-300))
 
@@ -139,10 +147,11 @@ class Record:
             laws.append(law_in_use(law, fewer * covariance_root(covariance), own))
             begins.append(
                 next(
-                    (i, t) for i, s in enumerate(self.found)
+                    (i, t)
+                    for i, s in enumerate(self.found)
                     if s.run == run and s.t[0] <= t <= s.t[-1]
                 )
-            )  # fmt: skip
+            )
         return Thirds(tuple(laws), tuple(begins))
 
 
@@ -160,9 +169,12 @@ def _of_uncoupled(structure: Structure, names: Sequence[str], scale: float) -> s
 
 
 def best_in_use(
-    record: Record, bench: Workbench, fit: LawFit, choice: FrictionChoice,
+    record: Record,
+    bench: Workbench,
+    fit: LawFit,
+    choice: FrictionChoice,
     on_progress: Callable[[str], object],
-) -> InUse:  # fmt: skip
+) -> InUse:
     """The fit as it is, or fitted anew with zeros of channels that wander: where its residuals show
     these (the likelihood's evidence) and forecasts of held-out data do not err more with them than
     chance makes."""

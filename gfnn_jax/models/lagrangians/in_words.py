@@ -39,10 +39,17 @@ Gains = dict[str, dict[str, tuple[float, float]]]
 
 
 def in_words(
-    recording: Recording, best: InUse, map_: SymplecticMap, traces: tuple[Trace, ...],
-    motions: Sequence[Motion], measured: Mapping[str, Velocity],
-    acting: Acting, messages: Sequence[str], steps: tuple[str, ...], seconds: float,
-) -> LearnedLaw:  # fmt: skip
+    recording: Recording,
+    best: InUse,
+    map_: SymplecticMap,
+    traces: tuple[Trace, ...],
+    motions: Sequence[Motion],
+    measured: Mapping[str, Velocity],
+    acting: Acting,
+    messages: Sequence[str],
+    steps: tuple[str, ...],
+    seconds: float,
+) -> LearnedLaw:
     """The law, its sensors and what its fit showed, by names of columns and in the file's units.
 
     measured: columns of velocities against the law. acting: how the inputs act. messages: warnings
@@ -59,7 +66,10 @@ def in_words(
     zeros, parameters = _zeros_and_sensors(fit, recording)
     shown = dict(zip(channels, sensors.observation_model.formulas, strict=True))
     return LearnedLaw(
-        map=map_, lagrangian=lagrangian, friction=friction, gains=gains,
+        map=map_,
+        lagrangian=lagrangian,
+        friction=friction,
+        gains=gains,
         delay=(acting.delay, acting.error) if recording.inputs else None,
         input_rules=dict(acting.others),
         which_friction=which_friction_line(best.choice, best.scale, law.dim, names.speeds),
@@ -70,15 +80,20 @@ def in_words(
         gauge=best.gauge,
         units={n: recording.unit(n) for n in (*recording.columns, *recording.coordinates)},
         velocities={n: one.in_file(recording, n) for n, one in measured.items()},
-        whiteness=found, traces=traces,
+        whiteness=found,
+        traces=traces,
         next_motions=_next_motions(motions, recording, names),
-        observe={n: f for n, f in shown.items() if n != f}, sensors=parameters,
-        alike=_alike(fit, lagrangian, friction), horizon=tuple(best.calibration.horizons),
+        observe={n: f for n, f in shown.items() if n != f},
+        sensors=parameters,
+        alike=_alike(fit, lagrangian, friction),
+        horizon=tuple(best.calibration.horizons),
         energy=_energy(traces, friction, recording.inputs),
         messages=(*messages, *_not_followed(found), *_warnings(best, recording, gains)),
-        steps=steps, num_samples=len(recording), seconds=seconds,
+        steps=steps,
+        num_samples=len(recording),
+        seconds=seconds,
         ended="every length of arcs was fitted",
-    )  # fmt: skip
+    )
 
 
 class _Names(NamedTuple):

@@ -61,9 +61,14 @@ class Acting(NamedTuple):
 
 
 def choose_rule(
-    benches: Mapping[str, Workbench], nodes: Sequence[Nodes], structure: Structure,
-    known: Mapping[Key, float], arcs: Arcs, sigma: np.ndarray, interval: float,
-) -> Acting:  # fmt: skip
+    benches: Mapping[str, Workbench],
+    nodes: Sequence[Nodes],
+    structure: Structure,
+    known: Mapping[Key, float],
+    arcs: Arcs,
+    sigma: np.ndarray,
+    interval: float,
+) -> Acting:
     """The fit of these arcs by the rule between samples (of ``benches``: rule -> workbench) and the
     delay that held-out arcs choose. interval: between samples, in seconds."""
     found = []
@@ -83,7 +88,7 @@ def choose_rule(
 
 def choose_again(
     last: Acting, holds: Sequence[str], nodes: Sequence[Nodes], length: int, interval: float
-) -> Acting:  # fmt: skip
+) -> Acting:
     """The rule between samples (of ``holds``) that held-out arcs choose with the last law: ``last``
     as it was, where that is its own. length: nodes of these arcs; many short ones tell it better
     than a few long ones."""

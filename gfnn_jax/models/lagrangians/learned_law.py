@@ -142,13 +142,17 @@ class LearnedLaw:
         )
         wander = sensors.wander if sensors is not None else None
         for name, sigma in self.noise.items():
-            zero = "" if wander is None else (
-                f" on a zero that wanders by {_of(wander.size * sigma, self.units[name])} over "
-                f"{wander.time:.3g} s"
-                if np.isfinite(wander.time)
-                else " on a zero that differs from run to run by "
-                f"{_of(wander.size * sigma, self.units[name])}"
-            )  # fmt: skip
+            zero = (
+                ""
+                if wander is None
+                else (
+                    f" on a zero that wanders by {_of(wander.size * sigma, self.units[name])} over "
+                    f"{wander.time:.3g} s"
+                    if np.isfinite(wander.time)
+                    else " on a zero that differs from run to run by "
+                    f"{_of(wander.size * sigma, self.units[name])}"
+                )
+            )
             lines.append(
                 f"{name}: noise σ {_of(sigma, self.units[name])}{zero}, RMS residual "
                 f"{_of(self.residual[name], self.units[name])}; residuals "
@@ -267,9 +271,11 @@ def in_columns(fit: LawFit) -> tuple[Lagrangian, np.ndarray]:
 def scaled(law: Lagrangian, covariance: np.ndarray, factor: float) -> tuple[Lagrangian, np.ndarray]:
     """The law with L, R and G times a factor, which moves nothing: the scale of a known mass."""
     law = dataclasses.replace(
-        law, coefficients=factor * law.coefficients, losses=factor * law.losses,
+        law,
+        coefficients=factor * law.coefficients,
+        losses=factor * law.losses,
         gains=factor * law.gains,
-    )  # fmt: skip
+    )
     by = np.full(len(covariance), factor)
     by[law.terms.count + law.friction.count + law.gains.size :] = 1.0  # γ is a rate
     return law, by[:, None] * covariance * by

@@ -155,8 +155,10 @@ def losses(dim: int, kinds: tuple[int, ...], width: float) -> list[Loss]:
         directions.append(tuple(wave))
     rows = [
         (c, kind, width if kind == DRY else 0.0)
-        for kind in kinds if kind != UNIFORM for c in directions
-    ]  # fmt: skip
+        for kind in kinds
+        if kind != UNIFORM
+        for c in directions
+    ]
     return rows + [((0,) * dim, UNIFORM, 0.0)] * (UNIFORM in kinds)
 
 

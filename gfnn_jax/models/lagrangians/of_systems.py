@@ -44,10 +44,16 @@ from gfnn_jax.models.lagrangians.zeros_of_runs import with_zeros_of_runs
 
 
 def search_of_systems(
-    nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
-    inputs: Mapping[str, ArcInputs], observation: Observation,
-    on_progress: Callable[[str], object], options: SearchOptions, parameters: tuple[str, ...],
-) -> Found | None:  # fmt: skip
+    nodes: Sequence[Nodes],
+    scales: Scales,
+    angles: tuple[int, ...],
+    num_inputs: int,
+    inputs: Mapping[str, ArcInputs],
+    observation: Observation,
+    on_progress: Callable[[str], object],
+    options: SearchOptions,
+    parameters: tuple[str, ...],
+) -> Found | None:
     """The law of runs that differ in ``parameters``, with the result of `search.search`; None where
     no coefficient depends on them."""
     groups = _of_one_value(nodes)
@@ -114,9 +120,10 @@ def _depending(every: Structure, found: Structure, none: tuple[int, ...]) -> Str
     uniform = [row for row in every.friction if row[1] == UNIFORM]
     terms = with_functions(every.terms, functions_in(found.terms, none))
     return dataclasses.replace(
-        every, terms=tuple(dict.fromkeys((found.terms[0], *terms))),
+        every,
+        terms=tuple(dict.fromkeys((found.terms[0], *terms))),
         friction=(*with_functions(directed, functions_in(found.friction, none)), *uniform),
-    )  # fmt: skip
+    )
 
 
 def _of_one_value(nodes: Sequence[Nodes]) -> list[list[int]]:
@@ -128,10 +135,16 @@ def _of_one_value(nodes: Sequence[Nodes]) -> list[list[int]]:
 
 
 def _first_law(
-    groups: Sequence[Sequence[int]], nodes: Sequence[Nodes], scales: Scales,
-    angles: tuple[int, ...], num_inputs: int, holds: tuple[str, ...], observation: Observation,
-    on_progress: Callable[[str], object], options: SearchOptions,
-) -> Acting:  # fmt: skip
+    groups: Sequence[Sequence[int]],
+    nodes: Sequence[Nodes],
+    scales: Scales,
+    angles: tuple[int, ...],
+    num_inputs: int,
+    holds: tuple[str, ...],
+    observation: Observation,
+    on_progress: Callable[[str], object],
+    options: SearchOptions,
+) -> Acting:
     """The law of the runs of one value, with the inputs as they act in it: of the value with most
     samples that has one."""
     for places in groups:
@@ -149,9 +162,12 @@ def _first_law(
 
 
 def _fitted(
-    bench: Workbench, nodes: Sequence[Nodes], structure: Structure, scales: Scales,
+    bench: Workbench,
+    nodes: Sequence[Nodes],
+    structure: Structure,
+    scales: Scales,
     options: SearchOptions,
-) -> tuple[LawFit | None, Sequence[Nodes]]:  # fmt: skip
+) -> tuple[LawFit | None, Sequence[Nodes]]:
     """A structure fitted to these nodes, and the nodes with its states; None where it cannot be."""
     try:
         without_zeros = dataclasses.replace(structure, zeros=())

@@ -59,10 +59,15 @@ OnProgress = Callable[[str], object]
 
 
 def fit_recording(
-    recording: Recording, *, friction: str = "auto", input_hold: str = "auto",
-    mass: Mapping[str, float] | None = None, terms: Sequence[Any] = (), loss: Loss | None = None,
+    recording: Recording,
+    *,
+    friction: str = "auto",
+    input_hold: str = "auto",
+    mass: Mapping[str, float] | None = None,
+    terms: Sequence[Any] = (),
+    loss: Loss | None = None,
     on_progress: Callable[[str], Any] = lambda message: None,
-) -> LearnedLaw:  # fmt: skip
+) -> LearnedLaw:
     """The law of a recording, from its positions and inputs.
 
     friction: "auto", "none", "linear", "quadratic", "dry", or several of them, as
@@ -114,8 +119,17 @@ def fit_recording(
     motions = next_motions(best.bench, best.fit, samples.angles)
     seconds = time.process_time() - started
     return in_words(
-        recording, best, map_, traces, motions, measured, acting, messages, tuple(steps), seconds,
-    )  # fmt: skip
+        recording,
+        best,
+        map_,
+        traces,
+        motions,
+        measured,
+        acting,
+        messages,
+        tuple(steps),
+        seconds,
+    )
 
 
 def _options(friction: str) -> SearchOptions:
@@ -198,15 +212,26 @@ class _Samples:
     def record(self, nodes: Sequence[Nodes], mass: Mapping[str, float], acting: Acting) -> Record:
         """The data that the last fits share."""
         return Record(
-            self.recording, nodes, self.stretches, self.scales, self.given, mass, acting.hold,
+            self.recording,
+            nodes,
+            self.stretches,
+            self.scales,
+            self.given,
+            mass,
+            acting.hold,
             acting.delay,
-        )  # fmt: skip
+        )
 
 
 def _found(
-    recording: Recording, loss: Loss | None, parameters: tuple[str, ...], terms: Sequence[Any],
-    holds: Sequence[str], on_progress: OnProgress, options: SearchOptions,
-) -> tuple[_Samples, np.ndarray, Found]:  # fmt: skip
+    recording: Recording,
+    loss: Loss | None,
+    parameters: tuple[str, ...],
+    terms: Sequence[Any],
+    holds: Sequence[str],
+    on_progress: OnProgress,
+    options: SearchOptions,
+) -> tuple[_Samples, np.ndarray, Found]:
     """The samples, the positions (n, d) of the gauge, and the law of these parameters; where
     nothing depends on them, all as of one system."""
     samples = _samples(recording, loss, on_progress, parameters)
@@ -220,9 +245,11 @@ def _found(
 
 
 def _samples(
-    recording: Recording, loss: Loss | None, on_progress: OnProgress,
+    recording: Recording,
+    loss: Loss | None,
+    on_progress: OnProgress,
     parameters: tuple[str, ...] = (),
-) -> _Samples:  # fmt: skip
+) -> _Samples:
     """The samples of the positions, without rests, each σ as given where it is."""
     observation, angles = _observation(recording)
     observation = observation if loss is None else dataclasses.replace(observation, loss=loss)
@@ -241,9 +268,11 @@ def _samples(
             for line in lines:
                 on_progress(line)
             samples = dataclasses.replace(
-                samples, stretches=moving.stretches, scales=measure(moving.stretches),
+                samples,
+                stretches=moving.stretches,
+                scales=measure(moving.stretches),
                 messages=lines,
-            )  # fmt: skip
+            )
     sigma = np.where(samples.given > 0, samples.given, samples.scales.sigma)
     return dataclasses.replace(samples, scales=dataclasses.replace(samples.scales, sigma=sigma))
 
@@ -269,9 +298,14 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
     names = recording.coordinates
     angles = tuple(i for i, name in enumerate(names) if name in recording.angles)
     observation = observed(
-        recording.observe, names, speed_names(names, recording.velocities), recording.guess,
-        offsets=recording.offsets, scales=recording.scales, columns=recording.columns,
-    )  # fmt: skip
+        recording.observe,
+        names,
+        speed_names(names, recording.velocities),
+        recording.guess,
+        offsets=recording.offsets,
+        scales=recording.scales,
+        columns=recording.columns,
+    )
     lengths = [i for i in range(len(names)) if i not in angles]
     open_ = observation.undetermined(lengths)
     if open_:
@@ -284,16 +318,20 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
 
 
 def _stretches(
-    recording: Recording, observation: Observation, angles: tuple[int, ...],
+    recording: Recording,
+    observation: Observation,
+    angles: tuple[int, ...],
     parameters: tuple[str, ...],
-) -> list[Stretch]:  # fmt: skip
+) -> list[Stretch]:
     """The stretches of a recording, as the parameters of ``observation`` show its coordinates."""
     if observation.is_plain:
         return stretches(recording, parameters=parameters)
     return stretches(
-        recording, observation.channels, partial(observation.coordinates_of, angles=angles),
+        recording,
+        observation.channels,
+        partial(observation.coordinates_of, angles=angles),
         parameters,
-    )  # fmt: skip
+    )
 
 
 def _asked(terms: Sequence[Any], samples: _Samples) -> Given | None:
@@ -305,9 +343,13 @@ def _asked(terms: Sequence[Any], samples: _Samples) -> Given | None:
 
 
 def _searched(
-    samples: _Samples, nodes: Sequence[Nodes], asked: Given | None, holds: Sequence[str],
-    on_progress: OnProgress, options: SearchOptions,
-) -> Found | None:  # fmt: skip
+    samples: _Samples,
+    nodes: Sequence[Nodes],
+    asked: Given | None,
+    holds: Sequence[str],
+    on_progress: OnProgress,
+    options: SearchOptions,
+) -> Found | None:
     """The law that a search finds, or that of the terms which were asked for; None where no
     coefficient depends on the samples' parameters."""
     scales = samples.scales
@@ -320,9 +362,15 @@ def _searched(
 
     def with_rules(inputs: Mapping[str, ArcInputs]) -> Found | None:
         return find(
-            nodes, scales, samples.angles, len(samples.recording.inputs), inputs,
-            samples.observation, on_progress, options,
-        )  # fmt: skip
+            nodes,
+            scales,
+            samples.angles,
+            len(samples.recording.inputs),
+            inputs,
+            samples.observation,
+            on_progress,
+            options,
+        )
 
     found = with_rules(inputs)
     if found is None:
@@ -333,9 +381,14 @@ def _searched(
         on_progress(f"inputs {RULES[acting.hold]}: held-out arcs choose it with the law found")
         if find is search:
             again = search_on(
-                acting, found.nodes, scales, samples.angles, len(samples.recording.inputs),
-                on_progress, options,
-            )  # fmt: skip
+                acting,
+                found.nodes,
+                scales,
+                samples.angles,
+                len(samples.recording.inputs),
+                on_progress,
+                options,
+            )
         else:
             again = with_rules({acting.hold: inputs[acting.hold]}) or found
         found = again if again.follows or not found.follows else found
@@ -372,9 +425,12 @@ def _forecasting_best(found: Found, samples: _Samples, on_progress: OnProgress) 
 
 
 def _with_velocities(
-    measured: Mapping[str, Velocity], samples: _Samples, nodes: Sequence[Nodes], bench: Workbench,
+    measured: Mapping[str, Velocity],
+    samples: _Samples,
+    nodes: Sequence[Nodes],
+    bench: Workbench,
     fit: LawFit,
-) -> tuple[_Samples, Sequence[Nodes], Workbench, LawFit]:  # fmt: skip
+) -> tuple[_Samples, Sequence[Nodes], Workbench, LawFit]:
     """The same, with measured velocities as further channels where they agree with the law."""
     recording, scales = samples.recording, samples.scales
     used = tuple(name for name, one in measured.items() if one.used)
@@ -421,7 +477,14 @@ def _map(record: Record, best: InUse, angles: tuple[int, ...]) -> SymplecticMap:
     inputs = np.concatenate([n.stretch.u[n.at] for n in record.nodes]) if names else None
     sensors = best.calibration.law.sensors
     map_ = map_of_law(
-        smoothed(best.moving, sensors.creep), z, record.scales.dt, angles=angles, signals=signals,
-        inputs=inputs, parameters=parameters, args=record.args, root=best.root,
-    )  # fmt: skip
+        smoothed(best.moving, sensors.creep),
+        z,
+        record.scales.dt,
+        angles=angles,
+        signals=signals,
+        inputs=inputs,
+        parameters=parameters,
+        args=record.args,
+        root=best.root,
+    )
     return dataclasses.replace(map_, sensors=sensors)

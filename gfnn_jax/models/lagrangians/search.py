@@ -95,10 +95,14 @@ def search(
 
 
 def search_on(
-    acting: Acting, nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...],
-    num_inputs: int, on_progress: Callable[[str], object] = lambda line: None,
+    acting: Acting,
+    nodes: Sequence[Nodes],
+    scales: Scales,
+    angles: tuple[int, ...],
+    num_inputs: int,
+    on_progress: Callable[[str], object] = lambda line: None,
     options: SearchOptions = SearchOptions(),
-) -> Found:  # fmt: skip
+) -> Found:
     """The law that a search comes to from one that was found, with its inputs as they are found to
     act and arcs of a period."""
     fit, bench = acting.fit, acting.bench
@@ -110,10 +114,15 @@ def search_on(
 
 
 def _along_longer_arcs(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, lengths: Sequence[float],
-    every: Structure, scales: Scales, on_progress: Callable[[str], object],
+    bench: Workbench,
+    nodes: Sequence[Nodes],
+    fit: LawFit,
+    lengths: Sequence[float],
+    every: Structure,
+    scales: Scales,
+    on_progress: Callable[[str], object],
     options: SearchOptions,
-) -> Found:  # fmt: skip
+) -> Found:
     """The law that a fit comes to by arcs of these lengths, in periods."""
     frictions = dataclasses.replace(every, terms=every.terms[:1])
     reached = [(nodes, fit)]
@@ -139,22 +148,31 @@ def _along_longer_arcs(
 
 def everything(
     angles: tuple[int, ...], num_inputs: int, observation: Observation, options: SearchOptions
-) -> Structure:  # fmt: skip
+) -> Structure:
     """All terms and frictions that a search may come to."""
     d, shifted = observation.dim, observation.shifts()
     rows = (*libraries.first(d, angles), *libraries.more(d, angles))
     turned = tuple(i for i in angles if i in observation.direct and i not in shifted)
     sensors = tuple(zip(observation.parameters, map(float, observation.values), strict=True))
     return Structure(
-        d, libraries.without_forces(rows, shifted), frictions_tried(d, options), turned,
-        num_inputs, sensors,
-    )  # fmt: skip
+        d,
+        libraries.without_forces(rows, shifted),
+        frictions_tried(d, options),
+        turned,
+        num_inputs,
+        sensors,
+    )
 
 
 def finished(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, every: Structure, scales: Scales,
-    on_progress: Callable, options: SearchOptions,
-) -> Found:  # fmt: skip
+    bench: Workbench,
+    nodes: Sequence[Nodes],
+    fit: LawFit,
+    every: Structure,
+    scales: Scales,
+    on_progress: Callable,
+    options: SearchOptions,
+) -> Found:
     """The law that a fit to the longest arcs comes to: its friction chosen, terms dropped and
     added."""
 
@@ -168,11 +186,15 @@ def finished(
 
 
 def by_arcs_that_tell(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit,
+    bench: Workbench,
+    nodes: Sequence[Nodes],
+    fit: LawFit,
     choose: Callable[[Workbench, Sequence[Nodes], LawFit], tuple[LawFit, FrictionChoice]],
     settled: Callable[[Workbench, Sequence[Nodes], LawFit, FrictionChoice], Found],
-    scales: Scales, on_progress: Callable, options: SearchOptions,
-) -> Found:  # fmt: skip
+    scales: Scales,
+    on_progress: Callable,
+    options: SearchOptions,
+) -> Found:
     """The law of a fit to the longest arcs, by steps that are short enough, with the friction that
     is to ``choose``, as it is ``settled``; and, where shorter arcs tell its coefficients better,
     that of these."""
@@ -191,9 +213,15 @@ def by_arcs_that_tell(
 
 
 def _settled(
-    every: Structure, dt: float, on_progress: Callable[[str], object], options: SearchOptions,
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, choice: FrictionChoice,
-) -> Found:  # fmt: skip
+    every: Structure,
+    dt: float,
+    on_progress: Callable[[str], object],
+    options: SearchOptions,
+    bench: Workbench,
+    nodes: Sequence[Nodes],
+    fit: LawFit,
+    choice: FrictionChoice,
+) -> Found:
     """The law by arcs as long as those of the fit: terms that they do not tell are dropped, and
     others of ``every`` tried."""
     terms = dataclasses.replace(every, friction=())
@@ -215,9 +243,12 @@ def as_found(
 
 
 def telling_more(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, lengths: Sequence[int],
+    bench: Workbench,
+    nodes: Sequence[Nodes],
+    fit: LawFit,
+    lengths: Sequence[int],
     options: SearchOptions,
-) -> LawFit | None:  # fmt: skip
+) -> LawFit | None:
     """The fit to arcs of the one of these ``lengths`` (nodes) that tells the coefficients best,
     longer ones first as long as shorter ones tell more. None where the standard errors, in the
     geometric mean, are not much smaller than those of ``fit``: longer arcs are a longer lever, but
@@ -243,9 +274,13 @@ def _errors(fit: LawFit) -> float:
 
 
 def arcs_by_length(
-    bench: Workbench, nodes: Sequence[Nodes], structure: Structure, known: Mapping[Key, float],
-    scales: Scales, options: SearchOptions,
-) -> tuple[LawFit, list[Nodes]]:  # fmt: skip
+    bench: Workbench,
+    nodes: Sequence[Nodes],
+    structure: Structure,
+    known: Mapping[Key, float],
+    scales: Scales,
+    options: SearchOptions,
+) -> tuple[LawFit, list[Nodes]]:
     """A structure fitted to arcs of growing length, and the nodes with its states."""
     fit, sigma, nodes = None, scales.sigma, list(nodes)
     for periods in options.periods:
@@ -276,9 +311,13 @@ def _word(bench: Workbench, key: Key) -> str:
 
 
 def prune(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, on_progress: Callable,
-    options: SearchOptions, friction: bool = True,
-) -> LawFit:  # fmt: skip
+    bench: Workbench,
+    nodes: Sequence[Nodes],
+    fit: LawFit,
+    on_progress: Callable,
+    options: SearchOptions,
+    friction: bool = True,
+) -> LawFit:
     """The fit without terms that are not seen, the least seen first, as long as held-out arcs do
     not lose; and, unless ``friction`` has been chosen, without that which would drive. First, of
     terms that the record tells only together, without one."""
@@ -359,9 +398,13 @@ def gains(costs: np.ndarray, others: np.ndarray, share: float) -> bool:
 
 
 def grow(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, every: Structure, on_progress: Callable,
+    bench: Workbench,
+    nodes: Sequence[Nodes],
+    fit: LawFit,
+    every: Structure,
+    on_progress: Callable,
     options: SearchOptions,
-) -> LawFit:  # fmt: skip
+) -> LawFit:
     """The fit with terms that the residuals ask for, each kept where held-out arcs gain."""
     refused: set[Key] = set()
     costs = None
@@ -391,9 +434,13 @@ def grow(
 
 
 def choose_friction(
-    bench: Workbench, nodes: Sequence[Nodes], fit: LawFit, candidates: Sequence[Loss],
-    on_progress: Callable, options: SearchOptions,
-) -> tuple[LawFit, FrictionChoice]:  # fmt: skip
+    bench: Workbench,
+    nodes: Sequence[Nodes],
+    fit: LawFit,
+    candidates: Sequence[Loss],
+    on_progress: Callable,
+    options: SearchOptions,
+) -> tuple[LawFit, FrictionChoice]:
     """The fit with the friction that held-out arcs choose, and how sure that is. Arcs are as long
     as those of the fit, or as long as three of them can be. A choice holds close to its fit, so
     that it is made again until it stands; where none has stood when the third is looked at, the
@@ -426,9 +473,7 @@ def choose_friction(
     return fit, choice._replace(rows=fit.structure.friction)
 
 
-def _without_drives(
-    bench: Workbench, fit: LawFit, on_progress: Callable[[str], object]
-) -> LawFit:  # fmt: skip
+def _without_drives(bench: Workbench, fit: LawFit, on_progress: Callable[[str], object]) -> LawFit:
     """The fit without friction whose coefficient has fallen below zero by other arcs than those
     that chose it, the farthest below first: friction does not drive."""
     while np.isfinite(fit.fitted.cost):

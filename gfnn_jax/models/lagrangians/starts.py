@@ -46,18 +46,24 @@ def no_law(scales: Scales) -> FitError:
 
 
 def best_start(
-    nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
-    benches: Mapping[str, Workbench], observation: Observation, periods: float,
+    nodes: Sequence[Nodes],
+    scales: Scales,
+    angles: tuple[int, ...],
+    num_inputs: int,
+    benches: Mapping[str, Workbench],
+    observation: Observation,
+    periods: float,
     on_progress: Callable[[str], object],
-) -> tuple[Workbench, LawFit]:  # fmt: skip
+) -> tuple[Workbench, LawFit]:
     """The start that leaves least of arcs of so many ``periods``, or of those that leave about as
     much the plainest; on the bench (hold -> it) of the rule by which inputs act.
 
     Raises FitError where there is none.
     """
-    d, some = observation.dim, _Starts(
-        nodes, scales, angles, num_inputs, benches, observation, periods, on_progress
-    )  # fmt: skip
+    d, some = (
+        observation.dim,
+        _Starts(nodes, scales, angles, num_inputs, benches, observation, periods, on_progress),
+    )
     plain = [some.add(libraries.textbook(d, angles))]
     if d > 1 and len(angles) == d:
         plain.append(some.add(libraries.relative(d, angles)))
@@ -72,9 +78,10 @@ def best_start(
         raise no_law(scales)
     best = min(map(some.misfit, some.fits))
     simple = [
-        fit for fit in some.fits
+        fit
+        for fit in some.fits
         if fit.structure.terms in plain and some.misfit(fit) <= _PLAIN_IS_ENOUGH * best
-    ]  # fmt: skip
+    ]
     (bench,) = some.benches.values()
     return bench, min(simple or some.fits, key=some.misfit)
 
@@ -84,10 +91,16 @@ class _Starts:
     one that was chosen."""
 
     def __init__(
-        self, nodes: Sequence[Nodes], scales: Scales, angles: tuple[int, ...], num_inputs: int,
-        benches: Mapping[str, Workbench], observation: Observation, periods: float,
+        self,
+        nodes: Sequence[Nodes],
+        scales: Scales,
+        angles: tuple[int, ...],
+        num_inputs: int,
+        benches: Mapping[str, Workbench],
+        observation: Observation,
+        periods: float,
         on_progress: Callable[[str], object],
-    ):  # fmt: skip
+    ):
         self.nodes, self.scales, self.benches, self.fits = nodes, scales, benches, []
         self.num_inputs, self.periods, self.on_progress = num_inputs, periods, on_progress
         self.dim, self.shifted = observation.dim, observation.shifts()
@@ -125,9 +138,14 @@ class _Starts:
             return structure.terms
         length = max(6, round(self.periods * self.scales.per_period))
         rule = choose_rule(
-            self.benches, self.nodes, structure, known, arcs_of(self.nodes, length),
-            self.scales.sigma, self.scales.dt,
-        )  # fmt: skip
+            self.benches,
+            self.nodes,
+            structure,
+            known,
+            arcs_of(self.nodes, length),
+            self.scales.sigma,
+            self.scales.dt,
+        )
         self.benches = {rule.hold: rule.bench}  # inputs act so in the other libraries too
         self.fits.append(rule.fit)
         self.on_progress(f"{self.periods:g} periods: {describe(rule.fit)}")

@@ -24,8 +24,14 @@ from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, losses
 from gfnn_jax.models.lagrangians.structure import powers_of
 
 _GREEK = {
-    "theta": "θ", "phi": "φ", "psi": "ψ", "alpha": "α", "beta": "β", "gamma": "γ", "omega": "ω",
-}  # fmt: skip
+    "theta": "θ",
+    "phi": "φ",
+    "psi": "ψ",
+    "alpha": "α",
+    "beta": "β",
+    "gamma": "γ",
+    "omega": "ω",
+}
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -62,9 +68,12 @@ class Expression:
 
 
 def terms_of(
-    terms: Terms, coefficients: np.ndarray, std: np.ndarray, names: Sequence[str],
+    terms: Terms,
+    coefficients: np.ndarray,
+    std: np.ndarray,
+    names: Sequence[str],
     speeds: Sequence[str],
-) -> Expression:  # fmt: skip
+) -> Expression:
     """Terms of Σ θ_j ℓ_j; a phase other than that of a cosine or a sine stays in the argument."""
     listed = []
     for (k, n, m, phase), c, s in zip(terms.rows(), coefficients, std, strict=True):
@@ -121,9 +130,11 @@ def _with_powers(term: str, powers: Sequence[int], parameters: Sequence[str]) ->
 
 
 def word_of(
-    key: tuple[Any, ...], names: Sequence[str], speeds: Sequence[str],
+    key: tuple[Any, ...],
+    names: Sequence[str],
+    speeds: Sequence[str],
     parameters: Sequence[str] = (),
-) -> str:  # fmt: skip
+) -> str:
     """A coefficient of a structure, by its term."""
     kind, *rest = key
     one, none = np.ones(1), np.zeros(1)

@@ -16,9 +16,13 @@ from gfnn_jax.models.lagrangians.residuals import Trace
 
 
 def traces_of(
-    recording: Recording, channels: tuple[str, ...], fit: LawFit, law: Lagrangian,
-    nodes: Sequence[Nodes], inputs: ArcInputs,
-) -> tuple[Trace, ...]:  # fmt: skip
+    recording: Recording,
+    channels: tuple[str, ...],
+    fit: LawFit,
+    law: Lagrangian,
+    nodes: Sequence[Nodes],
+    inputs: ArcInputs,
+) -> tuple[Trace, ...]:
     """The arcs of a fit, channels in the file's units. An input supplies the mean of its force over
     a step times the way; friction takes the mean of its power at the ends."""
     arcs, found, d = fit.arcs, [], fit.form.dim
@@ -35,11 +39,17 @@ def traces_of(
         supplied = acting[k, : n - 1] * (np.diff(q, axis=0) @ law.gains)
         found.append(
             Trace(
-                stretch.run, t, y / factors, (y - left[k, :n]) / factors,
-                fit.fitted.residuals[k, :n], stretch.u[nodes[i].at[a:b]], own.energy(q, v),
-                _summed(lost), _summed(supplied),
+                stretch.run,
+                t,
+                y / factors,
+                (y - left[k, :n]) / factors,
+                fit.fitted.residuals[k, :n],
+                stretch.u[nodes[i].at[a:b]],
+                own.energy(q, v),
+                _summed(lost),
+                _summed(supplied),
             )
-        )  # fmt: skip
+        )
     return tuple(found)
 
 

@@ -100,9 +100,13 @@ def velocities(recording: Recording, fit: LawFit, nodes: Sequence[Nodes]) -> dic
         white = _colour(left) < max(_COLOURED, chance) and not _copied(recording, i, name)
         allowed = max(_WRONG, chance * np.sqrt(3 * tau))
         found[name] = Velocity(
-            (1 + float(beta[0]), float(error[0])), (-float(beta[1]), float(error[1])),
-            (float(beta[2]), float(error[2])), sigma, bool(white), bool(white and share < allowed),
-        )  # fmt: skip
+            (1 + float(beta[0]), float(error[0])),
+            (-float(beta[1]), float(error[1])),
+            (float(beta[2]), float(error[2])),
+            sigma,
+            bool(white),
+            bool(white and share < allowed),
+        )
     return found
 
 
@@ -152,9 +156,7 @@ def _column(recording: Recording, s: Stretch, name: str, which: int = 0) -> np.n
     return channels_of(recording, [name], s.run)[which][at]
 
 
-def _at_nodes(
-    arcs: Arcs, nodes: Sequence[Nodes], columns: Sequence[np.ndarray]
-) -> np.ndarray:  # fmt: skip
+def _at_nodes(arcs: Arcs, nodes: Sequence[Nodes], columns: Sequence[np.ndarray]) -> np.ndarray:
     """(A, L, k) of columns (n, k) of each node's stretch, as `arcs_of` lays nodes out."""
     length, found = arcs.t.shape[1], []
     for i, a, b in arcs.home:

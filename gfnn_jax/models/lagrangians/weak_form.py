@@ -18,9 +18,14 @@ _SPACING = 0.25  # of a window's length, from one window to the next
 
 
 def weak_rows(
-    form: Form, t: np.ndarray, q: np.ndarray, v: np.ndarray, u: np.ndarray, length: float,
+    form: Form,
+    t: np.ndarray,
+    q: np.ndarray,
+    v: np.ndarray,
+    u: np.ndarray,
+    length: float,
     args: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Rows (windows, d, count) of the coefficients, and what the fixed part of the law gives
     (windows, d); their sum with the coefficients is zero for the law. Along one stretch: t (n,),
     q and v (n, d), u (n, inputs); ``length`` of the windows in units of t; args (k,) the parameters

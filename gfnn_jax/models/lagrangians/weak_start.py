@@ -77,9 +77,12 @@ def weak_start(
 
 
 def zeros_of_angles(
-    terms: Sequence[Row], friction: Sequence[Loss], num_inputs: int, nodes: Sequence[Nodes],
+    terms: Sequence[Row],
+    friction: Sequence[Loss],
+    num_inputs: int,
+    nodes: Sequence[Nodes],
     scales: Scales,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Zeros (d,) of angles, up to a quarter of a turn, from which their own potentials cos q_i have
     no sine; 0 of coordinates without.
 

@@ -24,9 +24,15 @@ _JITTER = 0.05  # of the spread of what they visit: orbits are thin, a map has t
 
 
 def drawn(
-    flow: Flow, coordinates: Coordinates, states, dt: float, *, region=None,
-    num_pairs: int = NUM_PAIRS, seed: int = 0,
-) -> Pairs:  # fmt: skip
+    flow: Flow,
+    coordinates: Coordinates,
+    states,
+    dt: float,
+    *,
+    region=None,
+    num_pairs: int = NUM_PAIRS,
+    seed: int = 0,
+) -> Pairs:
     """Pairs a time ``dt`` apart, in the user's coordinates.
 
     flow: the law, in the inner ``coordinates``. states: (N, 2d) of the user, around which pairs are

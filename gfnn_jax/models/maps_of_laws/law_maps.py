@@ -46,9 +46,16 @@ def more_pairs_would_help(sweeps, found: Found, bound: Tolerance, dearest: float
 
 
 def search_of_law(
-    law: LearnedHamiltonian, data: Dataset, tolerance: Tolerance, scene: Scene | None,
-    dearest: float, budget: Budget, on_progress, on_candidate, seed: int,
-) -> LawMaps | None:  # fmt: skip
+    law: LearnedHamiltonian,
+    data: Dataset,
+    tolerance: Tolerance,
+    scene: Scene | None,
+    dearest: float,
+    budget: Budget,
+    on_progress,
+    on_candidate,
+    seed: int,
+) -> LawMaps | None:
     """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's validation
     rows; None where none of them meets the tolerance, or no chart covers the drawn pairs."""
     try:
@@ -85,9 +92,16 @@ def law_explains_most(
 
 
 def search_around(
-    law: LearnedHamiltonian, data: Dataset, tolerance: Tolerance, scene: Scene | None,
-    budget: Budget, on_progress, on_candidate, better, seed: int,
-) -> LawMaps | None:  # fmt: skip
+    law: LearnedHamiltonian,
+    data: Dataset,
+    tolerance: Tolerance,
+    scene: Scene | None,
+    budget: Budget,
+    on_progress,
+    on_candidate,
+    better,
+    seed: int,
+) -> LawMaps | None:
     """Maps of a law's flow Φ and of S, which learns what Φ leaves over: of the whole law, then of
     its strongest terms, which leave more over but smoother. None where Φ has no image of some of
     the states, or no chart covers what is left."""
@@ -124,9 +138,16 @@ def _work(law: LearnedHamiltonian, states: int) -> float:
 
 
 def _around(
-    flow: Flow, diagnosis, data: Dataset, tolerance: Tolerance, scene: Scene | None,
-    budget: Budget, on_progress, on_candidate, better,
-) -> LawMaps:  # fmt: skip
+    flow: Flow,
+    diagnosis,
+    data: Dataset,
+    tolerance: Tolerance,
+    scene: Scene | None,
+    budget: Budget,
+    on_progress,
+    on_candidate,
+    better,
+) -> LawMaps:
     """The search for S around one flow, whose operations are added to every candidate's."""
     more = flow_operations(flow, data)
     sweeps = list(sweeps_for("auto", diagnosis.charts.charts, diagnosis.data, tolerance, scene))
@@ -135,9 +156,10 @@ def _around(
 
     def dearer(entry: Entry) -> Entry:
         candidate = dataclasses.replace(
-            entry.candidate, operations=entry.candidate.operations + more,
+            entry.candidate,
+            operations=entry.candidate.operations + more,
             label=f"{entry.candidate.label} around H",
-        )  # fmt: skip
+        )
         return entry._replace(candidate=candidate)
 
     entries, ranking = ([dearer(e) for e in part] for part in (found.entries, found.ranking))

@@ -55,10 +55,8 @@ def arcs_of(triples: Triples) -> np.ndarray:
     used = [np.sum(sizes // (nodes + 1)) * (nodes - 1) for nodes in range(2, longest + 1)]
     span = 3 + int(np.argmax(used))
     cut = [
-        s[first : first + span]
-        for s in stretches
-        for first in range(0, len(s) - span + 1, span)
-    ]  # fmt: skip
+        s[first : first + span] for s in stretches for first in range(0, len(s) - span + 1, span)
+    ]
     most = max(span, min(_MOST_NODES, int(_MOST_NUMBERS / (2 * triples.dim) ** 2)))
     return np.array(cut[:: -(-len(cut) * span // most)])
 

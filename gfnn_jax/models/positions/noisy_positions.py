@@ -39,9 +39,12 @@ class Latent(NamedTuple):
 
 
 def without_noise(
-    families: Iterable[Any], training: Triples, held_out: Triples, budget: Budget,
+    families: Iterable[Any],
+    training: Triples,
+    held_out: Triples,
+    budget: Budget,
     on_progress: Callable[[str], Any],
-) -> Latent | None:  # fmt: skip
+) -> Latent | None:
     """The S that readings with noise tell; None where latent positions explain arcs that were held
     out no better than least squares, or time ends before the first size."""
     arcs, held_out_arcs = arcs_of(training), arcs_of(held_out)

@@ -47,7 +47,7 @@ def images_of(piece: Generated, triples: Triples) -> np.ndarray:
 
 def map_of(
     piece: Generated, root: np.ndarray, sensors: Sensors, triples: Triples, sites: Sites | None
-) -> tuple[SymplecticMap, Pairs]:  # fmt: skip
+) -> tuple[SymplecticMap, Pairs]:
     """The map of this S, and its states at q₋ and at q, as pairs.
 
     root: (k, m), rootᵀ root the covariance of its coefficients.
@@ -70,9 +70,13 @@ def map_of(
         fitted = fit_predictors(TYPE1, before, middle, triples.dt, angles=tuple(angles))
         piece = dataclasses.replace(piece, predictor=affordable(fitted, piece.family).predictor)
     map_ = SymplecticMap(
-        pieces=(piece,), coordinates=Coordinates("positions", tuple(angles)),
-        domain=domain, scale=sizes(before), angle_centre=np.array(centres), dt=triples.dt,
-    )  # fmt: skip
+        pieces=(piece,),
+        coordinates=Coordinates("positions", tuple(angles)),
+        domain=domain,
+        scale=sizes(before),
+        angle_centre=np.array(centres),
+        dt=triples.dt,
+    )
     map_ = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
     map_ = dataclasses.replace(map_, posterior=Posterior(0, factor * root), sensors=sensors)
     return map_, Pairs(before, middle, triples.dt)

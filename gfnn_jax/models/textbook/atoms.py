@@ -41,8 +41,12 @@ _MOST_MONOMIALS = 500  # of the dictionary
 _CENTRES = {2: 15, 3: 9}  # tried along each axis, of the plane and of space
 _WIDER = 1.2  # times the box of the positions: where centres are tried
 _CENTRAL = (  # shapes of the distance from a centre
-    ("power", -1.0), ("power", -2.0), ("power", -3.0), ("power", 1.0), ("log", 0.0),
-)  # fmt: skip
+    ("power", -1.0),
+    ("power", -2.0),
+    ("power", -3.0),
+    ("power", 1.0),
+    ("log", 0.0),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,10 +153,16 @@ class _Singles(NamedTuple):
 
 
 def dictionary_of(
-    arguments: Sequence[Argument], weight: np.ndarray, base: np.ndarray, *, degree: int,
-    products: bool = False, centres: bool = False, average: Average = np.asarray,
+    arguments: Sequence[Argument],
+    weight: np.ndarray,
+    base: np.ndarray,
+    *,
+    degree: int,
+    products: bool = False,
+    centres: bool = False,
+    average: Average = np.asarray,
     allowed: Callable[[Atom], bool] | None = None,
-) -> Dictionary:  # fmt: skip
+) -> Dictionary:
     """The atoms that are tried. weight (2d,), or of each row: by which gradients are multiplied.
     base: orthonormal columns (rows, n), beside which atoms are looked for.
 

@@ -33,19 +33,23 @@ class Invariance:
     """
 
     def __init__(
-        self, symmetries: Sequence[SymmetryOfPairs], z: np.ndarray, arguments: list[Argument],
-        angles: tuple[int, ...], cyclic: tuple[int, ...],
-    ):  # fmt: skip
+        self,
+        symmetries: Sequence[SymmetryOfPairs],
+        z: np.ndarray,
+        arguments: list[Argument],
+        angles: tuple[int, ...],
+        cyclic: tuple[int, ...],
+    ):
         dim, left = z.shape[1] // 2, {s.text: s.left for s in symmetries}
         self._z = z
         self._generators = [
-            matrix for text, matrix in generators(dim, angles)
-            if left.get(text, np.inf) <= CERTAIN
-        ]  # fmt: skip
+            matrix for text, matrix in generators(dim, angles) if left.get(text, np.inf) <= CERTAIN
+        ]
         self._reflections = [
-            matrix for text, matrix in reflections(dim, angles)
+            matrix
+            for text, matrix in reflections(dim, angles)
             if self._generators and text in left and not np.any(matrix - np.diag(np.diag(matrix)))
-        ]  # fmt: skip
+        ]
         still = np.ones(len(arguments), bool)
         for generator in self._generators:
             moved = self._moved(generator)

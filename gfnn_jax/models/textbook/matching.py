@@ -69,9 +69,14 @@ class Matching:
     """
 
     def __init__(
-        self, base: np.ndarray, target: np.ndarray, weight: np.ndarray, arguments: list[Argument],
-        penalty: float = PENALTY, average: Average = np.asarray,
-    ):  # fmt: skip
+        self,
+        base: np.ndarray,
+        target: np.ndarray,
+        weight: np.ndarray,
+        arguments: list[Argument],
+        penalty: float = PENALTY,
+        average: Average = np.asarray,
+    ):
         self.weight, self.arguments, self._penalty, self._average = (
             weight,
             arguments,
@@ -148,9 +153,10 @@ class Matching:
         others = match.atoms[:i] + match.atoms[i + 1 :]
         places = [f.place for f in match.atoms[i]]
         own = [
-            j for j, a in enumerate(dictionary.atoms)
+            j
+            for j, a in enumerate(dictionary.atoms)
             if [f.place for f in a] == places and allowed(a)
-        ]  # fmt: skip
+        ]
         residual, basis, *_ = self._residual(others)
         if not own or not np.isfinite(residual).all():
             return []

@@ -135,9 +135,13 @@ class NoisyTextbook:
     """The search among the windows of noisy sequences. angles, cyclic: indices of z."""
 
     def __init__(
-        self, weak: WeakGradients, *, angles: Sequence[int] = (), cyclic: Sequence[int] = (),
+        self,
+        weak: WeakGradients,
+        *,
+        angles: Sequence[int] = (),
+        cyclic: Sequence[int] = (),
         on_progress: Callable[[str], Any] = lambda message: None,
-    ):  # fmt: skip
+    ):
         self._weak, self._on_progress = weak, on_progress
         self._dim = dim = weak.states.shape[1] // 2
         self._arguments = arguments_of(weak.states, tuple(angles), tuple(cyclic))
@@ -187,9 +191,13 @@ class NoisyTextbook:
 
     def _matches(self, products: bool) -> list[Match]:
         dictionary = dictionary_of(
-            self._arguments, self._weight, self._spanned, degree=self._degree, products=products,
+            self._arguments,
+            self._weight,
+            self._spanned,
+            degree=self._degree,
+            products=products,
             average=self._weak.average,
-        )  # fmt: skip
+        )
         self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
         penalty = OPTIONS.penalty / (len(self._target) * np.log(2))
         matching = Matching(
@@ -231,9 +239,14 @@ class NoisyTextbook:
             plain = joined(plain, Terms(self._dim, names, tuple(dict.fromkeys(rows))))
         atoms = tuple(others)
         whole = Formula(
-            plain, atoms, self._arguments, np.zeros(0), np.inf, len(self._target),
+            plain,
+            atoms,
+            self._arguments,
+            np.zeros(0),
+            np.inf,
+            len(self._target),
             complexity_of_law(plain, atoms),
-        )  # fmt: skip
+        )
         columns = self._columns(whole.family(whole.constants))
         kept = np.arange(columns.shape[1])
         while True:

@@ -109,11 +109,15 @@ class Textbook:
     """
 
     def __init__(
-        self, problem: Problem, rows: np.ndarray, *, angles: Sequence[int] = (),
+        self,
+        problem: Problem,
+        rows: np.ndarray,
+        *,
+        angles: Sequence[int] = (),
         cyclic: Sequence[int] = (),
         on_progress: Callable[[str], Any] = lambda message: None,
         symmetries: Sequence[SymmetryOfPairs] = (),
-    ):  # fmt: skip
+    ):
         dim = problem.z0.shape[1] // 2
         if dim > OPTIONS.most_dim:
             raise ValueError(f"expected at most {OPTIONS.most_dim} degrees of freedom, got {dim}")
@@ -177,9 +181,14 @@ class Textbook:
 
     def _dictionary(self, products: bool = False, centres: bool = False) -> Dictionary:
         return dictionary_of(
-            self._arguments, self._weight, self._spanned, degree=self._degree, products=products,
-            centres=centres, allowed=self._invariance.of_atom if self._invariance else None,
-        )  # fmt: skip
+            self._arguments,
+            self._weight,
+            self._spanned,
+            degree=self._degree,
+            products=products,
+            centres=centres,
+            allowed=self._invariance.of_atom if self._invariance else None,
+        )
 
     def _allowed(self, blocks: list[tuple[Atom, ...]]) -> list[tuple[Atom, ...]]:
         """The atoms of these that have the symmetries."""
@@ -193,9 +202,11 @@ class Textbook:
         return Matching(self._spanned, flat, self._weight, self._arguments)
 
     def _found(
-        self, dictionary: Dictionary, blocks: list[tuple[Atom, ...]],
+        self,
+        dictionary: Dictionary,
+        blocks: list[tuple[Atom, ...]],
         starts: list[tuple[Atom, ...]],
-    ) -> _State | None:  # fmt: skip
+    ) -> _State | None:
         """The simplest law of these atoms that is exact. blocks: of atoms that laws have together,
         tried as a whole; starts: others, beside which the search looks for more."""
         if self._closest is not None and self._explains_nothing(self._closest, dictionary):
@@ -233,9 +244,7 @@ class Textbook:
     def _is_exact(self, state: _State) -> bool:
         """Return whether the law is as exact as no approximation of so many numbers would be."""
         width = 2 * self._dim
-        others = [
-            a for a in state.match.atoms if powers_of(a, self._arguments, width) is None
-        ]  # fmt: skip
+        others = [a for a in state.match.atoms if powers_of(a, self._arguments, width) is None]
         if not others:
             return state.law.left <= OPTIONS.roundoff
         numbers = len(state.match.atoms) + sum(len(constants_of(a)) for a in others)
@@ -319,9 +328,10 @@ class Textbook:
         matching = self._matching(state.target)
         bound = 3 * max(state.law.left, OPTIONS.roundoff)
         simpler = [
-            m for m in matching.best(dictionary, min(3, len(state.match.atoms)))
+            m
+            for m in matching.best(dictionary, min(3, len(state.match.atoms)))
             if m.left <= _AS_WELL * max(state.match.left, _MATCHED)
-        ]  # fmt: skip
+        ]
         for match in sorted(simpler, key=lambda m: complexity_of(m.atoms)):
             if complexity_of(match.atoms) >= complexity_of(state.match.atoms):
                 break

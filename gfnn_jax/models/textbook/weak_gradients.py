@@ -93,9 +93,13 @@ def weak_gradients(
     rate = np.einsum("w,rwi->ri", slope, whole[own])
     deviation = np.roll(noise, len(noise) // 2) * np.linalg.norm(slope)
     return WeakGradients(
-        np.concatenate(states)[used], np.concatenate(noises)[used], -apply_j(rate), deviation,
-        place.reshape(own.shape), bump,
-    )  # fmt: skip
+        np.concatenate(states)[used],
+        np.concatenate(noises)[used],
+        -apply_j(rate),
+        deviation,
+        place.reshape(own.shape),
+        bump,
+    )
 
 
 def _followed(windows: np.ndarray, noise: np.ndarray) -> np.ndarray:
