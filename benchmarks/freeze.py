@@ -204,7 +204,9 @@ def fits_of_pairs() -> Fits:
         "two bodies": lambda: fit_(orbits_of_two_bodies(300, 0.2), tolerance=1e-6),
         "morse, textbook": lambda: fit_(two(morse, 2, 120, 0.3, size=0.2), tolerance=1e-10),
         "morse, noise": lambda: fit_(noisy(morse, 2, 12, 0.3, 30, 1e-3), tolerance=1e-3),
-        "standard map": lambda: fit_(gfnn.Pairs(*kicked(200), 1.0), tolerance=1e-10, angles=(0, 1)),
+        "standard map": lambda: fit_(
+            gfnn.Pairs(kicked(200)[0], kicked(200)[1], 1.0), tolerance=1e-10, angles=(0, 1)
+        ),
         "driven pendulum": lambda: fit_(driven(), tolerance=1e-4),
         "ring of springs": lambda: fit_(
             two(springs, 24, 12, 0.1, size=0.5), structure="ring", tolerance=1e-12
@@ -267,7 +269,7 @@ def fits_of_recordings() -> Fits:
         )
         return found.slice(stop=stop)
 
-    theta = {"angles": ["theta"]}
+    theta: dict[str, Any] = {"angles": ["theta"]}
     one = [(1.2, 0.0)]
     lengths = (0.5, 1.0, 2.0)
 
@@ -421,7 +423,7 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> tuple[str, list[str
 
 def main() -> int:
     """Run the fits; write or compare their numbers."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, help="file that the numbers are written to")
     parser.add_argument("--against", type=Path, help="file of the old commit")
     parser.add_argument("--only", help="fits whose name has this in it; several with commas")

@@ -253,7 +253,7 @@ def by_hand(system: System, arcs: Arcs, quick: bool) -> tuple[Acceleration, Any]
     jacobian = jax.jit(jax.jacfwd(residual))
     start = np.concatenate([_constants(system, arcs), arcs.x0.ravel()])
     found = least_squares(
-        residual,
+        residual,  # pyright: ignore[reportArgumentType]
         start,
         jac=lambda x: np.asarray(jacobian(x)),
         x_scale="jac",

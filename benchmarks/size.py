@@ -59,7 +59,9 @@ def constants(tree: ast.Module) -> Iterator[str]:
 def docstrings(tree: ast.Module) -> Iterator[ast.Expr]:
     """The docstring of each module, class and function that has one."""
     for node in ast.walk(tree):
-        if isinstance(node, (ast.Module, ast.ClassDef, Function)) and ast.get_docstring(node):
+        if isinstance(
+            node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+        ) and ast.get_docstring(node):
             first = node.body[0]
             assert isinstance(first, ast.Expr)
             yield first
@@ -126,7 +128,7 @@ def measure(package: Path = PACKAGE) -> dict:
 
 def main() -> None:
     """Print the size of the package."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--listed", action="store_true", help="name functions and constants")
     asked = parser.parse_args()
