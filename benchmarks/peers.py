@@ -253,9 +253,9 @@ def by_hand(system: System, arcs: Arcs, quick: bool) -> tuple[Acceleration, Any]
     jacobian = jax.jit(jax.jacfwd(residual))
     start = np.concatenate([_constants(system, arcs), arcs.x0.ravel()])
     found = least_squares(
-        residual,  # pyright: ignore[reportArgumentType]
+        residual,
         start,
-        jac=lambda x: np.asarray(jacobian(x)),
+        jac=lambda x: np.asarray(jacobian(x)),  # pyright: ignore[reportArgumentType]
         x_scale="jac",
         loss="soft_l1",  # pyright: ignore[reportArgumentType]
         f_scale=0.01,
