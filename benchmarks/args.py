@@ -24,13 +24,7 @@ from harness import SEED, TABLES, Numbers, between_markers, main, markdown, numb
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import Coordinates
-from gfnn_jax.scenes import (
-    DrawnFrom,
-    Scene,
-    driven_pendulum_phase,
-    henon_heiles,
-    pendulum_length,
-)
+from gfnn_jax.scenes import DrawnFrom, Scene, driven_pendulum_phase, henon_heiles, pendulum_length
 from gfnn_jax.scenes.draws import sample_params, sample_t0
 
 STEPS, ORBITS, BATCH = 1_000, 100, 1_000

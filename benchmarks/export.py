@@ -58,10 +58,7 @@ SCENES: dict[str, tuple[Callable[[], Scene], dict]] = {
     "section": (henon_heiles_section, {}),
     "pendulum-1": (functools.partial(driven_pendulum, 1), {}),
     "henon-heiles": (functools.partial(henon_heiles, energy=1 / 12), {}),
-    "henon-heiles-law": (
-        functools.partial(henon_heiles, energy=1 / 12),
-        {"learn": "hamiltonian"},
-    ),
+    "henon-heiles-law": (functools.partial(henon_heiles, energy=1 / 12), {"learn": "hamiltonian"}),
 }
 
 

@@ -17,16 +17,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 # Sets float64, so it comes before all of JAX.
-from harness import (
-    FIGURES,
-    TABLES,
-    Numbers,
-    between_markers,
-    markdown,
-    number,
-    provenance,
-    results,
-)
+from harness import FIGURES, TABLES, Numbers, between_markers, markdown, number, provenance, results
 from harness import main as run_pieces
 
 # isort: split

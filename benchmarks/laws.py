@@ -560,11 +560,7 @@ def tables() -> None:
                 lost(m),
                 *(
                     number(m.get(key))
-                    for key in (
-                        "fit_seconds",
-                        "microseconds_per_step",
-                        "symplecticity_defect",
-                    )
+                    for key in ("fit_seconds", "microseconds_per_step", "symplecticity_defect")
                 ),
             ]
         )

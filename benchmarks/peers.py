@@ -416,11 +416,7 @@ def _weak_form(
     return regression
 
 
-PEERS = {
-    "rigid body by hand": by_hand,
-    "neural ODE": neural_ode,
-    "PySINDy": pysindy_sparse,
-}
+PEERS = {"rigid body by hand": by_hand, "neural ODE": neural_ode, "PySINDy": pysindy_sparse}
 
 
 # Measuring

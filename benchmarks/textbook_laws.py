@@ -335,10 +335,7 @@ LAWS: dict[str, Law] = {
         {"q1 - q2": (0.98, 2.2)},
     ),
     "toda-3": Law(
-        {**_kinetic(3), **_ring(3, "exp(q{i} - q{j})", 1.0)},
-        *_box(1, 1, 1, 1, 1, 1),
-        0.1,
-        LATTICE,
+        {**_kinetic(3), **_ring(3, "exp(q{i} - q{j})", 1.0)}, *_box(1, 1, 1, 1, 1, 1), 0.1, LATTICE
     ),
     "magnetic-field": Law(
         {

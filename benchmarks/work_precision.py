@@ -63,10 +63,7 @@ SCENES = {
 QUICK = ("standard-map-regular", "henon-heiles-regular")
 # Scenes whose law is learned too: few pairs, and the terms of H that are told, in the scene's own
 # coordinates. A flow for each error asked for, and a map made from the law for each.
-LAWS = {
-    "two-body": (200, ("1/q1", "p2**2/q1**2", "p1**2")),
-    "henon-heiles-regular": (100, ()),
-}
+LAWS = {"two-body": (200, ("1/q1", "p2**2/q1**2", "p1**2")), "henon-heiles-regular": (100, ())}
 LAW_TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 SINGLE_STEPS, STRIDE, MOST_SIZES = 1_000, 10, 5
 FLOAT32_FLOOR = 1e-7  # of the data's spread: a larger map is no more accurate in float32

@@ -283,13 +283,7 @@ def test_a_second_fit_of_the_same_shapes_compiles_nothing(compilations):
     key, other, data = jax.random.key(11), start(seed=4), gradient_data(330, 5)
     with compilations() as found:
         result = adam(
-            Network(amplitude=2.0),
-            other,
-            data,
-            VALIDATION,
-            WEIGHT,
-            recipe=SHORT,
-            key=key,
+            Network(amplitude=2.0), other, data, VALIDATION, WEIGHT, recipe=SHORT, key=key
         )
     assert result.epochs == 6
     assert found.count == 0

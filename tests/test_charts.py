@@ -132,9 +132,7 @@ def test_jacobian_of_the_residual_and_determinant_are_those_of_the_formulas(char
 
 
 @pytest.mark.parametrize(
-    "chart",
-    [pytest.param(TYPE1, marks=pytest.mark.slow), MIDPOINT],
-    ids=lambda chart: chart.name,
+    "chart", [pytest.param(TYPE1, marks=pytest.mark.slow), MIDPOINT], ids=lambda chart: chart.name
 )
 def test_derivatives_of_step_and_rollout_in_state_and_parameters(chart):
     """Forward = reverse = through the iterations = finite difference, along a random direction."""

@@ -219,9 +219,7 @@ BAD_USAGE = [
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    BAD_USAGE,
-    ids=lambda x: " ".join(x) if type(x) is tuple else "",
+    ("arguments", "message"), BAD_USAGE, ids=lambda x: " ".join(x) if type(x) is tuple else ""
 )
 def test_refusals(arguments, message, tmp_path, model, capsys, monkeypatch):
     """Exit status 2, one line, nothing written."""

@@ -138,8 +138,7 @@ def test_an_interrupted_fit_publishes_the_best_of_all_its_runs(
 
 
 @pytest.mark.parametrize(
-    "family",
-    ["polynomial", *(pytest.param(f, marks=pytest.mark.slow) for f in ("sines", "mlp"))],
+    "family", ["polynomial", *(pytest.param(f, marks=pytest.mark.slow) for f in ("sines", "mlp"))]
 )
 def test_a_fit_survives_two_of_each_signal(family, tmp_path, monkeypatch):
     """Send signals to a fit that is resumed each time: the map is that of an undisturbed fit."""
@@ -244,8 +243,7 @@ def test_a_prediction_backwards_comes_back(model, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("stop", "status"),
-    [(interrupt, 130), (lambda: signal.raise_signal(signal.SIGTERM), 143)],
+    ("stop", "status"), [(interrupt, 130), (lambda: signal.raise_signal(signal.SIGTERM), 143)]
 )
 def test_a_prediction_resumes_to_the_same_bits(stop, status, model, tmp_path, capsys):
     with stopped_after(math.inf, stop):

@@ -76,10 +76,7 @@ def test_a_periodic_orbit_is_a_chain_too():
         ({"run": np.zeros(3)}, r"expected run as numbers or text of shape \(23,\), got float64"),
         ({"place": PLACES}, "expected run as well as place"),
         ({"run": LABELS, "place": PLACES + 0.5}, "expected place as integers"),
-        (
-            {"std": [1e-3]},
-            r"expected std of shape \(2,\), one of each coordinate, or .* \(1,\)",
-        ),
+        ({"std": [1e-3]}, r"expected std of shape \(2,\), one of each coordinate, or .* \(1,\)"),
         ({"std": [1e-3, 0.0]}, "expected every std finite and above 0"),
     ],
 )

@@ -230,8 +230,7 @@ def scattered(map_, z):
 
 @needs_cc
 @pytest.mark.parametrize(
-    "kind",
-    [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in MAPS],
+    "kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in MAPS]
 )
 def test_c_is_the_maps_own_step(kind, tmp_path):
     map_, z = MAPS[kind]()

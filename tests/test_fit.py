@@ -120,10 +120,7 @@ def test_a_folded_chart_is_refused_with_advice():
 def test_friction_is_noticed():
     z = disc(400)
     damped = gfnn.Pairs(z, pendulum(z) * np.array([[1.0, 0.5]]), 0.4)
-    with (
-        pytest.raises(LookedAt),
-        pytest.warns(gfnn.FitWarning, match="do not look symplectic"),
-    ):
+    with pytest.raises(LookedAt), pytest.warns(gfnn.FitWarning, match="do not look symplectic"):
         gfnn.fit(damped, learn="hamiltonian", on_candidate=stop)
 
 

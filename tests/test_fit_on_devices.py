@@ -85,8 +85,7 @@ def quartic(number):
 
 
 @pytest.mark.parametrize(
-    "kind",
-    ["map", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("law", "networks"))],
+    "kind", ["map", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("law", "networks"))]
 )
 def test_the_same_bits_on_any_number_of_devices(kind):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=3"

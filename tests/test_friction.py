@@ -204,11 +204,7 @@ def double_pendulum(gamma, count=200, dt=0.2):
 @pytest.mark.slow
 def test_a_double_pendulum_is_a_lagrangian_of_five_terms():
     fit = gfnn.fit(
-        double_pendulum(0.01),
-        tolerance=1e-10,
-        angles=(0, 1),
-        learn="hamiltonian",
-        max_seconds=None,
+        double_pendulum(0.01), tolerance=1e-10, angles=(0, 1), learn="hamiltonian", max_seconds=None
     )
     expected = {"v1²": 1, "v2²": 0.5, "v1 v2 cos(q1 - q2)": 1, "cos(q1)": 2, "cos(q2)": 1}
     assert law_of(fit) == pytest.approx(expected, rel=1e-11)

@@ -150,10 +150,7 @@ def kepler_state(a, e, anomaly, perihelion):
     q = a * np.array([c - e, b * s])
     p = np.array([-s, b * c]) / (np.sqrt(a) * (1 - e * c))
     turn = np.array(
-        [
-            [np.cos(perihelion), -np.sin(perihelion)],
-            [np.sin(perihelion), np.cos(perihelion)],
-        ]
+        [[np.cos(perihelion), -np.sin(perihelion)], [np.sin(perihelion), np.cos(perihelion)]]
     )
     return np.concatenate([turn @ q, turn @ p])
 

@@ -23,11 +23,7 @@ PAIRS = gfnn.Pairs(Z0, Z1, DT)
 SCENE = gfnn.scenes.make("two-body")
 KEY = jax.random.key(0)
 OF_NUMPY = dataclasses.replace(
-    SCENE,
-    flow=None,
-    step=None,
-    section=None,
-    hamiltonian=lambda z, t=0.0: np.sum(np.cos(z)),
+    SCENE, flow=None, step=None, section=None, hamiltonian=lambda z, t=0.0: np.sum(np.cos(z))
 )
 LENGTH = RNG.uniform(0.5, 2, 200)
 

@@ -358,9 +358,7 @@ def rough_steps(chart, params, z):
 
 
 @pytest.mark.parametrize(
-    "chart",
-    [pytest.param(TYPE2, marks=pytest.mark.slow), MIDPOINT],
-    ids=lambda chart: chart.name,
+    "chart", [pytest.param(TYPE2, marks=pytest.mark.slow), MIDPOINT], ids=lambda chart: chart.name
 )
 @hypothesis.settings(max_examples=60, deadline=None, derandomize=True, database=None)
 @hypothesis.given(

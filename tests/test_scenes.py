@@ -42,12 +42,7 @@ def kepler_state(a, e, mean_anomaly):
     )
 
 
-@given(
-    st.floats(0.1, 10),
-    st.floats(0, 0.95),
-    st.floats(-math.pi, math.pi),
-    st.floats(-20, 20),
-)
+@given(st.floats(0.1, 10), st.floats(0, 0.95), st.floats(-math.pi, math.pi), st.floats(-20, 20))
 @settings(max_examples=300, deadline=None)
 def test_kepler_flow_is_the_textbook_solution(a, e, mean_anomaly, phase):
     z0 = kepler_state(a, e, mean_anomaly)
