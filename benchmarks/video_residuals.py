@@ -27,7 +27,7 @@ from gfnn_jax.maps.estimates import Law, law_of
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.signals.local_cubics import smooth
-from gfnn_jax.solve.latent_arcs import SOFT_L1, fit_arcs
+from gfnn_jax.solve.latent_arcs import SOFT_L1, Readings
 
 NAME = "video_double_pendulum"
 TERMS = (
@@ -95,7 +95,7 @@ def causes(law: Law, recording: Any, seconds: float) -> dict[str, Any]:
     sigma, every = scales.sigma, np.arange(len(law.p))
     own = LawOnArcs(law.form, plain, (), h, u, law.p, every[1:])  # the first is the gauge
     scale = np.tile(sigma, 2) * np.repeat([1, scales.omega], 2)
-    best = fit_arcs(own, law.p[1:], start, y, sigma, scale)
+    best = Readings(own, y, sigma).fit(law.p[1:], start, scale)
     x, p = best.x, np.append(law.p[0], best.p)
     steps = LawOnArcs(law.form, plain, (), h, u, p, every).defects(p, x)
     lagrangian, (q, v) = law.form.lagrangian(p), np.split(x, 2, axis=-1)

@@ -14,9 +14,11 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 from gfnn_jax.errors import OutOfTime
+
+T = TypeVar("T")
 
 MAX_SECONDS = 120.0  # of a fit that is told of no budget
 
@@ -270,3 +272,14 @@ class Allowance:
 
 
 UNBOUNDED = Allowance()
+
+
+def within(unit: contextlib.AbstractContextManager[Any], make: Callable[[], T]) -> T | None:
+    """Make something inside a unit of a budget; None where the unit does not fit, or the time is
+    over before its end. The one place where a search's end is caught, but for loops that keep what
+    they have found."""
+    try:
+        with unit:
+            return make()
+    except OutOfTime:
+        return None

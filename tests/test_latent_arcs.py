@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax.solve.arc_models import Defects, Observed
-from gfnn_jax.solve.latent_arcs import fit_arcs
+from gfnn_jax.solve.latent_arcs import Readings
 
 
 class _Still:
@@ -31,12 +31,12 @@ def test_of_arcs_that_share_nothing_only_those_are_halved_that_got_worse():
     """From 3 a whole step to arctan x = 0 goes to −9.5, from 0.1 to −7e-4."""
     sizes, start = [], np.array([0.1, 3.0, -0.2])
     x, unit = np.tile(start[:, None, None], (1, 4, 1)), np.ones(1)
-    fit = fit_arcs(_Still(sizes), np.zeros(0), x, 0 * x, unit, unit, tolerance=1e-12)
+    fit = Readings(_Still(sizes), 0 * x, unit).fit(np.zeros(0), x, unit, tolerance=1e-12)
     assert fit.converged
     np.testing.assert_allclose(fit.x, 0, atol=1e-6)
     assert {arcs[0] for size, arcs in sizes if size == 1} == {1}
     assert {size for size, _ in sizes} == {1, 3}
-    alone = fit_arcs(_Still([]), np.zeros(0), x[1:2], 0 * x[1:2], unit, unit, tolerance=1e-12)
+    alone = Readings(_Still([]), 0 * x[1:2], unit).fit(np.zeros(0), x[1:2], unit, tolerance=1e-12)
     np.testing.assert_allclose(fit.x[1], alone.x[0], atol=1e-9)
 
 
@@ -64,7 +64,7 @@ def test_an_arc_that_no_step_makes_better_holds_back_no_other():
     y = np.broadcast_to(0.7 * np.arange(4)[None, :, None], x.shape) - 1
     y[0] += 2
     unit = np.ones(1)
-    fit = fit_arcs(_Rising(), np.zeros(1), x, y, 0.01 * unit, 0.01 * unit)
+    fit = Readings(_Rising(), y, 0.01 * unit).fit(np.zeros(1), x, 0.01 * unit)
     np.testing.assert_allclose(fit.p, 0.7, rtol=1e-3)
     np.testing.assert_allclose(fit.x[1:], 1.0, rtol=1e-3)
     np.testing.assert_array_equal(fit.x[0], x[0])
@@ -99,7 +99,7 @@ def _beside_a_broken_arc(most: float):
     for n in range(5):
         orbit[:, n + 1] = 1.2 * np.sin(orbit[:, n])
     model, x = _Broken(np.arange(5), 0.4, most), np.full(orbit.shape, 0.4)
-    return fit_arcs(model, np.zeros(1), x, orbit + 0.1, 0.01 * np.ones(1), 0.01 * np.ones(1))
+    return Readings(model, orbit + 0.1, 0.01 * np.ones(1)).fit(np.zeros(1), x, 0.01 * np.ones(1))
 
 
 def test_an_arc_whose_defects_no_step_closes_keeps_no_other_open():

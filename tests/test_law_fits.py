@@ -33,7 +33,7 @@ from gfnn_jax.models.lagrangians.search import search, search_on
 from gfnn_jax.models.lagrangians.text import speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.arc_models import Defects, Observed
-from gfnn_jax.solve.latent_arcs import fit_arcs, rows_of_arcs
+from gfnn_jax.solve.latent_arcs import Readings
 
 
 def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):
@@ -73,7 +73,7 @@ def chain(noise=1e-3, runs=3, end=12.0, dt=0.02, uniform=0.0):
 
 
 class _Decay:
-    """x' = −k x sampled at times 0.1 apart, seen directly: what `fit_arcs` asks of a model."""
+    """x' = −k x sampled at times 0.1 apart, seen directly: what `Readings.fit` asks of a model."""
 
     def defects(self, p, x):
         factor = np.exp(-0.1 * p[0])
@@ -97,13 +97,13 @@ def test_arcs_with_latent_states_find_a_rate_and_its_error():
         y = y[..., None]
         y[0, 3] = np.nan
         x = np.where(np.isfinite(y), y, 0.0)
-        fit = fit_arcs(_Decay(), np.array([0.1]), x, y, np.array([sigma]), np.array([sigma]))
+        fit = Readings(_Decay(), y, np.array([sigma])).fit(np.array([0.1]), x, np.array([sigma]))
         assert fit.converged
         found.append([fit.p[0], np.sqrt(fit.covariance()[0, 0])])
     p, std = np.array(found).T
     assert abs(p.mean() - k) < 4 * p.std() / np.sqrt(60)
     assert 0.75 < std.mean() / p.std() < 1.35
-    fit = fit_arcs(_Decay(), np.array([0.1]), x, y, np.array([sigma]), np.array([sigma]))
+    fit = Readings(_Decay(), y, np.array([sigma])).fit(np.array([0.1]), x, np.array([sigma]))
     np.testing.assert_allclose(fit.x[:, 1:], np.exp(-0.1 * fit.p[0]) * fit.x[:, :-1], atol=1e-6)
 
 
@@ -115,8 +115,8 @@ def test_rows_of_arcs_tell_the_residuals_of_other_coefficients():
     y[0, 3] = np.nan
     y = y[..., None]
     x = np.where(np.isfinite(y), y, 0.0)
-    fit = fit_arcs(_Decay(), np.array([0.1]), x, y, sigma, sigma)
-    rows = rows_of_arcs(_Decay(), fit.p, fit.x, y, sigma)
+    fit = Readings(_Decay(), y, sigma).fit(np.array([0.1]), x, sigma)
+    rows = Readings(_Decay(), y, sigma).rows(fit.p, fit.x)
     assert rows.shape == (2, 20, 1, 2)
     for change in (0.0, 0.01):
         states = np.exp(-(fit.p[0] + change) * t)[:, None]

@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gfnn_jax.budget import COMPILE, Budget
+from gfnn_jax.budget import COMPILE, Budget, within
 from gfnn_jax.candidates.candidate import Candidate, refined_images, with_error
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, measured_error
-from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.generating.generated import Generated
@@ -48,10 +47,9 @@ def measured(
     """The candidate with this map, its error and its time per step measured by the steps that users
     run, as long as compiling them fits into the budget."""
     held, compiling = data.pairs.take(data.validation), budget.compiling
-    try:
-        with budget.last(_TIMING, COMPILE, compiling, decides=True):
-            steps = stepped(map_, np.asarray(held.z0), held.dt, held.args)
-    except OutOfTime:
+    unit = budget.last(_TIMING, COMPILE, compiling, decides=True)
+    steps = within(unit, lambda: stepped(map_, np.asarray(held.z0), held.dt, held.args))
+    if steps is None:
         return Assembled(dataclasses.replace(candidate, map=map_), 0.0, compiled=False)
     images = np.where(steps.failed[:, None], np.nan, steps.images)
     error = measured_error(data, tolerance, images)

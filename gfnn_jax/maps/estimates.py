@@ -28,7 +28,7 @@ from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
 from gfnn_jax.solve.arc_models import Defects, Observed
-from gfnn_jax.solve.latent_arcs import fit_arcs, linearised
+from gfnn_jax.solve.latent_arcs import Readings
 from gfnn_jax.solve.linear import covariance_root
 
 FEWEST = 5  # samples from which a state is estimated
@@ -302,7 +302,7 @@ def _check_inputs(t: np.ndarray, begin: float, end: float, run: str) -> None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Windows:
-    """Windows of equal length as arcs whose law is known: what `fit_arcs` asks for."""
+    """Windows of equal length as arcs whose law is known: what `Readings.fit` asks for."""
 
     law: Law
     h: np.ndarray
@@ -353,10 +353,11 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
     )
     noise_of_readings = np.where(np.isfinite(y), np.array(noise), np.inf)
     white = None if wander is None else wander.whitening(t, noise_of_readings)
-    found = fit_arcs(arcs, np.zeros(0), x, y, sigma, scale, loss=loss, whitening=white)
+    readings = Readings(arcs, y, sigma, loss, white)
+    found = readings.fit(np.zeros(0), x, scale)
     if wander is None or white is None:
         return found.x[:, -1], found.last_covariance()
-    J, last = linearised(arcs, np.zeros(0), found.x, y, sigma, loss, white)
+    J, last = readings.linearised(np.zeros(0), found.x)
     near = white @ wander.latest(t, noise_of_readings).swapaxes(1, 2)[..., None]
     weights = np.sqrt(np.nan_to_num(loss.weights(found.whitened)))
     near = weights * near[..., 0].swapaxes(1, 2)

@@ -19,7 +19,7 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.generating.position_arcs import PositionArcs, nodes_of
 from gfnn_jax.maps.estimates import Forecast
-from gfnn_jax.solve.latent_arcs import fit_arcs, last_by_coefficients
+from gfnn_jax.solve.latent_arcs import Readings
 
 _EVEN = 0.01  # of a time step, by which times may miss an even grid
 
@@ -115,10 +115,11 @@ def _ends(map_: Any, piece: Any, recording: Recording) -> _Ends:
     for length in np.unique(lengths):
         rows = np.flatnonzero(lengths == length)
         x, y = nodes_of(np.array([windows[row] for row in rows]))
-        found = fit_arcs(known, np.zeros(0), x, y, sigma, sigma)
+        found = Readings(known, y, sigma).fit(np.zeros(0), x, sigma)
         positions[rows] = found.x[:, -1]
         root[rows] = found.transports @ np.linalg.pinv(found.arcs)
-        by_posterior[rows] = last_by_coefficients(arcs, np.zeros(directions), found.x, y, sigma)
+        moved = Readings(arcs, y, sigma).last_by_coefficients(np.zeros(directions), found.x)
+        by_posterior[rows] = moved
     return _Ends(positions, root, by_posterior)
 
 

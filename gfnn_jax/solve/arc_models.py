@@ -32,7 +32,7 @@ class Observed(NamedTuple):
 
 @runtime_checkable
 class Model(Protocol):
-    """States that move and are measured: what `fit_arcs` asks of a law, or of any other map."""
+    """States that move and are measured: what `Readings.fit` asks of a law, or of any other map."""
 
     def defects(self, p: np.ndarray, x: np.ndarray) -> Defects: ...
 

@@ -97,115 +97,86 @@ class Fitted:
         return covariance
 
 
-def fit_arcs(
-    model: Model | Known,
-    p: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-    sigma: np.ndarray,
-    state_scale: np.ndarray,
-    max_iterations: int = 30,
-    tolerance: float = 1e-4,
-    loss: Loss = SOFT_L1,
-    least: np.ndarray | None = None,
-    whitening: np.ndarray | None = None,
-) -> Fitted:
-    """Fit p (n,) and the states x (A, L, m), from what they start at, to y (A, L, k).
+@dataclasses.dataclass(frozen=True, eq=False)
+class Readings:
+    """Readings y (A, L, k) of the latent states of arcs, and the model that they are compared with.
 
-    Entries of y that are NaN were not measured. ``sigma`` (k,) or (A, L, k) is the noise of y,
-    ``state_scale`` (m,) the defect that counts as one standard deviation. While defects matter, an
-    iteration has to close them; then it has to lower the cost. Ends where it lowers it by less than
-    ``tolerance`` of itself. The cost is infinite where the defects could not be closed.
-
-    least: (k,) what of the residuals is no noise; sigma is then where the noise starts from, and is
-    estimated by every iteration, of (A, L, k) one factor for each of the k. None: sigma is known.
-    whitening: (A, k, L, L) of residuals in units of sigma, by channel; None: they are white.
+    y: NaN where nothing was measured. sigma: (k,) or (A, L, k), their noise. loss: of residuals in
+    units of it. whitening: (A, k, L, L) of these residuals, by channel; None: they are white.
     """
-    measured = np.isfinite(y)
-    data = _Data(model, measured, np.where(measured, y, 0.0), least, tolerance)
-    here = data.at(p, x, _Units(sigma, state_scale, loss, whitening))
-    start = _AtStates(data, here, here)
-    if not np.isfinite(here.cost):
-        return start.fitted(0, converged=False)
-    found = descended(start, _DAMPING, max_iterations)
-    last: _AtStates = found.problem
-    converged = found.settled or (found.stuck and last.closed(last.here))
-    return last.fitted(found.steps, converged and bool(np.isfinite(last.here.cost)))
 
+    model: Model | Known
+    y: np.ndarray
+    sigma: np.ndarray
+    loss: Loss = SOFT_L1
+    whitening: np.ndarray | None = None
 
-def eliminated_rows(
-    model: Model | Known,
-    p: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-    sigma: np.ndarray,
-    loss: Loss = SOFT_L1,
-    whitening: np.ndarray | None = None,
-) -> np.ndarray:
-    """Rows (R, n + 1) of [∂r/∂p, r] at p and x, without the states of each arc: what its own state
-    does not explain."""
-    (J, _), m = linearised(model, p, x, y, sigma, loss, whitening), x.shape[-1]
-    across = np.linalg.qr(J[..., :m], mode="complete")[0][..., m:]
-    return (across.swapaxes(1, 2) @ J[..., m:]).reshape(-1, J.shape[-1] - m)
+    def fit(
+        self,
+        p: np.ndarray,
+        x: np.ndarray,
+        state_scale: np.ndarray,
+        *,
+        max_iterations: int = 30,
+        tolerance: float = 1e-4,
+        least: np.ndarray | None = None,
+    ) -> Fitted:
+        """Fit p (n,) and the states x (A, L, m), from what they start at, to the readings.
 
+        ``state_scale`` (m,) is the defect that counts as one standard deviation. While defects
+        matter, an iteration has to close them; then it has to lower the cost. Ends where it lowers
+        it by less than ``tolerance`` of itself. The cost is infinite where the defects could not be
+        closed.
 
-def last_by_coefficients(
-    model: Model | Known, p: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray
-) -> np.ndarray:
-    """Derivative (A, m, n) in p of the last state of each arc that was fitted to y with p fixed."""
-    (J, last), m = linearised(model, p, x, y, sigma), x.shape[-1]
-    R = np.asarray(np.linalg.qr(J, mode="r"))
-    first = np.linalg.solve(R[:, :m, :m], -R[:, :m, m:-1])
-    return last[..., :m] @ first + last[..., m:-1]
+        least: (k,) what of the residuals is no noise; sigma is then where the noise starts from,
+        and is estimated by every iteration, of (A, L, k) one factor for each of the k. None: sigma
+        is known.
+        """
+        measured = np.isfinite(self.y)
+        data = _Data(self.model, measured, np.where(measured, self.y, 0.0), least, tolerance)
+        here = data.at(p, x, _Units(self.sigma, state_scale, self.loss, self.whitening))
+        start = _AtStates(data, here, here)
+        if not np.isfinite(here.cost):
+            return start.fitted(0, converged=False)
+        found = descended(start, _DAMPING, max_iterations)
+        last: _AtStates = found.problem
+        converged = found.settled or (found.stuck and last.closed(last.here))
+        return last.fitted(found.steps, converged and bool(np.isfinite(last.here.cost)))
 
+    def linearised(self, p: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (A, L k, m + n + 1) of [δx_0, δp, r] of all arcs at p and x, weighted as robust loss
+        has it, and δx_{L−1} (A, m, m + n + 1) by the same and by the defects before it."""
+        measured, (defects, observed) = np.isfinite(self.y), evaluated(self.model, p, x)
+        off = np.where(measured, np.where(measured, self.y, 0.0) - observed.values, 0.0)
+        units = _Units(self.sigma, np.ones(x.shape[-1]), self.loss, self.whitening)
+        return _linearised(_Iterate(p, x, defects, observed, measured, off, units), slice(None))
 
-def rows_of_arcs(
-    model: Model | Known,
-    p: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-    sigma: np.ndarray,
-    loss: Loss = SOFT_L1,
-    whitening: np.ndarray | None = None,
-) -> np.ndarray:
-    """Rows (A, L, k, n + 1) of the coefficients and the residuals, weighted as robust loss has it,
-    after each arc's own δx_0 was projected out: residuals − rows · δp are those of any other
-    coefficients near p, each arc with the state that suits them best."""
-    (J, _), m = linearised(model, p, x, y, sigma, loss, whitening), x.shape[-1]
-    Q = np.linalg.qr(J[..., :m])[0]
-    return (J[..., m:] - Q @ (Q.swapaxes(1, 2) @ J[..., m:])).reshape(*y.shape, -1)
+    def rows(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Rows (A, L, k, n + 1) of the coefficients and the residuals after each arc's own δx_0 was
+        projected out: residuals − rows · δp are those of any other coefficients near p, each arc
+        with the state that suits them best."""
+        (J, _), m = self.linearised(p, x), x.shape[-1]
+        Q = np.linalg.qr(J[..., :m])[0]
+        return (J[..., m:] - Q @ (Q.swapaxes(1, 2) @ J[..., m:])).reshape(*self.y.shape, -1)
 
+    def eliminated_rows(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Rows (R, n + 1) of [∂r/∂p, r] without the states of each arc: what its own state does not
+        explain."""
+        (J, _), m = self.linearised(p, x), x.shape[-1]
+        across = np.linalg.qr(J[..., :m], mode="complete")[0][..., m:]
+        return (across.swapaxes(1, 2) @ J[..., m:]).reshape(-1, J.shape[-1] - m)
 
-def sensitivities(
-    model: Model | Known,
-    p: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-    sigma: np.ndarray,
-    loss: Loss = SOFT_L1,
-    whitening: np.ndarray | None = None,
-) -> np.ndarray:
-    """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
-    rows = eliminated_rows(model, p, x, y, sigma, loss, whitening)
-    factor = np.asarray(np.linalg.qr(rows, mode="r"))
-    return np.concatenate([factor, np.zeros((factor.shape[1] - len(factor), factor.shape[1]))])
+    def triangle(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
+        factor = np.asarray(np.linalg.qr(self.eliminated_rows(p, x), mode="r"))
+        return np.concatenate([factor, np.zeros((factor.shape[1] - len(factor), factor.shape[1]))])
 
-
-def linearised(
-    model: Model | Known,
-    p: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-    sigma: np.ndarray,
-    loss: Loss = SOFT_L1,
-    whitening: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (A, L k, m + n + 1) of [δx_0, δp, r] of all arcs at p and x, weighted as robust loss has
-    it, and δx_{L−1} (A, m, m + n + 1) by the same and by the defects before it."""
-    measured, (defects, observed) = np.isfinite(y), evaluated(model, p, x)
-    off = np.where(measured, np.where(measured, y, 0.0) - observed.values, 0.0)
-    units = _Units(sigma, np.ones(x.shape[-1]), loss, whitening)
-    return _linearised(_Iterate.at(p, x, defects, observed, measured, off, units), slice(None))
+    def last_by_coefficients(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Derivative (A, m, n) in p of the last state of each arc that was fitted with p fixed."""
+        (J, last), m = self.linearised(p, x), x.shape[-1]
+        R = np.asarray(np.linalg.qr(J, mode="r"))
+        first = np.linalg.solve(R[:, :m, :m], -R[:, :m, m:-1])
+        return last[..., :m] @ first + last[..., m:-1]
 
 
 class _Data(NamedTuple):
@@ -232,7 +203,7 @@ class _Data(NamedTuple):
     ) -> _Iterate:
         with np.errstate(all="ignore"):
             off = np.where(self.measured, self.known - observed.values, 0.0)
-        return _Iterate.at(p, x, defects, observed, self.measured, off, units)
+        return _Iterate(p, x, defects, observed, self.measured, off, units)
 
     def moved(self, here: _Iterate, arcs: np.ndarray, x: np.ndarray) -> _Iterate:
         """The same iterate, but that these arcs (indices, n) have the states x (n, L, m)."""
@@ -378,34 +349,46 @@ class _Units(NamedTuple):
         return np.einsum("akij,ajk...->aik...", self.whitening[block], rows, optimize=True)
 
 
-class _Iterate(NamedTuple):
-    """State of an iteration: residuals in units of σ, the same made white, their cost, and the
-    norm of the defects in units of the states'."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Iterate:
+    """State of an iteration. off: residuals (A, L, k) in the units of y."""
 
     p: np.ndarray
     x: np.ndarray
     defects: Defects
     observed: Observed
     measured: np.ndarray
-    residuals: np.ndarray
-    white: np.ndarray
-    cost: float
-    gap: float
+    off: np.ndarray
     units: _Units
 
-    @classmethod
-    def at(
-        cls, p, x, defects: Defects, observed: Observed, measured, off, units: _Units
-    ) -> _Iterate:
-        """off: residuals (A, L, k) in the units of y."""
+    @cached_property
+    def residuals(self) -> np.ndarray:
+        """(A, L, k) in units of σ."""
         with np.errstate(all="ignore"):
-            residuals = off / units.sigma
-            white = units.white(residuals)
-            cost = float(np.sum(units.loss.of(white)))
-            gap = float(np.linalg.norm(defects.closing / units.state))
-        if not np.isfinite(cost + gap):
-            cost = gap = np.inf
-        return cls(p, x, defects, observed, measured, residuals, white, cost, gap, units)
+            return self.off / self.units.sigma
+
+    @cached_property
+    def white(self) -> np.ndarray:
+        """The same made white."""
+        with np.errstate(all="ignore"):
+            return self.units.white(self.residuals)
+
+    @cached_property
+    def _size(self) -> tuple[float, float]:
+        with np.errstate(all="ignore"):
+            cost = float(np.sum(self.units.loss.of(self.white)))
+            gap = float(np.linalg.norm(self.defects.closing / self.units.state))
+        return (cost, gap) if np.isfinite(cost + gap) else (np.inf, np.inf)
+
+    @property
+    def cost(self) -> float:
+        """Cost of the residuals."""
+        return self._size[0]
+
+    @property
+    def gap(self) -> float:
+        """Norm of the defects in units of the states'."""
+        return self._size[1]
 
     @property
     def merit(self) -> float:
@@ -450,7 +433,7 @@ class _Iterate(NamedTuple):
         # Of a state (q, v) whose positions are measured, velocities change as they do.
         state = self.units.state * np.resize(moved, self.units.state.shape)
         units = self.units._replace(sigma=sigma, state=state)
-        return self.at(self.p, self.x, self.defects, self.observed, self.measured, off, units)
+        return dataclasses.replace(self, off=off, units=units)
 
 
 class _Rows(NamedTuple):

@@ -22,7 +22,7 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.models.generating_functions.map_arcs import LONGEST, GeneratedOnArcs
-from gfnn_jax.solve.latent_arcs import fit_arcs
+from gfnn_jax.solve.latent_arcs import Readings
 
 _FEWEST = 4  # turns of an arc: of fewer, noise of the two monitors is not told apart
 _MOST_NODES = 20_000  # of all arcs: a minute and a quarter of a gigabyte at a hundred terms
@@ -113,7 +113,7 @@ def _fitted(
     model = GeneratedOnArcs(family, piece.chart, dt, moves, ends, family, joint=True)
     p, left = _start(piece, family, ends, arcs)
     equations = num * (length - 1) * width
-    found = fit_arcs(model, p, arcs.copy(), arcs, left, left, least=np.zeros(width))
+    found = Readings(model, arcs, left).fit(p, arcs.copy(), left, least=np.zeros(width))
     root = np.linalg.pinv(found.triangle).T
     sound = found.converged and np.isfinite(found.cost)
     own = dataclasses.replace(

@@ -25,7 +25,7 @@ from gfnn_jax.dataset.arcs import Arcs
 from gfnn_jax.fitting.triangle import Triangle, folded
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.solve.arc_models import Defects, Known, Observed, observed_whole
-from gfnn_jax.solve.latent_arcs import eliminated_rows, fit_arcs
+from gfnn_jax.solve.latent_arcs import Readings
 from gfnn_jax.solve.robust import Biweight
 
 LONGEST = 10  # steps of an arc: what S cannot represent adds up along a longer one
@@ -43,7 +43,7 @@ class GeneratedOnArcs:
     ends: affine pieces (before, after) around what S generates. along: a family whose rows are
     wanted: F is then that of S = 0, its derivatives in the states stay those of S, and Γ is in the
     coefficients of this family. None: no coefficient is free. joint: F is that of S all the same,
-    where ``along`` is its own family: `fit_arcs` then moves states and coefficients together.
+    where ``along`` is its own family: `Readings.fit` then moves states and coefficients together.
     """
 
     family: Any
@@ -119,9 +119,8 @@ class NearestArcs:
         for n in range(1, x.shape[1]):  # one that is missing starts from the one before
             x[:, n] = np.where(np.isfinite(x[:, n]), x[:, n], x[:, n - 1])
         usual = sigma if sigma.ndim == 1 else np.sqrt(np.mean(sigma**2, axis=(0, 1)))
-        found = fit_arcs(
-            Known(model, p), p[:0], x, arcs.states, sigma, usual, tolerance=_SETTLED, loss=BIWEIGHT
-        )
+        readings = Readings(Known(model, p), arcs.states, sigma, BIWEIGHT)
+        found = readings.fit(p[:0], x, usual, tolerance=_SETTLED)
         if not np.isfinite(found.cost):
             raise np.linalg.LinAlgError("expected states near the measured ones")
         return cls(model, p, arcs, found.x, sigma)
@@ -136,7 +135,7 @@ class NearestArcs:
             some = slice(first, first + size)
             model = dataclasses.replace(self.model, moves=self.arcs.moves[some], along=along)
             y, sigma = self.arcs.states[some], _of_arcs(self.sigma, some)
-            rows = eliminated_rows(model, self.p, self.x[some], y, sigma, BIWEIGHT)
+            rows = Readings(model, y, sigma, BIWEIGHT).eliminated_rows(self.p, self.x[some])
             yield rows, int(np.isfinite(y).sum()) - len(y) * width
 
     def triangle(self, along: Any, on_block: Callable[[], Any] = lambda: None) -> Triangle:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.budget import ROWS, Budget
+from gfnn_jax.budget import ROWS, Budget, within
 from gfnn_jax.candidates.assemble import Assembled, composed, measured
 from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import to_user
@@ -117,11 +117,12 @@ def learn_map(
     stalled = len(rivals) > 1 and best.error.bound > tolerance.bound
     if data.structure is not None:
         data = _fewer(data)
-    try:
-        with budget.unit(_FEWER_TERMS, ROWS, len(_THRESHOLDS) * _work(best.piece.family, data)):
-            best = _sparse(best, data, tolerance, noisy=stalled)
-    except OutOfTime:
+    unit = budget.unit(_FEWER_TERMS, ROWS, len(_THRESHOLDS) * _work(best.piece.family, data))
+    full, some = best, data
+    sparse = within(unit, lambda: _sparse(full, some, tolerance, noisy=stalled))
+    if sparse is None:
         budget.leave_out(_FEWER_TERMS, budget.ended)
+    best = sparse or full
     piece = best.piece
     gradient, with_hessian = piece.family.operations
     candidate = Candidate(

@@ -18,7 +18,7 @@ from gfnn_jax.dataset.arcs import Arcs
 from gfnn_jax.errors import InputError
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.solve.arc_models import Defects, Known, Observed, observed_whole
-from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs
+from gfnn_jax.solve.latent_arcs import Fitted, Readings
 from gfnn_jax.solve.robust import Biweight, robust
 
 
@@ -106,18 +106,8 @@ def fit_flow(
     if not (np.isfinite(x).all() and np.isfinite(noise).all()):
         return None
     given, free = (Known(model, c), c[:0]) if only_states else (model, c)
-    found = fit_arcs(
-        given,
-        free,
-        x,
-        y,
-        noise * relative,
-        noise,
-        max_iterations=iterations,
-        tolerance=gained,
-        loss=BIWEIGHT,
-        least=least,
-    )
+    readings = Readings(given, y, noise * relative, BIWEIGHT)
+    found = readings.fit(free, x, noise, max_iterations=iterations, tolerance=gained, least=least)
     if not np.isfinite(found.cost):
         return None
     return dataclasses.replace(found, p=c) if only_states else found

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
-from gfnn_jax.solve.latent_arcs import sensitivities
+from gfnn_jax.solve.latent_arcs import Readings
 
 _MOVED = 1 / 3  # of a standard error: what steps may move a combination of coefficients by
 _ORDER = 5
@@ -77,7 +77,7 @@ def _rows(bench: Workbench, fit: LawFit) -> np.ndarray:
     model = bench.model(fit.structure, fit.arcs, fit.p, np.arange(len(fit.p)))
     noise, whitening = fit.sigma * fit.arcs.noise, bench.whitening(fit.arcs)
     loss = bench.observation.loss
-    return sensitivities(model, fit.p, fit.fitted.x, fit.arcs.y, noise, loss, whitening)
+    return Readings(model, fit.arcs.y, noise, loss, whitening).triangle(fit.p, fit.fitted.x)
 
 
 def _asked(rows: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.models.lagrangians.structure import Key, Structure
-from gfnn_jax.solve.latent_arcs import Fitted, fit_arcs, rows_of_arcs, sensitivities
+from gfnn_jax.solve.latent_arcs import Fitted, Readings
 from gfnn_jax.solve.wander import Wander
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
@@ -181,17 +181,8 @@ class Workbench:
         whitening = self.whitening(arcs)
         for _ in range(3 if rescale else 1):
             noise, scale = sigma * arcs.noise, self.state_scale(sigma)
-            found = fit_arcs(
-                model,
-                p,
-                x,
-                arcs.y,
-                noise,
-                scale,
-                tolerance=1e-4 if rescale else 1e-3,
-                loss=self.observation.loss,
-                whitening=whitening,
-            )
+            readings = Readings(model, arcs.y, noise, self.observation.loss, whitening)
+            found = readings.fit(p, x, scale, tolerance=1e-4 if rescale else 1e-3)
             p, x = found.p, found.x
             change = np.nanmedian(np.abs(found.whitened), axis=(0, 1)) / 0.6745
             change = np.maximum(change, 1e-3)
@@ -207,18 +198,8 @@ class Workbench:
         model = self.model(fit.structure, arcs, fit.p, np.arange(0))
         noise, scale = fit.sigma * arcs.noise, self.state_scale(fit.sigma)
         loss = self.observation.loss
-        found = fit_arcs(
-            model,
-            np.zeros(0),
-            arcs.x,
-            arcs.y,
-            noise,
-            scale,
-            15,
-            1e-3,
-            loss,
-            whitening=self.whitening(arcs),
-        )
+        readings = Readings(model, arcs.y, noise, loss, self.whitening(arcs))
+        found = readings.fit(np.zeros(0), arcs.x, scale, max_iterations=15, tolerance=1e-3)
         lost = np.isfinite(arcs.y) & ~np.isfinite(found.residuals)
         if lost.any() or not np.isfinite(found.open).all():
             return np.full(len(arcs.home), np.inf)
@@ -248,11 +229,10 @@ class Workbench:
         )
         known = self.model(fit.structure, arcs, fit.p, np.arange(0))
         whitening = self.whitening(arcs)
-        own = fit_arcs(
-            known, np.zeros(0), arcs.x, arcs.y, noise, scale, 15, loss=loss, whitening=whitening
-        )
+        readings = Readings(known, arcs.y, noise, loss, whitening)
+        own = readings.fit(np.zeros(0), arcs.x, scale, max_iterations=15)
         model = self.model(fit.structure, arcs, fit.p, np.arange(len(fit.p)))
-        rows = rows_of_arcs(model, fit.p, own.x, arcs.y, noise, loss, whitening)
+        rows = dataclasses.replace(readings, model=model).rows(fit.p, own.x)
         fits = {}
         for k in np.unique(third).tolist():
             others = rows[third != k].reshape(-1, rows.shape[-1])
@@ -276,7 +256,8 @@ class Workbench:
         model = self.model(larger, fit.arcs, p, np.arange(len(p)))
         noise = fit.sigma * fit.arcs.noise
         white = self.whitening(fit.arcs)
-        R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, self.observation.loss, white)
+        readings = Readings(model, fit.arcs.y, noise, self.observation.loss, white)
+        R = readings.triangle(p, fit.fitted.x)
         old = [keys.index(k) for k in fit.structure.keys()]  # noqa: SIM118
         own = [keys.index(k) for k in new]
         Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))

@@ -45,7 +45,7 @@ from gfnn_jax.models.lagrangians.fit import (
     thirds_of,
 )
 from gfnn_jax.models.lagrangians.structure import Loss
-from gfnn_jax.solve.latent_arcs import rows_of_arcs
+from gfnn_jax.solve.latent_arcs import Readings
 from gfnn_jax.solve.linear import non_negative
 
 DECIDED = 20.0  # odds, below which two sets are as good
@@ -177,7 +177,7 @@ def _table_of(bench: Workbench, fit: LawFit, candidates: Sequence[Loss]) -> Tabl
     model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
     noise, loss = fit.sigma * fit.arcs.noise, bench.observation.loss
     white = bench.whitening(fit.arcs)
-    rows = rows_of_arcs(model, p, fit.fitted.x, fit.arcs.y, noise, loss, white)
+    rows = Readings(model, fit.arcs.y, noise, loss, white).rows(p, fit.fitted.x)
     # Arcs that the larger law cannot follow: their squares would overflow.
     rows[~(np.abs(rows) < _LARGEST).all(axis=(1, 2, 3))] = 0.0
     keys = larger.keys()

@@ -25,7 +25,7 @@ import numpy as np
 from gfnn_jax.dataset.stretches import Arcs, Nodes, arcs_of, with_states
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
 from gfnn_jax.models.lagrangians.structure import Key, Structure
-from gfnn_jax.solve.latent_arcs import sensitivities
+from gfnn_jax.solve.latent_arcs import Readings
 
 RULES = {
     "hold": "held from sample to sample",
@@ -156,7 +156,8 @@ def _correction(here: Acting, interval: float) -> tuple[float, float]:
     bench = dataclasses.replace(here.bench, inputs=lambda arcs: both)
     p = structure.start(known)
     model = bench.model(structure, fit.arcs, p, np.arange(len(p)))
-    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, fit.sigma * fit.arcs.noise)
+    readings = Readings(model, fit.arcs.y, fit.sigma * fit.arcs.noise)
+    R = readings.triangle(p, fit.fitted.x)
     own = [keys.index(key) for key in fit.structure.keys()]  # noqa: SIM118
     column = sum(
         known["gain", i, j] * R[:, keys.index(("gain", i, count + j))]

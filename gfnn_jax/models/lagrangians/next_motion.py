@@ -20,7 +20,7 @@ from gfnn_jax.flows import coulomb
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
 from gfnn_jax.models.lagrangians.structure import Key
-from gfnn_jax.solve.latent_arcs import sensitivities
+from gfnn_jax.solve.latent_arcs import Readings
 
 _FURTHER = (0.5, 1.0, 1.5, 2.0, 4.0)  # of the largest deflections of the record
 _NEARLY_OVER = 3.0  # radians: an angle is let go no higher
@@ -50,7 +50,7 @@ def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[M
     p, noise = larger.start(fit.values), fit.sigma * fit.arcs.noise
     model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
     loss, white = bench.observation.loss, bench.whitening(fit.arcs)
-    R = sensitivities(model, p, fit.fitted.x, fit.arcs.y, noise, loss, white)[:, :-1]
+    R = Readings(model, fit.arcs.y, noise, loss, white).triangle(p, fit.fitted.x)[:, :-1]
     own = [k for k, key in enumerate(keys) if key in known]
     Q = np.linalg.qr(R[:, own])[0]
     rest = np.linalg.norm(R - Q @ (Q.T @ R), axis=0)
@@ -66,7 +66,8 @@ def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[M
         model = bench.model(larger, arcs, p, np.arange(len(p)))
         model = dataclasses.replace(model, u=np.zeros_like(model.u))
         noise, white = fit.sigma * arcs.noise, bench.whitening(arcs)
-        J = sensitivities(model, p, arcs.x, arcs.y, noise, whitening=white)[:, :-1]
+        readings = Readings(model, arcs.y, noise, whitening=white)
+        J = readings.triangle(p, arcs.x)[:, :-1]
         after = before + _information(J[:, kept] / scale)
         less = np.sqrt(np.diag(_inverse(before)) / np.diag(_inverse(after)))
         order = np.argsort(-less)

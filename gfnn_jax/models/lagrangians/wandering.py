@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
-from gfnn_jax.solve.latent_arcs import linearised
+from gfnn_jax.solve.latent_arcs import Readings
 from gfnn_jax.solve.wander import Wander
 
 _EVIDENCE = 10.0  # logarithm of the likelihood's ratio, below which residuals are white
@@ -28,7 +28,8 @@ def wander_of(bench: Workbench, fit: LawFit) -> Wander | None:
     white."""
     arcs, loss, m = fit.arcs, bench.observation.loss, fit.fitted.x.shape[-1]
     model = bench.model(fit.structure, arcs, fit.p, np.arange(len(fit.p)))
-    rows, _ = linearised(model, fit.p, fit.fitted.x, arcs.y, fit.sigma * arcs.noise, loss)
+    readings = Readings(model, arcs.y, fit.sigma * arcs.noise, loss)
+    rows, _ = readings.linearised(fit.p, fit.fitted.x)
     finite = np.isfinite(arcs.y)
     weights = np.where(finite, loss.weights(fit.fitted.residuals), np.nan)
     noise = np.where(finite, arcs.noise / np.sqrt(weights), np.inf)

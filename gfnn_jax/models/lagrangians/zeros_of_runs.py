@@ -20,7 +20,7 @@ from gfnn_jax.dataset.stretches import Nodes, arcs_of, shifted, with_states
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
 from gfnn_jax.solve.arc_models import Defects, Observed
-from gfnn_jax.solve.latent_arcs import rows_of_arcs
+from gfnn_jax.solve.latent_arcs import Readings
 from gfnn_jax.solve.wander import Wander
 
 _FEWEST = 3  # runs: two tell one difference, and no scatter
@@ -78,7 +78,8 @@ def _found(
     model = _ByRun(bench.model(fit.structure, arcs, p, np.arange(len(p))), runs, len(names))
     start = np.concatenate([p, np.zeros(len(names) * k)])
     noise = fit.sigma * arcs.noise
-    rows = rows_of_arcs(model, start, fit.fitted.x, arcs.y, noise, bench.observation.loss)
+    readings = Readings(model, arcs.y, noise, bench.observation.loss)
+    rows = readings.rows(start, fit.fitted.x)
     rows = rows.reshape(len(rows), -1, rows.shape[-1])
     own, of_runs, left = np.split(rows, [len(p), len(start)], axis=-1)
     keys = fit.structure.keys()

@@ -16,7 +16,7 @@ import numpy as np
 from gfnn_jax.generating.position_arcs import PositionArcs, nodes_of
 from gfnn_jax.models.positions.discrete_lagrangian import Solved, residuals
 from gfnn_jax.models.positions.triples import Triples
-from gfnn_jax.solve.latent_arcs import SOFT_L1, fit_arcs
+from gfnn_jax.solve.latent_arcs import SOFT_L1, Readings
 
 _LONGEST = 24  # nodes of an arc: its own two positions cost a twelfth of what it tells
 _MOST_NODES = 20_000  # of all arcs: a minute and a quarter of a gigabyte at a hundred terms
@@ -84,7 +84,7 @@ def fit_latent(
     left = np.sqrt(arcs.size / max(equations - determined, 1))
     for _ in range(_SCALES):
         scale = np.tile(sigma, 2)
-        found = fit_arcs(model, p, x, y, scale, scale)
+        found = Readings(model, y, scale).fit(p, x, scale)
         p, x = found.p, found.x
         change = _size(found.residuals, dim) * left
         sigma = sigma * change
@@ -103,7 +103,7 @@ def held_out_cost(
     model = PositionArcs(family, triples.dt, params, none)
     x, y = nodes_of(arcs)
     scale = np.tile(sigma, 2)
-    found = fit_arcs(model, np.zeros(0), x, y, scale, scale)
+    found = Readings(model, y, scale).fit(np.zeros(0), x, scale)
     if not np.isfinite(found.cost):
         return np.full(len(arcs), np.inf)
     return np.nansum(SOFT_L1.of(found.residuals), axis=(1, 2))
