@@ -24,7 +24,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from current import check
+from commits import check
 
 HERE = Path(__file__).resolve().parent
 
@@ -64,8 +64,7 @@ def main(argv: Sequence[str]) -> int:
                 f"expected --check with --tell or alone, got {' '.join(options)}", file=sys.stderr
             )
             return 2
-        tell = "--tell" in options
-        return check(list(known), HERE / "results", only=names, only_tell=tell)
+        return check(list(known), names, HERE / "results", tell="--tell" in options)
     paths = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     failed = []
     for name in names or known:

@@ -45,10 +45,10 @@ from harness import (
 )
 
 # isort: split
+import commits
 import jax
 import numpy as np
 import sympy
-from current import code_of
 from users.case import Case, Refused
 from users.known import KNOWN
 from users.refused import REFUSED
@@ -396,6 +396,11 @@ def tables(path: Path) -> None:
         between_markers(TABLES, "as-a-user", f"{text}\n\n{provenance(found)}")
 
 
+def is_old(case: Numbers) -> bool:
+    """Whether a case was measured with other code than today's."""
+    return any(commits.changed(case["code"], "as-a-user.json"))
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", metavar="A,B", help=", ".join(CASES))
@@ -416,17 +421,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     folder = arguments.out or (Path("runs/as-a-user") if arguments.quick else RESULTS)
     path = folder / "as-a-user.json"
     measured = read({"": path}).get("", {"measured": {}})["measured"]
-    code = code_of(Path(__file__).resolve())
     for name in [] if arguments.tables else chosen:
-        old = arguments.old and measured.get(name, {}).get("code") != code
-        if name in measured and not (arguments.only or old):
+        done = measured.get(name)
+        if done and not arguments.only and not (arguments.old and is_old(done)):
             continue
-        measured[name] = m = measure(name) | {"code": code}
+        measured[name] = m = measure(name) | {"code": commits.code()}
         measured = {n: measured[n] for n in CASES if n in measured}
-        same = all(m.get("code") == code for m in measured.values())  # as old as its oldest case
-        write(
-            path, {"quick": arguments.quick, "measured": measured, "code": code if same else None}
-        )
+        code = next((m["code"] for m in measured.values() if is_old(m)), m["code"])
+        write(path, {"quick": arguments.quick, "measured": measured, "code": code})
         verdict = "; ".join(m["wrong"]) or "truthful"
         print(
             f"{name}: {m['seconds']:.1f} s, {m['model']}, claimed {number(m['claimed'])}, true "

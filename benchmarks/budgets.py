@@ -31,7 +31,6 @@ from harness import results as results_of
 
 # isort: split
 import numpy as np
-import ran
 from users.case import box
 from users.known import drawn
 from users.systems import fput, henon_heiles
@@ -150,7 +149,7 @@ def measured_here(system: str, budget: float, clock_name: str) -> Numbers:
 
 def measure(system: str, budget: float, clock_name: str, quick: bool) -> Numbers:
     """The same in a process of its own."""
-    command = ran.python("gfnn_jax", __file__, "--here", system, budget, clock_name)
+    command = [sys.executable, __file__, "--here", system, str(budget), clock_name]
     environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     return json.loads(done.stdout.splitlines()[-1])

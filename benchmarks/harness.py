@@ -23,12 +23,8 @@ PROCESSOR_TIME = "--processor-time"
 if PROCESSOR_TIME in sys.argv:
     time.perf_counter = time.monotonic = time.process_time
 
+import commits  # noqa: E402
 import jax  # noqa: E402
-import ran  # noqa: E402
-from current import code_of  # noqa: E402
-
-if "gfnn_jax" not in sys.modules:  # else all of it counts
-    ran.note("gfnn_jax")
 
 jax.config.update("jax_enable_x64", True)
 
@@ -213,7 +209,7 @@ def circumstances() -> Numbers:
         "python": platform.python_version(),
         "versions": versions(),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "code": code_of(Path(sys.argv[0]).resolve()) if Path(sys.argv[0]).suffix == ".py" else None,
+        "code": commits.code(),
     }
 
 

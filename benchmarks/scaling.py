@@ -36,7 +36,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import ran
 from harness import (
     SEED,
     TABLES,
@@ -108,7 +107,7 @@ def measure(quick: bool, *, learns: str) -> Numbers:
     for devices in DEVICES:
         flags = f"--xla_force_host_platform_device_count={devices}"
         done = subprocess.run(
-            ran.python("gfnn_jax", __file__, "--here", learns, 20 if quick else STEPS),
+            [sys.executable, __file__, "--here", learns, str(20 if quick else STEPS)],
             env={**os.environ, "XLA_FLAGS": flags},
             stdout=subprocess.PIPE,
             text=True,
@@ -185,7 +184,7 @@ def measure_fits_on_devices(quick: bool) -> Numbers:
     for count in (0, *DEVICES):
         flags = f"--xla_force_host_platform_device_count={max(count, 1)}"
         done = subprocess.run(
-            ran.python("gfnn_jax", __file__, "--fits-here", count, int(quick)),
+            [sys.executable, __file__, "--fits-here", str(count), str(int(quick))],
             env={**os.environ, "XLA_FLAGS": flags},
             stdout=subprocess.PIPE,
             text=True,
@@ -292,7 +291,7 @@ def run_group(task: str, file: Path, count: int) -> list[Numbers]:
     told = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": str(count)}
     running = [
         subprocess.Popen(
-            ran.python("gfnn_jax", __file__, "--group", task, file),
+            [sys.executable, __file__, "--group", task, str(file)],
             stdout=subprocess.PIPE,
             text=True,
             env={"OPENBLAS_NUM_THREADS": "1", **os.environ, **told, "JAX_PROCESS_ID": str(i)},

@@ -5,17 +5,16 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-from pathlib import Path
+import sys
 
 # Sets float64, so it comes before all of JAX.
 from harness import HERE, RESULTS, Numbers, angles_of, drawn, fitted, in_float32
 
 # isort: split
+import commits
 import jax
 import jax.numpy as jnp
 import numpy as np
-import ran
-from current import code_of
 from hard.cases import Case, counts, digits_of, tried
 
 import gfnn_jax as gfnn
@@ -36,7 +35,7 @@ def fingerprint(quick: bool) -> Numbers:
         "image": np.asarray(states)[:, 1].tolist(),
         "after 100 steps": np.asarray(states)[:, -1].tolist(),
         "label": fit.chosen.label,
-        "code": code_of(Path(__file__)),
+        "code": commits.code()["commit"],
     }
 
 
@@ -70,7 +69,7 @@ def precision(quick: bool) -> tuple[list[Case], Numbers]:
             )
         )
     code = "import gfnn_jax as g, numpy as n; z = n.random.rand(100, 2); g.fit(g.Pairs(z, z, 1.0))"
-    command = ran.python("gfnn_jax", "-c", code)
+    command = [sys.executable, "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=x64_off())
     line = done.stderr.strip().splitlines()[-1] if done.stderr else ""
     cases.append(

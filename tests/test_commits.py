@@ -1,0 +1,133 @@
+"""Results that are older than their code are found, told and measured again."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+import commits
+
+from benchmarks.__main__ import studies
+
+STUDY = """
+import json, pathlib, sys
+import commits
+
+def main(doc, pieces, prefix):
+    if sys.argv[2] == "broken":
+        sys.exit(1)
+    found = {"code": commits.code(), "measured": {"rms": 2.0}}
+    pathlib.Path(f"benchmarks/results/{prefix}-{sys.argv[2]}.json").write_text(json.dumps(found))
+
+main(__doc__, {}, "a-try")
+"""
+
+
+@pytest.fixture
+def repository(tmp_path, monkeypatch):
+    """A repository of a package of two modules and a study that loaded one; (root, commit)."""
+
+    def commit() -> str:
+        for words in (["add", "-A"], ["commit", "-qm", "one", "--allow-empty"]):
+            subprocess.run(["git", *words], check=True, cwd=tmp_path)
+        return commits.git("rev-parse", "HEAD").strip()
+
+    for variable in ("GIT_AUTHOR", "GIT_COMMITTER"):
+        monkeypatch.setenv(f"{variable}_NAME", "one")
+        monkeypatch.setenv(f"{variable}_EMAIL", "one@example.org")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(commits, "HERE", tmp_path / "benchmarks")
+    subprocess.run(["git", "init", "-q"], check=True)
+    for folder in ("gfnn_jax", "benchmarks/results"):
+        Path(folder).mkdir(parents=True)
+    Path("gfnn_jax/used.py").write_text('"""Doc."""\ndef f(x):\n    return x\n')
+    Path("gfnn_jax/idle.py").write_text("Y = 1\n")
+    Path("benchmarks/a_try.py").write_text(STUDY)
+    source = Path(__file__).parent.parent / "benchmarks/commits.py"
+    Path("benchmarks/commits.py").write_bytes(source.read_bytes())
+    forget()
+    yield tmp_path, commit
+    forget()
+
+
+def forget():
+    for cached in (commits._came_with, commits._differ, commits._meaning):
+        cached.cache_clear()
+
+
+def is_old(code, name="a-try-one.json"):
+    forget()
+    return list(commits.changed(code, name))
+
+
+def test_a_result_is_old_where_a_file_changed_that_it_loaded(repository):
+    root, commit = repository
+    first = commit()
+    code = {"commit": first, "dirty": False, "files": "benchmarks/a_try.py gfnn_jax/used.py"}
+    assert is_old(code) == []
+    used = root / "gfnn_jax/used.py"
+    used.write_text("def f(x):  # the same\n    '''Other words.'''\n    return (x)\n")
+    (root / "gfnn_jax/idle.py").write_text("Y = 2\n")
+    assert is_old(code) == []
+    used.write_text("def f(x):\n    return 2 * x\n")
+    assert is_old(code) == ["gfnn_jax/used.py"]
+    # One that was measured beside this change is of the commit that it came with, as one of 0.3.
+    for other in (code | {"dirty": True}, {"gfnn_jax/used.py": "ab1 cd2"}, {"gfnn_jax": "ab1"}):
+        (root / "benchmarks/results/a-try-one.json").write_text(json.dumps({"code": other}))
+        commit()
+        assert is_old(other) == []
+        used.write_text(used.read_text() + "Z = 1\n")
+        assert is_old(other) == ["gfnn_jax/used.py"]
+    used.unlink()
+    assert is_old(code) == ["gfnn_jax/used.py"]
+    assert len(is_old(None)) == len(is_old(code, "")) == 1
+
+
+def test_what_is_old_is_measured_again(repository, capsys):
+    root, commit = repository
+    results = root / "benchmarks/results"
+    commit()
+    for name in ("one", "broken", "other"):
+        code = None if name != "other" else {"gfnn_jax/used.py": ""}
+        (results / f"a-try-{name}.json").write_text(json.dumps({"code": code}))
+    (results / "nobody.json").write_text("{}")
+    commit()
+    forget()
+    before = (results / "a-try-broken.json").read_bytes()
+    assert commits.check(["a_try"], [], results, tell=True) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("nobody.json")
+    assert lines[1].startswith("1 of 3")
+    assert [line.split(",")[0] for line in lines[2:]] == ["a-try-broken.json", "a-try-one.json"]
+    assert commits.check(["a_try"], ["a_try"], results, tell=False) == 1
+    assert (results / "a-try-broken.json").read_bytes() == before
+    found = json.loads((results / "a-try-one.json").read_text())
+    assert found["measured"] == {"rms": 2.0}
+    assert found["code"]["dirty"] is False
+    assert "benchmarks/a_try.py" in found["code"]["files"].split()
+
+
+def test_every_result_of_the_repository_has_a_study():
+    here = commits.HERE
+    made = [r for s in studies() for r in commits.results_of(here / f"{s}.py", here / "results")]
+    assert {path for _, path, _ in made} == set((here / "results").glob("*.json"))
+
+
+def test_a_study_tells_its_commit_and_files():
+    text = "import harness, json; print(json.dumps(harness.circumstances()['code']))"
+    here = commits.HERE
+    done = subprocess.run(
+        [sys.executable, "-c", text],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(here), str(here.parent)])},
+        check=True,
+    )
+    code = json.loads(done.stdout)
+    assert {"gfnn_jax/phase_space.py", "benchmarks/harness.py"} <= set(code["files"].split())
+    assert "gfnn_jax/cli.py" not in code["files"]
