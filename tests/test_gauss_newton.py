@@ -10,11 +10,12 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.families.terms import Terms, given_terms, polynomial_terms
+from gfnn_jax.families.text import Term
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.linear_starts import log_start, midpoint_start
 from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.flows.collocation import Steps, images, truncation
-from gfnn_jax.models.hamiltonians.formula import Term, formula
+from gfnn_jax.models.hamiltonians.formula import formula
 from gfnn_jax.models.hamiltonians.law_candidate import assembled
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.phase_space import Pairs

@@ -16,10 +16,11 @@ import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.evaluate import report
+from gfnn_jax.families.text import Term
 from gfnn_jax.learn import searches
 from gfnn_jax.models.hamiltonians import choose_law
 from gfnn_jax.models.hamiltonians.choose_law import preferred
-from gfnn_jax.models.hamiltonians.formula import Term, formula
+from gfnn_jax.models.hamiltonians.formula import formula
 from gfnn_jax.models.maps_of_laws.draw import drawn
 
 FORMULA = "0.5 q1² + 0.5 q2² + 0.5 p1² + 0.5 p2² + q1² q2 - 0.333333333333 q2³"

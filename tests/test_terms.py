@@ -10,13 +10,13 @@ import sympy
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import Family, LinearFamily
-from gfnn_jax.families.expressions import parse, plain, to_text
+from gfnn_jax.families.expressions import parse, to_text
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
+from gfnn_jax.families.text import Term, plain
 from gfnn_jax.families.traced import traced
-from gfnn_jax.models.hamiltonians.formula import Term, formula
+from gfnn_jax.models.hamiltonians.formula import formula
 from gfnn_jax.models.lagrangians.learned_law import Hamiltonian
-from gfnn_jax.models.lagrangians.text import Term as LawTerm
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.pcr3bp import features
 
@@ -183,9 +183,9 @@ def test_what_a_fit_shows_can_be_given_to_it_and_to_sympy():
 def test_h_of_a_law_is_whole_for_sympy():
     """½ pᵀM⁻¹p + V at one state, of an M that depends on the angles."""
     listed = (("M11: 1", 1.0), ("M12: cos(a - b)", 0.4), ("M22: 1", 0.3), ("cos(a)", -2.0))
-    law = Hamiltonian(tuple(LawTerm(term, c, 0.0) for term, c in listed))
+    law = Hamiltonian(tuple(Term(term, c, 0.0) for term, c in listed))
     state = {"a": 0.3, "b": -1.1, "p1": 0.7, "p2": -0.2}
     p, mixed = np.array([0.7, -0.2]), 0.4 * np.cos(1.4)
     expected = p @ np.linalg.solve([[1.0, mixed], [mixed, 0.3]], p) / 2 - 2 * np.cos(0.3)
     assert float(law.sympy().subs(state)) == pytest.approx(expected, rel=1e-14)
-    assert r"\cos(a)" in law.latex()
+    assert r"\cos{\left(a \right)}" in law.latex()

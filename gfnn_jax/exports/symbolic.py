@@ -1,10 +1,37 @@
-"""Formulas as text, read by sympy: its home."""
+"""Formulas for people, for parsers, and as sympy reads them: its home."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+from gfnn_jax.families.text import Term, added, digits, in_letters, measured
+
+
+@dataclasses.dataclass(frozen=True)
+class Formula:
+    """A sum of terms, each as code in the names of its variables."""
+
+    terms: tuple[Term, ...]
+
+    @property
+    def formula(self) -> str:
+        """Formula as Python writes it, which ``--terms`` and sympy read."""
+        return added(f"{digits(c, s)}*{t}" for t, c, s in self.terms) or "0"
+
+    def __str__(self) -> str:
+        """Formula as a person writes it: the last digits' standard errors in brackets."""
+        return added(f"{measured(c, s)} {in_letters(t)}" for t, c, s in self.terms) or "0"
+
+    def sympy(self) -> Any:
+        """Formula as a sympy expression."""
+        return as_sympy(self.formula)
+
+    def latex(self) -> str:
+        """Formula in LaTeX's notation, its terms in their order."""
+        return added(f"{digits(c, s)} {as_latex(t)}" for t, c, s in self.terms) or "0"
 
 
 def as_sympy(text: str) -> Any:

@@ -11,7 +11,6 @@ import ast
 import dataclasses
 import keyword
 import math
-import re
 from collections.abc import Callable, Sequence
 from functools import cache, cached_property
 from typing import Any
@@ -19,9 +18,9 @@ from typing import Any
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.functions import CHEBYSHEV, FUNCTIONS
 from gfnn_jax.families.site_sums import balanced, of_a_window, written_out
+from gfnn_jax.families.text import OTHER_NAMES, added, plain
 
 _LONGEST_TEXT, _DEEPEST = 20_000, 60
-_OTHER_NAMES = {"atan": "arctan", "ln": "log"}
 _CONSTANTS = {"pi": math.pi, "e": math.e}
 
 
@@ -151,7 +150,7 @@ def coordinate_names(dim: int) -> tuple[str, ...]:
 
 def check_names(dim: int, names: Sequence[str]) -> None:
     """Raise InputError where these names of parameters could not be used in an expression."""
-    taken = {*coordinate_names(dim), *FUNCTIONS, *_OTHER_NAMES, "q", "p", "t"}
+    taken = {*coordinate_names(dim), *FUNCTIONS, *OTHER_NAMES, "q", "p", "t"}
     for name in names:
         if not name.isidentifier() or keyword.iskeyword(name):
             raise InputError(f"expected letters, digits and _ as a parameter's name, got '{name}'")
@@ -160,25 +159,6 @@ def check_names(dim: int, names: Sequence[str]) -> None:
                 f"'{name}' cannot name a parameter: it already names a coordinate, the time or a "
                 "function; choose another name"
             )
-
-
-_POWERS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹", "0123456789")
-_FACTORS = re.compile(r"([\w.]+|\)) +(?=(\w+|\())")
-
-
-def plain(text: str) -> str:
-    """Write a formula as people read it, "0.5 p1² − cos(q1)", as code does: "0.5*p1**2 - cos(q1)".
-
-    Text that is code already stays as it is.
-    """
-    text = re.sub("[⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda found: f"**{found[0].translate(_POWERS)}", text)
-
-    def times(found) -> str:
-        called = found[1] in {*FUNCTIONS, *_OTHER_NAMES} and found[2] == "("
-        code = called or any(keyword.iskeyword(word) for word in found.groups())
-        return found[0] if code else f"{found[1]}*"
-
-    return _FACTORS.sub(times, text.replace("−", "-"))
 
 
 @cache
@@ -264,7 +244,7 @@ def _parsed(node, names, text, depth) -> Expression:
         return -operand if isinstance(node.op, ast.USub) else operand
     if isinstance(node, ast.Call):
         name = node.func.id if isinstance(node.func, ast.Name) else "?"
-        name = _OTHER_NAMES.get(name, name)
+        name = OTHER_NAMES.get(name, name)
         known = name in FUNCTIONS or CHEBYSHEV.fullmatch(name)
         if not known or node.keywords or len(node.args) != 1:
             raise refuse(f"a call of '{ast.unparse(node.func)}' with {len(node.args)} arguments")
@@ -334,7 +314,7 @@ def _text(tree: Expression, names, width: int) -> tuple[str, int]:
         return f"{inside(operands[0], _ATOM)}**{exponent}", _POWER
     if operation == "+":
         left, right = inside(operands[0], _SUM), inside(operands[1], _SUM)
-        return (f"{left} - {right[1:]}" if right.startswith("-") else f"{left} + {right}"), _SUM
+        return added((left, right)), _SUM
     if operation == "*":
         factor = operands[0].value
         if factor is not None and factor < 0:

@@ -26,6 +26,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.families.text import added, barred, combination, power, shown
 
 MAX_POWER = 8  # of one coordinate in one term; powers come from a table of this length
 Powers = tuple[tuple[int, ...], ...]  # of the parameters, (m, k), for each coefficient
@@ -94,6 +95,21 @@ class Terms:
             (*(tuple(map(int, a[j])) for a in whole), float(self.phases[j]))
             for j in range(self.count)
         ]
+
+    def texts(self, names: Sequence[str], speeds: Sequence[str]) -> tuple[str, ...]:
+        """Each term as code in the names of the coordinates and of their velocities; a phase other
+        than that of a cosine or a sine stays in the argument."""
+        listed = []
+        for k, n, m, phase in self.rows():
+            factors = [power(x, e) for x, e in zip((*speeds, *names), (*k, *n), strict=True) if e]
+            if any(m):  # cos or sin of m·q + φ, whichever has the smaller |φ|
+                sine = abs(phase + np.pi / 2) < np.pi / 4
+                rest = phase + np.pi / 2 if sine else phase
+                shift = [f"{rest:.5g}"] if abs(rest) > 1e-12 else []
+                inside = added([combination(m, names), *shift])
+                factors.append(f"{'sin' if sine else 'cos'}({inside})")
+            listed.append("*".join(factors) or "1")
+        return tuple(listed)
 
     def take(self, keep: Any) -> Terms:
         """The terms with these indices, or where this mask holds."""
@@ -203,10 +219,31 @@ class Friction:
             for k in range(self.count)
         ]
 
+    def texts(self, speeds: Sequence[str]) -> tuple[tuple[str, float], ...]:
+        """Each term as code in the names of the velocities, and the number before it: ("v1**2", ½),
+        ("abs(v2 - v1)**3", ⅓), ("abs(v2)", 1); uniform friction, a row without a direction, is γ T.
+        """
+        listed = []
+        for direction, kind, width in self.rows():
+            speed = combination(direction[::-1], [*speeds][::-1])
+            squared = f"({speed})**2" if sum(map(bool, direction)) > 1 else f"{speed}**2"
+            listed.append(
+                {
+                    LINEAR: (squared, 1 / 2),
+                    QUADRATIC: (f"abs({speed})**3", 1 / 3),
+                    DRY: (f"sqrt({squared} + {width**2:.4g})" if width else f"abs({speed})", 1.0),
+                    UNIFORM: ("T", 1.0),
+                }[kind]
+            )
+        return tuple(listed)
+
     @property
     def names(self) -> tuple[str, ...]:
-        """Each term as it stands in a formula: "½ v1²", "⅓ |v1 - v2|³", "|v2|"."""
-        return tuple(_friction_named(c, kind) for c, kind, _ in self.rows())
+        """Each term as it stands in a formula: "½ v1²", "⅓ |v2 - v1|³", "|v2|"."""
+        speeds = [f"v{i + 1}" for i in range(self.directions.shape[1])]
+        sharp = dataclasses.replace(self, widths=np.zeros(self.count))
+        before = {1 / 2: "½ ", 1 / 3: "⅓ ", 1.0: ""}
+        return tuple(before[part] + barred(shown(t)) for t, part in sharp.texts(speeds))
 
     def take(self, keep: Any) -> Friction:
         return Friction(self.directions[keep], self.kinds[keep], self.widths[keep])
@@ -384,18 +421,6 @@ def functions_of(powers: Powers, args: Any) -> Any:
                 column = column * args[..., i] if n > 0 else column / args[..., i]
         columns.append(column)
     return namespace(args).stack(columns, axis=-1)
-
-
-def _friction_named(direction: tuple[int, ...], kind: int) -> str:
-    parts = [
-        f"{'-' if c < 0 else '+'} {abs(c) if abs(c) > 1 else ''}v{i + 1}"
-        for i, c in enumerate(direction)
-        if c
-    ]
-    speed = " ".join(parts).removeprefix("+ ")
-    if kind == LINEAR:
-        return f"½ ({speed})²" if len(parts) > 1 else f"½ {speed}²"
-    return f"⅓ |{speed}|³" if kind == QUADRATIC else f"|{speed}|"
 
 
 def _monomials(x: Any, n: Any, order: int) -> tuple[Any, Any, Any]:

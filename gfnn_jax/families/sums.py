@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import combinations, product
 from typing import Any
@@ -23,6 +23,7 @@ from gfnn_jax.arrays import as_row, matmul, namespace
 from gfnn_jax.families.expressions import depends_on, parse, window_terms
 from gfnn_jax.families.site_sums import site_sum
 from gfnn_jax.families.terms import Terms, exponents, given_terms, joined
+from gfnn_jax.families.text import added
 from gfnn_jax.phase_space import split
 
 ENDS = ("ring", "free", "fixed")
@@ -331,11 +332,6 @@ class Sums:
             last = first + part.terms.num_parameters
             yield part, params[first:last]
             first = last
-
-
-def added(texts: Iterable[str]) -> str:
-    """Sum of expressions as text."""
-    return " + ".join(texts).replace("+ -", "- ")
 
 
 def matrix_free(family) -> bool:

@@ -30,6 +30,7 @@ from gfnn_jax.families.expressions import (
     to_text,
 )
 from gfnn_jax.families.jets import jets
+from gfnn_jax.families.text import superscript
 from gfnn_jax.families.traced import traced
 
 # Up to this number, products with coefficients are written one by one, and XLA fuses them; beyond
@@ -181,7 +182,7 @@ class Terms:
         names = []
         for row in self.powers:
             factors = [
-                (text if alone else name) if a == 1 else f"{name}{_superscript(a)}"
+                (text if alone else name) if a == 1 else f"{name}{superscript(a)}"
                 for text, name, a in zip(self.variables, named, row, strict=True)
                 if a
                 for alone in [sum(row) == 1]
@@ -306,13 +307,6 @@ def _pulled_back(variables, slopes) -> dict[int, Any]:
             term = slope if isinstance(s, float) and s == 1.0 else slope * s
             gradient[i] = gradient[i] + term if i in gradient else term
     return gradient
-
-
-_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-def _superscript(exponent: int) -> str:
-    return str(exponent).translate(_DIGITS)
 
 
 # Constructors of families of terms.

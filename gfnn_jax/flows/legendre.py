@@ -18,13 +18,12 @@ import numpy as np
 
 from gfnn_jax.arrays import namespace
 from gfnn_jax.families.lagrangian import Derivatives, Friction, Lagrangian, Terms
+from gfnn_jax.families.text import shown
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.systems import OfSystems
 from gfnn_jax.flows.uniform import Uniform
 from gfnn_jax.phase_space import split
 from gfnn_jax.solve.linear import small_solve
-
-_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("terms",), meta_fields=())
@@ -44,7 +43,8 @@ class Legendre:
     @property
     def term_names(self) -> tuple[str, ...]:
         """Each ℓ_j as it stands in a formula: "v1 v2 cos(q1 - q2)"."""
-        return tuple(_named(*row) for row in self.terms.rows())
+        names = [[f"{letter}{i + 1}" for i in range(self.dim)] for letter in "qv"]
+        return tuple(map(shown, self.terms.texts(*names)))
 
     def take(self, rows) -> Legendre:
         """The family of these terms alone."""
@@ -133,22 +133,6 @@ class Legendre:
         return Lagrangian(
             self.terms, params, Friction.of([], self.dim), none, 0.0, none.reshape(self.dim, 0)
         )
-
-
-def _named(speeds, powers, mode, phase: float) -> str:
-    parts = []
-    for letter, exponents in (("v", speeds), ("q", powers)):
-        for i, n in enumerate(exponents, 1):
-            parts += [f"{letter}{i}" + ("" if n == 1 else str(n).translate(_DIGITS))] if n else []
-    if any(mode):
-        sign = "".join(
-            f" {'-' if m < 0 else '+'} {'' if abs(m) == 1 else f'{abs(m)} '}q{i}"
-            for i, m in enumerate(mode, 1)
-            if m
-        )
-        angle = sign[3:] if sign.startswith(" +") else "-" + sign[3:]
-        parts.append(f"{'cos' if phase == 0 else 'sin'}({angle})")
-    return " ".join(parts)
 
 
 def _solved(matrix, rows):

@@ -8,17 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.expressions import plain
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms
-
-
-class Term(NamedTuple):
-    """One term of the formula, its coefficient and that one's standard error."""
-
-    term: str
-    coefficient: float
-    std: float
+from gfnn_jax.families.text import Term, added, digits, plain
 
 
 class Rival(NamedTuple):
@@ -45,20 +37,16 @@ OnPartial = Callable[[PartialLaw], Any]
 
 def formula(terms: Sequence[Term]) -> str:
     """H as text: "0.5 p1² + 0.5 p2² - 0.333333333333 q2³"."""
-    text = ""
-    for term, coefficient, std in terms:
-        if coefficient == 0:
-            continue
-        sign = " - " if coefficient < 0 else " + "
-        size = abs(coefficient)
-        digits = 12 if std <= 0 else int(np.clip(np.ceil(np.log10(size / std)) + 1, 2, 12))
-        number = f"{size:.{digits}g}"
-        factor = "" if number == "1" else f"{number} "
-        if factor and term.startswith("1/"):
-            factor, term = number, term[1:]
-        shown = f"({term})" if factor and _is_sum(term) else term
-        text += (sign if text else sign.strip().removeprefix("+")) + factor + shown
-    return text or "0"
+    return added(_times(digits(c, std, spare=1), t) for t, c, std in terms if c) or "0"
+
+
+def _times(number: str, term: str) -> str:
+    """The term with its coefficient, one that is not 1."""
+    if number in ("1", "-1"):
+        return number[:-1] + term
+    if term.startswith("1/"):
+        return number + term[1:]
+    return f"{number} ({term})" if _is_sum(term) else f"{number} {term}"
 
 
 def as_code(family: Terms | Sums, terms: Sequence[Term]) -> str:

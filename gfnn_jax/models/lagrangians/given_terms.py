@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.expressions import plain
 from gfnn_jax.families.lagrangian import DRY, LINEAR, MAX_POWER, QUADRATIC
+from gfnn_jax.families.text import plain
 from gfnn_jax.models.lagrangians.structure import Loss, Row, with_powers
 
 _SINE = -np.pi / 2

@@ -10,7 +10,9 @@ import numpy as np
 from gfnn_jax.data.channels import args_of, parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
+from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.lagrangian import Powers
+from gfnn_jax.families.text import Term
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.in_use import InUse
@@ -19,8 +21,6 @@ from gfnn_jax.models.lagrangians.learned_law import LearnedLaw, NextMotion, hami
 from gfnn_jax.models.lagrangians.next_motion import Motion
 from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness, whiteness
 from gfnn_jax.models.lagrangians.text import (
-    Expression,
-    Term,
     friction_of,
     of_systems,
     speed_names,
@@ -120,7 +120,7 @@ def _standard_errors(best: InUse) -> tuple[np.ndarray, np.ndarray, np.ndarray, f
     return of_terms, of_losses, rest[: law.gains.size].reshape(law.gains.shape), float(std[-1])
 
 
-def _expressions(best: InUse, names: _Names) -> tuple[Expression, Expression]:
+def _expressions(best: InUse, names: _Names) -> tuple[Formula, Formula]:
     """L and Rayleigh's R; uniform friction enters R as γ T."""
     law = best.law
     of_terms, of_losses, _, of_rate = _standard_errors(best)
@@ -135,8 +135,8 @@ def _expressions(best: InUse, names: _Names) -> tuple[Expression, Expression]:
     kinetic = tuple(
         term for term, row in zip(lagrangian.terms, law.terms.rows(), strict=True) if any(row[0])
     )
-    uniform = Term(f"({Expression(kinetic).formula})", float(law.uniform), of_rate)
-    return lagrangian, Expression((*friction.terms, uniform))
+    uniform = Term(f"({Formula(kinetic).formula})", float(law.uniform), of_rate)
+    return lagrangian, Formula((*friction.terms, uniform))
 
 
 def _gains(best: InUse, recording: Recording) -> Gains:
@@ -236,7 +236,7 @@ def _next_motions(
     return tuple(named)
 
 
-def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[str, ...]:
+def _alike(fit: LawFit, lagrangian: Formula, friction: Formula) -> tuple[str, ...]:
     """Pairs of coefficients that the record cannot tell apart."""
     covariance = fit.covariance()
     scale = np.sqrt(np.diag(covariance))
@@ -253,9 +253,7 @@ def _alike(fit: LawFit, lagrangian: Expression, friction: Expression) -> tuple[s
     )
 
 
-def _energy(
-    traces: Sequence[Trace], friction: Expression, inputs: tuple[str, ...]
-) -> dict[str, Any]:
+def _energy(traces: Sequence[Trace], friction: Formula, inputs: tuple[str, ...]) -> dict[str, Any]:
     """Energy per second, means over the arcs: stored, lost by each friction, supplied by each
     input, and what these leave unexplained."""
     total = sum(trace.t[-1] - trace.t[0] for trace in traces)

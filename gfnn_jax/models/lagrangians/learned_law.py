@@ -8,21 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.exports import symbolic
+from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.lagrangian import DRY, Lagrangian
+from gfnn_jax.families.text import Term, measured
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.calibration import Horizon
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.input_rules import RULES
 from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness
-from gfnn_jax.models.lagrangians.text import (
-    Expression,
-    Term,
-    WhichFriction,
-    measured,
-    of_systems,
-    terms_of,
-)
+from gfnn_jax.models.lagrangians.text import WhichFriction, of_systems, terms_of
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
 _SHOWN = 3  # pairs of nearly collinear coefficients that are listed
@@ -79,8 +74,8 @@ class LearnedLaw:
     """
 
     map: SymplecticMap
-    lagrangian: Expression
-    friction: Expression
+    lagrangian: Formula
+    friction: Formula
     which_friction: WhichFriction
     gains: dict[str, dict[str, tuple[float, float]]]
     delay: tuple[float, float] | None
@@ -222,12 +217,12 @@ class Hamiltonian:
         return rf"\tfrac12 p^\top M(q)^{{-1}} p + {self._potential.latex()}"
 
     @property
-    def _potential(self) -> Expression:
-        return Expression(tuple(t for t in self.terms if not t.term.startswith("M")))
+    def _potential(self) -> Formula:
+        return Formula(tuple(t for t in self.terms if not t.term.startswith("M")))
 
 
 def hamiltonian_of(
-    law: Lagrangian, lagrangian: Expression, names: tuple[str, ...], parameters: tuple[str, ...]
+    law: Lagrangian, lagrangian: Formula, names: tuple[str, ...], parameters: tuple[str, ...]
 ) -> Hamiltonian:
     """The entries of M as "M12: factor", and V = −(the terms of L without v)."""
     terms = law.terms
