@@ -11,6 +11,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.dataset.arcs import arcs_of_pairs
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting import least_squares
+from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.models.hamiltonians.flow_arcs import FlowOnArcs, fit_flow, longest_arc
@@ -74,7 +75,7 @@ def test_errors_are_those_that_the_covariance_says():
     for seed in range(8):
         found = shot(measured(seed)[0])
         off = found.p - TRUE
-        squares += float(off @ np.linalg.solve(found.covariance(), off))
+        squares += float(off @ np.linalg.solve(Linearised.of_arcs(found).covariance, off))
         noise += found.sigma / 8
     assert 10 < squares < 42
     np.testing.assert_allclose(noise, NOISE, rtol=0.04)
@@ -86,7 +87,7 @@ def test_a_pair_is_an_arc_of_two_states():
     for seed in range(4):
         found = shot(measured(seed, 1_000, 2, noise=np.array([3e-3, 1e-3]))[0])
         off = found.p - TRUE
-        squares += float(off @ np.linalg.solve(found.covariance(), off))
+        squares += float(off @ np.linalg.solve(Linearised.of_arcs(found).covariance, off))
         noise += found.sigma / 4
     assert 4 < squares < 24  # chi squared of 12
     np.testing.assert_allclose(noise, [3e-3, 1e-3], rtol=0.08)
@@ -95,7 +96,7 @@ def test_a_pair_is_an_arc_of_two_states():
 def test_gross_errors_change_nothing_and_are_counted():
     clean, spoilt = shot(measured(0)[0]), measured(0, outliers=0.05)
     found = shot(spoilt[0])
-    deviation = np.sqrt(np.diag(clean.covariance()))
+    deviation = Linearised.of_arcs(clean).errors
     assert np.all(np.abs(found.p - TRUE) < 4 * deviation)
     assert outliers(found) == pytest.approx(spoilt[1].sum(), abs=1)
     np.testing.assert_allclose(found.sigma, NOISE, rtol=0.15)

@@ -7,6 +7,8 @@ import pytest
 
 from gfnn_jax.dataset.stretches import Arcs
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC
+from gfnn_jax.fitting.linearised import Linearised
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.models.lagrangians.friction_choice import Table, chosen
 from gfnn_jax.models.lagrangians.search import _likeliest, _without_drives
 from gfnn_jax.models.lagrangians.structure import Structure
@@ -103,7 +105,7 @@ def test_friction_that_falls_below_zero_by_longer_arcs_is_dropped():
             structure=structure,
             p=p,
             values=dict(zip(structure.keys(), p, strict=True)),
-            covariance=lambda: np.diag(np.full(len(p), 1e-4)),
+            linearised=Linearised(p, Triangle(100 * np.eye(len(p) + 1), 9)),
             arcs=Arcs(*5 * [None]),
             sigma=None,
             fitted=SimpleNamespace(cost=1.0, x=None),

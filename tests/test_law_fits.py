@@ -22,6 +22,7 @@ from gfnn_jax.families.lagrangian import (
     Lagrangian,
     Terms,
 )
+from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.flows.motion import NODES, Form
 from gfnn_jax.flows.schedules import HOLDS, at_stages, interpolate
 from gfnn_jax.jobs.forecast import forecast_recording
@@ -99,7 +100,7 @@ def test_arcs_with_latent_states_find_a_rate_and_its_error():
         x = np.where(np.isfinite(y), y, 0.0)
         fit = Readings(_Decay(), y, np.array([sigma])).fit(np.array([0.1]), x, np.array([sigma]))
         assert fit.converged
-        found.append([fit.p[0], np.sqrt(fit.covariance()[0, 0])])
+        found.append([fit.p[0], float(Linearised.of_arcs(fit).errors[0])])
     p, std = np.array(found).T
     assert abs(p.mean() - k) < 4 * p.std() / np.sqrt(60)
     assert 0.75 < std.mean() / p.std() < 1.35
@@ -606,7 +607,7 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     assert min(of["hold"].others.values()) > 1.5
     on = search_on(of["linear"], found["linear"].nodes, samples.scales, (), 1)
     assert on.acting.hold == "hold"
-    p, error = on.acting.fit.p, np.sqrt(np.diag(on.acting.fit.covariance()))
+    p, error = on.acting.fit.p, on.acting.fit.linearised.errors
     # L = ½ẋ² − 4.5 x², R = 0.3 ½ẋ², in the order of the terms, the losses and the gain.
     np.testing.assert_array_less(np.abs(p - [-4.5, 0.3, 2.0]), 4 * error)
     np.testing.assert_allclose(p, found["hold"].acting.fit.p, atol=2 * error.max())

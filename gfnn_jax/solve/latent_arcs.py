@@ -79,13 +79,6 @@ class Fitted:
         """(n, n), of p alone."""
         return self.factor[:-1, :-1]
 
-    def covariance(self) -> np.ndarray:
-        """(RᵀR)⁻¹, for white residuals of unit variance; infinite where derivatives overflow."""
-        if not self.triangle.any():
-            return np.full_like(self.triangle, np.inf)
-        inverse = np.linalg.pinv(self.triangle)
-        return inverse @ inverse.T
-
     def last_covariance(self) -> np.ndarray:
         """Covariance of the last state of each arc (A, m, m), with p as it is; 1e100 of each
         coordinate where derivatives overflow."""
@@ -165,11 +158,6 @@ class Readings:
         (J, _), m = self.linearised(p, x), x.shape[-1]
         across = np.linalg.qr(J[..., :m], mode="complete")[0][..., m:]
         return (across.swapaxes(1, 2) @ J[..., m:]).reshape(-1, J.shape[-1] - m)
-
-    def triangle(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """The triangle (n + 1, n + 1) of `eliminated_rows`: what a test of coefficients needs."""
-        factor = np.asarray(np.linalg.qr(self.eliminated_rows(p, x), mode="r"))
-        return np.concatenate([factor, np.zeros((factor.shape[1] - len(factor), factor.shape[1]))])
 
     def last_by_coefficients(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Derivative (A, m, n) in p of the last state of each arc that was fitted with p fixed."""

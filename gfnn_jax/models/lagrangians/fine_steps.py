@@ -14,14 +14,12 @@ from collections.abc import Callable
 import numpy as np
 
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
-from gfnn_jax.solve.latent_arcs import Readings
 
 _MOVED = 1 / 3  # of a standard error: what steps may move a combination of coefficients by
 _ORDER = 5
 _TIMES = 6  # that steps are shortened
 _GAINS = 0.5  # times what longer steps moved: shortening that leaves more does not help
 _SHORTEST = 0.02  # radians of the fastest motion in a step
-_RCOND = 1e-9  # of scaled columns: a combination that moves nothing
 
 
 def with_fine_steps(
@@ -65,22 +63,7 @@ def _with_steps(bench: Workbench, count: int) -> Workbench:
 def _moved(bench: Workbench, finer: Workbench, fit: LawFit) -> float:
     """The most by which any combination of coefficients moves, in its standard errors; 0 where no
     orbit follows the arcs by the finer steps."""
-    here, there = (_rows(one, fit) for one in (bench, finer))
-    if not (np.isfinite(here).all() and np.isfinite(there).all()):
+    here, there = (one.linearised(fit.structure, fit) for one in (bench, finer))
+    if not (here.triangle.finite and there.triangle.finite):
         return 0.0
-    change = _asked(there) - _asked(here)
-    return float(np.linalg.norm(here[:-1, :-1] @ change) / np.sqrt(fit.correlation))
-
-
-def _rows(bench: Workbench, fit: LawFit) -> np.ndarray:
-    """The triangle (n + 1, n + 1) of coefficients and residuals by the steps of a workbench."""
-    model = bench.model(fit.structure, fit.arcs, fit.p, np.arange(len(fit.p)))
-    noise, whitening = fit.sigma * fit.arcs.noise, bench.whitening(fit.arcs)
-    loss = bench.observation.loss
-    return Readings(model, fit.arcs.y, noise, loss, whitening).triangle(fit.p, fit.fitted.x)
-
-
-def _asked(rows: np.ndarray) -> np.ndarray:
-    """The Gauss–Newton step (n,) of the coefficients."""
-    size = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), 1e-300)
-    return np.linalg.lstsq(rows[:, :-1] / size, rows[:, -1], rcond=_RCOND)[0] / size
+    return here.moved_by(there)

@@ -4,12 +4,15 @@ cost."""
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs, Nodes, arcs_of, with_states
+from gfnn_jax.fitting.linearised import Linearised, without_each
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
@@ -18,9 +21,8 @@ from gfnn_jax.solve.latent_arcs import Fitted, Readings
 from gfnn_jax.solve.wander import Wander
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
-_NOTHING = 1e-9  # of the largest singular value of scaled columns: a combination that does nothing
-_PART = 1e-3  # of the largest coefficient of a combination, that is part of it
 _LEAST_LEFT = 1e-4  # of the squares of residuals, that one more term may leave over
+_IMITATED = 0.03  # of what a term changes, that no coefficient of the fit does
 FOLDS = 3
 
 
@@ -63,24 +65,18 @@ class LawFit:
             values |= {("term", structure.terms[k]): float(theta[k]) for k in structure.given[1:]}
         return values
 
-    def covariance(self) -> np.ndarray:
-        """Covariance of p: that of white residuals, times their correlation time."""
-        return self.fitted.covariance() * self.correlation
+    @functools.cached_property
+    def linearised(self) -> Linearised:
+        """The problem close to p, in which correlated residuals count once."""
+        return Linearised.of_arcs(self.fitted, self.correlation)
 
     def degenerate(self) -> dict[Key, float]:
         """The combination of coefficients that moves nothing, where there is one: as any two
         springs without friction follow from Lagrangians of a whole family."""
         if not np.isfinite(self.fitted.cost):
             return {}
-        R = self.fitted.triangle
-        size = np.linalg.norm(R, axis=0)
-        _, singular, across = np.linalg.svd(R / np.where(size > 0, size, 1.0))
-        if not len(singular) or singular[-1] > _NOTHING * singular[0]:
-            return {}
-        part = np.abs(across[-1])
-        step = across[-1] / np.where(size > 0, size, 1.0)
-        keys = self.structure.keys()
-        return {keys[k]: float(step[k]) for k in np.flatnonzero(part > _PART * part.max())}
+        keys, step = self.structure.keys(), self.linearised.null_direction()
+        return {keys[k]: float(step[k]) for k in np.flatnonzero(step)}
 
     def rms(self) -> np.ndarray:
         """Root mean square residual (k,), in units of the channels."""
@@ -231,14 +227,12 @@ class Workbench:
         whitening = self.whitening(arcs)
         readings = Readings(known, arcs.y, noise, loss, whitening)
         own = readings.fit(np.zeros(0), arcs.x, scale, max_iterations=15)
-        model = self.model(fit.structure, arcs, fit.p, np.arange(len(fit.p)))
-        rows = dataclasses.replace(readings, model=model).rows(fit.p, own.x)
+        rows = self.rows(fit.structure, fit, dataclasses.replace(arcs, x=own.x))
+        numbers = np.unique(third).tolist()
+        parts = [Triangle.of(rows[third == k].reshape(-1, rows.shape[-1])) for k in numbers]
         fits = {}
-        for k in np.unique(third).tolist():
-            others = rows[third != k].reshape(-1, rows.shape[-1])
-            size = np.maximum(np.linalg.norm(others[:, :-1], axis=0), 1e-300)
-            change = np.linalg.lstsq(others[:, :-1] / size, others[:, -1], rcond=1e-10)[0] / size
-            fitted = dataclasses.replace(fit.fitted, p=fit.p + change)
+        for k, p in zip(numbers, without_each(fit.p, parts), strict=True):
+            fitted = dataclasses.replace(fit.fitted, p=p)
             fits[k] = dataclasses.replace(fit, fitted=fitted)
         begun = np.flatnonzero(np.diff(third, prepend=-1)).tolist()
         homes = [(int(third[j]), *arcs.home[j][:2]) for j in begun]
@@ -251,29 +245,38 @@ class Workbench:
         known = fit.values
         new = [k for k in candidates.keys() if k not in known]  # noqa: SIM118
         larger = fit.structure.plus(new)
-        keys = larger.keys()
-        p = larger.start(known)
-        model = self.model(larger, fit.arcs, p, np.arange(len(p)))
-        noise = fit.sigma * fit.arcs.noise
-        white = self.whitening(fit.arcs)
-        readings = Readings(model, fit.arcs.y, noise, self.observation.loss, white)
-        R = readings.triangle(p, fit.fitted.x)
-        old = [keys.index(k) for k in fit.structure.keys()]  # noqa: SIM118
-        own = [keys.index(k) for k in new]
-        Q = np.linalg.qr(R[:, old])[0] if old else np.zeros((len(R), 0))
-        rest = R - Q @ (Q.T @ R)
-        length = np.linalg.norm(R, axis=0)
-        whole = max(rest[:, -1] @ rest[:, -1], 1e-300)
-        scores = {}
-        for key, k in zip(new, own, strict=True):
-            size = np.linalg.norm(rest[:, k])
-            if not (size > 0.03 * length[k] and size > 0):
-                scores[key] = 0.0
-                continue
-            along = rest[:, k] @ rest[:, -1] / size
-            over = max(1 - along**2 / whole, _LEAST_LEFT)
-            scores[key] = float(abs(along) / np.sqrt(fit.correlation * over))
-        return scores
+        added = self.linearised(larger, fit).added(*places(larger, fit.structure, new))
+        scores = added.scores(fit.correlation, _IMITATED, _LEAST_LEFT)
+        return dict(zip(new, scores.tolist(), strict=True))
+
+    def linearised(self, structure: Structure, fit: LawFit, arcs: Arcs | None = None) -> Linearised:
+        """The problem of a structure close to a fit of it, or of a part of it, the states of arcs
+        eliminated; ``arcs``: others than those of the fit, with their states."""
+        readings, p, x = self._close_to(structure, fit, arcs)
+        return Linearised(p, Triangle.of(readings.eliminated_rows(p, x)), fit.correlation)
+
+    def rows(self, structure: Structure, fit: LawFit, arcs: Arcs | None = None) -> np.ndarray:
+        """The rows (A, L, k, n + 1) of the same problem."""
+        readings, p, x = self._close_to(structure, fit, arcs)
+        return readings.rows(p, x)
+
+    def _close_to(
+        self, structure: Structure, fit: LawFit, arcs: Arcs | None
+    ) -> tuple[Readings, np.ndarray, np.ndarray]:
+        arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x) if arcs is None else arcs
+        p = structure.start(fit.values)
+        model = self.model(structure, arcs, p, np.arange(len(p)))
+        noise, white = fit.sigma * arcs.noise, self.whitening(arcs)
+        return Readings(model, arcs.y, noise, self.observation.loss, white), p, arcs.x
+
+
+def places(
+    larger: Structure, fitted: Structure, omitted: Sequence[Key]
+) -> tuple[list[int], list[int]]:
+    """Places among the coefficients of a ``larger`` structure of those that are fitted, and of
+    those that are omitted."""
+    keys = larger.keys()
+    return [keys.index(k) for k in fitted.keys()], [keys.index(k) for k in omitted]  # noqa: SIM118
 
 
 def describe(fit: LawFit) -> str:

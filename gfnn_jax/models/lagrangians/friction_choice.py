@@ -37,6 +37,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
+from gfnn_jax.fitting.linearised import Linearised
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.models.lagrangians.fit import (
     FOLDS,
     LawFit,
@@ -45,7 +47,6 @@ from gfnn_jax.models.lagrangians.fit import (
     thirds_of,
 )
 from gfnn_jax.models.lagrangians.structure import Loss
-from gfnn_jax.solve.latent_arcs import Readings
 from gfnn_jax.solve.linear import non_negative
 
 DECIDED = 20.0  # odds, below which two sets are as good
@@ -54,6 +55,7 @@ _LARGEST = 1e100  # of a residual, or of its derivatives
 _SURE = 20.0  # the logarithm of the largest odds that are told
 _GAINS = 5.0  # standard errors below zero, at which friction would have to drive
 _RCOND = 1e-10  # of coefficients that a record tells only together
+_IMITATED = 1e-3  # of what a friction changes, that no other coefficient does
 _LIMIT = 2.0  # standard errors of a coefficient, above its value: its upper limit
 
 
@@ -174,10 +176,7 @@ def _table_of(bench: Workbench, fit: LawFit, candidates: Sequence[Loss]) -> Tabl
     others = tuple(row for row in candidates if row not in structure.friction)
     larger = structure.plus([("loss", row) for row in others])
     p = larger.start(fit.values)
-    model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
-    noise, loss = fit.sigma * fit.arcs.noise, bench.observation.loss
-    white = bench.whitening(fit.arcs)
-    rows = Readings(model, fit.arcs.y, noise, loss, white).rows(p, fit.fitted.x)
+    rows = bench.rows(larger, fit)
     # Arcs that the larger law cannot follow: their squares would overflow.
     rows[~(np.abs(rows) < _LARGEST).all(axis=(1, 2, 3))] = 0.0
     keys = larger.keys()
@@ -310,18 +309,19 @@ class Table:
     def others(self, taken: tuple[Loss, ...]) -> dict[Loss, tuple[float, float]]:
         """ρ, of either sign, and its standard error of the candidates that were not taken, each
         alone beside those that were."""
-        f, triangle = self.width, self.triangles[-1]
-        base = [*range(f), *(f + k for k, row in enumerate(self.candidates) if row in taken)]
+        places = {row: self.width + k for k, row in enumerate(self.candidates)}
+        base = [*range(self.width), *(k for row, k in places.items() if row in taken)]
+        new = [row for row in places if row not in taken]
+        triangle = Triangle(self.triangles[-1], np.count_nonzero(self.rows[..., -1]))
+        whole = Linearised(np.zeros(self.rows.shape[-1] - 1), triangle)
+        one = whole.added(base, [places[row] for row in new])
         found = {}
-        for k, row in enumerate(self.candidates):
-            if row in taken:
-                continue
-            R = np.asarray(np.linalg.qr(triangle[:, [*base, f + k, -1]], mode="r"))
-            size = abs(R[-2, -2])
-            if size < 1e-3 * np.linalg.norm(triangle[:, f + k]):
-                continue  # the others imitate it: the record sets no limit
-            error = np.sqrt(self.correlation * self._variance(R[-1, -1])) / size
-            found[row] = float(R[-2, -1] / R[-2, -2]), float(error)
+        for row, rho, size, share, left in zip(
+            new, one.value, one.size, one.share, one.left, strict=True
+        ):
+            if share >= _IMITATED:  # else the others imitate it: the record sets no limit
+                error = np.sqrt(self.correlation * self._variance(left)) / size
+                found[row] = float(rho), float(error)
         return found
 
     def limits(self, taken: tuple[Loss, ...]) -> dict[Loss, float]:

@@ -153,7 +153,7 @@ def _zeros_and_sensors(
 ) -> tuple[dict[str, tuple[float, float]], dict[str, tuple[float, float]]]:
     """Zeros of angles and parameters of sensors by name, with their standard errors."""
     first = fit.form.count
-    std = np.sqrt(np.diag(fit.covariance()))[first:]
+    std = fit.linearised.errors[first:]
     fitted = list(zip(map(float, fit.p[first:]), map(float, std), strict=True))
     where = fit.structure.zeros
     zeros = {recording.coordinates[i]: one for i, one in zip(where, fitted, strict=False)}
@@ -238,18 +238,14 @@ def _next_motions(
 
 def _alike(fit: LawFit, lagrangian: Formula, friction: Formula) -> tuple[str, ...]:
     """Pairs of coefficients that the record cannot tell apart."""
-    covariance = fit.covariance()
-    scale = np.sqrt(np.diag(covariance))
-    with np.errstate(all="ignore"):
-        correlation = covariance / scale / scale[:, None]
     texts = dict(zip(fit.structure.terms, (t.term for t in lagrangian.terms), strict=True))
     texts |= dict(zip(fit.structure.friction, (t.term for t in friction.terms), strict=True))
     names = {key: texts.get(key[1], " ".join(map(str, key))) for key in fit.values}
     listed, together = list(names.values()), [names[key] for key in fit.degenerate()]
-    pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
     only = (f"{', '.join(together)}: only together",) if together else ()
     return only + tuple(
-        f"{listed[i]} and {listed[j]} (correlation {correlation[i, j]:+.3f})" for i, j in pairs
+        f"{listed[i]} and {listed[j]} (correlation {rho:+.3f})"
+        for i, j, rho in fit.linearised.collinear(_ALIKE)
     )
 
 

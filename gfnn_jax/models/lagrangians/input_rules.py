@@ -23,9 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs, Nodes, arcs_of, with_states
-from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
+from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, places
 from gfnn_jax.models.lagrangians.structure import Key, Structure
-from gfnn_jax.solve.latent_arcs import Readings
 
 RULES = {
     "hold": "held from sample to sample",
@@ -152,21 +151,14 @@ def _correction(here: Acting, interval: float) -> tuple[float, float]:
     ) / (2 * apart)
     both = np.concatenate([inputs(fit.arcs), by_delay], axis=-1)
     structure = dataclasses.replace(fit.structure, num_inputs=2 * count)
-    known, keys = fit.values, structure.keys()
     bench = dataclasses.replace(here.bench, inputs=lambda arcs: both)
-    p = structure.start(known)
-    model = bench.model(structure, fit.arcs, p, np.arange(len(p)))
-    readings = Readings(model, fit.arcs.y, fit.sigma * fit.arcs.noise)
-    R = readings.triangle(p, fit.fitted.x)
-    own = [keys.index(key) for key in fit.structure.keys()]  # noqa: SIM118
-    column = sum(
-        known["gain", i, j] * R[:, keys.index(("gain", i, count + j))]
-        for i in range(fit.form.dim)
-        for j in range(count)
-    )
-    Q = np.linalg.qr(R[:, own])[0]
-    rest = column - Q @ (Q.T @ column)
-    size = np.linalg.norm(rest)
-    if not size > _IMITATED * np.linalg.norm(column):
+    further = [("gain", i, count + j) for i in range(fit.form.dim) for j in range(count)]
+    own, others = places(structure, fit.structure, further)
+    turn = np.zeros((len(structure.keys()), len(own) + 1))
+    turn[own, range(len(own))] = 1.0
+    turn[others, -1] = [fit.values["gain", i, j - count] for _, i, j in further]
+    whole = bench.linearised(structure, fit).combined(turn)
+    found = whole.added(range(len(own)), [len(own)])
+    if not found.share[0] > _IMITATED:
         return 0.0, np.nan
-    return float(rest @ R[:, -1] / size**2), float(np.sqrt(fit.correlation) / size)
+    return float(found.value[0]), float(np.sqrt(fit.correlation) / found.size[0])

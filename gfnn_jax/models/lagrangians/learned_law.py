@@ -259,7 +259,7 @@ def in_columns(fit: LawFit) -> tuple[Lagrangian, np.ndarray]:
         last = form.friction.count - 1
         others = np.append(np.delete(others, last), others[last])
     turn[np.arange(terms.count, terms.count + rest), others] = 1.0
-    covariance = turn @ fit.covariance() @ turn.T
+    covariance = turn @ fit.linearised.covariance @ turn.T
     return dataclasses.replace(law, terms=moved), covariance
 
 

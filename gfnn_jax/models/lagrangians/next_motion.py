@@ -18,9 +18,8 @@ import numpy as np
 from gfnn_jax.dataset.stretches import Arcs
 from gfnn_jax.flows import coulomb
 from gfnn_jax.models.lagrangians import libraries
-from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
+from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, places
 from gfnn_jax.models.lagrangians.structure import Key
-from gfnn_jax.solve.latent_arcs import Readings
 
 _FURTHER = (0.5, 1.0, 1.5, 2.0, 4.0)  # of the largest deflections of the record
 _NEARLY_OVER = 3.0  # radians: an angle is let go no higher
@@ -40,36 +39,26 @@ class Motion(NamedTuple):
 def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[Motion]:
     """The best motions to record next, the best first; each as long as an arc of the fit."""
     structure, d = fit.structure, fit.form.dim
-    known = {key for key in structure.keys() if key[0] != "sensor"}  # noqa: SIM118
     rows, more = (library(d, tuple(angles)) for library in (libraries.first, libraries.more))
     rows = [*rows, *more] if len(rows) + len(more) <= _MOST_TERMS else rows
     library = libraries.without_forces(rows, bench.observation.shifts())
     lacking = [("term", row) for row in library if row not in structure.terms]
     larger = structure.plus(lacking)
-    keys = larger.keys()
-    p, noise = larger.start(fit.values), fit.sigma * fit.arcs.noise
-    model = bench.model(larger, fit.arcs, p, np.arange(len(p)))
-    loss, white = bench.observation.loss, bench.whitening(fit.arcs)
-    R = Readings(model, fit.arcs.y, noise, loss, white).triangle(p, fit.fitted.x)[:, :-1]
-    own = [k for k, key in enumerate(keys) if key in known]
-    Q = np.linalg.qr(R[:, own])[0]
-    rest = np.linalg.norm(R - Q @ (Q.T @ R), axis=0)
-    hardly = rest < _IMITATED * np.linalg.norm(R, axis=0)
-    kept = [k for k, key in enumerate(keys) if k in own or (key in lacking and hardly[k])]
-    scale = np.linalg.norm(R[:, kept], axis=0)
-    if not scale.any():
+    keys, whole = larger.keys(), bench.linearised(larger, fit)
+    own, others = places(larger, structure, lacking)
+    own = [k for k in own if keys[k][0] != "sensor"]
+    share = whole.added(own, others).share
+    hardly = {k for k, one in zip(others, share, strict=True) if one < _IMITATED}
+    kept = [k for k in range(len(keys)) if k in own or k in hardly]
+    here = whole.among(kept)
+    if not here.columns.any():
         return []  # the law moves no residual, nor would it elsewhere
-    scale = np.where(scale > 0, scale, 1.0)
-    before = _information(R[:, kept] / scale)
+    without_inputs = dataclasses.replace(
+        bench, inputs=lambda arcs: np.zeros((1, *bench.inputs(fit.arcs).shape[1:]))
+    )
     found = []
     for arcs in _followed(bench, fit, _starts(bench, fit, angles)):
-        model = bench.model(larger, arcs, p, np.arange(len(p)))
-        model = dataclasses.replace(model, u=np.zeros_like(model.u))
-        noise, white = fit.sigma * arcs.noise, bench.whitening(arcs)
-        readings = Readings(model, arcs.y, noise, whitening=white)
-        J = readings.triangle(p, arcs.x)[:, :-1]
-        after = before + _information(J[:, kept] / scale)
-        less = np.sqrt(np.diag(_inverse(before)) / np.diag(_inverse(after)))
+        less = here.sharpened_by(without_inputs.linearised(larger, fit, arcs).among(kept))
         order = np.argsort(-less)
         found.append(Motion(arcs.x[0, 0, :d], {keys[kept[k]]: float(less[k]) for k in order}))
     found.sort(key=lambda motion: -sum(np.log(list(motion.gains.values()))))
@@ -118,13 +107,3 @@ def _followed(bench: Workbench, fit: LawFit, starts: Sequence[np.ndarray]) -> li
         y = bench.observation(lane[None]).values
         arcs.append(Arcs(t, y, lane[None], np.ones(y.shape), home))
     return arcs
-
-
-def _information(R: np.ndarray) -> np.ndarray:
-    return R.T @ R
-
-
-def _inverse(information: np.ndarray) -> np.ndarray:
-    """The inverse, where nothing is told that of a billionth of the most."""
-    top = np.linalg.eigvalsh(information)[-1]
-    return np.linalg.inv(information + 1e-9 * top * np.eye(len(information)))

@@ -453,12 +453,8 @@ def _with_velocities(
 def _check_identifiable(fit: LawFit, observation: Observation) -> None:
     """Raises FitError where the record does not tell a sensor's parameters from the law."""
     count = len(observation.parameters)
-    R = fit.fitted.triangle
-    size = np.linalg.norm(R, axis=0)
     for name, k in zip(observation.parameters, range(len(fit.p) - count, len(fit.p)), strict=True):
-        others = np.delete(R, k, axis=1)
-        left = R[:, k] - others @ np.linalg.lstsq(others, R[:, k], rcond=None)[0]
-        if not np.linalg.norm(left) > _IMITATED * size[k]:
+        if not fit.linearised.unimitated(k) > _IMITATED:
             raise FitError(
                 f"{name}: not identifiable from this record, for coefficients of the law act as it "
                 "does. Write its value into --observe (observe=), or leave it out"

@@ -269,8 +269,7 @@ def telling_more(
 
 def _errors(fit: LawFit) -> float:
     """Geometric mean of the standard errors."""
-    variance = np.diag(fit.covariance())
-    return float(np.exp(0.5 * np.mean(np.log(np.maximum(variance, 1e-300)))))
+    return fit.linearised.sharpness
 
 
 def arcs_by_length(
@@ -384,9 +383,7 @@ def without_degeneracies(bench: Workbench, fit: LawFit, on_progress: Callable) -
 
 def significance(fit: LawFit) -> dict[Key, float]:
     """Coefficients in units of their standard errors; friction that drives is below 0."""
-    error = np.sqrt(np.diag(fit.covariance()))
-    z = np.where(error > 0, np.abs(fit.p) / error, 0.0)
-    keys = fit.structure.keys()
+    z, keys = fit.linearised.significance, fit.structure.keys()
     drives = [k[0] == "loss" and p < 0 for k, p in zip(keys, fit.p, strict=True)]
     return dict(zip(keys, np.where(drives, -z, z).tolist(), strict=True))
 
