@@ -26,7 +26,7 @@ from gfnn_jax.cli_process import (
     warnings_in_one_line,
 )
 from gfnn_jax.cli_summary import print_status, print_summary, print_table
-from gfnn_jax.data.kinds import are_recordings
+from gfnn_jax.data.files import are_recordings
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new

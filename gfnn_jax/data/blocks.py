@@ -9,6 +9,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,41 @@ class Block:
         return self
 
 
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """What is wanted of a file of states.
+
+    dt: given by the user, or None. initial: only the last state of each sequence, and no time step.
+    driven: its time too.
+    """
+
+    path: Path
+    dt: float | None = None
+    initial: bool = False
+    driven: bool = False
+
+    @property
+    def with_times(self) -> bool:
+        return self.driven or not self.initial
+
+    def agreed_dt(self, found: float | None) -> float:
+        """The time step, of those given and found: NaN of initial states and of uneven times.
+        Raises InputError where they disagree, or where there is none."""
+        given = self.dt
+        if self.initial:
+            return np.nan
+        if given is None and found is None:
+            raise InputError(f"{self.path}: holds no time step. Give it: --dt (dt=)")
+        if given is None or found is None:
+            return given if found is None else found  # pyright: ignore[reportReturnType]
+        if not abs(given - found) <= TIME_TOLERANCE * found:
+            own = "times that are uneven" if np.isnan(found) else f"the file's dt = {found}"
+            raise InputError(
+                f"{self.path}: the given dt = {given} disagrees with {own}. Leave out --dt (dt=)"
+            )
+        return given
+
+
 @dataclasses.dataclass
 class Source:
     """An open file: what its header says, and its rows, or those of a process's share of the pairs,
@@ -95,10 +131,9 @@ class Source:
 
     dim: int
     dt: float  # NaN where initial states need none, or the times say it
-    precision: str
-    units: dict[str, str]
-    is_array: bool
     blocks: Callable[..., Iterator[Block]]
+    precision: str = "float64"
+    units: dict[str, str] = dataclasses.field(default_factory=dict)
     parameters: tuple[str, ...] = ()
     uneven: bool = False
     period: float | None = None
@@ -124,26 +159,6 @@ def check_dt(dt: Any, what: str) -> float:
     if not (np.isfinite(value) and value > 0):
         raise InputError(f"{what} must be finite and above 0, got {value}")
     return value
-
-
-def agreed_dt(path, given: float | None, found: float | None) -> float:
-    if found is not None and np.isnan(found):
-        if given is not None:
-            raise InputError(
-                f"{path}: the given dt = {given} disagrees with times that are uneven. Leave out "
-                "--dt (dt=)"
-            )
-        return found
-    if given is None and found is None:
-        raise InputError(f"{path}: holds no time step. Give it: --dt (dt=)")
-    if given is None or found is None:
-        return given if found is None else found  # pyright: ignore[reportReturnType]
-    if abs(given - found) > TIME_TOLERANCE * found:
-        raise InputError(
-            f"{path}: the given dt = {given} disagrees with the file's dt = {found}. Leave out "
-            "--dt (dt=)"
-        )
-    return given
 
 
 def check_width(path, name: str, shape: tuple[int, ...]) -> int:

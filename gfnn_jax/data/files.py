@@ -9,9 +9,10 @@ between them, one number where it is always the same:
   ``param_names``; and of a driven system its ``period``, with ``t0``, the time of the drive at each
   z0 (N,) or at the begin of each sequence (M,), unless ``times`` say it.
 - ``.npy``: one array of shape (L, 2d) or (M, L, 2d).
-- ``.csv``: a header that names the columns ``t, q1..qd, p1..pd`` in any order, optionally
-  ``sequence``; units as in ``q1 [km]`` or ``q1 (km)``. Every further column is a parameter, where
-  it is constant in each sequence; one named ``period`` makes ``t`` the time of a drive.
+- ``.csv``: text of any dialect (`text_files`) whose header names the columns ``t, q1..qd, p1..pd``
+  in any order, optionally ``sequence``; units as in ``q1 [km]`` or ``q1 (km)``. Every further
+  column is a parameter, where it is constant in each sequence; one named ``period`` makes ``t`` the
+  time of a drive.
 
 All are read as blocks of consecutive rows, so that a whole file and a file larger than memory go
 through the same checks. Every refusal is an `InputError`: one line that says what was expected
@@ -25,7 +26,8 @@ import dataclasses
 import hashlib
 import itertools
 import warnings
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +39,15 @@ from gfnn_jax.data.blocks import (
     TIME,
     Block,
     DataWarning,
+    Request,
     Source,
     check_dt,
     column,
+    damage,
 )
-from gfnn_jax.data.csv_files import open_csv
+from gfnn_jax.data.csv_files import are_states, open_csv
 from gfnn_jax.data.npz_files import open_npy, open_npz
+from gfnn_jax.data.text_files import TextFile
 from gfnn_jax.errors import InputError
 from gfnn_jax.processes import WHOLE, Share
 
@@ -128,7 +133,7 @@ def read_trajectories(
     duplicated columns and about states that never move.
     """
     with opened(path, dt) as source:
-        blocks = list(source.blocks(2**62 if source.is_array else BLOCK_ROWS))
+        blocks = list(source.blocks(2**62))
         states = np.concatenate([np.empty((0, 2 * source.dim)), *(b.states for b in blocks)])
         sequence = np.concatenate([np.empty(0), *(b.sequence for b in blocks)])
         place = np.concatenate([np.empty(0, int), *(b.place for b in blocks)])
@@ -251,21 +256,16 @@ def joined(parts: list[np.ndarray | None]) -> np.ndarray | None:
     return np.concatenate(found) if found else None
 
 
-def read_initial_states(path, dim: int) -> np.ndarray:
-    """Initial states (B, 2d) float64 to predict from, for a map of ``dim`` degrees of freedom.
-
-    An ``.npy`` of shape (B, 2d), an ``.npz`` with ``z0``, or a ``.csv`` without a column ``t``
-    holds one state a row; of any other trajectory file each sequence gives its last state.
-    """
-    return read_initial(path, dim)[0]
-
-
 def read_initial(
     path, dim: int, parameters: tuple[str, ...] = ()
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """(states, params) to predict from: as `read_initial_states`, with the values (B, k) of these
-    parameters, which the file must hold; None where there are none. t among them is the time of a
-    drive: t0 of the file, or the time of each sequence's last state."""
+    """Initial states (B, 2d) float64 to predict from, for a map of ``dim`` degrees of freedom, and
+    the values (B, k) of these parameters, which the file must hold; None where there are none.
+
+    An ``.npy`` of shape (B, 2d), an ``.npz`` with ``z0``, or a ``.csv`` without a column ``t``
+    holds one state a row; of any other trajectory file each sequence gives its last state. t among
+    the parameters is the time of a drive: t0 of the file, or the time of the last state.
+    """
     driven = TIME in parameters
     with opened(path, None, initial=True, driven=driven) as source:
         if source.dim != dim:
@@ -333,27 +333,62 @@ def opened(
     """Open a trajectory file, its header checked. ``initial``: only its last states are wanted, and
     their times where ``driven``."""
     path = Path(path)
-    kinds = {".npz": open_npz, ".npy": open_npy, ".csv": open_csv}
-    if path.suffix.lower() not in kinds:
+    if path.suffix.lower() not in (".npz", ".npy", ".csv"):
         raise InputError(f"{path}: expected a .npz, .npy or .csv file")
-    if dt is not None:
-        dt = check_dt(dt, "the given dt")
+    request = Request(path, None if dt is None else check_dt(dt, "the given dt"), initial, driven)
     try:
-        if not path.exists():
-            raise InputError(f"{path}: no such file")
         if not path.is_file():
-            raise InputError(f"{path}: is not a file")
+            raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
         if path.stat().st_size == 0:
             raise InputError(f"{path}: is empty")
         stream = open(path, "rb")  # noqa: SIM115, closed below
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     with stream:
-        source = kinds[path.suffix.lower()](path, stream, dt, initial, driven)
+        if path.suffix.lower() == ".csv":
+            source = open_csv(request)
+        else:
+            source = (open_npz if path.suffix.lower() == ".npz" else open_npy)(request, stream)
         unchecked = source.blocks
         if not initial:  # of initial states only the rows that are used are checked
             source.blocks = lambda *given: (block.checked(path) for block in unchecked(*given))
         yield source
+
+
+def are_recordings(paths: str | Path | Sequence[str | Path], *, with_roles: bool = False) -> bool:
+    """Return whether files are to be read by `gfnn_jax.read` (True) or as canonical trajectories
+    (False).
+
+    Canonical are an ``.npz`` with ``z0`` or ``trajectories``, a plain ``.npy``, and text with
+    columns q1 … and p1 …. All else is a recording; so is every file but these two kinds of ``.npz``
+    where roles are given (``with_roles``). Raises InputError where files are of both kinds.
+    """
+    kinds = {path: _is_recording(path, with_roles) for path in listed(paths)}
+    if len(set(kinds.values())) > 1:
+        one = next(path for path, is_one in kinds.items() if is_one)
+        other = next(path for path, is_one in kinds.items() if not is_one)
+        raise InputError(
+            f"expected files of one kind, got a recording ({one}) and states q, p ({other})"
+        )
+    return any(kinds.values())
+
+
+def _is_recording(path: Path, with_roles: bool) -> bool:
+    if not path.is_file():
+        return False  # the reader of trajectories says what is the matter
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        with damage(path, "the archive"), zipfile.ZipFile(path) as archive:
+            return not {"z0.npy", "trajectories.npy"} & set(archive.namelist())
+    if with_roles:
+        return True
+    if suffix == ".npy":
+        with damage(path, "the array"):
+            return np.load(path, mmap_mode="r", allow_pickle=False).dtype.names is not None
+    try:
+        return not are_states(TextFile(path).names)
+    except InputError:
+        return True  # the reader of recordings says what is the matter
 
 
 def _warn_of_odd_columns(path, states: np.ndarray, sequence: np.ndarray) -> None:

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.data.files import read_trajectories
-from gfnn_jax.data.kinds import are_recordings
+from gfnn_jax.data.files import are_recordings, read_trajectories
 from gfnn_jax.data.recording import Recording, read
 from gfnn_jax.data.recording_summary import RecordingSummary, summarise
 from gfnn_jax.errors import InputError

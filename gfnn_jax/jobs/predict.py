@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gfnn_jax.data.files import read_initial, read_initial_noise
-from gfnn_jax.data.kinds import are_recordings
+from gfnn_jax.data.files import are_recordings, read_initial, read_initial_noise
 from gfnn_jax.data.parts import number_of_parts, part_of, put_together
 from gfnn_jax.data.predictions import PredictionWriter, is_done, job_of
 from gfnn_jax.errors import InputError
