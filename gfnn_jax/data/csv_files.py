@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -47,7 +48,8 @@ class _StatesInText:
         self._check_header()
         self.each_row = request.initial and not {"t", "sequence"} & set(self.names)
         self.with_time = "t" in self.names and request.with_times
-        first = next(self._tables(BLOCK_ROWS))
+        with contextlib.closing(self._tables(BLOCK_ROWS)) as tables:
+            first = next(tables)
         found = _first_dt(self, first) if "t" in self.names and not request.initial else None
         dt = request.agreed_dt(found)
         self.usual = dt if found is None else found
