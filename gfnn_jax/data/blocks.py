@@ -85,7 +85,7 @@ class Block:
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """What is wanted of a file of states.
+    """Request for a file of states.
 
     dt: given by the user, or None. initial: only the last state of each sequence, and no time step.
     driven: its time too.
