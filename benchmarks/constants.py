@@ -193,7 +193,7 @@ CONSTANTS = tuple(
             ("damped", "outliers"),
             "neighbours ÷ unknowns",
         ),
-        ("diagnosis.clean", "_MOST_OUTLIERS", ("outliers",), "part of the pairs"),
+        ("diagnosis.outliers", "_MOST_OUTLIERS", ("outliers",), "part of the pairs"),
         ("learn.gross_errors", "_BEYOND", ("outliers",), "residual ÷ neighbours'"),
         ("fitting.significance", "CERTAIN", ("damped",), "standard errors"),
         ("fitting.significance", "ABOVE_NOISE", ("law", "sequences"), "standard errors"),

@@ -61,8 +61,7 @@ from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.terms import polynomial_terms
 from gfnn_jax.fitting import gauss_newton, least_squares, linear_starts, row_blocks
-from gfnn_jax.fitting.together import levenberg_marquardt_together
-from gfnn_jax.fitting.training import Limits
+from gfnn_jax.fitting.levenberg_marquardt import Limits, levenberg_marquardt_together
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.learn.refit import help_refit, refit

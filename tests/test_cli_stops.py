@@ -333,9 +333,9 @@ TRAINING = """
 import sys
 from gfnn_jax import cli
 from gfnn_jax.jobs import progress
-from gfnn_jax.models.generating_functions import network_sweep
+from gfnn_jax.models.generating_functions import networks
 
-network_sweep._CHECKPOINT_SECONDS = progress.BETWEEN = 0.0
+networks._CHECKPOINT_SECONDS = progress.BETWEEN = 0.0
 sys.exit(cli.main(sys.argv[1:]))
 """
 

@@ -10,9 +10,8 @@ import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.data.files import read_trajectories
 from gfnn_jax.data.sample import read_sample
-from gfnn_jax.dataset.bounds import bound_of_mean
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.dataset.measured_error import Tolerance, bound_of_mean
 from gfnn_jax.dataset.runs import identified, next_of, sampled, steps_between
 from gfnn_jax.dataset.split import correlation_time, split_rows
 from gfnn_jax.learn.stated import of_few

@@ -6,12 +6,11 @@ import pytest
 from gfnn_jax.diagnosis.local_jacobians import (
     chart_determinant,
     data_defect,
-    differs_between_sequences,
     local_jacobians,
     look_symplectic,
-    outliers,
-    volume_change,
 )
+from gfnn_jax.diagnosis.outliers import outliers
+from gfnn_jax.diagnosis.residuals import differs_between_sequences, volume_change
 from gfnn_jax.generating.charts import CHARTS
 
 

@@ -331,9 +331,9 @@ def test_files_of_several_dt_are_all_taken(tmp_path):
 @pytest.mark.filterwarnings("ignore:no candidate:gfnn_jax.errors.FitWarning")
 def test_a_network_is_that_of_the_sample_and_says_so(tmp_path, monkeypatch):
     from gfnn_jax.learn import searches
-    from gfnn_jax.models.generating_functions import network_sweep
+    from gfnn_jax.models.generating_functions import networks
 
-    monkeypatch.setattr(network_sweep, "_MLP_HIDDEN", (3,))
+    monkeypatch.setattr(networks, "_MLP_HIDDEN", (3,))
     train = searches.NetworkSweep._trained
     monkeypatch.setattr(
         searches.NetworkSweep,

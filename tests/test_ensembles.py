@@ -9,14 +9,17 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp
-from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
-from gfnn_jax.fitting.together import levenberg_marquardt_together
-from gfnn_jax.fitting.training import Limits, LMState
+from gfnn_jax.fitting.levenberg_marquardt import (
+    Limits,
+    LMState,
+    levenberg_marquardt,
+    levenberg_marquardt_together,
+)
 from gfnn_jax.jobs.predict import predict
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.jobs.search import search
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.models.generating_functions import network_sweep
+from gfnn_jax.models.generating_functions import networks
 
 DT = 0.5
 
@@ -173,7 +176,7 @@ def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypat
     def run(folder, at):
         return search(pairs_of(150, 0), None, options, progress=Stopping(at), kept_in=folder)
 
-    monkeypatch.setattr(network_sweep, "_CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(networks, "_CHECKPOINT_SECONDS", 0.0)
     whole = run(tmp_path / "whole", 99)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "part", 3)

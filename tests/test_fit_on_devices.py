@@ -17,7 +17,7 @@ from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
-from gfnn_jax.fitting import accelerated, gauss_newton, least_squares, row_blocks
+from gfnn_jax.fitting import gauss_newton, least_squares, row_blocks
 from gfnn_jax.fitting.triangle import folded
 from gfnn_jax.flows.collocation import Steps
 
@@ -221,19 +221,22 @@ def test_an_accelerator_makes_the_same_factor(of, monkeypatch):
     """Its program, on a CPU's device."""
     w, target = rows()
     family, weight = of(box_inputs(w)), np.array([0.5, 2.0])
-    assert accelerated.takes(family)
+    assert least_squares.accelerator_takes(family)
     plain = least_squares.reduce(family, [(w, target)], weight)
     device = jax.devices()[0]
-    for own, named in ((accelerated._factor, "_factor"), (accelerated._merged, "_merged")):
+    for own, named in (
+        (least_squares._factor_on_device, "_factor_on_device"),
+        (least_squares._merged_on_device, "_merged_on_device"),
+    ):
         called = []
         monkeypatch.setattr(
-            accelerated, named, lambda *a, own=own, called=called: (called.append(1), own(*a))[1]
+            least_squares, named, lambda *a, own=own, called=called: (called.append(1), own(*a))[1]
         )
     one, other = (
-        accelerated.factor(family, part, weight, 500, device)
+        least_squares.factor_on_device(family, part, weight, 500, device)
         for part in ((w[:500], target[:500]), (w[500:], target[500:]))
     )
-    same_factor(accelerated.merged(one, other, device), plain.factor)
+    same_factor(least_squares.merged_on_device(one, other, device), plain.factor)
 
 
 def test_rows_go_to_an_accelerator_where_there_is_one(monkeypatch):
@@ -241,13 +244,13 @@ def test_rows_go_to_an_accelerator_where_there_is_one(monkeypatch):
     w, target = rows(30_000)
     family, weight, shapes = Products(box_inputs(w), 4), np.ones(2), set()
     plain = least_squares.reduce(family, [(w, target)], weight)
-    run = accelerated._factor
+    run = least_squares._factor_on_device
 
     def seen(family, rows, weights):
         shapes.add(rows[0].shape)
         return run(family, rows, weights)
 
-    monkeypatch.setattr(accelerated, "_factor", seen)
+    monkeypatch.setattr(least_squares, "_factor_on_device", seen)
     monkeypatch.setattr(Named, "platform", "gpu")
     put = jax.device_put
     monkeypatch.setattr(jax, "device_put", lambda tree, device: put(tree))

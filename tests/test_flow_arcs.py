@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax.dataset.arcs import arcs_of_pairs
+from gfnn_jax.dataset.runs import arcs_of_pairs
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.linearised import Linearised

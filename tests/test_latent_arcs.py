@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from gfnn_jax.solve.arc_models import Defects, Observed
-from gfnn_jax.solve.latent_arcs import Readings
+from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
 
 
 class _Still:

@@ -33,8 +33,7 @@ from gfnn_jax.models.lagrangians.recordings import _samples
 from gfnn_jax.models.lagrangians.search import search, search_on
 from gfnn_jax.models.lagrangians.text import speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
-from gfnn_jax.solve.arc_models import Defects, Observed
-from gfnn_jax.solve.latent_arcs import Readings
+from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
 
 
 def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):

@@ -14,8 +14,7 @@ from jax.flatten_util import ravel_pytree
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.family import DifferentiatedByJax, from_function
 from gfnn_jax.fitting import levenberg_marquardt as lm
-from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
-from gfnn_jax.fitting.training import BLOCK, Limits
+from gfnn_jax.fitting.levenberg_marquardt import BLOCK, Limits, levenberg_marquardt
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("amplitude",), meta_fields=())

@@ -7,8 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
-from gfnn_jax.diagnosis.hidden_friction import hidden_friction
-from gfnn_jax.diagnosis.neighbours import is_noise
+from gfnn_jax.diagnosis.residuals import hidden_friction, is_noise
 
 RNG = np.random.default_rng(0)
 

@@ -10,13 +10,13 @@ from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.noise import of_differences
 from gfnn_jax.dataset.runs import identified
-from gfnn_jax.diagnosis.noise import noise_of_sites, state_noise
+from gfnn_jax.diagnosis.residuals import noise_of_sites, state_noise
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.models.hamiltonians.white import leaves_white
 from gfnn_jax.scenes import froeschle
-from gfnn_jax.solve.robust import of_residuals, robust
+from gfnn_jax.solve.noise import of_residuals, robust
 
 
 def noisy_turns(angle, sigma, num_steps):

@@ -10,19 +10,20 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax.budget import Budget
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.dataset.arcs import arcs_of_pairs
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.dataset.runs import arcs_of_pairs
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.triangle import Triangle
+from gfnn_jax.generating.arcs import GeneratedOnArcs
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn import noisy_sweeps
 from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
 from gfnn_jax.maps.affine import Affine
-from gfnn_jax.models.generating_functions.map_arcs import GeneratedOnArcs, NearestArcs
+from gfnn_jax.models.generating_functions.map_arcs import NearestArcs
 from gfnn_jax.models.generating_functions.size import Size
 from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from gfnn_jax.fitting.operations import EACH, LEAST, operations_of
+from gfnn_jax.fitting.adam import EACH, LEAST, operations_of
 
 
 def counted(function, *shapes):

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax.dataset.rests import without_rests
-from gfnn_jax.dataset.stretches import measure, stretches
+from gfnn_jax.dataset.stretches import measure, stretches, without_rests
 
 HELD, NOISE, DT = 0.1, 1e-3, 0.05
 

@@ -7,11 +7,9 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import Coordinates
-from gfnn_jax.dataset.arcs import arcs_of_pairs
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.runs import identified, steps_between
-from gfnn_jax.diagnosis.clean import clean
-from gfnn_jax.diagnosis.screening import gross_errors
+from gfnn_jax.dataset.runs import arcs_of_pairs, identified, steps_between
+from gfnn_jax.diagnosis.outliers import clean, gross_errors
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps, images
 

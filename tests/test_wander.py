@@ -11,8 +11,7 @@ from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
 from gfnn_jax.maps.estimates import Window, estimate_states, law_in_use, propagate
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.maps.sensors import Sensors
-from gfnn_jax.solve.robust import SoftL1
-from gfnn_jax.solve.wander import Wander
+from gfnn_jax.solve.noise import SoftL1, Wander
 
 WANDER = Wander(2.0, 1.5)
 

@@ -7,7 +7,7 @@ What is known of the motion decides which of these tells it:
 - `of_halves`: products of M with random signs, where all positions are alike, and all momenta.
 
 Where the orbits themselves are known, the noise is what is left over of the states
-(`solve.robust.of_residuals`).
+(`solve.noise.of_residuals`).
 """
 
 from __future__ import annotations

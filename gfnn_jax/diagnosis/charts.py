@@ -9,7 +9,7 @@ import numpy as np
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.diagnosis.local_jacobians import SAFE, ChartDeterminant, chart_determinant
 from gfnn_jax.errors import FitError
-from gfnn_jax.fitting.base_map import fit_half_map
+from gfnn_jax.fitting.linear_starts import fit_half_map
 from gfnn_jax.generating.charts import CHARTS, TYPE1, AnyChart
 from gfnn_jax.maps.affine import Affine
 

@@ -18,11 +18,15 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
 from gfnn_jax.errors import FitError
-from gfnn_jax.fitting import accelerated, row_blocks
+from gfnn_jax.families.products import Products
+from gfnn_jax.families.sines import Sines
+from gfnn_jax.fitting import row_blocks
 from gfnn_jax.fitting.triangle import Triangle
 
 # Rows that are folded at once stay in the cache: 16 MiB take a quarter longer per row. A block of
@@ -113,19 +117,19 @@ def _of_parts(family: Any, parts: Iterable[Sequence[Any]], weight) -> Triangle:
 def _on_devices(family: Any, rows, weight, reporting: Callable[[Iterator], Iterator]) -> Triangle:
     """The triangle of rows that are shared out among devices."""
     m = family.num_parameters
-    on_host = row_blocks.devices()[0].platform == "cpu" or not accelerated.takes(family)
+    on_host = row_blocks.devices()[0].platform == "cpu" or not accelerator_takes(family)
     least = (_PART_ON_CPU if on_host else _PART_ON_ACCELERATORS) * (m + 1)
 
     def of_part(part, device) -> Triangle:
         if on_host:
             return _of_parts(family, _blocks([part], m), weight)
         pairs = _pairs_of(m, part[0].shape[1], least)
-        return Triangle(accelerated.factor(family, part, weight, pairs, device), part[0].size)
+        return Triangle(factor_on_device(family, part, weight, pairs, device), part[0].size)
 
     def of_both(one: Triangle, other: Triangle, device) -> Triangle:
         if on_host:
             return one.merge(other)
-        factor = accelerated.merged(one.factor, other.factor, device)
+        factor = merged_on_device(one.factor, other.factor, device)
         return Triangle(factor, one.rows + other.rows)
 
     found = row_blocks.tree(of_part, reporting(_blocks(rows, m, least)), of_both)
@@ -213,3 +217,38 @@ def fit(
     """Fit one linear family to (w, target_gradient): ``reduce`` and ``solve`` in one go."""
     triangles = [reduce(family, [rows], weight) for rows in (train, held)]
     return solve(triangles[0], triangles[1], family.num_parameters)
+
+
+def accelerator_takes(family: Any) -> bool:
+    """Return whether the gradients of its terms can be traced by JAX."""
+    return isinstance(family, (Products, Sines))
+
+
+def factor_on_device(
+    family: Any, rows: Sequence[np.ndarray], weight, pairs: int, device
+) -> np.ndarray:
+    """R of [A b] of rows (w, target_gradient), and args, filled up to so many pairs: one shape, one
+    program."""
+    count = len(rows[0])
+    taken = np.minimum(np.arange(max(pairs, count)), count - 1)
+    weights = (taken == np.arange(len(taken)))[:, None] * np.asarray(weight)
+    filled = tuple(array[taken] for array in rows)
+    return np.asfortranarray(_factor_on_device(*jax.device_put((family, filled, weights), device)))
+
+
+def merged_on_device(one: np.ndarray, other: np.ndarray, device) -> np.ndarray:
+    """R of the stacked [one; other]."""
+    return np.asfortranarray(_merged_on_device(*jax.device_put((one, other), device)))
+
+
+@jax.jit
+def _factor_on_device(family, rows, weights):
+    w, target, *args = rows
+    gradients = family.term_gradients(w, *args) * weights[..., None]
+    block = jnp.concatenate([gradients, (target * weights)[..., None]], axis=-1)
+    return jnp.linalg.qr(block.reshape(-1, block.shape[-1]), mode="r")
+
+
+@jax.jit
+def _merged_on_device(one, other):
+    return jnp.linalg.qr(jnp.concatenate([one, other]), mode="r")

@@ -18,14 +18,22 @@ needs only to lead downhill, but it does take float64: anything less is refused.
 
 Memory: A is never held whole. The peak is 2 P² + 4 · 2d · chunk · P numbers in linearising and 3 P²
 in a trial, whatever N; each also keeps a few activations of S for every pair of a chunk.
+
+A training repeats iterations in blocks, units of a fit's budget, and keeps the parameters that fit
+the validation pairs best. Several networks are trained together: one program linearises and tries a
+step of all, and a member whose step does not lower its loss waits with more damping for the next
+iteration, so that no member's search makes the others wait.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
-from functools import partial
-from typing import Any
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,15 +41,187 @@ import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
+from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families import Family
-from gfnn_jax.fitting.training import Limits, LMResult, LMState, first_state, result_of, trained
+from gfnn_jax.fitting import row_blocks
 from gfnn_jax.phase_space import require_x64
-from gfnn_jax.solve.levenberg_marquardt import Nielsen, Tried
+from gfnn_jax.solve.levenberg_marquardt import Nielsen, Rule, Tried, descended
+
+BLOCK = 10  # iterations that are made together: a unit of a fit's budget
+
+
+class LMState(NamedTuple):
+    """All that the next iteration depends on: arrays and numbers, ready for a checkpoint.
+
+    theta, best_theta: flattened parameters (P,), of now and of the best validation error so far.
+    damping:           μ; NaN before the first iteration, which takes it from AᵀA. (E,) of members
+                       that are trained together, whose theta are (E, P).
+    iteration:         iterations done.
+    train_rms, validation_rms, best_validation_rms: of ∇S − target_gradient, per
+                       component.
+    landmark_rms, landmark_iteration: the train_rms that progress is measured from, and its time.
+    seconds:           time spent so far, without compilation.
+    """
+
+    theta: Any
+    best_theta: Any
+    damping: Any
+    iteration: int
+    train_rms: float
+    validation_rms: float
+    best_validation_rms: float
+    landmark_rms: float
+    landmark_iteration: int
+    seconds: float
+
+
+class LMResult(NamedTuple):
+    """params: the parameters with the lowest validation error met, in the pytree that was given.
+
+    train_rms is of the last iteration, validation_rms of ``params``; both are per component of ∇S,
+    so that dt times them is the one-step state error to first order in dt. iterations and seconds
+    include what was resumed from. stopped_because: target, iterations, budget or no progress.
+    """
+
+    params: Any
+    train_rms: float
+    validation_rms: float
+    iterations: int
+    seconds: float
+    compile_seconds: float
+    stopped_because: str
+
+
+class Limits(NamedTuple):
+    """Limits of a training, and what is called with its states.
+
+    max_iterations: most iterations. A run repeats to the last bit on one machine with the same
+                number of threads.
+    block:      gives the context in which the next so many iterations are made; it raises
+                OutOfTime to stop before them.
+    target_rms: stop once the validation RMS is as small.
+    patience:   stop when train_rms fell by less than 1 % in so many iterations.
+    reports:    called with the state after every iteration.
+    """
+
+    max_iterations: int = 200
+    block: Callable[[int], AbstractContextManager] = lambda iterations: nullcontext()
+    target_rms: float = 0.0
+    patience: int = 20
+    reports: tuple[Callable[[LMState], Any], ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class _Training:
+    """A training where it stands: `solve.levenberg_marquardt` makes its iterations.
+
+    linearised: θ -> trial steps from there, of each damping one. size: numbers in the residual.
+    """
+
+    state: LMState
+    linearised: Callable[[Any], Callable[[Any], Tried]]
+    validation_rms: Callable[[Any], float]
+    size: int
+    limits: Limits
+    started: float
+
+    @property
+    def stopped_because(self) -> str | None:
+        """The reason why there is no further iteration, None where there is one."""
+        state, limits = self.state, self.limits
+        if state.best_validation_rms <= limits.target_rms:
+            return "target"
+        if state.iteration >= limits.max_iterations:
+            return "iterations"
+        if state.iteration - state.landmark_iteration >= limits.patience:
+            return "no progress"
+        return None
+
+    @cached_property
+    def _steps(self) -> Callable[[Any], Tried]:
+        return self.linearised(self.state.theta)
+
+    def tried(self, damping: Any, failures: int) -> Tried:
+        return self._steps(damping)
+
+    def moved(self, there: Any, damping: Any) -> tuple[_Training, bool]:
+        """The training at θ and F of a step, validated and reported."""
+        theta, loss = there
+        train_rms, held_rms = math.sqrt(loss / self.size), self.validation_rms(theta)
+        seconds = time.perf_counter() - self.started
+        state = _next_state(self.state, theta, damping, train_rms, held_rms, seconds)
+        for report in self.limits.reports:
+            report(state)
+        further = dataclasses.replace(self, state=state)
+        return further, further.stopped_because is not None
+
+
+def trained(
+    state: LMState, linearised, rule: Rule, validation_rms, size: int, limits: Limits
+) -> tuple[LMState, str]:
+    """The last state from this one on, and why there is no further one."""
+    started = time.perf_counter() - state.seconds
+    here = _Training(state, linearised, validation_rms, size, limits, started)
+    while (stopped_because := here.stopped_because) is None:
+        try:
+            with limits.block(BLOCK):
+                found = descended(here, rule, BLOCK, here.state.damping)
+                here = found.problem
+        except OutOfTime:
+            return here.state, "budget"
+        if found.stuck:
+            return here.state, "no progress"
+    return here.state, stopped_because
+
+
+def result_of(state: LMState, params, compile_seconds: float, stopped_because: str) -> LMResult:
+    return LMResult(
+        params=jax.tree.map(jnp.asarray, params),
+        train_rms=state.train_rms,
+        validation_rms=state.best_validation_rms,
+        iterations=state.iteration,
+        seconds=state.seconds,
+        compile_seconds=compile_seconds,
+        stopped_because=stopped_because,
+    )
+
+
+def first_state(theta, damping, validation_rms):
+    return LMState(
+        theta=np.asarray(theta),
+        best_theta=np.asarray(theta),
+        damping=damping,
+        iteration=0,
+        train_rms=math.nan,
+        validation_rms=validation_rms,
+        best_validation_rms=validation_rms,
+        landmark_rms=math.inf,
+        landmark_iteration=0,
+        seconds=0.0,
+    )
+
+
+def _next_state(state, theta, damping, train_rms, validation_rms, seconds):
+    theta, iteration = np.asarray(theta), state.iteration + 1
+    better = validation_rms < state.best_validation_rms
+    progress = train_rms < 0.99 * state.landmark_rms
+    return LMState(
+        theta=theta,
+        best_theta=theta if better else state.best_theta,
+        damping=damping,
+        iteration=iteration,
+        train_rms=train_rms,
+        validation_rms=validation_rms,
+        best_validation_rms=validation_rms if better else state.best_validation_rms,
+        landmark_rms=train_rms if progress else state.landmark_rms,
+        landmark_iteration=iteration if progress else state.landmark_iteration,
+        seconds=seconds,
+    )
+
 
 # δ₂ is a correction: where it is not small beside δ₁ the expansion has failed and δ₁ goes alone.
 LARGEST_ACCELERATION = 0.75
 OF_LARGEST = 1e-3  # the first damping, of the largest entry on AᵀA's diagonal
-
 Rows = Float[Array | np.ndarray, "_ _"]
 
 
@@ -239,3 +419,129 @@ def _check_rows(theta, *data):
                 f"w and target_gradient must be (N, 2d) with N > 0: got {[x.shape for x in data]}"
             )
     require_x64("Levenberg–Marquardt")
+
+
+# One trial in an iteration: a member whose step fails waits with four times the damping.
+WAITING = Nielsen(growth=4.0, trials=1)
+
+
+def levenberg_marquardt_together(
+    family: Family,
+    members: Sequence[Any],
+    w: Rows,
+    target_gradient: Rows,
+    *,
+    validation: tuple[Rows, Rows],
+    weight: Any = 1.0,
+    shares: Float[np.ndarray, "_ _"],
+    limits: Limits = Limits(),  # noqa: B008, it is frozen
+    chunk: int = 500,
+    resume: LMState | None = None,
+) -> LMResult:
+    """Minimise that loss for E members of a family at once, each from its own start and with its
+    own shares of the pairs; one program linearises and tries a step of all of them.
+
+    members: E starts, pytrees of one structure. shares: (E, N), 0 or more, of mean 1: what the
+    square of a pair's residual counts in each member's loss. All else is as for
+    `levenberg_marquardt`, but for this: a member whose step does not lower its loss waits with four
+    times the damping for the next iteration; validation errors are those of the members' mean ∇S;
+    theta and best_theta of a state are (E, P), its damping (E,); the params that are returned have
+    a leading axis E. The memory is E times as much.
+
+    On the devices of the fit (`fitting.row_blocks`) members are trained one at a time on each: to
+    the same bits on any number of devices, which one batch of all members would not give.
+    """
+    flat = [flattened(member) for member in members]
+    theta, layout = np.stack([t for t, _ in flat]), flat[0][1]
+    w, target_gradient, weight, held = prepared(theta, w, target_gradient, validation, weight)
+    *points, weights = chunked(w, target_gradient, weight, chunk)
+    padding = weights.shape[0] * weights.shape[1] - len(w)
+    parts = np.pad(np.sqrt(shares), ((0, 0), (0, padding))).reshape(-1, *weights.shape[:2], 1)
+    on_device = tuple(points), parts * weights
+
+    def linearised(theta):
+        """The trial step of every member from θ (E, P)."""
+
+        def tried(damping) -> Tried:
+            theta_, losses, decrease, promised, used = program(theta, damping)
+            if not np.isfinite(losses).all():
+                raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
+            there = theta_, float(np.mean(losses))
+            return Tried(there, np.asarray(decrease), np.asarray(used), np.asarray(promised))
+
+        return tried
+
+    def validation_rms(theta):
+        return math.sqrt(float(_loss_of_mean(family, held, theta, layout=layout)))
+
+    started, unknown = time.perf_counter(), np.full(len(theta), math.nan)
+    compiled = _compiled_on_devices if row_blocks.devices() else _compiled_together
+    program = compiled(family, on_device, theta, layout)
+    _loss_of_mean.lower(family, held, theta, layout=layout).compile()
+    compile_seconds = time.perf_counter() - started
+    first = first_state(theta, unknown, validation_rms(theta)) if resume is None else resume
+    state, why = trained(first, linearised, WAITING, validation_rms, w.size, limits)
+    each = [unflattened(one, layout) for one in np.asarray(state.best_theta)]
+    return result_of(state, jax.tree.map(lambda *a: np.stack(a), *each), compile_seconds, why)
+
+
+def _compiled_together(family, rows, theta, layout):
+    """One trial step of all members, compiled: `_try_together`'s of (θ, μ)."""
+    given = (family, *jax.device_put(rows))
+    unknown = np.full(len(theta), math.nan)
+    _try_together.lower(*given, theta, unknown, layout=layout).compile()
+    return partial(_try_together, *given, layout=layout)
+
+
+def _compiled_on_devices(family, rows, theta, layout):
+    """The same, each member by itself on the next device that is free."""
+    points, weights = rows
+    own = [weights[i : i + 1] for i in range(len(theta))]
+    placed = {d: jax.device_put((family, points, own), d) for d in row_blocks.devices()}
+
+    def compile_on(device, _) -> None:
+        family, points, own = placed[device]
+        unknown = np.full(1, math.nan)
+        _try_together.lower(family, points, own[0], theta[:1], unknown, layout=layout).compile()
+
+    def program(theta, damping):
+        def of_one(i: int, device):
+            family, points, own = placed[device]
+            start = theta[i : i + 1], damping[i : i + 1]
+            found = _try_together(family, points, own[i], *start, layout=layout)
+            return jax.tree.map(np.asarray, found)
+
+        found = row_blocks.each(of_one, range(len(theta)))
+        return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
+
+    row_blocks.each(compile_on, placed)
+    return program
+
+
+@partial(jax.jit, static_argnames="layout")
+def _try_together(family, points, weights, thetas, dampings, *, layout):
+    """One trial step of every member: θ (E, P) and F (E,) after it, as before where F did not fall;
+    the decrease of F, the promised one, and μ (E,). The products AᵀA of all members are one batched
+    product of matrices."""
+
+    def of_one(theta, damping, weight):
+        chunks = (*points, weight)
+        matrix, slope, loss = linearize(family, chunks, theta, layout=layout)
+        first = OF_LARGEST * jnp.max(jnp.diagonal(matrix))
+        damping = jnp.where(jnp.isnan(damping), first, damping)
+        trial, trial_loss, promised = attempt(
+            family, chunks, theta, matrix, slope, damping, layout=layout
+        )
+        better = loss - trial_loss > 0
+        theta = jnp.where(better, trial, theta)
+        losses = jnp.where(better, trial_loss, loss)
+        return theta, losses, loss - trial_loss, promised, damping
+
+    return jax.vmap(of_one)(thetas, dampings, weights)
+
+
+@partial(jax.jit, static_argnames="layout")
+def _loss_of_mean(family, held, thetas, *, layout):
+    """The mean square of a component of the residual of the members' mean ∇S."""
+    each = jax.vmap(lambda theta: residual(family, layout, theta, *held))(thetas)
+    return jnp.mean(jnp.mean(each, axis=0) ** 2)

@@ -12,10 +12,14 @@ from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
-from gfnn_jax.diagnosis.hidden_friction import hidden_friction
-from gfnn_jax.diagnosis.local_jacobians import differs_between_sequences, volume_change
-from gfnn_jax.diagnosis.neighbours import is_noise
-from gfnn_jax.diagnosis.noise import noise_of_sites, state_noise
+from gfnn_jax.diagnosis.residuals import (
+    differs_between_sequences,
+    hidden_friction,
+    is_noise,
+    noise_of_sites,
+    state_noise,
+    volume_change,
+)
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting.significance import CERTAIN
 from gfnn_jax.learn.check import not_radians, wrapped

@@ -22,8 +22,7 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.wrong_values import without_wrong_values
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
-from gfnn_jax.diagnosis.clean import clean
-from gfnn_jax.diagnosis.local_jacobians import looked_for_errors
+from gfnn_jax.diagnosis.outliers import clean, looked_for_errors
 from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
 from gfnn_jax.errors import FitError, FitWarning, InputError
 from gfnn_jax.fitting import row_blocks

@@ -18,13 +18,14 @@ import numpy as np
 
 from gfnn_jax.budget import ROWS, Budget
 from gfnn_jax.candidates.candidate import Candidate, validated
-from gfnn_jax.dataset.arcs import arcs_of_pairs, onward
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.dataset.runs import arcs_of_pairs, onward
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import uncertainty
 from gfnn_jax.fitting.triangle import Triangle
+from gfnn_jax.generating.arcs import GeneratedOnArcs
 from gfnn_jax.learn.conclude import only_noise
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
@@ -33,7 +34,7 @@ from gfnn_jax.models.generating_functions.coefficient_noise import (
     Factors,
     part_of_noise,
 )
-from gfnn_jax.models.generating_functions.map_arcs import LONGEST, GeneratedOnArcs, NearestArcs
+from gfnn_jax.models.generating_functions.map_arcs import LONGEST, NearestArcs
 from gfnn_jax.models.generating_functions.size import Size
 from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 from gfnn_jax.models.hamiltonians.choose_law import preferred

@@ -32,8 +32,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.positions.discrete_lagrangian import displacement, residuals, solve
-from gfnn_jax.models.positions.latent_positions import starting_noise
-from gfnn_jax.models.positions.noisy_positions import without_noise
+from gfnn_jax.models.positions.latent_positions import starting_noise, without_noise
 from gfnn_jax.models.positions.position_maps import images_of, map_of, states_of
 from gfnn_jax.models.positions.triples import Triples, triples_of
 from gfnn_jax.phase_space import Pairs, sizes

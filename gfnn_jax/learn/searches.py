@@ -18,11 +18,10 @@ from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed
 from gfnn_jax.errors import FitError
 from gfnn_jax.learn.request import Request
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.generating_functions.ensembles import EnsembleSweep
 from gfnn_jax.models.generating_functions.linear_map import linear_map
 from gfnn_jax.models.generating_functions.map_of_terms import LearnedMap, map_of
 from gfnn_jax.models.generating_functions.model_sweep import ModelSweep
-from gfnn_jax.models.generating_functions.network_sweep import NetworkSweep
+from gfnn_jax.models.generating_functions.networks import EnsembleSweep, NetworkSweep
 from gfnn_jax.models.generating_functions.sweeps import sweep_of_dt, sweeps_for
 from gfnn_jax.models.hamiltonians.choose_law import MAX_COST_RATIO, law_of, preferred
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian

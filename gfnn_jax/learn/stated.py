@@ -18,11 +18,11 @@ from gfnn_jax.budget import FLOW, ROWS, Budget
 from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import to_user
-from gfnn_jax.dataset.bounds import bound_of_mean
 from gfnn_jax.dataset.measured_error import (
     FEW,
     FEWEST_RUNS,
     Tolerance,
+    bound_of_mean,
     clusters,
     count_of_runs,
     error_of_each,

@@ -27,8 +27,7 @@ from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
-from gfnn_jax.solve.arc_models import Defects, Observed
-from gfnn_jax.solve.latent_arcs import Readings
+from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
 from gfnn_jax.solve.linear import covariance_root
 
 FEWEST = 5  # samples from which a state is estimated

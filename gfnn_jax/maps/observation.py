@@ -30,9 +30,8 @@ from gfnn_jax.families.expressions import (
 )
 from gfnn_jax.families.jets import jets
 from gfnn_jax.families.traced import traced
-from gfnn_jax.solve.arc_models import Observed
-from gfnn_jax.solve.latent_arcs import SOFT_L1
-from gfnn_jax.solve.robust import Loss
+from gfnn_jax.solve.latent_arcs import SOFT_L1, Observed
+from gfnn_jax.solve.noise import Loss
 
 _SAME = 1e-6  # sine of the angle between changes that are the same
 _TRIED = 12  # places of an angle from which a state is looked for

@@ -17,7 +17,7 @@ import numpy as np
 from gfnn_jax.coordinates import whole_turns
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
-from gfnn_jax.generating.position_arcs import PositionArcs, nodes_of
+from gfnn_jax.generating.arcs import PositionArcs, nodes_of
 from gfnn_jax.maps.estimates import Forecast
 from gfnn_jax.solve.latent_arcs import Readings
 

@@ -51,8 +51,7 @@ from gfnn_jax.maps.stroboscopic import OverPhases
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.scene import Scene
-from gfnn_jax.solve.robust import Biweight, SoftL1
-from gfnn_jax.solve.wander import Wander
+from gfnn_jax.solve.noise import Biweight, SoftL1, Wander
 from gfnn_jax.storage.checkpoints import load_model, save_model
 from gfnn_jax.storage.outputs import ensure_new
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.maps.observation import Observation
-from gfnn_jax.solve.wander import Wander
+from gfnn_jax.solve.noise import Wander
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,21 +15,79 @@ not be followed from its first state (multiple shooting; Bock, Springer Ser. Che
 c_n the move of x_{n+1} that would close the defect, which makes δx_n a function of δx_0 and δp
 alone. The arc's own δx_0 is eliminated by its own QR; what remains of all arcs are rows for δp.
 Where it converges the defects are zero, and each arc is an orbit of the model. Residuals enter in
-units of the noise through a robust loss (`solve.robust`). The noise may be estimated on the way.
-Where it is not white, a *whitening* (`solve.wander`) mixes residuals along an arc into white ones.
+units of the noise through a robust loss (`solve.noise`). The noise may be estimated on the way.
+Where it is not white, a *whitening* (`solve.noise`) mixes residuals along an arc into white ones.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from gfnn_jax.solve.arc_models import Defects, Known, Model, Observed, evaluated
 from gfnn_jax.solve.levenberg_marquardt import Factors, Tried, descended
-from gfnn_jax.solve.robust import Loss, SoftL1, of_residuals
+from gfnn_jax.solve.noise import Loss, SoftL1, of_residuals
+
+
+class Defects(NamedTuple):
+    """The linearised defects of states (A, L, m): c_n (A, L − 1, m), Φ_n (…, m, m) and, in the n
+    coefficients, Γ_n (…, m, n)."""
+
+    closing: np.ndarray
+    by_state: np.ndarray
+    by_coefficients: np.ndarray
+
+
+class Observed(NamedTuple):
+    """g at the states (A, L, k), and its derivatives (A, L, k, m) and (A, L, k, n)."""
+
+    values: np.ndarray
+    by_state: np.ndarray
+    by_coefficients: np.ndarray
+
+
+@runtime_checkable
+class Model(Protocol):
+    """States that move and are measured: what `Readings.fit` asks of a law, or of any other map."""
+
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects: ...
+
+    def observe(self, p: np.ndarray, x: np.ndarray) -> Observed: ...
+
+    def take(self, arcs: np.ndarray) -> Model:
+        """The same model of some of the arcs (indices)."""
+        ...
+
+
+def observed_whole(x: np.ndarray, coefficients: int) -> Observed:
+    """The states themselves, g(x; p) = x."""
+    own = np.broadcast_to(np.eye(x.shape[-1]), (*x.shape, x.shape[-1]))
+    return Observed(x, own, np.broadcast_to(0.0, (*x.shape, coefficients)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """A model whose coefficients p (n,) are known: only states are latent."""
+
+    model: Model
+    p: np.ndarray
+
+    def take(self, arcs: np.ndarray) -> Known:
+        return Known(self.model.take(arcs), self.p)
+
+
+def evaluated(model: Model | Known, p: np.ndarray, x: np.ndarray) -> tuple[Defects, Observed]:
+    """The linearised defects of states x (A, L, m), and what is measured of them."""
+    if not isinstance(model, Known):
+        return model.defects(p, x), model.observe(p, x)
+    defects, observed = evaluated(model.model, model.p, x)
+    return (
+        defects._replace(by_coefficients=defects.by_coefficients[..., :0]),
+        observed._replace(by_coefficients=observed.by_coefficients[..., :0]),
+    )
+
 
 _DEFECT = 0.1  # a defect of this many standard deviations costs as much as a residual of one
 _CLOSED = 0.1  # standard deviations, rms: arcs whose defects are smaller are orbits of the model

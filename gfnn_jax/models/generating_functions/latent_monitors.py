@@ -19,9 +19,10 @@ import numpy as np
 
 from gfnn_jax.dataset.rows import residual_weight
 from gfnn_jax.families.products import Products
+from gfnn_jax.generating.arcs import GeneratedOnArcs
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
-from gfnn_jax.models.generating_functions.map_arcs import LONGEST, GeneratedOnArcs
+from gfnn_jax.models.generating_functions.map_arcs import LONGEST
 from gfnn_jax.solve.latent_arcs import Readings
 
 _FEWEST = 4  # turns of an arc: of fewer, noise of the two monitors is not told apart

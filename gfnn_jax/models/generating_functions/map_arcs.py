@@ -16,88 +16,22 @@ Comput. 8 (1987) 1052). Residuals have variance one where noise is all that is l
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
-from gfnn_jax.dataset.arcs import Arcs
+from gfnn_jax.dataset.runs import Arcs
 from gfnn_jax.fitting.triangle import Triangle, folded
-from gfnn_jax.generating.charts import AnyChart
-from gfnn_jax.solve.arc_models import Defects, Known, Observed, observed_whole
-from gfnn_jax.solve.latent_arcs import Readings
-from gfnn_jax.solve.robust import Biweight
+from gfnn_jax.generating.arcs import GeneratedOnArcs
+from gfnn_jax.solve.latent_arcs import Known, Readings
+from gfnn_jax.solve.noise import Biweight
 
 LONGEST = 10  # steps of an arc: what S cannot represent adds up along a longer one
 # Of normal residuals it takes one part in forty, so that rows keep their variance of one.
 BIWEIGHT = Biweight(15.0)
 _SETTLED = 1e-3  # of the squared distance: what the states still gain moves no coefficient
-_LANES = 4_096  # steps whose matrices are computed at once
 _BLOCK_BYTES = 4 * 2**20  # of the rows of a block of arcs: they stay in the cache
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class GeneratedOnArcs:
-    """The map that S = Σ c_j φ_j generates, on arcs in which these steps ``moves`` (A, L − 1).
-
-    ends: affine pieces (before, after) around what S generates. along: a family whose rows are
-    wanted: F is then that of S = 0, its derivatives in the states stay those of S, and Γ is in the
-    coefficients of this family. None: no coefficient is free. joint: F is that of S all the same,
-    where ``along`` is its own family: `Readings.fit` then moves states and coefficients together.
-    """
-
-    family: Any
-    chart: AnyChart
-    dt: float
-    moves: np.ndarray
-    ends: tuple[Sequence[Any], Sequence[Any]] = ((), ())
-    along: Any = None
-    joint: bool = False
-
-    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
-        width, free = x.shape[-1], 0 if self.along is None else self.along.num_parameters
-        found = np.zeros((*self.moves.shape, width, 1 + width + free))
-        found[..., 1 : 1 + width] = np.eye(width)
-        lanes = np.flatnonzero(self.moves)
-        for first in range(0, len(lanes), _LANES):
-            some = np.unravel_index(lanes[first : first + _LANES], self.moves.shape)
-            found[some] = self._linearised(p, x[:, :-1][some], x[:, 1:][some])
-        return Defects(found[..., 0], found[..., 1 : 1 + width], found[..., 1 + width :])
-
-    def _linearised(self, p: np.ndarray, y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
-        """[c, Φ, Γ] (n, 2d, 1 + 2d + free) of steps from z to Z (n, 2d)."""
-        before, after = self._of_states(y0.shape[-1])
-        for piece in self.ends[0]:
-            y0 = piece.image(y0)
-        for piece in reversed(self.ends[1]):
-            y1 = piece.inverse().image(y1)
-        w, target = self.chart.evaluation_point(y0, y1), self.chart.target_gradient(y0, y1, self.dt)
-        gradient, hessian = self.family.gradient_and_hessian(self.family.unflatten(p), w)
-        miss = -target if self.along is not None and not self.joint else gradient - target
-        parts = [miss[..., None], hessian @ before[0] - before[1]]
-        if self.along is not None:
-            parts.append(self.along.term_gradients(w))
-        # F + ∂F/∂z δz + ∂F/∂Z δZ + ∇φ δc = 0, for δZ.
-        return -np.linalg.solve(hessian @ after[0] - after[1], np.concatenate(parts, axis=-1))
-
-    def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
-        return observed_whole(x, 0 if self.along is None else self.along.num_parameters)
-
-    def take(self, arcs: np.ndarray) -> GeneratedOnArcs:
-        return dataclasses.replace(self, moves=self.moves[arcs])
-
-    def _of_states(self, width: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(∂w, ∂g) in z, and in Z, (2d, 2d) each."""
-        first = second = eye = np.eye(width)
-        for piece in self.ends[0]:
-            first = piece.matrix @ first
-        for piece in self.ends[1]:
-            second = piece.matrix @ second
-        none = np.zeros_like(eye)
-        return [
-            (self.chart.evaluation_point(*e).T, self.chart.target_gradient(*e, self.dt).T)
-            for e in ((first.T, none), (none, np.linalg.inv(second).T))
-        ]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

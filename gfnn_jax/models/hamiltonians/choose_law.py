@@ -13,7 +13,7 @@ from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError
-from gfnn_jax.fitting.turns import backwards, tangent, turns
+from gfnn_jax.fitting.linear_starts import backwards, tangent, turns
 from gfnn_jax.models.hamiltonians.formula import OnPartial
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.options import OPTIONS

@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.budget import UNBOUNDED, Allowance
-from gfnn_jax.dataset.arcs import Arcs
+from gfnn_jax.dataset.runs import Arcs
 from gfnn_jax.errors import InputError
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.solve.arc_models import Defects, Known, Observed, observed_whole
-from gfnn_jax.solve.latent_arcs import Fitted, Readings
-from gfnn_jax.solve.robust import Biweight, robust
+from gfnn_jax.solve.latent_arcs import Defects, Fitted, Known, Observed, Readings, observed_whole
+from gfnn_jax.solve.noise import Biweight, robust
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,8 +26,7 @@ from gfnn_jax.dataset.rows import residual_weight
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
-from gfnn_jax.fitting.levenberg_marquardt import levenberg_marquardt
-from gfnn_jax.fitting.training import Limits
+from gfnn_jax.fitting.levenberg_marquardt import Limits, levenberg_marquardt
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.rates import rates, substeps_for

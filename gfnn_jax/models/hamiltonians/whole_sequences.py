@@ -11,15 +11,15 @@ import numpy as np
 
 from gfnn_jax.budget import Allowance
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.dataset.arcs import Arcs, arcs_of_pairs, onward
 from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.runs import Arcs, arcs_of_pairs, onward
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
 from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_above_noise
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.models.hamiltonians.flow_arcs import BIWEIGHT, FlowOnArcs, fit_flow, longest_arc
 from gfnn_jax.solve.latent_arcs import OUTLYING, Fitted
-from gfnn_jax.solve.robust import robust
+from gfnn_jax.solve.noise import robust
 
 _SHORTEST = 3  # steps of an arc that says more than its pairs do
 _RISE = 1.01  # of the held-out arcs' noise, by chance

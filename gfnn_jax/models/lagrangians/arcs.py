@@ -9,7 +9,7 @@ import numpy as np
 from gfnn_jax.flows import coulomb
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
-from gfnn_jax.solve.arc_models import Defects, Observed
+from gfnn_jax.solve.latent_arcs import Defects, Observed
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.models.lagrangians.structure import Key, Structure
 from gfnn_jax.solve.latent_arcs import Fitted, Readings
-from gfnn_jax.solve.wander import Wander
+from gfnn_jax.solve.noise import Wander
 
 _SETTLED = 1.15  # a noise scale that changed by less needs no second fit
 _LEAST_LEFT = 1e-4  # of the squares of residuals, that one more term may leave over

@@ -18,8 +18,16 @@ from gfnn_jax.data.channels import parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import by_name, symbols
 from gfnn_jax.data.wrong_values import without_wrong_values
-from gfnn_jax.dataset.rests import Moving, without_rests
-from gfnn_jax.dataset.stretches import Nodes, Scales, Stretch, measure, nodes_of, stretches
+from gfnn_jax.dataset.stretches import (
+    Moving,
+    Nodes,
+    Scales,
+    Stretch,
+    measure,
+    nodes_of,
+    stretches,
+    without_rests,
+)
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law, smoothed
@@ -48,7 +56,7 @@ from gfnn_jax.models.lagrangians.starts import no_law
 from gfnn_jax.models.lagrangians.text import speed_names
 from gfnn_jax.models.lagrangians.traces import traces_of
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
-from gfnn_jax.solve.robust import Loss
+from gfnn_jax.solve.noise import Loss
 
 _MISSED = 0.8  # of a channel's variation: no law that leaves as much over follows the recording
 _ABOVE_NOISE = 3.0  # times: such a rest is no noise
@@ -75,7 +83,7 @@ def fit_recording(
     "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
     terms: those of L, V and R, as text in the names of columns (`models.lagrangians.given_terms`),
     which are then all that is fitted. loss: of residuals in units of their noise; None: the soft L1
-    of `solve.robust`.
+    of `solve.noise`.
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found.
     """

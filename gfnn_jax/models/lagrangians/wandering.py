@@ -1,7 +1,7 @@
 """Zeros of channels that wander, found in the residuals of arcs by restricted maximum likelihood.
 
 Of rows X of all that was fitted, states and coefficients, and residuals r with covariance σ² C
-(`solve.wander`), N of them less M fitted numbers,
+(`solve.noise`), N of them less M fitted numbers,
 
     2 log likelihood = −(N − M) log rᵀ C⁻¹ r − log |C| − log |Xᵀ C⁻¹ X|
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from gfnn_jax.models.lagrangians.fit import LawFit, Workbench
 from gfnn_jax.solve.latent_arcs import Readings
-from gfnn_jax.solve.wander import Wander
+from gfnn_jax.solve.noise import Wander
 
 _EVIDENCE = 10.0  # logarithm of the likelihood's ratio, below which residuals are white
 _STEPS = (2.0, 1.4)  # factors by which size and time are searched

@@ -19,9 +19,8 @@ import numpy as np
 from gfnn_jax.dataset.stretches import Nodes, arcs_of, shifted, with_states
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
-from gfnn_jax.solve.arc_models import Defects, Observed
-from gfnn_jax.solve.latent_arcs import Readings
-from gfnn_jax.solve.wander import Wander
+from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
+from gfnn_jax.solve.noise import Wander
 
 _FEWEST = 3  # runs: two tell one difference, and no scatter
 _GAIN = 0.05  # of the held-out cost, that zeros of runs have to bring, as terms have

@@ -1,7 +1,8 @@
-"""Gross errors that are many: pairs far from a polynomial map that resists them, before any fit.
+"""The rows that a fit takes: each once, and none that contradicts the rows around it.
 
-Neighbours tell few outliers (`diagnosis.local_jacobians.outliers`), since many hide each other, and
-a map that is found tells those that did not spoil the search for it (`learn.gross_errors`). A state
+Neighbours tell few *outliers*, since many hide each other (`outliers`), and a map that is found
+tells those that did not spoil the search for it (`learn.gross_errors`). *Gross errors* that are
+many are pairs far from a polynomial map that resists them, before any fit (`gross_errors`). A state
 that is a gross error spoils two pairs of a sequence: a twentieth of the states is a tenth of the
 pairs.
 
@@ -23,25 +24,179 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
-from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.coordinates import Coordinates, nearest_image
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.diagnosis.local_jacobians import looked_for_errors
-from gfnn_jax.solve.robust import Biweight, robust
+from gfnn_jax.dataset.runs import Identified, first_occurrences, steps_between
+from gfnn_jax.dataset.structures import Structure
+from gfnn_jax.dataset.varied import given_by
+from gfnn_jax.diagnosis.local_jacobians import (
+    MANY_TERMS,
+    NEIGHBOURS_PER_TERM,
+    check_number,
+    pseudo_inverse,
+)
+from gfnn_jax.solve.noise import Biweight, robust
+
+_MOST_OUTLIERS = 0.05  # of the pairs may be left out
+
+
+def clean(
+    found: Identified,
+    coordinates: Coordinates,
+    structure: Structure | None = None,
+    jumps: bool = False,
+) -> tuple[Dataset, list[str]]:
+    """The data set without copies, without gross errors that are certain, and, where they are few,
+    without outliers; and warnings about what was left out. jumps: whether an angle is wrapped that
+    was not named: pairs contradict their neighbours where it jumps, and none is an error.
+
+    Raises FitError where too few are left, or states have no inner coordinates.
+    """
+    (pairs, row), messages = found, []
+    first = first_occurrences(pairs)
+    copies = len(pairs) - len(first)
+    if copies:
+        messages.append(f"{copies} of {len(pairs)} pairs are copies of others: each counts once")
+        pairs, row = pairs.take(first), row[first]
+        if structure is None:
+            check_number(pairs)
+    data = Dataset.of(pairs, coordinates, structure, row)
+    if structure is not None or jumps:  # of many dimensions too few pairs have neighbours
+        return data, messages
+    everyone, count = data, len(data)
+    found_outliers = outliers(data.y0, data.y1, data.scale, given_by(data))
+    few = len(found_outliers) <= _MOST_OUTLIERS * count
+    wrong = np.zeros(count, bool)
+    wrong[found_outliers[: len(found_outliers) if few else 0]] = True
+    gross = gross_errors(data, steps_between(pairs) == 1, wrong)
+    wrong[gross] = True
+    kept = np.flatnonzero(~wrong)
+    if len(gross):
+        data = everyone.lifted_anew(kept)  # the interval of an angle is that of what is left
+        if not few:
+            found_outliers = kept[outliers(data.y0, data.y1, data.scale, given_by(data))]
+            few = len(found_outliers) <= _MOST_OUTLIERS * count
+            kept = np.setdiff1d(kept, found_outliers) if few else kept
+            data = everyone.lifted_anew(kept)
+    elif len(kept) < count:
+        data = data.take(kept)
+    if len(found_outliers):
+        messages.append(
+            f"{len(found_outliers)} of {count} pairs contradict the pairs around them "
+            f"(numbers {_named(row[found_outliers])}, from 0): "
+            + (
+                "outliers, they are left out"
+                if few
+                else "too many for outliers, they are kept. Is q first, and does z1 follow z0?"
+            )
+        )
+    if len(gross):
+        messages.append(
+            f"{len(gross)} of {count} pairs (numbers {_named(row[gross])}, from 0) are far from a "
+            "polynomial fitted to the others: outliers, they are left out"
+        )
+    return data, messages
+
+
+def _named(rows: np.ndarray) -> str:
+    return ", ".join(map(str, rows[:5])) + (", …" if len(rows) > 5 else "")
+
+
+# A pair is an outlier that its neighbours' fit misses by so many standard deviations.
+_OUTLYING, _OUTLIER_ROUNDS = 30.0, 5
+# Where there are fewer pairs than so many neighbourhoods hold, more deviations make an outlier, by
+# that factor. Of 4,000 times 20 clean pairs of a kicked pendulum the most is 102 deviations: a fit
+# to a few neighbours is now and then good by chance.
+_NEIGHBOURHOODS = 10
+# Pairs that are looked at for gross errors, in blocks of a sequence: 50,000 take two seconds.
+_MOST_LOOKED_AT, _BLOCK = 50_000, 1_000
+# Of more terms than a few (above) only pairs are looked at that an affine map of all misses by so
+# many times the median, and so many that tell what is usual: 2,000 pairs of 32 degrees of freedom
+# take a second instead of eight.
+_SUSPECT, _USUAL = 3.0, 100
+
+
+def outliers(y0, y1, scale, given=None) -> np.ndarray:
+    """Rows of the pairs whose move contradicts that of the pairs around them.
+
+    y0, y1: (N, 2d) with angles lifted. given: (N, k) of unit sizes, what else a move depends on. A
+    pair's move is predicted from its neighbours, by an affine
+    fit. An outlier misses it by many times what that fit leaves over among them: the deleted
+    studentised residual. A steep or noisy map leaves much over everywhere and has no outliers.
+    Outliers hide each other: the others are looked at again without those found.
+    """
+    x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
+    x = x if given is None else np.concatenate([x, given], axis=1)
+    rows, found = looked_for_errors(len(x)), []
+    few = _NEIGHBOURHOODS * NEIGHBOURS_PER_TERM * (1 + x.shape[1]) / len(x)
+    for _ in range(_OUTLIER_ROUNDS):
+        outlying = _studentised(x[rows], move[rows]) > _OUTLYING * max(1.0, few)
+        if not outlying.any():
+            break
+        found.append(rows[outlying])
+        rows = rows[~outlying]
+    return np.sort(np.concatenate([np.zeros(0, int), *found]))
+
+
+def _studentised(x, move):
+    """The error of each move (N, 2d) predicted by its neighbours, over its standard deviation."""
+    n, width = x.shape
+    terms = 1 + width
+    count = NEIGHBOURS_PER_TERM * terms
+    if n <= count:
+        return np.zeros(n)
+    tree, floor = cKDTree(x), 1e-13 * (1 + np.abs(move).max())
+    error, deviation = np.zeros(n), np.zeros(n)
+    rows = _suspect(x, move) if terms > MANY_TERMS else np.arange(n)
+    for block in np.array_split(rows, 1 + len(rows) // 10_000):  # in bounded memory
+        near = tree.query(x[block], k=count + 1)[1][:, 1:]
+        offset = x[near] - x[block][:, None, :]
+        design = np.concatenate([np.ones((*offset.shape[:2], 1)), offset], axis=-1)
+        moves, kept = move[near], np.ones(near.shape)
+        for _ in range(2):  # the second time without the neighbour that fits worst: an outlier?
+            inverse = pseudo_inverse(design * kept[..., None])
+            solution = inverse @ (moves * kept[..., None])
+            rest = np.sum((moves - design @ solution) ** 2, axis=-1) * kept
+            deviation[block] = np.sqrt(rest.sum(axis=1) / (kept.sum(axis=1) - terms))
+            kept[np.arange(len(block)), np.argmax(rest, axis=1)] = 0.0
+        growth = np.sqrt(1 + np.sum(inverse[:, 0] ** 2, axis=-1))
+        error[block] = np.linalg.norm(move[block] - solution[:, 0], axis=1) / growth
+    # With so few neighbours a fit is now and then exact by chance.
+    return error / (np.maximum(deviation, np.median(deviation[rows])) + floor)
+
+
+def looked_for_errors(count: int) -> np.ndarray:
+    """Rows of so many pairs that are looked at for gross errors: all, or blocks of every part."""
+    blocks = -(-count // _BLOCK)
+    apart = -(-blocks // (_MOST_LOOKED_AT // _BLOCK))
+    return np.flatnonzero(np.arange(count) // _BLOCK % apart == 0)
+
+
+def _suspect(x, move) -> np.ndarray:
+    """Rows whose move one affine map of all pairs misses by more than usual, and a few others: in
+    many dimensions neighbours are far apart, and tell little more than all pairs do."""
+    design = np.column_stack([np.ones(len(x)), x])
+    rest = move - design @ np.linalg.lstsq(design, move, rcond=None)[0]
+    size = np.linalg.norm(rest, axis=1)
+    far = size > _SUSPECT * np.median(size)
+    far[:_USUAL] = True
+    return np.flatnonzero(far)
+
 
 # Times the median residual: beyond the second, a pair is a gross error. Those between the two are
 # fewer than this part of them. Of normal noise and d = 1 one pair of 100,000 is beyond the first.
 _ORDINARY, _BEYOND, _BETWEEN = 4.0, 8.0, 0.1
-_FEWEST, _MOST = 5, 0.45  # gross errors; of all pairs
+_FEWEST_ERRORS, _MOST_ERRORS = 5, 0.45  # gross errors; of all pairs
 # Among so many neighbours of the state or of the image all but so many are ordinary; of all that
 # are far from the polynomial so many stand alone in that way.
-_NEIGHBOURS, _BUT, _ALONE = 10, 4, 0.8
+_NEIGHBOURS_OF_ERROR, _BUT, _ALONE = 10, 4, 0.8
 # Of the stretches of sequences between two good states so many are bridged by the polynomial, by
 # no more than so many steps.
 _BRIDGED, _LONGEST = 0.8, 10
 # A state is a regressor within so many robust deviations of the median: others have too much
 # weight in a fit.
 _WITHIN = 8.0
-_PAIRS_PER_TERM, _MOST_TERMS, _MOST_ROWS = 8, 130, 3_000
+_PAIRS_PER_MONOMIAL, _MOST_TERMS, _MOST_ROWS = 8, 130, 3_000
 _GAINED = 0.9  # of the residual, that a higher degree must leave
 _USABLE = 0.25  # of the moves' size: a polynomial that leaves more says nothing
 _ABSOLUTE, _BIWEIGHT = 8, 7  # rounds of either loss
@@ -73,8 +228,8 @@ def gross_errors(data: Dataset, goes_on: np.ndarray, left_out: np.ndarray) -> np
     far = np.flatnonzero((size > _BEYOND) & ~left_out)
     between = np.sum((size > _ORDINARY) & (size <= _BEYOND))
     # Those that neighbours told before are gross errors too: beside them there may be few.
-    few = not len(far) or len(far) + left_out.sum() < _FEWEST
-    if few or len(far) > _MOST * len(size) or between > _BETWEEN * len(far):
+    few = not len(far) or len(far) + left_out.sum() < _FEWEST_ERRORS
+    if few or len(far) > _MOST_ERRORS * len(size) or between > _BETWEEN * len(far):
         return none
     if goes_on.any():
         return _borne_out(best, far, goes_on, left_out)
@@ -151,7 +306,7 @@ def _models(data: Dataset, known: np.ndarray) -> Iterator[_Model]:
     """Models by rising degree, as far as the pairs tell their terms."""
     coordinates, width = data.coordinates, data.y0.shape[1]
     width += len(coordinates.angles) - len(set(coordinates.cyclic) - set(coordinates.angles))
-    most = min(_MOST_TERMS, int(known.sum()) // _PAIRS_PER_TERM)
+    most = min(_MOST_TERMS, int(known.sum()) // _PAIRS_PER_MONOMIAL)
     degree = 1
     while math.comb(width + degree, degree) <= most:
         yield _Model(data, known, degree)
@@ -186,7 +341,7 @@ def _ordinary_around(data: Dataset, unit, size, rows) -> np.ndarray:
     gross error has no neighbours but its like."""
     near_one = np.zeros(len(rows), bool)
     for y in (data.y0 / unit, data.y1 / unit):
-        near = cKDTree(y).query(y[rows], k=_NEIGHBOURS + 1)[1][:, 1:]
+        near = cKDTree(y).query(y[rows], k=_NEIGHBOURS_OF_ERROR + 1)[1][:, 1:]
         near_one |= np.sort(size[near], axis=1)[:, -1 - _BUT] < _ORDINARY
     return near_one
 

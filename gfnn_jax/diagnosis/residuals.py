@@ -1,0 +1,315 @@
+"""Findings in the residuals of a map: noise or structure, friction, something that differs between
+sequences.
+
+Noise differs from one pair to the next however close they are; what a map cannot represent is a
+function of the state, so that neighbours have nearly the same of it. (The part of a variogram that
+does not vanish with the distance is the nugget: G. Matheron, Econ. Geol. 58 (1963) 1246.)
+
+What a symplectic map leaves over of another one is, to first order, J∇K of some K at the images.
+Friction, −ρ_i p_i, is no such field: beside a K of as many terms as the pairs tell apart, ρ is a
+coefficient like others, with a standard error.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations_with_replacement
+
+import numpy as np
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+
+from gfnn_jax.candidates.assemble import stepped
+from gfnn_jax.coordinates import CARTESIAN, nearest_image
+from gfnn_jax.dataset.noise import of_halves, of_pairs
+from gfnn_jax.dataset.runs import next_of
+from gfnn_jax.families.inputs import box_inputs
+from gfnn_jax.families.products import Products
+from gfnn_jax.fitting.significance import CERTAIN
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.phase_space import Pairs, apply_j, sizes, split
+
+_APART = 1e-4  # of the coordinates' sizes: the step of the central differences
+_PROBES = 4  # random directions of each half of the coordinates
+
+
+def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
+    """Standard deviation (2d,) of each coordinate's noise, from the residuals of these pairs.
+
+    pairs: with their runs and places, in the order of these. taken: the part of the residuals'
+    degrees of freedom that the map's coefficients took.
+    """
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    width, size = z0.shape[1], sizes(z0)
+    residual = _difference(map_, z1, _images(map_, pairs, z0))
+    jacobian = np.empty((len(z0), width, width))
+    for j, apart in enumerate(_APART * size):
+        offset = apart * (np.arange(width) == j)
+        jacobian[:, :, j] = _change(map_, pairs, offset) / apart
+    known = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
+    shared = np.flatnonzero(next_of(pairs, np.flatnonzero(known)))
+    return of_pairs(residual[known], jacobian[known], shared) / np.sqrt(1.0 - taken)
+
+
+def noise_of_sites(map_: SymplecticMap, pairs: Pairs) -> np.ndarray:
+    """The same (2d,) where all positions have one noise, and all momenta one, as of equal sites.
+
+    The sums of squares of M's rows are means of (M v)² over random signs v: the steps that they
+    take do not depend on d (Hutchinson, Commun. Stat. Simul. 18 (1989) 1059).
+    """
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    dim, size, rng = pairs.dim, sizes(z0), np.random.default_rng(0)
+    residual = _difference(map_, z1, _images(map_, pairs, z0))
+    halves = np.arange(2 * dim) // dim
+    grown = np.zeros((2, len(z0), 2 * dim))
+    for half in (0, 1):
+        apart = _APART * float(size[halves == half].min())
+        for _ in range(_PROBES):
+            signs = rng.choice([-1.0, 1.0], z0.shape) * (halves == half)
+            grown[half] += (_change(map_, pairs, apart * signs) / apart) ** 2 / _PROBES
+    known = np.isfinite(residual).all(axis=1) & np.isfinite(grown).all(axis=(0, 2))
+    return of_halves(residual[known], grown[:, known])
+
+
+def _images(map_: SymplecticMap, pairs: Pairs, z) -> np.ndarray:
+    return stepped(map_, z, pairs.dt, pairs.args, timed=False).images
+
+
+def _change(map_: SymplecticMap, pairs: Pairs, offset) -> np.ndarray:
+    """(N, 2d), what the step changes by when the states of the pairs change by the offset, to
+    second order."""
+    z0 = np.asarray(pairs.z0)
+    ahead, behind = (_images(map_, pairs, z0 + sign * offset) for sign in (1, -1))
+    return _difference(map_, ahead, behind) / 2
+
+
+def _difference(map_: SymplecticMap, one, other) -> np.ndarray:
+    plain = map_.coordinates.forward is CARTESIAN.forward
+    return nearest_image(one - other, map_.coordinates.angles if plain else ())
+
+
+# Neighbours that are looked at; the part of them that is closest, and its least number.
+_NEAREST, _CLOSEST, _FEWEST = 6, 0.25, 20
+# Mean square of differences between close neighbours, ÷ that of two unrelated ones: of noise 0.9
+# and more, of a dry friction that was not learned 0.006, of two bodies by degree 6 0.14.
+_NOISE = 0.6
+# The same of products of two coordinates, above which neighbours are too far apart to tell: 2,000
+# pairs of four degrees of freedom have 0.2, of eight 0.45.
+_SMOOTH = 0.3
+
+
+def is_noise(z, residual, run, place) -> bool | None:
+    """Return whether the residuals differ between close neighbours as much as between any two; None
+    where the pairs lie too far apart for a smooth function to tell.
+
+    z, residual: (N, 2d) in units of the coordinates' sizes. run, place: (N,) of each row: rows that
+    follow each other share a state, and its noise, and are no neighbours.
+    """
+    one, other = _close_neighbours(np.asarray(z), np.asarray(run), np.asarray(place))
+    if len(one) < _FEWEST:
+        return None
+    if _difference_of_neighbours(residual, one, other) < _NOISE:
+        return False
+    # Products of coordinates are as smooth as what may be missing is at best.
+    smooth = np.asarray(z) * np.roll(z, 1, axis=1)
+    return True if _difference_of_neighbours(smooth, one, other) < _SMOOTH else None
+
+
+def _difference_of_neighbours(values, one, other) -> float:
+    values = np.asarray(values)
+    each = np.sum(values[one] ** 2 + values[other] ** 2)
+    return float(np.sum((values[one] - values[other]) ** 2) / each) if each > 0 else 0.0
+
+
+def _close_neighbours(z, run, place) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and the nearest neighbour of each, the quarter of them that is closest."""
+    rows = np.arange(len(z))
+    distance, near = cKDTree(z).query(z, k=min(_NEAREST + 1, len(z)))
+    distance, near = distance[:, 1:], near[:, 1:]
+    follows = (run[near] == run[:, None]) & (np.abs(place[near] - place[:, None]) <= 1)
+    distance = np.where(follows, np.inf, distance)
+    first = np.argmin(distance, axis=1)
+    distance, near = distance[rows, first], near[rows, first]
+    closest = np.argsort(distance)[: max(_FEWEST, int(_CLOSEST * len(z)))]
+    closest = closest[np.isfinite(distance[closest])]
+    return rows[closest], near[closest]
+
+
+_DEGREES = (8, 6, 5, 4, 3, 2)  # of K
+_ROWS_PER_TERM, _MOST_TERMS = 10, 400
+# A change of volume is reported where it is certain, in the inner half of the states by so many
+# standard errors and in the outer too, and where both are the same within this factor. It is larger
+# than the square of the residuals, to which order J∇K is what they are, and than roundoff.
+_OF_HALVES, _ALIKE_OF_HALVES, _ROUNDOFF = 3.0, 2.0, 1e-13
+
+
+def hidden_friction(images, residual, angles: tuple[int, ...] = ()) -> tuple[float, float] | None:
+    """(change of phase-space volume in a step, its standard error) by friction in the residuals
+    (n, 2d) of a symplectic map at its images (n, 2d); None where it is not certain, or the pairs
+    are too few."""
+    images, residual = np.asarray(images), np.asarray(residual)
+    whole, square = _by_friction(images, residual, angles), np.mean((residual / sizes(images)) ** 2)
+    if whole is None or not abs(whole[0]) > max(CERTAIN * whole[1], square, _ROUNDOFF):
+        return None
+    distance = np.linalg.norm((images - images.mean(axis=0)) / sizes(images), axis=1)
+    inside = distance <= np.median(distance)
+    for half in (inside, ~inside):
+        part = _by_friction(images[half], residual[half], angles)
+        if part is None or not abs(part[0]) > _OF_HALVES * part[1]:
+            return None
+        if not 1 / _ALIKE_OF_HALVES < part[0] / whole[0] < _ALIKE_OF_HALVES:
+            return None
+    return whole
+
+
+def _by_friction(images, residual, angles) -> tuple[float, float] | None:
+    """The sum of −ρ_i and its standard error, which knows that pairs differ in what is left."""
+    count, width = residual.shape
+    inputs = box_inputs(images, angles=angles)
+    most = min(_MOST_TERMS, count * width // _ROWS_PER_TERM)
+    family = next(
+        (f for f in (Products(inputs, n) for n in _DEGREES) if f.num_parameters <= most), None
+    )
+    if family is None:
+        return None
+    size, (_, p) = sizes(images), split(images)
+    slopes = family.term_gradients(images)  # (n, 2d, terms)
+    fields = np.moveaxis(apply_j(np.moveaxis(slopes, -1, 1)), 1, -1)
+    rates = -p[..., None] * np.eye(width // 2)
+    rates = np.concatenate([np.zeros_like(rates), rates], axis=1)
+    design = np.concatenate([fields, rates], axis=-1) / size[:, None]
+    design = design.reshape(count * width, -1)
+    design = design / np.linalg.norm(design, axis=0).clip(np.finfo(float).tiny)
+    norms = np.linalg.norm((rates / size[:, None]).reshape(count * width, -1), axis=0)
+    inverse = np.linalg.pinv(design, rcond=1e-10)
+    target = (residual / size).ravel()
+    left = (target - design @ (inverse @ target)).reshape(count, width)
+    own = inverse[-(width // 2) :] / norms[:, None]
+    weights = own.sum(axis=0).reshape(count, width)
+    rho, scores = float(np.sum(weights.ravel() * target)), np.sum(weights * left, axis=1)
+    freedom = max(1.0 - design.shape[1] / design.shape[0], 0.1)
+    return -rho, float(np.linalg.norm(scores) / freedom)
+
+
+# What an affine fit within sequences may leave of a residual that agrees within them; neighbours
+# among which the nearest one of another sequence is sought.
+_EXPLAINED, _SEQUENCE_NEIGHBOURS = 0.25, 50
+_NEARBY = 16  # neighbours that tell the size of what is left over at a state
+# Times as much as a neighbour as far in the same sequence leaves over, one of another sequence does
+# where something differs between them.
+_ACROSS = 3.0
+# A cubic law is fitted where there are so many pairs for each of its terms.
+_PAIRS_PER_TERM = 10
+# The changes of volume of the inner half of the states and of the outer: within a factor, or by so
+# many standard errors, they are the same.
+_ALIKE, _HALVES_APART = 3.0, 2.0
+
+
+def volume_change(z, residual) -> tuple[float, float]:
+    """(change of phase-space volume per step, its standard error) that a symplectic fit left over.
+
+    z, residual: (N, 2d), states and Z − Z_predicted. The residual of a symplectic map is noise or
+    has no divergence; friction is linear in z to first order, and its trace is the rate at which
+    volumes shrink. The fit takes up a part of it, by a field without divergence that is not linear:
+    the divergence is the mean of a cubic law's over the states, or a linear law's where the pairs
+    are few. (0, inf) where the law explains less than half of the residual.
+
+    Friction holds everywhere; a misfit may be concentrated where states are few, and a law fitted
+    to it then has any divergence. The change is 0 where the inner half of the states and the outer
+    one, by their distance from the mean in units of the spread, do not agree on it.
+    """
+    z, residual = np.asarray(z), np.asarray(residual)
+    change, error = _divergence(z, residual)
+    if not np.isfinite(error):
+        return change, error
+    distance = np.linalg.norm((z - z.mean(axis=0)) / sizes(z), axis=1)
+    inside = distance <= np.median(distance)
+    (one, its), (other, others) = (_divergence(z[h], residual[h]) for h in (inside, ~inside))
+    alike = 1 / _ALIKE <= one / other <= _ALIKE if other else False
+    agree = alike or abs(one - other) <= _HALVES_APART * np.hypot(its, others)
+    return (change if agree else 0.0), error
+
+
+def _divergence(z, residual) -> tuple[float, float]:
+    """The mean divergence of the law that explains these residuals, and its standard error; (0,
+    inf) where it explains less than half of them."""
+    width = z.shape[1]
+    size = sizes(z)
+    x = (z - z.mean(axis=0)) / size
+    few = len(z) < _PAIRS_PER_TERM * math.comb(width + 3, 3)
+    degrees = range(2 if few else 4)
+    terms = [t for k in degrees for t in combinations_with_replacement(range(width), k)]
+
+    def monomials(terms):
+        return np.stack([np.prod(x[:, list(term)], axis=1) for term in terms], axis=1)
+
+    design = monomials(terms)
+    coefficients = np.linalg.lstsq(design, residual, rcond=None)[0]
+    rest = residual - design @ coefficients
+    if np.mean(rest**2) > 0.5 * np.mean(residual**2):
+        return 0.0, np.inf
+    covariance = np.linalg.pinv(design.T @ design)
+    change, variance = 0.0, 0.0
+    for i in range(width):
+        own = [j for j, term in enumerate(terms) if i in term]
+        powers = np.array([terms[j].count(i) for j in own])
+        lowered = monomials([_without(terms[j], i) for j in own])
+        slope = np.zeros(len(terms))  # of each term, in direction i
+        slope[own] = powers * lowered.mean(axis=0) / size[i]
+        change += slope @ coefficients[:, i]
+        variance += slope @ covariance @ slope * rest[:, i].var()
+    return float(change), float(np.sqrt(variance))
+
+
+def _without(term: tuple[int, ...], i: int) -> tuple[int, ...]:
+    """The term with one factor of the i-th coordinate less."""
+    place = term.index(i)
+    return term[:place] + term[place + 1 :]
+
+
+def _in_local_units(z: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Residuals (N, 2d) ÷ their root mean square among the neighbours of z (N, 2d)."""
+    count = min(len(z), _NEARBY)
+    _, near = cKDTree(z).query(z, k=count)
+    size = np.sqrt(np.mean(residual[near.reshape(len(z), count)] ** 2, axis=1))
+    return residual / np.where(size > 0, size, 1.0)
+
+
+def differs_between_sequences(z, residual, sequence) -> bool:
+    """Return whether what a fit left over agrees within a sequence and differs between sequences:
+    then something that the states do not hold, a parameter, differs between them.
+
+    z, residual: (N, 2d), in units of the coordinates' sizes; sequence: (N,). Within, every other
+    pair of a sequence is predicted by an affine fit to the rest of it; between, a pair by its
+    nearest neighbour in other sequences, and by the next one of its own that is no nearer. Noise is
+    predicted by none of them, a misfit by as far a neighbour of whichever sequence; where that is
+    too far away to tell, as in many dimensions, nothing is. Residuals are looked at in units of
+    their size nearby: a step magnifies the noise of the states, in close passages a hundred times,
+    and a few of these would stand for all.
+    """
+    z = np.asarray(z)
+    residual = _in_local_units(z, np.asarray(residual))
+    total, within, rows = 0.0, 0.0, []
+    for number in np.unique(sequence):
+        own = np.flatnonzero(sequence == number)
+        if len(own) < 4 * (1 + z.shape[1]):
+            continue
+        design = np.column_stack([np.ones(len(own)), z[own]])
+        fitted = np.linalg.lstsq(design[::2], residual[own[::2]], rcond=None)[0]
+        total += np.sum(residual[own[1::2]] ** 2)
+        within += np.sum((residual[own[1::2]] - design[1::2] @ fitted) ** 2)
+        rows.append(own)
+    if len(rows) < 2 or not within < _EXPLAINED * total:
+        return False
+    rows = np.concatenate(rows)
+    count = min(len(rows), _SEQUENCE_NEIGHBOURS)
+    _, near = cKDTree(z[rows]).query(z[rows], k=count)
+    other = sequence[rows][near] != sequence[rows][:, None]
+    first = np.argmax(other, axis=1)  # the nearest of another sequence
+    as_far = ~other & (np.arange(count) > first[:, None])
+    known = other.any(axis=1) & as_far.any(axis=1)
+    residual, near, places = residual[rows], near[known], np.arange(len(rows))[known]
+    across, along = (
+        np.sum((residual[places] - residual[near[np.arange(len(near)), k[known]]]) ** 2)
+        for k in (first, np.argmax(as_far, axis=1))
+    )
+    return bool(across > 0.5 * np.sum(residual[places] ** 2) and across > _ACROSS * along)
