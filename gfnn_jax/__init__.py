@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from gfnn_jax.learn.fitted import Fit
     from gfnn_jax.learn.monitors import Monitors, fit_monitors
     from gfnn_jax.learn.options import FitOptions
-    from gfnn_jax.maps.saved import load, register
+    from gfnn_jax.learn.saved import load
+    from gfnn_jax.maps.saved import register
     from gfnn_jax.maps.stroboscopic import stroboscopic
     from gfnn_jax.maps.symplectic_map import SymplecticMap
     from gfnn_jax.models.model import Fitted, TrainingData
@@ -64,7 +65,7 @@ _HOMES = {
     "fit": "learn.fit",
     "fit_monitors": "learn.monitors",
     "from_function": "families",
-    "load": "maps.saved",
+    "load": "learn.saved",
     "read": "data.recording",
     "reference_trajectories": "scenes.trajectories",
     "register": "maps.saved",

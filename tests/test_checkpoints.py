@@ -116,9 +116,9 @@ def test_every_file_is_guarded(model):
 
 
 def test_flipped_bit_is_named(model):
-    path = next(model.glob("arrays/d/*"))
+    path = model / "arrays.npz"
     path.write_bytes(path.read_bytes()[:-1] + b"?")
-    with pytest.raises(InputError, match=rf"arrays/d/{path.name} has changed"):
+    with pytest.raises(InputError, match=r"arrays.npz has changed"):
         load_model(model)
 
 
@@ -140,7 +140,7 @@ def kernel(record):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: r.update(format=3), "has format 3, this release reads format 2"),
+        (lambda r: r.update(format=4), "has format 4, this release reads formats 2 and 3"),
         (lambda r: r.pop("format"), "model.json is damaged"),
         (lambda r: kernel(r).update(shape=[8, 4]), r"float64 of shape \(8, 4\), found"),
         (lambda r: kernel(r).update(dtype="float32"), "should be float32 of shape"),

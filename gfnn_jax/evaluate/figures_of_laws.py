@@ -11,14 +11,14 @@ import numpy as np
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate.forecasts import Forecasts
-from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
+from gfnn_jax.learn.fitted import Fit
 
 _AHEAD = 2 / 3  # of the longest run that a forecast is shown for
 _MOST_TIMES = 600
 _MOST_CHANNELS = 6
 
 
-def law_figure(fit: LearnedLaw, recording: Recording, path: Path) -> Path:
+def law_figure(fit: Fit, recording: Recording, path: Path) -> Path:
     """Write the figure of a law and the recording that it was learned from, in the file's units."""
     channels = list(fit.whiteness)[:_MOST_CHANNELS]
     figure, axes = plt.subplots(
@@ -79,7 +79,7 @@ def forecasts_figure(found: Forecasts, recording: Recording, path: Path) -> Path
     return path
 
 
-def _forecast(axes, fit: LearnedLaw, recording: Recording, run: str, name: str) -> None:
+def _forecast(axes, fit: Fit, recording: Recording, run: str, name: str) -> None:
     t = recording.times(run)
     begin = t[0] + (1 - _AHEAD) * np.ptp(t)
     ahead = t[t > begin][:: max(1, int(np.sum(t > begin)) // _MOST_TIMES)]
@@ -104,7 +104,7 @@ def _forecast(axes, fit: LearnedLaw, recording: Recording, run: str, name: str) 
     axes.set_xlabel("t [s]")
 
 
-def _residuals(axes, fit: LearnedLaw, name: str) -> None:
+def _residuals(axes, fit: Fit, name: str) -> None:
     k = list(fit.whiteness).index(name)
     for trace in fit.traces:
         axes.plot(trace.t, trace.measured[:, k] - trace.fitted[:, k], ".", ms=2, color="C0")
@@ -115,7 +115,7 @@ def _residuals(axes, fit: LearnedLaw, name: str) -> None:
     axes.set_xlabel("t [s]")
 
 
-def _whiteness(axes, fit: LearnedLaw, name: str) -> None:
+def _whiteness(axes, fit: Fit, name: str) -> None:
     of = fit.whiteness[name]
     axes.axhspan(-of.bound, of.bound, color="0.85")
     axes.stem(of.lags[1:], of.autocorrelation[1:], basefmt=" ")
@@ -126,7 +126,7 @@ def _whiteness(axes, fit: LearnedLaw, name: str) -> None:
     axes.set_xlabel("lag [s]")
 
 
-def _energy(axes, fit: LearnedLaw) -> None:
+def _energy(axes, fit: Fit) -> None:
     """Draw the ledger of the longest arc: what is stored, lost, supplied, and left unexplained."""
     trace = max(fit.traces, key=lambda one: np.ptp(one.t))
     stored = trace.energy - trace.energy[0]

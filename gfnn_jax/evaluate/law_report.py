@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.evaluate.report import device
+from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.maps.saved import versions
-from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 
 
-def assemble(fit: LearnedLaw, *, source: str, seed: int) -> dict[str, Any]:
+def assemble(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[str, Any]:
     """The report of a fit of the recording ``source``."""
     map_, sensors = fit.map, fit.map.sensors
     assert sensors is not None
     num_parameters = sum(t.std > 0 for t in (*fit.lagrangian.terms, *fit.friction.terms))
     return {
+        "verdict": fit.verdict,
         "scene": None,
         "dt": float(np.asarray(map_.dt)),
         "seed": seed,

@@ -28,21 +28,22 @@ def device() -> str:
 def assemble(
     fit: Fit,
     *,
-    scene: str | None,
-    dt: float,
-    seed: int,
-    data: dict[str, Any],
-    rollout: dict[str, Any] | None,
+    scene: str | None = None,
+    data: dict[str, Any] | None = None,
+    rollout: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Assemble the report of a fit, and of rollouts with it (see `rollout_part`) where there are.
 
-    data: facts about the pairs beside their number: source, digest, precision, units.
+    scene: its name, where that is not the fit's own. data: facts about the pairs beside their
+    number: source, digest, precision, units.
     """
     chosen = fit.chosen
+    lent = fit.scene.name if fit.scene is not None else None
     return {
-        "scene": scene,
-        "dt": dt,
-        "seed": seed,
+        "verdict": fit.verdict,
+        "scene": scene or lent,
+        "dt": float(np.asarray(fit.map.dt)),
+        "seed": fit.seed,
         "dtype": str(fit.map.scale.dtype),
         "device": device(),
         "versions": versions(),
@@ -51,7 +52,7 @@ def assemble(
             "symplecticity_defect": fit.data_defect,
             "noise": None if fit.noise is None else fit.noise.tolist(),
             "symmetries": [symmetry._asdict() for symmetry in fit.symmetries],
-            **data,
+            **(data or {}),
         },
         "model": {
             "learns": chosen.learns,

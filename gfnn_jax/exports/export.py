@@ -76,6 +76,7 @@ def export(
     """
     if to not in SUFFIXES:
         raise InputError(f"expected {' or '.join(SUFFIXES)} to export to, got '{to}'")
+    map_ = getattr(map_, "map", map_)  # a fit
     folder = None if isinstance(map_, SymplecticMap) else Path(map_)
     if out is None and folder is None:
         raise InputError("expected a file to write (out=...): a map in memory has no folder")

@@ -14,7 +14,6 @@ from gfnn_jax.data.files import iterate_pairs, read_trajectories
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.data.summary import summary
 from gfnn_jax.errors import InputError, OutOfTime
-from gfnn_jax.evaluate import report
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, refusals, scene_named, search
@@ -134,12 +133,8 @@ def fit(
                 fitted = not_refitted(fitted, why_not(fitted.map)) if large else fitted
             progress.status("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
-            result = report.assemble(
-                fitted,
+            result = fitted.report(
                 scene=scene_name,
-                dt=float(np.asarray(fitted.map.dt)),
-                seed=asked.seed,
-                rollout=None,
                 data={
                     "source": trajectories.source,
                     "digest": trajectories.digest,

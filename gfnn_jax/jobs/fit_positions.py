@@ -6,11 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gfnn_jax.data.recording import read
 from gfnn_jax.data.recording_summary import refuse_mistakes
-from gfnn_jax.evaluate import report
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import failures_of_arithmetic, line, refusals
 from gfnn_jax.jobs.units import units_of
@@ -47,13 +44,8 @@ def fit_positions(
         )
     progress.status("the report: the derivative of a step")
     fitted = fitted.settled()
-    result = report.assemble(
-        fitted,
-        scene=None,
-        dt=float(np.asarray(fitted.map.dt)),
-        seed=asked.seed,
-        rollout=None,
-        data={"source": recording.source, "positions": list(recording.positions)},
+    result = fitted.report(
+        data={"source": recording.source, "positions": list(recording.positions)}
     )
     job = {
         "command": "fit",

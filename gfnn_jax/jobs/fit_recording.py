@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 
 from gfnn_jax.data.recording import read
 from gfnn_jax.data.recording_summary import refuse_mistakes
-from gfnn_jax.evaluate import law_report, report
+from gfnn_jax.evaluate import report
 from gfnn_jax.evaluate.figures_of_laws import law_figure
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.search import failures_of_arithmetic, refusals
 from gfnn_jax.jobs.units import units_of
 from gfnn_jax.jobs.written import REPORT
 from gfnn_jax.learn.fit import fit as learn_fit
+from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.maps import saved
-from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
+from gfnn_jax.learn.saved import save
 from gfnn_jax.storage.outputs import atomic_folder
 
 FIGURE = "law.png"
@@ -26,7 +26,7 @@ FIGURE = "law.png"
 class Learned(NamedTuple):
     """A law, where it was written, and its report."""
 
-    fit: LearnedLaw
+    fit: Fit
     out: Path
     report: dict[str, Any]
 
@@ -52,17 +52,15 @@ def fit_recording(
     refuse_mistakes(recording, despite)
     with refusals(), failures_of_arithmetic():
         fitted = learn_fit(recording, options=asked, on_progress=progress.line)
-    result = law_report.assemble(fitted, source=recording.source, seed=asked.seed)
-    kept = ("seed", "device", "data", "fit", "map", "lagrangian", "friction", "gauge")
+    result = fitted.report(source=recording.source, seed=asked.seed)
     job = {
         "command": "fit",
         "data": recording.source,
         **asked.deciding,
         **units_of(recording),
     }
-    record = {"job": job, **report.finite({key: result[key] for key in kept})}
     with atomic_folder(out) as folder:
-        saved.save(fitted.map, folder, record=record)
+        save(fitted, folder, record={"job": job, **result})
         law_figure(fitted, recording, folder / FIGURE)
         (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
     return Learned(fitted, out, result)

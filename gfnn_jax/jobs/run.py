@@ -12,7 +12,7 @@ import numpy as np
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.structures import Bodies, structure_of
 from gfnn_jax.errors import InputError
-from gfnn_jax.evaluate import figures, figures_of_many, metrics, report
+from gfnn_jax.evaluate import figures, figures_of_many, metrics
 from gfnn_jax.jobs.measure import Measured, measure, plane_of
 from gfnn_jax.jobs.progress import SILENT, Progress
 from gfnn_jax.jobs.rollouts import NUM_STEPS, NUM_TRAJECTORIES, map_rollouts
@@ -95,11 +95,8 @@ def run(
         progress.status(f"rollouts of {NUM_STEPS} steps")
         rollouts = map_rollouts(fitted.map, z0, **given)
         measured = measure(rollouts, scene, reference, given["params"])
-        result = report.assemble(
-            fitted,
+        result = fitted.report(
             scene=name,
-            dt=scene.dt,
-            seed=asked.seed,
             rollout=measured.report,
             data={"source": "reference data of the scene", "digest": pairs_digest(pairs)},
         )

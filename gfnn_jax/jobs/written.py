@@ -12,6 +12,7 @@ import numpy as np
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import report
 from gfnn_jax.learn.fitted import Fit
+from gfnn_jax.learn.saved import save
 from gfnn_jax.maps import saved
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.storage.outputs import atomic_folder
@@ -28,12 +29,8 @@ class Ran(NamedTuple):
 
 
 def write(folder: Path, model: Path, fit: Fit, result: dict[str, Any], job: dict[str, Any]) -> None:
-    """Write the chosen map into the folder ``model``, and its report into ``folder``.
-
-    The record in the model keeps the parts of the report on the map's origin and accuracy.
-    """
-    origin = {key: result[key] for key in ("scene", "seed", "device", "data", "fit", "map")}
-    saved.save(fit.map, model, record={"job": job, **report.finite(origin)})
+    """Write the fit into the folder ``model``, and its report into ``folder``."""
+    save(fit, model, record={"job": job, **report.finite(result)})
     (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
 
 

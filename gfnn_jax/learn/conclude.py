@@ -53,12 +53,13 @@ _NOISE_NUMBERS = 8_192  # the same of many sites: numbers of so many pairs
 
 
 class Conclusion(NamedTuple):
-    """Reason why the search ended; the noise (2d,) that the residuals suggest, or None;
-    warnings."""
+    """Reason why the search ended; the noise (2d,) that the residuals suggest, or None; warnings;
+    and whether H leaves no more than white noise."""
 
     ended: str
     noise: np.ndarray | None
     messages: list[str]
+    white: bool = False
 
 
 def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion:
@@ -122,7 +123,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         [*diagnosis, *messages, unmet] if reason == _WHITE else [*messages, unmet, *diagnosis]
     )
     messages += request.budget.left_out
-    return Conclusion(ended, noise, messages)
+    return Conclusion(ended, noise, messages, reason == _WHITE)
 
 
 def _hidden(chosen: Chosen, searched: Searched) -> list[str]:

@@ -32,7 +32,7 @@ from gfnn_jax.learn.check import wrapped
 from gfnn_jax.learn.choose import Chosen, choose
 from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.diagnose import diagnose_request
-from gfnn_jax.learn.fitted import Fit
+from gfnn_jax.learn.fitted import Choice, Fit
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, with_options
@@ -67,14 +67,13 @@ def fit(
     on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
     on_better: Callable[[SymplecticMap, Candidate], Any] | None = None,
     **changes: Any,
-) -> Any:
+) -> Fit:
     """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
 
-    Of a `Recording` learn its law, a Lagrangian with friction and inputs, from its positions: a
-    `models.lagrangians.learned_law.LearnedLaw`; of the options ``learn`` ("auto" or "lagrangian"),
-    ``friction``, ``input_hold``, ``mass`` and ``on_progress`` apply
-    (`models.lagrangians.recordings`). With learn="map" learn the map of its positions instead, a
-    `Fit`: see `fit_positions`. Of pairs a `Fit`.
+    For a `Recording` learn its law, a Lagrangian with friction and inputs, from its positions; of
+    the options ``learn`` ("auto" or "lagrangian"), ``friction``, ``input_hold``, ``mass`` and
+    ``on_progress`` apply (`models.lagrangians.recordings`). With learn="map" learn the map of its
+    positions instead: see `fit_positions`.
 
     pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
                Of different dt, S is a function of dt too, in the midpoint chart. With parameters
@@ -113,7 +112,7 @@ def fit(
             )
         for message in law.messages:
             warnings.warn(message, FitWarning, stacklevel=2)
-        return law
+        return Fit(law.map, law)
     if options.loss is not None:
         raise FitError("loss: only for the law of a recording, got pairs")
     budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None, spent)
@@ -180,8 +179,7 @@ def fit(
         messages.append(damping.line(data.dt))
     num_states = min(_STATES_MEASURED, block_of(2 * data.dim))
     some = chosen.data.pairs.take(chosen.data.validation[:num_states])
-    return Fit(
-        map=chosen.candidate.map,
+    choice = Choice(
         candidates=_all_candidates(chosen, found),
         asked=request.tolerance,
         num_pairs=len(data),
@@ -207,7 +205,10 @@ def fit(
         test_pairs=data.pairs.take(data.test) if len(data.test) else None,
         operations=budget.operations,
         budget=budget,
+        white=conclusion.white,
+        seed=options.seed,
     )
+    return Fit(chosen.candidate.map, choice)
 
 
 def _check_of_recording(scene: Scene | None, options: FitOptions) -> None:
@@ -263,9 +264,8 @@ def fit_positions(
         warnings.warn(message, FitWarning, stacklevel=3)
     test = found.states.take(found.test[: min(_STATES_MEASURED, block_of(2 * found.map.dim))])
     determinant = np.asarray(found.map.determinant(test.z0))
-    return Fit(
-        map=found.map,
-        candidates=found.candidates,
+    choice = Choice(
+        candidates=tuple(dataclasses.replace(c, map=None) for c in found.candidates),
         asked=asked,
         num_pairs=found.positions.num_triples,
         determinants={},
@@ -284,7 +284,9 @@ def fit_positions(
         validation_pairs=found.states.take(found.validation),
         operations=budget.operations,
         budget=budget,
+        seed=options.seed,
     )
+    return Fit(found.map, choice)
 
 
 def _devices(devices: int | str | None) -> tuple[Any, ...]:
@@ -304,7 +306,7 @@ def _all_candidates(chosen: Chosen, found: Searched) -> tuple[Candidate, ...]:
     ]
     if found.law is not None and chosen.candidate.learns == "map":
         others.append(found.law.candidate)
-    candidates = [*others, dataclasses.replace(chosen.candidate, chosen=True)]
+    candidates = [*others, dataclasses.replace(chosen.candidate, chosen=True, map=None)]
     return tuple(sorted(candidates, key=lambda c: (c.operations, c.validation_relative)))
 
 

@@ -1,4 +1,5 @@
-"""A fit as a user has it: the map, how it was chosen, and what was told on the way."""
+"""A fit as a user has it, whatever the data: the map, the law, the verdict, and how they were
+found."""
 
 from __future__ import annotations
 
@@ -24,6 +25,9 @@ from gfnn_jax.learn.posterior import work_of_posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.hamiltonians.formula import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
+from gfnn_jax.models.lagrangians.friction_choice import DECIDED
+from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
+from gfnn_jax.models.lagrangians.text import Expression
 from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS
 from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.scenes.scene import Scene
@@ -31,18 +35,17 @@ from gfnn_jax.scenes.scene import Scene
 _OF_DERIVATIVE = 3.0  # times a step's: the time that compiling its derivative takes
 
 
-@dataclasses.dataclass(frozen=True)
-class Fit:
-    """A fitted map and how it was chosen.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Choice:
+    """How a map was chosen among candidates.
 
-    map: the chosen map. candidates: every candidate met on the way, by rising operations.
-    asked: the tolerance, and ``met`` whether the chosen map's upper 95 % bound is within
-    it. num_pairs: that trained and validated. determinants: chart -> its determinant over the data.
-    data_defect: how far the pairs' local Jacobians are from symplectic (median). base_map: whether
-    one was factored out. noise: (2d,) standard deviation of each coordinate's noise that the
-    residuals suggest where larger models stopped helping, else None. messages: the warnings,
-    and the friction that the map has. ended: why the search ended. seconds: of it all;
-    compile_seconds: of compiling, in them.
+    candidates: every candidate met on the way, by rising operations. asked: the tolerance, and
+    ``met`` whether the chosen map's upper 95 % bound is within it. num_pairs: that trained and
+    validated. determinants: chart -> its determinant over the data. data_defect: how far the pairs'
+    local Jacobians are from symplectic (median). base_map: whether one was factored out. noise:
+    (2d,) standard deviation of each coordinate's noise that the residuals suggest where larger
+    models stopped helping, else None. messages: the warnings, and the friction that the map has.
+    ended: why the search ended. seconds: of it all; compile_seconds: of compiling, in them.
     test_states: (n, 2d) held-out states, test_args their parameters. model_determinant_min: the
     chosen chart's determinant there, where it is closest to 0; NaN for a flow, which has no chart.
     hamiltonian: H, where one was found, whether its flow was chosen or not. pairs: that were taken.
@@ -55,14 +58,14 @@ class Fit:
     validation_pairs, test_pairs: that chose, and that stated the error; None where the pairs were
     too few for these. operations: of the search, as counted; as ``max_operations`` they give this
     map again, whatever the clock. budget: what is left of it. defect_known: whether there is
-    time in it to compile the derivative of a step.
+    time in it to compile the derivative of a step. white: whether H leaves no more than white
+    noise, so that the pairs do not contradict it. seed: of what was drawn.
     """
 
-    map: SymplecticMap
     candidates: tuple[Candidate, ...]
     asked: Tolerance
     num_pairs: int
-    validation_pairs: Pairs
+    validation_pairs: Pairs | None
     determinants: dict[str, ChartDeterminant]
     data_defect: float
     base_map: bool
@@ -84,18 +87,213 @@ class Fit:
     stated_by: str = ""
     test_pairs: Pairs | None = None
     operations: int = 0
-    budget: Budget = dataclasses.field(default_factory=Budget, repr=False)
+    budget: Budget | None = None
     defect_known: bool = True
+    white: bool = False
+    seed: int = 0
 
-    def __repr__(self) -> str:
-        """One line: the chosen map, its error and the tolerance."""
+    @property
+    def law(self) -> LearnedHamiltonian | None:
+        """H, where one was found that meets the tolerance or was chosen."""
+        law = self.hamiltonian
+        known = law is not None and (
+            self.chosen.learns == "hamiltonian" or self._met_by(law.candidate)
+        )
+        return law if known else None
+
+    @property
+    def friction(self) -> Expression | None:
+        """Rayleigh's R of the law, where it has friction."""
+        return Expression(self.law.friction) if self.law is not None and self.law.friction else None
+
+    @property
+    def verdict(self) -> str:
+        """What the pairs tell, as `Fit.verdict` says."""
+        law = self.law
+        if law is None:
+            return "map" if self.met else f"map: the tolerance is missed, for {self.ended}"
+        if not (self.met or self.white):
+            return f"partly: the tolerance is missed, for {self.ended}"
+        if law.null_terms:
+            return f"one of several: the pairs do not tell {', '.join(law.null_terms)} apart"
+        rivals = [rival.formula for rival in law.rivals if rival.odds < DECIDED]
+        return f"one of several: {'; '.join(rivals)} is as likely" if rivals else "identified"
+
+    @property
+    def line(self) -> str:
+        """The chosen map, its error and the tolerance."""
         best = self.chosen
         error = best.validation_relative if self.asked.relative else best.validation_rms
         return (
-            f"Fit({best.chart} {best.label}, {best.num_parameters:,} parameters: one-step error "
+            f"{best.chart} {best.label}, {best.num_parameters:,} parameters: one-step error "
             f"{error:.2e} (≤ {best.validation_bound:.2e} at 95 %), tolerance {self.tolerance:g} "
-            f"{'met' if self.met else 'not met'}, {self.num_pairs:,} pairs, {self.seconds:.1f} s)"
+            f"{'met' if self.met else 'not met'}, {self.num_pairs:,} pairs, {self.seconds:.1f} s"
         )
+
+    @property
+    def max_operations(self) -> int:
+        """A bound on operations that gives this map again: the one that was asked for, or those
+        that were done."""
+        asked = None if self.budget is None else self.budget.max_operations
+        return self.operations if asked is None else asked
+
+    @property
+    def relative_tolerance(self) -> float:
+        """The tolerance as a part of the spread, whichever way it was asked for."""
+        if self.asked.relative:
+            return self.asked.bound
+        assert self.pairs is not None
+        return self.asked.bound / float(np.max(sizes(self.pairs.z0)))
+
+    @property
+    def formula(self) -> str | None:
+        """H as text that ``terms`` and sympy read, where one was found that meets the tolerance or
+        was chosen; ``print(fit.law)`` shows it as people read it."""
+        return None if self.law is None else self.law.formula
+
+    @property
+    def tolerance(self) -> float:
+        """The number that was asked for, relative or absolute."""
+        return self.asked.bound
+
+    @property
+    def chosen(self) -> Candidate:
+        return next(c for c in self.candidates if c.chosen)
+
+    @property
+    def met(self) -> bool:
+        """Return whether the chosen candidate's validation error is within the tolerance, at 95
+        %."""
+        return self._met_by(self.chosen)
+
+    def _met_by(self, candidate: Candidate) -> bool:
+        return candidate.validation_bound <= self.tolerance
+
+    @property
+    def table(self) -> str:
+        """Every candidate by rising operations, the chosen one marked: text for ``print``."""
+        from rich.console import Console  # loaded when first used
+
+        text = io.StringIO()
+        # Neither colours nor a notebook's own display: a string.
+        plain = Console(width=132, file=text, force_terminal=False, force_jupyter=False)
+        plain.print(candidates_table(self))
+        return text.getvalue()
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Fit:
+    """What `gfnn.fit` and `gfnn.load` give.
+
+    map: the map that was chosen, which rolls out, estimates and forecasts. found: how it was found:
+    a `Choice` among candidates, for pairs and for maps of positions; a
+    `models.lagrangians.learned_law.LearnedLaw`, for recordings; None of a folder that holds a map
+    alone. Its attributes are those of the fit too: `candidates`, `met` and `chosen` of the first,
+    `gains`, `zeros`, `noise` and `horizon` of the second. stored: what a folder holds beside these:
+    ``verdict`` and ``record``, the report with the job that wrote it.
+    """
+
+    map: SymplecticMap
+    found: Choice | LearnedLaw | None = None
+    stored: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def law(self) -> LearnedHamiltonian | LearnedLaw | None:
+        """The law: H where it meets the tolerance or was chosen, or L with its friction. None of a
+        generated map without a law, and where none is stored."""
+        return self.found.law if isinstance(self.found, Choice) else self.found
+
+    @property
+    def verdict(self) -> str | None:
+        """What the data tell, ``KIND`` or ``KIND: reason``. KIND is identified, one of several,
+        partly, or map, of a generated map without a law; no law and not mechanical are those of a
+        `FitError`. None where a folder holds none."""
+        return self.stored.get("verdict", None if self.found is None else self.found.verdict)
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """The warnings, and the friction that the map has."""
+        return () if self.found is None else self.found.messages
+
+    @property
+    def table(self) -> str:
+        """Every candidate, the chosen one marked; or the law, its errors and its horizon."""
+        return "" if self.found is None else self.found.table
+
+    @property
+    def formula(self) -> str | None:
+        """The law, H or L, as text that ``terms`` and sympy read."""
+        return None if self.found is None else self.found.formula
+
+    @property
+    def hamiltonian(self) -> Any:
+        """H with its terms, where one was found, whether its flow was chosen or not."""
+        return None if self.found is None else self.found.hamiltonian
+
+    @property
+    def lagrangian(self) -> Expression | None:
+        """L with its terms, of a recording."""
+        return getattr(self.found, "lagrangian", None)
+
+    @property
+    def friction(self) -> Expression | None:
+        """Rayleigh's R with its terms; None of a system without."""
+        return None if self.found is None else self.found.friction
+
+    def __repr__(self) -> str:
+        """One line: the chosen map, its error and the tolerance; or the law."""
+        return f"Fit({self.map if self.found is None else self.found.line})"
+
+    def __getattr__(self, name: str) -> Any:
+        """Attributes of what was found; for one version also those of the map, which `gfnn.load`
+        gave before."""
+        own = self.__dict__
+        if not name.startswith("__") and "map" in own:
+            if hasattr(own.get("found"), name):
+                return getattr(own["found"], name)
+            if hasattr(own["map"], name):
+                warnings.warn(
+                    f"fit.{name} is fit.map.{name}: a fit is no map, and will not stand for it in "
+                    "the next version",
+                    DeprecationWarning,
+                    stacklevel=2,
+                )
+                return getattr(own["map"], name)
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def replaced(self, **changes: Any) -> Fit:
+        """The fit with another map (``map``), and other values of what was found."""
+        map_ = changes.pop("map", self.map)
+        assert self.found is not None
+        return Fit(map_, dataclasses.replace(self.found, **changes), self.stored)
+
+    def save(self, folder, *, scene: Scene | None = None, overwrite: bool = False) -> None:
+        """Save the fit as a folder, which `gfnn.load` reads: map, law, verdict and report.
+
+        scene: the scene that the map was learned in, where it is not one of the package's own.
+        Raises InputError where ``folder`` exists (unless ``overwrite``) or the map holds a function
+        that cannot be found again by a name, WorkError where writing fails.
+        """
+        from gfnn_jax.learn import saved  # stands after this module: a shorthand for its function
+
+        scene = scene or getattr(self.found, "scene", None)
+        saved.save(self, folder, scene=scene, overwrite=overwrite)
+
+    def report(self, **about: Any) -> dict[str, Any]:
+        """What ``report.json`` holds, with numbers that are not finite as None.
+
+        about: further entries, as of ``assemble`` in `evaluate.report` and `evaluate.law_report`.
+        Of a fit that was loaded it is the report that was saved. Raises ValueError where the folder
+        holds none.
+        """
+        from gfnn_jax.evaluate import law_report, report  # stand after this module: a shorthand
+
+        if "record" in self.stored:
+            return {name: part for name, part in self.stored["record"].items() if name != "job"}
+        if self.found is None:
+            raise ValueError("expected a fit, or the folder of one: this one holds a map alone")
+        of = report if isinstance(self.found, Choice) else law_report
+        return report.finite(of.assemble(self, **about))
 
     def accelerate(
         self,
@@ -151,13 +349,8 @@ class Fit:
         messages = self.budget.left_out[known:]
         for message in messages:
             warnings.warn(message, FitWarning, stacklevel=2)
-        candidates = tuple(
-            dataclasses.replace(c, map=map_) if c.chosen else c for c in self.candidates
-        )
-        found = dataclasses.replace(
-            self,
+        found = self.replaced(
             map=map_,
-            candidates=candidates,
             messages=(*self.messages, *messages),
             defect_known=defect_known,
             seconds=self.budget.seconds,
@@ -175,48 +368,6 @@ class Fit:
         """
         return self.map.sample(key, num)
 
-    @property
-    def max_operations(self) -> int:
-        """A bound on operations that gives this map again: the one that was asked for, or those
-        that were done."""
-        asked = self.budget.max_operations
-        return self.operations if asked is None else asked
-
-    @property
-    def relative_tolerance(self) -> float:
-        """The tolerance as a part of the spread, whichever way it was asked for."""
-        if self.asked.relative:
-            return self.asked.bound
-        assert self.pairs is not None
-        return self.asked.bound / float(np.max(sizes(self.pairs.z0)))
-
-    @property
-    def formula(self) -> str | None:
-        """H as text that ``terms`` and sympy read, where one was found that meets the tolerance or
-        was chosen; ``print(fit.hamiltonian)`` shows it as people read it."""
-        law = self.hamiltonian
-        if law is None or not (self.chosen.learns == "hamiltonian" or self._met_by(law.candidate)):
-            return None
-        return law.formula
-
-    @property
-    def tolerance(self) -> float:
-        """The number that was asked for, relative or absolute."""
-        return self.asked.bound
-
-    @property
-    def chosen(self) -> Candidate:
-        return next(c for c in self.candidates if c.chosen)
-
-    @property
-    def met(self) -> bool:
-        """Return whether the chosen candidate's validation error is within the tolerance, at 95
-        %."""
-        return self._met_by(self.chosen)
-
-    def _met_by(self, candidate: Candidate) -> bool:
-        return candidate.validation_bound <= self.tolerance
-
     @cached_property
     def symplecticity_defect(self) -> float:
         """The largest defect ‖AᵀJA − μJ‖ of the chosen map's unrolled step at the test states, by
@@ -226,19 +377,8 @@ class Fit:
         defects = self.map.defect(z, args, iterations=steps.iterations)
         return float(np.max(np.asarray(defects)))
 
-    @property
-    def table(self) -> str:
-        """Every candidate by rising operations, the chosen one marked: text for ``print``."""
-        from rich.console import Console  # loaded when first used
 
-        text = io.StringIO()
-        # Neither colours nor a notebook's own display: a string.
-        plain = Console(width=132, file=text, force_terminal=False, force_jupyter=False)
-        plain.print(candidates_table(self))
-        return text.getvalue()
-
-
-def candidates_table(fit: Fit):
+def candidates_table(fit: Choice | Fit):
     """The candidates of a fit as a ``rich`` table, by rising operations; the chosen one is marked.
 
     An error with ~ before it is an estimate: the gradient's residual, which was told as a first

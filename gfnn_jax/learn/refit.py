@@ -61,7 +61,7 @@ def not_refitted(fitted: Fit, why: str) -> Fit:
         f"them: {why}"
     )
     warnings.warn(message, FitWarning, stacklevel=2)
-    return dataclasses.replace(fitted, messages=(*fitted.messages, message))
+    return fitted.replaced(messages=(*fitted.messages, message))
 
 
 def work_of_refit(fitted: Fit, num_pairs: int, reading: float) -> float:
@@ -107,18 +107,19 @@ def refit(
         messages.append(message)
         warnings.warn(message, FitWarning, stacklevel=3)
 
-    old, law = fitted.chosen, fitted.hamiltonian
-    most = _OUTLYING * np.maximum(old.deviations, _ROUNDOFF * np.asarray(old.map.scale))
+    old, law, map_ = fitted.chosen, fitted.hamiltonian, fitted.map
+    most = _OUTLYING * np.maximum(old.deviations, _ROUNDOFF * np.asarray(map_.scale))
     apart = [held] if test is None else [held, test]
-    worker = RowsOfRefit(old.map, {"most": most, "held": _states_of(apart)})
+    worker = RowsOfRefit(map_, {"most": most, "held": _states_of(apart)})
     apart = [pairs.take(np.flatnonzero(worker.close(pairs))) for pairs in apart]
     held, test = apart[0], apart[-1]
-    chosen, num_pairs, before, after = None, fitted.num_pairs, old.validation_rms, np.inf
+    chosen, better = None, None
+    num_pairs, before, after = fitted.num_pairs, old.validation_rms, np.inf
     if len(held) and len(test):
-        before = worker.error(old.map, held, tolerance).rms
+        before = worker.error(map_, held, tolerance).rms
         worker.task["held"] = _states_of(apart)
         worker.task |= worker.resolving(held)
-        bare = dataclasses.replace(old.map, posterior=None)
+        bare = dataclasses.replace(map_, posterior=None)
         group.broadcast(
             {**packed(bare, scene), **{_OF_TASK + n: v for n, v in worker.task.items()}}
         )
@@ -131,7 +132,7 @@ def refit(
         if found.other_dt:
             warn(
                 f"{found.other_dt} of {found.count + found.outliers + found.other_dt} pairs are "
-                f"not dt = {float(old.map.dt):g} apart: they are left out"
+                f"not dt = {float(map_.dt):g} apart: they are left out"
             )
         if found.unresolved:
             warn(
@@ -143,7 +144,8 @@ def refit(
             # Test pairs of few runs did not state the sample's error either, which then stands.
             few = test.run is not None and len(np.unique(test.run)) < FEWEST_RUNS_TESTED
             candidate = old if few else with_error(old, worker.error(found.map, test, tolerance))
-            chosen = dataclasses.replace(candidate, map=found.map, train_rms=found.train_rms)
+            chosen = dataclasses.replace(candidate, train_rms=found.train_rms)
+            better = found.map
             num_pairs = found.count
     else:
         group.broadcast({})
@@ -158,14 +160,11 @@ def refit(
         law = _with_coefficients(law, found.law, chosen)
     if chosen.validation_bound > fitted.tolerance:
         warn(not_met(chosen, tolerance, fitted.ended))
-    candidates = tuple(chosen if c.chosen else c for c in fitted.candidates)
-    seconds = fitted.seconds + time.perf_counter() - started
-    return dataclasses.replace(
-        fitted,
-        map=chosen.map,
-        candidates=candidates,
+    return fitted.replaced(
+        map=map_ if chosen is old else better,
+        candidates=tuple(chosen if c.chosen else c for c in fitted.candidates),
         num_pairs=num_pairs,
-        seconds=seconds,
+        seconds=fitted.seconds + time.perf_counter() - started,
         hamiltonian=law,
         messages=tuple(messages),
     )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -102,7 +103,7 @@ _TYPES: dict[str, type] = {
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 
 
-def register(kind: type) -> type:
+def register(kind: type, name: str = "") -> type:
     """Register a dataclass of one's own, a family, a piece or a loss, for `save` and `load`, by its
     name.
 
@@ -110,12 +111,18 @@ def register(kind: type) -> type:
     of the class are arrays, numbers, text, tuples of these, or of other registered types. Raises
     InputError where it is no dataclass, or another type has its name.
     """
-    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+    if not (isinstance(kind, type) and (dataclasses.is_dataclass(kind) or _is_tuple(kind))):
         raise InputError(f"expected a dataclass to register, got {kind!r}")
-    if _TYPES.get(kind.__name__, kind).__module__ != kind.__module__:
-        raise InputError(f"another type is registered as {kind.__name__}: choose another name")
-    _TYPES[kind.__name__], _NAMES[kind] = kind, kind.__name__
+    name = name or kind.__name__
+    if _TYPES.get(name, kind).__module__ != kind.__module__:
+        raise InputError(f"another type is registered as {name}: choose another name")
+    _TYPES[name], _NAMES[kind] = kind, name
     return kind
+
+
+def _is_tuple(kind: type) -> bool:
+    """Return whether a type is a ``NamedTuple``."""
+    return issubclass(kind, tuple) and hasattr(kind, "_fields")
 
 
 # Names in models that earlier releases saved.
@@ -138,12 +145,14 @@ def save(
     scene: Scene | None = None,
     record: dict[str, Any] | None = None,
     overwrite: bool = False,
+    beside: dict[str, Any] | None = None,
 ) -> None:
     """Save a map as a model folder.
 
     scene:  the scene whose coordinates or features the map uses, where it is not one of the
             package's own; `load` needs it too.
     record: JSON-able, anything worth keeping, such as the origin of the data and the fit's report.
+    beside: further trees of registered types, by name.
 
     Raises InputError where ``folder`` exists (unless ``overwrite``) or the map holds a function
     that cannot be found again by a name, WorkError where writing fails.
@@ -157,6 +166,8 @@ def save(
         "record": record or {},
         "versions": versions(),
     }
+    for name, tree in (beside or {}).items():
+        description[name], arrays[name] = _encode(tree)
     save_model(folder, arrays, description)
 
 
@@ -165,9 +176,17 @@ def load(folder, scene: Scene | None = None) -> SymplecticMap:
 
     scene: the scene that the map was learned in, where it is not one of the package's own.
 
-    Raises InputError, in one line, where the folder is damaged, of another format, or needs a scene
+    Raises InputError, in one line, where the folder is damaged, of a newer format, or needs a scene
     that was not given.
     """
+    return load_beside(folder, scene)[0]
+
+
+def load_beside(
+    folder, scene: Scene | None = None, names: Sequence[str] = ()
+) -> tuple[SymplecticMap, dict[str, Any]]:
+    """Load the map of a model folder, and what it holds beside: trees of these names, None where
+    there are none, and the ``record``. Raises InputError as `load` does."""
     arrays, description = load_model(folder)
     name = description.get("scene")
     if scene is None and name is not None:
@@ -179,14 +198,26 @@ def load(folder, scene: Scene | None = None) -> SymplecticMap:
         scene = SCENES[name]()
     if scene is not None and name is not None and scene.name != name:
         raise InputError(f"{folder}: was learned in the scene '{name}', not in '{scene.name}'")
+    trees = {name: arrays.pop(name, None) for name in names}
     try:
-        return _decode(*_renamed(description["map"], arrays), scene)
+        map_ = _decode(*_renamed(description["map"], arrays), scene)
+        beside = {n: _decode(description.get(n), tree, scene) for n, tree in trees.items()}
+        return map_, {**beside, "record": description["record"]}
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"{folder}: does not describe a map of this release ({error}). Fit it again"
         ) from error
+
+
+def can_be_saved(tree: Any) -> bool:
+    """Return whether a tree is of registered types alone."""
+    try:
+        _encode(tree)
+    except InputError:
+        return False
+    return True
 
 
 def packed(map_: SymplecticMap, scene: Scene | None = None) -> dict[str, np.ndarray]:
@@ -263,20 +294,26 @@ def _lender(map_: SymplecticMap, scene: Scene | None) -> str | None:
 
 def _encode(value: Any) -> tuple[Any, Any]:
     """Encode a node as (text, arrays); either is None where there is none."""
-    if isinstance(value, dict) or (isinstance(value, (jax.Array, np.ndarray)) and value.ndim > 0):
+    if isinstance(value, (jax.Array, np.ndarray)) and value.ndim > 0:
         return None, value
+    if isinstance(value, dict):
+        if value and all(map(_is_array, jax.tree.leaves(value))):
+            return None, value  # the parameters of a network
+        items = {str(i): item for i, item in enumerate(value.values())}
+        return _encode_all(items, {"type": "dict", "keys": list(value)})
     if isinstance(value, (np.generic, np.ndarray, jax.Array)):
         return value.item(), None
     if isinstance(value, Coordinates):
         text = {"name": value.name, "angles": list(value.angles), "cyclic": list(value.cyclic)}
         change = None if value.forward is CARTESIAN.forward else _OF_SCENE
         return {"type": "Coordinates", **text, "change": change}, None
-    if type(value) in _TYPES.values():
-        items = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    if type(value) in _NAMES:
+        names = _fields_of(type(value))
+        items = {name: getattr(value, name) for name in names}
         if items.get("features") is not None:
             items["features"] = _OF_SCENE  # _lender has found whose they are
         return _encode_all(items, {"type": _NAMES[type(value)]})
-    if isinstance(value, tuple) and any(dataclasses.is_dataclass(item) for item in value):
+    if isinstance(value, tuple) and any(map(_has_parts, value)):
         return _encode_all({str(i): item for i, item in enumerate(value)}, {"type": "tuple"})
     if isinstance(value, tuple):
         return [_encode(item)[0] for item in value], None
@@ -287,6 +324,20 @@ def _encode(value: Any) -> tuple[Any, Any]:
         f"a map that holds a {kind} of your own cannot be saved: gfnn_jax.register makes a "
         "dataclass known"
     )
+
+
+def _has_parts(item: Any) -> bool:
+    """Return whether an item of a tuple needs a place of its own among the arrays."""
+    return type(item) in _NAMES or isinstance(item, (dict, jax.Array, np.ndarray))
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, (jax.Array, np.ndarray))
+
+
+def _fields_of(kind: Any) -> tuple[str, ...]:
+    """Names of the fields of a dataclass or a named tuple."""
+    return kind._fields if _is_tuple(kind) else tuple(f.name for f in dataclasses.fields(kind))
 
 
 def _encode_all(items: dict[str, Any], text: dict[str, Any]) -> tuple[Any, Any]:
@@ -311,7 +362,7 @@ def _decode(text: Any, arrays: Any, scene: Scene | None) -> Any:
     items = {}
     for name in {**text, **(arrays or {})}:
         numbers = (arrays or {}).get(name)
-        if name == "type":
+        if name == "type" or (kind, name) == ("dict", "keys"):
             continue
         if name == "features" and text[name] == _OF_SCENE:
             if scene is None or scene.features is None:
@@ -323,6 +374,8 @@ def _decode(text: Any, arrays: Any, scene: Scene | None) -> Any:
             items[name] = numbers
     if kind == "tuple":
         return tuple(items[str(i)] for i in range(len(items)))
+    if kind == "dict":
+        return {key: items[str(i)] for i, key in enumerate(text["keys"])}
     if kind not in _TYPES:
         raise InputError(
             f"holds a {kind}, which is not known: import the module that registers it "

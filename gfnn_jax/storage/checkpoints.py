@@ -2,7 +2,8 @@
 
 A folder holds
 
-- ``arrays/``: the arrays, by Orbax, under their names in the tree;
+- ``arrays.npz``: the arrays, under their names in the tree; of a checkpoint, and of a model that
+  0.3 saved, ``arrays/``, by Orbax;
 - ``model.json``: everything else in plain text, with shape, dtype and SHA-256 of every array;
 - ``SHA256SUMS``: the digest of every file (``sha256sum -c SHA256SUMS`` checks it too).
 
@@ -31,7 +32,9 @@ from gfnn_jax.storage.outputs import (
     uninterrupted,
 )
 
-FORMAT = 2
+# Formats of folders: 0.3 and checkpoints have their arrays by Orbax, models since 0.4 in one .npz.
+BY_ORBAX, AS_NPZ = 2, 3
+_ARRAYS = {BY_ORBAX: "arrays", AS_NPZ: "arrays.npz"}
 _SUMS = "SHA256SUMS"
 _JSON = "model.json"
 
@@ -42,7 +45,7 @@ def save_model(folder, arrays: dict[str, Any], description: dict[str, Any]) -> N
     An existing ``folder`` is replaced; `outputs.ensure_new` checks first. Raises WorkError if
     writing fails; an existing folder is then unchanged.
     """
-    _write(Path(folder), arrays, {"description": description})
+    _write(Path(folder), arrays, {"format": AS_NPZ, "description": description})
 
 
 def load_model(folder) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -78,7 +81,8 @@ class TrainingCheckpoints:
 
     def save(self, step: int, tree: Any) -> None:
         """Save the tree of ``step``; it and the checkpoint before it remain. Raises WorkError."""
-        _write(self._path(step), tree, {"step": int(step), "identity": self.identity})
+        about = {"format": BY_ORBAX, "step": int(step), "identity": self.identity}
+        _write(self._path(step), tree, about)
         before = [old for old in self._steps() if old < step]
         # Later steps are damaged ones that were passed over; a kill leaves hidden folders.
         unused = [
@@ -151,9 +155,12 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
         # The number keeps apart names that are equal once other characters are gone.
         if array is not None and array.size:
             entry["key"] = f"{number:04d}.{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
+            if (
+                record["format"] == AS_NPZ and array.dtype.kind == "V"
+            ):  # bfloat16 has no code in .npz
+                array = np.frombuffer(array.tobytes(), np.uint8)
             stored[entry["key"]] = array
     record = {
-        "format": FORMAT,
         **record,
         "leaves": leaves,
         "structure": _structure(tree, iter(range(len(leaves)))),
@@ -161,8 +168,10 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
     text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
     # Orbax writes in threads of its own, which would go on in a folder that is gone.
     with uninterrupted(), atomic_folder(folder) as new:
-        if stored:
-            _orbax().save((new / "arrays").absolute(), stored)
+        if stored and record["format"] == AS_NPZ:
+            np.savez(new / _ARRAYS[AS_NPZ], allow_pickle=False, **stored)
+        elif stored:
+            _orbax().save((new / _ARRAYS[BY_ORBAX]).absolute(), stored)
         (new / _JSON).write_text(text, encoding="utf-8")
         sums = [
             f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(new).as_posix()}\n"
@@ -184,8 +193,8 @@ def _read(folder: Path, like: Any = None) -> tuple[Any, dict[str, Any]]:
         version = json.loads((folder / _JSON).read_bytes())["format"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Damaged(f"{folder}: {_JSON} is damaged or unreadable ({error})") from error
-    if version != FORMAT:
-        other = f"{folder}: has format {version!r}, this release reads format {FORMAT}"
+    if version not in _ARRAYS:
+        other = f"{folder}: has format {version!r}, this release reads formats 2 and 3"
         try:
             _verify_files(folder)
         except Damaged as error:
@@ -194,7 +203,7 @@ def _read(folder: Path, like: Any = None) -> tuple[Any, dict[str, Any]]:
     _verify_files(folder)
     record = json.loads((folder / _JSON).read_bytes())
     try:
-        stored = _orbax().restore((folder / "arrays").absolute()) if _any_stored(record) else {}
+        stored = _stored(folder / _ARRAYS[version]) if _any_stored(record) else {}
         leaves = [_restored(folder, entry, stored) for entry in record["leaves"]]
         if like is None:
             return _rebuild(folder, record["structure"], leaves), record
@@ -207,6 +216,14 @@ def _read(folder: Path, like: Any = None) -> tuple[Any, dict[str, Any]]:
 
 def _any_stored(record: dict[str, Any]) -> bool:
     return any("key" in entry for entry in record["leaves"])
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    """Arrays by key, of an ``.npz`` or of a folder of Orbax's."""
+    if path.suffix != ".npz":
+        return _orbax().restore(path.absolute())
+    with np.load(path, allow_pickle=False) as arrays:
+        return dict(arrays)
 
 
 def _orbax():
@@ -270,6 +287,8 @@ def _restored(folder: Path, entry: dict[str, Any], stored: dict[str, Any]) -> An
         return entry["value"]
     shape, dtype = tuple(entry["shape"]), np.dtype(entry["dtype"])
     array = np.asarray(stored[entry["key"]]) if "key" in entry else np.empty(shape, dtype)
+    if dtype.kind == "V" and array.dtype == np.uint8:
+        array = np.frombuffer(array.tobytes(), dtype).reshape(shape)
     if array.shape != shape or array.dtype != dtype:
         raise Damaged(
             f"{folder}: {name} should be {dtype} of shape {shape}, found {array.dtype} of shape "

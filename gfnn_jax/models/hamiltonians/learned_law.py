@@ -70,7 +70,7 @@ class LearnedHamiltonian:
     misfit: bool = False
     widths: tuple[float, ...] = ()
     turns: bool = False
-    kinds: Callable[[], WhichFriction | None] | None = None
+    kinds: Callable[[], WhichFriction | None] | WhichFriction | None = None
 
     @cached_property
     def which_friction(self) -> WhichFriction | None:
@@ -78,7 +78,7 @@ class LearnedHamiltonian:
         largest coefficients that the pairs allow of those not seen. None of a network, of a law
         with parameters or of many sites, and where the pairs' flow fails. Computed when it is first
         asked for."""
-        return None if self.kinds is None else self.kinds()
+        return self.kinds() if callable(self.kinds) else self.kinds
 
     @cached_property
     def root(self) -> np.ndarray | None:

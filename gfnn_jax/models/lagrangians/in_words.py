@@ -17,7 +17,12 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.in_use import InUse
 from gfnn_jax.models.lagrangians.input_rules import Acting
-from gfnn_jax.models.lagrangians.learned_law import LearnedLaw, NextMotion, hamiltonian_of
+from gfnn_jax.models.lagrangians.learned_law import (
+    ONLY_TOGETHER,
+    LearnedLaw,
+    NextMotion,
+    hamiltonian_of,
+)
 from gfnn_jax.models.lagrangians.next_motion import Motion
 from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness, whiteness
 from gfnn_jax.models.lagrangians.text import (
@@ -93,6 +98,7 @@ def in_words(
         num_samples=len(recording),
         seconds=seconds,
         ended="every length of arcs was fitted",
+        flaws=_flaws(best, found),
     )
 
 
@@ -159,6 +165,21 @@ def _zeros_and_sensors(
     zeros = {recording.coordinates[i]: one for i, one in zip(where, fitted, strict=False)}
     keys = fit.structure.keys()[first + len(where) :]
     return zeros, {name: one for (_, name), one in zip(keys, fitted[len(where) :], strict=True)}
+
+
+def _flaws(best: InUse, found: Mapping[str, Whiteness]) -> tuple[str, ...]:
+    """Reasons why the law is not all of the motion, or is not reliable."""
+    converged, driven = best.fit.fitted.converged, best.choice.gains
+    return (
+        *([] if converged else ["the fit of the law did not converge"]),
+        *(["the record gains energy that no input explains"] if driven else []),
+        *(
+            f"{one.fit_percent:.0f} % of the variation of {name} is followed, and the rest is no "
+            "noise"
+            for name, one in found.items()
+            if one.fit_percent < _FOLLOWED and not one.white
+        ),
+    )
 
 
 def _not_followed(found: Mapping[str, Whiteness]) -> list[str]:
@@ -242,7 +263,7 @@ def _alike(fit: LawFit, lagrangian: Formula, friction: Formula) -> tuple[str, ..
     texts |= dict(zip(fit.structure.friction, (t.term for t in friction.terms), strict=True))
     names = {key: texts.get(key[1], " ".join(map(str, key))) for key in fit.values}
     listed, together = list(names.values()), [names[key] for key in fit.degenerate()]
-    only = (f"{', '.join(together)}: only together",) if together else ()
+    only = (f"{', '.join(together)}: {ONLY_TOGETHER}",) if together else ()
     return only + tuple(
         f"{listed[i]} and {listed[j]} (correlation {rho:+.3f})"
         for i, j, rho in fit.linearised.collinear(_ALIKE)

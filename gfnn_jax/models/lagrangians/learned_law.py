@@ -15,11 +15,13 @@ from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.calibration import Horizon
 from gfnn_jax.models.lagrangians.fit import LawFit
+from gfnn_jax.models.lagrangians.friction_choice import DECIDED
 from gfnn_jax.models.lagrangians.input_rules import RULES
 from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness
 from gfnn_jax.models.lagrangians.text import WhichFriction, of_systems, terms_of
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
+ONLY_TOGETHER = "only together"  # end of a line about coefficients that are identified as a sum
 _SHOWN = 3  # pairs of nearly collinear coefficients that are listed
 
 
@@ -70,7 +72,8 @@ class LearnedLaw:
     apart. next_motions: those that would tell the most, the best first. horizon: for how long a
     forecast can be trusted. energy: stored, lost, supplied per second, means over the record.
     messages: warnings. steps: what the search did, line by line.
-    num_samples, seconds (of the processor). ended: why the search ended.
+    num_samples, seconds (of the processor). ended: why the search ended. flaws: reasons why the law
+    is not all of the motion.
     """
 
     map: SymplecticMap
@@ -100,6 +103,26 @@ class LearnedLaw:
     num_samples: int
     seconds: float
     ended: str
+    flaws: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """What the recording tells: identified, one of several, or partly, with the reason."""
+        if self.flaws:
+            return f"partly: {'; '.join(self.flaws)}"
+        together = [names for names in self.alike if names.endswith(ONLY_TOGETHER)]
+        if together:
+            return f"one of several: {'; '.join(together)}"
+        kinds, odds = set(self.which_friction.kinds), self.which_friction.odds
+        rivals = [name for name in odds if odds[name] < DECIDED and not kinds < {*name.split("+")}]
+        if rivals:
+            return f"one of several: friction may be {' or '.join(['+'.join(kinds), *rivals])}"
+        return "identified"
+
+    @property
+    def line(self) -> str:
+        """L and R."""
+        return f"L = {self.lagrangian}; R = {self.friction}"
 
     @property
     def formula(self) -> str:
@@ -186,7 +209,7 @@ class LearnedLaw:
         return f"inputs: {RULES[self.map.sensors.hold]}{when}{chosen}"
 
     def __repr__(self) -> str:
-        return f"LearnedLaw(L = {self.lagrangian}; R = {self.friction})"
+        return f"LearnedLaw({self.line})"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,116 @@
+"""Fits on disk: the folder of a map (`maps.saved`), with the law, the verdict and the report.
+
+What was found is a tree of registered types, as a map is. The data are not in the folder, nor what
+only the search needed; the kinds of friction that are seen are computed before.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.dataset.measured_error import Tolerance
+from gfnn_jax.diagnosis.damping import LearnedDamping
+from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
+from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
+from gfnn_jax.learn.fitted import Choice, Fit
+from gfnn_jax.learn.positions import OfPositions
+from gfnn_jax.maps import saved as maps
+from gfnn_jax.models.hamiltonians import formula
+from gfnn_jax.models.hamiltonians.fitted_law import Dropped
+from gfnn_jax.models.hamiltonians.fractions import Proposal
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
+from gfnn_jax.models.lagrangians import text
+from gfnn_jax.models.lagrangians.calibration import Horizon
+from gfnn_jax.models.lagrangians.learned_law import Hamiltonian, LearnedLaw, NextMotion
+from gfnn_jax.models.lagrangians.residuals import OfInput, Whiteness
+from gfnn_jax.models.lagrangians.velocities import Velocity
+from gfnn_jax.scenes.scene import Scene
+
+for _kind in (
+    Choice,
+    Candidate,
+    ChartDeterminant,
+    Dropped,
+    Hamiltonian,
+    Horizon,
+    LearnedDamping,
+    LearnedHamiltonian,
+    LearnedLaw,
+    NextMotion,
+    OfInput,
+    OfPositions,
+    Proposal,
+    SymmetryOfPairs,
+    Tolerance,
+    Velocity,
+    Whiteness,
+    formula.PartialLaw,
+    formula.Rival,
+    formula.Term,
+    text.Expression,
+    text.WhichFriction,
+):
+    maps.register(_kind)
+maps.register(text.Term, "TermOfLagrangian")
+
+
+def save(
+    fit: Fit,
+    folder,
+    *,
+    scene: Scene | None = None,
+    record: dict[str, Any] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Save a fit as a model folder. record: its report with whatever is worth keeping beside;
+    None: the report, without what takes long to compute. The rest as of `maps.saved.save`."""
+    known = "symplecticity_defect" in fit.__dict__
+    if record is None and isinstance(fit.found, Choice) and not known:
+        fit = fit.replaced(defect_known=False)
+    if record is None:
+        record = {} if fit.found is None and "record" not in fit.stored else fit.report()
+    beside = {"verdict": fit.verdict, "found": _portable(fit.found)}
+    maps.save(fit.map, folder, scene=scene, record=record, overwrite=overwrite, beside=beside)
+
+
+def load(folder, scene: Scene | None = None) -> Fit:
+    """Load the fit of a model folder: its map predicts the same bits as the saved one, and its law,
+    verdict, table and messages are those of the fit.
+
+    A folder that holds a map alone, as one of `SymplecticMap.save` or of release 0.3, gives a fit
+    with no more than that. scene: the scene that the map was learned in, where it is not one of the
+    package's own.
+
+    Raises InputError, in one line, where the folder is damaged, of a newer format, or needs a scene
+    that was not given.
+    """
+    map_, beside = maps.load_beside(folder, scene, ("verdict", "found"))
+    found = beside["found"]
+    if isinstance(found, Choice):
+        found = dataclasses.replace(found, scene=scene)
+    elif found is not None:
+        found = dataclasses.replace(found, map=map_)
+    kept = {name: beside[name] for name in ("verdict", "record") if beside[name]}
+    return Fit(map_, found, kept)
+
+
+def _portable(found: Choice | LearnedLaw | None) -> Any:
+    """What was found, without the data, the map and the functions that compute from the data."""
+    if found is None:
+        return None
+    if not isinstance(found, Choice):
+        return dataclasses.replace(found, map=None, traces=())
+    law = found.hamiltonian
+    if law is not None:
+        law = dataclasses.replace(
+            law,
+            candidate=dataclasses.replace(law.candidate, map=None),
+            covariance=None,
+            kinds=law.which_friction,
+            proposals=tuple(p._replace(fraction=str(p.fraction)) for p in law.proposals),
+        )
+        law = law if maps.can_be_saved(law) else None  # a user's functions of z cannot
+    without = dict.fromkeys(("pairs", "validation_pairs", "test_pairs", "scene", "budget"))
+    return dataclasses.replace(found, hamiltonian=law, **without)

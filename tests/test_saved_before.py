@@ -1,0 +1,59 @@
+"""Models that release 0.3.0 saved are loaded, and give the numbers that they gave then."""
+
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gfnn_jax as gfnn
+
+FOLDERS = Path(__file__).parent / "data" / "saved-0.3.0"
+NUMBERS = json.loads((FOLDERS / "numbers.json").read_text())
+
+
+def loaded(name, tmp_path):
+    """The fit of a folder of 0.3.0, of which the archives hold one for each kind of model."""
+    with zipfile.ZipFile(FOLDERS / f"{name}.zip") as archive:
+        archive.extractall(tmp_path / name)
+    return gfnn.load(tmp_path / name)
+
+
+def numbers_of(map_, known):
+    """What was written down beside a model: a rollout, a step with args, or a linearisation."""
+    z = np.array(known["z0"])
+    if "states" in known:
+        return map_.rollout(z, 5)[0], known["states"]
+    if "image" in known:
+        args = {name: np.array(values) for name, values in known["args"].items()}
+        return map_.step(z, args)[0], known["image"]
+    A, B = map_.linearise(z[0], np.zeros(len(map_.signals.names)))
+    return np.concatenate([A, B], axis=1), np.concatenate(known["linearised"], axis=1)
+
+
+def test_every_archive_has_its_numbers():
+    assert {path.stem for path in FOLDERS.glob("*.zip")} == set(NUMBERS)
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_a_folder_of_0_3_0(name, tmp_path):
+    fit = loaded(name, tmp_path)
+    assert isinstance(fit, gfnn.Fit)
+    assert fit.law is None
+    assert fit.verdict is None
+    found, known = numbers_of(fit.map, NUMBERS[name])
+    assert np.mean(np.isfinite(known)) > 0.5  # one lane of the sines is lost on its way
+    np.testing.assert_allclose(found, known, rtol=1e-12, atol=1e-13)
+
+
+def test_a_recording_is_estimated_from(tmp_path):
+    """The sensors of a law, and the posterior behind its bands, are in its folder."""
+    map_ = loaded("recording-sensor", tmp_path).map
+    t = 0.04 * np.arange(60)
+    recording = gfnn.Recording(
+        {"t": t, "theta": 0.3 * np.cos(3.1 * t)}, positions=["theta"], angles=["theta"]
+    )
+    ahead = map_.forecast(recording, t[-1] + 0.04 * np.arange(1, 10))
+    assert np.isfinite(ahead.values["theta"]).all()
+    assert np.all(ahead.std["theta"] > 0)
