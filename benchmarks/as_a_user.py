@@ -169,7 +169,7 @@ def by_command(case: Case) -> Learned:
         )
         seconds = _of_children() - started
         report = json.loads((model / "report.json").read_text(encoding="utf-8"))
-        map_ = gfnn.load(model)
+        map_ = gfnn.load(model).map
     fit, chosen = report["fit"], report["model"]
     before, lines = "gfnn: warning: ", done.stderr.splitlines()
     said = [line.removeprefix(before) for line in lines if line.startswith(before)]

@@ -121,7 +121,7 @@ def measured_here(system: str, budget: float, clock_name: str) -> Numbers:
         found = fit(pairs, seed=SEED, max_seconds=budget, clock=clock)
         fitted = clock() - started
         found = found.settled()
-        report.assemble(found, scene=None, dt=float(pairs.dt), seed=SEED, rollout=None, data={})
+        report.assemble(found)
         reported = clock() - started
         saved.save(found.map, Path(folder) / "model")
     seconds, chosen = clock() - started, found.chosen

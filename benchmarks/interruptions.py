@@ -93,7 +93,7 @@ def data_of(folder: Path) -> tuple[Path, np.ndarray]:
 
 def prediction(model: Path, states: np.ndarray) -> np.ndarray:
     """Step the states by the saved map."""
-    return np.asarray(gfnn.load(model).step(states)[0])
+    return np.asarray(gfnn.load(model).map.step(states)[0])
 
 
 def stopped(command: Sequence[str], name: str, delay: float) -> Numbers | None:

@@ -18,10 +18,16 @@ class WorkError(RuntimeError):
 
 
 class FitError(ValueError):
-    """Error of data or of a request that can give no map: what was expected and what came."""
+    """Error of data or of a request that can give no map: what was expected and what came.
 
-    def __init__(self, message: str):
+    verdict: what the data tell, ``no law`` or ``not mechanical`` with a reason, where the search
+    has come to one; "" where the data or the request were refused. fit: the fit behind a verdict,
+    where there is one.
+    """
+
+    def __init__(self, message: str, verdict: str = "", fit: object = None):
         super().__init__(" ".join(message.split()))
+        self.verdict, self.fit = verdict, fit
 
 
 class OutOfTime(Exception):

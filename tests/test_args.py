@@ -257,7 +257,7 @@ def test_a_length_is_found_from_an_orbit(learned):
 
 def test_a_saved_map_knows_its_parameters(learned, tmp_path):
     learned.map.save(tmp_path / "m")
-    map_ = gfnn.load(tmp_path / "m")
+    map_ = gfnn.load(tmp_path / "m").map
     assert map_.parameters.names == ("l",)
     z, length, _ = pendulums(3)
     for one, other in zip(map_.step(z, length), learned.map.step(z, length), strict=True):
@@ -315,7 +315,7 @@ def test_a_series_is_differentiated_in_its_parameter(series):
 def test_a_series_with_a_parameter_is_saved_and_put_in_a_row(series, tmp_path):
     z, delta = np.array([[0.2, -0.1], [0.1, 0.3]]), {"delta": np.array([0.05, -0.02])}
     series.map.save(tmp_path / "model")
-    again = gfnn.load(tmp_path / "model")
+    again = gfnn.load(tmp_path / "model").map
     image = series.map.step(z, delta)[0]
     np.testing.assert_array_equal(again.step(z, delta)[0], image)
     twice = again.then(again).step(z, delta)[0]

@@ -259,7 +259,7 @@ def test_horizon_is_the_first_step_beyond():
 def test_predictions_hold_bands(noisy, tmp_path, monkeypatch):
     scene, fit = noisy
     fit.map.save(tmp_path / "model")
-    loaded = gfnn.load(tmp_path / "model")
+    loaded = gfnn.load(tmp_path / "model").map
     np.testing.assert_array_equal(
         np.asarray(loaded.sample(jax.random.key(3), 2).params),
         np.asarray(fit.sample(jax.random.key(3), 2).params),

@@ -1,6 +1,5 @@
 """The command line: exit statuses, one line per refusal, nothing harmed, reports."""
 
-import dataclasses
 import json
 import subprocess
 import sys
@@ -461,7 +460,7 @@ def test_data_inside_the_output_are_not_deleted(fitted, tmp_path, capsys, monkey
 
 def test_strict(fitted, tmp_path, capsys, monkeypatch):
     """A missed tolerance: the map is written, and the exit status says so where asked for."""
-    missed = dataclasses.replace(fitted, asked=Tolerance(1e-300))
+    missed = fitted.replaced(asked=Tolerance(1e-300))
     monkeypatch.setattr(search, "fit", lambda *args, **kwargs: missed)
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
     assert gfnn(*fit, "--strict") == 1
@@ -524,11 +523,11 @@ def test_a_recording_without_a_law_is_one_line(error, status, line, tmp_path, ca
 
 
 def test_warnings_of_a_law_are_warnings(monkeypatch):
-    law = types.SimpleNamespace(messages=("a drive is missing",))
+    law = types.SimpleNamespace(messages=("a drive is missing",), map=None)
     monkeypatch.setattr(learn_fit, "fit_recording", lambda *args, **kwargs: law)
     recording = Recording({"t": np.arange(9.0), "x": np.arange(9.0)}, positions=["x"])
     with pytest.warns(FitWarning, match="a drive is missing"):
-        assert learn_fit.fit(recording) is law
+        assert learn_fit.fit(recording).law is law
 
 
 def test_a_forecast_takes_no_options_of_steps(model, tmp_path, capsys, monkeypatch):

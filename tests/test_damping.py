@@ -72,7 +72,7 @@ def test_the_rotation_number_of_its_attractor_is_the_maps(learned):
 
 def test_it_is_saved_and_loaded(learned, tmp_path):
     learned.map.save(tmp_path / "model")
-    loaded = gfnn.load(tmp_path / "model")
+    loaded = gfnn.load(tmp_path / "model").map
     z = states_of(20, 2)
     assert np.array_equal(loaded.step(z)[0], learned.map.step(z)[0])
     assert loaded.multiplier() == learned.map.multiplier()
@@ -135,8 +135,8 @@ def test_a_map_of_such_a_factor_goes_back_and_is_saved(of_decay, tmp_path):
     back = np.asarray(of_decay.map.inverse(image, test.args)[0])
     assert np.abs(nearest_image(back - test.z0, (0,))).max() < 1e-11
     of_decay.map.save(tmp_path / "model")
-    assert np.array_equal(gfnn.load(tmp_path / "model").step(test.z0, test.args)[0], image)
-    report = assemble(of_decay, scene=None, dt=1.0, seed=0, data={}, rollout=None)["map"]
+    assert np.array_equal(gfnn.load(tmp_path / "model").map.step(test.z0, test.args)[0], image)
+    report = assemble(of_decay)["map"]
     assert report["multiplier"] is None
     assert report["damping"]["parameters"] == ("decay",)
     low, high = report["damping"]["low"], report["damping"]["high"]

@@ -216,7 +216,7 @@ def test_the_stroboscopic_map_is_a_period_of_steps(learned, tmp_path):
     np.testing.assert_allclose(once.inverse(found[:, 1])[0], z, atol=1e-13)
     assert np.asarray(once.defect(z)).max() < 1e-13
     once.save(tmp_path / "m")
-    np.testing.assert_array_equal(gfnn.load(tmp_path / "m").step(z)[0], once.step(z)[0])
+    np.testing.assert_array_equal(gfnn.load(tmp_path / "m").map.step(z)[0], once.step(z)[0])
     with pytest.raises(ValueError, match="a whole part of the period"):
         gfnn.stroboscopic(learned.map.over(0.3))
     with pytest.raises(ValueError, match="a driven map"):

@@ -145,7 +145,7 @@ def test_bands_hold_the_true_error(fit, noise):
 
 def test_a_saved_ensemble_keeps_its_members_and_predicts_bands(fit, tmp_path):
     fit.map.save(tmp_path / "m")
-    again, z, key = gfnn.load(tmp_path / "m"), states(5, 5), jax.random.key(2)
+    again, z, key = gfnn.load(tmp_path / "m").map, states(5, 5), jax.random.key(2)
     for ours, theirs in zip(
         fit.sample(key, 3).rollout(z, 50), again.sample(key, 3).rollout(z, 50), strict=True
     ):

@@ -50,7 +50,7 @@ def test_uniform_friction_is_learned_with_h(damped, tmp_path):
     assert damped.symplecticity_defect < 1e-14
     damped.map.save(tmp_path / "m")
     z = states(5, 1)
-    again = gfnn.load(tmp_path / "m")
+    again = gfnn.load(tmp_path / "m").map
     np.testing.assert_array_equal(again.step(z)[0], damped.map.step(z)[0])
     assert again.multiplier() == damped.map.multiplier()
     with pytest.raises(ValueError, match="without friction"):

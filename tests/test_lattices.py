@@ -154,7 +154,7 @@ def test_a_ring_of_many_sites(tmp_path):
     states, _ = fit.map.rollout(z, 50)
     np.testing.assert_allclose(fit.map.hamiltonian(states[:, -1]), energy, rtol=1e-13)
     fit.map.save(tmp_path / "model")
-    again, _ = gfnn.load(tmp_path / "model").rollout(z, 50)
+    again, _ = gfnn.load(tmp_path / "model").map.rollout(z, 50)
     np.testing.assert_array_equal(again, states)
     # Where the ring is as a whole matters to no force: it is no part of the domain.
     moved = z + np.repeat([100.0, 0.0], 40)
@@ -224,7 +224,7 @@ def test_two_fields_at_every_site(tmp_path, structure):
         "(q2_{i+1} - q2_i)²": 0.1,
     }
     fit.map.save(tmp_path / "model")
-    found, _ = gfnn.load(tmp_path / "model").step(z0[12:])
+    found, _ = gfnn.load(tmp_path / "model").map.step(z0[12:])
     np.testing.assert_allclose(found, z1[12:], atol=1e-13)
 
 
@@ -330,7 +330,7 @@ def test_bodies_of_a_species_share_their_coefficients(tmp_path):
             "1/|q_2 - q_3|": -4.0,
         }
     )
-    np.testing.assert_allclose(gfnn.load(model).step(z0[:5])[0], z1[:5], atol=1e-13)
+    np.testing.assert_allclose(gfnn.load(model).map.step(z0[:5])[0], z1[:5], atol=1e-13)
 
 
 @pytest.mark.slow
@@ -464,7 +464,7 @@ def test_coupled_standard_maps(tmp_path, reduced):
     off = np.remainder(back - z0[50:] + np.pi, 2 * np.pi) - np.pi
     np.testing.assert_allclose(off, 0, atol=1e-13)
     fit.map.save(tmp_path / "model")
-    again, _ = gfnn.load(tmp_path / "model").rollout(z0[50:], 10)
+    again, _ = gfnn.load(tmp_path / "model").map.rollout(z0[50:], 10)
     np.testing.assert_array_equal(again, states)
 
 

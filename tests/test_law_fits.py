@@ -415,7 +415,7 @@ def test_uniform_friction_of_a_double_pendulum(tmp_path):
     assert fit.map.multiplier() == pytest.approx(np.exp(-term.coefficient * 0.02))
     assert abs(fit.energy["closure"]) < 0.02 * fit.energy["lost"][term.term]
     fit.map.save(tmp_path / "model")
-    again = gfnn.load(tmp_path / "model")
+    again = gfnn.load(tmp_path / "model").map
     assert again.multiplier() == fit.map.multiplier()
     past = chain(runs=1, end=3.0, uniform=0.04)
     values = [map_.forecast(past, np.array([3.5])).values["theta1"] for map_ in (fit.map, again)]
@@ -463,7 +463,7 @@ def test_a_forecast_says_where_it_leaves_the_motion_that_was_learned(swing):
 def test_a_law_is_saved_with_its_sensors(swing, tmp_path):
     recording, fit = swing
     fit.map.save(tmp_path / "model")
-    again = gfnn.load(tmp_path / "model")
+    again = gfnn.load(tmp_path / "model").map
     past, times = recording.slice(26.0, 28.0), np.array([28.5, 30.0])
     for name, values in fit.map.forecast(past, times).values.items():
         np.testing.assert_array_equal(values, again.forecast(past, times).values[name])
@@ -574,7 +574,7 @@ def test_a_recording_is_run_from_file_to_forecasts(tmp_path, capsys):
     assert max(found["median"]["theta"]) < 2e-3  # noise of 1e-3, the law's own error on top
     assert found["within_two_deviations"] > 0.85
     assert (out / "forecasts.png").stat().st_size > 10_000
-    assert gfnn.load(out / "model").sensors.positions == ("theta",)
+    assert gfnn.load(out / "model").map.sensors.positions == ("theta",)
     assert main(arguments) == 2  # exists already
     assert main([*arguments, "--overwrite", "--tolerance", "1e-3"]) == 2
     assert "--tolerance" in capsys.readouterr().err

@@ -138,7 +138,7 @@ def test_the_law_beside_its_map(tmp_path):
     _, info = MAP.rollout(z, STEPS, inputs=U, samples=5, key=jax.random.key(0))
     assert 0 < info.bands.std[0, -1, 0] < 0.1
     MAP.save(tmp_path / "m")
-    again = gfnn.load(tmp_path / "m")
+    again = gfnn.load(tmp_path / "m").map
     np.testing.assert_array_equal(
         again.rollout(z, STEPS, inputs=U)[0], MAP.rollout(z, STEPS, inputs=U)[0]
     )

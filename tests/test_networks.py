@@ -63,7 +63,7 @@ def test_it_has_no_formula_and_is_saved_to_the_bit(fit, tmp_path):
     with pytest.raises(gfnn.FitError, match="got a network"):
         fit.accelerate()
     fit.map.save(tmp_path / "m")
-    again, z = gfnn.load(tmp_path / "m"), states(50, 3)
+    again, z = gfnn.load(tmp_path / "m").map, states(50, 3)
     np.testing.assert_array_equal(again.step(z)[0], fit.map.step(z)[0])
 
 

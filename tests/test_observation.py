@@ -112,7 +112,7 @@ def test_a_camera_is_learned_saved_and_forecast(tmp_path):
         assert right(fit.sensors[name], value, 1.0), name
     fit.map.save(tmp_path / "model")
     past, times = recording.slice(6.0, 10.0), t[251:]
-    found = gfnn.load(tmp_path / "model").forecast(past, times)
+    found = gfnn.load(tmp_path / "model").map.forecast(past, times)
     assert set(found.values) == {"px", "py", "theta"}
     assert np.sqrt(np.mean((found.values["px"][0] - px[251:]) ** 2)) < 0.6
     assert np.abs(found.values["theta"][0] - theta[251:]).max() < 0.01

@@ -37,7 +37,7 @@ def covariance_of(pairs, map_):
 def kept(map_, folder):
     """The map, saved and loaded."""
     map_.save(folder)
-    return gfnn.load(folder)
+    return gfnn.load(folder).map
 
 
 def test_a_family(pairs, fresh, tmp_path):

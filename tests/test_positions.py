@@ -96,7 +96,7 @@ def test_momenta_are_the_maps_own(lifted):
 
 def test_it_is_saved_and_loaded(wrapped, tmp_path):
     wrapped.map.save(tmp_path / "model")
-    loaded = gfnn.load(tmp_path / "model")
+    loaded = gfnn.load(tmp_path / "model").map
     q, other = np.mod(turns(20, 1, 4), 2 * np.pi).swapaxes(0, 1)
     assert np.array_equal(loaded.from_positions(q, other), wrapped.map.from_positions(q, other))
     z = np.asarray(loaded.from_positions(q, other))
@@ -368,7 +368,7 @@ def test_it_forecasts_the_same_when_loaded(of_noisy, tmp_path):
     recording = recorded(noisy(turns(5, 10, 1), 1e-3, 5), ["theta"], ["theta"])
     ours, theirs = (
         map_.forecast(recording, 10.0 + np.arange(1, 6))
-        for map_ in (of_noisy.map, gfnn.load(tmp_path / "model"))
+        for map_ in (of_noisy.map, gfnn.load(tmp_path / "model").map)
     )
     assert np.array_equal(ours.values["theta"], theirs.values["theta"])
     assert np.array_equal(ours.std["theta"], theirs.std["theta"])

@@ -238,7 +238,7 @@ def test_pendulums_of_five_lengths_are_one_law(of_lengths):
 def test_a_length_that_no_run_had_is_forecast_within_its_band(of_lengths, tmp_path):
     _, fit = of_lengths
     fit.map.save(tmp_path / "law")
-    map_ = gfnn.load(tmp_path / "law")
+    map_ = gfnn.load(tmp_path / "law").map
     for length in (1.2, 2.3):
         new = swings((length,), end=20.0)
         ahead = new.times("0")[new.times("0") > 4.0]

@@ -395,5 +395,5 @@ def test_a_law_outside_of_the_dictionary_ends_as_a_map():
     assert fit.chosen.learns == "map"
     assert len(fit.partial_laws) == 3
     assert all("p1²" in law.formula and 1e-10 < law.left < 1e-2 for law in fit.partial_laws)
-    told = assemble(fit, scene=None, dt=0.1, seed=0, data={}, rollout=None)
+    told = assemble(fit)
     assert told["partial_laws"][0]["formula"] == fit.partial_laws[0].formula

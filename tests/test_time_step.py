@@ -97,7 +97,7 @@ def test_the_derivative_in_dt_is_the_velocity(learned):
 def test_saved_and_predicted_at_any_dt(learned, tmp_path, capsys):
     learned.map.save(tmp_path / "m")
     z, dt = sampled(3, seed=2).z0, np.array([0.2, 0.3, 0.5])
-    loaded = gfnn.load(tmp_path / "m")
+    loaded = gfnn.load(tmp_path / "m").map
     np.testing.assert_array_equal(loaded.step(z, dt=dt)[0], learned.map.step(z, dt=dt)[0])
     assert loaded.step(z, dt=0.9)[1].status.tolist() == [1, 1, 1]
     np.save(tmp_path / "z.npy", z)

@@ -118,7 +118,7 @@ def test_a_fit_finds_how_a_zero_wanders(swing, tmp_path):
     for term, true in zip(fit.lagrangian.terms[1:], [2.0], strict=True):
         assert abs(term.coefficient - true) < 3 * term.std
     fit.map.save(tmp_path / "map")
-    assert gfnn.load(tmp_path / "map").sensors.wander == found
+    assert gfnn.load(tmp_path / "map").map.sensors.wander == found
 
 
 @pytest.mark.slow

@@ -29,12 +29,13 @@ def assemble(
     fit: Fit,
     *,
     scene: str | None = None,
+    seed: int | None = None,
     data: dict[str, Any] | None = None,
     rollout: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Assemble the report of a fit, and of rollouts with it (see `rollout_part`) where there are.
 
-    scene: its name, where that is not the fit's own. data: facts about the pairs beside their
+    scene, seed: where these are not the fit's own. data: facts about the pairs beside their
     number: source, digest, precision, units.
     """
     chosen = fit.chosen
@@ -43,7 +44,7 @@ def assemble(
         "verdict": fit.verdict,
         "scene": scene or lent,
         "dt": float(np.asarray(fit.map.dt)),
-        "seed": fit.seed,
+        "seed": fit.seed if seed is None else seed,
         "dtype": str(fit.map.scale.dtype),
         "device": device(),
         "versions": versions(),

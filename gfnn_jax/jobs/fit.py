@@ -134,6 +134,7 @@ def fit(
             progress.status("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
             result = fitted.report(
+                seed=asked.seed,
                 scene=scene_name,
                 data={
                     "source": trajectories.source,

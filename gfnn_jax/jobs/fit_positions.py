@@ -45,7 +45,7 @@ def fit_positions(
     progress.status("the report: the derivative of a step")
     fitted = fitted.settled()
     result = fitted.report(
-        data={"source": recording.source, "positions": list(recording.positions)}
+        seed=asked.seed, data={"source": recording.source, "positions": list(recording.positions)}
     )
     job = {
         "command": "fit",

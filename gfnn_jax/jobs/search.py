@@ -98,11 +98,12 @@ def line(candidate: Candidate) -> str:
 
 @contextlib.contextmanager
 def refusals() -> Iterator[None]:
-    """Turn a FitError, of options or data that can give no map, into an InputError."""
+    """Turn a FitError, of options or data that can give no map, into an InputError; where the data
+    were taken and the search found no law, into a WorkError."""
     try:
         yield
     except FitError as error:
-        raise InputError(str(error)) from error
+        raise (WorkError if error.verdict else InputError)(str(error)) from error
 
 
 @contextlib.contextmanager

@@ -86,13 +86,13 @@ def load(folder, scene: Scene | None = None) -> Fit:
     Raises InputError, in one line, where the folder is damaged, of a newer format, or needs a scene
     that was not given.
     """
-    map_, beside = maps.load_beside(folder, scene, ("verdict", "found"))
-    found = beside["found"]
+    map_, beside = maps.load_beside(folder, scene)
+    found = beside.get("found")
     if isinstance(found, Choice):
         found = dataclasses.replace(found, scene=scene)
     elif found is not None:
         found = dataclasses.replace(found, map=map_)
-    kept = {name: beside[name] for name in ("verdict", "record") if beside[name]}
+    kept = {name: beside[name] for name in ("verdict", "record") if beside.get(name)}
     return Fit(map_, found, kept)
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -166,8 +165,8 @@ def save(
         "record": record or {},
         "versions": versions(),
     }
-    for name, tree in (beside or {}).items():
-        description[name], arrays[name] = _encode(tree)
+    if beside:
+        description["beside"], arrays["beside"] = _encode_all(beside, {"type": "dict"})
     save_model(folder, arrays, description)
 
 
@@ -182,11 +181,9 @@ def load(folder, scene: Scene | None = None) -> SymplecticMap:
     return load_beside(folder, scene)[0]
 
 
-def load_beside(
-    folder, scene: Scene | None = None, names: Sequence[str] = ()
-) -> tuple[SymplecticMap, dict[str, Any]]:
-    """Load the map of a model folder, and what it holds beside: trees of these names, None where
-    there are none, and the ``record``. Raises InputError as `load` does."""
+def load_beside(folder, scene: Scene | None = None) -> tuple[SymplecticMap, dict[str, Any]]:
+    """Load the map of a model folder, and what it holds beside by name, the ``record`` among it.
+    Raises InputError as `load` does."""
     arrays, description = load_model(folder)
     name = description.get("scene")
     if scene is None and name is not None:
@@ -198,10 +195,11 @@ def load_beside(
         scene = SCENES[name]()
     if scene is not None and name is not None and scene.name != name:
         raise InputError(f"{folder}: was learned in the scene '{name}', not in '{scene.name}'")
-    trees = {name: arrays.pop(name, None) for name in names}
+    texts, trees = description.get("beside", {}), arrays.pop("beside", None) or {}
     try:
         map_ = _decode(*_renamed(description["map"], arrays), scene)
-        beside = {n: _decode(description.get(n), tree, scene) for n, tree in trees.items()}
+        names = [name for name in {**texts, **trees} if name != "type"]
+        beside = {name: _decode(texts.get(name), trees.get(name), scene) for name in names}
         return map_, {**beside, "record": description["record"]}
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error

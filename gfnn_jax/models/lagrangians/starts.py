@@ -41,7 +41,8 @@ def no_law(scales: Scales) -> FitError:
     return FitError(
         "no law of the terms tried follows this recording. Check units and roles (gfnn look); name "
         "a missing input or position (--inputs, --positions); cut off rest and collisions (--from, "
-        f"--to); or give terms that you know (--terms){few}"
+        f"--to); or give terms that you know (--terms){few}",
+        verdict="no law: none of the terms tried follows this recording",
     )
 
 
