@@ -17,6 +17,8 @@ def assemble(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[str,
     """The report of a fit of the recording ``source``."""
     map_, sensors = fit.map, fit.map.sensors
     assert sensors is not None
+    assert fit.lagrangian is not None
+    assert fit.friction is not None
     num_parameters = sum(t.std > 0 for t in (*fit.lagrangian.terms, *fit.friction.terms))
     return {
         "verdict": fit.verdict,

@@ -20,6 +20,7 @@ from gfnn_jax.diagnosis.damping import LearnedDamping
 from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
 from gfnn_jax.errors import FitWarning, OutOfTime
+from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.learn.positions import OfPositions
 from gfnn_jax.learn.posterior import work_of_posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -27,7 +28,6 @@ from gfnn_jax.models.hamiltonians.formula import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.friction_choice import DECIDED
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
-from gfnn_jax.models.lagrangians.text import Expression
 from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS
 from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.scenes.scene import Scene
@@ -102,9 +102,9 @@ class Choice:
         return law if known else None
 
     @property
-    def friction(self) -> Expression | None:
+    def friction(self) -> Formula | None:
         """Rayleigh's R of the law, where it has friction."""
-        return Expression(self.law.friction) if self.law is not None and self.law.friction else None
+        return Formula(self.law.friction) if self.law is not None and self.law.friction else None
 
     @property
     def verdict(self) -> str:
@@ -231,12 +231,12 @@ class Fit:
         return None if self.found is None else self.found.hamiltonian
 
     @property
-    def lagrangian(self) -> Expression | None:
+    def lagrangian(self) -> Formula | None:
         """L with its terms, of a recording."""
         return getattr(self.found, "lagrangian", None)
 
     @property
-    def friction(self) -> Expression | None:
+    def friction(self) -> Formula | None:
         """Rayleigh's R with its terms; None of a system without."""
         return None if self.found is None else self.found.friction
 

@@ -14,17 +14,19 @@ from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.damping import LearnedDamping
 from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
+from gfnn_jax.exports.symbolic import Formula
+from gfnn_jax.families.text import Term
 from gfnn_jax.learn.fitted import Choice, Fit
 from gfnn_jax.learn.positions import OfPositions
 from gfnn_jax.maps import saved as maps
-from gfnn_jax.models.hamiltonians import formula
 from gfnn_jax.models.hamiltonians.fitted_law import Dropped
+from gfnn_jax.models.hamiltonians.formula import PartialLaw, Rival
 from gfnn_jax.models.hamiltonians.fractions import Proposal
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
-from gfnn_jax.models.lagrangians import text
 from gfnn_jax.models.lagrangians.calibration import Horizon
 from gfnn_jax.models.lagrangians.learned_law import Hamiltonian, LearnedLaw, NextMotion
 from gfnn_jax.models.lagrangians.residuals import OfInput, Whiteness
+from gfnn_jax.models.lagrangians.text import WhichFriction
 from gfnn_jax.models.lagrangians.velocities import Velocity
 from gfnn_jax.scenes.scene import Scene
 
@@ -46,14 +48,13 @@ for _kind in (
     Tolerance,
     Velocity,
     Whiteness,
-    formula.PartialLaw,
-    formula.Rival,
-    formula.Term,
-    text.Expression,
-    text.WhichFriction,
+    Formula,
+    PartialLaw,
+    Rival,
+    Term,
+    WhichFriction,
 ):
     maps.register(_kind)
-maps.register(text.Term, "TermOfLagrangian")
 
 
 def save(

@@ -102,7 +102,7 @@ _TYPES: dict[str, type] = {
 _NAMES = {kind: name for name, kind in _TYPES.items()}
 
 
-def register(kind: type, name: str = "") -> type:
+def register(kind: type) -> type:
     """Register a dataclass of one's own, a family, a piece or a loss, for `save` and `load`, by its
     name.
 
@@ -112,7 +112,7 @@ def register(kind: type, name: str = "") -> type:
     """
     if not (isinstance(kind, type) and (dataclasses.is_dataclass(kind) or _is_tuple(kind))):
         raise InputError(f"expected a dataclass to register, got {kind!r}")
-    name = name or kind.__name__
+    name = kind.__name__
     if _TYPES.get(name, kind).__module__ != kind.__module__:
         raise InputError(f"another type is registered as {name}: choose another name")
     _TYPES[name], _NAMES[kind] = kind, name
