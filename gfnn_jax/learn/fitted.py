@@ -37,7 +37,7 @@ _OF_DERIVATIVE = 3.0  # times a step's: the time that compiling its derivative t
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Choice:
-    """How a map was chosen among candidates.
+    """A choice of a map among candidates.
 
     candidates: every candidate met on the way, by rising operations. asked: the tolerance, and
     ``met`` whether the chosen map's upper 95 % bound is within it. num_pairs: that trained and
@@ -108,7 +108,7 @@ class Choice:
 
     @property
     def verdict(self) -> str:
-        """What the pairs tell, as `Fit.verdict` says."""
+        """Verdict of the pairs, as of `Fit.verdict`."""
         law = self.law
         if law is None:
             return "map" if self.met else f"map: the tolerance is missed, for {self.ended}"
@@ -183,7 +183,7 @@ class Choice:
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """What `gfnn.fit` and `gfnn.load` give.
+    """Result of `gfnn.fit` and `gfnn.load`.
 
     map: the map that was chosen, which rolls out, estimates and forecasts. found: how it was found:
     a `Choice` among candidates, for pairs and for maps of positions; a
@@ -205,7 +205,7 @@ class Fit:
 
     @property
     def verdict(self) -> str | None:
-        """What the data tell, ``KIND`` or ``KIND: reason``. KIND is identified, one of several,
+        """Verdict of the data, ``KIND`` or ``KIND: reason``. KIND is identified, one of several,
         partly, or map, of a generated map without a law; no law and not mechanical are those of a
         `FitError`. None where a folder holds none."""
         return self.stored.get("verdict", None if self.found is None else self.found.verdict)
@@ -280,7 +280,7 @@ class Fit:
         saved.save(self, folder, scene=scene, overwrite=overwrite)
 
     def report(self, **about: Any) -> dict[str, Any]:
-        """What ``report.json`` holds, with numbers that are not finite as None.
+        """Make the report, which ``report.json`` holds, with numbers that are not finite as None.
 
         about: further entries, as of ``assemble`` in `evaluate.report` and `evaluate.law_report`.
         Of a fit that was loaded it is the report that was saved. Raises ValueError where the folder

@@ -98,7 +98,7 @@ def load(folder, scene: Scene | None = None) -> Fit:
 
 
 def _portable(found: Choice | LearnedLaw | None) -> Any:
-    """What was found, without the data, the map and the functions that compute from the data."""
+    """Strip what was found of the data, the map and the functions that compute from the data."""
     if found is None:
         return None
     if not isinstance(found, Choice):

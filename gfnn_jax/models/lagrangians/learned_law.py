@@ -107,7 +107,7 @@ class LearnedLaw:
 
     @property
     def verdict(self) -> str:
-        """What the recording tells: identified, one of several, or partly, with the reason."""
+        """Verdict of the recording: identified, one of several, or partly, with the reason."""
         if self.flaws:
             return f"partly: {'; '.join(self.flaws)}"
         together = [names for names in self.alike if names.endswith(ONLY_TOGETHER)]
