@@ -10,7 +10,7 @@ from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import polynomial_terms
-from gfnn_jax.models.hamiltonians.centrifugal import centrifugal_terms
+from gfnn_jax.models.hamiltonians.libraries import centrifugal_terms
 
 
 def spherical_pendulum_pairs(count, latitude=False):

@@ -17,14 +17,14 @@ from gfnn_jax.data.files import read_initial, read_trajectories
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.varied import as_varied
-from gfnn_jax.families.terms import given_terms
+from gfnn_jax.families.terms import given_terms, polynomial_terms
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.parameters import Parameters, sampled
-from gfnn_jax.models.hamiltonians.white import leaves_white
-from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
+from gfnn_jax.models.hamiltonians.covariance import leaves_white
+from gfnn_jax.models.parameters import functions_of_parameters, walked
 from gfnn_jax.scenes.draws import sample_t0
 
 PERIOD = 5.0
@@ -156,9 +156,8 @@ def test_libraries_of_an_even_law_grow_past_odd_degrees():
     z, t0 = states(400)
     args = t0[:, None]
     gradient = LAW.gradient(C, z, args)
-    libraries = state_libraries(
-        1, ("t",), angles=(), cyclic=(), plain=(), features=None, reversor=None, own=None
-    )
+    plain = (polynomial_terms(1, n) for n in (2, 3, 4, 6, 8, 10, 12, 14))
+    libraries = [dataclasses.replace(family, parameters=("t",)) for family in plain]
 
     def attempt(family):
         terms = family.term_gradients(z, args).reshape(-1, family.num_parameters)

@@ -14,11 +14,13 @@ from gfnn_jax.fitting import least_squares
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.models.hamiltonians.flow_arcs import FlowOnArcs, fit_flow, longest_arc
-from gfnn_jax.models.hamiltonians.whole_sequences import (
+from gfnn_jax.models.hamiltonians.sequences import (
+    FlowOnArcs,
+    Measured,
     about_outliers,
     covariance_root_of,
     lacks_terms,
+    longest_arc,
 )
 from gfnn_jax.scenes import henon_heiles
 from gfnn_jax.solve.latent_arcs import OUTLYING
@@ -48,7 +50,7 @@ def shot(states, start=1.01 * TRUE, steps=STEPS, least=1e-15, angles=()):
     arcs = arcs_of_pairs(*pairs_of(states), 100)
     assert arcs is not None
     model = FlowOnArcs(OSCILLATOR, DT, steps, arcs.moves)
-    found = fit_flow(model, start, arcs, np.full(2, least), angles)
+    found = Measured(arcs, np.full(2, least), angles).fit(model, start)
     assert found is not None
     assert found.converged
     return found
@@ -119,7 +121,8 @@ def test_states_that_are_missing_are_bridged():
     arcs = arcs_of_pairs(z0[keep], z1[keep], 100, np.diff(place[keep]).clip(0))
     assert arcs is not None
     assert not arcs.measured[:, 5].any()
-    found = fit_flow(FlowOnArcs(OSCILLATOR, DT, STEPS, arcs.moves), TRUE, arcs, np.full(2, 1e-15))
+    model = FlowOnArcs(OSCILLATOR, DT, STEPS, arcs.moves)
+    found = Measured(arcs, np.full(2, 1e-15)).fit(model, TRUE)
     assert found is not None
     assert np.isnan(found.residuals[:, 5]).all()
     np.testing.assert_allclose(found.x, states, atol=5 * NOISE)
@@ -138,7 +141,7 @@ def test_angles_go_on_over_turns():
     arcs = arcs_of_pairs(*pairs_of(seen), 100)
     assert arcs is not None
     model = FlowOnArcs(family, dt, Steps(4, 1), arcs.moves)
-    found = fit_flow(model, 1.002 * true, arcs, np.full(2, 1e-15), (0,))
+    found = Measured(arcs, np.full(2, 1e-15), (0,)).fit(model, 1.002 * true)
     assert found is not None
     np.testing.assert_allclose(found.x, states, atol=3 * NOISE)
     np.testing.assert_allclose(found.p, true, atol=5e-4)

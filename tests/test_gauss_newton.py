@@ -17,6 +17,7 @@ from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.flows.collocation import Steps, images, truncation
 from gfnn_jax.models.hamiltonians.formula import formula
 from gfnn_jax.models.hamiltonians.law_candidate import assembled
+from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.phase_space import Pairs
 
@@ -35,7 +36,7 @@ def henon_heiles(count, dt, seed=0, size=0.3):
 
 def learned(pairs, *, tolerance=1e-12, terms=(), coordinates=CARTESIAN):
     data, asked = Dataset.of(identified(pairs).pairs, coordinates).divided(0), Tolerance(tolerance)
-    return learn_hamiltonian(data, asked, terms=terms), data, asked
+    return learn_hamiltonian(LawProblem(data, asked, terms=terms)), data, asked
 
 
 def problem_of(pairs):
@@ -104,7 +105,7 @@ def test_henon_heiles_told_nothing(dt):
 def test_an_exact_polynomial_ends_the_search_before_laws_of_physics():
     said = []
     data = Dataset.of(identified(henon_heiles(100, 1.0)).pairs, CARTESIAN).divided(0)
-    law = learn_hamiltonian(data, Tolerance(1e-12), on_progress=said.append)
+    law = learn_hamiltonian(LawProblem(data, Tolerance(1e-12), on_progress=said.append))
     assert law.candidate.num_parameters == 6
     assert "H: 34 terms" in said
     assert not any("atoms" in line for line in said)

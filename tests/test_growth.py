@@ -15,6 +15,7 @@ from gfnn_jax.families.terms import Terms, given_terms, multiplied
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.growth import grow
 from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.phase_space import Pairs
 
@@ -33,7 +34,7 @@ def pairs_of(terms, coefficients, count, dt, seed=0):
 def learned(pairs, tolerance, terms=(), angles=(0,)):
     coordinates = Coordinates("angles", angles=angles) if angles else CARTESIAN
     data = Dataset.of(identified(pairs).pairs, coordinates).divided(0)
-    return learn_hamiltonian(data, Tolerance(tolerance), terms=terms)
+    return learn_hamiltonian(LawProblem(data, Tolerance(tolerance), terms=terms))
 
 
 def test_growth_follows_the_difference_of_two_angles():

@@ -1,5 +1,7 @@
 """A library of H that is too dear beside the map at hand is told before it is fitted."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -8,12 +10,10 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.families.terms import given_terms, polynomial_terms
-from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.linear_starts import midpoint_start
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
-from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
-from gfnn_jax.models.hamiltonians.worth import too_dear
+from gfnn_jax.models.hamiltonians.library_search import too_dear
+from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.phase_space import Pairs
 
 
@@ -31,14 +31,14 @@ def test_a_few_terms_of_many_are_told_from_many(terms, coefficients, dear):
     z1 = images(law, np.array(coefficients, float), z0, 0.1, Steps(12, 1)).states
     pairs = Pairs(z0, z1, 0.1)
     data, asked = Dataset.of(identified(pairs).pairs, CARTESIAN).divided(0), Tolerance(1e-5)
-    problem = Problem(data.y0, data.y1, 0.1, data.scale)
+    problem = LawProblem(data, asked).beginning(data)
     cubic, rows = polynomial_terms(2, 3), data.training[:150]
     start = midpoint_start(cubic, z0[rows], z1[rows], 0.1, data.scale)
-    fit = problem.fit(cubic, start, rows)
-    last = FittedLaw(cubic, fit, rows, validation_error(cubic, fit, data, asked), ())
+    last = problem.fitted(cubic, start, rows)
 
     def told(dearest):
-        return too_dear(problem, polynomial_terms(2, 4), last, data, asked, dearest)
+        beside = dataclasses.replace(problem, dearest=dearest)
+        return too_dear(beside, polynomial_terms(2, 4), last)
 
     assert told(5e3) == dear
     assert not told(np.inf)

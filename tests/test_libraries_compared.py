@@ -6,7 +6,7 @@ import pytest
 from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.library_search import simplest_where_few_decide
-from gfnn_jax.models.hamiltonians.options import OPTIONS
+from gfnn_jax.models.hamiltonians.problem import LawProblem
 
 BEST = 3e-12, 1e-9  # of the larger library: at most states, and at one
 
@@ -30,6 +30,6 @@ def test_few_states_with_large_errors_do_not_decide(small, large, taken, relativ
         return FittedLaw(None, None, np.arange(3), one_step_error(error, spread, asked), ())
 
     laws = {"small": law(*small), "large": law(*large)._replace(stalled=True)}
-    found = simplest_where_few_decide([*laws.values()], laws["large"], asked, OPTIONS)
+    found = simplest_where_few_decide(LawProblem(None, asked), [*laws.values()], laws["large"])
     assert found.stalled
     assert found.error is laws[taken].error

@@ -14,7 +14,7 @@ from gfnn_jax.diagnosis.residuals import noise_of_sites, state_noise
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import MIDPOINT
-from gfnn_jax.models.hamiltonians.white import leaves_white
+from gfnn_jax.models.hamiltonians.covariance import leaves_white
 from gfnn_jax.scenes import froeschle
 from gfnn_jax.solve.noise import of_residuals, robust
 

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps
-from gfnn_jax.models.hamiltonians.flow_arcs import FlowWithConstants
+from gfnn_jax.models.hamiltonians.sequences import FlowOnArcs
 from gfnn_jax.models.textbook.noisy_search import NoisyTextbook
 from gfnn_jax.models.textbook.weak_gradients import weak_gradients
 from gfnn_jax.phase_space import apply_j
@@ -105,7 +105,7 @@ def test_steps_with_a_constant_inside_have_its_derivative():
         return given_terms(1, ["p1**2", f"exp(-{constants[0]}*q1)", "exp(-2.6*q1)"])
 
     def model():
-        return FlowWithConstants(family, 0.1, Steps(5, 1), np.ones((3, 3), bool), terms=3)
+        return FlowOnArcs(family, 0.1, Steps(5, 1), np.ones((3, 3), bool), terms=3)
 
     p = np.array([0.5, -1.6, 0.8, 1.3])
     found = model().defects(p, x)

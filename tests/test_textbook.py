@@ -17,20 +17,20 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
 from gfnn_jax.evaluate.report import assemble
-from gfnn_jax.families.terms import given_terms
+from gfnn_jax.families.terms import given_terms, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.models.textbook.arguments import arguments_of
 from gfnn_jax.models.textbook.atoms import (
     Factor,
     atom_text,
     constants_of,
-    dictionary_of,
     gradient_of,
     powers_of,
     with_constants,
 )
+from gfnn_jax.models.textbook.dictionary import Setting
 from gfnn_jax.models.textbook.invariance import Invariance
-from gfnn_jax.models.textbook.matching import Matching, orthonormal
+from gfnn_jax.models.textbook.matching import Matching
 from gfnn_jax.models.textbook.search import Textbook
 from gfnn_jax.models.textbook.shapes import constants_for, has_constant, kinds_for, values
 from gfnn_jax.phase_space import apply_j, sizes
@@ -206,18 +206,16 @@ def test_products_of_coordinates_are_read_as_such():
 
 def test_matching_finds_atoms_that_were_put_there_and_their_constants():
     z = ring(60)
-    arguments, weight = arguments_of(z), np.ones(4)
-    unit = np.broadcast_to(np.eye(4)[:, None, :], (4, 60, 4)).reshape(4, -1).T
-    base = orthonormal(unit)
+    setting = Setting(z, np.ones(4))
+    setting.take(polynomial_terms(2, 1), np.ones(4))
+    arguments = setting.arguments
     place = {a.text: i for i, a in enumerate(arguments)}
     true = (
         (Factor(place["sqrt(q1**2 + q2**2)"], ("exp", -1.0), -0.7),),
         (Factor(place["q1 - q2"], ("power", 3.0)),),
     )
     target = sum(c * gradient_of(a, arguments) for c, a in zip((-1.5, 0.2), true, strict=True))
-    matching = Matching(base, target.ravel(), weight, arguments)
-    dictionary = dictionary_of(arguments, weight, base, degree=3, products=False)
-    best = matching.best(dictionary, 3)[0]
+    best = Matching(setting, target.ravel()).best(setting.dictionary(), 3)[0]
     assert best.left < 1e-12
     found = {(f.place, f.kind): f.theta for atom in best.atoms for f in atom}
     assert found[true[0][0].place, ("exp", -1.0)] == pytest.approx(-0.7, abs=1e-11)
@@ -278,10 +276,9 @@ def test_atoms_and_terms_with_a_symmetry_are_left_as_they_are_by_it():
     pairs = kepler_pairs(200)
     data = Dataset.of(identified(pairs).pairs, CARTESIAN).divided(0)
     z = np.random.default_rng(1).uniform(0.5, 1.0, (100, 4))
-    arguments = arguments_of(z)
-    invariance = Invariance(symmetries_of_pairs(data), z, arguments, (), ())
-    weight, base = np.ones(4), np.zeros((400, 0))
-    every = dictionary_of(arguments, weight, base, degree=4).atoms
+    setting = Setting(z, np.ones(4))
+    arguments, invariance = setting.arguments, Invariance(symmetries_of_pairs(data), setting)
+    every = setting.dictionary().atoms
     kept = [atom for atom in every if invariance.of_atom(atom)]
     turn = np.array([[np.cos(0.1), np.sin(0.1)], [-np.sin(0.1), np.cos(0.1)]])
     turned = z @ np.kron(np.eye(2), turn).T

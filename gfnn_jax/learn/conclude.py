@@ -29,8 +29,8 @@ from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.size import OF_SOLVE, OF_STEPS
 from gfnn_jax.models.hamiltonians.choose_law import long_step
-from gfnn_jax.models.hamiltonians.law_messages import TURNS
-from gfnn_jax.models.hamiltonians.white import leaves_white
+from gfnn_jax.models.hamiltonians.covariance import leaves_white
+from gfnn_jax.models.hamiltonians.law_candidate import TURNS
 from gfnn_jax.search.extrapolate import GAINED
 from gfnn_jax.search.search import MET, Entry
 

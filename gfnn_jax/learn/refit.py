@@ -208,6 +208,4 @@ def _with_coefficients(
     )
     flow = dataclasses.replace(law.flow, params=fit.coefficients)
     text = getattr(flow.family, "prefix", "") + formula(terms)
-    return dataclasses.replace(
-        law, flow=flow, terms=terms, shown=text, candidate=candidate, condition=fit.condition
-    )
+    return dataclasses.replace(law, flow=flow, terms=terms, shown=text, candidate=candidate)

@@ -26,6 +26,7 @@ from gfnn_jax.models.generating_functions.sweeps import sweep_of_dt, sweeps_for
 from gfnn_jax.models.hamiltonians.choose_law import MAX_COST_RATIO, law_of, preferred
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.networks import learn_network
+from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.maps_of_laws.law_maps import (
     better_than,
     law_explains_most,
@@ -176,28 +177,20 @@ def _law(
     options = request.options
     if not request.seeks_law:
         return None
+    problem = LawProblem(
+        data,
+        request.tolerance,
+        request.budget,
+        scene=request.scene,
+        terms=options.terms,
+        dearest=dearest,
+        on_progress=request.on_progress,
+        partly=request.partly,
+    )
     if request.of_network:
-        law = learn_network(
-            data,
-            request.tolerance,
-            request.scene,
-            seed=options.seed,
-            budget=request.budget,
-            on_progress=request.on_progress,
-            max_iterations=options.max_iterations,
-        )
+        law = learn_network(problem, seed=options.seed, max_iterations=options.max_iterations)
     else:
-        law = law_of(
-            data,
-            request.tolerance,
-            request.scene,
-            options.learn,
-            options.terms,
-            request.budget,
-            request.on_progress,
-            dearest,
-            request.partly,
-        )
+        law = law_of(problem, options.learn)
     if law is not None:
         if better is not None:
             better.offer(law.candidate, lambda: composed(law.flow, data))

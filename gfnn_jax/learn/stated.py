@@ -34,7 +34,7 @@ from gfnn_jax.fitting.left_out import without_each
 from gfnn_jax.flows.collocation import Steps, truncation
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.models.hamiltonians.work import work_of_refit
+from gfnn_jax.models.hamiltonians.problem import work_of_refit
 
 _FOLDS = 5
 FEWEST_RUNS_TESTED = 10  # runs that state the error for all others

@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms, joined, multiplied, polynomial_terms
 from gfnn_jax.phase_space import TIME
@@ -32,6 +34,7 @@ class ParameterOptions:
     polynomials: degrees of those without; features: of a scene's. gained: a library that lowers
     the error by less has not helped; leap: one that lowers it by more is taken at once.
     apart: the ratio of the largest to the smallest value from which on logarithms are taken.
+    far_from_zero: of the largest value; nearer to it a parameter has no negative powers.
     """
 
     harmonics: tuple[int, ...] = (1, 2, 4)
@@ -44,36 +47,43 @@ class ParameterOptions:
     gained: float = 0.5
     leap: float = 0.03
     apart: float = 1.2
+    far_from_zero: float = 0.02
 
 
 OPTIONS = ParameterOptions()
-_FAR_FROM_ZERO = 0.02  # of the largest value: nearer to it a parameter has no negative powers
 
 
-def state_libraries(
-    dim: int,
-    parameters: tuple[str, ...],
-    *,
-    angles: Sequence[int],
-    cyclic: Sequence[int],
-    plain: tuple[str, ...],
-    features,
-    reversor,
-    own: Terms | None,
-) -> list[Terms]:
-    """Libraries of the state alone, by rising size. angles: that enter H, plain: the names of the
-    other coordinates. own: a user's terms, which stand in all of them, at first alone."""
+def angles_and_others(data: Dataset) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """The angles that enter by themselves, and the names of the coordinates that are none."""
+    dim, coordinates = data.dim, data.coordinates
+    angles = tuple(i for i in coordinates.angles if i < dim and i not in coordinates.cyclic)
+    left = (*angles, *coordinates.cyclic)
+    names = coordinate_names(dim)
+    return angles, tuple(name for i, name in enumerate(names) if i not in left)
+
+
+def states_and_functions(
+    data: Dataset, rows: np.ndarray, *, features=None, reversor=None, own: Terms | None = None
+) -> tuple[list[Terms], list[list[Terms]]]:
+    """Libraries of the state alone, by rising size, and functions of the args of these rows, which
+    multiply them. own: a user's terms, which stand in all libraries, at first alone. features,
+    reversor: of a scene."""
+    dim, parameters = data.dim, data.parameters
+    angles, plain = angles_and_others(data)
     if angles and features is None:
-        basis = Modes(dim, tuple(angles), plain)
+        basis = Modes(dim, angles, plain)
         found = [basis.terms(basis.box(*size)) for size in OPTIONS.boxes]
     else:
         degrees = OPTIONS.polynomials if features is None else OPTIONS.features
+        cyclic = data.coordinates.cyclic
         found = [
             polynomial_terms(dim, d, cyclic=cyclic, features=features, reversor=reversor)
             for d in degrees
         ]
     found = [dataclasses.replace(family, parameters=parameters) for family in found]
-    return found if own is None else [own, *(joined(own, family) for family in found)]
+    states = found if own is None else [own, *(joined(own, family) for family in found)]
+    args, alone = data.given(rows)[1], own is not None
+    return states, functions_of_parameters(dim, parameters, args, alone, data.period)
 
 
 def functions_of_parameters(
@@ -135,8 +145,9 @@ def _powers(dim: int, parameters: tuple[str, ...], args) -> Terms:
 
 
 def keeps_away(values) -> bool:
+    """Return whether a parameter with these values keeps its sign and away from 0."""
     size = np.abs(values)
-    return bool(np.ptp(np.sign(values)) == 0 and size.min() > _FAR_FROM_ZERO * size.max())
+    return bool(np.ptp(np.sign(values)) == 0 and size.min() > OPTIONS.far_from_zero * size.max())
 
 
 def _chebyshev(dim: int, parameters: tuple[str, ...], args, degree: int) -> Terms:

@@ -23,7 +23,6 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.diagnosis.local_jacobians import SINGULAR
 from gfnn_jax.errors import FitError, OutOfTime
-from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms, joined, multiplied
@@ -39,7 +38,7 @@ from gfnn_jax.fitting.significance import (
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import CHARTS, AnyChart
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
+from gfnn_jax.models.parameters import states_and_functions, walked
 
 _CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
 _MOST_TERMS = 500
@@ -213,33 +212,15 @@ def _of_chart(attempt: _Attempts, scene) -> Iterator[_Tried]:
     if data.structure is not None:
         yield from _of_sites(data, tolerance, attempt)
         return
-    coordinates, dim = data.coordinates, data.dim
-    angles = tuple(i for i in coordinates.angles if i < dim and i not in coordinates.cyclic)
-    plain = tuple(
-        name
-        for i, name in enumerate(coordinate_names(dim))
-        if i not in angles and i not in coordinates.cyclic
-    )
-    states = state_libraries(
-        dim,
-        data.parameters,
-        angles=angles,
-        cyclic=coordinates.cyclic,
-        plain=plain,
-        features=scene.features if scene is not None else None,
-        reversor=None,
-        own=None,
-    )
-    _, args = data.given(data.training)
-    functions = functions_of_parameters(dim, data.parameters, args, own=False, period=data.period)
-
+    features = scene.features if scene is not None else None
+    states, functions = states_and_functions(data, data.training, features=features)
     yield from walked(
         states,
         functions,
         attempt,
         lambda tried: tried.error.bound,
         bound=tolerance.bound,
-        most=min(len(data.training) * 2 * dim / ROWS_PER_TERM, _MOST_TERMS),
+        most=min(len(data.training) * 2 * data.dim / ROWS_PER_TERM, _MOST_TERMS),
     )
 
 

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
-from gfnn_jax.budget import Budget, OutOfTime
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
-from gfnn_jax.errors import FitError
+from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.fitting.linear_starts import backwards, tangent, turns
-from gfnn_jax.models.hamiltonians.formula import OnPartial
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.options import OPTIONS
+from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.scenes.scene import Scene
 
@@ -30,30 +27,18 @@ _BESIDE = dataclasses.replace(
 MAX_COST_RATIO = 4.0
 # Where none meets the tolerance, errors that the noise of held-out pairs does not tell apart.
 _AS_GOOD = 1.01
-# Of the error that a library must leave to have helped, where noise hides what it brings.
-_GAINED_ALONE = 0.8
 _TURNED = 0.2  # radians backwards that are worth a word
 
 
-def law_of(
-    data: Dataset,
-    tolerance: Tolerance,
-    scene: Scene | None,
-    learn: str,
-    terms: Sequence[str | Callable],
-    budget: Budget,
-    on_progress: Callable[[str], Any],
-    dearest: float = np.inf,
-    partly: OnPartial = lambda law: None,
-) -> LearnedHamiltonian | None:
+def law_of(problem: LawProblem, learn: str) -> LearnedHamiltonian | None:
     """The Hamiltonian of these pairs, or None where "auto" finds none, or the budget ends before
     the first.
 
-    data: without a base map. dearest: operations of a step of H that is chosen beside a map that
-    meets the tolerance; of use where H is not asked for. partly: as of `learn_hamiltonian`.
+    The problem's ``dearest`` is of use where H is not asked for; its options are chosen here.
     Raises FitError where a Hamiltonian is asked for and there is none to learn.
     """
-    unfit = unfit_for_law(data, scene)
+    data, budget = problem.data, problem.budget
+    unfit = unfit_for_law(data, problem.scene)
     if unfit is not None:
         if learn == "hamiltonian":
             raise FitError(f"expected data of an autonomous flow to learn H from: {unfit}")
@@ -61,29 +46,20 @@ def law_of(
     # S of a driven system, or of one with parameters or several dt, needs more terms than H: no map
     # to wait for.
     structured = data.structure is not None
-    foremost = learn == "hamiltonian" or terms or data.varied or structured
+    foremost = learn == "hamiltonian" or problem.terms or data.varied or structured
     options = OPTIONS if foremost else _BESIDE
     if learn == "hamiltonian":  # no map stands in for a law that misses the tolerance
-        options = dataclasses.replace(options, only_within=False, gained=_GAINED_ALONE)
+        options = dataclasses.replace(options, only_within=False, gained=OPTIONS.gained_alone)
     if structured:  # nothing else is learned of bodies, and of sites S in a few seconds
         options = dataclasses.replace(options, max_operations=np.inf)
+    dearest = np.inf if foremost else problem.dearest
     try:
         with np.errstate(all="ignore"):  # starts that run away are part of the search
-            return learn_hamiltonian(
-                data,
-                tolerance,
-                scene,
-                terms=terms,
-                budget=budget,
-                on_progress=on_progress,
-                options=options,
-                dearest=np.inf if foremost else dearest,
-                partly=partly,
-            )
+            return learn_hamiltonian(dataclasses.replace(problem, options=options, dearest=dearest))
     except OutOfTime:
         budget.leave_out("H", "no set of terms was fitted within the budget")
     except (FitError, np.linalg.LinAlgError) as error:
-        if learn == "hamiltonian" or terms:
+        if learn == "hamiltonian" or problem.terms:
             raise FitError(str(error)) from error
         if isinstance(error, np.linalg.LinAlgError):
             budget.leave_out("H", f"its linear algebra failed: {error}")

@@ -6,46 +6,71 @@ its energy gets no spurious loss. Uniform friction comes first, because its flow
 J; it is claimed where it meets the tolerance, or where rates of their own for the degrees of
 freedom would explain no more. A constant determinant of local Jacobians is no sign of it, which two
 oscillators of different friction have too. Then comes friction linear in each velocity, and where
-neither meets the tolerance all kinds compete (`friction_kinds`).
+neither meets the tolerance all kinds compete: linear, quadratic and dry, of each velocity and of
+the relative ones of neighbours, fitted together with H. |v|v and the sign of v are smooth where v
+keeps its sign, and a fit is as exact there as any other; pairs in which a speed turns are left out
+of it. Which of the kinds there are held-out pairs say, by the rule of recordings
+(`models.lagrangians.friction_choice`).
+
+A map cannot leave such steps out: its dry friction is √(v² + ε²) − ε with ε as small as its steps
+can follow, or as the tolerance asks (`followed`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, OutOfTime
-from gfnn_jax.families.lagrangian import LINEAR, UNIFORM, Friction
+from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction
+from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.significance import CERTAIN
+from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.forces import Forced
+from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.flows.uniform import Uniform, without_forces
+from gfnn_jax.maps.laws import STIFFEST
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
-from gfnn_jax.models.hamiltonians.friction_kinds import (
-    Rates,
-    candidates,
-    choice_of,
-    with_friction,
-    without_turns,
-)
 from gfnn_jax.models.hamiltonians.legendre import lagrangian_of
 from gfnn_jax.models.hamiltonians.libraries import libraries_of, modes_of
-from gfnn_jax.models.hamiltonians.options import OPTIONS, LawOptions
-from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
-from gfnn_jax.models.hamiltonians.work import LawWork
+from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, Table, chosen
+from gfnn_jax.models.lagrangians.libraries import losses
+from gfnn_jax.models.lagrangians.structure import Loss
+from gfnn_jax.models.lagrangians.text import WhichFriction, which_friction_line
+from gfnn_jax.phase_space import split
 
-_GAINED = 0.5  # of the held-out error of H alone: what friction must lower it to
-_ALIKE = 0.7  # of what uniform friction leaves over: what rates of their own must lower it to
-_LOOKED_AT = 600  # pairs that tell whether friction explains anything
-_BOXES = ((1, 1), (1, 2), (2, 2))  # (order, degree) of the modes of angles that are tried
 
-Searched = tuple[FittedLaw, LawOptions]
+@dataclasses.dataclass(frozen=True)
+class FrictionOptions:
+    """Tuned on the pairs of benchmarks/friction.py and friction_kinds.py.
+
+    gained: of the held-out error of H alone, what friction must lower it to. alike: of what uniform
+    friction leaves over, what rates of their own must lower it to. looked_at: pairs that tell
+    whether friction explains anything, and limits. boxes: (order, degree) of the modes of angles
+    that are tried. sharp: ε of dry friction in a fit, in rms speeds: of pairs in which none turns,
+    roundoff. turning: of its rms, a speed at which a step is taken to turn. rounded: of the scale,
+    residuals below it do not tell kinds apart.
+    """
+
+    gained: float = 0.5
+    alike: float = 0.7
+    looked_at: int = 600
+    boxes: tuple[tuple[int, int], ...] = ((1, 1), (1, 2), (2, 2))
+    sharp: float = 1e-9
+    turning: float = 0.05
+    rounded: float = 1e-12
+
+
+OPTIONS = FrictionOptions()
 Forces = Callable[[Any], Any]  # what makes a family with friction of one of H
-Search = Callable[[Forces, Dataset], Searched]  # of laws with these forces, by these pairs
+Search = Callable[[Forces, Dataset], FittedLaw]  # of laws with these forces, by these pairs
 
 
 def linear_in_velocities(family) -> Forced:
@@ -54,132 +79,113 @@ def linear_in_velocities(family) -> Forced:
     return Forced(family, Friction.of(rows, family.dim))
 
 
-def beside_friction(
-    problem: Problem,
-    work: LawWork,
-    before: Searched,
-    data: Dataset,
-    tolerance: Tolerance,
-    search: Search,
-) -> Searched:
-    """The best that ``search`` finds with friction, where H alone, ``before``, misses the tolerance
-    and friction is certain and worth it; else ``before``."""
-    best, bound, rows = before, tolerance.bound, data.training[:_LOOKED_AT]
-    simple = data.args is None and data.structure is None
-    if not simple or best[0].error.bound <= bound:
-        return before
-    work.capped(before[1].max_operations)
+def beside_friction(problem: LawProblem, alone: FittedLaw, search: Search) -> FittedLaw:
+    """The best that ``search`` finds with friction, where H alone misses the tolerance and friction
+    is certain and worth it; else H alone."""
+    best, data, rows = alone, problem.data, problem.data.training[: OPTIONS.looked_at]
+    if not problem.simple or problem.met_by(alone):
+        return alone
+    problem.work.capped(problem.options.max_operations)
     try:
-        with work.again("whether friction explains anything", best[0].family, len(rows)):
-            if not _explains(problem, best[0], rows):
-                return before
+        what = "whether friction explains anything"
+        with problem.work.again(what, alone.family, len(rows)):
+            if not _explains(problem.flows, alone, rows):
+                return alone
     except OutOfTime:
-        work.budget.leave_out("H with friction", work.ended)
-        return before
+        problem.budget.leave_out("H with friction", problem.work.ended)
+        return alone
     for forces in (Uniform, linear_in_velocities)[: 1 if data.dim == 1 else 2]:
-        try:
-            found = search(forces, data)
-        except OutOfTime:
-            work.budget.leave_out("H with friction", work.ended)
-            break
-        except FitError:  # no such friction is in the pairs
+        law = _found(problem, "H with friction", lambda own=forces: search(own, data))
+        if law is None or not _certain(law):
             continue
-        except np.linalg.LinAlgError as error:
-            work.budget.leave_out("H with friction", f"the arithmetic failed ({error})")
+        if not law.error.relative < OPTIONS.gained * best.error.relative:
             continue
-        law = found[0]
-        met = law.error.bound <= bound
-        if not _certain(law) or not law.error.relative < _GAINED * best[0].error.relative:
+        met = problem.met_by(law)
+        if forces is Uniform and not met and not _alike(problem.flows, law, rows):
             continue
-        if forces is Uniform and not met and not _alike(problem, law, rows):
-            continue
-        best = found
+        best = law
         if met:
             return best
+    what = "H with friction of every kind"
+    return _found(problem, what, lambda: _of_kinds(problem, alone, best, search)) or best
+
+
+def _found(
+    problem: LawProblem, what: str, search: Callable[[], FittedLaw | None]
+) -> FittedLaw | None:
+    """Law that a search finds; None where no such friction is in the pairs, or no time is left."""
     try:
-        return _of_kinds(problem, work, before, best, data, tolerance, search) or best
+        return search()
     except OutOfTime:
-        work.budget.leave_out("H with friction of every kind", work.ended)
-    except FitError:  # no such friction is in the pairs
+        problem.budget.leave_out(what, problem.work.ended)
+    except FitError:
         pass
     except np.linalg.LinAlgError as error:
-        work.budget.leave_out("H with friction of every kind", f"the arithmetic failed ({error})")
-    return best
+        problem.budget.leave_out(what, f"the arithmetic failed ({error})")
+    return None
 
 
 def _of_kinds(
-    problem: Problem,
-    work: LawWork,
-    before: Searched,
-    best: Searched,
-    data: Dataset,
-    tolerance: Tolerance,
-    search: Search,
-) -> Searched | None:
+    problem: LawProblem, alone: FittedLaw, near: FittedLaw, search: Search
+) -> FittedLaw | None:
     """H with the kinds of friction that held-out pairs choose; None where these are those of
-    ``best``, or not certain, or not worth it."""
-    near = best[0]
-    every = candidates(data, near.family, near.fit.coefficients)
-    steady = without_turns(data, near.family, near.fit.coefficients, every)
-    full, options = search(lambda family: Forced(family, every), steady)
-    choice = choice_of(problem, full.family, full.fit.coefficients, full.fit.steps, full.fit.used)
+    ``near``, the best so far, or not certain, or not worth it."""
+    data, law = problem.data, (near.family, near.fit.coefficients)
+    every = candidates(data, *law)
+    full = search(lambda family: Forced(family, every), without_turns(data, *law, every))
+    table = _table(problem.flows, full.family, full.fit.coefficients, full.fit.steps, full.fit.used)
+    choice = None if table is None else chosen(table)
     if choice is None or not choice.kinds:
         return None
     taken = set(choice.kinds)  # of kinds beside these limits tell
     odds = {kinds: odds for kinds, odds in choice.odds.items() if not taken <= set(kinds)}
-    if taken <= {LINEAR, UNIFORM} and best is not before:
-        return near._replace(odds=odds), best[1]
-    own = without_forces(full.family)
-    family = with_friction(own, choice.rows)
-    names = dict(zip(full.family.term_names, full.fit.coefficients, strict=True))
-    start = np.array([names.get(name, 0.0) for name in family.term_names])
+    if taken <= {LINEAR, UNIFORM} and near is not alone:
+        return near._replace(odds=odds)
+    family = with_friction(without_forces(full.family), choice.rows)
+    start = full.start_of(family)
     steady = without_turns(data, family, start)
-    rows = steady.training
-    with work.again("H with the friction that was chosen", family, len(rows)):
-        fit = problem.fit(family, start, rows, rounds=False)
-    error = validation_error(family, fit, steady, tolerance)
-    law = full._replace(family=family, fit=fit, rows=rows, error=error, larger=None, odds=odds)
-    alone = validation_error(before[0].family, before[0].fit, steady, tolerance)
-    if not _certain(law) or not error.relative < _GAINED * alone.relative:
-        return None
-    return law, options
+    with problem.work.again("H with the friction that was chosen", family, len(steady.training)):
+        fit = problem.flows.fit(family, start, steady.training, rounds=False)
+    judged = problem.on(steady)
+    error = judged.error_of(family, fit)
+    law = full._replace(
+        family=family, fit=fit, rows=steady.training, error=error, larger=None, odds=odds
+    )
+    before = judged.error_of(alone.family, alone.fit)
+    worth_it = error.relative < OPTIONS.gained * before.relative
+    return law if _certain(law) and worth_it else None
 
 
-def mechanical(
-    problem: Problem, work: LawWork, data: Dataset, tolerance: Tolerance
-) -> FittedLaw | None:
+def mechanical(problem: LawProblem) -> FittedLaw | None:
     """The law of a Lagrangian, without friction or with it, as `beside_friction` would have it;
     None where the pairs are of no such system."""
     try:
-        alone = lagrangian_of(problem, work, data, tolerance)
+        alone = lagrangian_of(problem)
     except OutOfTime:
-        work.budget.leave_out("the Lagrangian", work.ended)
+        problem.budget.leave_out("the Lagrangian", problem.work.ended)
         return None
     except np.linalg.LinAlgError:
         return None
     if alone is None:
         return None
 
-    def search(forces: Forces, data: Dataset) -> Searched:
-        found = lagrangian_of(problem, work, data, tolerance, forces)
+    def search(forces: Forces, data: Dataset) -> FittedLaw:
+        found = lagrangian_of(problem.on(data), forces)
         assert found is not None
-        return found, OPTIONS
+        return found
 
-    return beside_friction(problem, work, (alone, OPTIONS), data, tolerance, search)[0]
+    return beside_friction(problem, alone, search)
 
 
-def libraries_with(
-    forces: Forces, data: Dataset, scene, terms, options: LawOptions
-) -> Iterator[Any]:
+def libraries_with(forces: Forces, problem: LawProblem) -> Iterator[Any]:
     """The families of H by rising size, each with these forces; of angles their shortest modes."""
-    basis = modes_of(data, scene, terms)
+    basis = modes_of(problem, problem.terms)
     if basis is None:
-        yield from map(forces, libraries_of(data, scene, terms, options))
+        yield from map(forces, libraries_of(problem))
         return
-    most = len(data.training) * 2 * data.dim / options.rows_per_term
-    for size in _BOXES:
+    for size in OPTIONS.boxes:
         family = basis.terms(basis.box(*size))
-        if family.num_parameters < most:
+        if family.num_parameters < problem.most_terms:
             yield forces(family)
 
 
@@ -190,11 +196,11 @@ def _certain(law: FittedLaw) -> bool:
     return bool(len(rates) and (rates > CERTAIN * errors).all())
 
 
-def _explains(problem: Problem, alone: FittedLaw, rows) -> bool:
+def _explains(flows: Problem, alone: FittedLaw, rows) -> bool:
     """Return whether γ, in the problem linearised about H alone, is certain to be above 0."""
     family = Uniform(alone.family)
     c = np.append(alone.fit.coefficients, 0.0)
-    found = problem.linearised(family, c, alone.fit.steps, rows)
+    found = flows.linearised(family, c, alone.fit.steps, rows)
     if not found.finite:
         return False
     # The last row of R but one is what γ alone explains, the last what nothing does.
@@ -203,16 +209,16 @@ def _explains(problem: Problem, alone: FittedLaw, rows) -> bool:
     return bool(-along / size > CERTAIN * noise / abs(size))
 
 
-def _alike(problem: Problem, law: FittedLaw, rows) -> bool:
+def _alike(flows: Problem, law: FittedLaw, rows) -> bool:
     """Return whether rates of their own for the degrees of freedom would explain no more than γ
     does."""
     if not isinstance(law.family, Uniform) or law.family.dim == 1:
         return True
     c, steps = law.fit.coefficients, law.fit.steps
-    found = problem.images(law.family, c, rows, steps, derivatives=True)
-    own = problem.images(law.family, c, rows, steps, derivatives=True, along=Rates(law.family.dim))
-    residual = ((found.states - problem.z1[rows]) / problem.scale).ravel()
-    columns = [f.by_coefficient / problem.scale[:, None] for f in (found, own)]
+    found = flows.images(law.family, c, rows, steps, derivatives=True)
+    own = flows.images(law.family, c, rows, steps, derivatives=True, along=Rates(law.family.dim))
+    residual = ((found.states - flows.z1[rows]) / flows.scale).ravel()
+    columns = [f.by_coefficient / flows.scale[:, None] for f in (found, own)]
     if not all(np.isfinite(a).all() for a in (residual, *columns)):
         return True
 
@@ -222,4 +228,169 @@ def _alike(problem: Problem, law: FittedLaw, rows) -> bool:
         scaled = matrix / np.where(size > 0, size, 1.0)
         return float(np.linalg.norm(scaled @ np.linalg.lstsq(scaled, residual)[0] - residual))
 
-    return left(*columns) > _ALIKE * left(columns[0])
+    return left(*columns) > OPTIONS.alike * left(columns[0])
+
+
+class Smoothed(NamedTuple):
+    """A family as a map steps it, the substeps that it needs, and the widths ε (F,) of its dry
+    friction, () without any."""
+
+    family: Any
+    substeps: int
+    widths: tuple[float, ...]
+
+
+def candidates(data: Dataset, family, coefficients) -> Friction:
+    """Friction of every kind and direction but uniform friction, its ε those of a fit."""
+    v = _velocities(family, coefficients, data.y0[data.training])
+    width = OPTIONS.sharp * float(np.sqrt(np.mean(v**2)))
+    return Friction.of(losses(data.dim, (LINEAR, QUADRATIC, DRY), width), data.dim)
+
+
+def friction_of(family) -> Friction | None:
+    """The terms of R of a family; None where it has none, or uniform friction alone."""
+    while isinstance(family, Uniform):
+        family = family.family
+    return family.friction if isinstance(family, Forced) else None
+
+
+def is_smooth(family) -> bool:
+    """Return whether no friction of this family depends on the sign of a speed."""
+    friction = friction_of(family)
+    return friction is None or not np.any(friction.kinds != LINEAR)
+
+
+def without_turns(data: Dataset, family, coefficients, friction: Friction | None = None) -> Dataset:
+    """The data without the pairs in which a speed of this friction, the family's own where none is
+    given, turns; all of them where friction is smooth."""
+    friction = friction or friction_of(family)
+    if friction is None:
+        return data
+    own = friction.take(friction.kinds != LINEAR)
+    if not own.count:
+        return data
+    before, after = (
+        _velocities(family, coefficients, z) @ own.directions.T for z in (data.y0, data.y1)
+    )
+    least = OPTIONS.turning * np.sqrt(np.mean(before[data.training] ** 2, axis=0))
+    slow = np.minimum(np.abs(before), np.abs(after)) <= least
+    goes_on = ~np.any(slow | (before * after < 0), axis=1)
+    training, validation = (r[goes_on[r]] for r in (data.training, data.validation))
+    return data.trained_on(training).validated_on(validation)
+
+
+def with_friction(own, rows: Sequence[Loss]) -> Any:
+    """The family ``own`` of H with these frictions."""
+    losses_of_r = [row for row in rows if row[1] != UNIFORM]
+    family = Forced(own, Friction.of(losses_of_r, own.dim)) if losses_of_r else own
+    return Uniform(family) if len(losses_of_r) < len(rows) else family
+
+
+def followed(family, coefficients, data: Dataset, noise: float) -> Smoothed:
+    """The family as steps over dt follow it. noise: of the scale, that the map may err by.
+
+    A body that dry friction holds creeps at up to ε. That is noise ÷ dt, or, where it is more, the
+    width over which the most substeps that a flow may have are no stiffer than Newton's method
+    bears.
+    """
+    friction = friction_of(family)
+    if friction is None or not np.any(friction.kinds == DRY):
+        return Smoothed(family, 1, ())
+    own, dry = without_forces(family), friction.kinds == DRY
+    directions = friction.directions.astype(float)
+    rho = coefficients[own.num_parameters :][: friction.count]
+    z, dt = data.y0[data.training], float(np.max(data.each_dt))
+    _, hessian = own.gradient_and_hessian(coefficients[: own.num_parameters], z)
+    by_p = hessian[:, data.dim :, data.dim :]
+    masses = np.einsum("ki,nij,kj->nk", directions, by_p, directions).max(axis=0)
+    rates = np.abs(rho) * masses * dt  # of a change of speed over a step
+    creeping = noise * np.abs(directions) @ data.scale[: data.dim] / dt
+    widths = np.maximum(creeping, rates / (STIFFEST * MOST_SUBSTEPS))
+    substeps = int(np.ceil(np.max(rates[dry] / widths[dry]) / STIFFEST))
+    wide = dataclasses.replace(friction, widths=np.where(dry, widths, friction.widths))
+    smoothed = _replaced(family, wide)
+    return Smoothed(smoothed, max(substeps, 1), tuple(map(float, widths[dry])))
+
+
+def kinds_of_friction(problem: LawProblem, law: FittedLaw, steps: Steps) -> WhichFriction | None:
+    """The kinds that a law has, with odds where these were found, and upper limits of the others;
+    None of a law with parameters or of many sites, and in coordinates other than the user's."""
+    data, family, coefficients = problem.data, law.family, law.fit.coefficients
+    own, taken = without_forces(family), _rows_of(family)
+    plain = data.coordinates.forward is CARTESIAN.forward
+    if not problem.simple or matrix_free(own) or not plain:
+        return None
+    every = candidates(data, family, coefficients)
+    rows = without_turns(data, family, coefficients, every).training[: OPTIONS.looked_at]
+    mine = friction_of(family)
+    known = {(c, kind) for c, kind, _ in taken}
+    more = [row for row in every.rows() if (row[0], row[1]) not in known]
+    friction = Friction.of([*(mine.rows() if mine is not None else ()), *more], data.dim)
+    larger: Any = Forced(own, friction)
+    known_c = own.num_parameters + (0 if mine is None else mine.count)
+    c = np.concatenate([coefficients[:known_c], np.zeros(len(more)), coefficients[known_c:]])
+    larger = Uniform(larger) if isinstance(family, Uniform) else larger
+    limits: dict[Loss, float] = {}
+    if len(rows) * data.dim > len(c):
+        table = _table(problem.flows, larger, c, steps, rows)
+        limits = {} if table is None else table.limits(taken)
+    sharp = {(c, kind, 0.0): limit for (c, kind, _), limit in limits.items()}
+    choice = FrictionChoice(taken, law.odds or {}, sharp, gains=False)
+    return which_friction_line(choice, 1.0, data.dim, [f"v{i + 1}" for i in range(data.dim)])
+
+
+def _rows_of(family) -> tuple[Loss, ...]:
+    """The frictions of a family, uniform friction last."""
+    friction = friction_of(family)
+    rows = () if friction is None else tuple(friction.rows())
+    uniform = (((0,) * family.dim, UNIFORM, 0.0),) if isinstance(family, Uniform) else ()
+    return (*rows, *uniform)
+
+
+def _table(flows: Problem, family, coefficients, steps: Steps, rows) -> Table | None:
+    """The pairs of these rows close to a law; uniform friction, where it has none, is a candidate
+    more of several degrees of freedom. None where its flow fails."""
+    friction, first = friction_of(family), without_forces(family).num_parameters
+    assert friction is not None
+    found = flows.images(family, coefficients, rows, steps, derivatives=True)
+    unit, kinds, rho = flows.unit(rows), friction.rows(), coefficients[first:]
+    slopes = found.by_coefficient / unit[..., None]
+    left = (flows.z1[rows] - found.states) / unit + slopes[..., first:] @ rho
+    if not isinstance(family, Uniform) and family.dim > 1:
+        even = flows.images(
+            family, coefficients, rows, steps, derivatives=True, along=Rates(family.dim)
+        ).by_coefficient.sum(axis=-1, keepdims=True)
+        slopes = np.concatenate([slopes, even / unit[..., None]], axis=-1)
+    if slopes.shape[-1] > first + len(kinds):
+        kinds = [*kinds, ((0,) * family.dim, UNIFORM, 0.0)]
+    size = np.linalg.norm(slopes[..., :first].reshape(-1, first), axis=0)
+    slopes[..., :first] /= np.where(size > 0, size, 1.0)
+    table = np.concatenate([slopes, left[..., None]], axis=-1)[:, None]
+    finite = np.isfinite(table).all()
+    return Table(tuple(kinds), table, 1.0, OPTIONS.rounded) if finite else None
+
+
+def _velocities(family, coefficients, z) -> np.ndarray:
+    """v = ∂H/∂p (N, d) of states z (N, 2d)."""
+    own = without_forces(family)
+    return split(own.gradient(coefficients[: own.num_parameters], z))[1]
+
+
+def _replaced(family, friction: Friction) -> Any:
+    """The family with this friction in the place of its own."""
+    if isinstance(family, Uniform):
+        return Uniform(_replaced(family.family, friction))
+    return dataclasses.replace(family, friction=friction)
+
+
+class Rates:
+    """The fields (p_i, 0) of every degree of freedom, as the terms of a linear family."""
+
+    def __init__(self, dim: int):
+        self.num_parameters = dim
+
+    def term_gradients(self, w, args=None):
+        """(..., 2d, d)."""
+        p = split(w)[1]
+        rates = p[..., None] * np.eye(p.shape[-1])
+        return np.concatenate([rates, np.zeros_like(rates)], axis=-2)

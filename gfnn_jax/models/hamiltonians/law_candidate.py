@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
@@ -15,7 +16,6 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import truncation
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre
@@ -31,64 +31,47 @@ from gfnn_jax.models.hamiltonians.cost_of_flow import (
 from gfnn_jax.models.hamiltonians.covariance import covariance_root
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.formula import Term, formula
-from gfnn_jax.models.hamiltonians.friction_kinds import (
+from gfnn_jax.models.hamiltonians.friction import (
     followed,
     is_smooth,
     kinds_of_friction,
     without_turns,
 )
-from gfnn_jax.models.hamiltonians.law_messages import messages, unmet
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
-from gfnn_jax.models.hamiltonians.options import LawOptions
-from gfnn_jax.models.hamiltonians.steps_of_law import bound_of, cheapest, error_of_steps, resolving
+from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.symmetries import symmetries_of
 
+TURNS = "friction is not smooth in steps in which a body turns or stops"
+_NAMED = 5  # terms in a message
 _NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
 
 
 def learned_from(
+    problem: LawProblem,
     found: FittedLaw,
-    problem,
-    data: Dataset,
-    tolerance: Tolerance,
-    seconds: float,
-    options: LawOptions,
-    of_arcs: Callable[[], np.ndarray] | None,
+    started: float,
+    of_arcs: Callable[[], np.ndarray] | None = None,
 ) -> LearnedHamiltonian:
     """Make the candidate of a fitted law, with the cheapest steps that are fine enough.
 
-    of_arcs: makes the root, where the fit was not to these pairs but to arcs of them."""
-    family, fit, whole = found.family, found.fit, found.whole
-    rows = data.validation
-    z, args = data.y0[rows], data.given(rows)[1]
-    some = slice(FREQUENCY_STATES)
-    fastest = rates(family, fit.coefficients, data.y0[some], data.given(some)[1])
-    by_row = problem  # each at its own dt
-    if data.own_dt is not None:  # the map's own dt, from which others follow
-        problem = Problem(data.y0, data.y1, data.dt, data.scale, args=data.args, weight=data.weight)
-    steady = without_turns(data, family, fit.coefficients)
-    steps = cheapest(problem, family, fit, fastest, steady, tolerance, options)
-    sharp, own_steps, turns = family, steps, not is_smooth(family)
-    noise = max(bound_of(tolerance, data.scale), fit.rms)
-    family, fewest, widths = followed(family, fit.coefficients, data, noise)
-    steps = dataclasses.replace(steps, substeps=max(fewest, steps.substeps))
-    steps = resolving(family, fit.coefficients, steps, data, tolerance)
+    started: when its search did. of_arcs: makes the root, where the fit was not to these pairs but
+    to arcs of them."""
+    seconds = time.perf_counter() - started
+    data, family, fit, whole = problem.data, found.family, found.fit, found.whole
+    c, scale, some = fit.coefficients, data.scale, slice(FREQUENCY_STATES)
+    z, args = data.y0[data.validation], data.given(data.validation)[1]
+    fastest = rates(family, c, data.y0[some], data.given(some)[1])
+    own_steps = problem.cheapest(family, fit, fastest, without_turns(data, family, c).training)
+    noise, turns = max(problem.bound, fit.rms), not is_smooth(family)
+    family, fewest, widths = followed(family, c, data, noise)
+    steps = dataclasses.replace(own_steps, substeps=max(fewest, own_steps.substeps))
+    steps = problem.resolving(family, c, steps)
     contraction = contraction_of(fastest, data.dt, steps)
     by_newton = (contraction > CONTRACTING or bool(widths)) and not matrix_free(family)
-    scale = data.scale
-    off = truncation(family, fit.coefficients, z, data.dt, steps, args=args, scale=scale) / scale
-    flow = Flow(
-        family,
-        fit.coefficients,
-        data.dt,
-        data.scale,
-        steps.stages,
-        steps.substeps,
-        by_newton,
-    )
-    longest = flow.over(np.max(data.each_dt)).substeps
-    of_all = dataclasses.replace(steps, substeps=longest)
-    error = error_of_steps(family, fit.coefficients, of_all, data, tolerance)
+    off = truncation(family, c, z, data.dt, steps, args=args, scale=scale) / scale
+    flow = Flow(family, c, data.dt, scale, steps.stages, steps.substeps, by_newton)
+    of_all = dataclasses.replace(steps, substeps=flow.over(np.max(data.each_dt)).substeps)
+    error = problem.error_of_steps(family, c, of_all)
     candidate = Candidate(
         label=_label(family),
         family=family.name,
@@ -105,57 +88,43 @@ def learned_from(
         rank=family.num_parameters,
         learns="hamiltonian",
     )
-    terms = tuple(
-        Term(*entry)
-        for entry in zip(
-            family.term_names, fit.coefficients.tolist(), fit.standard_errors.tolist(), strict=True
-        )
-    )
-    of_h = without_forces(family).num_parameters
-    terms, friction = terms[:of_h], terms[of_h:]
-    omega_h = omega_h_of(family, fit.coefficients, data, fastest)
+    columns = family.term_names, c.tolist(), fit.standard_errors.tolist()
+    terms, of_h = tuple(map(Term, *columns)), without_forces(family)
+    terms, friction = terms[: of_h.num_parameters], terms[of_h.num_parameters :]
     symmetries = found.symmetries
     if not symmetries and isinstance(family, Terms) and data.args is None:
-        symmetries = symmetries_of(family, fit.coefficients, z, data.coordinates.angles)
-    left_out = len(np.setdiff1d(found.rows, fit.used))
-    resolved = np.abs(off).max(axis=1) <= bound_of(tolerance, data.scale)
+        symmetries = symmetries_of(family, c, z, data.coordinates.angles)
+    unresolved = np.abs(off).max(axis=1) > problem.bound
     of_rows = steps if data.own_dt is None else of_all
-    covariance = of_arcs or partial(covariance_root, found, by_row, data, of_rows)
+    covariance = of_arcs or partial(covariance_root, found, problem.flows, data, of_rows)
     if whole is not None:
         covariance = partial(np.asarray, whole.root)
-    return LearnedHamiltonian(
+    law = LearnedHamiltonian(
         with_error(candidate, error),
         flow,
         terms,
-        getattr(without_forces(family), "prefix", "") + formula(terms),
-        float(np.abs(off).max()),
-        omega_h,
-        contraction,
-        fit.condition,
-        found.null,
-        left_out,
-        tuple(
-            messages(
-                error, omega_h, data, tolerance, found, left_out, int((~resolved).sum()), turns
-            )
-        ),
+        getattr(of_h, "prefix", "") + formula(terms),
+        omega_h_of(family, c, data, fastest),
+        null_terms=found.null,
+        left_out=len(np.setdiff1d(found.rows, fit.used)),
         stalled=found.stalled,
         covariance=covariance,
         noise=None if whole is None else whole.noise,
         arcs=0 if whole is None else whole.arcs,
         misfit=whole is not None and whole.misfit,
         dropped=found.dropped,
-        unmet=unmet(error, omega_h, tolerance, found),
         friction=friction,
         constants=found.constants,
         symmetries=symmetries,
         proposals=found.proposals,
         rivals=found.rivals,
         widths=widths,
-        turns=turns and found.error.bound <= tolerance.bound < error.bound,
-        kinds=partial(
-            kinds_of_friction, by_row, sharp, fit.coefficients, own_steps, data, found.odds or {}
-        ),
+        turns=turns and problem.met_by(found) and error.bound > problem.tolerance.bound,
+        kinds=partial(kinds_of_friction, problem, found, own_steps),
+    )
+    messages = _messages(problem, found, law, turns, int(unresolved.sum()))
+    return dataclasses.replace(
+        law, messages=tuple(messages), unmet=_unmet(problem.tolerance, found, law)
     )
 
 
@@ -163,6 +132,70 @@ def _label(family) -> str:
     of_h = without_forces(family)
     what = "L" if isinstance(of_h, Legendre) else "H"
     return f"{what}, {of_h.num_parameters} terms" + (", friction" if of_h is not family else "")
+
+
+def _unmet(tolerance: Tolerance, found: FittedLaw, law: LearnedHamiltonian) -> str:
+    """State why the tolerance is missed; "" where it is met."""
+    if tolerance.met_by(law.candidate):
+        return ""
+    why = "If you know terms of H, give them: --terms (terms=)"
+    if law.fast:
+        why = (
+            f"The motion turns by ωh = {law.omega_h:.2g} radians in a step; beyond π pairs of one "
+            "dt do not determine H (aliasing): sample with a smaller dt, or with several"
+        )
+    elif not is_smooth(found.family):
+        why = TURNS.capitalize()
+    elif found.ended:
+        why = f"The search for modes ended: {found.ended}"
+    return (
+        "no H of the terms tried meets the tolerance: the best has a one-step error of "
+        f"{law.candidate.validation_relative:.2e} of the spread. {why}"
+    )
+
+
+def _messages(
+    problem: LawProblem, found: FittedLaw, law: LearnedHamiltonian, turns: bool, unresolved: int
+) -> Iterator[str]:
+    """Lines about a law: aliasing, misfit, terms that are not determined, pairs too fast for it.
+    unresolved: held-out pairs, at some of which a body ``turns``."""
+    omega_h, held_out = law.omega_h, len(problem.data.validation)
+    if problem.tolerance.met_by(law.candidate) and law.fast:
+        yield (
+            f"the motion turns by ωh = {omega_h:.2g} radians in a step (median over the states"
+            f"{', beyond π' if omega_h > np.pi else ''}). Pairs of one dt determine "
+            "frequencies only modulo 2π/dt (aliasing): of the H that fit, this is the "
+            + ("simplest. A smaller dt, or several, would decide" if omega_h > np.pi else "slowest")
+        )
+    if found.whole is not None:
+        yield from found.whole.messages
+        if found.whole.misfit:
+            yield (
+                "H misses whole sequences by more than their noise: it lacks terms that single "
+                "steps do not show; bands count what it misses"
+            )
+    if found.undetermined:
+        names = found.undetermined
+        some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
+        yield (
+            f"the pairs do not determine {len(names)} terms of H ({some}): they are left out, and "
+            "H holds only where the pairs are"
+        )
+    if law.left_out:
+        yield (
+            f"{law.left_out} of {len(found.rows)} pairs move too fast for the steps by which H was "
+            "fitted, as in close passages: they were left out"
+        )
+    if unresolved and turns:
+        yield (
+            f"{TURNS}: there the map errs, and not the law, in {unresolved} of "
+            f"{held_out} held-out pairs"
+        )
+    elif unresolved:
+        yield (
+            f"{unresolved} of {held_out} held-out pairs move too fast for the map's "
+            "steps, as in close passages: there the map errs, and not H"
+        )
 
 
 def assembled(

@@ -18,8 +18,7 @@ from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.models.hamiltonians.cost_of_flow import FAST
 from gfnn_jax.models.hamiltonians.fitted_law import Dropped
-from gfnn_jax.models.hamiltonians.formula import Rival, Term, as_code
-from gfnn_jax.models.hamiltonians.fractions import Proposal
+from gfnn_jax.models.hamiltonians.formula import Proposal, Rival, Term, as_code
 from gfnn_jax.models.lagrangians.text import WhichFriction, odds_text
 from gfnn_jax.phase_space import apply_j
 
@@ -29,15 +28,15 @@ class LearnedHamiltonian:
     """H as learned, in the inner coordinates.
 
     candidate: as the others of a fit, its error measured by steps in NumPy. flow: the piece.
-    terms, shown: what H is, as people read it; () and None of a network. truncation: largest error
-    of the flow's own steps on the held-out states, ÷ scale. omega_h: the fastest oscillation of the
-    linearised flow, times dt, in the median over the data; beyond π pairs of one dt may not tell H.
-    contraction: the fixed point's factor where it is largest. condition: of the terms' columns.
+    terms, shown: what H is, as people read it; () and None of a network. omega_h: the fastest
+    oscillation of the linearised flow, times dt, in the median over the data; beyond π pairs of one
+    dt may not tell H.
     null_terms: that the data do not tell from the others. left_out: pairs that the flow does not
     resolve. stalled: whether larger libraries were no more accurate. covariance: makes ``root``;
-    None of a network. unmet: that the tolerance is missed, and what that may be from; "" where it
-    is met. ended: what cut the search for it short, "" where nothing did. dropped: terms that went
-    in the end. friction: γ where that is uniform, else the terms of Rayleigh's R; of a system
+    None of a network. noise: (2d,) of the coordinates, arcs: into which sequences were cut, where
+    whole ones were fitted. unmet: that the tolerance is missed, and what that may be from; "" where
+    it is met. ended: what cut the search for it short, "" where nothing did. dropped: terms that
+    went in the end. friction: γ where that is uniform, else the terms of Rayleigh's R; of a system
     without, (). constants: numbers inside terms that noisy sequences told, each with its term and
     its standard error. symmetries: that H has to roundoff. proposals: simple fractions near its
     numbers, which noisy sequences allow. rivals: the next two laws that they allow. misfit: whether
@@ -48,15 +47,12 @@ class LearnedHamiltonian:
     flow: Flow
     terms: tuple[Term, ...]
     shown: str | None
-    truncation: float
     omega_h: float
-    contraction: float
-    condition: float
-    null_terms: tuple[str, ...]
-    left_out: int
-    messages: tuple[str, ...]
-    stalled: bool
-    covariance: Callable[[], np.ndarray] | None
+    messages: tuple[str, ...] = ()
+    null_terms: tuple[str, ...] = ()
+    left_out: int = 0
+    stalled: bool = False
+    covariance: Callable[[], np.ndarray] | None = None
     noise: np.ndarray | None = None
     arcs: int = 0
     unmet: str = ""

@@ -16,53 +16,45 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
-from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
-from gfnn_jax.models.hamiltonians.work import LawWork
+from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.phase_space import split
 
-_SHORTEST = 2  # Σ|m_i| of the modes of angles; degree of the powers of lengths in a mass
-_POTENTIAL = 4  # degree of the powers of lengths in a potential
-_SINE = -np.pi / 2
-_ROWS_PER_TERM = 2.0
-_NULL = 1e-8  # of the largest singular value of the linear start
+# Σ|m_i| of the modes of angles and the degree of the powers of lengths in a mass; the degree of
+# those in a potential (benchmarks/double_pendulum.py).
+_SHORTEST, _POTENTIAL = 2, 4
 
 
 def lagrangian_of(
-    problem: Problem,
-    work: LawWork,
-    data: Dataset,
-    tolerance: Tolerance,
-    forces: Callable[[Any], Any] | None = None,
+    problem: LawProblem, forces: Callable[[Any], Any] | None = None
 ) -> FittedLaw | None:
     """The law of all terms, with these forces, fitted to the training pairs; None where there are
     not several degrees of freedom with an angle among them, or the pairs are too few."""
+    data, rows = problem.data, problem.data.training
     coordinates, dim = data.coordinates, data.dim
     angles = tuple(a for a in coordinates.angles if a < dim)
     mechanical = coordinates.forward is CARTESIAN.forward and len(angles) == len(coordinates.angles)
     if not (angles and dim > 1 and mechanical) or coordinates.cyclic or data.varied:
         return None
-    family, rows = Legendre(library(dim, angles)), data.training
-    if _ROWS_PER_TERM * family.num_parameters > len(rows) * dim:
+    family = Legendre(library(dim, angles))
+    if problem.options.rows_per_lagrangian_term * family.num_parameters > len(rows) * dim:
         return None
-    start = _start(family, problem, rows)
+    start = _start(family, problem.flows, rows)
     if forces is not None:
         family = forces(family)
         start = np.concatenate([start, np.zeros(family.num_parameters - len(start))])
-    with work.library(family.label, family, len(rows)), np.errstate(all="ignore"):
-        fit = problem.fit(family, start, rows)
-    return FittedLaw(family, fit, rows, validation_error(family, fit, data, tolerance), ())
+    with problem.work.library(family.label, family, len(rows)), np.errstate(all="ignore"):
+        fit = problem.flows.fit(family, start, rows)
+    return FittedLaw(family, fit, rows, problem.error_of(family, fit))
 
 
 def library(dim: int, angles: tuple[int, ...]) -> Terms:
     """Masses of modes of the angles and powers of the lengths, potentials of both."""
     none, lengths = (0,) * dim, [i for i in range(dim) if i not in angles]
-    waves = [none]
+    waves, sine = [none], -np.pi / 2
     for mode in product(range(-_SHORTEST, _SHORTEST + 1), repeat=len(angles)):
         first = next((m for m in mode if m), 0)
         if first > 0 and sum(map(abs, mode)) <= _SHORTEST:
@@ -81,7 +73,7 @@ def library(dim: int, angles: tuple[int, ...]) -> Terms:
             (power, wave, phase)
             for power in powers
             for wave in waves
-            for phase in ((0.0, _SINE) if any(wave) else (0.0,))
+            for phase in ((0.0, sine) if any(wave) else (0.0,))
         ]
 
     pairs = combinations_with_replacement(range(dim), 2)
@@ -104,4 +96,4 @@ def _start(family: Legendre, problem: Problem, rows) -> np.ndarray:
     matrix = np.moveaxis(design, 1, 2).reshape(-1, family.num_parameters)
     target = np.concatenate([p / sizes[0], force / sizes[1]]).ravel()
     size = np.linalg.norm(matrix, axis=0)
-    return np.linalg.lstsq(matrix / size, target, rcond=_NULL)[0] / size
+    return np.linalg.lstsq(matrix / size, target, rcond=1e-8)[0] / size

@@ -1,301 +1,242 @@
 """Search of libraries of terms of H, by rising size: the smallest that meets the tolerance.
 
 Libraries are polynomials, terms that a user or a scene gives, those of a structure, with friction
-or without, or with parameters; each is fitted from the one before. Where there are angles, one
-library grows mode by mode.
+or without, or with parameters; each is fitted from the one before, from several starts. Where there
+are angles, one library grows mode by mode.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from gfnn_jax.coordinates import to_user
-from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.measured_error import FEW, OneStepError, Tolerance, measured_error
+from gfnn_jax.dataset.measured_error import FEW, OneStepError, measured_error
 from gfnn_jax.dataset.structures import Bodies
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
-from gfnn_jax.families.terms import Terms
+from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting.growth import grow
-from gfnn_jax.fitting.significance import ABOVE_NOISE
-from gfnn_jax.models.hamiltonians.centrifugal import centrifugal_terms
+from gfnn_jax.fitting.linear_starts import forward_start, log_start, midpoint_start
+from gfnn_jax.fitting.significance import ABOVE_NOISE, null_terms, significant
+from gfnn_jax.flows.collocation import of_lanes
+from gfnn_jax.flows.rates import rates
+from gfnn_jax.models.hamiltonians.cost_of_flow import FAST, FREQUENCY_STATES, operations_of
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
-from gfnn_jax.models.hamiltonians.friction import (
-    Forces,
-    beside_friction,
-    libraries_with,
-)
+from gfnn_jax.models.hamiltonians.friction import Forces, beside_friction, libraries_with
 from gfnn_jax.models.hamiltonians.libraries import (
-    angles_and_others,
+    centrifugal_terms,
     libraries_of,
     own_terms,
     promising,
 )
-from gfnn_jax.models.hamiltonians.library_fit import fitted_library
-from gfnn_jax.models.hamiltonians.options import LawOptions
-from gfnn_jax.models.hamiltonians.steps_of_law import bound_of, validation_error
-from gfnn_jax.models.hamiltonians.work import LawWork
-from gfnn_jax.models.hamiltonians.worth import too_dear
-from gfnn_jax.models.parameters import functions_of_parameters, state_libraries, walked
-
-_HOPELESS = 10.0  # times the tolerance, of an error that is known before a library is fitted
-# Libraries in a row that do not help end the search; with given terms; of a structure, whose
-# libraries differ in kind.
-_POOR, _POOR_GIVEN, _POOR_STRUCTURED = 2, 3, 5
-_SMALL = 35  # terms of the libraries that are tried before laws of physics: 0.3 s of two bodies
-_EXACT = 1e-13  # of the spread: a polynomial that errs by no more is no approximation
-_AFFINE_ROWS = 50_000  # training pairs that the affine map is fitted to
-_FIRST_ROUND = 5e8  # operations that the first round of growth is expected to take
+from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.parameters import states_and_functions, walked
 
 
-def of_libraries(
-    problem,
-    work: LawWork,
-    basis: Modes | None,
-    data: Dataset,
-    tolerance: Tolerance,
-    scene,
-    terms,
-    options: LawOptions,
-    on_progress,
-    early: Sequence[FittedLaw],
-) -> tuple[FittedLaw, LawOptions]:
-    """The best library of terms of H, without friction or with it, and the options for fewer.
+def of_libraries(problem: LawProblem, basis: Modes | None, early: Sequence[FittedLaw]) -> FittedLaw:
+    """The best library of terms of H, without friction or with it.
 
-    early: the first libraries without friction, where these are fitted already.
+    basis: of the library that grows, where one does. early: the first libraries without friction,
+    where these are fitted already.
     """
 
-    def search(forces: Forces | None = None, data: Dataset = data) -> tuple[FittedLaw, LawOptions]:
-        known = early if forces is None else ()
-        return _searched(
-            problem, work, data, tolerance, scene, terms, options, on_progress, forces, known
-        )
+    def search(forces: Forces | None = None, data=problem.data) -> FittedLaw:
+        return _searched(problem.on(data), forces, early if forces is None else ())
 
-    if data.args is not None:
-        found = _walked(problem, work, data, tolerance, scene, terms, options, on_progress)
+    if problem.data.args is not None:
+        found = _walked(problem)
     elif basis is not None:
-        found = _grown(problem, work, basis, data, tolerance, options, on_progress), options
+        found = _grown(problem, basis)
     else:
         found = search()
-        if not terms and data.structure is None:
-            found = _beside_centrifugal(problem, work, found, data, tolerance, options, on_progress)
-    return beside_friction(problem, work, found, data, tolerance, search)
+        if not problem.terms and problem.data.structure is None:
+            found = _beside_centrifugal(problem, found)
+    return beside_friction(problem, found, search)
 
 
-def small_polynomials(
-    problem, work: LawWork, data: Dataset, tolerance: Tolerance, options: LawOptions, on_progress
-) -> list[FittedLaw]:
+def small_polynomials(problem: LawProblem) -> list[FittedLaw]:
     """The smallest polynomials that a search for H begins with, up to the first that is exact.
 
     They are soon fitted, at steps too long for the matching of atoms too, and the search goes on
     from them.
     """
     fitted: list[FittedLaw] = []
-    libraries, _ = _libraries(data, tolerance, None, (), options)
+    libraries, _ = _libraries(problem)
     for family in libraries:
-        if family.num_parameters > _SMALL:
+        if family.num_parameters > problem.options.small:
             break
         last = fitted[-1] if fitted else None
-        if last is not None and too_dear(problem, family, last, data, tolerance, work.dearest):
+        if last is not None and too_dear(problem, family, last):
             break
-        on_progress(f"H: {family.num_parameters} terms")
+        problem.on_progress(f"H: {family.num_parameters} terms")
         try:
-            fitted.append(
-                fitted_library(problem, work, family, data, tolerance, last, options, on_progress)
-            )
+            fitted.append(fitted_library(problem, family, last))
         except OutOfTime:  # whatever follows finds no time either
             break
-        if is_exact(fitted[-1], tolerance):
+        if is_exact(problem, fitted[-1]):
             break
     return fitted
 
 
-def is_exact(found: FittedLaw, tolerance: Tolerance) -> bool:
-    return found.error.bound <= tolerance.bound and found.error.relative <= _EXACT
+def is_exact(problem: LawProblem, law: FittedLaw) -> bool:
+    """Return whether the law is no approximation."""
+    return problem.met_by(law) and law.error.relative <= problem.options.exact
 
 
 def _searched(
-    problem,
-    work: LawWork,
-    data,
-    tolerance: Tolerance,
-    scene,
-    terms,
-    options: LawOptions,
-    on_progress,
-    forces: Forces | None = None,
-    early: Sequence[FittedLaw] = (),
-) -> tuple[FittedLaw, LawOptions]:
-    """The smallest library that meets the tolerance, else the best; and the options, which try no
-    fewer terms where the tolerance is out of reach. forces: friction, that libraries have too.
+    problem: LawProblem, forces: Forces | None = None, early: Sequence[FittedLaw] = ()
+) -> FittedLaw:
+    """The smallest library that meets the tolerance, else the best; no fewer of its terms are tried
+    where the tolerance is out of reach. forces: friction, that libraries have too.
     early: the first libraries, where these are fitted already."""
-    bound = tolerance.bound
-    best: FittedLaw | None = None
-    structured = data.structure is not None
-    most_poor = _POOR_STRUCTURED if structured else _POOR_GIVEN if terms else _POOR
+    options, structured = problem.options, problem.data.structure is not None
+    most_poor = options.poor_given if problem.terms else options.poor
+    most_poor = options.poor_structured if structured else most_poor
     tried: list[FittedLaw] = []
-    poor = 0
-    libraries, errors = _libraries(data, tolerance, scene, terms, options, forces)
+    best: FittedLaw | None = None
+    poor, no_law = 0, False
+    libraries, errors = _libraries(problem, forces)
     try:
         for i, family in enumerate(libraries):
-            if tried and too_dear(problem, family, tried[-1], data, tolerance, work.dearest):
-                on_progress(
-                    f"H: {family.num_parameters} terms skipped, costlier per step than the map"
-                )
+            name = f"H: {family.num_parameters} terms"
+            last = tried[-1] if tried else None
+            if last is not None and too_dear(problem, family, last):
+                problem.on_progress(f"{name} skipped, costlier per step than the map")
                 continue
             if i < len(early):
                 found = early[i]
             else:
-                on_progress(f"H: {family.num_parameters} terms")
-                last = tried[-1] if tried else None
-                found = fitted_library(
-                    problem, work, family, data, tolerance, last, options, on_progress
-                )
+                problem.on_progress(name)
+                found = fitted_library(problem, family, last)
             better = best is None or found.error.relative < options.gained * best.error.relative
             poor = 0 if better else poor + 1
-            if best is None or found.error.relative < best.error.relative:
-                best = found
+            best = _lower(best, found)
             tried.append(found)
             errors.append(found.error.bound)
-            if best.error.bound <= bound or poor == most_poor:
+            if problem.met_by(best) or poor == most_poor:
                 break
             left = len(libraries) - 1 - i
-            if not structured and options.only_within and _out_of_reach(errors, left, bound):
-                options = dataclasses.replace(options, thresholds=())  # no law: nothing to read
+            no_law = not structured and options.only_within
+            no_law = no_law and _out_of_reach(errors, left, problem.tolerance.bound)
+            if no_law:
                 break
     except OutOfTime:
         if best is None:
             raise
+    best = _any(problem, best)._replace(stalled=poor == most_poor)
+    if no_law:  # nothing to read
+        best = best._replace(thresholds=())
+    if problem.met_by(best):
+        return best
+    best = simplest_where_few_decide(problem, tried, best)
+    found = _simplest_within_noise(problem, tried, best)
+    return found._replace(stalled=True) if found.noisy else found
+
+
+def _lower(best: FittedLaw | None, found: FittedLaw) -> FittedLaw:
+    """The law of the lower error."""
+    return found if best is None or found.error.relative < best.error.relative else best
+
+
+def _any(problem: LawProblem, best: FittedLaw | None) -> FittedLaw:
+    """The best law. Raises FitError where there is none."""
     if best is None:
-        raise FitError(f"expected more pairs: {len(data.y0)} are too few for any library of terms")
-    best = best._replace(stalled=poor == most_poor)
-    if best.error.bound <= bound:
-        return best, options
-    best = simplest_where_few_decide(tried, best, tolerance, options)
-    found, options = _simplest_within_noise(tried, best, options)
-    return (found._replace(stalled=True) if found.noisy else found), options
+        count = len(problem.data.y0)
+        raise FitError(f"expected more pairs: {count} are too few for any library of terms")
+    return best
 
 
 def simplest_where_few_decide(
-    tried: Sequence[FittedLaw], best: FittedLaw, tolerance: Tolerance, options: LawOptions
+    problem: LawProblem, tried: Sequence[FittedLaw], best: FittedLaw
 ) -> FittedLaw:
     """The first and simplest of the libraries whose error lies below the 95 % bound of the best's,
     where few held-out states make that, as in a close passage: chance decides there which is
     lowest. At most states the best must not have helped either. Elsewhere the best."""
 
     def measured(found: FittedLaw) -> float:
-        return found.error.relative if tolerance.relative else found.error.rms
+        return found.error.relative if problem.tolerance.relative else found.error.rms
 
     def as_good(found: FittedLaw) -> bool:
-        helped = best.error.typical < options.gained * found.error.typical
+        helped = best.error.typical < problem.options.gained * found.error.typical
         return measured(found) <= best.error.bound and not helped
 
     if not FEW * best.error.typical < measured(best):
         return best
-    return next(filter(as_good, tried), best)._replace(stalled=best.stalled)
+    found = next(filter(as_good, tried), best)
+    return found._replace(stalled=best.stalled, thresholds=best.thresholds)
 
 
 def _simplest_within_noise(
-    tried: Sequence[FittedLaw], best: FittedLaw, options: LawOptions
-) -> tuple[FittedLaw, LawOptions]:
-    """The first and simplest of the libraries that are as good as the best, and the options that
-    drop what is noise, where there are several: they have met the pairs' noise, and the fewest
-    terms leave no more of it. Else the best."""
-    near = [f for f in tried if f.error.relative <= options.flat * best.error.relative]
+    problem: LawProblem, tried: Sequence[FittedLaw], best: FittedLaw
+) -> FittedLaw:
+    """The first and simplest of the libraries that are as good as the best, of whose terms those
+    are to go that are noise, where there are several: they have met the pairs' noise, and the
+    fewest terms leave no more of it. Else the best."""
+    near = [f for f in tried if f.error.relative <= problem.options.flat * best.error.relative]
     if len(near) < 2:
-        return best, options
-    noisy = near[0]._replace(noisy=True, larger=near[-1], stalled=best.stalled)
-    return noisy, dataclasses.replace(options, thresholds=(ABOVE_NOISE,))
+        return best
+    return near[0]._replace(
+        noisy=True, larger=near[-1], stalled=best.stalled, thresholds=(ABOVE_NOISE,)
+    )
 
 
-def _libraries(
-    data: Dataset,
-    tolerance: Tolerance,
-    scene,
-    terms,
-    options: LawOptions,
-    forces: Forces | None = None,
-) -> tuple[list[Any], list[float]]:
+def _libraries(problem: LawProblem, forces: Forces | None = None) -> tuple[list[Any], list[float]]:
     """Libraries by rising size, and the errors of those before them that are known to be hopeless
     without a fit."""
-    known = libraries_of if forces is None else partial(libraries_with, forces)
-    libraries = list(known(data, scene, terms, options))
+    data = problem.data
+    found = libraries_of(problem) if forces is None else libraries_with(forces, problem)
+    libraries = list(found)
     if isinstance(data.structure, Bodies):
         return promising(libraries, data), []
     if len(libraries) > 1 and libraries[0].quadratic and not data.varied:
-        affine = affine_error(data, tolerance).bound
-        if affine > _HOPELESS * tolerance.bound:
+        affine = affine_error(problem).bound
+        if affine > problem.options.hopeless * problem.tolerance.bound:
             return libraries[1:], [affine]
     return libraries, []
 
 
-def _beside_centrifugal(
-    problem,
-    work: LawWork,
-    before: tuple[FittedLaw, LawOptions],
-    data: Dataset,
-    tolerance: Tolerance,
-    options: LawOptions,
-    on_progress,
-) -> tuple[FittedLaw, LawOptions]:
-    """The best of libraries with centrifugal terms and their options, where ``before`` misses the
-    tolerance, the pairs ask for such terms and these libraries are better; else ``before``."""
-    best, _ = before
-    if best.error.bound <= tolerance.bound:
-        return before
-    own = centrifugal_terms(data, data.training, best.family)
+def _beside_centrifugal(problem: LawProblem, best: FittedLaw) -> FittedLaw:
+    """The best of libraries with centrifugal terms, where ``best`` misses the tolerance, the pairs
+    ask for such terms and these libraries are better; else ``best``."""
+    if problem.met_by(best):
+        return best
+    own = centrifugal_terms(problem.data, problem.data.training, best.family)
     if not own:
-        return before
+        return best
+    options = problem.options
     options = dataclasses.replace(options, given_degrees=options.given_degrees[1:])
     try:
-        found = _searched(problem, work, data, tolerance, None, own, options, on_progress)
+        with_them = dataclasses.replace(problem, scene=None, terms=own, options=options)
+        found = _searched(with_them)
     except OutOfTime:
-        work.budget.leave_out("libraries of H with centrifugal terms", work.ended)
-        return before
+        what = "libraries of H with centrifugal terms"
+        problem.budget.leave_out(what, problem.work.ended)
+        return best
     except FitError:
-        return before
-    return found if found[0].error.relative < best.error.relative else before
+        return best
+    return _lower(best, found)
 
 
-def _walked(
-    problem,
-    work: LawWork,
-    data: Dataset,
-    tolerance: Tolerance,
-    scene,
-    terms,
-    options: LawOptions,
-    on_progress,
-) -> tuple[FittedLaw, LawOptions]:
+def _walked(problem: LawProblem) -> FittedLaw:
     """The best of the libraries of states and parameters, which grow together; as `_searched`."""
-    own = own_terms(data, terms) if terms else None
-    angles, plain = angles_and_others(data)
-    states = state_libraries(
-        data.dim,
-        data.parameters,
-        angles=angles,
-        cyclic=data.coordinates.cyclic,
-        plain=plain,
+    scene, data = problem.scene, problem.data
+    states, functions = states_and_functions(
+        data,
+        data.training,
         features=scene.features if scene is not None else None,
         reversor=scene.reversor if scene is not None else None,
-        own=own,
+        own=own_terms(problem),
     )
-    _, args = data.given(data.training)
-    functions = functions_of_parameters(
-        data.dim, data.parameters, args, own is not None, data.period
-    )
-    most = len(data.training) * 2 * data.dim / options.rows_per_term
     best: FittedLaw | None = None
     tried: list[FittedLaw] = []
 
-    def attempt(family: Terms) -> FittedLaw:
-        on_progress(f"H: {family.num_parameters} terms")
-        return fitted_library(problem, work, family, data, tolerance, best, options, on_progress)
+    def attempt(family) -> FittedLaw:
+        problem.on_progress(f"H: {family.num_parameters} terms")
+        return fitted_library(problem, family, best)
 
     try:
         for found in walked(
@@ -303,39 +244,29 @@ def _walked(
             functions,
             attempt,
             lambda found: found.error.bound,
-            bound=tolerance.bound,
-            most=min(most, options.most_terms),
+            bound=problem.tolerance.bound,
+            most=min(problem.most_terms, problem.options.most_terms),
         ):
             tried.append(found)
-            if best is None or found.error.relative < best.error.relative:
-                best = found
+            best = _lower(best, found)
         stalled = True
     except OutOfTime:
         if best is None:
             raise
         stalled = False
-    if best is None:
-        raise FitError(f"expected more pairs: {len(data.y0)} are too few for any library of terms")
-    if best.error.bound <= tolerance.bound:
-        return best, options
-    return _simplest_within_noise(tried, best._replace(stalled=stalled), options)
+    best = _any(problem, best)
+    if problem.met_by(best):
+        return best
+    return _simplest_within_noise(problem, tried, best._replace(stalled=stalled))
 
 
-def _grown(
-    problem,
-    work: LawWork,
-    basis: Modes,
-    data: Dataset,
-    tolerance: Tolerance,
-    options: LawOptions,
-    on_progress,
-) -> FittedLaw:
+def _grown(problem: LawProblem, basis: Modes) -> FittedLaw:
     """The library that has grown to the tolerance, or as far as the cap and the pairs allow."""
-    goal = options.goal * bound_of(tolerance, problem.scale)
-    most = int(len(data.training) * 2 * data.dim / options.rows_per_term)
+    data, options, work, flows = problem.data, problem.options, problem.work, problem.flows
+    most = min(int(problem.most_terms), options.most_modes)
     work.capped(options.growth_part * options.mode_operations)
-    grown, ended, expected = None, "", _FIRST_ROUND
-    rounds = grow(problem, basis, data.training, goal, min(most, options.most_modes))
+    grown, ended, expected = None, "", options.first_round
+    rounds = grow(flows, basis, data.training, options.goal * problem.bound, most)
     try:
         while True:
             before = work.made()
@@ -345,7 +276,8 @@ def _grown(
                 break
             grown, ended, expected = further, further.ended, work.made() - before
             why = f": {ended}" if ended else ""
-            on_progress(f"H grows: {len(grown.coefficients)} modes, error {grown.rms:.1e}{why}")
+            count = len(grown.coefficients)
+            problem.on_progress(f"H grows: {count} modes, error {grown.rms:.1e}{why}")
     except OutOfTime:
         if grown is None:
             raise
@@ -358,24 +290,26 @@ def _grown(
     work.capped((1 - options.growth_part) * options.mode_operations)
     count = int(np.ceil(options.rows_compared * len(grown.coefficients) / (2 * data.dim)))
     rows = data.training[: max(count, 500)]
-    fit = problem.fit(grown.family, grown.coefficients, rows, rounds=False, on_progress=on_progress)
-    error = validation_error(grown.family, fit, data, tolerance)
-    return FittedLaw(grown.family, fit, rows, error, (), ended=ended)
+    law = problem.fitted(
+        grown.family, grown.coefficients, rows, rounds=False, on_progress=problem.on_progress
+    )
+    return law._replace(ended=ended)
 
 
-def affine_error(data: Dataset, tolerance: Tolerance) -> OneStepError:
+def affine_error(problem: LawProblem) -> OneStepError:
     """The held-out error of the affine map that is closest to the training pairs: that of a
     quadratic H, whose flow is affine, is hardly smaller."""
+    data = problem.data
 
     def design(rows):
         z = data.y0[rows] / data.scale
         return np.column_stack([np.ones(len(z)), z])
 
     moved = data.y1 - data.y0
-    rows = data.training[:_AFFINE_ROWS]
+    rows = data.training[: problem.options.affine_rows]
     known = np.linalg.lstsq(design(rows), moved[rows], rcond=None)[0]
     found = data.y0[data.validation] + design(data.validation) @ known
-    return measured_error(data, tolerance, to_user(data.coordinates, found))
+    return measured_error(data, problem.tolerance, to_user(data.coordinates, found))
 
 
 def _out_of_reach(errors: list[float], left: int, bound: float) -> bool:
@@ -385,3 +319,109 @@ def _out_of_reach(errors: list[float], left: int, bound: float) -> bool:
         return False
     gain = min(errors[-1] / errors[-2], errors[-2] / errors[-3], 1.0)
     return errors[-1] * gain**left > bound
+
+
+def too_dear(problem: LawProblem, family, last: FittedLaw) -> bool:
+    """Return whether a step of no law of this library costs up to the ``dearest`` operations.
+
+    One Gauss–Newton problem at the last law tells which terms the tolerance asks for: those whose
+    absence would double the mean square that it allows. What the linear problem leaves unknown is
+    of the order of the last law's error squared, and is allowed too.
+    """
+    if not np.isfinite(problem.dearest):
+        return False
+    data, fit, flows = problem.data, last.fit, problem.flows
+    fastest = rates(last.family, fit.coefficients, data.y0[:FREQUENCY_STATES])
+
+    def dear(family) -> bool:
+        cost = operations_of(family, 2 * family.dim, fastest, flows.dt, fit.steps)
+        return cost > problem.dearest
+
+    if not dear(family):
+        return False
+    start = last.start_of(family)
+    rows = data.training[: max(len(last.rows), 2 * family.num_parameters)]
+    found = flows.linearised(family, start, fit.steps, rows)
+    if not np.isfinite(found.norm) or found.rows <= family.num_parameters:
+        return False
+    allowed = max(problem.bound, last.error.relative**2)
+    kept, _ = significant(found, start, np.sqrt(found.rows), allowed)
+    return not kept.size or dear(family.take(tuple(kept.tolist())))
+
+
+def fitted_library(problem: LawProblem, family, last: FittedLaw | None) -> FittedLaw:
+    """The library fitted to as many training pairs as tell its terms, from the best start. last:
+    the library before."""
+    data, options, names = problem.data, problem.options, family.term_names
+    z = data.y0[data.training]
+    least, fewest = 200, 100
+    if data.structure is not None:
+        least = fewest = data.structure.fewest(z.shape[1])
+    enough = z[: max(least, -(-4 * family.num_parameters // z.shape[1]))]
+    args = data.given(data.training[: len(enough)])[1]
+    kept, null = null_terms(family, enough, args=args)
+    elsewhere = null_terms(family, _scattered(enough), args=args)[0] if null else []
+    undetermined = tuple(names[j] for j in null if j in elsewhere)
+    family = family.take(kept)
+    count = int(np.ceil(options.rows_compared * family.num_parameters / z.shape[1]))
+    rows = data.training[: max(count, fewest)]
+    best: FittedLaw | None = None
+    # Nothing but H is learned of such pairs.
+    first = last is None and (data.varied or data.structure is not None)
+    name = f"H of {family.num_parameters} terms"
+    with problem.work.library(name, family, len(rows), first=first):
+        for start in _starts(problem, family, rows, last):
+            found = problem.fitted(family, start, rows, on_progress=problem.on_progress)
+            best = _lower(best, found)
+            if found.error.relative <= options.on_branch:
+                break
+    assert best is not None
+    return best._replace(null=tuple(names[j] for j in null), undetermined=undetermined)
+
+
+def _scattered(z) -> np.ndarray:
+    """States of all directions around the states z."""
+    size = z.std(axis=0)
+    size = np.where(size > 0, size, np.maximum(np.abs(z).max(axis=0), size.max()))
+    return z + size * np.random.default_rng(0).normal(size=z.shape)
+
+
+def _starts(problem: LawProblem, family, rows, last: FittedLaw | None) -> Iterator[np.ndarray]:
+    """The start whose flow is nearest to the pairs; and the one that turns forwards what seems to
+    turn backwards, before it where that is by more than a quarter."""
+    flows, many = problem.flows, problem.data.training[: problem.options.turning]
+    dt, args = flows.given(many)
+    turned = None
+    known = len(many) > flows.z0.shape[1] and not matrix_free(family)
+    if args is None and np.ndim(dt) == 0 and known:
+        turned = forward_start(family, flows.z0[many], flows.z1[many], dt, flows.scale)
+    if turned is not None and turned[0] > FAST:
+        yield turned[1]
+    yield _start(problem, family, rows, last)
+    if turned is not None and turned[0] <= FAST:
+        yield turned[1]
+
+
+def _start(problem: LawProblem, family, rows, last: FittedLaw | None) -> np.ndarray:
+    """The start whose flow is nearest to the pairs: midpoint, of all of them or of those that move
+    least, logarithm, or the last library's."""
+    flows = problem.flows
+    z0, z1 = flows.z0[rows], flows.z1[rows]
+    dt, args = flows.given(rows)
+
+    def midpoint(part):
+        own = of_lanes(dt, part), flows.scale, of_lanes(args, part)
+        return midpoint_start(family, z0[part], z1[part], *own)
+
+    moved = np.linalg.norm((z1 - z0) / flows.scale, axis=1)
+    quieter = moved <= np.median(moved)  # the midpoint says little of a step that goes far
+    starts = [midpoint(slice(None)), midpoint(quieter)]
+    # Pairs of one affine regression, more of them than it has unknowns.
+    alike = args is None and np.ndim(dt) == 0 and len(z0) > z0.shape[1]
+    logarithm = log_start(family, z0, z1, dt, flows.scale) if alike else None
+    if logarithm is not None:
+        starts.append(logarithm)
+    if last is not None:
+        starts.append(last.start_of(family))
+    some = rows[:100]
+    return min(starts, key=lambda c: flows.distance(family, c, some))

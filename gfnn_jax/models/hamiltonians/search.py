@@ -12,173 +12,121 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from gfnn_jax.budget import UNBOUNDED, Budget
+from gfnn_jax.budget import UNBOUNDED
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.split import outermost
 from gfnn_jax.errors import FitError, OutOfTime
+from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.models.hamiltonians.arcs import arcs_of
-from gfnn_jax.models.hamiltonians.centrifugal import centrifugal_terms
 from gfnn_jax.models.hamiltonians.covariance import covariance_root
-from gfnn_jax.models.hamiltonians.fewer_terms import (
-    ROUNDOFF,
-    of_whole_sequences,
-    refitted,
-    sparse,
-    without_noise,
-)
+from gfnn_jax.models.hamiltonians.dictionary import law_of_physics
+from gfnn_jax.models.hamiltonians.fewer_terms import sparse, without_noise
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
-from gfnn_jax.models.hamiltonians.formula import OnPartial
-from gfnn_jax.models.hamiltonians.friction import mechanical
-from gfnn_jax.models.hamiltonians.friction_kinds import is_smooth, without_turns
+from gfnn_jax.models.hamiltonians.friction import is_smooth, mechanical, without_turns
 from gfnn_jax.models.hamiltonians.law_candidate import learned_from
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.libraries import (
+    centrifugal_terms,
     check_finite,
     modes_of,
     own_terms,
 )
 from gfnn_jax.models.hamiltonians.library_search import is_exact, of_libraries, small_polynomials
-from gfnn_jax.models.hamiltonians.noisy_textbook import law_of_sequences
-from gfnn_jax.models.hamiltonians.options import OPTIONS, LawOptions
-from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
+from gfnn_jax.models.hamiltonians.noisy_dictionary import law_of_sequences
+from gfnn_jax.models.hamiltonians.options import OPTIONS
+from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.hamiltonians.sequences import fitted_to_sequences
 from gfnn_jax.models.hamiltonians.symmetries import imposed
-from gfnn_jax.models.hamiltonians.textbook import law_of_physics
-from gfnn_jax.models.hamiltonians.work import LawWork
 
 
-def learn_hamiltonian(
-    data: Dataset,
-    tolerance: Tolerance,
-    scene: Any = None,
-    *,
-    terms: Sequence[str | Callable] = (),
-    budget: Budget | None = None,
-    on_progress: Callable[[str], Any] = lambda message: None,
-    options: LawOptions = OPTIONS,
-    dearest: float = np.inf,
-    partly: OnPartial = lambda law: None,
-) -> LearnedHamiltonian:
+def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
     """The Hamiltonian of these pairs: the smallest library that meets the tolerance, else the best.
-
-    data: without a base map. scene: lends its features and reversor. terms: a user's own.
-    dearest: as of `LawWork`. partly: called with laws of physics that explain a part, where none
-    explains all.
 
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
-    basis = modes_of(data, scene, terms)
-    if basis is not None and not terms:
+    started, data, options = time.perf_counter(), problem.data, problem.options
+    basis = modes_of(problem, problem.terms)
+    if basis is not None and not problem.terms:
         own = centrifugal_terms(data, data.training, basis.terms(basis.box()))
-        basis = modes_of(data, scene, own)
-    budget = budget or Budget()
+        basis = modes_of(problem, own)
     if data.before or data.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")
-    started = time.perf_counter()
-    if terms and data.structure is None:
-        check_finite(own_terms(data, terms), data, data.training)
+    own = own_terms(problem)
+    if own is not None and data.structure is None:
+        check_finite(own, data, data.training)
     most = options.max_operations if basis is None else options.mode_operations
-    if not terms and scene is None:
-        problem = Problem(
-            data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
-        )
-        own = LawWork(problem, budget, most, dearest)
-        whole = law_of_sequences(problem, own, data, tolerance, on_progress, partly)
+    if not problem.terms and problem.scene is None:
+        of_sequences = problem.beginning(data, most)
+        whole = law_of_sequences(of_sequences)
         if whole is not None:
-            seconds = time.perf_counter() - started
-            problem.allowance = UNBOUNDED
-            found = learned_from(whole, problem, data, tolerance, seconds, options, None)
+            of_sequences.flows.allowance = UNBOUNDED
+            found = learned_from(of_sequences, whole, started)
             for note in found.notes:
-                on_progress(note)
+                problem.on_progress(note)
             return found
-    of_steps, arcs = data, arcs_of(data)
+    everywhere, arcs = data, arcs_of(data)
     if arcs is not None:
-        on_progress(f"H: fitting arcs of {arcs.length} steps, for single steps are too noisy")
-        data = arcs.data
-    problem = Problem(
-        data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
-    )
-    work = LawWork(problem, budget, most, dearest)
-    everywhere, free = data, (*data.coordinates.cyclic, *data.whole)
+        everywhere, length = arcs.data, arcs.length
+        problem.on_progress(f"H: fitting arcs of {length} steps, for single steps are too noisy")
+    problem = problem.beginning(everywhere, most)
+    free = (*everywhere.coordinates.cyclic, *everywhere.whole)
     if data.structure is None:
-        outer = outermost(data.y0[data.training], free)
+        outer = outermost(everywhere.y0[everywhere.training], free)
     else:  # a state of many sites is in the middle and far out at once
-        outer = np.zeros(len(data.training), bool)
-    data = everywhere.trained_on(everywhere.training[~outer])
-    best, options = _best_law(
-        problem, work, basis, data, tolerance, scene, terms, options, on_progress, partly
-    )
-    _check_resolved(problem, best, data)
-    far = everywhere.training[outer]
-    best, outside = _simplified(
-        problem, work, best, data, everywhere, far, tolerance, options, on_progress
-    )
-    problem.allowance, of_arcs = UNBOUNDED, None
+        outer = np.zeros(len(everywhere.training), bool)
+    inner = problem.on(everywhere.trained_on(everywhere.training[~outer]))
+    best = _best_law(inner, basis)
+    _check_resolved(inner, best)
+    best, outside = _simplified(inner, everywhere, everywhere.training[outer], best)
+    ended, of_arcs = problem.work.ended, None
     if arcs is not None:
-        of_arcs = partial(covariance_root, best, problem, everywhere, best.fit.steps)
-        everywhere = of_steps
-        problem = Problem(
-            of_steps.y0, of_steps.y1, of_steps.dt, of_steps.scale, weight=of_steps.weight
-        )
-        best = best._replace(error=validation_error(best.family, best.fit, of_steps, tolerance))
+        problem.flows.allowance = UNBOUNDED
+        of_arcs = partial(covariance_root, best, problem.flows, everywhere, best.fit.steps)
+        problem = problem.beginning(data)
+        best = best._replace(error=problem.error_of(best.family, best.fit))
+    problem.flows.allowance = UNBOUNDED
     if best.noisy or arcs is not None:
-        best = _along_sequences(problem, work, best, everywhere, tolerance, on_progress)
-    best = _with_symmetries(best, everywhere)
-    seconds = time.perf_counter() - started
-    learned = learned_from(best, problem, everywhere, tolerance, seconds, options, of_arcs)
+        best = _along_sequences(problem, best)
+    best = _with_symmetries(best, data)
+    learned = learned_from(problem, best, started, of_arcs)
     candidate = dataclasses.replace(learned.candidate, outside=outside)
-    return dataclasses.replace(learned, candidate=candidate, ended=work.ended)
+    return dataclasses.replace(learned, candidate=candidate, ended=ended or problem.work.ended)
 
 
-def _best_law(
-    problem,
-    work: LawWork,
-    basis,
-    data: Dataset,
-    tolerance: Tolerance,
-    scene,
-    terms,
-    options: LawOptions,
-    on_progress,
-    partly: OnPartial,
-) -> tuple[FittedLaw, LawOptions]:
+def _best_law(problem: LawProblem, basis: Modes | None) -> FittedLaw:
     """The law of the smallest polynomials, of physics, of a mechanical system or of the libraries,
-    the first within the tolerance, else the best; and the options for fewer terms."""
+    the first within the tolerance, else the best."""
     with_masses, best, early = None, None, list[FittedLaw]()
-    if not terms and scene is None:
-        if basis is None and data.args is None and data.structure is None:
-            early = small_polynomials(problem, work, data, tolerance, options, on_progress)
-            best = early[-1] if early and is_exact(early[-1], tolerance) else None
+    if not problem.terms and problem.scene is None:
+        if basis is None and problem.simple:
+            early = small_polynomials(problem)
+            best = early[-1] if early and is_exact(problem, early[-1]) else None
         if best is None:
-            best = law_of_physics(problem, work, data, tolerance, on_progress, partly)
+            best = law_of_physics(problem)
         if best is None:
-            best = with_masses = mechanical(problem, work, data, tolerance)
-    if best is None or not best.error.bound <= tolerance.bound:
+            best = with_masses = mechanical(problem)
+    if best is None or not problem.met_by(best):
         try:
-            best, options = of_libraries(
-                problem, work, basis, data, tolerance, scene, terms, options, on_progress, early
-            )
+            best = of_libraries(problem, basis, early)
         except (OutOfTime, FitError):
             if best is None:
                 raise
         if with_masses is not None and with_masses.error.relative <= best.error.relative:
-            best = with_masses._replace(noisy=True)
-    return best, options
+            best = with_masses._replace(noisy=True, thresholds=best.thresholds)
+    return best
 
 
-def _check_resolved(problem, best: FittedLaw, data: Dataset) -> None:
+def _check_resolved(problem: LawProblem, best: FittedLaw) -> None:
     """Raise FitError where one dt of this law takes more substeps than a flow may have."""
-    everyone = np.arange(len(data)) if is_smooth(best.family) else best.rows
-    if problem.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
+    everyone = np.arange(len(problem.data)) if is_smooth(best.family) else best.rows
+    found = problem.flows.substeps_for(best.family, best.fit.coefficients, everyone)
+    if found >= MOST_SUBSTEPS:
         raise FitError(
             f"the H found is too fast: one dt needs {MOST_SUBSTEPS} substeps or more. Use a "
             "smaller dt; if the pairs are of a map without a flow, use --learn map (learn='map')"
@@ -186,59 +134,55 @@ def _check_resolved(problem, best: FittedLaw, data: Dataset) -> None:
 
 
 def _simplified(
-    problem,
-    work: LawWork,
-    best: FittedLaw,
-    data: Dataset,
-    whole: Dataset,
-    far: np.ndarray,
-    tolerance: Tolerance,
-    options: LawOptions,
-    on_progress,
+    problem: LawProblem, whole: Dataset, far: np.ndarray, best: FittedLaw
 ) -> tuple[FittedLaw, float | None]:
     """The law without the terms that are noise or not asked for, fitted to all training pairs, as
     far as the budget goes; and its error at the outermost states, of a fit without them.
 
-    data: without the outermost states ``far``. whole: with them.
+    The problem's data are without the outermost states ``far``, the ``whole`` with them.
     """
-    outside, what, law = None, "", (best.family, best.fit.coefficients)
+    outside, what, law, work = None, "", (best.family, best.fit.coefficients), problem.work
     data, everywhere, there = (
-        without_turns(rows, *law) for rows in (data, whole, whole.validated_on(far))
+        without_turns(rows, *law) for rows in (problem.data, whole, whole.validated_on(far))
     )
+    problem = problem.on(data)
     try:
         if best.noisy:
             what = "dropping the terms of H that are noise"
-            work.uncapped()  # what is pruned is soon fitted
+            work.capped(np.inf)  # what is pruned is soon fitted
             with work.again(what, (best.larger or best).family, len(data.training)):
-                best = without_noise(problem, best, data.training, data, tolerance, options)
+                best = without_noise(problem, best)
         what = "dropping the terms of H that the pairs do not ask for"
         with work.again(what, best.family, len(best.fit.used)):
-            best = sparse(problem, best, data, tolerance, options, on_progress)
+            best = sparse(problem, best)
         if len(there.validation) and len(far):
-            outside = validation_error(best.family, best.fit, there, tolerance).relative
-        misses = best.error.bound > tolerance.bound and np.isfinite(work.dearest)
+            outside = problem.on(there).error_of(best.family, best.fit).relative
+        misses = not problem.met_by(best) and np.isfinite(problem.dearest)
         few = len(best.fit.used) < len(everywhere.training)
-        if best.error.relative > ROUNDOFF and few and not misses:
+        if best.error.relative > problem.options.roundoff and few and not misses:
             what = "the fit of H to all pairs"
             with work.again(what, best.family, len(everywhere.training)):
-                best = refitted(problem, best, everywhere.training, data, tolerance)
+                best = problem.refitted(best, everywhere.training)
     except OutOfTime:  # what was found stands
         work.budget.leave_out(what, work.ended)
     return best, outside
 
 
-def _along_sequences(
-    problem, work: LawWork, best: FittedLaw, data: Dataset, tolerance: Tolerance, on_progress
-) -> FittedLaw:
-    """The law fitted to whole sequences, where it misses the tolerance and is smooth: |v|v and
-    sign v are not where sequences turn."""
-    if not (is_smooth(best.family) and best.error.bound > tolerance.bound):
+def _along_sequences(problem: LawProblem, best: FittedLaw) -> FittedLaw:
+    """The law fitted to whole sequences, where it misses the tolerance, is smooth (|v|v and sign v
+    are not where sequences turn), and held-out steps bear it out."""
+    if not is_smooth(best.family) or problem.met_by(best):
         return best
-    what, budget = "the fit of H to whole sequences", work.budget
-    on_progress("H: fitting whole sequences")
+    what, budget, rows = "the fit of H to whole sequences", problem.budget, problem.data.training
+    problem.on_progress("H: fitting whole sequences")
     try:
-        with work.again(what, best.family, len(data.training)):
-            return of_whole_sequences(problem, best, data, tolerance, budget)
+        with problem.work.again(what, best.family, len(rows)):
+            if best.error.relative <= problem.options.roundoff:
+                return best
+            found = fitted_to_sequences(problem, best)
+            rise = problem.options.rise
+            better = found is not None and found.error.relative <= rise * best.error.relative
+            return found if found is not None and better else best
     except OutOfTime:
         budget.leave_out(what, budget.ended)
     except np.linalg.LinAlgError as error:
@@ -248,7 +192,8 @@ def _along_sequences(
 
 def _with_symmetries(best: FittedLaw, data: Dataset) -> FittedLaw:
     """The law with the symmetries that it has to roundoff imposed to the last bit."""
-    if isinstance(best.family, Terms) and data.args is None and best.error.relative <= ROUNDOFF:
+    clean = isinstance(best.family, Terms) and best.error.relative <= OPTIONS.roundoff
+    if clean and data.args is None:
         c, deviations = best.fit.coefficients, best.fit.standard_errors
         z = data.y0[data.validation]
         c = imposed(best.family, c, deviations, z, data.coordinates.angles)

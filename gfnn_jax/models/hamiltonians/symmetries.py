@@ -15,7 +15,7 @@ import numpy as np
 
 from gfnn_jax.diagnosis.symmetries import generators, reflections
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.phase_space import symplectic_form
+from gfnn_jax.models.textbook.invariance import restrictions
 
 _HOLDS = 1e-10  # of the restriction's parts, that a symmetry leaves over
 _STATES = 200
@@ -32,12 +32,14 @@ class Symmetry(NamedTuple):
     rows: np.ndarray
 
 
-class Restricted(NamedTuple):
-    """Numbers p (n,) that have the symmetries, their covariance, and which these are."""
+class Known(NamedTuple):
+    """Numbers p (n,) of a law, coefficients first, their covariance, from so many rows, and the
+    symmetries that the law has by them."""
 
     numbers: np.ndarray
     covariance: np.ndarray
-    symmetries: tuple[str, ...]
+    rows: int
+    symmetries: tuple[str, ...] = ()
 
 
 def symmetries_of(family: Terms, c: np.ndarray, z: np.ndarray, angles: Sequence[int] = ()):
@@ -68,32 +70,25 @@ def imposed(
     return moved if np.all(np.abs(moved - c) <= most) else c
 
 
-def restricted(
-    family: Terms,
-    p: np.ndarray,
-    covariance: np.ndarray,
-    z: np.ndarray,
-    angles: Sequence[int],
-    rows: int,
-) -> Restricted:
-    """The numbers p (n,), coefficients first, with every symmetry that shortens the description.
+def restricted(family: Terms, known: Known, z: np.ndarray, angles: Sequence[int]) -> Known:
+    """The numbers with every symmetry that shortens the description.
 
     A restriction of r coefficients raises half the misfit by ½χ² and saves ½ r ln(rows). It is the
     linear problem of the least change of p in units of its covariance.
     """
-    terms, texts = family.num_parameters, []
+    terms, texts, (p, covariance, rows, _) = family.num_parameters, [], known
     for symmetry in _candidates(family, z[:_STATES], tuple(angles)):
         a = np.zeros((terms, len(p)))
         a[:, :terms] = _independent(symmetry.rows, p[:terms])
         deviation = np.sqrt(np.einsum("ij,jk,ik->i", a, covariance, a).clip(0.0))
         parts = np.linalg.norm(a * p, axis=1)
-        known = deviation <= _KNOWN * parts  # these terms have it, or those before imply it
-        if np.any(np.abs(a @ p)[known] > _HOLDS * parts[known]) or (~known).sum() == terms:
+        same = deviation <= _KNOWN * parts  # these terms have it, or those before imply it
+        if np.any(np.abs(a @ p)[same] > _HOLDS * parts[same]) or (~same).sum() == terms:
             continue
-        if known.all():
+        if same.all():
             texts.append(symmetry.text)
             continue
-        a = a[~known]
+        a = a[~same]
         of_rows = a @ covariance @ a.T
         values, vectors = np.linalg.eigh(of_rows)
         free = values > _KNOWN * values.max()
@@ -104,7 +99,7 @@ def restricted(
         gain = covariance @ a.T @ inverse
         p, covariance = p - gain @ off, covariance - gain @ a @ covariance
         texts.append(symmetry.text)
-    return Restricted(p, covariance, tuple(texts))
+    return Known(p, covariance, rows, tuple(texts))
 
 
 def _independent(rows: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -121,15 +116,11 @@ def _independent(rows: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 def _candidates(family: Terms, z: np.ndarray, angles: tuple[int, ...]) -> Iterator[Symmetry]:
     """Symmetries that are looked for, at states z where every term is finite."""
-    dim = family.dim
+    continuous = list(generators(family.dim, angles))
+    discrete = list(reflections(family.dim, angles))
+    matrices = [matrix for _, matrix in continuous], [matrix for _, matrix in discrete]
     with np.errstate(all="ignore"):
-        gradients = family.term_gradients(z)
-        for text, generator in generators(dim, angles):
-            # {φ, I} = ∇φᵀ J ∇I, of a quadratic or linear I with ∇I = A z + b.
-            moved = (z @ generator[:, :-1].T + generator[:, -1]) @ symplectic_form(dim).T
-            yield Symmetry(text, np.einsum("nij,ni->nj", gradients, moved))
-        for text, matrix in reflections(dim, angles):
-            there = np.einsum("ki,nkj->nij", matrix, family.term_gradients(z @ matrix.T))
-            rows = (gradients - there).reshape(-1, gradients.shape[-1])
-            if np.isfinite(rows).all():
-                yield Symmetry(text, rows)
+        rows = restrictions(family, z, *matrices)
+        for (text, _), found in zip([*continuous, *discrete], rows, strict=True):
+            if np.isfinite(found).all():
+                yield Symmetry(text, found)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.families.expressions import coordinate_names
-from gfnn_jax.models.textbook.shapes import number
+from gfnn_jax.models.textbook.shapes import Kind, kinds_for, number
 
 
 class Argument(NamedTuple):
@@ -29,6 +29,16 @@ class Argument(NamedTuple):
     index: int = -1
     circular: bool = False
     axes: tuple[Argument, ...] = ()
+
+    @property
+    def kinds(self) -> list[Kind]:
+        """The shapes that have values at all states."""
+        return kinds_for(self.value, distance=bool(self.square), circular=self.circular)
+
+    @property
+    def entering(self) -> set[int]:
+        """The coordinates that the argument depends on."""
+        return set(np.flatnonzero(np.any(self.gradient != 0, axis=0)).tolist())
 
     def around(self, centre: tuple[complex, ...]) -> Argument:
         """The distance from this centre, which may be complex."""

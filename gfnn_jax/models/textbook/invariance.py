@@ -16,34 +16,26 @@ import numpy as np
 
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs, generators, reflections
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.models.textbook.arguments import Argument, arguments_of
+from gfnn_jax.models.textbook.arguments import arguments_of
 from gfnn_jax.models.textbook.atoms import Atom
+from gfnn_jax.models.textbook.dictionary import Setting
 from gfnn_jax.models.textbook.shapes import Kind, parity
 from gfnn_jax.phase_space import symplectic_form
 
-CERTAIN = 1e-11  # of what it would change by: a conserved quantity of clean pairs changes by less
-_ROUNDED = 1e-10  # of the largest value, or slope: below it there is none
+# Of what it would change by: a conserved quantity of clean pairs changes by less (textbook.py). Of
+# the largest value, or slope: below it there is none.
+_CERTAIN, _ROUNDED = 1e-11, 1e-10
 
 
 class Invariance:
     """The symmetries that clean pairs show: conserved quantities, to roundoff; where there are
-    such, reversal of time and reflection of all coordinates too, which alone shorten little.
+    such, reversal of time and reflection of all coordinates too, which alone shorten little."""
 
-    z: (N, 2d) states; arguments: at these. angles, cyclic: indices of z.
-    """
-
-    def __init__(
-        self,
-        symmetries: Sequence[SymmetryOfPairs],
-        z: np.ndarray,
-        arguments: list[Argument],
-        angles: tuple[int, ...],
-        cyclic: tuple[int, ...],
-    ):
-        dim, left = z.shape[1] // 2, {s.text: s.left for s in symmetries}
-        self._z = z
+    def __init__(self, symmetries: Sequence[SymmetryOfPairs], setting: Setting):
+        z, arguments, angles, dim = setting.states, setting.arguments, setting.angles, setting.dim
+        left, self._z = {s.text: s.left for s in symmetries}, z
         self._generators = [
-            matrix for text, matrix in generators(dim, angles) if left.get(text, np.inf) <= CERTAIN
+            matrix for text, matrix in generators(dim, angles) if left.get(text, np.inf) <= _CERTAIN
         ]
         self._reflections = [
             matrix
@@ -52,7 +44,7 @@ class Invariance:
         ]
         still = np.ones(len(arguments), bool)
         for generator in self._generators:
-            moved = self._moved(generator)
+            moved = moved_by(generator, z)
             rates = (np.abs(np.einsum("ni,ni->n", x.gradient, moved)).max() for x in arguments)
             sizes = (np.abs(x.gradient * moved).max() for x in arguments)
             still &= [r <= _ROUNDED * s for r, s in zip(rates, sizes, strict=True)]
@@ -60,7 +52,7 @@ class Invariance:
         self._signs = [
             [_sign(x.value, y.value) for x, y in zip(arguments, there, strict=True)]
             for r in self._reflections
-            for there in [arguments_of(z @ r.T, angles, cyclic)]
+            for there in [arguments_of(z @ r.T, angles, setting.cyclic)]
         ]
 
     def __bool__(self) -> bool:
@@ -75,7 +67,8 @@ class Invariance:
 
     def terms(self, family: Terms) -> list[int]:
         """The terms of which a combination has the symmetries; all of them where none has."""
-        rows = np.concatenate(list(self._restrictions(family)))
+        given = self._generators, self._reflections
+        rows = np.concatenate(list(restrictions(family, self._z, *given)))
         size = np.linalg.norm(family.term_gradients(self._z).reshape(-1, rows.shape[-1]), axis=0)
         size = np.where(size > 0, size, 1.0)
         _, singular, across = np.linalg.svd(np.linalg.qr(rows / size, mode="r"))
@@ -83,19 +76,28 @@ class Invariance:
         kept = np.flatnonzero(np.abs(free).max(axis=0, initial=0.0) > _ROUNDED)
         return kept.tolist() or list(range(family.num_parameters))
 
-    def _restrictions(self, family: Terms) -> Iterator[np.ndarray]:
-        """(n, terms): what is 0 of a combination of terms that has a symmetry."""
-        gradients = family.term_gradients(self._z)
-        for generator in self._generators:
-            yield np.einsum("nij,ni->nj", gradients, self._moved(generator))
-        for matrix in self._reflections:
-            there = np.einsum("ki,nkj->nij", matrix, family.term_gradients(self._z @ matrix.T))
-            yield (gradients - there).reshape(-1, gradients.shape[-1])
 
-    def _moved(self, generator: np.ndarray) -> np.ndarray:
-        """J∇I (N, 2d) of the generator I = ½ zᵀA z + bᵀz."""
-        slope = self._z @ generator[:, :-1].T + generator[:, -1]
-        return slope @ symplectic_form(len(slope[0]) // 2).T
+def restrictions(
+    family: Terms,
+    z: np.ndarray,
+    continuous: Sequence[np.ndarray],
+    discrete: Sequence[np.ndarray],
+) -> Iterator[np.ndarray]:
+    """(n, terms) at states z (N, 2d), what is 0 of a combination of terms that has a symmetry: the
+    Poisson bracket {φ, I} = ∇φᵀ J ∇I of each term with the generator I of a continuous symmetry, or
+    ∇φ − Rᵀ∇φ(R z) of a discrete one, z → R z."""
+    gradients = family.term_gradients(z)
+    for generator in continuous:
+        yield np.einsum("nij,ni->nj", gradients, moved_by(generator, z))
+    for matrix in discrete:
+        there = np.einsum("ki,nkj->nij", matrix, family.term_gradients(z @ matrix.T))
+        yield (gradients - there).reshape(-1, gradients.shape[-1])
+
+
+def moved_by(generator: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """J∇I (N, 2d) of the generator I = ½ zᵀA z + bᵀz, (2d, 2d + 1) of A and b."""
+    slope = z @ generator[:, :-1].T + generator[:, -1]
+    return slope @ symplectic_form(len(slope[0]) // 2).T
 
 
 def _turned(sign: int, kind: Kind) -> int:

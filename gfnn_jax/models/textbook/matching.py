@@ -10,35 +10,53 @@ Gauss–Newton with the coefficients projected out (variable projection; Golub &
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.models.textbook.arguments import Argument
 from gfnn_jax.models.textbook.atoms import (
     Atom,
-    Average,
-    Dictionary,
     complexity_of,
     constants_of,
     gradient_of,
     with_constants,
 )
+from gfnn_jax.models.textbook.dictionary import Dictionary, Setting
 from gfnn_jax.solve.levenberg_marquardt import Factors, Tried, descended
 
-_BEAM = 4  # states that go on
-_PAIRED = 160  # atoms, those that explain most, whose pairs are tried
-_BRANCHES = 4  # atoms, and pairs of them, that each state is continued by
-_INDEPENDENT = 1e-5  # of a column, that those before it do not span
-_HARDLY = 4.0  # times what a match leaves over, that a plainer one may leave
-_REFINEMENTS = 8  # Gauss–Newton steps of inner constants
-_DAMPING = Factors(first=1e-2, shrunk_by=0.1, least=5e-4, trials=4)  # of them, of their lengths
-_GAINED = 1e-3  # of what is left over: a step that gains less is the last
-_FARTHEST = 0.2  # of the distances: by which a centre moves in a step
-_FLOOR = 1e-13  # of what is left over: below it is roundoff
-PENALTY = 0.5  # halvings of what is left over that a unit of complexity must bring, of clean pairs
+
+@dataclasses.dataclass(frozen=True)
+class MatchingOptions:
+    """Tuned on the laws of benchmarks/textbook.py.
+
+    beam: states that go on. paired: atoms, those that explain most, whose pairs are tried.
+    branches: atoms, and pairs of them, that each state is continued by, of so many looked_at.
+    independent: of a column,
+    that those before it do not span. hardly: times what a match leaves over, that a plainer one may
+    leave. refinements: Gauss–Newton steps of inner constants. gained: of what is left over, a step
+    that gains less is the last. farthest: of the distances, by which a centre moves in a step.
+    floor: of what is left over, below it is roundoff. penalty: halvings of what is left over that a
+    unit of complexity must bring, of clean pairs.
+    """
+
+    beam: int = 4
+    paired: int = 160
+    branches: int = 4
+    looked_at: int = 240
+    independent: float = 1e-5
+    hardly: float = 4.0
+    refinements: int = 8
+    gained: float = 1e-3
+    farthest: float = 0.2
+    floor: float = 1e-13
+    penalty: float = 0.5
+
+
+OPTIONS = MatchingOptions()
+_DAMPING = Factors(first=1e-2, shrunk_by=0.1, least=5e-4, trials=4)  # of inner constants
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +65,11 @@ class Match:
 
     atoms: tuple[Atom, ...]
     left: float
+
+    @property
+    def complexity(self) -> float:
+        """Complexity of the atoms."""
+        return complexity_of(self.atoms)
 
 
 class _Left(NamedTuple):
@@ -60,37 +83,18 @@ class _Left(NamedTuple):
 
 
 class Matching:
-    """The search for atoms that, beside a base, have the gradient ``target`` (rows,).
+    """The search for atoms that, beside the base of a setting, have this gradient.
 
-    base: (rows, n) orthonormal columns that are always there. weight: (2d,), or of each row, by
-    which gradients are multiplied. arguments: at the states. penalty: halvings of what is left over
-    that a unit of complexity must bring. average: makes the rows of gradients at the states, where
-    they are not these themselves.
+    target: (rows,), weighted. penalty: halvings of what is left over that a unit of complexity must
+    bring.
     """
 
-    def __init__(
-        self,
-        base: np.ndarray,
-        target: np.ndarray,
-        weight: np.ndarray,
-        arguments: list[Argument],
-        penalty: float = PENALTY,
-        average: Average = np.asarray,
-    ):
-        self.weight, self.arguments, self._penalty, self._average = (
-            weight,
-            arguments,
-            penalty,
-            average,
-        )
-        self.base, self.target = base, target
+    def __init__(self, setting: Setting, target: np.ndarray, penalty: float = OPTIONS.penalty):
+        self.setting, self.arguments, self.base = setting, setting.arguments, setting.spanned
+        self.target, self._penalty = target, penalty
         self.size = float(np.linalg.norm(target))
-        self._beside_base = target - base @ (base.T @ target)
+        self._beside_base = target - self.base @ (self.base.T @ target)
         self._last: tuple[Sequence[Atom], _Left] | None = None
-
-    def columns(self, atoms: Sequence[Atom]) -> np.ndarray:
-        """(rows, atoms): the weighted gradients."""
-        return np.stack([self._flat(gradient_of(a, self.arguments)) for a in atoms], axis=1)
 
     def residual_of(self, atoms: Sequence[Atom]) -> float:
         """The part of the target that base and atoms do not explain."""
@@ -113,13 +117,14 @@ class Matching:
                         grown.setdefault(frozenset(refined.atoms), refined)
             if not grown:
                 break
-            beam = sorted(grown.values(), key=self.cost)[:_BEAM]
+            beam = sorted(grown.values(), key=self.cost)[: OPTIONS.beam]
             found.update({frozenset(m.atoms): m for m in beam})
         return sorted(found.values(), key=self.cost)
 
     def cost(self, match: Match) -> float:
         """The logarithm of what is left over, and the penalty on the complexity of the atoms."""
-        return float(np.log2(max(match.left, _FLOOR)) + self._penalty * complexity_of(match.atoms))
+        left = np.log2(max(match.left, OPTIONS.floor))
+        return float(left + self._penalty * match.complexity)
 
     def plainer(self, match: Match, dictionary: Dictionary) -> Match:
         """The match with each atom, in turn, in a plainer shape of the same argument, where that
@@ -129,7 +134,7 @@ class Matching:
             tried = self._exchanged(match, i, dictionary, lambda a, s=own: complexity_of((a,)) < s)
             if tried:
                 best = min(tried, key=self.cost)
-                match = best if best.left < _HARDLY * match.left else match
+                match = best if best.left < OPTIONS.hardly * match.left else match
         return match
 
     def exchanged(self, match: Match, dictionary: Dictionary) -> list[Match]:
@@ -150,22 +155,15 @@ class Matching:
         self, match: Match, i: int, dictionary: Dictionary, allowed: Callable[[Atom], bool]
     ) -> list[Match]:
         """The match with another shape of the i-th atom's argument: the few that explain most."""
-        others = match.atoms[:i] + match.atoms[i + 1 :]
+        others, near = match.atoms[:i] + match.atoms[i + 1 :], dictionary.atoms
         places = [f.place for f in match.atoms[i]]
-        own = [
-            j
-            for j, a in enumerate(dictionary.atoms)
-            if [f.place for f in a] == places and allowed(a)
-        ]
+        own = [j for j, a in enumerate(near) if [f.place for f in a] == places and allowed(a)]
         residual, basis, *_ = self._residual(others)
         if not own or not np.isfinite(residual).all():
             return []
-        columns = dictionary.columns[:, own]
-        columns = columns - basis @ (basis.T @ columns)
-        size = np.linalg.norm(columns, axis=0)
-        part = np.where(size > _INDEPENDENT, residual @ columns, 0.0) / np.maximum(size, 1e-300)
-        first = _apart(np.argsort(-(part**2)), [dictionary.atoms[j] for j in own], _BRANCHES)
-        return [self.refined((*others, dictionary.atoms[own[k]])) for k in first]
+        part, _ = self._parts(residual, basis, dictionary.columns[:, own])
+        first = _apart((near[own[k]],) for k in np.argsort(-(part**2)))
+        return [self.refined((*others, *atom)) for atom in first]
 
     def refined(self, atoms: tuple[Atom, ...]) -> Match:
         """The match with the inner constants that leave least."""
@@ -174,19 +172,20 @@ class Matching:
         if not inner:
             return Match(atoms, left)
         start = _AtConstants(self, tuple(inner), Match(atoms, left))
-        return descended(start, _DAMPING, _REFINEMENTS).problem.match
+        return descended(start, _DAMPING, OPTIONS.refinements).problem.match
 
     def slopes(self, match: Match, inner: Sequence[tuple[int, int]]):
         """(residual, its slopes (rows, n) in these constants with base and coefficients
         projected out)."""
         left = self._residual(match.atoms)
         coefficients = self._coefficients(left, len(match.atoms))
-        columns = [
-            coefficients[i] * self._flat(gradient_of(match.atoms[i], self.arguments, along=k))
-            for i, k in inner
-        ]
+        columns = [coefficients[i] * self._column(match.atoms[i], along=k) for i, k in inner]
         slopes = np.stack(columns, axis=1)
         return left.residual, slopes - left.basis @ (left.basis.T @ slopes)
+
+    def _column(self, atom: Atom, along: int | None = None) -> np.ndarray:
+        """(rows,): the weighted gradient of an atom, or its derivative in one of its constants."""
+        return self.setting.flat(gradient_of(atom, self.arguments, along))
 
     def _residual(self, atoms: Sequence[Atom]) -> _Left:
         """Residual beside the base and these atoms. The last is kept: the next step starts from the
@@ -199,7 +198,7 @@ class Matching:
         if not atoms:
             return _Left(self._beside_base, self.base)
         with np.errstate(all="ignore"):
-            columns = self.columns(atoms)
+            columns = np.stack([self._column(atom) for atom in atoms], axis=1)
         if not np.isfinite(columns).all():
             return _Left(np.full_like(self.target, np.inf), self.base)
         size = np.linalg.norm(columns, axis=0)
@@ -228,12 +227,12 @@ class Matching:
             return []
         own, columns = basis[:, self.base.shape[1] :], dictionary.columns
         part, size = self._parts(residual, own, columns)
-        independent, gain = size > _INDEPENDENT, part**2
-        singles = _apart(np.argsort(-gain), dictionary.atoms, _BRANCHES)
-        found: list[tuple[Atom, ...]] = [(dictionary.atoms[i],) for i in singles]
+        independent, gain = size > OPTIONS.independent, part**2
+        atoms = dictionary.atoms
+        found = _apart((atoms[i],) for i in np.argsort(-gain))
         if len(match.atoms) + 2 > most:
             return found
-        top = np.argsort(-gain)[:_PAIRED]
+        top = np.argsort(-gain)[: OPTIONS.paired]
         top = top[independent[top]]
         unit = (columns[:, top] - own @ (own.T @ columns[:, top])) / size[top]
         gram = unit.T @ unit
@@ -242,18 +241,9 @@ class Matching:
         with np.errstate(all="ignore"):
             both = (a * a + b * b - 2 * gram * a * b) / free
         both = np.where(free > 1e-7, both, 0.0)
-        order = np.argsort(-np.triu(both, 1), axis=None)[: 40 * _BRANCHES]
-        kinds: set[tuple] = set()
-        for k in order:
-            i, j = divmod(int(k), len(top))
-            pair = dictionary.atoms[top[i]], dictionary.atoms[top[j]]
-            kind = tuple(tuple(f.form for f in atom) for atom in pair)
-            if kind not in kinds:
-                kinds.add(kind)
-                found.append(pair)
-            if len(kinds) == _BRANCHES:
-                break
-        return found
+        order = np.argsort(-np.triu(both, 1), axis=None)
+        pairs = (tuple(atoms[top[i]] for i in divmod(int(k), len(top))) for k in order)
+        return found + _apart(pairs)
 
     def gains(self, match: Match, dictionary: Dictionary) -> np.ndarray:
         """(atoms,): the part of the square of what a match leaves over that each atom explains."""
@@ -267,7 +257,7 @@ class Matching:
         where little of a column is left, and the lengths that are left. Columns are without the
         base already."""
         size = np.sqrt(np.maximum(1 - np.sum((own.T @ columns) ** 2, axis=0), 0.0))
-        large = size > _INDEPENDENT
+        large = size > OPTIONS.independent
         return np.where(large, residual @ columns / np.where(large, size, 1.0), 0.0), size
 
     def moved(self, atoms: tuple[Atom, ...], step: np.ndarray) -> tuple[Atom, ...]:
@@ -282,13 +272,10 @@ class Matching:
                         factor.theta
                         + np.clip(next(changes), -0.7 * abs(factor.theta), abs(factor.theta))
                     )
-                far = _FARTHEST * np.abs(self.arguments[factor.place].value).max()
+                far = OPTIONS.farthest * np.abs(self.arguments[factor.place].value).max()
                 moved += [c + np.clip(next(changes), -far, far) for c in factor.centre]
             found.append(with_constants(atom, map(float, moved)))
         return tuple(found)
-
-    def _flat(self, gradient: np.ndarray) -> np.ndarray:
-        return (self._average(gradient) * self.weight).ravel()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -321,25 +308,15 @@ class _AtConstants:
 
     def moved(self, there: Match, damping: float) -> tuple[_AtConstants, bool]:
         """The match of a step; settled where it gained little."""
-        settled = 1 - there.left / self.match.left < _GAINED
+        settled = 1 - there.left / self.match.left < OPTIONS.gained
         return dataclasses.replace(self, match=there), settled
 
 
-def _apart(order: np.ndarray, atoms: list[Atom], count: int) -> list[int]:
-    """The first of each kind of atom, whatever its constant."""
-    kinds: dict[tuple, int] = {}
-    for i in order[: 60 * count]:
-        kind = tuple(f.form for f in atoms[i])
-        kinds.setdefault(kind, int(i))
-        if len(kinds) == count:
+def _apart(found: Iterable[tuple[Atom, ...]]) -> list[tuple[Atom, ...]]:
+    """The first of each kind of atoms, whatever their constants: few of them."""
+    kinds: dict[tuple, tuple[Atom, ...]] = {}
+    for atoms in islice(found, OPTIONS.looked_at):
+        kinds.setdefault(tuple(tuple(f.form for f in atom) for atom in atoms), atoms)
+        if len(kinds) == OPTIONS.branches:
             break
     return list(kinds.values())
-
-
-def orthonormal(columns: np.ndarray) -> np.ndarray:
-    """A basis of what the columns span."""
-    if not columns.shape[1]:
-        return columns
-    size = np.linalg.norm(columns, axis=0)
-    u, s, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
-    return u[:, s > 1e-12 * s[0]]

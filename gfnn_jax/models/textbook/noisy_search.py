@@ -15,20 +15,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
-from gfnn_jax.fitting.significance import null_terms
-from gfnn_jax.models.textbook.arguments import Argument, arguments_of
-from gfnn_jax.models.textbook.atoms import (
-    Atom,
-    atom_text,
-    blocks_of,
-    complexity_of,
-    constants_of,
-    dictionary_of,
-    powers_of,
-    with_constants,
-)
-from gfnn_jax.models.textbook.matching import Match, Matching, orthonormal
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.models.textbook.arguments import Argument
+from gfnn_jax.models.textbook.atoms import Atom, complexity_of, constants_of, with_constants
+from gfnn_jax.models.textbook.dictionary import Setting, beside
+from gfnn_jax.models.textbook.matching import Match, Matching
 from gfnn_jax.models.textbook.weak_gradients import WeakGradients
 
 
@@ -36,33 +27,33 @@ from gfnn_jax.models.textbook.weak_gradients import WeakGradients
 class NoisyTextbookOptions:
     """Tuned on the laws of benchmarks/textbook.py with noise of 1e-3 of the spread.
 
-    degrees: of products of coordinates, by degrees of freedom from 1. atoms: of a law, beside the
+    atoms: of a law, beside the
     coordinates and products of two. penalty: natural logarithms of likelihood that a unit of
     complexity must bring. finalists: laws that are handed on. explained: RMS of what a match leaves
     over, in units of the noise, from which on products of shapes are looked at too. kept: standard
     errors of a coordinate, or a product of two, that a law is handed on with. exchanged:
-    matches whose atoms are tried in other shapes.
+    matches whose atoms are tried in other shapes; looked_at: that are read as laws. far:
+    deviations, beyond which a row has less weight.
     """
 
-    degrees: tuple[int, ...] = (6, 4, 4)
     atoms: int = 5
     penalty: float = 5.0
     finalists: int = 6
     explained: float = 1.5
     kept: float = 2.0
     exchanged: int = 4
+    looked_at: int = 30
+    far: float = 3.0
 
 
 OPTIONS = NoisyTextbookOptions()
-_LOOKED_AT = 30  # matches that are read as laws
-_FAR = 3.0  # deviations, beyond which a row has less weight
 
 
 class Formula(NamedTuple):
     """H = Σ c_j φ_j: terms without constants inside, and atoms with them.
 
     left: RMS of what it leaves over of the weak gradients, in units of their noise; rows: so many
-    numbers. complexity: of its atoms.
+    numbers.
     """
 
     plain: Terms
@@ -71,7 +62,20 @@ class Formula(NamedTuple):
     coefficients: np.ndarray
     left: float
     rows: int
-    complexity: float
+
+    @property
+    def complexity(self) -> float:
+        """Complexity, in units of `shapes.complexity`: of the atoms, and of products of coordinates
+        beyond those of two."""
+        beyond = [row for row in self.plain.powers if sum(row) > 2]
+        return complexity_of(self.atoms) + sum(1.0 + 0.1 * n for row in beyond for n in row if n)
+
+    @property
+    def length(self) -> float:
+        """Description length: natural logarithms."""
+        numbers = len(self.coefficients) + len(self.constants)
+        penalty = OPTIONS.penalty * self.complexity + 0.5 * np.log(self.rows) * numbers
+        return self.rows * np.log(self.left) + penalty
 
     @property
     def constants(self) -> np.ndarray:
@@ -95,9 +99,7 @@ class Formula(NamedTuple):
 
     def family(self, constants: np.ndarray) -> Terms:
         """The terms, with these constants inside. Raises InputError for one that has run away."""
-        texts = [atom_text(atom, self.arguments) for atom in _with(self.atoms, constants)]
-        dim = self.plain.dim
-        return joined(self.plain, given_terms(dim, texts)) if texts else self.plain
+        return beside(self.plain, _with(self.atoms, constants), self.arguments)
 
     @property
     def kind(self) -> frozenset:
@@ -110,25 +112,13 @@ class Formula(NamedTuple):
         count = self.plain.num_parameters
         atoms = tuple(self.atoms[j - count] for j in kept if j >= count)
         plain = self.plain.take([j for j in kept if j < count])
-        return self._replace(
-            plain=plain,
-            atoms=atoms,
-            coefficients=coefficients,
-            complexity=complexity_of_law(plain, atoms),
-        )
+        return self._replace(plain=plain, atoms=atoms, coefficients=coefficients)
 
 
 def _with(atoms: Sequence[Atom], constants: np.ndarray) -> tuple[Atom, ...]:
     """The atoms with these constants (k,) inside."""
     given = iter(constants.tolist())
     return tuple(with_constants(atom, given) for atom in atoms)
-
-
-def complexity_of_law(plain: Terms, atoms: Sequence[Atom]) -> float:
-    """Complexity of a law, in units of `shapes.complexity`: its atoms, and products of coordinates
-    beyond those of two."""
-    beyond = [row for row in plain.powers if sum(row) > 2]
-    return complexity_of(atoms) + sum(1.0 + 0.1 * n for row in beyond for n in row if n)
 
 
 class NoisyTextbook:
@@ -143,14 +133,9 @@ class NoisyTextbook:
         on_progress: Callable[[str], Any] = lambda message: None,
     ):
         self._weak, self._on_progress = weak, on_progress
-        self._dim = dim = weak.states.shape[1] // 2
-        self._arguments = arguments_of(weak.states, tuple(angles), tuple(cyclic))
-        every = polynomial_terms(dim, 2, cyclic=(*angles, *cyclic))
-        kept, _ = null_terms(every, weak.states)
-        self._base = every.take(kept)
+        given = weak.states, 1.0 / weak.deviation, angles, cyclic, weak.average
+        self._setting = Setting(*given)
         self._weigh(weak.deviation)
-        degrees = OPTIONS.degrees
-        self._degree = degrees[dim - 1] if dim <= len(degrees) else 3
 
     def formulas(self) -> list[Formula]:
         """The laws that are worth a fit, the likeliest for their complexity first."""
@@ -168,17 +153,18 @@ class NoisyTextbook:
     def _searched(self, products: bool) -> list[Formula]:
         """The laws of each kind, by rising length."""
         found: dict[frozenset, Formula] = {}
-        for match in sorted(self._matches(products), key=self._length_of_match)[:_LOOKED_AT]:
+        for match in sorted(self._matches(products), key=self._length_of_match)[
+            : OPTIONS.looked_at
+        ]:
             formula = self._formula(match)
             if found.setdefault(formula.kind, formula).left > formula.left:
                 found[formula.kind] = formula
-        return sorted(found.values(), key=self._length)
+        return sorted(found.values(), key=lambda formula: formula.length)
 
     def _weigh(self, deviations: np.ndarray) -> None:
         """Weigh the rows by their noise (2d,) or (R, 2d)."""
-        self._weight = 1.0 / deviations
-        self._target = (self._weak.target * self._weight).ravel()
-        self._spanned = orthonormal(self._columns(self._base))
+        self._setting.take(self._setting.base, 1.0 / deviations)
+        self._target = (self._weak.target * self._setting.weight).ravel()
 
     def _deviations(self, formula: Formula) -> np.ndarray:
         """(R, 2d) of the noise of the rows, as far as this law tells how states move them; more
@@ -187,67 +173,31 @@ class NoisyTextbook:
         gradient, hessian = family.gradient_and_hessian(c, self._weak.states)
         found = self._weak.deviations(hessian)
         off = np.abs(self._weak.average(gradient) - self._weak.target) / found
-        return found * np.maximum(1.0, np.where(np.isfinite(off), off, np.inf) / _FAR)
+        return found * np.maximum(1.0, np.where(np.isfinite(off), off, np.inf) / OPTIONS.far)
 
     def _matches(self, products: bool) -> list[Match]:
-        dictionary = dictionary_of(
-            self._arguments,
-            self._weight,
-            self._spanned,
-            degree=self._degree,
-            products=products,
-            average=self._weak.average,
-        )
+        setting = self._setting
+        dictionary = setting.dictionary(products=products)
         self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
-        penalty = OPTIONS.penalty / (len(self._target) * np.log(2))
         matching = Matching(
-            self._spanned,
-            self._target,
-            self._weight,
-            self._arguments,
-            penalty,
-            self._weak.average,
+            setting, self._target, OPTIONS.penalty / (len(self._target) * np.log(2))
         )
         found = matching.best(dictionary, OPTIONS.atoms)
         if not products:
-            most = len(self._target) / 4 - self._base.num_parameters
-            blocks = [b for b in blocks_of(self._arguments, self._degree) if len(b) < most]
-            found += [matching.refined(block) for block in blocks]
+            most = len(self._target) / 4 - setting.base.num_parameters
+            found += [matching.refined(b) for b in setting.blocks() if len(b) < most]
         likeliest = sorted(found, key=self._length_of_match)[: OPTIONS.exchanged]
         return found + [m for best in likeliest for m in matching.exchanged(best, dictionary)]
 
     def _length_of_match(self, match: Match) -> float:
-        penalty = OPTIONS.penalty * complexity_of(match.atoms)
-        return len(self._target) * np.log(match.left) + penalty
-
-    def _length(self, formula: Formula) -> float:
-        """Description length: natural logarithms."""
-        rows = len(self._target)
-        numbers = len(formula.coefficients) + len(formula.constants)
-        penalty = OPTIONS.penalty * formula.complexity + 0.5 * np.log(rows) * numbers
-        return rows * np.log(formula.left) + penalty
+        return len(self._target) * np.log(match.left) + OPTIONS.penalty * match.complexity
 
     def _formula(self, match: Match) -> Formula:
         """The law of a match, without the coordinates and products that it does not ask for."""
-        rows, others = [], []
-        for atom in match.atoms:
-            row = powers_of(atom, self._arguments, 2 * self._dim)
-            others.append(atom) if row is None else rows.append(row)
-        plain = self._base
-        if rows:
-            names = polynomial_terms(self._dim, 1).variables
-            plain = joined(plain, Terms(self._dim, names, tuple(dict.fromkeys(rows))))
-        atoms = tuple(others)
-        whole = Formula(
-            plain,
-            atoms,
-            self._arguments,
-            np.zeros(0),
-            np.inf,
-            len(self._target),
-            complexity_of_law(plain, atoms),
-        )
-        columns = self._columns(whole.family(whole.constants))
+        setting, nothing = self._setting, np.zeros(0)
+        given = *setting.plain(match.atoms), setting.arguments, nothing, np.inf
+        whole = Formula(*given, len(self._target))
+        columns = setting.columns(whole.family(whole.constants))
         kept = np.arange(columns.shape[1])
         while True:
             own = columns[:, kept]
@@ -261,9 +211,3 @@ class NoisyTextbook:
             if significance[worst] >= OPTIONS.kept or len(kept) == 1:
                 return whole.take(kept.tolist(), c / size)._replace(left=float(left))
             kept = np.delete(kept, worst)
-
-    def _columns(self, family: Terms) -> np.ndarray:
-        """(rows, terms): the weighted weak gradients."""
-        gradients = np.moveaxis(family.term_gradients(self._weak.states), -1, 0)
-        rows = self._weak.average(gradients) * self._weight
-        return rows.reshape(len(rows), -1).T

@@ -18,31 +18,16 @@ import numpy as np
 
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
+from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
-from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.flows.collocation import Steps, of_lanes
-from gfnn_jax.models.textbook.arguments import arguments_of
-from gfnn_jax.models.textbook.atoms import (
-    Atom,
-    Dictionary,
-    atom_text,
-    blocks_of,
-    complexity_of,
-    constants_of,
-    dictionary_of,
-    powers_of,
-    tops_of,
-    with_constants,
-)
+from gfnn_jax.models.textbook.atoms import Atom, complexity_of, constants_of, with_constants
+from gfnn_jax.models.textbook.dictionary import Dictionary, Setting
 from gfnn_jax.models.textbook.invariance import Invariance
-from gfnn_jax.models.textbook.matching import Match, Matching, orthonormal
+from gfnn_jax.models.textbook.matching import Match, Matching
 from gfnn_jax.phase_space import apply_j
 
 _STEPS = Steps(6, 1)
-_ROUNDED = 1e-8  # of a constant, that may be rounded away where the law stays as exact
-_MATCHED = 1e-14  # of gradients: a match at roundoff
-_AS_WELL = 1e3  # times what a match leaves over: below it a simpler one is looked at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +35,7 @@ class TextbookOptions:
     """Tuned on the laws of benchmarks/textbook.py.
 
     rows: pairs that are looked at; quiet: the part of them that move least, which is used: their
-    midpoints say more. degrees: of products of coordinates, by degrees of freedom from 1. atoms: of
+    midpoints say more. atoms: of
     a law, beside the coordinates and products of two. rounds: of matching. finalists: matches that
     go through their flow; plainer: of them, that are tried in plainer shapes too. corrections: of
     gradients, at most; contracted: by which each must lower what is left over. roundoff: of the
@@ -60,12 +45,13 @@ class TextbookOptions:
     nearer to it by about one digit each. lost: part of the
     pairs whose flow may fail. most_dim: degrees of freedom, beyond which the dictionary is too
     large. rows_per_term: that all products of coordinates need together. certain: twice the
-    logarithm of the odds that what an atom explains is no chance.
+    logarithm of the odds that what an atom explains is no chance. rounded: of a constant, that may
+    be rounded away where the law stays as exact. matched: of gradients, a match at roundoff;
+    as_well: times what a match leaves over, below it a simpler one is looked at.
     """
 
     rows: int = 260
     quiet: float = 0.6
-    degrees: tuple[int, ...] = (6, 4, 4)
     atoms: int = 5
     rounds: int = 4
     finalists: int = 6
@@ -79,6 +65,9 @@ class TextbookOptions:
     most_dim: int = 4
     rows_per_term: float = 1.6
     certain: float = 10.0
+    rounded: float = 1e-8
+    matched: float = 1e-14
+    as_well: float = 1e3
 
 
 OPTIONS = TextbookOptions()
@@ -104,7 +93,6 @@ class Textbook:
     """The search for the law of these rows of a problem's pairs, which have no args.
 
     angles, cyclic: indices of z. symmetries: of the pairs; only what has them by itself is tried.
-    null: the coordinates and products of two that the states do not tell from those before.
     Raises ValueError for more degrees of freedom than ``OPTIONS.most_dim``.
     """
 
@@ -121,27 +109,21 @@ class Textbook:
         dim = problem.z0.shape[1] // 2
         if dim > OPTIONS.most_dim:
             raise ValueError(f"expected at most {OPTIONS.most_dim} degrees of freedom, got {dim}")
-        self._problem, self._on_progress, self._dim = problem, on_progress, dim
+        self._problem, self._on_progress = problem, on_progress
         rows = np.asarray(rows[: OPTIONS.rows])
         moved = np.linalg.norm((problem.z1 - problem.z0)[rows] / problem.scale, axis=1)
         self._rows = np.sort(rows[np.argsort(moved)[: int(np.ceil(OPTIONS.quiet * len(rows)))]])
-        z0, z1 = problem.z0[self._rows], problem.z1[self._rows]
+        z0, self._z1 = problem.z0[self._rows], problem.z1[self._rows]
         dt = of_lanes(problem.dt, self._rows)
         self._h = dt[:, None] if np.ndim(dt) else dt
-        self._z1, self._middle = z1, 0.5 * (z0 + z1)
-        self._weight = 1.0 / np.roll(problem.scale, dim)
-        self._arguments = arguments_of(self._middle, tuple(angles), tuple(cyclic))
-        every = polynomial_terms(dim, 2, cyclic=(*angles, *cyclic))
-        kept, null = null_terms(every, self._middle)
-        self._base, self.null = every.take(kept), tuple(every.term_names[j] for j in null)
-        given = self._middle, self._arguments, tuple(angles), tuple(cyclic)
-        self._invariance = Invariance(symmetries, *given)
-        self._tried = 0  # atoms of the dictionary before
+        self._middle, weight = 0.5 * (z0 + self._z1), 1.0 / np.roll(problem.scale, dim)
+        self._setting = setting = Setting(self._middle, weight, angles, cyclic)
+        self.null = setting.null
+        self._invariance = Invariance(symmetries, setting)
         if self._invariance:
-            self._base = self._base.take(self._invariance.terms(self._base))
-        columns = self._base.term_gradients(self._middle) * self._weight[:, None]
-        self._spanned = orthonormal(columns.reshape(-1, columns.shape[-1]))
-        self._target = -apply_j(z1 - z0) / self._h
+            setting.take(setting.base.take(self._invariance.terms(setting.base)), weight)
+        self._tried = 0  # atoms of the dictionary before
+        self._target = -apply_j(self._z1 - z0) / self._h
         self._closest: _State | None = None  # of the laws that were not exact
         self._partial: list[_State] = []
 
@@ -153,12 +135,13 @@ class Textbook:
     def law(self, *, products: bool = False, centres: bool = False) -> Law | None:
         """The plainest law whose flow takes z₀ to z₁, of a dictionary with products of shapes, with
         distances from other centres than the origin, or with neither; None where none is found."""
-        if centres and not any(argument.axes for argument in self._arguments):
+        setting = self._setting
+        if centres and not any(argument.axes for argument in setting.arguments):
             return None
-        blocks = [] if products or centres else blocks_of(self._arguments, self._degree)
-        tops = tops_of(self._arguments) if products else []
+        blocks = [] if products or centres else setting.blocks()
+        tops = setting.tops() if products else []
         with np.errstate(all="ignore"):
-            dictionary = self._dictionary(products, centres)
+            dictionary = self._dictionary(products=products, centres=centres)
             tried, self._tried = self._tried, len(dictionary.atoms)
             if len(dictionary.atoms) == tried:  # products and centres have brought nothing
                 return None
@@ -174,21 +157,9 @@ class Textbook:
             kinds.setdefault(kind, state)
         return [state.law for state in list(kinds.values())[:3]]
 
-    @property
-    def _degree(self) -> int:
-        degrees = OPTIONS.degrees
-        return degrees[self._dim - 1] if self._dim <= len(degrees) else 3
-
-    def _dictionary(self, products: bool = False, centres: bool = False) -> Dictionary:
-        return dictionary_of(
-            self._arguments,
-            self._weight,
-            self._spanned,
-            degree=self._degree,
-            products=products,
-            centres=centres,
-            allowed=self._invariance.of_atom if self._invariance else None,
-        )
+    def _dictionary(self, **contents: bool) -> Dictionary:
+        allowed = self._invariance.of_atom if self._invariance else None
+        return self._setting.dictionary(allowed=allowed, **contents)
 
     def _allowed(self, blocks: list[tuple[Atom, ...]]) -> list[tuple[Atom, ...]]:
         """The atoms of these that have the symmetries."""
@@ -198,8 +169,7 @@ class Textbook:
         return list(dict.fromkeys(block for block in kept if block))
 
     def _matching(self, target: np.ndarray) -> Matching:
-        flat = (target * self._weight).ravel()
-        return Matching(self._spanned, flat, self._weight, self._arguments)
+        return Matching(self._setting, (target * self._setting.weight).ravel())
 
     def _found(
         self,
@@ -212,26 +182,28 @@ class Textbook:
         if self._closest is not None and self._explains_nothing(self._closest, dictionary):
             return None  # what is left over is noise
         self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
-        rows = self._middle.size
-        most = rows / OPTIONS.rows_per_term - self._base.num_parameters
+        most = self._middle.size / OPTIONS.rows_per_term - self._setting.base.num_parameters
         blocks = [b for b in blocks if len(b) < most]
         target, last = self._target, np.inf
         for _ in range(OPTIONS.rounds):
             matching = self._matching(target)
-            tried = self._finalists(matching, dictionary, starts)
+            # The best matches, and plainer ones that leave hardly more.
+            best = matching.best(dictionary, OPTIONS.atoms, starts)[: OPTIONS.finalists]
+            plainer = [matching.plainer(m, dictionary) for m in best[: OPTIONS.plainer]]
+            tried = list({m.atoms: m for m in [*plainer, *best]}.values())
             whole = sorted((matching.refined(b) for b in blocks), key=lambda m: m.left)
             tried += [m for m in whole if m.left < 10 * tried[0].left][:2]
             states = [s for m in tried for s in [self._converged(m, target)] if s is not None]
             exact = [s for s in map(self._without_spare, states) if self._is_exact(s)]
             if exact:
-                return min(exact, key=lambda s: complexity_of(s.match.atoms))
+                return min(exact, key=lambda s: s.match.complexity)
             if not states:
                 return None
             self._partial += states
-            best = min(states, key=lambda s: s.law.left)
-            if not best.law.left < OPTIONS.contracted * last:
+            closest = min(states, key=lambda s: s.law.left)
+            if not closest.law.left < OPTIONS.contracted * last:
                 break
-            target, last, self._closest = best.target, best.law.left, best
+            target, last, self._closest = closest.target, closest.law.left, closest
         return None
 
     def _without_spare(self, state: _State) -> _State:
@@ -243,8 +215,7 @@ class Textbook:
 
     def _is_exact(self, state: _State) -> bool:
         """Return whether the law is as exact as no approximation of so many numbers would be."""
-        width = 2 * self._dim
-        others = [a for a in state.match.atoms if powers_of(a, self._arguments, width) is None]
+        _, others = self._setting.plain(state.match.atoms)
         if not others:
             return state.law.left <= OPTIONS.roundoff
         numbers = len(state.match.atoms) + sum(len(constants_of(a)) for a in others)
@@ -257,103 +228,79 @@ class Textbook:
         chance = 2 * np.log(len(dictionary.atoms)) + OPTIONS.certain
         return bool(-self._middle.size * np.log1p(-min(gain, 1 - 1e-12)) < chance)
 
-    def _finalists(
-        self, matching: Matching, dictionary: Dictionary, starts: list[tuple[Atom, ...]]
-    ) -> list[Match]:
-        """The best matches, and plainer ones that leave hardly more."""
-        tried = matching.best(dictionary, OPTIONS.atoms, starts)[: OPTIONS.finalists]
-        plainer = [matching.plainer(m, dictionary) for m in tried[: OPTIONS.plainer]]
-        return list({m.atoms: m for m in [*plainer, *tried]}.values())
-
     def _converged(self, match: Match, target: np.ndarray) -> _State | None:
         """The match with coefficients and constants as far as corrections lead; None where its
         flow fails."""
         best = None
         for _ in range(OPTIONS.corrections):
-            law, corrected = self._corrected(match, target)
-            if law is None:
+            found = self._corrected(match, target)
+            if found is None:
                 return best
-            if best is not None and not law.left < OPTIONS.contracted * best.law.left:
-                return best if best.law.left <= law.left else _State(match, law, corrected)
-            best, target = _State(match, law, corrected), corrected
+            if best is not None and not found.law.left < OPTIONS.contracted * best.law.left:
+                return best if best.law.left <= found.law.left else found
+            best, target = found, found.target
             match = self._matching(target).refined(match.atoms)
         return best
 
-    def _corrected(self, match: Match, target: np.ndarray) -> tuple[Law | None, np.ndarray]:
+    def _corrected(self, match: Match, target: np.ndarray) -> _State | None:
         """The law of these atoms with the coefficients that the gradients ask for, and the
-        gradients as its flow corrects them."""
+        gradients as its flow corrects them; None where a constant has run away, or the flow fails.
+        """
         try:
-            family = self._family(match.atoms)
-        except InputError:  # a constant that has run away
-            return None, target
-        columns = family.term_gradients(self._middle) * self._weight[:, None]
-        columns = columns.reshape(-1, columns.shape[-1])
+            family = self._setting.family(match.atoms)
+        except InputError:
+            return None
+        columns = self._setting.columns(family)
         size = np.linalg.norm(columns, axis=0)
         if not np.isfinite(size).all():
-            return None, target
+            return None
         size = np.where(size > 0, size, 1.0)
-        flat = (target * self._weight).ravel()
+        flat = (target * self._setting.weight).ravel()
         c = np.linalg.lstsq(columns / size, flat, rcond=1e-13)[0] / size
         images = self._problem.images(family, c, self._rows, _STEPS).states
         off = (images - self._z1) / self._problem.scale
         known = np.isfinite(off).all(axis=1)
         if np.mean(~known) > OPTIONS.lost:
-            return None, target
+            return None
         corrected = family.gradient(c, self._middle) - apply_j(self._z1 - images) / self._h
         corrected = np.where(known[:, None], corrected, target)
-        return Law(family, c, float(np.sqrt(np.mean(off[known] ** 2)))), corrected
-
-    def _family(self, atoms: Sequence[Atom]) -> Terms:
-        """Terms of the coordinates, products of two, and these atoms."""
-        width = 2 * self._dim
-        rows, texts = [], []
-        for atom in atoms:
-            row = powers_of(atom, self._arguments, width)
-            if row is None:
-                texts.append(atom_text(atom, self._arguments))
-            else:
-                rows.append(row)
-        family = self._base
-        if rows:
-            names = polynomial_terms(self._dim, 1).variables
-            family = joined(family, Terms(self._dim, names, tuple(dict.fromkeys(rows))))
-        return joined(family, given_terms(self._dim, texts)) if texts else family
+        return _State(match, Law(family, c, float(np.sqrt(np.mean(off[known] ** 2)))), corrected)
 
     # Simpler ways to say the same
 
     def _simplified(self, state: _State) -> _State:
         """The simplest law that is as exact: other atoms that match the corrected gradients, fewer
         of them, constants of fewer digits."""
-        dictionary = self._dictionary()
-        matching = self._matching(state.target)
+        matching, dictionary = self._matching(state.target), self._dictionary()
         bound = 3 * max(state.law.left, OPTIONS.roundoff)
-        simpler = [
-            m
-            for m in matching.best(dictionary, min(3, len(state.match.atoms)))
-            if m.left <= _AS_WELL * max(state.match.left, _MATCHED)
-        ]
-        for match in sorted(simpler, key=lambda m: complexity_of(m.atoms)):
-            if complexity_of(match.atoms) >= complexity_of(state.match.atoms):
+        others = matching.best(dictionary, min(3, len(state.match.atoms)))
+        simpler = [m for m in others if self._as_well(m.left, state)]
+        for match in sorted(simpler, key=lambda m: m.complexity):
+            if match.complexity >= state.match.complexity:
                 break
             found = self._converged(match, state.target)
             if found is not None and found.law.left <= bound:
                 state = found
                 break
-        state = self._fewer(state, bound)
-        return self._rounded(state, bound)
+        return self._rounded(self._fewer(state, bound), bound)
 
     def _fewer(self, state: _State, bound: float) -> _State:
         """Drop the atoms, and their factors, that are not needed."""
         matching = self._matching(state.target)
         for atoms in _shorter(state.match.atoms):
-            if complexity_of(atoms) >= complexity_of(state.match.atoms):
+            if complexity_of(atoms) >= state.match.complexity:
                 continue
-            if matching.residual_of(atoms) > _AS_WELL * max(state.match.left, _MATCHED):
+            if not self._as_well(matching.residual_of(atoms), state):
                 continue
             found = self._converged(matching.refined(atoms), state.target)
             if found is not None and found.law.left <= bound:
                 return self._fewer(found, bound)
         return state
+
+    @staticmethod
+    def _as_well(left: float, state: _State) -> bool:
+        """Return whether another match may do as well as that of a law."""
+        return left <= OPTIONS.as_well * max(state.match.left, OPTIONS.matched)
 
     def _rounded(self, state: _State, bound: float) -> _State:
         """Round each constant to as few digits as leave the law as exact."""
@@ -365,20 +312,20 @@ class Textbook:
                     inner[k] = rounded
                     atoms[i] = with_constants(atom, inner)
                     match = Match(tuple(atoms), state.match.left)
-                    law, corrected = self._corrected(match, state.target)
-                    if law is not None and law.left <= max(bound / 3, 2 * state.law.left):
-                        state = _State(match, law, corrected)
+                    found = self._corrected(match, state.target)
+                    if found and found.law.left <= max(bound / 3, 2 * state.law.left):
+                        state = found
                         break
         return state
 
 
 def _of_few_digits(constant: float) -> Iterator[float]:
     """Numbers near the constant, those of fewest digits first."""
-    if abs(constant) < _ROUNDED:
+    if abs(constant) < OPTIONS.rounded:
         yield 0.0
     for digits in range(1, 13):
         rounded = float(f"{constant:.{digits}g}")
-        if abs(rounded - constant) <= _ROUNDED * abs(constant):
+        if abs(rounded - constant) <= OPTIONS.rounded * abs(constant):
             yield rounded
 
 

@@ -11,57 +11,67 @@ states together. Among the laws within the noise the one of least description le
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
-from functools import partial
+import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.budget import FLOW, MATCHING, Allowance
+from gfnn_jax.budget import FLOW, MATCHING
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.noise import of_differences
 from gfnn_jax.dataset.runs import next_of
 from gfnn_jax.errors import InputError, OutOfTime
-from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.significance import ABOVE_NOISE
 from gfnn_jax.flows.collocation import Steps, operations
+from gfnn_jax.models.hamiltonians import arcs
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
-from gfnn_jax.models.hamiltonians.flow_arcs import FlowWithConstants
-from gfnn_jax.models.hamiltonians.formula import OnPartial, PartialLaw, Rival, Term
+from gfnn_jax.models.hamiltonians.formula import PartialLaw, Rival, Term, proposals
 from gfnn_jax.models.hamiltonians.formula import formula as formula_of
-from gfnn_jax.models.hamiltonians.fractions import proposals
-from gfnn_jax.models.hamiltonians.steps_of_law import validation_error
-from gfnn_jax.models.hamiltonians.symmetries import restricted
-from gfnn_jax.models.hamiltonians.whole_sequences import (
+from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.hamiltonians.sequences import (
     Measured,
-    SequenceFit,
     Sequences,
-    about_outliers,
     covariance_root_of,
-    has_rows_to_spare,
-    lacks_terms,
     noise_of,
+    summary_of,
     triangle_of,
 )
-from gfnn_jax.models.hamiltonians.work import LawWork
-from gfnn_jax.models.textbook.noisy_search import OPTIONS, Formula, NoisyTextbook
+from gfnn_jax.models.hamiltonians.symmetries import Known, restricted
+from gfnn_jax.models.textbook.noisy_search import OPTIONS as SEARCH
+from gfnn_jax.models.textbook.noisy_search import Formula, NoisyTextbook
 from gfnn_jax.models.textbook.weak_gradients import weak_gradients
 from gfnn_jax.solve.latent_arcs import Fitted
 from gfnn_jax.solve.linear import covariance_root
 
-_OPERATIONS = (2e8, 4e8, 8e8, 1.6e9)  # of a search, by degrees of freedom from 1
-_ORDER, _ALIKE = 6, 1.5  # of the differences that tell the noise, see `arcs`
-_LEAST = 3e-6  # of the spread: less noise than that is not what weak gradients leave over
-_LOOKED_AT = 20_000  # rows by which laws are compared
-_BEHIND = 40.0  # natural logarithms of likelihood by which a law is behind that is not fitted
-_BROUGHT = 3.0  # of it, that further terms must bring
-_FITTED = 4  # laws
-_EVALUATIONS = 3  # of the flow at each state, that the fits of a law to sequences take together
-_SCREENED, _ITERATIONS = 3e-4, 12  # of the cost, and iterations, while laws are compared
-_AS_NOISE = 1.1  # times the noise, that a law may leave over
+
+@dataclasses.dataclass(frozen=True)
+class NoisyDictionaryOptions:
+    """Tuned on the laws of benchmarks/textbook_noise.py.
+
+    operations: of a search, by degrees of freedom from 1. least: of the spread, less noise than
+    that is not what weak gradients leave over. looked_at: rows by which laws are compared. behind:
+    natural logarithms of likelihood by which a law is behind that is not fitted; brought: that
+    further terms must bring. fitted: laws. evaluations: of the flow at each state, that the fits of
+    a law to sequences take together. screened, iterations: part of the cost from which one counts,
+    and how many, while laws are compared. as_noise: times the noise, that a law may leave over.
+    sure: logarithm of the largest odds that are told.
+    """
+
+    operations: tuple[float, ...] = (2e8, 4e8, 8e8, 1.6e9)
+    least: float = 3e-6
+    looked_at: int = 20_000
+    behind: float = 40.0
+    brought: float = 3.0
+    fitted: int = 4
+    evaluations: int = 3
+    screened: float = 3e-4
+    iterations: int = 12
+    as_noise: float = 1.1
+    sure: float = 40.0
+
+
+OPTIONS = NoisyDictionaryOptions()
 _STEPS = Steps(6, 1)
-_SURE = 40.0  # logarithm of the largest odds that are told
 
 
 class _LawOfSequences(NamedTuple):
@@ -72,18 +82,12 @@ class _LawOfSequences(NamedTuple):
     length: float
 
 
-def law_of_sequences(
-    problem: Problem,
-    work: LawWork,
-    data: Dataset,
-    tolerance: Tolerance,
-    on_progress: Callable[[str], Any],
-    partly: OnPartial,
-) -> FittedLaw | None:
+def law_of_sequences(problem: LawProblem) -> FittedLaw | None:
     """The law, or None where the pairs are no noisy sequences of one dt, or nothing in the
-    dictionary leaves no more than their noise. partly: called with the three laws that come
+    dictionary leaves no more than their noise. ``partly`` is called with the three laws that come
     closest, where none does."""
-    if data.varied or data.structure is not None or data.dim > len(_OPERATIONS):
+    data, budget = problem.data, problem.budget
+    if data.varied or data.structure is not None or data.dim > len(OPTIONS.operations):
         return None
     stretches = _stretches(data)
     noise = _noise_of(stretches, data.scale)
@@ -91,22 +95,19 @@ def law_of_sequences(
     if noise is None or weak is None:
         return None
     angles = tuple(a for a in data.coordinates.angles if a < data.dim)
-    search = NoisyTextbook(
-        weak, angles=angles, cyclic=data.coordinates.cyclic, on_progress=on_progress
-    )
+    cyclic = data.coordinates.cyclic
+    search = NoisyTextbook(weak, angles=angles, cyclic=cyclic, on_progress=problem.on_progress)
     name = "laws of physics behind noise"
     try:
-        with work.budget.unit(name, MATCHING, _OPERATIONS[data.dim - 1]):
+        with budget.unit(name, MATCHING, OPTIONS.operations[data.dim - 1]):
             formulas = _worth(search.formulas())
         family = formulas[0].family(formulas[0].constants)
         states = len(formulas) * len(data.training)
-        expected = _EVALUATIONS * states * operations(family, 2 * data.dim, _STEPS, family)
-        with work.budget.unit(name, FLOW, expected):
-            return _chosen(
-                problem, formulas, data, tolerance, noise, Allowance(work.budget), partly
-            )
+        one = operations(family, 2 * data.dim, _STEPS, family)
+        with budget.unit(name, FLOW, OPTIONS.evaluations * states * one):
+            return _chosen(problem, formulas, noise)
     except OutOfTime:
-        work.budget.leave_out(name, work.ended)
+        budget.leave_out(name, problem.work.ended)
     except (np.linalg.LinAlgError, InputError):
         pass
     return None
@@ -114,7 +115,7 @@ def law_of_sequences(
 
 def _stretches(data: Dataset) -> list[np.ndarray]:
     """States (L, 2d) of the training sequences without gaps, their angles going on over turns."""
-    rows = np.sort(data.training)[:_LOOKED_AT]
+    rows = np.sort(data.training)[: OPTIONS.looked_at]
     goes_on = next_of(data.pairs, rows)
     if not goes_on.any():
         return []
@@ -128,35 +129,28 @@ def _stretches(data: Dataset) -> list[np.ndarray]:
 
 def _noise_of(stretches: list[np.ndarray], scale: np.ndarray) -> np.ndarray | None:
     """(2d,) the noise of each coordinate; None where differences of the states do not tell it."""
-    found = []
+    found, order = [], arcs.OPTIONS.order
     for i, size in enumerate(scale):
         moves = [np.diff(own[:, i : i + 1], axis=0) / size for own in stretches]
-        if not any(len(own) > _ORDER for own in moves):
+        if not any(len(own) > order for own in moves):
             return None
-        found.append(of_differences(moves, _ORDER, _ALIKE))
-    if None in found or min(found) < _LEAST:
+        found.append(of_differences(moves, order, arcs.OPTIONS.alike))
+    if None in found or min(found) < OPTIONS.least:
         return None
     return np.array(found, float) * scale
 
 
-def _chosen(
-    problem: Problem,
-    formulas: list[Formula],
-    data: Dataset,
-    tolerance: Tolerance,
-    noise: np.ndarray,
-    allowance: Allowance,
-    partly: OnPartial,
-) -> FittedLaw | None:
+def _chosen(problem: LawProblem, formulas: list[Formula], noise: np.ndarray) -> FittedLaw | None:
     """The law of least description length, where it leaves no more than noise."""
-    first = formulas[0]
-    sequences = Sequences.along(
-        problem, first.family(first.constants), first.coefficients, _STEPS, data, allowance
-    )
+    first, data = formulas[0], problem.data
+    family = first.family(first.constants)
+    sequences = Sequences.along(problem, family, first.coefficients, _STEPS)
     if sequences is None:
         return None
-    train = sequences.arcs(np.sort(data.training)[:_LOOKED_AT])
-    held = sequences.arcs(np.sort(data.validation)[:_LOOKED_AT])
+    train, held = (
+        sequences.arcs(np.sort(rows)[: OPTIONS.looked_at])
+        for rows in (data.training, data.validation)
+    )
     if train is None or held is None:
         return None
     laws: list[_LawOfSequences] = []
@@ -168,31 +162,28 @@ def _chosen(
             return None
     if not laws:
         return None
-    best = min(laws, key=lambda law: law.length)
-    on_held_out = _fitted(sequences, held, best.formula, best.fitted.p, only_states=True)
-    for found in (best.fitted, on_held_out):
-        if found is None or not _rms(noise_of(found) / noise) <= _AS_NOISE:
-            for law in sorted(laws, key=lambda law: law.length)[:3]:
-                left = _rms(noise_of(law.fitted) / noise)
-                partly(PartialLaw(_shown(law), left, "times the noise"))
-            return None
+    laws.sort(key=lambda law: law.length)
+    best = laws[0]
     formula, fitted = best.formula, best.fitted
-    if has_rows_to_spare(fitted, len(fitted.p)):
-        everyone = sequences.arcs(np.arange(len(data.y0)))
-        again = None if everyone is None else _fitted(sequences, everyone, formula, fitted.p)
-        fitted = again or fitted
-    found = _law(problem, formula, fitted, data, tolerance)
-    return found._replace(rivals=_rivals(best, laws))
+    on_held_out = _fitted(sequences, held, formula, fitted.p, only_states=True)
+    for found in (fitted, on_held_out):
+        if found is None or not _rms(noise_of(found) / noise) <= OPTIONS.as_noise:
+            for law in laws[:3]:
+                left = _rms(noise_of(law.fitted) / noise)
+                problem.partly(PartialLaw(_shown(law), left, "times the noise"))
+            return None
+    fitted = sequences.refitted(fitted, formula.family, len(formula.coefficients))
+    return _law(problem, formula, fitted)._replace(rivals=_rivals(laws))
 
 
-def _rivals(best: _LawOfSequences, laws: list[_LawOfSequences]) -> tuple[Rival, ...]:
-    """The next two laws of least description length, with the odds of the best against them."""
+def _rivals(laws: list[_LawOfSequences]) -> tuple[Rival, ...]:
+    """The next two laws of least description length, with the odds of the first against them."""
     others: dict[frozenset, _LawOfSequences] = {}
-    for law in sorted(laws, key=lambda law: law.length):
-        if law.formula.kind != best.formula.kind:
+    for law in laws:
+        if law.formula.kind != laws[0].formula.kind:
             others.setdefault(law.formula.kind, law)
     return tuple(
-        Rival(_shown(law), float(np.exp(min(law.length - best.length, _SURE))))
+        Rival(_shown(law), float(np.exp(min(law.length - laws[0].length, OPTIONS.sure))))
         for law in list(others.values())[:2]
     )
 
@@ -217,19 +208,23 @@ def _worth(formulas: list[Formula]) -> list[Formula]:
 
     kept: list[Formula] = []
     for formula in formulas:
-        if behind(formula, formulas[0]) > _BEHIND:
+        if behind(formula, formulas[0]) > OPTIONS.behind:
             continue
-        if any(o.kind < formula.kind and behind(formula, o) > -_BROUGHT for o in kept):
+        if any(o.kind < formula.kind and behind(formula, o) > -OPTIONS.brought for o in kept):
             continue
         kept.append(formula)
-    return kept[:_FITTED]
+    return kept[: OPTIONS.fitted]
 
 
-def _significant(sequences: Sequences, arcs: Measured, formula: Formula) -> _LawOfSequences | None:
+def _significant(
+    sequences: Sequences, measured: Measured, formula: Formula
+) -> _LawOfSequences | None:
     """The terms of a law that whole sequences tell from noise, fitted to them."""
     p = np.concatenate([formula.coefficients, formula.constants])
     while True:
-        found = _fitted(sequences, arcs, formula, p, gained=_SCREENED, iterations=_ITERATIONS)
+        found = _fitted(
+            sequences, measured, formula, p, gained=OPTIONS.screened, iterations=OPTIONS.iterations
+        )
         if found is None:
             return None
         kept = _certain(found, formula)
@@ -245,16 +240,16 @@ def _significant(sequences: Sequences, arcs: Measured, formula: Formula) -> _Law
     length = float(
         np.sum(count * np.log(noise_of(found)))
         + 0.5 * np.log(count.sum()) * len(found.p)
-        + OPTIONS.penalty * formula.complexity
+        + SEARCH.penalty * formula.complexity
     )
     return _LawOfSequences(formula, found, length)
 
 
 def _fitted(
-    sequences: Sequences, arcs: Measured, formula: Formula, p: np.ndarray, **options: Any
+    sequences: Sequences, measured: Measured, formula: Formula, p: np.ndarray, **options: Any
 ) -> Fitted | None:
-    law = partial(FlowWithConstants, formula.family, terms=len(p) - len(formula.constants))
-    return sequences.fitted(arcs, law, p, **options)
+    terms = len(p) - len(formula.constants)
+    return sequences.fitted(measured, formula.family, p, terms, **options)
 
 
 def _certain(found: Fitted, formula: Formula) -> list[int]:
@@ -278,9 +273,7 @@ def _certain(found: Fitted, formula: Formula) -> list[int]:
     return kept
 
 
-def _law(
-    problem: Problem, formula: Formula, fitted: Fitted, data: Dataset, tolerance: Tolerance
-) -> FittedLaw:
+def _law(problem: LawProblem, formula: Formula, fitted: Fitted) -> FittedLaw:
     """The law as any other that was fitted to pairs, with what its sequences tell.
 
     Standard errors are marginal: those of the constants inside widen them. A sample of the
@@ -288,11 +281,12 @@ def _law(
     times (m + k)/m for k constants beside m coefficients, which leaves the mean variance of the
     images at the states as it is.
     """
-    root, terms = covariance_root_of(fitted), len(formula.coefficients)
-    coordinates, rows = data.coordinates, triangle_of(fitted).rows
-    family = formula.family(fitted.p[terms:])
+    root, terms, data = covariance_root_of(fitted), len(formula.coefficients), problem.data
     known = restricted(
-        family, fitted.p, root.T @ root, data.y0[data.training], coordinates.angles, rows
+        formula.family(fitted.p[terms:]),
+        Known(fitted.p, root.T @ root, triangle_of(fitted).rows),
+        data.y0[data.training],
+        data.coordinates.angles,
     )
     c, covariance = known.numbers[:terms], known.covariance
     deviations = np.sqrt(np.diag(covariance).clip(0.0))
@@ -303,27 +297,16 @@ def _law(
     inner = tuple(map(Term, names, constants, deviations[terms:].tolist()))
     coefficients = map(Term, family.term_names, c.tolist(), deviations.tolist())
     near = proposals([*coefficients, *inner], covariance, len(inner))
-    fit = problem.fit(family, c, data.training, rounds=False)
+    fit = problem.flows.fit(family, c, data.training, rounds=False)
     fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
-    whole = SequenceFit(
-        tuple(range(terms)),
-        fit,
-        _covariance_root_of_coefficients(covariance, terms),
-        noise_of(fitted),
-        len(fitted.x),
-        about_outliers(fitted.residuals),
-        lacks_terms(fitted),
-    )
-    error = validation_error(family, fit, data, tolerance)
     return FittedLaw(
         family,
         fit,
         data.training,
-        error,
-        (),
+        problem.error_of(family, fit),
         noisy=True,
         stalled=True,
-        whole=whole,
+        whole=summary_of(fitted, _covariance_root_of_coefficients(covariance, terms)),
         constants=inner,
         symmetries=known.symmetries,
         proposals=near,

@@ -1,0 +1,224 @@
+"""Problem of a search for H: its pairs, what is asked of the law, and the work that is left."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.budget import FLOW, Allowance, Budget, Counted
+from gfnn_jax.coordinates import to_user
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
+from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
+from gfnn_jax.flows.collocation import Steps, images, operations, truncation
+from gfnn_jax.flows.rates import MOST_SUBSTEPS
+from gfnn_jax.models.hamiltonians.cost_of_flow import operations_of
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
+from gfnn_jax.models.hamiltonians.formula import OnPartial
+from gfnn_jax.models.hamiltonians.options import OPTIONS, LawOptions
+
+
+class LawWork:
+    """Work that a search for H may still do.
+
+    A library takes as many times the operations of one evaluation as the library before it did. The
+    search has a cap of its own, on the operations that it makes: without a budget that is what ends
+    it, at the same library on any machine.
+    """
+
+    def __init__(self, flows: Problem, budget: Budget, most: float):
+        self.flows, self.budget, self._cap = flows, budget, Counted(most)
+        self._evaluations = OPTIONS.evaluations
+        flows.allowance = Allowance(budget, self._cap)
+
+    @property
+    def ended(self) -> str:
+        """Reason that cut the search short; "" where nothing has."""
+        capped = f"the search for H reached its own limit of {self._cap.most:.2g} operations"
+        return self.budget.ended or (capped if self._cap.spent > self._cap.most else "")
+
+    def made(self) -> float:
+        """Operations so far."""
+        return self._cap.spent
+
+    def capped(self, most: float) -> None:
+        """Cap the search anew, beside what it has made; infinity lifts the cap."""
+        self._cap.most = self._cap.spent + most
+
+    @contextlib.contextmanager
+    def library(self, name: str, family, rows: int, *, first: bool = False) -> Iterator[None]:
+        """The fit of a library to so many pairs. first: it is fitted whatever the budget, where
+        nothing else would be left."""
+        one, before = self._one(family, rows), self._cap.spent
+        expected = self._evaluations * one
+        unit = (
+            self.budget.free(FLOW, expected, self.made)
+            if first
+            else self.budget.unit(name, FLOW, expected, made=self.made)
+        )
+        with self._without_clock(first), unit:
+            yield
+        self._evaluations = (self._cap.spent - before) / one
+
+    @contextlib.contextmanager
+    def again(self, name: str, family, rows: int) -> Iterator[None]:
+        """A unit in which terms that are close to their optimum are fitted to so many pairs. It
+        makes a law of a library, so that the end of the search is no reason to leave it out."""
+        given, over = (name, FLOW, OPTIONS.close * self._one(family, rows)), self.budget.over
+        unit = (
+            self.budget.last(*given, decides=True, made=self.made)
+            if over
+            else self.budget.unit(*given, made=self.made)
+        )
+        with self._without_clock(over), unit:
+            yield
+
+    def round(self, name: str, expected: float):
+        """A unit of so many operations."""
+        return self.budget.unit(name, FLOW, expected, made=self.made)
+
+    @contextlib.contextmanager
+    def _without_clock(self, bare: bool) -> Iterator[None]:
+        """Flows that, where ``bare``, look at the cap alone."""
+        allowance = self.flows.allowance
+        if bare:
+            self.flows.allowance = Allowance(cap=self._cap)
+        try:
+            yield
+        finally:
+            self.flows.allowance = allowance
+
+    def _one(self, family, rows: int) -> float:
+        """Operations of an evaluation."""
+        return rows * operations(family, self.flows.z0.shape[1], Steps(6, 1), family)
+
+
+def work_of_refit(family, rows: int, dim: int, steps: Steps) -> float:
+    """Operations of a fit of terms that are close to their optimum to so many pairs."""
+    return OPTIONS.close * rows * operations(family, 2 * dim, steps, family)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LawProblem:
+    """A search for H behind pairs.
+
+    data: without a base map; its training pairs are fitted, its validation pairs judge. scene:
+    lends its features and reversor. terms: a user's own, text or functions. dearest: operations of
+    a step above which H is not taken, for a map at hand meets the tolerance with fewer; infinite
+    where none does.
+    on_progress: is told what is tried. partly: called with laws of physics that explain a part,
+    where none explains all. begun: its work, once the search has begun.
+
+    Errors are those of steps, Z_predicted − Z, in the user's coordinates; the steps' own
+    (truncation) is held to a tenth of the tolerance.
+    """
+
+    data: Dataset
+    tolerance: Tolerance
+    budget: Budget = dataclasses.field(default_factory=Budget)
+    scene: Any = None
+    terms: Sequence[Any] = ()
+    options: LawOptions = OPTIONS
+    dearest: float = np.inf
+    on_progress: Callable[[str], Any] = lambda message: None
+    partly: OnPartial = lambda law: None
+    begun: LawWork | None = None
+
+    def beginning(self, data: Dataset, most: float = np.inf) -> LawProblem:
+        """The search as it begins, of these pairs, capped at so many operations."""
+        work = LawWork(flows_of(data, data.each_dt), self.budget, most)
+        return dataclasses.replace(self, data=data, begun=work)
+
+    def on(self, data: Dataset) -> LawProblem:
+        """The same search with other training and validation rows."""
+        return dataclasses.replace(self, data=data)
+
+    @property
+    def work(self) -> LawWork:
+        """The work that is left of a search that has begun."""
+        assert self.begun is not None
+        return self.begun
+
+    @property
+    def flows(self) -> Problem:
+        """Fits through the flow of these pairs."""
+        return self.work.flows
+
+    @property
+    def simple(self) -> bool:
+        """Return whether the pairs depend on nothing but their states, and have no structure."""
+        return self.data.args is None and self.data.structure is None
+
+    @property
+    def most_terms(self) -> float:
+        """Terms that the training rows tell apart."""
+        return len(self.data.training) * 2 * self.data.dim / self.options.rows_per_term
+
+    @property
+    def bound(self) -> float:
+        """The tolerance as a part of the coordinates' scale."""
+        asked = self.tolerance
+        return asked.bound if asked.relative else asked.bound / float(self.data.scale.max())
+
+    def met_by(self, law: FittedLaw) -> bool:
+        """Return whether the law's held-out error is within the tolerance, at 95 %."""
+        return law.error.bound <= self.tolerance.bound
+
+    def fitted(self, family, start, rows, **options: Any) -> FittedLaw:
+        """The terms fitted to these rows from ``start``; options: of `gauss_newton.Problem.fit`."""
+        fit = self.flows.fit(family, start, rows, **options)
+        return FittedLaw(family, fit, rows, self.error_of(family, fit))
+
+    def refitted(self, law: FittedLaw, rows) -> FittedLaw:
+        """Fitted to these rows, from where it is: each of them averages the noise."""
+        found = self.fitted(law.family, law.fit.coefficients, rows, rounds=False)
+        return law._replace(fit=found.fit, rows=rows, error=found.error)
+
+    def error_of(self, family, fit: FlowFit) -> OneStepError:
+        """Error by steps that resolve the held-out pairs: an unresolved passage says nothing of the
+        law."""
+        steps = self.resolving(family, fit.coefficients, fit.steps)
+        return self.error_of_steps(family, fit.coefficients, steps)
+
+    def error_of_steps(self, family, coefficients, steps: Steps) -> OneStepError:
+        """Error of these steps over the held-out pairs."""
+        data, rows = self.data, self.data.validation
+        dt, args = data.given(rows)
+        found = images(family, coefficients, data.y0[rows], dt, steps, args=args, scale=data.scale)
+        return measured_error(data, self.tolerance, to_user(data.coordinates, found.states))
+
+    def resolving(self, family, coefficients, steps: Steps) -> Steps:
+        """Keep these steps, or, where the law misses the tolerance by them, take finer ones: halved
+        until they resolve the held-out pairs, or there are as many as a flow may have."""
+        if self.error_of_steps(family, coefficients, steps).bound <= self.tolerance.bound:
+            return steps
+        rows, scale = self.data.validation, self.data.scale
+        states, (dt, args) = self.data.y0[rows], self.data.given(rows)
+        while 2 * steps.substeps <= MOST_SUBSTEPS:
+            off = truncation(family, coefficients, states, dt, steps, args=args, scale=scale)
+            if np.sqrt(np.mean((off / scale) ** 2)) <= OPTIONS.truncation * self.bound:
+                break
+            steps = dataclasses.replace(steps, substeps=2 * steps.substeps)
+        return steps
+
+    def cheapest(self, family, fit: FlowFit, fastest, rows) -> Steps:
+        """Steps whose own error on these rows is a tenth of the tolerance; near roundoff, or at it,
+        where that is not twice as dear. All rows have the data's own dt."""
+
+        def cost(steps: Steps) -> float:
+            return operations_of(family, 2 * family.dim, fastest, self.data.dt, steps)
+
+        bound = max(self.options.truncation * self.bound, 0.3 * fit.rms)
+        tolerances = (bound, min(bound, OPTIONS.near_roundoff), None)
+        flows = self.flows if self.data.own_dt is None else flows_of(self.data, self.data.dt)
+        found = flows.fine_steps(family, fit.coefficients, rows, tolerances)
+        return next(s for s in reversed(found) if s == found[0] or cost(s) < 2 * cost(found[0]))
+
+
+def flows_of(data: Dataset, dt) -> Problem:
+    """Fits through the flow over dt of these pairs."""
+    return Problem(data.y0, data.y1, dt, data.scale, args=data.args, weight=data.weight)

@@ -1,0 +1,313 @@
+"""The dictionary of the atoms that are tried, and the states at which they are looked at."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain, combinations, combinations_with_replacement, permutations, product
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.families.terms import Terms, exponents, given_terms, joined, polynomial_terms
+from gfnn_jax.fitting.significance import null_terms
+from gfnn_jax.models.textbook.arguments import Argument, arguments_of
+from gfnn_jax.models.textbook.atoms import (
+    Atom,
+    Factor,
+    atom_text,
+    gradient_of,
+    powers_of,
+    value_of,
+)
+from gfnn_jax.models.textbook.shapes import Kind, constants_for, has_constant, values
+
+
+@dataclasses.dataclass(frozen=True)
+class DictionaryOptions:
+    """Tuned on the laws of benchmarks/textbook.py.
+
+    degrees: of products of coordinates, by degrees of freedom from 1; 3 beyond. coarse: of the
+    constants tried of one factor every so manieth, in products; beyond 2d = ``small`` coordinates
+    products have no constants: they are too many. independent: of a column's length, that the base
+    does not span. most_monomials: of a block. centres: tried along each axis, of the plane and of
+    space; wider: times the box of the positions, where these are; central: shapes of the distance
+    from one.
+    """
+
+    degrees: tuple[int, ...] = (6, 4, 4)
+    coarse: int = 3
+    small: int = 4
+    independent: float = 1e-6
+    most_monomials: int = 500
+    centres: tuple[tuple[int, int], ...] = ((2, 15), (3, 9))
+    wider: float = 1.2
+    central: tuple[Kind, ...] = (
+        ("power", -1.0),
+        ("power", -2.0),
+        ("power", -3.0),
+        ("power", 1.0),
+        ("log", 0.0),
+    )
+
+
+OPTIONS = DictionaryOptions()
+_Group = Iterator[tuple[list[Atom], np.ndarray]]  # atoms, gradients (atoms, N, 2d)
+
+
+class Dictionary(NamedTuple):
+    """Atoms and their gradients, weighted by coordinate, without what a base spans of them, as
+    columns of unit length (rows, atoms)."""
+
+    atoms: list[Atom]
+    columns: np.ndarray
+
+
+class Setting:
+    """The states at which laws are looked at, and the rows that gradients of H make there.
+
+    states: (N, 2d). angles, cyclic: indices of z. average: makes the rows (…, R, 2d) of gradients
+    (…, N, 2d) at the states, where they are not these themselves. arguments: at the states. null:
+    the coordinates and products of two that the states do not tell from those before. base: the
+    others, which are in every law; spanned: (rows, n) orthonormal columns of them. weight: (2d,),
+    or of each row, by which gradients are multiplied.
+    """
+
+    def __init__(
+        self,
+        states: np.ndarray,
+        weight: np.ndarray,
+        angles: Sequence[int] = (),
+        cyclic: Sequence[int] = (),
+        average: Callable[[np.ndarray], np.ndarray] = np.asarray,
+    ):
+        self.states, self.angles, self.cyclic = states, tuple(angles), tuple(cyclic)
+        self.average, self.dim = average, states.shape[1] // 2
+        self.arguments = arguments_of(states, self.angles, self.cyclic)
+        every = polynomial_terms(self.dim, 2, cyclic=(*angles, *cyclic))
+        kept, null = null_terms(every, states)
+        self.null = tuple(every.term_names[j] for j in null)
+        self.take(every.take(kept), weight)
+
+    def take(self, base: Terms, weight: np.ndarray) -> None:
+        """Take this base, and these weights."""
+        self.base, self.weight = base, weight
+        self.spanned = orthonormal(self.columns(base))
+
+    @property
+    def degree(self) -> int:
+        """The highest degree of products of coordinates."""
+        degrees = OPTIONS.degrees
+        return degrees[self.dim - 1] if self.dim <= len(degrees) else 3
+
+    def flat(self, gradient: np.ndarray) -> np.ndarray:
+        """(rows,) of a gradient (N, 2d) at the states."""
+        return (self.average(gradient) * self.weight).ravel()
+
+    def columns(self, family: Terms) -> np.ndarray:
+        """(rows, terms): the weighted gradients of a family's terms."""
+        gradients = np.moveaxis(family.term_gradients(self.states), -1, 0)
+        return (self.average(gradients) * self.weight).reshape(family.num_parameters, -1).T
+
+    def plain(self, atoms: Sequence[Atom]) -> tuple[Terms, tuple[Atom, ...]]:
+        """The base with those of the atoms that are products of coordinates, and the others."""
+        rows = [powers_of(atom, self.arguments, 2 * self.dim) for atom in atoms]
+        others = tuple(atom for atom, row in zip(atoms, rows, strict=True) if row is None)
+        products = dict.fromkeys(row for row in rows if row is not None)
+        if not products:
+            return self.base, others
+        names = polynomial_terms(self.dim, 1).variables
+        return joined(self.base, Terms(self.dim, names, tuple(products))), others
+
+    def family(self, atoms: Sequence[Atom]) -> Terms:
+        """Terms of the base and these atoms. Raises InputError for a constant that has run away."""
+        return beside(*self.plain(atoms), self.arguments)
+
+    def dictionary(
+        self,
+        *,
+        products: bool = False,
+        centres: bool = False,
+        allowed: Callable[[Atom], bool] | None = None,
+    ) -> Dictionary:
+        """The atoms that are tried: shapes of one argument, and products of coordinates from the
+        third degree on; the base is in every law.
+
+        products: of a coordinate, a product of two or a sine or cosine with a shape of another
+        argument too. centres: shapes of distances from centres beside the origin too. allowed: says
+        which atoms; None: all.
+        """
+        atoms: list[Atom] = []
+        gradients: list[np.ndarray] = []
+        with np.errstate(all="ignore"):
+            groups = [self._of_one(), self._of_coordinates()]
+            groups += [self._of_products()] if products else []
+            groups += [self._of_centres()] if centres else []
+            for own, gradient in chain(*groups):
+                if allowed is not None:
+                    chosen = [i for i, atom in enumerate(own) if allowed(atom)]
+                    own, gradient = [own[i] for i in chosen], gradient[chosen]
+                atoms += own
+                gradients.append(self.average(gradient))
+            rows = (np.concatenate(gradients) * self.weight).reshape(len(atoms), -1)
+            size = np.linalg.norm(rows, axis=1)
+        kept = np.flatnonzero(np.isfinite(size) & (size > 0))
+        columns = (rows[kept] / size[kept, None]).T
+        for _ in range(2):  # the second time makes them orthogonal to roundoff
+            columns = columns - self.spanned @ (self.spanned.T @ columns)
+        size = np.linalg.norm(columns, axis=0)
+        independent = np.flatnonzero(size > OPTIONS.independent)
+        atoms = [atoms[kept[i]] for i in independent]
+        return Dictionary(atoms, columns[:, independent] / size[independent])
+
+    def blocks(self) -> list[tuple[Atom, ...]]:
+        """Atoms that laws have together: the first inverse powers of an argument, all products of
+        coordinates up to a degree."""
+        found: list[tuple[Atom, ...]] = []
+        for place, argument in enumerate(self.arguments):
+            kinds = [] if argument.circular else argument.kinds
+            for last in (2, 3, 4):
+                if ("power", -float(last)) in kinds:
+                    powers = range(1, last + 1)
+                    found.append(tuple((Factor(place, ("power", -float(n))),) for n in powers))
+        for highest in range(3, self.degree + 1):
+            block = tuple(self._monomials(highest, alone=True))
+            if block and len(block) <= OPTIONS.most_monomials:
+                found.append(block)
+        return found
+
+    def tops(self) -> list[tuple[Atom, ...]]:
+        """The three atoms that (p_i − p_j cos q)²/sin² q has beside p_j²: of a body that turns
+        about several axes, in Euler angles. None of them explains much without the others."""
+        places = dict(enumerate(self.arguments))
+        momenta = [place for place, argument in places.items() if argument.index >= self.dim]
+        circular = [place for place, argument in places.items() if argument.circular]
+        found = []
+        for above, under in permutations(circular, 2):
+            one_angle = places[above].entering == places[under].entering
+            if not one_angle or ("power", -2.0) not in places[under].kinds:
+                continue
+            pole = Factor(under, ("power", -2.0))
+            for i, j in combinations(momenta, 2):
+                squares = ((Factor(k, ("power", 2.0)), pole) for k in (i, j))
+                both = (Factor(place, ("power", 1.0)) for place in (i, j, above))
+                found.append((*squares, (*both, pole)))
+        return found
+
+    def _of_one(self) -> _Group:
+        """Shapes of one argument."""
+        for place, argument in enumerate(self.arguments):
+            single = _singles(place, argument, 1)
+            yield (
+                [(factor,) for factor in single.factors],
+                single.slope[:, :, None] * argument.gradient,
+            )
+
+    def _of_coordinates(self) -> _Group:
+        """Products of coordinates."""
+        for atom in self._monomials(self.degree):
+            yield [atom], gradient_of(atom, self.arguments)[None]
+
+    def _of_products(self) -> _Group:
+        """Products with a shape of something else."""
+        every = OPTIONS.coarse if 2 * self.dim <= OPTIONS.small else None
+        coarse = [_singles(place, x, every) for place, x in enumerate(self.arguments)]
+        entering = [x.entering for x in self.arguments]
+        for multiplier in self._multipliers():
+            used = {i for f in multiplier for i in entering[f.place]}
+            value = value_of(multiplier, self.arguments)
+            gradient = gradient_of(multiplier, self.arguments)
+            for argument, own, single in zip(self.arguments, entering, coarse, strict=True):
+                if used == own:
+                    continue
+                along = (single.slope * value)[:, :, None] * argument.gradient
+                yield (
+                    [(*multiplier, factor) for factor in single.factors],
+                    along + single.value[:, :, None] * gradient,
+                )
+
+    def _of_centres(self) -> _Group:
+        """Shapes of distances from the points of a grid, along the positions' range and somewhat
+        beyond."""
+
+        def grid(x: np.ndarray, points: int) -> list[float]:
+            middle, half = 0.5 * (x.min() + x.max()), 0.5 * OPTIONS.wider * np.ptp(x)
+            return np.linspace(middle - half, middle + half, points).tolist()
+
+        for place, argument in enumerate(self.arguments):
+            if not argument.axes:
+                continue
+            points = dict(OPTIONS.centres)[len(argument.axes)]
+            for centre in product(*(grid(x.value, points) for x in argument.axes)):
+                moved = argument.around(centre)
+                slopes = np.array([values(kind, moved.value, None)[1] for kind in OPTIONS.central])
+                atoms = [(Factor(place, kind, centre=centre),) for kind in OPTIONS.central]
+                yield atoms, slopes[:, :, None] * moved.gradient
+
+    @property
+    def _coordinates(self) -> list[int]:
+        """The places of the coordinates."""
+        return [place for place, x in enumerate(self.arguments) if x.index >= 0]
+
+    def _monomials(self, degree: int, *, alone: bool = False) -> list[Atom]:
+        """Products of coordinates of degree 3 to this one. alone: powers of one coordinate too."""
+        plain = self._coordinates
+        return [
+            tuple(Factor(plain[k], ("power", float(n))) for k, n in enumerate(row) if n)
+            for row in exponents(len(plain), degree)
+            if sum(row) > 2 and (alone or sum(n > 0 for n in row) > 1)
+        ]
+
+    def _multipliers(self) -> list[Atom]:
+        """Coordinates, products of two of them, sines and cosines: what shapes are multiplied
+        by."""
+
+        def one(place: int, n: float = 1.0) -> Factor:
+            return Factor(place, ("power", n))
+
+        plain = self._coordinates
+        pairs = combinations_with_replacement(plain, 2)
+        squares = ((one(i, 2.0),) if i == j else (one(i), one(j)) for i, j in pairs)
+        circular = [place for place, x in enumerate(self.arguments) if x.circular]
+        return [*((one(i),) for i in plain), *squares, *((one(i),) for i in circular)]
+
+
+class _Singles(NamedTuple):
+    """The atoms of one argument: their factors, f and f' (atoms, N)."""
+
+    factors: list[Factor]
+    value: np.ndarray
+    slope: np.ndarray
+
+
+def _singles(place: int, argument: Argument, every: int | None) -> _Singles:
+    """Shapes of the argument, with every so manieth of the constants that are tried; None: those
+    without constants."""
+    x, factors, f, slopes = argument.value, [], [], []
+    for kind in argument.kinds:
+        if argument.index >= 0 and kind in (("power", 1.0), ("power", 2.0)):
+            continue  # these are in every law
+        if every is None and has_constant(kind):
+            continue
+        thetas = constants_for(kind, x)[::every].tolist() if has_constant(kind) else [None]
+        for theta in thetas:
+            value, slope = values(kind, x, theta)
+            factors.append(Factor(place, kind, theta))
+            f.append(value)
+            slopes.append(slope)
+    return _Singles(factors, np.array(f), np.array(slopes))
+
+
+def beside(plain: Terms, atoms: Iterable[Atom], arguments: Sequence[Argument]) -> Terms:
+    """The terms, then these atoms. Raises InputError for a constant that has run away."""
+    texts = [atom_text(atom, arguments) for atom in atoms]
+    return joined(plain, given_terms(plain.dim, texts)) if texts else plain
+
+
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """A basis of what the columns span."""
+    if not columns.shape[1]:
+        return columns
+    size = np.linalg.norm(columns, axis=0)
+    u, s, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
+    return u[:, s > 1e-12 * s[0]]
