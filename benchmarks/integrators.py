@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 from gfnn_jax.phase_space import hamiltonian_vector_field
 from gfnn_jax.scenes import Scene
-from gfnn_jax.scenes.pcr3bp import MU
+from gfnn_jax.scenes.systems import MU
 
 # γ₁, …, γ_s of the symmetric compositions Φ(γ_s h) ∘ … ∘ Φ(γ₁ h) of leapfrogs Φ; the second half
 # mirrors the first. Yoshida, Phys. Lett. A 150 (1990); Kahan & Li, Math. Comp. 66 (1997).

@@ -45,7 +45,7 @@ from returns.tools import ITERATIONS, PRECISIONS, Sizes, Tool, tools
 import gfnn_jax as gfnn
 from gfnn_jax.evaluate import figures, metrics, report
 from gfnn_jax.scenes import Scene, driven_pendulum, henon_heiles_section
-from gfnn_jax.scenes.henon_heiles_section import FIXED_POINT
+from gfnn_jax.scenes.systems import FIXED_POINT
 
 PERIODS = (1, 2, 4, 8, 16)
 FULL = Sizes(3_000, 1_000, 50, 2, 200, 7, PRECISIONS)

@@ -49,7 +49,7 @@ from gfnn_jax.coordinates import TWO_PI
 from gfnn_jax.evaluate import figures, metrics, report
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.scenes import DrawnFrom, Scene, driven_pendulum, henon_heiles, henon_heiles_section
-from gfnn_jax.scenes.henon_heiles_section import FIXED_POINT
+from gfnn_jax.scenes.systems import FIXED_POINT
 from gfnn_jax.solve.status import OK
 
 FIGURE = FIGURES / "two_body_error.png"

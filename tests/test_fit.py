@@ -15,7 +15,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.diagnosis.local_jacobians import local_jacobians, look_symplectic
 from gfnn_jax.learn import choose
 from gfnn_jax.scenes import DrawnFrom, Scene, henon_heiles
-from gfnn_jax.scenes.two_body import angular_momentum
+from gfnn_jax.scenes.systems import angular_momentum
 
 
 def pendulum(z, num_steps=50, dt=0.4):

@@ -2,10 +2,6 @@
 
 import dataclasses
 import math
-import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-import gfnn_jax
 from gfnn_jax import scenes
 from gfnn_jax.coordinates import to_inner, to_user
 from gfnn_jax.phase_space import hamiltonian_vector_field, symplectic_form, symplecticity_defect
 from gfnn_jax.scenes import draws
 from gfnn_jax.scenes import trajectories as tr
-from gfnn_jax.scenes.two_body import angular_momentum, hamiltonian, kepler_flow
+from gfnn_jax.scenes.systems import angular_momentum, kepler_energy, kepler_flow
 
 FLOW = jax.jit(jax.vmap(kepler_flow))
 
@@ -62,7 +57,7 @@ def test_kepler_flow_on_circles_whole_periods_and_long_times():
     z0 = jnp.array([kepler_state(1.0, 0.9, 0.3)])
     z = FLOW(z0, jnp.array([2 * math.pi * 1000]))
     np.testing.assert_allclose(z, z0, atol=1e-9, rtol=0)
-    for invariant in (hamiltonian, angular_momentum):
+    for invariant in (kepler_energy, angular_momentum):
         np.testing.assert_allclose(invariant(z[0]), invariant(z0[0]), rtol=3e-14)
     # Circular orbits are an ordinary point of the derivatives too.
     jacobian = np.asarray(jax.jit(jax.jacfwd(kepler_flow))(circle[0], 0.7))
@@ -282,35 +277,11 @@ def test_chaotic_henon_heiles_stays_in_the_well():
         assert np.abs(orbit[..., :2]).max() < 1.01
 
 
-NEW_SCENE = """
-from gfnn_jax.scenes.scene import DrawnFrom, Scene
-
-
-def free_rotor():
-    return Scene("free-rotor", "turns", dim=1, dt=0.1, sampling=DrawnFrom(None))
-
-
-SCENES = {"free-rotor": free_rotor}
-"""
-
-
-def test_a_new_scene_needs_its_own_file_only(tmp_path):
-    """A copy of the folder with one more module in it, as another process finds it."""
-    package = tmp_path / "gfnn_jax"
-    shutil.copytree(Path(gfnn_jax.__file__).parent, package)
-    (package / "scenes" / "free_rotor.py").write_text(NEW_SCENE)
-    code = (
-        "from gfnn_jax import scenes;"
-        "s = scenes.make('free-rotor');"
-        "print(scenes.free_rotor() == s, s.num_pairs, s.tolerance, *scenes.names())"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
-    )
-    expected = {*scenes.names(), "free-rotor"}
-    *first, names = done.stdout.split(maxsplit=3)
-    assert first == ["True", "4000", "1e-08"]
-    assert set(names.split()) == expected
+def test_a_scene_of_ones_own_has_a_name(monkeypatch):
+    mine = dataclasses.replace(scenes.two_body(), name="mine")
+    monkeypatch.setitem(scenes.SCENES, "mine", lambda: mine)
+    assert scenes.make("mine") is mine
+    assert scenes.make("mine", 0.2).dt == 0.2
 
 
 def test_the_same_scene_made_twice_has_the_same_functions():

@@ -18,7 +18,7 @@ from gfnn_jax.families.traced import traced
 from gfnn_jax.models.hamiltonians.formula import formula
 from gfnn_jax.models.lagrangians.learned_law import Hamiltonian
 from gfnn_jax.scenes import SCENES
-from gfnn_jax.scenes.pcr3bp import features
+from gfnn_jax.scenes.systems import pcr3bp_features as features
 
 RNG = np.random.default_rng(0)
 W = RNG.uniform(0.3, 0.9, (5, 2, 4))

@@ -19,7 +19,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.coordinates import TWO_PI, Coordinates, polar
 from gfnn_jax.evaluate import metrics
 from gfnn_jax.scenes import DrawnFrom, pcr3bp, two_body
-from gfnn_jax.scenes.pcr3bp import MU
+from gfnn_jax.scenes.systems import MU
 
 
 def delaunay() -> Coordinates:

@@ -1,17 +1,11 @@
-"""Scenes that come with the package, each a `Scene`, by function and by name.
-
-Each scene is one module here. Its ``SCENES`` maps names on the command line to the functions that
-make the scenes. Its function of the module's own name becomes a function of this package.
-"""
+"""Scenes that come with the package, each a `Scene`, by function and by name."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-import importlib
-import pkgutil
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from functools import partial
 
 from gfnn_jax.scenes.scene import (
     AroundOrbit,
@@ -21,34 +15,39 @@ from gfnn_jax.scenes.scene import (
     Section,
     UniformInEllipse,
 )
+from gfnn_jax.scenes.systems import (
+    ESCAPE_ENERGY,
+    driven_pendulum,
+    driven_pendulum_phase,
+    fput,
+    froeschle,
+    henon_heiles,
+    henon_heiles_section,
+    n_body,
+    pcr3bp,
+    pendulum_length,
+    standard_map,
+    toda,
+    two_body,
+)
 
-if TYPE_CHECKING:  # what is collected below
-    from gfnn_jax.scenes.driven_pendulum import driven_pendulum
-    from gfnn_jax.scenes.driven_pendulum_phase import driven_pendulum_phase
-    from gfnn_jax.scenes.fput import fput
-    from gfnn_jax.scenes.froeschle import froeschle
-    from gfnn_jax.scenes.henon_heiles import henon_heiles
-    from gfnn_jax.scenes.henon_heiles_section import henon_heiles_section
-    from gfnn_jax.scenes.n_body import n_body
-    from gfnn_jax.scenes.pcr3bp import pcr3bp
-    from gfnn_jax.scenes.pendulum_length import pendulum_length
-    from gfnn_jax.scenes.standard_map import standard_map
-    from gfnn_jax.scenes.toda import toda
-    from gfnn_jax.scenes.two_body import two_body
-
-_OTHER_MODULES = ("scene", "trajectories", "draws")
-SCENES: dict[str, Callable[[], Scene]] = {}
-
-
-def _collect() -> None:
-    for found in pkgutil.iter_modules(__path__):
-        if found.name not in _OTHER_MODULES:
-            module = importlib.import_module(f"{__name__}.{found.name}")
-            SCENES.update(module.SCENES)
-            globals()[found.name] = getattr(module, found.name)
-
-
-_collect()
+SCENES: dict[str, Callable[[], Scene]] = {  # by their names on the command line
+    "driven-pendulum": driven_pendulum,
+    "driven-pendulum-phase": driven_pendulum_phase,
+    "fput": fput,
+    "froeschle": froeschle,
+    "henon-heiles-regular": henon_heiles,
+    "henon-heiles-chaotic": partial(henon_heiles, energy=ESCAPE_ENERGY),
+    "henon-heiles-printed": partial(henon_heiles, printed=True),
+    "henon-heiles-section": henon_heiles_section,
+    "n-body": n_body,
+    "pcr3bp": pcr3bp,
+    "pendulum-length": pendulum_length,
+    "standard-map-regular": standard_map,
+    "standard-map-chaotic": partial(standard_map, k=1.2),
+    "toda": toda,
+    "two-body": two_body,
+}
 
 
 def names() -> tuple[str, ...]:

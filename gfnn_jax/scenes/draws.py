@@ -17,14 +17,7 @@ from jaxtyping import Float
 from gfnn_jax.coordinates import TWO_PI, to_inner, to_user
 from gfnn_jax.phase_space import Pairs, require_x64
 from gfnn_jax.scenes.scene import AroundOrbit, DrawnFrom, Scene
-from gfnn_jax.scenes.trajectories import (
-    after_own_dt,
-    blocks,
-    reference_of,
-    reference_trajectories,
-    trajectories_from,
-    with_params,
-)
+from gfnn_jax.scenes.trajectories import Reference, reference_trajectories, with_params
 
 Drawn = Float[np.ndarray, "num phase"]
 
@@ -54,10 +47,10 @@ def _perturbations(key, *, length, shape):
 
 
 @lru_cache(maxsize=KEPT_ORBITS)
-def _orbit(law: AroundOrbit, *reference):
+def _orbit(law: AroundOrbit, reference: Reference):
     """States (num_steps + 1, 2d) of the law's orbit."""
     start = np.array([law.start])
-    states = trajectories_from(start, 1, law.num_steps, *reference)
+    states = reference.trajectories(start, 1, law.num_steps)
     return np.concatenate([start, states[:, 0]])
 
 
@@ -84,7 +77,7 @@ def _draw(scene, law, num, key):
     require_x64("drawing states")
     if isinstance(law, DrawnFrom):
         return np.asarray(_drawn(key, draw=law.draw, num=num), np.float64)
-    orbit = _orbit(law, *reference_of(scene))
+    orbit = _orbit(law, Reference.of(scene))
     time, noise = _perturbations(key, length=len(orbit), shape=(_enough(num), 2 * scene.dim))
     z = orbit[np.asarray(time)[:num]] + law.sigma * np.asarray(noise)[:num]
     return _reduce_angles(scene.coordinates, z)
@@ -162,11 +155,7 @@ def sample_pairs(
         )
     z0 = sample_states(scene, num_pairs, key)
     dt = low + (high - low) * _uniform(jax.random.fold_in(key, 1), num_pairs)
-    reference = reference_of(scene)
-    x0 = with_params(scene, z0, params, t0)
-    z1 = np.empty_like(x0)
-    for rows in blocks(num_pairs):
-        z1[rows] = after_own_dt(x0[rows], dt[rows], flow=reference[1], hamiltonian=reference[4])
+    z1 = Reference.of(scene).after(with_params(scene, z0, params, t0), dt)
     return Pairs(z0, z1[:, : z0.shape[1]], dt, args, t0, period)
 
 

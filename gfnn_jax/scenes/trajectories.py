@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.phase_space import hamiltonian_vector_field, require_x64
-from gfnn_jax.scenes.scene import Scene
+from gfnn_jax.scenes.scene import Scene, Section
 
 States = Float[Array | np.ndarray, "batch phase"]
 
@@ -30,27 +30,27 @@ SAVED_AT_ONCE = 64  # states of a trajectory that one call of the program return
 LONGEST_RETURN = 1e6  # time allowed for a return to a section; lost orbits run out of steps before
 
 
-def _solve(field, start, end, z, until=None):
-    """Integrate dz/dt = field(z, t) by Dopri8 from z (2d,) at time ``start`` to time ``end``.
+def _solve(field, start, end, z, until=None, *, tolerance=TOLERANCE, predicts=False):
+    """Integrate dz/dt = field(z, t) from z (2d,) at time ``start`` to time ``end``: by Dopri8, or
+    where it ``predicts`` by Dopri5, which is then differentiated forwards.
 
     With ``until`` the solver stops at the end of the first step after which ``until(z)`` holds. It
     never interpolates. The result is NaN where the solver fails.
     """
     import diffrax  # takes half a second: loaded when first used
 
-    event = None if until is None else diffrax.Event(lambda t, y, args, **_: until(y))
-    # A dead lane gets an interval of length zero, so that the others do not wait for it.
-    end = jnp.where(jnp.all(jnp.isfinite(z)), end, start)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, z, _: field(z, t)),
-        diffrax.Dopri8(),
+        diffrax.Dopri5() if predicts else diffrax.Dopri8(),
         start,
-        end,
+        # A dead lane gets an interval of length zero, so that the others do not wait for it.
+        jnp.where(jnp.all(jnp.isfinite(z)), end, start),
         None,
         z,
-        stepsize_controller=diffrax.PIDController(rtol=TOLERANCE, atol=TOLERANCE),
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
         max_steps=MAX_SOLVER_STEPS,
-        event=event,
+        event=None if until is None else diffrax.Event(lambda t, y, args, **_: until(y)),
+        adjoint=diffrax.ForwardMode() if predicts else diffrax.RecursiveCheckpointAdjoint(),
         throw=False,
     )
     assert solution.ys is not None  # saved at its end
@@ -60,109 +60,96 @@ def _solve(field, start, end, z, until=None):
 
 
 @dataclasses.dataclass(frozen=True)
-class _WithArgs:
-    """Vector field of a Hamiltonian with parameters: ``field(x, t)`` for x = (z, args).
+class _Dynamics:
+    """All of a scene that a compiled program depends on: what moves x = (z, parameters, time of the
+    drive at t = 0), z of ``width`` entries. begins: True where x has that time."""
 
-    z has ``width`` entries; args are constant in time. begins: True where the last of the args is
-    the time of the drive at t = 0.
-    """
-
-    hamiltonian: Callable
+    flow: Callable | None
+    step: Callable | None
+    section: Section | None
+    hamiltonian: Callable | None
     width: int
-    begins: bool = False
+    begins: bool
 
     def field(self, x, t=0.0):
+        """Vector field of the Hamiltonian; parameters are constant in time."""
         z, args = x[: self.width], x[self.width :]
         begin, own = (args[-1], args[:-1]) if self.begins else (0.0, args)
         given = (own,) if own.size else ()
         along = hamiltonian_vector_field(lambda z, t: self.hamiltonian(z, t, *given))
-        return jnp.concatenate([along(z, begin + t), jnp.zeros_like(args)])
+        rate = along(z, begin + t if self.begins else t)
+        return jnp.concatenate([rate, jnp.zeros_like(args)]) if args.size else rate
 
+    def integrated(self, dt):
+        """Make ``advance(t, x)`` by one ``dt``, for x (B, ...). A state that fails becomes NaN for
+        good. Each dt is one solve, so that a trajectory does not depend on which of its states are
+        saved."""
+        return jax.vmap(lambda t, x: _solve(self.field, t, t + dt, x), in_axes=(None, 0))
 
-def _field(hamiltonian):
-    given = isinstance(hamiltonian, _WithArgs)
-    return hamiltonian.field if given else hamiltonian_vector_field(hamiltonian)
+    def advance(self, dt, period):
+        """Make ``advance(t, x)``, x (B, ...) one dt or one step of the map later.
 
+        With a period dt is a whole number of them. Each is one solve from time 0, so that the time
+        never grows and loses digits.
+        """
+        if self.step is not None or self.section is not None:
+            lanes = jax.vmap(self.step or self._returned)
+            return lambda t, x: lanes(x)
+        if period is None:
+            return self.integrated(dt)
+        one, periods = self.integrated(period), jnp.round(dt / period).astype(int)
+        return lambda t, x: jax.lax.fori_loop(0, periods, lambda _, x: one(0.0, x), x)
 
-def _integrator(hamiltonian, dt):
-    """Make ``advance(t, z)`` by one ``dt``, for z (B, 2d). A state that fails becomes NaN for good.
+    def _returned(self, z):
+        """The next crossing of the section, to roundoff, from z (2d,).
 
-    Each dt is one solve, so that a trajectory does not depend on which of its states are saved.
-    """
-    field = _field(hamiltonian)
-    return jax.vmap(lambda t, z: _solve(field, t, t + dt, z), in_axes=(None, 0))
+        The orbit is followed to below the section and then to beyond it. It is brought back onto it
+        with the section's own coordinate as the independent variable (Hénon, Physica D 5, 1982).
+        """
+        assert self.section is not None
+        field, i = hamiltonian_vector_field(self.section.hamiltonian), self.section.index
 
+        def by_coordinate(x, _):
+            rate = field(x)
+            return rate / rate[i]
 
-def _stroboscopic(hamiltonian, period, dt):
-    """Make ``advance(t, z)`` by ``dt``, a whole number of periods of the Hamiltonian in t.
-
-    Each period is one solve from time 0, so that the time never grows and loses digits.
-    """
-    one = _integrator(hamiltonian, period)
-    periods = jnp.round(dt / period).astype(int)
-    return lambda t, z: jax.lax.fori_loop(0, periods, lambda _, z: one(0.0, z), z)
-
-
-def _return_map(section):
-    """Make ``step(z)``, the next crossing of the section, to roundoff, from z (2d,).
-
-    The orbit is followed to below the section and then to beyond it. It is brought back onto it
-    with the section's own coordinate as the independent variable (Hénon, Physica D 5, 1982).
-    """
-    field, i = hamiltonian_vector_field(section.hamiltonian), section.index
-
-    def by_coordinate(x, _):
-        rate = field(x)
-        return rate / rate[i]
-
-    def step(z):
-        x = section.lift(z)
+        x = self.section.lift(z)
         x = _solve(field, 0.0, LONGEST_RETURN, x, until=lambda x: x[i] < 0)
         x = _solve(field, 0.0, LONGEST_RETURN, x, until=lambda x: x[i] > 0)
-        return section.coordinates(_solve(by_coordinate, x[i], 0.0, x))
+        return self.section.coordinates(_solve(by_coordinate, x[i], 0.0, x))
 
-    return step
+    @partial(jax.jit, static_argnames=("self",))
+    def continued(self, start, x0, first, count, every, times):
+        """States after ``every``, 2 every, ..., count every steps, from step ``first`` on.
 
+        Returns (SAVED_AT_ONCE, B, ...), of which the first ``count`` rows count. start: the states
+        at step 0, for an exact flow; x0: those at step ``first``. times: dt, and the period.
+        """
+        dt, period = times
+        advance = None if self.flow is not None else self.advance(dt, period)
 
-@partial(jax.jit, static_argnames=("flow", "step", "section", "hamiltonian", "period"))
-def _continued(start, z0, first, count, every, dt, flow, step, section, hamiltonian, period):
-    """States after ``every``, 2 every, ..., count every steps, from step ``first`` on.
+        def ahead(x, i):
+            if advance is None:
+                return jax.vmap(self.flow, (0, None))(start, dt * (i + every).astype(float))
+            return jax.lax.fori_loop(i, i + every, lambda i, x: advance(dt * i.astype(float), x), x)
 
-    Returns (SAVED_AT_ONCE, B, 2d), of which the first ``count`` rows count. start: the states at
-    step 0, for an exact flow; z0: those at step ``first``.
-    """
-    if flow is not None:
-        lanes = jax.vmap(flow, in_axes=(0, None))
+        def save(k, carry):
+            x, saved = carry
+            x = ahead(x, first + every * k)
+            return x, saved.at[k].set(x)
 
-        def ahead(z, i):
-            return lanes(start, dt * (i + every).astype(float))
+        saved = jnp.zeros((SAVED_AT_ONCE, *x0.shape))
+        return jax.lax.fori_loop(0, count, save, (x0, saved))[1]
 
-    else:
-        advance = _advance(dt, step, section, hamiltonian, period)
-
-        def ahead(z, i):
-            return jax.lax.fori_loop(i, i + every, lambda i, z: advance(dt * i.astype(float), z), z)
-
-    def save(k, carry):
-        z, saved = carry
-        z = ahead(z, first + every * k)
-        return z, saved.at[k].set(z)
-
-    saved = jnp.zeros((SAVED_AT_ONCE, *z0.shape))
-    return jax.lax.fori_loop(0, count, save, (z0, saved))[1]
-
-
-def _advance(dt, step, section, hamiltonian, period):
-    """Make ``advance(t, z)``, z (B, 2d) one dt or one step of the map later."""
-    if step is not None or section is not None:
-        lanes = jax.vmap(step or _return_map(section))
-        return lambda t, z: lanes(z)
-    if period is not None:
-        return _stroboscopic(hamiltonian, period, dt)
-    return _integrator(hamiltonian, dt)
+    @partial(jax.jit, static_argnames=("self",))
+    def after(self, x, dt):
+        """Advance states x (B, ...), each by its own time dt (B,)."""
+        if self.flow is not None:
+            return jax.vmap(self.flow)(x, dt)
+        return jax.vmap(lambda x, dt: _solve(self.field, 0.0, dt, x))(x, dt)
 
 
-def blocks(num):
+def _blocks(num):
     """Yield ``rows``, the numbers of the states that are solved together, all of one length.
 
     The last state fills up the last block. A state has the same bits beside any others, for the
@@ -173,57 +160,50 @@ def blocks(num):
         yield np.minimum(np.arange(first, first + lanes), num - 1)
 
 
-def trajectories_from(z0, save_every: int, num_saved: int, *reference) -> np.ndarray:
-    """States after save_every, 2 save_every, ... steps: (num_saved, B, 2d)."""
-    saved = np.empty((num_saved, *z0.shape))
-    for rows in blocks(len(z0)):
-        start = z = z0[rows]
-        for done in range(0, num_saved, SAVED_AT_ONCE):
-            count = min(SAVED_AT_ONCE, num_saved - done)
-            part = _continued(start, z, done * save_every, count, save_every, *reference)
-            saved[done : done + count, rows] = np.asarray(part)[:count]
-            z = saved[done + count - 1, rows]
-    return saved
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """Everything that a trajectory of a scene depends on; it compares by value."""
 
+    dynamics: _Dynamics
+    dt: float
+    period: float | None
 
-def _check_traceable(scene: Scene) -> None:
-    z, t = jax.ShapeDtypeStruct((2 * scene.dim,), jnp.float64), 0.0
-    given = tuple(jax.ShapeDtypeStruct((n,), jnp.float64) for n in [len(scene.parameters)] if n)
-    for name, function, arguments in (
-        ("flow", scene.flow, (z, t)),
-        ("step", scene.step, (z,)),
-        ("hamiltonian", scene.hamiltonian, (z, t, *given)),
-    ):
-        try:
-            _ = None if function is None else jax.eval_shape(function, *arguments)
-        except jax.errors.TracerArrayConversionError:
-            raise InputError(
-                f"expected the {name} of the scene {scene.name} written with jax.numpy, which JAX "
-                "can trace; it uses NumPy's functions"
-            ) from None
+    @classmethod
+    def of(cls, scene: Scene) -> Reference:
+        """Raises InputError where the scene's flow, map or Hamiltonian is written with NumPy."""
+        z, t = jax.ShapeDtypeStruct((2 * scene.dim,), jnp.float64), 0.0
+        args = [jax.ShapeDtypeStruct((n,), jnp.float64) for n in [len(scene.parameters)] if n]
+        for name, given in (("flow", (z, t)), ("step", (z,)), ("hamiltonian", (z, t, *args))):
+            function = getattr(scene, name)
+            try:
+                _ = None if function is None else jax.eval_shape(function, *given)
+            except jax.errors.TracerArrayConversionError:
+                raise InputError(
+                    f"expected the {name} of the scene {scene.name} written with jax.numpy, which "
+                    "JAX can trace; it uses NumPy's functions"
+                ) from None
+        parts = scene.flow, scene.step, scene.section, scene.hamiltonian
+        dynamics = _Dynamics(*parts, 2 * scene.dim, scene.any_phase)
+        return cls(dynamics, scene.dt, None if scene.any_phase else scene.period)
 
+    def trajectories(self, x0, save_every: int, num_saved: int) -> np.ndarray:
+        """States after save_every, 2 save_every, ... steps: (num_saved, B, ...)."""
+        saved, times = np.empty((num_saved, *x0.shape)), (self.dt, self.period)
+        for rows in _blocks(len(x0)):
+            start = x = x0[rows]
+            for done in range(0, num_saved, SAVED_AT_ONCE):
+                count, first = min(SAVED_AT_ONCE, num_saved - done), done * save_every
+                part = self.dynamics.continued(start, x, first, count, save_every, times)
+                saved[done : done + count, rows] = np.asarray(part)[:count]
+                x = saved[done + count - 1, rows]
+        return saved
 
-def reference_of(scene: Scene) -> tuple:
-    """Everything that a trajectory of the scene depends on, as arguments of `trajectories_from`.
-
-    Raises InputError where the scene's flow, map or Hamiltonian is written with NumPy.
-    """
-    _check_traceable(scene)
-    hamiltonian = scene.hamiltonian
-    if scene.parameters or scene.any_phase:
-        assert hamiltonian is not None
-        hamiltonian = _WithArgs(hamiltonian, 2 * scene.dim, scene.any_phase)
-    period = None if scene.any_phase else scene.period
-    return scene.dt, scene.flow, scene.step, scene.section, hamiltonian, period
-
-
-@partial(jax.jit, static_argnames=("flow", "hamiltonian"))
-def after_own_dt(x, dt, *, flow, hamiltonian):
-    """Advance states x (B, ...), each by its own time dt (B,)."""
-    if flow is not None:
-        return jax.vmap(flow)(x, dt)
-    field = _field(hamiltonian)
-    return jax.vmap(lambda x, dt: _solve(field, 0.0, dt, x))(x, dt)
+    def after(self, x0, dt) -> np.ndarray:
+        """States (B, ...) each its own time dt (B,) later."""
+        x1 = np.empty_like(x0)
+        for rows in _blocks(len(x0)):
+            x1[rows] = self.dynamics.after(x0[rows], dt[rows])
+        return x1
 
 
 def reference_trajectories(
@@ -240,25 +220,23 @@ def reference_trajectories(
     require_x64("a reference trajectory")
     z0 = np.asarray(z0, np.float64)
     x0 = with_params(scene, z0, params, t0)
-    saved = trajectories_from(x0, save_every, num_steps // save_every, *reference_of(scene))
+    saved = Reference.of(scene).trajectories(x0, save_every, num_steps // save_every)
     saved = np.moveaxis(saved, 0, 1)[..., : z0.shape[1]]
     return np.concatenate([z0[:, None], saved], axis=1)
 
 
 def with_params(scene: Scene, z0, params, t0=None):
-    """Concatenate states, parameters and initial times of the drive (B, 2d + k)."""
-    if (t0 is not None) != scene.any_phase:
-        wanted = "t0, the time of the drive" if scene.any_phase else "no t0"
-        raise ValueError(f"expected {wanted} for the scene {scene.name}")
-    count = len(scene.parameters)
-    if (params is not None) != bool(count):
-        wanted = f"params {', '.join(scene.parameters)}" if count else "no params"
-        raise ValueError(f"expected {wanted} for the scene {scene.name}")
-    if count:
-        z0 = np.concatenate([z0, np.broadcast_to(params, (len(z0), count))], axis=1)
-    if t0 is not None:
-        z0 = np.concatenate([z0, np.broadcast_to(t0, len(z0))[:, None]], axis=1)
-    return z0
+    """Concatenate states, parameters and initial times of the drive (B, 2d + k). Raises ValueError
+    where they do not fit the scene."""
+    names, num = scene.parameters, len(z0)
+    phase, known = "t0, the time of the drive", f"params {', '.join(names)}"
+    for given, needed, what in ((params, bool(names), known), (t0, scene.any_phase, phase)):
+        if (given is not None) != needed:
+            what = what if needed else f"no {what.split()[0].strip(',')}"
+            raise ValueError(f"expected {what} for the scene {scene.name}")
+    more = [] if params is None else [np.broadcast_to(params, (num, len(names)))]
+    more += [] if t0 is None else [np.broadcast_to(t0, num)[:, None]]
+    return np.concatenate([z0, *more], axis=1)
 
 
 def flow_step(field: Callable, dt: float, tolerance: float) -> Callable:
@@ -268,28 +246,11 @@ def flow_step(field: Callable, dt: float, tolerance: float) -> Callable:
     ``tolerance``, the allowed local error, absolute and relative. Where the solver fails the state
     becomes NaN. The step can be differentiated forwards, through the solver's steps that ran.
     """
-    import diffrax
 
-    term = diffrax.ODETerm(lambda t, z, _: field(z))
-    controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
+    def along(z, t):
+        return field(z)
 
-    def step(z):
-        solution = diffrax.diffeqsolve(
-            term,
-            diffrax.Dopri5(),
-            0.0,
-            dt,
-            None,
-            z,
-            stepsize_controller=controller,
-            max_steps=MAX_SOLVER_STEPS,
-            adjoint=diffrax.ForwardMode(),
-            throw=False,
-        )
-        assert solution.ys is not None  # saved at its end
-        return jnp.where(solution.result == diffrax.RESULTS.successful, solution.ys[-1], jnp.nan)
-
-    return step
+    return lambda z: _solve(along, 0.0, dt, z, tolerance=tolerance, predicts=True)
 
 
 def reference_error(scene: Scene, z0: States, num_steps: int) -> float:
