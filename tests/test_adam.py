@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax.families.family import DifferentiatedByJax
-from gfnn_jax.fitting.adam import DEFAULT, PAPER, PAPER_STANDARD_MAP, QUICK, Recipe, adam, minimise
+from gfnn_jax.fitting.adam import DEFAULT, PAPER, PAPER_STANDARD_MAP, QUICK, Recipe, Training
 
 WEIGHT = np.array([0.5, 0.1])
 
@@ -70,16 +70,9 @@ SHORT = Recipe(batch_size=50, epochs=6, rate=0.02, schedule="cosine", dtype="flo
 
 
 def fit(recipe=SHORT, *, params=None, train=TRAIN, seed=7, **options):
-    return adam(
-        NETWORK,
-        start() if params is None else params,
-        train,
-        VALIDATION,
-        WEIGHT,
-        recipe=recipe,
-        key=jax.random.key(seed),
-        **options,
-    )
+    training = Training(recipe, jax.random.key(seed), **options)
+    params = start() if params is None else params
+    return training.of_gradients(NETWORK, params, train, VALIDATION, WEIGHT)
 
 
 @functools.cache
@@ -263,14 +256,13 @@ def test_refuses_unknown_schedules_and_sizes():
 def test_any_loss_of_a_batch():
     """The mean of rows (a batch of them all each time) by its squared distances."""
     rows = np.random.default_rng(3).standard_normal((40, 3))
-    result = minimise(
+    recipe = Recipe(40, epochs=40, epoch_length=10, rate=0.1, schedule="cosine", dtype="float64")
+    result = Training(recipe, jax.random.key(0)).of_loss(
         lambda centre, rows: jnp.mean(jnp.sum((rows - centre[None, :]) ** 2, axis=-1)),
         jnp.zeros(3),
         (rows,),
         (rows,),
-        components=3,
-        key=jax.random.key(0),
-        recipe=Recipe(40, epochs=40, epoch_length=10, rate=0.1, schedule="cosine", dtype="float64"),
+        3,
     )
     np.testing.assert_allclose(result.params, rows.mean(axis=0), atol=1e-4)
     expected = np.sqrt(np.mean(rows.var(axis=0)))
@@ -282,9 +274,8 @@ def test_a_second_fit_of_the_same_shapes_compiles_nothing(compilations):
     fit()
     key, other, data = jax.random.key(11), start(seed=4), gradient_data(330, 5)
     with compilations() as found:
-        result = adam(
-            Network(amplitude=2.0), other, data, VALIDATION, WEIGHT, recipe=SHORT, key=key
-        )
+        training = Training(SHORT, key)
+        result = training.of_gradients(Network(amplitude=2.0), other, data, VALIDATION, WEIGHT)
     assert result.epochs == 6
     assert found.count == 0
     assert result.compile_seconds < 0.1
@@ -316,7 +307,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
 from test_adam import NETWORK, WEIGHT, gradient_data, start
-from gfnn_jax.fitting.adam import Recipe, adam
+from gfnn_jax.fitting.adam import Recipe, Training
 from gfnn_jax.storage.checkpoints import TrainingCheckpoints
 
 train, held = gradient_data(230, 0), gradient_data(50, 1)
@@ -324,8 +315,8 @@ recipe = Recipe(batch_size=40, epochs=4, rate=0.01, schedule="cosine", dtype="fl
 
 def trained(count, **more):
     devices = jax.devices()[:count] if count else ()
-    return adam(NETWORK, start(), train, held, WEIGHT, recipe=recipe, key=jax.random.key(0),
-                devices=devices, **more)
+    training = Training(recipe, jax.random.key(0), devices=devices, **more)
+    return training.of_gradients(NETWORK, start(), train, held, WEIGHT)
 
 def close(one, other):
     for a, b in zip(jax.tree.leaves(one.params), jax.tree.leaves(other.params), strict=True):

@@ -205,7 +205,7 @@ def test_memory_is_bounded_by_the_chunk_and_not_by_the_pairs():
     given = (NETWORK, lm.chunked(w, target, np.ones(2), chunk), theta)
     square = np.zeros((theta.size, theta.size))
     linearize = lm.linearize.lower(*given, layout=layout)
-    attempt = lm.attempt.lower(*given, square, theta, 1.0, layout=layout)
+    attempt = lm.attempt.lower(*given, (square, theta), 1.0, layout=layout)
     jacobian, matrix = 2 * chunk * num_parameters, num_parameters**2
     assert len(w) * 2 * num_parameters > 4 * (jacobian + matrix)  # whole, it would not fit below
 

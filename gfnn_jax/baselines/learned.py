@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.coordinates import TWO_PI
-from gfnn_jax.fitting.adam import AdamFit, Recipe, minimise
+from gfnn_jax.fitting.adam import AdamFit, Recipe, Training
 
 HELD = 2_000  # rows that validate, at most a tenth of all
 
@@ -100,17 +100,14 @@ def train(
     Returns the params in float64 and the record of the training.
     """
     held = min(HELD, len(rows[0]) // 10)
-    trained = minimise(
-        loss,
-        params,
-        tuple(r[held:] for r in rows),
-        tuple(r[:held] for r in rows),
-        components=components,
-        recipe=recipe,
-        key=budget.key,
+    training = Training(
+        recipe,
+        budget.key,
         cap=budget.cap,
         on_epoch=lambda epoch, _, rms: budget.on_progress(f"epoch {epoch}: error {rms:.1e}"),
     )
+    apart = tuple(r[held:] for r in rows), tuple(r[:held] for r in rows)
+    trained = training.of_loss(loss, params, *apart, components)
     return in_float64(trained.params), trained
 
 

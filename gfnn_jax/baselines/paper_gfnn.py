@@ -18,7 +18,7 @@ from gfnn_jax.baselines.learned import HELD, Budget, Sequences, in_float64
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import PAPER_HIDDEN, PAPER_HIDDEN_STANDARD_MAP, Mlp, amplitude_of
-from gfnn_jax.fitting.adam import PAPER, PAPER_STANDARD_MAP, AdamFit, adam
+from gfnn_jax.fitting.adam import PAPER, PAPER_STANDARD_MAP, AdamFit, Training
 from gfnn_jax.generating.charts import TYPE2
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.domain import covering
@@ -49,18 +49,19 @@ def paper_gfnn(pairs: Sequences, budget: Budget) -> PaperGfnn:
     held = min(HELD, len(w) // 10)
     iterations = recipe.epochs * (len(w) // recipe.batch_size)
     recipe = dataclasses.replace(recipe, epochs=max(1, iterations // _PART), epoch_length=_PART)
-    training = adam(
+    training = Training(
+        recipe,
+        budget.key,
+        cap=budget.cap,
+        on_epoch=lambda epoch, _, rms: budget.on_progress(
+            f"{epoch * _PART} iterations: error {rms:.1e}"
+        ),
+    ).of_gradients(
         family,
         family.init(budget.key, jnp.float32),
         (w[held:], target[held:]),
         (w[:held], target[:held]),
         pairs.dt * np.ones(2 * pairs.dim),
-        recipe=recipe,
-        key=budget.key,
-        cap=budget.cap,
-        on_epoch=lambda epoch, _, rms: budget.on_progress(
-            f"{epoch * _PART} iterations: error {rms:.1e}"
-        ),
     )
     scale = sizes(z0)
     generated = Generated(family, in_float64(training.params), TYPE2, pairs.dt, scale)

@@ -59,6 +59,20 @@ class Candidate:
     learns: str = "map"
     outside: float | None = None
 
+    @classmethod
+    def of(cls, error: OneStepError, **what: Any) -> Candidate:
+        """The candidate of this error."""
+        return cls(**_fields_of(error), **what)
+
+
+def _fields_of(error: OneStepError) -> dict[str, Any]:
+    return {
+        "validation_rms": error.rms,
+        "validation_relative": error.relative,
+        "validation_bound": error.bound,
+        "deviations": error.deviations,
+    }
+
 
 def refined_images(
     data: Dataset, chart: AnyChart, family, params, rows: np.ndarray
@@ -92,11 +106,4 @@ def validated(
 
 
 def with_error(candidate: Candidate, error: OneStepError) -> Candidate:
-    return dataclasses.replace(
-        candidate,
-        validation_rms=error.rms,
-        validation_relative=error.relative,
-        validation_bound=error.bound,
-        deviations=error.deviations,
-        validated=True,
-    )
+    return dataclasses.replace(candidate, **_fields_of(error), validated=True)

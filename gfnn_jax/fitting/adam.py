@@ -1,12 +1,12 @@
 """Minimise a loss by Adam, among them the paper's for S(params, w). The one home of optax.
 
-`adam` fits S to target gradients. Its loss is the paper's (3), a mean over pairs, with a weight for
-the size of each coordinate:
+`Training.of_gradients` fits S to target gradients. Its loss is the paper's (3), a mean over pairs,
+with a weight for the size of each coordinate:
 
     L(θ) = mean of ‖weight · (∇S(θ, w) − target_gradient)‖²
 
 ``weight = h`` in all entries is the paper's; ``h / scale`` of the conjugate coordinate makes L
-independent of the units of q and p. `minimise` takes any loss of a batch.
+independent of the units of q and p. `Training.of_loss` takes any loss of a batch.
 
 An epoch is one compiled scan. Its order of the pairs is a function of the key and the epoch's
 number alone, so that nothing but the state below is needed to go on, and the same key gives the
@@ -113,63 +113,180 @@ class AdamFit(NamedTuple):
     stopped_because: str
 
 
-def adam(
-    family: Family,
-    params: Any,
-    train: tuple[Rows, Rows],
-    validation: tuple[Rows, Rows],
-    weight: Any,
-    *,
-    recipe: Recipe,
-    key: Any,
-    on_epoch: Callable[[int, float, float], Any] | None = None,
-    checkpoint: Callable[[int, dict[str, Any]], Any] | None = None,
-    resume: dict[str, Any] | None = None,
-    cap: float | None = None,
-    devices: Sequence[Any] = (),
-) -> AdamFit:
-    """Minimise L over train = (w, target_gradient), each (N, 2d).
+@dataclasses.dataclass(frozen=True, eq=False)
+class Training:
+    """A training by Adam: its recipe, and what is called along it.
 
-    family:     what is compiled for it serves every set of data of the same shapes.
-    params:     any pytree of floating-point arrays: the start.
-    validation: (w, target_gradient) of pairs kept apart.
-    weight:     (2d,).
     key:        a ``jax.random.key``; decides the order of the rows.
     on_epoch:   called with (epochs done, train_rms, validation_rms) after each epoch.
     checkpoint: called with (epochs done, state) after each epoch, to save the state: dicts and
-                lists of NumPy arrays and numbers (and the containers of ``params``). Given back as
+                lists of NumPy arrays and numbers (and the containers of the params). Given back as
                 ``resume`` the fit goes on as though it had never stopped, bit for bit on one
-                device; ``params`` then only lends its structure.
-    cap:        operations of the training, counted (`fitting.adam`): the epochs are as many
-                as it allows, one or more, and the rate goes through its whole schedule in them.
+                device; the params then only lend their structure.
+    cap:        operations of the training, counted: the epochs are as many as it allows, one or
+                more, and the rate goes through its whole schedule in them.
     devices:    JAX's, of this process, among which the rows of each batch are shared out; their
                 number divides that of the rows. Batches are the same, so that the results differ by
                 rounding from those of one device, and a state may be gone on with on another
                 number. Every device holds all rows of train.
 
-    An interrupt (Ctrl-C) passes through; the last state given to ``checkpoint`` is whole.
-    Raises ValueError where shapes do not agree, data are not finite or the loss is not finite at
-    the start, RuntimeError where float64 is asked for and JAX's x64 mode is off. Where numbers
-    cease to be finite later, the fit stops and says so.
+    An interrupt (Ctrl-C) passes through; the last state given to ``checkpoint`` is whole. What is
+    compiled serves the next training with the same loss, or family, and data of the same shapes.
     """
-    weight = np.asarray(weight, recipe.dtype)
-    train, validation = ((np.asarray(w), np.asarray(target)) for w, target in (train, validation))
-    _check(train, validation, weight)
-    return _minimise(
-        _gradient_loss,
-        (family, weight),
-        params,
-        train,
-        validation,
-        components=weight.size,
-        recipe=recipe,
-        key=key,
-        on_epoch=on_epoch,
-        checkpoint=checkpoint,
-        resume=resume,
-        cap=cap,
-        devices=devices,
-    )
+
+    recipe: Recipe
+    key: Any
+    on_epoch: Callable[[int, float, float], Any] | None = None
+    checkpoint: Callable[[int, dict[str, Any]], Any] | None = None
+    resume: dict[str, Any] | None = None
+    cap: float | None = None
+    devices: Sequence[Any] = ()
+
+    def of_gradients(
+        self,
+        family: Family,
+        params: Any,
+        train: tuple[Rows, Rows],
+        validation: tuple[Rows, Rows],
+        weight: Any,
+    ) -> AdamFit:
+        """Minimise L over train = (w, target_gradient), each (N, 2d).
+
+        params: any pytree of floating-point arrays: the start. validation: (w, target_gradient) of
+        pairs kept apart. weight: (2d,).
+
+        Raises ValueError where shapes do not agree, data are not finite or the loss is not finite
+        at the start, RuntimeError where float64 is asked for and JAX's x64 mode is off. Where
+        numbers cease to be finite later, the fit stops and says so.
+        """
+        weight = np.asarray(weight, self.recipe.dtype)
+        train, validation = (
+            (np.asarray(w), np.asarray(target)) for w, target in (train, validation)
+        )
+        _check(train, validation, weight)
+        data = params, train, validation
+        return self._minimised(_gradient_loss, (family, weight), data, weight.size)
+
+    def of_loss(
+        self, loss: Callable, params: Any, train: tuple, validation: tuple, components: int
+    ) -> AdamFit:
+        """Minimise ``loss(params, *batch)``, a mean over the rows of a batch, over all rows of
+        train.
+
+        train, validation: tuples of arrays that agree in their first axis, the rows. components:
+        what a row's loss is a sum of: the errors reported are √(loss / components). Raises as
+        ``of_gradients``.
+        """
+        return self._minimised(_LossOfRows(loss), None, (params, train, validation), components)
+
+    def _minimised(self, loss: Callable, given: Any, data: tuple, components: int) -> AdamFit:
+        """Minimise ``loss(given, params, *batch)``; what is given, a pytree, may change without
+        another compilation. data: (params, train, validation)."""
+        recipe, cap, devices = self.recipe, self.cap, self.devices
+        if recipe.dtype == "float64":
+            require_x64("training in float64")
+        params, train, validation = jax.tree.map(
+            lambda a: jnp.asarray(np.asarray(a, recipe.dtype)), data
+        )
+        num_rows, batch_size = len(train[0]), min(recipe.batch_size, len(train[0]))
+        everywhere, among = None, None
+        if devices:
+            if batch_size % len(devices):
+                raise ValueError(
+                    "expected a number of devices that divides the rows of a batch, "
+                    f"{batch_size}, got {len(devices)}"
+                )
+            mesh = jax.sharding.Mesh(np.array(devices), ("rows",))
+            everywhere = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
+            among = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(None, "rows"))
+            params, train, validation, given = jax.device_put(
+                (params, train, validation, given), everywhere
+            )
+        length = recipe.epoch_length or num_rows // batch_size
+
+        def rates(epoch):
+            """The rate of each iteration of an epoch: (length,)."""
+            first = round(epoch / epochs * recipe.epochs * length)
+            return _rates(first, recipe=recipe, length=length)
+
+        def order(epoch):
+            """The rows of each batch (length, batch_size): permutations in a row that fill the
+            epoch. By NumPy: XLA permutes by sorting, which takes a CPU as long as a small network's
+            epoch."""
+            random = np.random.default_rng(np.asarray(_seed(self.key, epoch)))
+            in_pass = num_rows // batch_size
+            passes = [
+                random.permutation(num_rows)[: in_pass * batch_size].reshape(in_pass, batch_size)
+                for _ in range(-(-length // in_pass))
+            ]
+            batches = np.concatenate(passes)[:length].astype(np.int32)
+            return jax.device_put(batches, among) if devices else batches
+
+        started = time.perf_counter()
+        carry, epochs = _first_carry(params), recipe.epochs
+        program = _run_epoch.trace(carry, given, order(0), rates(0), train, loss=loss)
+        operations = operations_of(program.jaxpr)
+        if cap is not None:
+            epochs = min(epochs, max(1, int(cap / operations)))
+        program.lower().compile()
+        _validate.lower(params, given, validation, loss=loss).compile()
+        compile_seconds = time.perf_counter() - started
+
+        def rms(value):
+            return math.sqrt(float(value) / components)
+
+        if self.resume is None:
+            start = rms(_validate(params, given, validation, loss=loss))
+            if not math.isfinite(start):
+                raise ValueError("the loss is not finite on the validation rows at the start")
+            epoch, seconds = 0, 0.0
+            best = {"params": _copied(params), "train_rms": math.nan, "validation_rms": start}
+            history: dict[str, list[float]] = {"train_rms": [], "validation_rms": []}
+        else:
+            epoch, seconds, best = (self.resume[name] for name in ("epoch", "seconds", "best"))
+            history = {
+                name: np.asarray(column).tolist() for name, column in self.resume["history"].items()
+            }
+            structure = jax.tree.structure(carry)
+            carry = structure.unflatten([jnp.array(leaf) for leaf in self.resume["carry"]])
+            carry = jax.device_put(carry, everywhere) if devices else carry
+
+        capped = epochs < recipe.epochs
+        stopped_because = f"the cap of {cap:.3g} operations" if capped else "epochs"
+        while epoch < epochs:
+            started = time.perf_counter()
+            batches, now_rates = order(epoch), rates(epoch)
+            carry, value = _run_epoch(carry, given, batches, now_rates, train, loss=loss)
+            epoch += 1
+            held = _validate(carry[0], given, validation, loss=loss)
+            now = {"train_rms": rms(value), "validation_rms": rms(held)}
+            seconds += time.perf_counter() - started
+            for name, column in history.items():
+                column.append(now[name])
+            if not all(map(math.isfinite, now.values())):
+                stopped_because = f"not finite in epoch {epoch}: try a lower rate"
+                break
+            if now["validation_rms"] < best["validation_rms"]:
+                best = {"params": _copied(carry[0]), **now}
+            if self.checkpoint is not None:
+                leaves = _copied(jax.tree.leaves(carry))
+                columns = {name: np.array(column) for name, column in history.items()}
+                state = {"epoch": epoch, "seconds": seconds, "carry": leaves}
+                self.checkpoint(epoch, {**state, "best": best, "history": columns})
+            if self.on_epoch is not None:
+                self.on_epoch(epoch, now["train_rms"], now["validation_rms"])
+
+        return AdamFit(
+            params=jax.tree.map(jnp.asarray, best["params"]),
+            train_rms=best["train_rms"],
+            validation_rms=best["validation_rms"],
+            history={name: np.array(column) for name, column in history.items()},
+            epochs=epoch,
+            seconds=seconds,
+            compile_seconds=compile_seconds,
+            operations=operations,
+            stopped_because=stopped_because,
+        )
 
 
 def _gradient_loss(given, params, w, target_gradient):
@@ -234,163 +351,6 @@ def _rates(first, *, recipe, length):
 @jax.jit
 def _seed(key, epoch):
     return jax.random.key_data(jax.random.fold_in(key, epoch))
-
-
-def minimise(
-    loss: Callable,
-    params: Any,
-    train: tuple,
-    validation: tuple,
-    *,
-    components: int,
-    recipe: Recipe,
-    key: Any,
-    on_epoch: Callable[[int, float, float], Any] | None = None,
-    cap: float | None = None,
-) -> AdamFit:
-    """Minimise ``loss(params, *batch)``, a mean over the rows of a batch, over all rows of train.
-
-    params:     any pytree of floating-point arrays: the start.
-    train, validation: tuples of arrays that agree in their first axis, the rows.
-    components: what a row's loss is a sum of: the errors reported are √(loss / components).
-    recipe, key, on_epoch, cap: as of `adam`, and so is what is raised. What is compiled serves the
-                next call with this very ``loss`` and shapes.
-    """
-    return _minimise(
-        _LossOfRows(loss),
-        None,
-        params,
-        train,
-        validation,
-        components=components,
-        recipe=recipe,
-        key=key,
-        on_epoch=on_epoch,
-        cap=cap,
-    )
-
-
-def _minimise(
-    loss,
-    given,
-    params,
-    train,
-    validation,
-    *,
-    components,
-    recipe,
-    key,
-    on_epoch,
-    cap,
-    checkpoint=None,
-    resume=None,
-    devices=(),
-) -> AdamFit:
-    """`minimise` of ``loss(given, params, *batch)``: what is given, a pytree, may change without
-    another compilation."""
-    if recipe.dtype == "float64":
-        require_x64("training in float64")
-    params, train, validation = jax.tree.map(
-        lambda a: jnp.asarray(np.asarray(a, recipe.dtype)), (params, train, validation)
-    )
-    num_rows, batch_size = len(train[0]), min(recipe.batch_size, len(train[0]))
-    everywhere, among = None, None
-    if devices:
-        if batch_size % len(devices):
-            raise ValueError(
-                f"expected a number of devices that divides the {batch_size} rows of a batch, got "
-                f"{len(devices)}"
-            )
-        mesh = jax.sharding.Mesh(np.array(devices), ("rows",))
-        everywhere = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
-        among = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(None, "rows"))
-        params, train, validation, given = jax.device_put(
-            (params, train, validation, given), everywhere
-        )
-    length = recipe.epoch_length or num_rows // batch_size
-
-    def rates(epoch):
-        """The rate of each iteration of an epoch: (length,)."""
-        first = round(epoch / epochs * recipe.epochs * length)
-        return _rates(first, recipe=recipe, length=length)
-
-    def order(epoch):
-        """The rows of each batch (length, batch_size): permutations in a row that fill the epoch.
-
-        By NumPy: XLA permutes by sorting, which on a CPU takes as long as a small network's epoch.
-        """
-        random = np.random.default_rng(np.asarray(_seed(key, epoch)))
-        in_pass = num_rows // batch_size
-        passes = [
-            random.permutation(num_rows)[: in_pass * batch_size].reshape(in_pass, batch_size)
-            for _ in range(-(-length // in_pass))
-        ]
-        batches = np.concatenate(passes)[:length].astype(np.int32)
-        return jax.device_put(batches, among) if devices else batches
-
-    started = time.perf_counter()
-    carry, epochs = _first_carry(params), recipe.epochs
-    program = _run_epoch.trace(carry, given, order(0), rates(0), train, loss=loss)
-    operations = operations_of(program.jaxpr)
-    if cap is not None:
-        epochs = min(epochs, max(1, int(cap / operations)))
-    program.lower().compile()
-    _validate.lower(params, given, validation, loss=loss).compile()
-    compile_seconds = time.perf_counter() - started
-
-    def rms(value):
-        return math.sqrt(float(value) / components)
-
-    if resume is None:
-        start = rms(_validate(params, given, validation, loss=loss))
-        if not math.isfinite(start):
-            raise ValueError("the loss is not finite on the validation rows at the start")
-        epoch, seconds = 0, 0.0
-        best = {"params": _copied(params), "train_rms": math.nan, "validation_rms": start}
-        history: dict[str, list[float]] = {"train_rms": [], "validation_rms": []}
-    else:
-        epoch, seconds, best = resume["epoch"], resume["seconds"], resume["best"]
-        history = {name: np.asarray(column).tolist() for name, column in resume["history"].items()}
-        structure = jax.tree.structure(carry)
-        carry = structure.unflatten([jnp.array(leaf) for leaf in resume["carry"]])
-        carry = jax.device_put(carry, everywhere) if devices else carry
-
-    capped = epochs < recipe.epochs
-    stopped_because = f"the cap of {cap:.3g} operations" if capped else "epochs"
-    while epoch < epochs:
-        started = time.perf_counter()
-        batches, now_rates = order(epoch), rates(epoch)
-        carry, value = _run_epoch(carry, given, batches, now_rates, train, loss=loss)
-        epoch += 1
-        held = _validate(carry[0], given, validation, loss=loss)
-        now = {"train_rms": rms(value), "validation_rms": rms(held)}
-        seconds += time.perf_counter() - started
-        for name, column in history.items():
-            column.append(now[name])
-        if not all(map(math.isfinite, now.values())):
-            stopped_because = f"not finite in epoch {epoch}: try a lower rate"
-            break
-        if now["validation_rms"] < best["validation_rms"]:
-            best = {"params": _copied(carry[0]), **now}
-        if checkpoint is not None:
-            leaves = _copied(jax.tree.leaves(carry))
-            columns = {name: np.array(column) for name, column in history.items()}
-            state = {"epoch": epoch, "seconds": seconds, "carry": leaves}
-            checkpoint(epoch, {**state, "best": best, "history": columns})
-        if on_epoch is not None:
-            on_epoch(epoch, now["train_rms"], now["validation_rms"])
-
-    return AdamFit(
-        params=jax.tree.map(jnp.asarray, best["params"]),
-        train_rms=best["train_rms"],
-        validation_rms=best["validation_rms"],
-        history={name: np.array(column) for name, column in history.items()},
-        epochs=epoch,
-        seconds=seconds,
-        compile_seconds=compile_seconds,
-        operations=operations,
-        stopped_because=stopped_because,
-    )
 
 
 def _copied(tree):

@@ -11,7 +11,6 @@ the standard errors.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
@@ -88,6 +87,7 @@ class FlowFit(NamedTuple):
     steps: Steps
 
 
+@dataclasses.dataclass(eq=False)
 class Problem:
     """Pairs z0 -> z1 (N, 2d) a time dt apart, and how the flow between them is computed.
 
@@ -98,20 +98,14 @@ class Problem:
     its blocks, spent before it is made.
     """
 
-    def __init__(
-        self,
-        z0,
-        z1,
-        dt,
-        scale,
-        *,
-        args=None,
-        weight=None,
-        options: GaussNewtonOptions = OPTIONS,
-        allowance: Allowance = UNBOUNDED,
-    ):
-        self.z0, self.z1, self.dt, self.scale, self.args = z0, z1, dt, scale, args
-        self.weight, self.options, self.allowance = weight, options, allowance
+    z0: Any
+    z1: Any
+    dt: Any
+    scale: Any
+    args: Any = None
+    weight: Any = None
+    options: GaussNewtonOptions = OPTIONS
+    allowance: Allowance = UNBOUNDED
 
     def unit(self, rows) -> np.ndarray:
         """Divisors of the residuals of these rows: (2d,), or (n, 2d) of weighted ones."""
@@ -189,9 +183,8 @@ class Problem:
 
     def _unpaid(self) -> Problem:
         """The problem whose operations are spent already."""
-        problem = copy.copy(self)
-        problem.allowance = dataclasses.replace(self.allowance, cap=None)
-        return problem
+        allowance = dataclasses.replace(self.allowance, cap=None)
+        return dataclasses.replace(self, allowance=allowance)
 
     def _paid(self, block, family, steps: Steps, along=None):
         self.allowance.spend(len(block) * operations(family, self.z0.shape[1], steps, along))

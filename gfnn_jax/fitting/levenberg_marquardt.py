@@ -264,10 +264,9 @@ def levenberg_marquardt(
         def tried(damping) -> Tried:
             if math.isnan(damping):
                 damping = OF_LARGEST * float(np.max(np.diagonal(np.asarray(matrix))))
-            found = attempt(
-                family, chunks, theta, matrix, slope, np.float64(damping), layout=layout
+            trial, trial_loss, promised = attempt(
+                family, chunks, theta, (matrix, slope), np.float64(damping), layout=layout
             )
-            trial, trial_loss, promised = found
             decrease = float(loss - trial_loss)
             return Tried((trial, float(trial_loss)), decrease, damping, float(promised))
 
@@ -305,7 +304,7 @@ def _compile(family, chunks, held, theta, layout) -> None:
     matrix = jax.ShapeDtypeStruct((theta.size, theta.size), theta.dtype)
     damping = jax.ShapeDtypeStruct((), theta.dtype)
     linearize.lower(family, chunks, theta, layout=layout).compile()
-    attempt.lower(family, chunks, theta, matrix, theta, damping, layout=layout).compile()
+    attempt.lower(family, chunks, theta, (matrix, theta), damping, layout=layout).compile()
     _loss.lower(family, held, theta, layout=layout).compile()
 
 
@@ -351,8 +350,9 @@ def linearize(family, chunks, theta, *, layout):
 
 
 @partial(jax.jit, static_argnames="layout")
-def attempt(family, chunks, theta, matrix, slope, damping, *, layout):
-    """Trial θ (P,), its F, and the decrease that δ₁ promises."""
+def attempt(family, chunks, theta, normal, damping, *, layout):
+    """Trial θ (P,), its F, and the decrease that δ₁ promises. normal: AᵀA and Aᵀr."""
+    matrix, slope = normal
     factor = jnp.linalg.cholesky(matrix + damping * jnp.eye(theta.size, dtype=theta.dtype))
     step = -cho_solve((factor, True), slope)
 
@@ -530,7 +530,7 @@ def _try_together(family, points, weights, thetas, dampings, *, layout):
         first = OF_LARGEST * jnp.max(jnp.diagonal(matrix))
         damping = jnp.where(jnp.isnan(damping), first, damping)
         trial, trial_loss, promised = attempt(
-            family, chunks, theta, matrix, slope, damping, layout=layout
+            family, chunks, theta, (matrix, slope), damping, layout=layout
         )
         better = loss - trial_loss > 0
         theta = jnp.where(better, trial, theta)

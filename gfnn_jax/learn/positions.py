@@ -314,16 +314,13 @@ class _Sweep:
         left = residuals(family, params, training) / self.spread
         error = self.error_of(images_of(piece, held), self.split.validation)
         gradient, with_hessian = family.operations
-        candidate = Candidate(
+        candidate = Candidate.of(
+            error,
             label=family.label,
             family=family.name,
             chart=TYPE1.name,
             num_parameters=family.num_parameters,
             operations=float(gradient + with_hessian),
-            validation_rms=error.rms,
-            validation_relative=error.relative,
-            validation_bound=error.bound,
-            deviations=error.deviations,
             train_rms=float(np.sqrt(np.mean(left**2))),
             validated=True,
             fit_seconds=time.perf_counter() - started,

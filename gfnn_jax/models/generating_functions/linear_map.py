@@ -42,16 +42,13 @@ def linear_map(data: Dataset, tolerance: Tolerance) -> Candidate | None:
     ]
     error, piece = min(tried, key=lambda found: found[0].relative)
     width = len(data.scale)
-    candidate = Candidate(
+    candidate = Candidate.of(
+        error,
         label="linear",
         family="linear",
         chart="affine",
         num_parameters=width * (width + 3) // 2,
         operations=2.0 * width**2,
-        validation_rms=error.rms,
-        validation_relative=error.relative,
-        validation_bound=error.bound,
-        deviations=error.deviations,
         train_rms=error.relative,
         fit_seconds=0.0,
     )

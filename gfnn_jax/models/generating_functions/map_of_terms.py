@@ -124,16 +124,13 @@ def learn_map(
     best = sparse or full
     piece = best.piece
     gradient, with_hessian = piece.family.operations
-    candidate = Candidate(
+    candidate = Candidate.of(
+        best.error,
         label=f"S, {piece.family.num_parameters} terms",
         family=piece.family.name,
         chart=piece.chart.name,
         num_parameters=piece.family.num_parameters,
         operations=float(gradient + with_hessian),
-        validation_rms=best.error.rms,
-        validation_relative=best.error.relative,
-        validation_bound=best.error.bound,
-        deviations=best.error.deviations,
         train_rms=best.train_rms,
         fit_seconds=time.perf_counter() - started,
     )

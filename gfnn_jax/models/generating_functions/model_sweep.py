@@ -72,16 +72,13 @@ class ModelSweep:
         seconds = time.perf_counter() - started
         images = self._images_of_users(fitted, self.data.validation)
         error = measured_error(self.data, self.tolerance, images)
-        return Candidate(
+        return Candidate.of(
+            error,
             label=fitted.label,
             family=self.model.name,
             chart="model",
             num_parameters=fitted.num_parameters,
             operations=float(fitted.operations),
-            validation_rms=error.rms,
-            validation_relative=error.relative,
-            validation_bound=error.bound,
-            deviations=error.deviations,
             train_rms=float("nan"),
             fit_seconds=seconds,
             validated=True,

@@ -126,16 +126,13 @@ class NetworkSweep(Generates):
             resume=resume[1] if resume else None,
         )
         error = estimated_error(self.data, self.tolerance, result.validation_rms)
-        return Candidate(
+        return Candidate.of(
+            error,
             label=family.label,
             family=self.kind,
             chart=self.chart.name,
             num_parameters=family.num_parameters,
             operations=size.operations,
-            validation_rms=error.rms,
-            validation_relative=error.relative,
-            validation_bound=error.bound,
-            deviations=error.deviations,
             train_rms=result.train_rms,
             fit_seconds=result.seconds,
         )

@@ -360,16 +360,13 @@ class LinearSweep(CoefficientNoise):
 
     def _candidate(self, size: Size, train_rms, held_rms, seconds) -> Candidate:
         error = estimated_error(self.data, self.tolerance, held_rms)
-        return Candidate(
+        return Candidate.of(
+            error,
             label=f"{self._prefix}{size.family.label}",
             family=self.kind,
             chart=self.chart.name,
             num_parameters=size.family.num_parameters,
             operations=size.operations,
-            validation_rms=error.rms,
-            validation_relative=error.relative,
-            validation_bound=error.bound,
-            deviations=error.deviations,
             train_rms=train_rms,
             fit_seconds=seconds,
         )
