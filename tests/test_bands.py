@@ -15,8 +15,8 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.jobs.predict import predict
 from gfnn_jax.maps.bands import bands, horizon
-from gfnn_jax.models.generating_functions.map_of_terms import learn_map
-from gfnn_jax.models.generating_functions.sweeps import LinearSweep
+from gfnn_jax.models.generating_functions.map_of_terms import SumOfTerms
+from gfnn_jax.models.generating_functions.sweeps import Linear, LinearSweep
 from gfnn_jax.scenes import henon_heiles
 
 NOISE = 1e-3
@@ -216,7 +216,7 @@ def test_residual_of_s_moves_with_the_states_as_its_derivatives_say():
     pairs = gfnn.sample_pairs(henon_heiles(), 100, jax.random.key(0))
     data = Dataset.of(pairs, CARTESIAN).trained_on(np.arange(80)).validated_on(np.arange(80, 100))
     for chart in (MIDPOINT, TYPE2):
-        sweep = LinearSweep(data, Tolerance(1e-6), chart, "polynomial", None, None)
+        sweep = LinearSweep(data, Tolerance(1e-6), chart, Linear("polynomial"))
         family = sweep.sizes[0].family
         drawn = np.random.default_rng(0).normal(size=family.num_parameters)
         params = family.unflatten(drawn)
@@ -324,7 +324,7 @@ def kicked():
 def test_the_posterior_of_s_with_parameters_tells_noise_from_misfit(kicked):
     data, rng = Dataset.of(kicked, CARTESIAN), np.random.default_rng(1)
     data = data.trained_on(np.arange(500)).validated_on(np.arange(500, 600))
-    found = learn_map(data, Tolerance(1e-8), chart="type2")
+    found = SumOfTerms(data, Tolerance(1e-8), chart="type2").learned()
     z, args = rng.uniform(-0.8, 0.8, (200, 2)), rng.uniform(0.6, 0.9, (200, 1))
     image, piece = strong_kicks(z, args[:, 0]), found.piece
     point, aim = TYPE2.evaluation_point(z, image), TYPE2.target_gradient(z, image, 1.0)

@@ -94,7 +94,7 @@ def of_kicks(num=2_000, factors=None):
     """The sweep of polynomials in type 2, without any compilation."""
     pairs = kicked(num)
     data = Dataset.of(identified(pairs).pairs, Coordinates("plain")).divided(0)
-    return sweeps.LinearSweep(data, Tolerance(1e-11), TYPE2, "polynomial", None, None, factors)
+    return sweeps.LinearSweep(data, Tolerance(1e-11), TYPE2, sweeps.Linear("polynomial"), factors)
 
 
 def quiet(_):

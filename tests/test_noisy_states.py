@@ -25,7 +25,7 @@ from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.models.generating_functions.map_arcs import NearestArcs
 from gfnn_jax.models.generating_functions.size import Size
-from gfnn_jax.models.generating_functions.sweeps import LinearSweep
+from gfnn_jax.models.generating_functions.sweeps import Linear, LinearSweep
 
 SIGMA, DT = 0.03, 0.5
 
@@ -122,7 +122,7 @@ def sweep_of(chart, sigma, num=3_000):
     rng = np.random.default_rng(2)
     pairs = gfnn.Pairs(*(z + sigma * rng.normal(size=z.shape) for z in (z0, z1)), DT)
     data = Dataset.of(pairs, CARTESIAN).trained_on(np.arange(300, num)).validated_on(np.arange(300))
-    plain = LinearSweep(data, Tolerance(1e-6), chart, "polynomial", None, None)
+    plain = LinearSweep(data, Tolerance(1e-6), chart, Linear("polynomial"))
     return plain, family, params, pairs
 
 
@@ -163,7 +163,7 @@ def test_derivatives_in_the_states_count_a_base_map():
     turn = np.array([[0.8, 0.6], [-0.6, 0.8]])
     half = Affine(turn, np.zeros(2), np.zeros(2))
     data = plain.data.without(None, half)
-    moved = LinearSweep(data, plain.tolerance, MIDPOINT, "polynomial", None, None)
+    moved = LinearSweep(data, plain.tolerance, MIDPOINT, Linear("polynomial"))
     of_point, of_target = moved.of_states
     z0, z1 = plain.data.y0[:5], plain.data.y1[:5]
     states = np.concatenate([z0, z1], axis=1) / np.tile(data.scale, 2)

@@ -45,6 +45,19 @@ class Stretch:
     noise: np.ndarray
     args: np.ndarray
 
+    def part(self, a: int, b: int) -> Stretch:
+        """Samples a to b."""
+        names = ("t", "y", "u", "q", "noise")
+        return dataclasses.replace(self, **{name: getattr(self, name)[a:b] for name in names})
+
+    def cut(self) -> list[Stretch]:
+        """The parts between gaps."""
+        steps = np.diff(self.t)
+        cuts = (
+            np.flatnonzero(steps > GAP * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
+        )
+        return [self.part(a, b) for a, b in pairwise([0, *cuts.tolist(), len(self.t)])]
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Nodes:
@@ -141,7 +154,7 @@ def stretches(
         if coordinates_of is not None and len(q):
             q = q.copy()
             q[:, turns] = np.unwrap(q[:, turns], axis=0)
-        found += pieces(run, t, y, u, q, noise, args_of(recording, run, parameters))
+        found += Stretch(run, t, y, u, q, noise, args_of(recording, run, parameters)).cut()
     found = [s for s in found if len(s.t) >= _SHORTEST]
     if not found:
         raise FitError(
@@ -149,23 +162,6 @@ def stretches(
             "times the median, or a missing position or input, is a gap)"
         )
     return found
-
-
-def pieces(
-    run: str,
-    t: np.ndarray,
-    y: np.ndarray,
-    u: np.ndarray,
-    q: np.ndarray,
-    noise: np.ndarray,
-    args: np.ndarray,
-    gap: float = GAP,
-) -> list[Stretch]:
-    """A run cut at its gaps."""
-    steps = np.diff(t)
-    cuts = np.flatnonzero(steps > gap * np.median(steps)) + 1 if len(steps) else []
-    parts = (np.split(a, cuts) for a in (t, y, u, q, noise))
-    return [Stretch(run, *part, args=args) for part in zip(*parts, strict=True)]
 
 
 def measure(found: Sequence[Stretch]) -> Scales:
@@ -295,7 +291,7 @@ def without_rests(found: Sequence[Stretch], scales: Scales) -> Moving:
         resting += sum(float(stretch.t[b - 1] - stretch.t[a]) for a, b in _runs(at_rest))
         for a, b in _runs(~at_rest):
             if b - a >= window:
-                kept.append(_part(stretch, a, b))
+                kept.append(stretch.part(a, b))
             else:
                 short += float(stretch.t[b - 1] - stretch.t[a])
     return Moving(kept, resting, short) if kept else Moving(list(found), 0.0, 0.0)
@@ -326,9 +322,3 @@ def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
     """[a, b) of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
-def _part(stretch: Stretch, a: int, b: int) -> Stretch:
-    """Samples a to b."""
-    names = ("t", "y", "u", "q", "noise")
-    return dataclasses.replace(stretch, **{name: getattr(stretch, name)[a:b] for name in names})

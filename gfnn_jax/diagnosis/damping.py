@@ -314,7 +314,7 @@ class _Problem:
             undamped = self._undamped(b, c)
             terms, target = self._design(family, undamped, self.data.training)
             solved = _solved(terms, target)
-            columns = self._columns(family, solved, undamped, spread, values, b, c)
+            columns = self._columns(family, solved, undamped, spread, (b, c, values))
             change, root = _last_unknowns(np.column_stack([terms, columns, target]), terms.shape[1])
             least = np.maximum(_CLOSE * np.linalg.norm(root, axis=1), _CHANGED)
             if not (np.abs(change) > least).any():
@@ -332,16 +332,13 @@ class _Problem:
         terms = family.term_gradients(w, *args) * weight[:, None]
         return terms.reshape(-1, terms.shape[-1]), (target * weight).ravel()
 
-    def _columns(
-        self, family: Products, solved, undamped: Dataset, spread, values, b, c
-    ) -> np.ndarray:
+    def _columns(self, family: Products, solved, undamped: Dataset, spread, of_pairs) -> np.ndarray:
         """(n, t (k + a)): the derivatives of the residuals of ∇S in the coefficients of b and c,
-        which move the momenta of D_b⁻¹Z = (Q, (P − c)/b)."""
+        which move the momenta of D_b⁻¹Z = (Q, (P − c)/b). of_pairs: b, c and the functions of the
+        args at the pairs."""
         dim, chart, dt, rows = self.data.dim, self.chart, undamped.dt, self.data.training
         (w, _, *args), weight = rows_of(undamped, chart, rows)
-        b, c, values = (
-            np.broadcast_to(x, (len(self.data), x.shape[-1]))[rows] for x in (b, c, values)
-        )
+        b, c, values = (np.broadcast_to(x, (len(self.data), x.shape[-1]))[rows] for x in of_pairs)
         p = (split(self.data.y1[rows])[1] - c) / b
         each, angles = values[:, :, None, None], np.eye(dim)[self._angles]
         by_factor = -(p / b)[:, None, None, :] * each * spread

@@ -29,14 +29,14 @@ from gfnn_jax.generating.arcs import GeneratedOnArcs
 from gfnn_jax.learn.conclude import only_noise
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
-from gfnn_jax.models.generating_functions.coefficient_noise import (
-    SAMPLE_ROWS,
-    Factors,
-    part_of_noise,
-)
 from gfnn_jax.models.generating_functions.map_arcs import LONGEST, NearestArcs
 from gfnn_jax.models.generating_functions.size import Size
-from gfnn_jax.models.generating_functions.sweeps import LinearSweep
+from gfnn_jax.models.generating_functions.sweeps import (
+    SAMPLE_ROWS,
+    Factors,
+    LinearSweep,
+    part_of_noise,
+)
 from gfnn_jax.models.hamiltonians.choose_law import preferred
 from gfnn_jax.search.extrapolate import GAINED
 from gfnn_jax.search.search import Entry

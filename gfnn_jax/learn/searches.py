@@ -19,7 +19,7 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.learn.request import Request
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.generating_functions.linear_map import linear_map
-from gfnn_jax.models.generating_functions.map_of_terms import LearnedMap, map_of
+from gfnn_jax.models.generating_functions.map_of_terms import LearnedMap, SumOfTerms
 from gfnn_jax.models.generating_functions.model_sweep import ModelSweep
 from gfnn_jax.models.generating_functions.networks import EnsembleSweep, NetworkSweep
 from gfnn_jax.models.generating_functions.sweeps import sweep_of_dt, sweeps_for
@@ -89,9 +89,9 @@ def searched(
     wanted = not early and options.learn != "hamiltonian" and not met_by_law
     if wanted and options.family == "auto":
         try:
-            of_terms = map_of(
-                diagnosis.data, tolerance, scene, options.chart, law, budget, on_progress
-            )
+            of_terms = SumOfTerms(
+                diagnosis.data, tolerance, scene, options.chart, budget, on_progress
+            ).beside(law)
             if of_terms is not None and law is not None and _no_better(of_terms, law, tolerance):
                 of_terms = None
         except FitError as error:

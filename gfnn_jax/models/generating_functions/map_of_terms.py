@@ -17,7 +17,7 @@ import numpy as np
 
 from gfnn_jax.budget import ROWS, Budget, within
 from gfnn_jax.candidates.assemble import Assembled, composed, measured
-from gfnn_jax.candidates.candidate import Candidate, with_error
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
@@ -70,99 +70,113 @@ class _Tried(NamedTuple):
     train_rms: float
 
 
-def learn_map(
-    data: Dataset,
-    tolerance: Tolerance,
-    scene: Any = None,
-    *,
-    chart: str = "auto",
-    budget: Budget | None = None,
-    on_progress: Callable[[str], Any] = lambda message: None,
-    needed: bool = True,
-) -> LearnedMap:
-    """The map of these pairs of one dt and several systems, or of many sites: of the first chart
-    that meets the tolerance, else of the best. needed: whether the first library is fitted whatever
-    the budget, because nothing else would be left.
+@dataclasses.dataclass(frozen=True)
+class SumOfTerms:
+    """The search for an S that is a sum of terms.
 
-    Raises FitError where no chart covers the data, or the pairs are too few.
+    data: pairs of one dt and several systems, or of many sites. chart: its name; "auto": each in
+    turn.
     """
-    budget, started, given = budget or Budget(), time.perf_counter(), data
-    best: _Tried | None = None
-    tried: list[_Tried] = []
-    try:
-        for name in _CHARTS if chart == "auto" else (chart,):
-            attempts = _Attempts(CHARTS[name], data, tolerance, budget, on_progress, needed)
-            for found in _of_chart(attempts, scene):
-                tried.append(found)
-                needed = False
-                if best is None or found.error.bound < best.error.bound:
-                    best = found
-            if best is not None and best.error.bound <= tolerance.bound:
-                break
-    except OutOfTime:
-        if best is None:
-            raise
-    if best is None or not np.isfinite(best.error.bound):
-        raise FitError(
-            "the pairs determine no S of such terms: they are too few, or no chart covers them"
-            f"{' for all values of the parameters' if data.args is not None else ''}. Add pairs, "
-            "or take a smaller dt"
+
+    data: Dataset
+    tolerance: Tolerance
+    scene: Any = None
+    chart: str = "auto"
+    budget: Budget = dataclasses.field(default_factory=Budget)
+    on_progress: Callable[[str], Any] = lambda message: None
+
+    def beside(self, law: Any) -> LearnedMap | None:
+        """The map that is learned; None where there is none beside a law."""
+        try:
+            with np.errstate(all="ignore"):
+                return self.learned(needed=law is None)
+        except (FitError, OutOfTime):
+            if law is None:
+                raise
+            return None
+
+    def learned(self, needed: bool = True) -> LearnedMap:
+        """The map of the first chart that meets the tolerance, else of the best. needed: whether
+        the first library is fitted whatever the budget, because nothing else would be left.
+
+        Raises FitError where no chart covers the data, or the pairs are too few.
+        """
+        started, data, tolerance, budget = (
+            time.perf_counter(),
+            self.data if self.data.structure is None else _fewer(self.data),
+            self.tolerance,
+            self.budget,
         )
-    rivals = [
-        f
-        for f in tried
-        if f.piece.chart is best.piece.chart and f.error.relative <= _FLAT * best.error.relative
-    ]
-    stalled = len(rivals) > 1 and best.error.bound > tolerance.bound
-    if data.structure is not None:
-        data = _fewer(data)
-    unit = budget.unit(_FEWER_TERMS, ROWS, len(_THRESHOLDS) * _work(best.piece.family, data))
-    full, some = best, data
-    sparse = within(unit, lambda: _sparse(full, some, tolerance, noisy=stalled))
-    if sparse is None:
-        budget.leave_out(_FEWER_TERMS, budget.ended)
-    best = sparse or full
-    piece = best.piece
-    gradient, with_hessian = piece.family.operations
-    candidate = Candidate.of(
-        best.error,
-        label=f"S, {piece.family.num_parameters} terms",
-        family=piece.family.name,
-        chart=piece.chart.name,
-        num_parameters=piece.family.num_parameters,
-        operations=float(gradient + with_hessian),
-        train_rms=best.train_rms,
-        fit_seconds=time.perf_counter() - started,
-    )
-    covariance = partial(_covariance_root, piece, data)
-    return LearnedMap(with_error(candidate, best.error), piece, given, covariance, stalled)
+        best: _Tried | None = None
+        tried: list[_Tried] = []
 
+        def attempt(chart: AnyChart, family: Any) -> _Tried:
+            """A library fitted in a chart, a unit of the budget."""
+            name = f"S in {chart.name}: {family.num_parameters} terms"
+            work = _work(family, data)
+            self.on_progress(name)
+            first = needed and not tried
+            with budget.free(ROWS, work) if first else budget.unit(name, ROWS, work):
+                tried.append(_fitted(chart, family, data, tolerance))
+            return tried[-1]
 
-def map_of(
-    data: Dataset,
-    tolerance: Tolerance,
-    scene: Any,
-    chart: str,
-    law: Any,
-    budget: Budget,
-    on_progress: Callable[[str], Any],
-) -> LearnedMap | None:
-    """Learn by `learn_map`; None where it finds none beside a law."""
-    try:
-        with np.errstate(all="ignore"):
-            return learn_map(
-                data,
-                tolerance,
-                scene,
-                chart=chart,
-                budget=budget,
-                on_progress=on_progress,
-                needed=law is None,
+        try:
+            for name in _CHARTS if self.chart == "auto" else (self.chart,):
+                for found in self._of_chart(data, partial(attempt, CHARTS[name])):
+                    if best is None or found.error.bound < best.error.bound:
+                        best = found
+                if best is not None and best.error.bound <= tolerance.bound:
+                    break
+        except OutOfTime:
+            if best is None:
+                raise
+        if best is None or not np.isfinite(best.error.bound):
+            raise FitError(
+                "the pairs determine no S of such terms: they are too few, or no chart covers them"
+                f"{' for all values of the parameters' if data.args is not None else ''}. Add "
+                "pairs, or take a smaller dt"
             )
-    except (FitError, OutOfTime):
-        if law is None:
-            raise
-        return None
+        chart, limit = best.piece.chart, _FLAT * best.error.relative
+        rivals = [f for f in tried if f.piece.chart is chart and f.error.relative <= limit]
+        stalled = len(rivals) > 1 and best.error.bound > tolerance.bound
+        unit = budget.unit(_FEWER_TERMS, ROWS, len(_THRESHOLDS) * _work(best.piece.family, data))
+        full = best
+        sparse = within(unit, lambda: _sparse(full, data, tolerance, noisy=stalled))
+        if sparse is None:
+            budget.leave_out(_FEWER_TERMS, budget.ended)
+        best = sparse or full
+        piece = best.piece
+        gradient, with_hessian = piece.family.operations
+        candidate = Candidate.of(
+            best.error,
+            label=f"S, {piece.family.num_parameters} terms",
+            family=piece.family.name,
+            chart=piece.chart.name,
+            num_parameters=piece.family.num_parameters,
+            operations=float(gradient + with_hessian),
+            train_rms=best.train_rms,
+            fit_seconds=time.perf_counter() - started,
+            validated=True,
+        )
+        covariance = partial(_covariance_root, piece, data)
+        return LearnedMap(candidate, piece, self.data, covariance, stalled)
+
+    def _of_chart(self, data: Dataset, attempt: Callable[[Any], _Tried]) -> Iterator[_Tried]:
+        """Iterate over what is tried in a chart."""
+        tolerance, scene = self.tolerance, self.scene
+        if data.structure is not None:
+            yield from _of_sites(data, tolerance, attempt)
+            return
+        features = scene.features if scene is not None else None
+        states, functions = states_and_functions(data, data.training, features=features)
+        yield from walked(
+            states,
+            functions,
+            attempt,
+            lambda tried: tried.error.bound,
+            bound=tolerance.bound,
+            most=min(len(data.training) * 2 * data.dim / ROWS_PER_TERM, _MOST_TERMS),
+        )
 
 
 def assembled(learned: LearnedMap, tolerance: Tolerance, budget: Budget) -> Assembled:
@@ -171,54 +185,10 @@ def assembled(learned: LearnedMap, tolerance: Tolerance, budget: Budget) -> Asse
     return measured(learned.candidate, map_, learned.data, tolerance, budget)
 
 
-@dataclasses.dataclass
-class _Attempts:
-    """Libraries fitted in a chart, each a unit of the budget; the first of them in any case where
-    it is ``needed``."""
-
-    chart: AnyChart
-    data: Dataset
-    tolerance: Tolerance
-    budget: Budget
-    on_progress: Callable[[str], Any]
-    needed: bool
-
-    def __post_init__(self) -> None:
-        if self.data.structure is not None:
-            self.data = _fewer(self.data)
-
-    def __call__(self, family: Any) -> _Tried:
-        name = f"S in {self.chart.name}: {family.num_parameters} terms"
-        work = _work(family, self.data)
-        self.on_progress(name)
-        first, self.needed = self.needed, False
-        unit = self.budget.free(ROWS, work) if first else self.budget.unit(name, ROWS, work)
-        with unit:
-            return _fitted(self.chart, family, self.data, self.tolerance)
-
-
 def _work(family: Any, data: Dataset) -> float:
     """Operations of a least-squares fit of the family's terms."""
     rows = len(data.training) * data.spread.size
     return 2.0 * rows * family.num_parameters**2
-
-
-def _of_chart(attempt: _Attempts, scene) -> Iterator[_Tried]:
-    """Iterate over what is tried in a chart."""
-    data, tolerance = attempt.data, attempt.tolerance
-    if data.structure is not None:
-        yield from _of_sites(data, tolerance, attempt)
-        return
-    features = scene.features if scene is not None else None
-    states, functions = states_and_functions(data, data.training, features=features)
-    yield from walked(
-        states,
-        functions,
-        attempt,
-        lambda tried: tried.error.bound,
-        bound=tolerance.bound,
-        most=min(len(data.training) * 2 * data.dim / ROWS_PER_TERM, _MOST_TERMS),
-    )
 
 
 def _fewer(data: Dataset) -> Dataset:
