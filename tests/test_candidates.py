@@ -1,5 +1,6 @@
 """Candidates: the error of one step, and which sizes exist."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -76,7 +77,7 @@ def test_a_size_too_large_to_count_is_never_looked_at():
         looked_at.append(degree)
         return Products(inputs, degree)
 
-    groups = (map(family, group) for group in sweeps._DEGREES)
+    groups = (map(family, group) for group in sweeps.OPTIONS.degrees)
     kept = list(itertools.chain(*sweeps._determined(groups, 10**6, sweeps.ROWS_PER_TERM)))
     assert [f.degree for f in kept] == [2, 3, 4]
     assert looked_at == [2, 3, 4, 5]
@@ -127,7 +128,8 @@ def test_the_estimate_is_of_the_size_of_the_error():
 
 def test_more_pairs_never_take_a_candidate_away(monkeypatch):
     """Where a factorisation of all rows would take too long, it is of a sample of them."""
-    monkeypatch.setattr(sweeps, "_MOST_OPERATIONS", 300 * 27**2)
+    options = dataclasses.replace(sweeps.OPTIONS, most_operations=300 * 27**2)
+    monkeypatch.setattr(sweeps, "OPTIONS", options)
     found = Search([of_kicks()], 1e-11, Budget(), quiet, quiet).to_its_end()
     assert found.ranking[0].candidate.label == "polynomial 4"
     assert found.ranking[0].candidate.validation_bound < 1e-11
@@ -140,7 +142,8 @@ def test_a_factorisation_stops_when_the_time_is_spent():
 
 
 def test_a_fit_that_goes_on_takes_the_factors_that_were_kept(monkeypatch, tmp_path):
-    monkeypatch.setattr(sweeps, "_WORTH_KEEPING", 0.0)
+    options = dataclasses.replace(sweeps.OPTIONS, worth_keeping=0.0)
+    monkeypatch.setattr(sweeps, "OPTIONS", options)
 
     def again():
         swept = [of_kicks(factors=KeptFactors(tmp_path))]
@@ -160,7 +163,8 @@ def test_a_fit_that_goes_on_takes_the_factors_that_were_kept(monkeypatch, tmp_pa
 @pytest.mark.parametrize(("odd", "even"), [(0.0, True), (1e-4, False), (1e-1, False)])
 def test_an_even_generating_function_is_known_by_its_pairs(odd, even, monkeypatch):
     """A kick by the force −q − q³/2 − odd q² of each of three coordinates, and a drift."""
-    monkeypatch.setattr(sweeps, "_MOST_TERMS", 300)  # degree 4
+    options = dataclasses.replace(sweeps.OPTIONS, most_terms=300)
+    monkeypatch.setattr(sweeps, "OPTIONS", options)  # degree 4
     z = np.random.default_rng(0).uniform(-0.5, 0.5, (900, 6))
     q, p = z[:, :3], z[:, 3:]
     p = p - 0.1 * (q + q**3 / 2 + odd * q**2)

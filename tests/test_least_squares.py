@@ -101,7 +101,8 @@ def test_plain_solution_is_numpys(monkeypatch):
 @pytest.mark.parametrize("bytes_per_block", [1, 200_000])  # 256 and 355 rows; neither divides 2,400
 def test_blocks_and_parts_of_the_rows_do_not_matter(monkeypatch, bytes_per_block):
     whole = least_squares.fit(FAMILY, *parts(W, NOISY), ONE)
-    monkeypatch.setattr(least_squares, "_BLOCK_BYTES", bytes_per_block)
+    options = dataclasses.replace(least_squares.OPTIONS, block_bytes=bytes_per_block)
+    monkeypatch.setattr(least_squares, "OPTIONS", options)
     (w, target), held = parts(W, NOISY)
     uneven = ((w[i:j], target[i:j]) for i, j in ((0, 7), (7, 7), (7, 450), (450, 600)))
     train = least_squares.reduce(FAMILY, uneven, ONE)
@@ -113,7 +114,8 @@ def test_blocks_and_parts_of_the_rows_do_not_matter(monkeypatch, bytes_per_block
 
 
 def test_a_reduction_can_be_stopped_between_blocks(monkeypatch):
-    monkeypatch.setattr(least_squares, "_BLOCK_BYTES", 1)
+    options = dataclasses.replace(least_squares.OPTIONS, block_bytes=1)
+    monkeypatch.setattr(least_squares, "OPTIONS", options)
     calls = []
 
     def stop():

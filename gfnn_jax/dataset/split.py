@@ -8,6 +8,7 @@ kindly.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +16,23 @@ import numpy as np
 from gfnn_jax.dataset.runs import steps_between
 from gfnn_jax.phase_space import Pairs, sizes
 
-# Of the pairs, those that validate, and again those that test: a part, at least, at most.
-_FRACTION, _FEWEST, _MOST = 0.1, 4, 2_000
-# Fewer pairs than these have none to spare for a test: they state the error by cross-validation.
-_FEWEST_SPLIT = 60
-_PARTS = 4  # blocks that are held out, of one long run
-_OUTSIDE = 0.05  # of the training pairs, by which errors outside the data are measured
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the split (benchmarks/stated_errors.py)."""
+
+    # Of the pairs, those that validate, and again those that test: a part, at least, at most.
+    fraction: float = 0.1
+    fewest: int = 4
+    most: int = 2_000
+    # Fewer pairs than these have none to spare for a test: they state the error by cross-
+    # validation.
+    fewest_split: int = 60
+    parts: int = 4  # blocks that are held out, of one long run
+    outside: float = 0.05  # of the training pairs, by which errors outside the data are measured
+
+
+OPTIONS = Options()
 
 
 class Split(NamedTuple):
@@ -56,15 +68,15 @@ def split_rows(pairs: Pairs, seed: int) -> Split:
     held out is cut into blocks of time first, between which a correlation time is left out.
     """
     rng, count = np.random.default_rng(seed), len(pairs)
-    target = max(_FEWEST, int(_FRACTION * count))
-    tested = count >= _FEWEST_SPLIT
+    target = max(OPTIONS.fewest, int(OPTIONS.fraction * count))
+    tested = count >= OPTIONS.fewest_split
     goes_on = steps_between(pairs) > 0  # from each row to the next
     # Single pairs are stretches of their own.
     if not goes_on.any():
-        order, target = rng.permutation(count), min(target, _MOST)
+        order, target = rng.permutation(count), min(target, OPTIONS.most)
         ends = target, (1 + tested) * target
         return Split(order[ends[1] :], order[: ends[0]], order[ends[0] : ends[1]], np.arange(count))
-    block = _blocks(goes_on, target, max(_FEWEST, target // _PARTS))
+    block = _blocks(goes_on, target, max(OPTIONS.fewest, target // OPTIONS.parts))
     lengths = np.bincount(block)
     order = rng.permutation(len(lengths))
     # Blocks in random order until there are rows enough: the last one may bring more.
@@ -75,8 +87,8 @@ def split_rows(pairs: Pairs, seed: int) -> Split:
     gap = correlation_time(pairs, goes_on)
     apart = _apart(goes_on, part, gap)
     kept = [rng.permutation(np.flatnonzero(apart & (part == p))) for p in range(3)]
-    stretch = _blocks(goes_on, 0, max(_FEWEST, 2 * gap))
-    return Split(kept[0], kept[1][:_MOST], kept[2][:_MOST], stretch)
+    stretch = _blocks(goes_on, 0, max(OPTIONS.fewest, 2 * gap))
+    return Split(kept[0], kept[1][: OPTIONS.most], kept[2][: OPTIONS.most], stretch)
 
 
 def _apart(goes_on: np.ndarray, part: np.ndarray, gap: int) -> np.ndarray:
@@ -106,7 +118,7 @@ def correlation_time(pairs: Pairs, goes_on: np.ndarray) -> int:
     """
     z = np.asarray(pairs.z0, np.float64)
     x = (z - z.mean(axis=0)) / sizes(z)
-    most = max(1, int(_FRACTION * len(x)) // _PARTS**2)
+    most = max(1, int(OPTIONS.fraction * len(x)) // OPTIONS.parts**2)
     together = np.ones(len(x), bool)
     for step in range(1, most):
         together = together[:-1] & goes_on[step - 1 :]
@@ -125,7 +137,7 @@ def outermost(y: np.ndarray, free: tuple[int, ...] = ()) -> np.ndarray:
     centred = counted - counted.mean(axis=0)
     inverse = np.linalg.pinv(centred.T @ centred, rcond=1e-12, hermitian=True)
     distance = np.sum((centred @ inverse) * centred, axis=1)
-    return distance > np.quantile(distance, 1 - _OUTSIDE)
+    return distance > np.quantile(distance, 1 - OPTIONS.outside)
 
 
 def _blocks(goes_on: np.ndarray, longest: int, part: int) -> np.ndarray:

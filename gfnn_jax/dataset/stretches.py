@@ -22,13 +22,23 @@ from gfnn_jax.signals.local_cubics import Smooth, choose_half, smooth
 GAP = 3.5  # median steps: a longer one ends a stretch
 PER_PERIOD = 40  # nodes
 MOST_STEPS = 6_000  # of a fit: more tell little more
-_STEP = 0.25  # radians of the fastest motion, of a Runge–Kutta step
-_BLOCK = 8.0  # periods of a block, where only some blocks of a long recording are taken
-_SHORTEST = (
-    9  # samples of a stretch, nodes of an arc: shorter ones tell less than their state needs
-)
-_SHORTEST_ARC = 5
-_SLOW = 0.1  # of the rms speed: less of it, in one of several systems, tells no frequency
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of stretches, nodes and arcs (benchmarks/random_recordings.py)."""
+
+    step: float = 0.25  # radians of the fastest motion, of a Runge–Kutta step
+    block: float = 8.0  # periods of a block, where only some blocks of a long recording are taken
+    # samples of a stretch, nodes of an arc: shorter ones tell less than their state needs
+    shortest: int = 9
+    shortest_arc: int = 5
+    slow: float = 0.1  # of the rms speed: less of it, in one of several systems, tells no frequency
+    still: float = 1.5  # of the noise: the standard deviation up to which a coordinate stands still
+    kept: float = 0.25  # periods of a rest that stay, in which the body comes to a stop or starts
+
+
+OPTIONS = Options()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -107,7 +117,7 @@ class Scales:
     @property
     def substeps(self) -> int:
         """Runge–Kutta steps between two nodes that a search begins with."""
-        return max(1, int(np.ceil(2 * np.pi / self.per_period / _STEP)))
+        return max(1, int(np.ceil(2 * np.pi / self.per_period / OPTIONS.step)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -155,11 +165,11 @@ def stretches(
             q = q.copy()
             q[:, turns] = np.unwrap(q[:, turns], axis=0)
         found += Stretch(run, t, y, u, q, noise, args_of(recording, run, parameters)).cut()
-    found = [s for s in found if len(s.t) >= _SHORTEST]
+    found = [s for s in found if len(s.t) >= OPTIONS.shortest]
     if not found:
         raise FitError(
-            f"{recording.source}: no run has {_SHORTEST} samples in a row (a step above {GAP:g} "
-            "times the median, or a missing position or input, is a gap)"
+            f"{recording.source}: no run has {OPTIONS.shortest} samples in a row (a step above "
+            f"{GAP:g} times the median, or a missing position or input, is a gap)"
         )
     return found
 
@@ -185,7 +195,7 @@ def measure(found: Sequence[Stretch]) -> Scales:
     systems: dict[tuple[float, ...], list[Smooth]] = {}
     for stretch, own in zip(found, smooths, strict=True):
         systems.setdefault(tuple(stretch.args.tolist()), []).append(own)
-    omega = max(_frequency(own, _SLOW * speed) for own in systems.values())
+    omega = max(_frequency(own, OPTIONS.slow * speed) for own in systems.values())
     with np.errstate(invalid="ignore"):
         stride = size / np.nanstd(np.concatenate([s.y for s in found]), axis=0)
     return Scales(sigma, speed, omega, dt, half, float(np.nanmax(stride)))
@@ -206,9 +216,9 @@ def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
         known = [
             (s.t[have], s.y[have, k : k + 1]) for s in found for have in [~np.isnan(s.y[:, k])]
         ]
-        known = [pair for pair in known if len(pair[0]) >= _SHORTEST]
+        known = [pair for pair in known if len(pair[0]) >= OPTIONS.shortest]
         if not known:
-            raise FitError(f"a column has no {_SHORTEST} samples in a row: leave it out")
+            raise FitError(f"a column has no {OPTIONS.shortest} samples in a row: leave it out")
         sigma.append(float(choose_half(known)[1][0]))
     return np.array(sigma)
 
@@ -217,14 +227,14 @@ def nodes_of(found: Sequence[Stretch], scales: Scales) -> list[Nodes]:
     """The nodes of all stretches; of a long recording those of blocks, spread evenly over it."""
     rows = [np.arange(0, len(s.t), scales.every) for s in found]
     total = sum(map(len, rows))
-    length = round(_BLOCK * scales.period / scales.dt / scales.every)
+    length = round(OPTIONS.block * scales.period / scales.dt / scales.every)
     keep = -(-total * scales.substeps // MOST_STEPS)  # every so many blocks
     nodes, count = [], 0
     for s, at in zip(found, rows, strict=True):
         blocks = [at] if keep == 1 else [at[k : k + length] for k in range(0, len(at), length)]
         for block in blocks:
             count += 1
-            if len(block) < _SHORTEST_ARC or (count - 1) % keep:
+            if len(block) < OPTIONS.shortest_arc or (count - 1) % keep:
                 continue
             q, v, _ = smooth(s.t, s.q, scales.half, block)[0]
             x = np.concatenate([q, v], axis=1)
@@ -238,7 +248,7 @@ def arcs_of(nodes: Sequence[Nodes], length: int) -> Arcs:
     for i, node in enumerate(nodes):
         count = max(1, round(len(node.t) / length))
         edges = np.linspace(0, len(node.t), count + 1).round().astype(int)
-        home += [(i, int(a), int(b)) for a, b in pairwise(edges) if b - a >= _SHORTEST_ARC]
+        home += [(i, int(a), int(b)) for a, b in pairwise(edges) if b - a >= OPTIONS.shortest_arc]
     longest = max(b - a for _, a, b in home)
     t, y, x, noise = [], [], [], []
     for i, a, b in home:
@@ -269,10 +279,6 @@ def shifted(nodes: Sequence[Nodes], zeros: Mapping[str, np.ndarray]) -> list[Nod
     return found
 
 
-_STILL = 1.5  # of the noise: the standard deviation up to which a coordinate stands still
-_KEPT = 0.25  # periods of a rest that stay, in which the body comes to a stop or starts
-
-
 class Moving(NamedTuple):
     """The stretches without their rests, the seconds of these, and those of what moves for less
     than a period of the fastest motion, which is left out too."""
@@ -287,7 +293,7 @@ def without_rests(found: Sequence[Stretch], scales: Scales) -> Moving:
     window = max(9, round(scales.period / scales.dt))
     kept, resting, short = [], 0.0, 0.0
     for stretch in found:
-        at_rest = _shrunk(_still(stretch, scales.sigma, window), round(_KEPT * window))
+        at_rest = _shrunk(_still(stretch, scales.sigma, window), round(OPTIONS.kept * window))
         resting += sum(float(stretch.t[b - 1] - stretch.t[a]) for a, b in _runs(at_rest))
         for a, b in _runs(~at_rest):
             if b - a >= window:
@@ -303,7 +309,7 @@ def _still(stretch: Stretch, sigma: np.ndarray, window: int) -> np.ndarray:
     if count < 1:
         return np.zeros(len(q), bool)
     views = np.lib.stride_tricks.sliding_window_view(q, window, axis=0)
-    quiet = (views.std(axis=-1) <= _STILL * sigma[: q.shape[1]]).all(axis=1)
+    quiet = (views.std(axis=-1) <= OPTIONS.still * sigma[: q.shape[1]]).all(axis=1)
     begun = np.concatenate([np.cumsum(quiet), np.full(window - 1, np.sum(quiet))])
     ended = np.concatenate([np.zeros(window, int), np.cumsum(quiet)[:-1]])[: len(q)]
     return begun > ended

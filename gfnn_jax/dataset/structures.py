@@ -29,16 +29,45 @@ from gfnn_jax.maps.domain import Ranges, ranges_of
 from gfnn_jax.phase_space import sizes
 
 _ENDS = {"ring": ("ring",), "chain": ("free", "fixed")}
-# (reach, degree, whether functions are tried too) of the libraries, by rising size.
-_LIBRARIES = (
-    (1, 2, False),
-    (1, 4, False),
-    (1, 2, True),
-    (2, 2, False),
-    (2, 4, False),
-    (1, 6, False),
-    (1, 8, False),
-)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Libraries of structures, by rising size (benchmarks/many.py)."""
+
+    # (reach, degree, whether functions are tried too) of the libraries, by rising size.
+    libraries: tuple[tuple[int, int, bool], ...] = (
+        (1, 2, False),
+        (1, 4, False),
+        (1, 2, True),
+        (2, 2, False),
+        (2, 4, False),
+        (1, 6, False),
+        (1, 8, False),
+    )
+    # (degree, whether products of p, of modes of q and of modes of the difference are tried) of
+    # the libraries where q is an angle, by rising size.
+    fourier: tuple[tuple[int, bool], ...] = (
+        (2, False),
+        (4, False),
+        (2, True),
+        (6, False),
+        (3, True),
+        (4, True),
+    )
+    # Powers of the distances of bodies, by rising size.
+    powers: tuple[tuple[int, ...], ...] = ((-3, -2, -1, 1, 2), (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4))
+    # A library of sites is fitted to so many pairs, or to those that hold so many numbers; one of
+    # bodies to so many pairs, of which the quiet ones come first.
+    fewest_pairs: int = 4
+    fewest_numbers: int = 4_000
+    fewest_states: int = 200
+    most_products: int = 350  # of a library: those of higher degree are not tried of several fields
+    fewest_sites: int = 5  # a window of the longest reach meets itself in a smaller ring
+
+
+OPTIONS = Options()
+
 _FUNCTIONS = (
     "cos(q1)",
     "sin(q1)",
@@ -49,16 +78,6 @@ _FUNCTIONS = (
     "exp(q2 - q1)",
     "exp(q1 - q2)",
 )
-# (degree, whether products of p, of modes of q and of modes of the difference are tried) of the
-# libraries where q is an angle, by rising size.
-_FOURIER = ((2, False), (4, False), (2, True), (6, False), (3, True), (4, True))
-# Powers of the distances of bodies, by rising size.
-_POWERS = ((-3, -2, -1, 1, 2), (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4))
-# A library of sites is fitted to so many pairs, or to those that hold so many numbers; one of
-# bodies to so many pairs, of which the quiet ones come first.
-_FEWEST_PAIRS, _FEWEST_NUMBERS, _FEWEST_STATES = 4, 4_000, 200
-_MOST_PRODUCTS = 350  # of a library: those of higher degree are not tried of several fields
-_FEWEST_SITES = 5  # a window of the longest reach meets itself in a smaller ring
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,22 +91,22 @@ class Sites:
 
     def fewest(self, width: int) -> int:
         """Pairs of states (2d,) that a library is fitted to, at least."""
-        return max(1, min(_FEWEST_PAIRS, _FEWEST_NUMBERS // width))
+        return max(1, min(OPTIONS.fewest_pairs, OPTIONS.fewest_numbers // width))
 
     def libraries(self, dim: int, given: Sequence[str] = ()) -> Iterator[Sums]:
         """Sums by rising size. given: a user's own terms, as text in a site's q1, p1 and the next
         sites' q2, p2, …"""
         ends = _ENDS[self.kind]
         if self.angles:
-            for degree, products in _FOURIER:
+            for degree, products in OPTIONS.fourier:
                 yield from (
                     periodic_site_terms(dim, end, degree, products=products) for end in ends
                 )
             return
         if given:
             yield from (site_terms(dim, end, 0, 0, given, self.fields) for end in ends)
-        for reach, degree, with_functions in _LIBRARIES:
-            if comb((2 + reach) * self.fields + degree, degree) > _MOST_PRODUCTS:
+        for reach, degree, with_functions in OPTIONS.libraries:
+            if comb((2 + reach) * self.fields + degree, degree) > OPTIONS.most_products:
                 continue
             functions = (*given, *(self._functions() if with_functions else ()))
             yield from (site_terms(dim, end, reach, degree, functions, self.fields) for end in ends)
@@ -138,12 +157,12 @@ class Bodies:
 
     def fewest(self, width: int) -> int:
         """Pairs that a library is fitted to, at least."""
-        return _FEWEST_STATES
+        return OPTIONS.fewest_states
 
     def libraries(self, dim: int, given: Sequence[str] = ()) -> Iterator[Sums]:
         """Sums by rising size: of bodies that are all alike, then of bodies that are not; where
         species are known, of these."""
-        for powers in _POWERS:
+        for powers in OPTIONS.powers:
             if self.species:
                 yield body_terms(self.count, self.space, powers, species=self.species)
                 continue
@@ -192,8 +211,10 @@ def structure_of(
         raise FitError(f"expected {EXPECTED}, got {text!r}")
     if dim % fields:
         raise FitError(f"expected {fields} q of every site; got {dim} degrees of freedom")
-    if dim // fields < _FEWEST_SITES:
-        raise FitError(f"expected a {kind} of at least {_FEWEST_SITES} sites, got {dim // fields}")
+    if dim // fields < OPTIONS.fewest_sites:
+        raise FitError(
+            f"expected a {kind} of at least {OPTIONS.fewest_sites} sites, got {dim // fields}"
+        )
     sides = {(): "", tuple(range(dim)): "q", tuple(range(2 * dim)): "qp"}
     if coordinates.angles not in sides:
         raise FitError(

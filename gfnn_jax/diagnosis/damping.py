@@ -33,21 +33,37 @@ from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping, DampingOfArgs, FunctionsOfArgs
 from gfnn_jax.phase_space import split, symplectic_form
 
-# Of many more than these training pairs, so many tell whether D_b gains anything: neighbours of a
-# million clean pairs are so close together that what their fits are off by, not friction, makes a
-# change of areas certain.
-_SAMPLE, _PLENTY = 1_000, 20
-_DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20, 24, 28)  # of S, that are tried in turn
-# Rows × terms² of one solve: a quarter of a second on one core, and of a sample a fortieth.
-_MOST_OPERATIONS, _OF_SAMPLE = 1e9, 1e8
-_UPDATES = 10  # of Gauss–Newton, which converges in four or five
-_CLOSE = 0.01  # standard errors: an update that is smaller is the last
-_CHANGED = 1e-13  # of a coefficient's unit, in which an update that is smaller is the last too
-_BETTER, _WORSE = 0.9, 2  # of the held-out rows' residual: degrees in a row that leave more end it
-_GAIN = 0.5  # of the held-out residual: what another unknown must lower it to
-_ROUNDOFF, _AT_ROUNDOFF = 1e-15, 1e-14  # of the spread: reached, and as good as reached
-_FEWER = 1.1  # of the held-out residual: what fewer functions of the args may leave
-_EXPLAINED = 0.3  # of the factors' variance, by one coordinate that is named
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the search for a loss of area (benchmarks/damped_maps.py)."""
+
+    # Of many more than these training pairs, so many tell whether D_b gains anything: neighbours
+    # of a million clean pairs are so close together that what their fits are off by, not
+    # friction, makes a change of areas certain.
+    sample: int = 1_000
+    plenty: int = 20
+    # of S, that are tried in turn
+    degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20, 24, 28)
+    # Rows × terms² of one solve: a quarter of a second on one core, and of a sample a fortieth.
+    most_operations: float = 1000000000.0
+    of_sample: float = 100000000.0
+    updates: int = 10  # of Gauss–Newton, which converges in four or five
+    close: float = 0.01  # standard errors: an update that is smaller is the last
+    # of a coefficient's unit, in which an update that is smaller is the last too
+    changed: float = 1e-13
+    # of the held-out rows' residual: degrees in a row that leave more end it
+    better: float = 0.9
+    worse: int = 2
+    gain: float = 0.5  # of the held-out residual: what another unknown must lower it to
+    # of the spread: reached, and as good as reached
+    roundoff: float = 1e-15
+    at_roundoff: float = 1e-14
+    fewer: float = 1.1  # of the held-out residual: what fewer functions of the args may leave
+    explained: float = 0.3  # of the factors' variance, by one coordinate that is named
+
+
+OPTIONS = Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +142,7 @@ def learn_damping(
     error: float,
     chart: str,
     reversor,
-    most_operations: float = _MOST_OPERATIONS,
+    most_operations: float = OPTIONS.most_operations,
 ) -> LearnedDamping | None:
     """The D_b behind these pairs; None where areas are kept, or no D_b explains what is lost.
 
@@ -138,9 +154,11 @@ def learn_damping(
     deviation = 1.5 * float(np.median(np.abs(factors - b))) / np.sqrt(len(factors))
     if not b > 0 or not abs(b - 1) > max(3 * error, CERTAIN * deviation):
         return None
-    if len(data.training) > _PLENTY * _SAMPLE:
-        some = data.take(np.concatenate([data.training[:_SAMPLE], data.validation[:_SAMPLE]]))
-        if learn_damping(some, jacobians, error, chart, reversor, _OF_SAMPLE) is None:
+    if len(data.training) > OPTIONS.plenty * OPTIONS.sample:
+        some = data.take(
+            np.concatenate([data.training[: OPTIONS.sample], data.validation[: OPTIONS.sample]])
+        )
+        if learn_damping(some, jacobians, error, chart, reversor, OPTIONS.of_sample) is None:
             return None
     start = LearnedDamping(np.asarray(b), np.asarray(np.inf), np.zeros(dim))
     undamped = data.without(None, start.piece)
@@ -158,13 +176,13 @@ def learn_damping(
     found, problem = best(np.ones((1, dim)))
     if dim > 1:
         own, its = best(np.eye(dim))
-        if own.held_out < _GAIN * found.held_out:
+        if own.held_out < OPTIONS.gain * found.held_out:
             found, problem = own, its
     if found.family is None or not problem.is_certain(found):
         return None
     none = np.zeros((0, dim))
     kept = problem.fitted(found.family, found.functions, none, np.zeros((1, 0)))  # areas are
-    if not found.held_out < _GAIN * kept.held_out:
+    if not found.held_out < OPTIONS.gain * kept.held_out:
         return None
     found = problem.with_fewer_functions(found)
     return problem.as_learned(found)
@@ -176,7 +194,7 @@ def where_areas_differ(jacobians, centres, scale, parameters: tuple[str, ...] = 
     centres: (n, 2d + k), the states at which the Jacobians are, and the ``parameters`` there.
     """
     factors = area_factors(jacobians, scale)
-    explained, sentence = _EXPLAINED, ""
+    explained, sentence = OPTIONS.explained, ""
     names = (*coordinate_names(len(scale) // 2), *parameters)
     for name, x in zip(names, np.asarray(centres).T, strict=True):
         fitted = np.polyval(np.polyfit(x - x.mean(), factors, 2), x - x.mean())
@@ -224,9 +242,9 @@ class _Problem:
         best, worse = _Fitted(factor, unknown, self._drift(np.zeros((1, 0))), np.inf, spread), 0
         for family in self._families(spread, factor):
             found = self.fitted(family, self._functions(family.degree), spread, best.factor)
-            worse = 0 if found.held_out < _BETTER * best.held_out else worse + 1
+            worse = 0 if found.held_out < OPTIONS.better * best.held_out else worse + 1
             best = found if worse == 0 else best
-            if worse == _WORSE or best.held_out < _ROUNDOFF:
+            if worse == OPTIONS.worse or best.held_out < OPTIONS.roundoff:
                 break
         return best
 
@@ -236,7 +254,7 @@ class _Problem:
             return found
         assert found.family is not None
         best, degree, enough = found, 0, found.family.degree
-        as_little = max(_FEWER * found.held_out, _AT_ROUNDOFF)
+        as_little = max(OPTIONS.fewer * found.held_out, OPTIONS.at_roundoff)
         while degree < enough:
             middle = (degree + enough) // 2
             functions = self._functions(middle)
@@ -285,10 +303,10 @@ class _Problem:
             cyclic=undamped.coordinates.cyclic,
             args=undamped.given(rows)[1],
         )
-        for degree in _DEGREES:
+        for degree in OPTIONS.degrees:
             family = Products(inputs, degree)
             terms = family.num_parameters
-            if degree > _DEGREES[0] and (
+            if degree > OPTIONS.degrees[0] and (
                 ROWS_PER_TERM * terms > w.size or w.size * terms**2 > self.most_operations
             ):
                 return
@@ -307,7 +325,7 @@ class _Problem:
         known = factor[:t]
         factor = np.concatenate([known, np.zeros((t - len(known), k))])
         shift, unknown = np.zeros((t, a)), np.full((t * k, 0), np.inf)
-        for _ in range(_UPDATES):
+        for _ in range(OPTIONS.updates):
             b, c = _momenta(spread, values @ factor), self._drift(values @ shift)
             if not (b > 0).all():
                 return _Fitted(factor, unknown, self._drift(shift), np.inf, spread)
@@ -316,7 +334,7 @@ class _Problem:
             solved = _solved(terms, target)
             columns = self._columns(family, solved, undamped, spread, (b, c, values))
             change, root = _last_unknowns(np.column_stack([terms, columns, target]), terms.shape[1])
-            least = np.maximum(_CLOSE * np.linalg.norm(root, axis=1), _CHANGED)
+            least = np.maximum(OPTIONS.close * np.linalg.norm(root, axis=1), OPTIONS.changed)
             if not (np.abs(change) > least).any():
                 break
             factor = factor + change[: t * k].reshape(t, k)

@@ -6,6 +6,7 @@ Neighbours also tell which pairs are outliers, and the residuals of a fit whethe
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -15,28 +16,45 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.phase_space import Pairs, symplecticity_defect
 
-# States at which a Jacobian is taken: so many, or as many as so many operations allow, in eight
-# degrees of freedom 50 instead of ten seconds and more.
-_CENTRES, _FEWEST_CENTRES, _OPERATIONS = 400, 50, 5e9
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the local fits (benchmarks/as_a_user.py)."""
+
+    # States at which a Jacobian is taken: so many, or as many as so many operations allow, in
+    # eight degrees of freedom 50 instead of ten seconds and more.
+    centres: int = 400
+    fewest_centres: int = 50
+    operations: float = 5000000000.0
+    # From so many pairs on the neighbourhoods keep their size: more pairs then average the noise
+    # away instead of shrinking them below it.
+    local_enough: int = 4_000
+    most_neighbours: int = 1_000
+    # Neighbours are sought among so many pairs: a tree of a million takes a second more.
+    most_among: int = 200_000
+    # of a neighbourhood's size: a thinner one says nothing of the direction across
+    filled: float = 0.03
+    # a smaller singular value of a local fit is a direction without neighbours
+    spanned: float = 1e-8
+    # Neighbourhoods grow until noise leaves no more than this error in the Jacobian's entries.
+    slope_error: float = 0.05
+    # Pairs are held not to be symplectic whose Jacobians are known well enough, as a part of
+    # their distance from the identity, and miss by so many errors and by more than this part of
+    # it.
+    known: float = 0.06
+    errors: float = 3.0
+    missed: float = 0.1
+    # Neighbours that spread less than this part of their largest spread do not fill a direction.
+    thin: float = 0.05
+
+
+OPTIONS = Options()
+
 # Neighbours per unknown of a local fit: enough to average noise, few enough to stay local.
 NEIGHBOURS_PER_TERM = 3
-# From so many pairs on the neighbourhoods keep their size: more pairs then average the noise away
-# instead of shrinking them below it.
-_LOCAL_ENOUGH, _MOST_NEIGHBOURS = 4_000, 1_000
-# Neighbours are sought among so many pairs: a tree of a million takes a second more.
-_MOST_AMONG = 200_000
-_FILLED = 0.03  # of a neighbourhood's size: a thinner one says nothing of the direction across
-_SPANNED = 1e-8  # a smaller singular value of a local fit is a direction without neighbours
 # With more terms than these a local fit goes by its Gram matrix, which tells no directions apart
 # that are smaller than the second figure: with 65 terms ten times as fast as singular values.
 MANY_TERMS, _SPANNED_OF_GRAM = 40, 1e-7
-# Neighbourhoods grow until noise leaves no more than this error in the Jacobian's entries.
-_SLOPE_ERROR = 0.05
-# Pairs are held not to be symplectic whose Jacobians are known well enough, as a part of their
-# distance from the identity, and miss by so many errors and by more than this part of it.
-_KNOWN, _ERRORS, _MISSED = 0.06, 3.0, 0.1
-# Neighbours that spread less than this part of their largest spread do not fill a direction.
-_THIN = 0.05
 # A determinant this far from zero is safe; below the lower figure the chart folds inside the data.
 SAFE, SINGULAR = 0.2, 0.03
 
@@ -85,9 +103,9 @@ def local_jacobians(y0, y1, scale, given=None, *, seed: int = 0) -> tuple[np.nda
     quadratic = n >= 20 * (1 + width + len(i))
     terms = 1 + width + (len(i) if quadratic else 0)
     fewest = NEIGHBOURS_PER_TERM * terms
-    count = min(n, max(fewest, min(_MOST_NEIGHBOURS, fewest * n // _LOCAL_ENOUGH)))
-    affordable = max(_FEWEST_CENTRES, int(_OPERATIONS / (6 * count * terms**2)))
-    chosen = _centres(n, min(_CENTRES, affordable), seed)
+    count = min(n, max(fewest, min(OPTIONS.most_neighbours, fewest * n // OPTIONS.local_enough)))
+    affordable = max(OPTIONS.fewest_centres, int(OPTIONS.operations / (6 * count * terms**2)))
+    chosen = _centres(n, min(OPTIONS.centres, affordable), seed)
     among = _among(n, seed)
     tree = cKDTree(x[among])
     while True:
@@ -104,14 +122,14 @@ def local_jacobians(y0, y1, scale, given=None, *, seed: int = 0) -> tuple[np.nda
         noise = np.sqrt(np.sum(rest**2, axis=1) / max(1, count - terms))
         spread = np.sqrt(np.sum(inverse[:, 1 : 1 + width] ** 2, axis=-1))
         error = np.median(noise.max(axis=1) * spread.max(axis=1))
-        if error <= _SLOPE_ERROR or count >= min(n, _MOST_NEIGHBOURS):
+        if error <= OPTIONS.slope_error or count >= min(n, OPTIONS.most_neighbours):
             break
-        count = min(n, _MOST_NEIGHBOURS, 2 * count)
+        count = min(n, OPTIONS.most_neighbours, 2 * count)
     slope = np.eye(of_state) + np.swapaxes(solution[:, 1 : 1 + of_state], 1, 2)
     # How far neighbours reach in the direction where they differ least, apart from what the other
     # columns tell of it: along a curve or a torus the rest of the map is anybody's guess.
     reach = 1 / (np.sqrt(count) * spread.max(axis=1) * np.sqrt(np.mean(offset**2, axis=(1, 2))))
-    filled = _full_rank(design) & (reach > _FILLED)
+    filled = _full_rank(design) & (reach > OPTIONS.filled)
     known = float(error + 0.5 * count * error**2) if np.mean(filled) > 0.5 else np.inf
     return slope * scale[:, None] / scale[None, :], known
 
@@ -127,16 +145,16 @@ def _centres(count: int, most: int, seed: int) -> np.ndarray:
 
 def _among(count: int, seed: int) -> np.ndarray:
     """The rows of so many among which neighbours are sought."""
-    if count <= _MOST_AMONG:
+    if count <= OPTIONS.most_among:
         return np.arange(count)
-    return np.sort(_centres(count, _MOST_AMONG, seed))
+    return np.sort(_centres(count, OPTIONS.most_among, seed))
 
 
 def pseudo_inverse(design):
     """Pseudo-inverses of local designs (n, neighbours, terms). They take the map for the identity
     in what the neighbours do not span: a thin tube of data, the torus of a single orbit."""
     if design.shape[-1] <= MANY_TERMS:
-        return np.linalg.pinv(design, rcond=_SPANNED)
+        return np.linalg.pinv(design, rcond=OPTIONS.spanned)
     across = np.swapaxes(design, 1, 2)
     gram = across @ design
     ridge = _SPANNED_OF_GRAM**2 * np.trace(gram, axis1=1, axis2=2)
@@ -149,7 +167,7 @@ def _full_rank(design):
     apart."""
     terms = design.shape[-1]
     if terms <= MANY_TERMS:
-        return np.linalg.matrix_rank(design, rtol=_SPANNED) == terms
+        return np.linalg.matrix_rank(design, rtol=OPTIONS.spanned) == terms
     squares = np.linalg.eigvalsh(np.swapaxes(design, 1, 2) @ design)
     return squares[:, 0] > _SPANNED_OF_GRAM**2 * squares[:, -1]
 
@@ -185,7 +203,9 @@ def look_symplectic(jacobians, error: float, scale) -> bool:
     move = np.abs(jacobians * scale[None, None, :] / scale[None, :, None] - np.eye(len(scale)))
     size = float(np.median(move.max(axis=(1, 2))))
     defect = data_defect(jacobians, scale)
-    return error > _KNOWN * size or defect <= max(_ERRORS * error, _MISSED * size)
+    return error > OPTIONS.known * size or defect <= max(
+        OPTIONS.errors * error, OPTIONS.missed * size
+    )
 
 
 def sampled_dimension(y, scale) -> int:
@@ -197,9 +217,9 @@ def sampled_dimension(y, scale) -> int:
     """
     x, width = np.asarray(y) / scale, np.shape(y)[1]
     count = min(len(x), NEIGHBOURS_PER_TERM * (1 + width))
-    centres = np.linspace(0, len(x) - 1, min(_CENTRES, len(x))).astype(int)
+    centres = np.linspace(0, len(x) - 1, min(OPTIONS.centres, len(x))).astype(int)
     among = x[_among(len(x), 0)]
     _, near = cKDTree(among).query(x[centres], k=count)
     offset = among[near] - among[near].mean(axis=1, keepdims=True)
     spread = np.linalg.svd(offset, compute_uv=False)
-    return int(np.median(np.sum(spread > _THIN * spread[:, :1], axis=1)))
+    return int(np.median(np.sum(spread > OPTIONS.thin * spread[:, :1], axis=1)))

@@ -17,6 +17,7 @@ nothing is said.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from itertools import combinations_with_replacement
@@ -37,7 +38,60 @@ from gfnn_jax.diagnosis.local_jacobians import (
 )
 from gfnn_jax.solve.noise import Biweight, robust
 
-_MOST_OUTLIERS = 0.05  # of the pairs may be left out
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the screens (benchmarks/hard_cases.py, benchmarks/constants.py)."""
+
+    most_outliers: float = 0.05  # of the pairs may be left out
+    # A pair is an outlier that its neighbours' fit misses by so many standard deviations.
+    outlying: float = 30.0
+    outlier_rounds: int = 5
+    # Where there are fewer pairs than so many neighbourhoods hold, more deviations make an
+    # outlier, by that factor. Of 4,000 times 20 clean pairs of a kicked pendulum the most is 102
+    # deviations: a fit to a few neighbours is now and then good by chance.
+    neighbourhoods: int = 10
+    # Pairs that are looked at for gross errors, in blocks of a sequence: 50,000 take two seconds.
+    most_looked_at: int = 50_000
+    block: int = 1_000
+    # Of more terms than a few (above) only pairs are looked at that an affine map of all misses
+    # by so many times the median, and so many that tell what is usual: 2,000 pairs of 32 degrees
+    # of freedom take a second instead of eight.
+    suspect: float = 3.0
+    usual: int = 100
+    # Times the median residual: beyond the second, a pair is a gross error. Those between the two
+    # are fewer than this part of them. Of normal noise and d = 1 one pair of 100,000 is beyond
+    # the first.
+    ordinary: float = 4.0
+    beyond: float = 8.0
+    between: float = 0.1
+    # gross errors; of all pairs
+    fewest_errors: int = 5
+    most_errors: float = 0.45
+    # Among so many neighbours of the state or of the image all but so many are ordinary; of all
+    # that are far from the polynomial so many stand alone in that way.
+    neighbours_of_error: int = 10
+    but: int = 4
+    alone: float = 0.8
+    # Of the stretches of sequences between two good states so many are bridged by the polynomial,
+    # by no more than so many steps.
+    bridged: float = 0.8
+    longest: int = 10
+    # A state is a regressor within so many robust deviations of the median: others have too much
+    # weight in a fit.
+    within: float = 8.0
+    pairs_per_monomial: int = 8
+    most_terms: int = 130
+    most_rows: int = 3_000
+    gained: float = 0.9  # of the residual, that a higher degree must leave
+    usable: float = 0.25  # of the moves' size: a polynomial that leaves more says nothing
+    # rounds of either loss
+    absolute: int = 8
+    biweight: int = 7
+    spanned: float = 1e-12  # of the largest: a smaller eigenvalue of a Gram matrix is roundoff
+
+
+OPTIONS = Options()
 
 
 def clean(
@@ -65,7 +119,7 @@ def clean(
         return data, messages
     everyone, count = data, len(data)
     found_outliers = outliers(data.y0, data.y1, data.scale, given_by(data))
-    few = len(found_outliers) <= _MOST_OUTLIERS * count
+    few = len(found_outliers) <= OPTIONS.most_outliers * count
     wrong = np.zeros(count, bool)
     wrong[found_outliers[: len(found_outliers) if few else 0]] = True
     gross = gross_errors(data, steps_between(pairs) == 1, wrong)
@@ -75,7 +129,7 @@ def clean(
         data = everyone.lifted_anew(kept)  # the interval of an angle is that of what is left
         if not few:
             found_outliers = kept[outliers(data.y0, data.y1, data.scale, given_by(data))]
-            few = len(found_outliers) <= _MOST_OUTLIERS * count
+            few = len(found_outliers) <= OPTIONS.most_outliers * count
             kept = np.setdiff1d(kept, found_outliers) if few else kept
             data = everyone.lifted_anew(kept)
     elif len(kept) < count:
@@ -102,20 +156,6 @@ def _named(rows: np.ndarray) -> str:
     return ", ".join(map(str, rows[:5])) + (", …" if len(rows) > 5 else "")
 
 
-# A pair is an outlier that its neighbours' fit misses by so many standard deviations.
-_OUTLYING, _OUTLIER_ROUNDS = 30.0, 5
-# Where there are fewer pairs than so many neighbourhoods hold, more deviations make an outlier, by
-# that factor. Of 4,000 times 20 clean pairs of a kicked pendulum the most is 102 deviations: a fit
-# to a few neighbours is now and then good by chance.
-_NEIGHBOURHOODS = 10
-# Pairs that are looked at for gross errors, in blocks of a sequence: 50,000 take two seconds.
-_MOST_LOOKED_AT, _BLOCK = 50_000, 1_000
-# Of more terms than a few (above) only pairs are looked at that an affine map of all misses by so
-# many times the median, and so many that tell what is usual: 2,000 pairs of 32 degrees of freedom
-# take a second instead of eight.
-_SUSPECT, _USUAL = 3.0, 100
-
-
 def outliers(y0, y1, scale, given=None) -> np.ndarray:
     """Rows of the pairs whose move contradicts that of the pairs around them.
 
@@ -128,9 +168,9 @@ def outliers(y0, y1, scale, given=None) -> np.ndarray:
     x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
     x = x if given is None else np.concatenate([x, given], axis=1)
     rows, found = looked_for_errors(len(x)), []
-    few = _NEIGHBOURHOODS * NEIGHBOURS_PER_TERM * (1 + x.shape[1]) / len(x)
-    for _ in range(_OUTLIER_ROUNDS):
-        outlying = _studentised(x[rows], move[rows]) > _OUTLYING * max(1.0, few)
+    few = OPTIONS.neighbourhoods * NEIGHBOURS_PER_TERM * (1 + x.shape[1]) / len(x)
+    for _ in range(OPTIONS.outlier_rounds):
+        outlying = _studentised(x[rows], move[rows]) > OPTIONS.outlying * max(1.0, few)
         if not outlying.any():
             break
         found.append(rows[outlying])
@@ -167,9 +207,9 @@ def _studentised(x, move):
 
 def looked_for_errors(count: int) -> np.ndarray:
     """Rows of so many pairs that are looked at for gross errors: all, or blocks of every part."""
-    blocks = -(-count // _BLOCK)
-    apart = -(-blocks // (_MOST_LOOKED_AT // _BLOCK))
-    return np.flatnonzero(np.arange(count) // _BLOCK % apart == 0)
+    blocks = -(-count // OPTIONS.block)
+    apart = -(-blocks // (OPTIONS.most_looked_at // OPTIONS.block))
+    return np.flatnonzero(np.arange(count) // OPTIONS.block % apart == 0)
 
 
 def _suspect(x, move) -> np.ndarray:
@@ -178,30 +218,12 @@ def _suspect(x, move) -> np.ndarray:
     design = np.column_stack([np.ones(len(x)), x])
     rest = move - design @ np.linalg.lstsq(design, move, rcond=None)[0]
     size = np.linalg.norm(rest, axis=1)
-    far = size > _SUSPECT * np.median(size)
-    far[:_USUAL] = True
+    far = size > OPTIONS.suspect * np.median(size)
+    far[: OPTIONS.usual] = True
     return np.flatnonzero(far)
 
 
-# Times the median residual: beyond the second, a pair is a gross error. Those between the two are
-# fewer than this part of them. Of normal noise and d = 1 one pair of 100,000 is beyond the first.
-_ORDINARY, _BEYOND, _BETWEEN = 4.0, 8.0, 0.1
-_FEWEST_ERRORS, _MOST_ERRORS = 5, 0.45  # gross errors; of all pairs
-# Among so many neighbours of the state or of the image all but so many are ordinary; of all that
-# are far from the polynomial so many stand alone in that way.
-_NEIGHBOURS_OF_ERROR, _BUT, _ALONE = 10, 4, 0.8
-# Of the stretches of sequences between two good states so many are bridged by the polynomial, by
-# no more than so many steps.
-_BRIDGED, _LONGEST = 0.8, 10
-# A state is a regressor within so many robust deviations of the median: others have too much
-# weight in a fit.
-_WITHIN = 8.0
-_PAIRS_PER_MONOMIAL, _MOST_TERMS, _MOST_ROWS = 8, 130, 3_000
-_GAINED = 0.9  # of the residual, that a higher degree must leave
-_USABLE = 0.25  # of the moves' size: a polynomial that leaves more says nothing
-_ABSOLUTE, _BIWEIGHT = 8, 7  # rounds of either loss
 _TUKEY = Biweight(6.0)  # in medians
-_SPANNED = 1e-12  # of the largest: a smaller eigenvalue of a Gram matrix is roundoff
 
 
 def gross_errors(data: Dataset, goes_on: np.ndarray, left_out: np.ndarray) -> np.ndarray:
@@ -219,22 +241,22 @@ def gross_errors(data: Dataset, goes_on: np.ndarray, left_out: np.ndarray) -> np
         return rows[gross_errors(data.take(rows), within, left_out[rows])]
     best = None
     for model in _models(data, ~left_out):
-        if best is not None and not model.left < _GAINED * best.left:
+        if best is not None and not model.left < OPTIONS.gained * best.left:
             continue
         best = model
-    if best is None or not best.left < _USABLE:
+    if best is None or not best.left < OPTIONS.usable:
         return none
     size = np.where(left_out, np.inf, best.sizes)
-    far = np.flatnonzero((size > _BEYOND) & ~left_out)
-    between = np.sum((size > _ORDINARY) & (size <= _BEYOND))
+    far = np.flatnonzero((size > OPTIONS.beyond) & ~left_out)
+    between = np.sum((size > OPTIONS.ordinary) & (size <= OPTIONS.beyond))
     # Those that neighbours told before are gross errors too: beside them there may be few.
-    few = not len(far) or len(far) + left_out.sum() < _FEWEST_ERRORS
-    if few or len(far) > _MOST_ERRORS * len(size) or between > _BETWEEN * len(far):
+    few = not len(far) or len(far) + left_out.sum() < OPTIONS.fewest_errors
+    if few or len(far) > OPTIONS.most_errors * len(size) or between > OPTIONS.between * len(far):
         return none
     if goes_on.any():
         return _borne_out(best, far, goes_on, left_out)
     alone = far[_ordinary_around(data, best.unit, size, far)]
-    return alone if len(alone) >= _ALONE * len(far) else none
+    return alone if len(alone) >= OPTIONS.alone * len(far) else none
 
 
 class _Model:
@@ -273,8 +295,8 @@ class _Model:
         """((coefficients, median residual), every row's residual in units of it, the median)."""
         inside = self._within(y)
         rows = np.flatnonzero(inside & known)
-        if len(rows) > _MOST_ROWS:
-            rows = np.sort(np.random.default_rng(0).choice(rows, _MOST_ROWS, replace=False))
+        if len(rows) > OPTIONS.most_rows:
+            rows = np.sort(np.random.default_rng(0).choice(rows, OPTIONS.most_rows, replace=False))
         design = self._design(y)
         coefficients, median = _resistant(design[rows], move[rows])
         size = np.linalg.norm(move - design @ coefficients, axis=1)
@@ -282,13 +304,13 @@ class _Model:
         return (coefficients, median), np.where(inside, in_units, 0.0), median
 
     def _within(self, y):
-        far = np.abs(y - self._centre) > _WITHIN * self.unit
+        far = np.abs(y - self._centre) > OPTIONS.within * self.unit
         far[:, [*self._angles, *self._free]] = False
         return ~far.any(axis=1)
 
     def _design(self, y):
         """Monomials (N, m) of the coordinates, of an angle's cosine and sine."""
-        x = (y - self._centre) / (_WITHIN / 2 * self.unit)
+        x = (y - self._centre) / (OPTIONS.within / 2 * self.unit)
         columns = []
         for i in range(y.shape[1]):
             if i in self._angles:
@@ -306,7 +328,7 @@ def _models(data: Dataset, known: np.ndarray) -> Iterator[_Model]:
     """Models by rising degree, as far as the pairs tell their terms."""
     coordinates, width = data.coordinates, data.y0.shape[1]
     width += len(coordinates.angles) - len(set(coordinates.cyclic) - set(coordinates.angles))
-    most = min(_MOST_TERMS, int(known.sum()) // _PAIRS_PER_MONOMIAL)
+    most = min(OPTIONS.most_terms, int(known.sum()) // OPTIONS.pairs_per_monomial)
     degree = 1
     while math.comb(width + degree, degree) <= most:
         yield _Model(data, known, degree)
@@ -316,20 +338,20 @@ def _models(data: Dataset, known: np.ndarray) -> Iterator[_Model]:
 def _resistant(design, move) -> tuple[np.ndarray, float]:
     """Coefficients (m, 2d) and the median size of the residuals."""
     values, vectors = np.linalg.eigh(design.T @ design)
-    known = values > _SPANNED * values[-1]
+    known = values > OPTIONS.spanned * values[-1]
     turn = vectors[:, known] / np.sqrt(values[known])
     basis, weight = design @ turn, np.ones(len(design))
     coefficients, median = np.zeros((basis.shape[1], move.shape[1])), 0.0
     floor = np.finfo(float).eps * np.abs(move).max(initial=0.0)
-    for n in range(_ABSOLUTE + _BIWEIGHT):
+    for n in range(OPTIONS.absolute + OPTIONS.biweight):
         weighted = basis.T * weight
-        ridge = _SPANNED * np.eye(len(weighted))
+        ridge = OPTIONS.spanned * np.eye(len(weighted))
         coefficients = np.linalg.solve(weighted @ basis + ridge, weighted @ move)
         size = np.linalg.norm(move - basis @ coefficients, axis=1)
         median = max(float(np.median(size)), floor)
         if median == 0:
             break
-        if n < _ABSOLUTE:
+        if n < OPTIONS.absolute:
             weight = median / np.maximum(size, median)
         else:
             weight = _TUKEY.weights(size / median)
@@ -341,8 +363,8 @@ def _ordinary_around(data: Dataset, unit, size, rows) -> np.ndarray:
     gross error has no neighbours but its like."""
     near_one = np.zeros(len(rows), bool)
     for y in (data.y0 / unit, data.y1 / unit):
-        near = cKDTree(y).query(y[rows], k=_NEIGHBOURS_OF_ERROR + 1)[1][:, 1:]
-        near_one |= np.sort(size[near], axis=1)[:, -1 - _BUT] < _ORDINARY
+        near = cKDTree(y).query(y[rows], k=OPTIONS.neighbours_of_error + 1)[1][:, 1:]
+        near_one |= np.sort(size[near], axis=1)[:, -1 - OPTIONS.but] < OPTIONS.ordinary
     return near_one
 
 
@@ -361,11 +383,11 @@ def _borne_out(model: _Model, rows, goes_on, left_out) -> np.ndarray:
         steps = other - one + 1
         if not (begins[one] or ends[other]):
             inner += 1
-            if steps > _LONGEST or not model.bridge(one, steps, other) <= _BEYOND:
+            if steps > OPTIONS.longest or not model.bridge(one, steps, other) <= OPTIONS.beyond:
                 continue
             bridged += 1
         kept.append(np.arange(one, other + 1))
-    if not kept or bridged < _BRIDGED * inner:
+    if not kept or bridged < OPTIONS.bridged * inner:
         return rows[:0]
     found = np.concatenate(kept)
     return found[~left_out[found]]

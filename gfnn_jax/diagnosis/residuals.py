@@ -12,6 +12,7 @@ coefficient like others, with a standard error.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from itertools import combinations_with_replacement
 
@@ -28,8 +29,50 @@ from gfnn_jax.fitting.significance import CERTAIN
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, apply_j, sizes, split
 
-_APART = 1e-4  # of the coordinates' sizes: the step of the central differences
-_PROBES = 4  # random directions of each half of the coordinates
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the tests of residuals (benchmarks/as_a_user.py, benchmarks/friction_kinds.py)."""
+
+    apart: float = 1e-4  # of the coordinates' sizes: the step of the central differences
+    probes: int = 4  # random directions of each half of the coordinates
+    # Neighbours that are looked at; the part of them that is closest, and its least number.
+    nearest: int = 6
+    closest: float = 0.25
+    fewest: int = 20
+    # Mean square of differences between close neighbours, ÷ that of two unrelated ones: of noise
+    # 0.9 and more, of a dry friction that was not learned 0.006, of two bodies by degree 6 0.14.
+    noise: float = 0.6
+    # The same of products of two coordinates, above which neighbours are too far apart to tell:
+    # 2,000 pairs of four degrees of freedom have 0.2, of eight 0.45.
+    smooth: float = 0.3
+    degrees: tuple[int, ...] = (8, 6, 5, 4, 3, 2)  # of K
+    rows_per_term: int = 10
+    most_terms: int = 400
+    # A change of volume is reported where it is certain, in the inner half of the states by so
+    # many standard errors and in the outer too, and where both are the same within this factor.
+    # It is larger than the square of the residuals, to which order J∇K is what they are, and than
+    # roundoff.
+    of_halves: float = 3.0
+    alike_of_halves: float = 2.0
+    roundoff: float = 1e-13
+    # What an affine fit within sequences may leave of a residual that agrees within them;
+    # neighbours among which the nearest one of another sequence is sought.
+    explained: float = 0.25
+    sequence_neighbours: int = 50
+    nearby: int = 16  # neighbours that tell the size of what is left over at a state
+    # Times as much as a neighbour as far in the same sequence leaves over, one of another
+    # sequence does where something differs between them.
+    across: float = 3.0
+    # A cubic law is fitted where there are so many pairs for each of its terms.
+    pairs_per_term: int = 10
+    # The changes of volume of the inner half of the states and of the outer: within a factor, or
+    # by so many standard errors, they are the same.
+    alike: float = 3.0
+    halves_apart: float = 2.0
+
+
+OPTIONS = Options()
 
 
 def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
@@ -42,7 +85,7 @@ def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
     width, size = z0.shape[1], sizes(z0)
     residual = _difference(map_, z1, _images(map_, pairs, z0))
     jacobian = np.empty((len(z0), width, width))
-    for j, apart in enumerate(_APART * size):
+    for j, apart in enumerate(OPTIONS.apart * size):
         offset = apart * (np.arange(width) == j)
         jacobian[:, :, j] = _change(map_, pairs, offset) / apart
     known = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
@@ -62,10 +105,10 @@ def noise_of_sites(map_: SymplecticMap, pairs: Pairs) -> np.ndarray:
     halves = np.arange(2 * dim) // dim
     grown = np.zeros((2, len(z0), 2 * dim))
     for half in (0, 1):
-        apart = _APART * float(size[halves == half].min())
-        for _ in range(_PROBES):
+        apart = OPTIONS.apart * float(size[halves == half].min())
+        for _ in range(OPTIONS.probes):
             signs = rng.choice([-1.0, 1.0], z0.shape) * (halves == half)
-            grown[half] += (_change(map_, pairs, apart * signs) / apart) ** 2 / _PROBES
+            grown[half] += (_change(map_, pairs, apart * signs) / apart) ** 2 / OPTIONS.probes
     known = np.isfinite(residual).all(axis=1) & np.isfinite(grown).all(axis=(0, 2))
     return of_halves(residual[known], grown[:, known])
 
@@ -87,16 +130,6 @@ def _difference(map_: SymplecticMap, one, other) -> np.ndarray:
     return nearest_image(one - other, map_.coordinates.angles if plain else ())
 
 
-# Neighbours that are looked at; the part of them that is closest, and its least number.
-_NEAREST, _CLOSEST, _FEWEST = 6, 0.25, 20
-# Mean square of differences between close neighbours, ÷ that of two unrelated ones: of noise 0.9
-# and more, of a dry friction that was not learned 0.006, of two bodies by degree 6 0.14.
-_NOISE = 0.6
-# The same of products of two coordinates, above which neighbours are too far apart to tell: 2,000
-# pairs of four degrees of freedom have 0.2, of eight 0.45.
-_SMOOTH = 0.3
-
-
 def is_noise(z, residual, run, place) -> bool | None:
     """Return whether the residuals differ between close neighbours as much as between any two; None
     where the pairs lie too far apart for a smooth function to tell.
@@ -105,13 +138,13 @@ def is_noise(z, residual, run, place) -> bool | None:
     follow each other share a state, and its noise, and are no neighbours.
     """
     one, other = _close_neighbours(np.asarray(z), np.asarray(run), np.asarray(place))
-    if len(one) < _FEWEST:
+    if len(one) < OPTIONS.fewest:
         return None
-    if _difference_of_neighbours(residual, one, other) < _NOISE:
+    if _difference_of_neighbours(residual, one, other) < OPTIONS.noise:
         return False
     # Products of coordinates are as smooth as what may be missing is at best.
     smooth = np.asarray(z) * np.roll(z, 1, axis=1)
-    return True if _difference_of_neighbours(smooth, one, other) < _SMOOTH else None
+    return True if _difference_of_neighbours(smooth, one, other) < OPTIONS.smooth else None
 
 
 def _difference_of_neighbours(values, one, other) -> float:
@@ -123,23 +156,15 @@ def _difference_of_neighbours(values, one, other) -> float:
 def _close_neighbours(z, run, place) -> tuple[np.ndarray, np.ndarray]:
     """Rows and the nearest neighbour of each, the quarter of them that is closest."""
     rows = np.arange(len(z))
-    distance, near = cKDTree(z).query(z, k=min(_NEAREST + 1, len(z)))
+    distance, near = cKDTree(z).query(z, k=min(OPTIONS.nearest + 1, len(z)))
     distance, near = distance[:, 1:], near[:, 1:]
     follows = (run[near] == run[:, None]) & (np.abs(place[near] - place[:, None]) <= 1)
     distance = np.where(follows, np.inf, distance)
     first = np.argmin(distance, axis=1)
     distance, near = distance[rows, first], near[rows, first]
-    closest = np.argsort(distance)[: max(_FEWEST, int(_CLOSEST * len(z)))]
+    closest = np.argsort(distance)[: max(OPTIONS.fewest, int(OPTIONS.closest * len(z)))]
     closest = closest[np.isfinite(distance[closest])]
     return rows[closest], near[closest]
-
-
-_DEGREES = (8, 6, 5, 4, 3, 2)  # of K
-_ROWS_PER_TERM, _MOST_TERMS = 10, 400
-# A change of volume is reported where it is certain, in the inner half of the states by so many
-# standard errors and in the outer too, and where both are the same within this factor. It is larger
-# than the square of the residuals, to which order J∇K is what they are, and than roundoff.
-_OF_HALVES, _ALIKE_OF_HALVES, _ROUNDOFF = 3.0, 2.0, 1e-13
 
 
 def hidden_friction(images, residual, angles: tuple[int, ...] = ()) -> tuple[float, float] | None:
@@ -148,15 +173,15 @@ def hidden_friction(images, residual, angles: tuple[int, ...] = ()) -> tuple[flo
     are too few."""
     images, residual = np.asarray(images), np.asarray(residual)
     whole, square = _by_friction(images, residual, angles), np.mean((residual / sizes(images)) ** 2)
-    if whole is None or not abs(whole[0]) > max(CERTAIN * whole[1], square, _ROUNDOFF):
+    if whole is None or not abs(whole[0]) > max(CERTAIN * whole[1], square, OPTIONS.roundoff):
         return None
     distance = np.linalg.norm((images - images.mean(axis=0)) / sizes(images), axis=1)
     inside = distance <= np.median(distance)
     for half in (inside, ~inside):
         part = _by_friction(images[half], residual[half], angles)
-        if part is None or not abs(part[0]) > _OF_HALVES * part[1]:
+        if part is None or not abs(part[0]) > OPTIONS.of_halves * part[1]:
             return None
-        if not 1 / _ALIKE_OF_HALVES < part[0] / whole[0] < _ALIKE_OF_HALVES:
+        if not 1 / OPTIONS.alike_of_halves < part[0] / whole[0] < OPTIONS.alike_of_halves:
             return None
     return whole
 
@@ -165,9 +190,10 @@ def _by_friction(images, residual, angles) -> tuple[float, float] | None:
     """The sum of −ρ_i and its standard error, which knows that pairs differ in what is left."""
     count, width = residual.shape
     inputs = box_inputs(images, angles=angles)
-    most = min(_MOST_TERMS, count * width // _ROWS_PER_TERM)
+    most = min(OPTIONS.most_terms, count * width // OPTIONS.rows_per_term)
     family = next(
-        (f for f in (Products(inputs, n) for n in _DEGREES) if f.num_parameters <= most), None
+        (f for f in (Products(inputs, n) for n in OPTIONS.degrees) if f.num_parameters <= most),
+        None,
     )
     if family is None:
         return None
@@ -190,20 +216,6 @@ def _by_friction(images, residual, angles) -> tuple[float, float] | None:
     return -rho, float(np.linalg.norm(scores) / freedom)
 
 
-# What an affine fit within sequences may leave of a residual that agrees within them; neighbours
-# among which the nearest one of another sequence is sought.
-_EXPLAINED, _SEQUENCE_NEIGHBOURS = 0.25, 50
-_NEARBY = 16  # neighbours that tell the size of what is left over at a state
-# Times as much as a neighbour as far in the same sequence leaves over, one of another sequence does
-# where something differs between them.
-_ACROSS = 3.0
-# A cubic law is fitted where there are so many pairs for each of its terms.
-_PAIRS_PER_TERM = 10
-# The changes of volume of the inner half of the states and of the outer: within a factor, or by so
-# many standard errors, they are the same.
-_ALIKE, _HALVES_APART = 3.0, 2.0
-
-
 def volume_change(z, residual) -> tuple[float, float]:
     """(change of phase-space volume per step, its standard error) that a symplectic fit left over.
 
@@ -224,8 +236,8 @@ def volume_change(z, residual) -> tuple[float, float]:
     distance = np.linalg.norm((z - z.mean(axis=0)) / sizes(z), axis=1)
     inside = distance <= np.median(distance)
     (one, its), (other, others) = (_divergence(z[h], residual[h]) for h in (inside, ~inside))
-    alike = 1 / _ALIKE <= one / other <= _ALIKE if other else False
-    agree = alike or abs(one - other) <= _HALVES_APART * np.hypot(its, others)
+    alike = 1 / OPTIONS.alike <= one / other <= OPTIONS.alike if other else False
+    agree = alike or abs(one - other) <= OPTIONS.halves_apart * np.hypot(its, others)
     return (change if agree else 0.0), error
 
 
@@ -235,7 +247,7 @@ def _divergence(z, residual) -> tuple[float, float]:
     width = z.shape[1]
     size = sizes(z)
     x = (z - z.mean(axis=0)) / size
-    few = len(z) < _PAIRS_PER_TERM * math.comb(width + 3, 3)
+    few = len(z) < OPTIONS.pairs_per_term * math.comb(width + 3, 3)
     degrees = range(2 if few else 4)
     terms = [t for k in degrees for t in combinations_with_replacement(range(width), k)]
 
@@ -268,7 +280,7 @@ def _without(term: tuple[int, ...], i: int) -> tuple[int, ...]:
 
 def _in_local_units(z: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Residuals (N, 2d) ÷ their root mean square among the neighbours of z (N, 2d)."""
-    count = min(len(z), _NEARBY)
+    count = min(len(z), OPTIONS.nearby)
     _, near = cKDTree(z).query(z, k=count)
     size = np.sqrt(np.mean(residual[near.reshape(len(z), count)] ** 2, axis=1))
     return residual / np.where(size > 0, size, 1.0)
@@ -298,10 +310,10 @@ def differs_between_sequences(z, residual, sequence) -> bool:
         total += np.sum(residual[own[1::2]] ** 2)
         within += np.sum((residual[own[1::2]] - design[1::2] @ fitted) ** 2)
         rows.append(own)
-    if len(rows) < 2 or not within < _EXPLAINED * total:
+    if len(rows) < 2 or not within < OPTIONS.explained * total:
         return False
     rows = np.concatenate(rows)
-    count = min(len(rows), _SEQUENCE_NEIGHBOURS)
+    count = min(len(rows), OPTIONS.sequence_neighbours)
     _, near = cKDTree(z[rows]).query(z[rows], k=count)
     other = sequence[rows][near] != sequence[rows][:, None]
     first = np.argmax(other, axis=1)  # the nearest of another sequence
@@ -312,4 +324,4 @@ def differs_between_sequences(z, residual, sequence) -> bool:
         np.sum((residual[places] - residual[near[np.arange(len(near)), k[known]]]) ** 2)
         for k in (first, np.argmax(as_far, axis=1))
     )
-    return bool(across > 0.5 * np.sum(residual[places] ** 2) and across > _ACROSS * along)
+    return bool(across > 0.5 * np.sum(residual[places] ** 2) and across > OPTIONS.across * along)

@@ -8,6 +8,7 @@ hold them, are compared with the images of others.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from itertools import combinations
 from typing import NamedTuple
@@ -21,14 +22,27 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.fitting.linear_starts import fitted_gradients
 from gfnn_jax.phase_space import apply_j
 
-_MOST_DIM = 4
-_CONSERVED = 0.01  # of what it would change by, that a conserved quantity changes by
-_DEGREES, _MOST_TERMS, _ROWS_PER_TERM = (2, 3, 4, 5, 6), 210, 4
-_ROWS = 100_000  # pairs, the first ones, of which runs are followed
-_TRAINED, _HELD = 1_000, 500  # pairs to which gradients are fitted, and on which they are compared
-_FITTED = 0.2  # of the gradients, that polynomials may leave over where they are compared
-_AS_WELL = 1.5  # times what they leave of the pairs themselves, they may leave of the images
-_COVERED = 0.5  # part of the images that must lie among the pairs
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the search for symmetries (benchmarks/as_a_user.py)."""
+
+    most_dim: int = 4
+    conserved: float = 0.01  # of what it would change by, that a conserved quantity changes by
+    degrees: tuple[int, ...] = (2, 3, 4, 5, 6)
+    most_terms: int = 210
+    rows_per_term: int = 4
+    rows: int = 100000  # pairs, the first ones, of which runs are followed
+    # pairs to which gradients are fitted, and on which they are compared
+    trained: int = 1_000
+    held: int = 500
+    fitted: float = 0.2  # of the gradients, that polynomials may leave over where they are compared
+    # times what they leave of the pairs themselves, they may leave of the images
+    as_well: float = 1.5
+    covered: float = 0.5  # part of the images that must lie among the pairs
+
+
+OPTIONS = Options()
 
 
 class SymmetryOfPairs(NamedTuple):
@@ -45,7 +59,7 @@ class SymmetryOfPairs(NamedTuple):
 def symmetries_of_pairs(data: Dataset) -> tuple[SymmetryOfPairs, ...]:
     """The symmetries that the pairs show, or a sample of them; none of pairs with args, of many
     degrees of freedom, or where too few lie where their images do. data: without a base map."""
-    if data.varied or data.structure is not None or data.dim > _MOST_DIM:
+    if data.varied or data.structure is not None or data.dim > OPTIONS.most_dim:
         return ()
     angles = tuple(a for a in data.coordinates.angles if a < data.dim)
     if len(angles) < len(data.coordinates.angles):  # a momentum is one: pairs of a kicked map
@@ -54,7 +68,7 @@ def symmetries_of_pairs(data: Dataset) -> tuple[SymmetryOfPairs, ...]:
 
 
 def _conserved(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPairs]:
-    rows = np.arange(min(len(data.y0), _ROWS))
+    rows = np.arange(min(len(data.y0), OPTIONS.rows))
     goes_on, before, after = next_of(data.pairs, rows), data.y0[rows], data.y1[rows]
     first = before[np.concatenate([[True], ~goes_on])]
     last = after[np.concatenate([~goes_on, [True]])]
@@ -65,7 +79,7 @@ def _conserved(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPai
         if not spread > 0 or not moved > 0:
             continue
         left = np.sqrt(np.mean((values[2] - values[1]) ** 2)) / spread / moved
-        if left <= _CONSERVED:
+        if left <= OPTIONS.conserved:
             yield SymmetryOfPairs(text, float(left))
 
 
@@ -75,14 +89,16 @@ def _generated(generator: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _reflected(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPairs]:
-    rows = np.concatenate([_some(data.training, _TRAINED), _some(data.validation, _HELD)])
-    train, held = np.split(np.arange(len(rows)), [min(len(data.training), _TRAINED)])
+    rows = np.concatenate(
+        [_some(data.training, OPTIONS.trained), _some(data.validation, OPTIONS.held)]
+    )
+    train, held = np.split(np.arange(len(rows)), [min(len(data.training), OPTIONS.trained)])
     before, after = data.y0[rows], data.y1[rows]
     middle, weight = 0.5 * (before + after), 1.0 / np.roll(data.scale, data.dim)
     gradient = -apply_j(after - before) / data.dt
     inputs = box_inputs(middle[train], angles=angles, cyclic=data.coordinates.cyclic)
-    most = min(_MOST_TERMS, len(train) * 2 * data.dim // _ROWS_PER_TERM)
-    known = [f for f in (Products(inputs, n) for n in _DEGREES) if f.num_parameters <= most]
+    most = min(OPTIONS.most_terms, len(train) * 2 * data.dim // OPTIONS.rows_per_term)
+    known = [f for f in (Products(inputs, n) for n in OPTIONS.degrees) if f.num_parameters <= most]
     if not known or not len(held):
         return
     c = fitted_gradients(known[-1], middle[train], gradient[train], data.scale)
@@ -96,11 +112,11 @@ def _reflected(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPai
     for text, matrix in reflections(data.dim, angles):
         there = middle[held] @ matrix.T
         inside = ((there[:, plain] >= low) & (there[:, plain] <= high)).all(axis=1)
-        if np.mean(inside) < _COVERED:
+        if np.mean(inside) < OPTIONS.covered:
             continue
         own = missed(middle[held][inside], gradient[held][inside])
         left = missed(there[inside], gradient[held][inside] @ matrix.T)
-        if own <= _FITTED and left <= _AS_WELL * own:
+        if own <= OPTIONS.fitted and left <= OPTIONS.as_well * own:
             yield SymmetryOfPairs(text, left)
 
 

@@ -61,11 +61,12 @@ class GaussNewtonOptions:
     misfits: float = 10.0
     errors: float = 100.0
     selections: int = 4
+    # A step's own error, of the coordinates' sizes, that is roundoff; at dt of long arcs too.
+    fine: float = 5e-16
+    rounded: float = 1e-13
 
 
 OPTIONS = GaussNewtonOptions()
-# A step's own error, of the coordinates' sizes, that is roundoff; at dt of long arcs too.
-_FINE, _ROUNDED = 5e-16, 1e-13
 
 
 class FlowFit(NamedTuple):
@@ -321,9 +322,11 @@ class Problem:
         off = np.abs(off / self.scale).max(axis=1, initial=0.0)
         known = np.isfinite(size) & np.isfinite(off)
         if not known.any():
-            return known, off, _ROUNDED
+            return known, off, OPTIONS.rounded
         o = self.options
-        limit = max(o.misfits * np.median(size[known]), o.errors * np.median(off[known]), _ROUNDED)
+        limit = max(
+            o.misfits * np.median(size[known]), o.errors * np.median(off[known]), OPTIONS.rounded
+        )
         return known, off, float(limit)
 
     def distance(self, family, c, rows) -> float:
@@ -361,7 +364,7 @@ class Problem:
             return float(off[int(0.95 * (len(off) - 1))])
 
         return tuple(
-            _cheapest(error, substeps, _FINE if tolerance is None else tolerance)
+            _cheapest(error, substeps, OPTIONS.fine if tolerance is None else tolerance)
             for tolerance in tolerances
         )
 
@@ -385,7 +388,7 @@ def _cheapest(error: Callable[[Steps], float], substeps: int, tolerance: float) 
             errors[steps] = error(steps)
             if errors[steps] <= tolerance:
                 return steps
-            if last and errors[last] <= min(_ROUNDED, 2 * errors[steps]):
+            if last and errors[last] <= min(OPTIONS.rounded, 2 * errors[steps]):
                 return last
             last = steps
     best = min(errors.values())

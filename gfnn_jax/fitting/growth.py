@@ -51,15 +51,20 @@ class GrowthOptions:
     at_once: int = 16
     rounds: int = 60
     idle: int = 4
+    box_pairs: int = 2_000  # that the first box is told by
+    # of the residual: a gain, and what fewer modes may cost
+    gained: float = 0.9
+    worse: float = 1.2
+    # of the residual, below which a step is taken before candidates are looked at
+    settled: float = 0.1
+    # of the residual: what a flow's own steps may err by, and what is left of it when they are
+    # chosen again
+    resolved: float = 1e-4
+    again: float = 0.03
+    fewest: float = 0.5  # of the pairs, whose flow must be computed
 
 
 OPTIONS = GrowthOptions()
-_BOX_PAIRS = 2_000  # that the first box is told by
-_GAINED, _WORSE = 0.9, 1.2  # of the residual: a gain, and what fewer modes may cost
-_SETTLED = 0.1  # of the residual, below which a step is taken before candidates are looked at
-_RESOLVED, _AGAIN = 1e-4, 0.03  # of the residual: what a flow's own steps may err by, and what is
-# left of it when they are chosen again
-_FEWEST = 0.5  # of the pairs, whose flow must be computed
 
 
 class Grown(NamedTuple):
@@ -80,7 +85,7 @@ def grow(
 
     most: modes at most. Nothing is found where the rows are too few for the smallest library.
     """
-    enough = rows[:_BOX_PAIRS]
+    enough = rows[: OPTIONS.box_pairs]
     z0, z1 = problem.z0[enough], problem.z1[enough]
     modes = _box(basis, z0, len(rows))
     if not modes:
@@ -97,18 +102,18 @@ def grow(
             break
         count = int(OPTIONS.rows_per_mode * len(present) / (2 * basis.dim))
         some = rows[: max(OPTIONS.pairs, count)]
-        if steps is None or best.rms < _AGAIN * resolved:
+        if steps is None or best.rms < OPTIONS.again * resolved:
             resolved = min(best.rms, 1.0)
             family, c = basis.terms(list(present)), np.array(list(present.values()))
-            (steps,) = problem.fine_steps(family, c, some, (_RESOLVED * resolved,))
+            (steps,) = problem.fine_steps(family, c, some, (OPTIONS.resolved * resolved,))
         looked = _Linearised(problem, basis, present, steps, some)
-        if not looked.rms <= _WORSE * best.rms:
+        if not looked.rms <= OPTIONS.worse * best.rms:
             present = {
                 m: 0.5 * (before.get(m, 0.0) + present.get(m, 0.0)) for m in before | present
             }
             idle += 1
             continue
-        idle = 0 if looked.rms < _GAINED * best.rms else idle + 1
+        idle = 0 if looked.rms < OPTIONS.gained * best.rms else idle + 1
         if looked.rms < best.rms:
             best = Grown(*looked.without_new(), looked.rms)
             pace.append((len(best.coefficients), best.rms))
@@ -121,9 +126,9 @@ def grow(
         room = most - len(solved)
         gain = np.linalg.norm(rest) / np.linalg.norm(looked.residual)
         # What a long step leaves over is curvature, which asks for any mode.
-        tried = basis.around(solved) if gain > _SETTLED else []
+        tried = basis.around(solved) if gain > OPTIONS.settled else []
         found = looked.candidates(tried, rest, span, room)
-        if not found and gain > _GAINED:
+        if not found and gain > OPTIONS.gained:
             ended = (
                 "the pairs have no room for more modes" if room <= 0 else "no further mode gains"
             )
@@ -172,7 +177,7 @@ class _Linearised:
         self._good = good
         self.residual = residual[good].ravel()
         self.matrix = self._columns(found.by_coefficient)
-        enough = good.mean() >= _FEWEST
+        enough = good.mean() >= OPTIONS.fewest
         self.rms = float(np.sqrt(np.mean(self.residual**2))) if enough else np.inf
 
     def _images(self, along: Terms):

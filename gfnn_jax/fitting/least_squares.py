@@ -14,6 +14,7 @@ Memory for m parameters: one block of rows and the triangle, whatever the number
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -29,25 +30,38 @@ from gfnn_jax.families.sines import Sines
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.fitting.triangle import Triangle
 
-# Rows that are folded at once stay in the cache: 16 MiB take a quarter longer per row. A block of
-# 1,500 terms takes 50 ms on two cores.
-_BLOCK_BYTES, _FEWEST_ROWS = 2 * 2**20, 256
-# Rows of a part that a device folds, for each term: to merge two parts takes a third as many
-# operations as rows as there are terms. An accelerator wants larger ones, and was not at hand to
-# tell how large.
-_PART_ON_CPU, _PART_ON_ACCELERATORS = 4, 16
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the solves (benchmarks/constants.py)."""
+
+    # Rows that are folded at once stay in the cache: 16 MiB take a quarter longer per row. A
+    # block of 1,500 terms takes 50 ms on two cores.
+    block_bytes: int = 2 * 2**20
+    fewest_rows: int = 256
+    # Rows of a part that a device folds, for each term: to merge two parts takes a third as many
+    # operations as rows as there are terms. An accelerator wants larger ones, and was not at hand
+    # to tell how large.
+    part_on_cpu: int = 4
+    part_on_accelerators: int = 16
+    # Standard deviations of chance by which a ridge must lower the held-out squares. Of
+    # Hénon–Heiles with noise of 1e-2 and 10⁴ pairs (benchmarks/bands.py) chance alone chose 0.01:
+    # 4 times the error.
+    certain: float = 3.0
+    # A leading block is judged by a triangular solve where the smallest diagonal entry of R,
+    # relative to its column, is no smaller than this, and where there are as many rows per term.
+    well_conditioned: float = 1e-13
+    well_determined: float = 1.5
+
+
+OPTIONS = Options()
+
 # Rows per term, the fewest that the terms of S are fitted to. Of 70 clean pairs of a pendulum half
 # as many gain two digits by a map that is 1.7 times as dear, and twice as many lose one and a half
 # (benchmarks/constants.py).
 ROWS_PER_TERM = 3
 # Ridge parameters tried, relative to the largest singular value; the first is plain least squares.
 _RIDGES = (0.0, *(10.0**k for k in range(-13, 0)))
-# Standard deviations of chance by which a ridge must lower the held-out squares. Of Hénon–Heiles
-# with noise of 1e-2 and 10⁴ pairs (benchmarks/bands.py) chance alone chose 0.01: 4 times the error.
-_CERTAIN = 3.0
-# A leading block is judged by a triangular solve where the smallest diagonal entry of R, relative
-# to its column, is no smaller than this, and where there are as many rows per term.
-_WELL_CONDITIONED, _WELL_DETERMINED = 1e-13, 1.5
 
 
 class LeastSquaresFit(NamedTuple):
@@ -118,7 +132,7 @@ def _on_devices(family: Any, rows, weight, reporting: Callable[[Iterator], Itera
     """The triangle of rows that are shared out among devices."""
     m = family.num_parameters
     on_host = row_blocks.devices()[0].platform == "cpu" or not accelerator_takes(family)
-    least = (_PART_ON_CPU if on_host else _PART_ON_ACCELERATORS) * (m + 1)
+    least = (OPTIONS.part_on_cpu if on_host else OPTIONS.part_on_accelerators) * (m + 1)
 
     def of_part(part, device) -> Triangle:
         if on_host:
@@ -147,7 +161,10 @@ def _blocks(rows, num_parameters: int, least: int = 0) -> Iterator[tuple[np.ndar
 
 def _pairs_of(num_parameters: int, width: int, least: int) -> int:
     """Number of pairs of states (2d,) of this width in a block."""
-    return max(1, max(_FEWEST_ROWS, _BLOCK_BYTES // (8 * (num_parameters + 1)), least) // width)
+    return max(
+        1,
+        max(OPTIONS.fewest_rows, OPTIONS.block_bytes // (8 * (num_parameters + 1)), least) // width,
+    )
 
 
 def residuals(train: Triangle, held: Triangle, sizes: Sequence[int]) -> list[tuple[float, float]]:
@@ -162,8 +179,8 @@ def residuals(train: Triangle, held: Triangle, sizes: Sequence[int]) -> list[tup
 def _residual(train: Triangle, held: Triangle, size: int) -> tuple[float, float]:
     a, b = train.leading(size)
     diagonal = np.abs(np.diagonal(a))
-    well_conditioned = (diagonal > _WELL_CONDITIONED * np.linalg.norm(a, axis=0)).all()
-    if not well_conditioned or train.rows < _WELL_DETERMINED * size:
+    well_conditioned = (diagonal > OPTIONS.well_conditioned * np.linalg.norm(a, axis=0)).all()
+    if not well_conditioned or train.rows < OPTIONS.well_determined * size:
         fit = solve(train, held, size)
         return fit.train_rms, fit.validation_rms
     c = scipy.linalg.solve_triangular(a, b, check_finite=False)
@@ -187,7 +204,7 @@ def solve(train: Triangle, held: Triangle, num_terms: int) -> LeastSquaresFit:
     errors = held.missed(tried)
     best = int(np.argmin(errors))
     apart = held.image_norm(tried[:, best] - tried[:, 0])
-    by_chance = _CERTAIN * 2 * apart * errors[best] / math.sqrt(max(held.rows, 1))
+    by_chance = OPTIONS.certain * 2 * apart * errors[best] / math.sqrt(max(held.rows, 1))
     if not errors[0] ** 2 - errors[best] ** 2 > by_chance:
         best = 0
     c, error = tried[:, best], errors[best]

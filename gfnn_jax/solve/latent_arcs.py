@@ -89,18 +89,30 @@ def evaluated(model: Model | Known, p: np.ndarray, x: np.ndarray) -> tuple[Defec
     )
 
 
-_DEFECT = 0.1  # a defect of this many standard deviations costs as much as a residual of one
-_CLOSED = 0.1  # standard deviations, rms: arcs whose defects are smaller are orbits of the model
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of Gauss–Newton over latent arcs (benchmarks/random_recordings.py)."""
+
+    # a defect of this many standard deviations costs as much as a residual of one
+    defect: float = 0.1
+    # standard deviations, rms: arcs whose defects are smaller are orbits of the model
+    closed: float = 0.1
+    settled: float = 0.003  # of the noise: a change that needs no further iteration
+    # Of the largest pivot, each in units of its column, below which one determines nothing: of an
+    # arc of gross errors alone, or of the speed of a body that sticks.
+    loose: float = 1e-12
+    # Of a step, that an arc which it made worse goes with its states: where arcs share no
+    # coefficients, and where they do.
+    parts_alone: tuple[float, ...] = (0.5, 0.25, 0.125, 0.0)
+    parts_together: tuple[float, ...] = (0.25, 0.0)
+    # times the defects of an arc that stays, at the most, by a step of the coefficients
+    grown: float = 2.0
+    block_bytes: int = 64 * 2**20  # of the sensitivities of a block of arcs
+
+
+OPTIONS = Options()
+
 _DAMPING = Factors(1e-4, first=5e-6, grown_by=5.0, shrunk_by=0.2, least=1e-12, keeps=True)
-_SETTLED = 0.003  # of the noise: a change that needs no further iteration
-# Of the largest pivot, each in units of its column, below which one determines nothing: of an arc
-# of gross errors alone, or of the speed of a body that sticks.
-_LOOSE = 1e-12
-# Of a step, that an arc which it made worse goes with its states: where arcs share no coefficients,
-# and where they do.
-_PARTS_ALONE, _PARTS_TOGETHER = (0.5, 0.25, 0.125, 0.0), (0.25, 0.0)
-_GROWN = 2.0  # times the defects of an arc that stays, at the most, by a step of the coefficients
-_BLOCK_BYTES = 64 * 2**20  # of the sensitivities of a block of arcs
 OUTLYING = 5.0  # standard deviations: a residual beyond does not tell the noise
 SOFT_L1 = SoftL1()
 
@@ -288,7 +300,7 @@ class _AtStates:
 
     def closed(self, at: _Iterate) -> bool:
         """True where arcs are orbits of the model."""
-        return at.gap <= float(_CLOSED * np.sqrt(self.here.x.size))
+        return at.gap <= float(OPTIONS.closed * np.sqrt(self.here.x.size))
 
     def tried(self, damping: float, failures: int) -> Tried:
         """A step of p and x; each that failed halves the next. Where it fails, or arcs share no p,
@@ -324,7 +336,7 @@ class _AtStates:
             return at.gaps if of_gaps else at.merits
 
         before = left(here) * (1 + 1e-9)
-        for part in _PARTS_ALONE if not len(here.p) else _PARTS_TOGETHER:
+        for part in OPTIONS.parts_alone if not len(here.p) else OPTIONS.parts_together:
             now = left(there)
             worse = np.flatnonzero(~(now <= before))
             if not len(worse):
@@ -334,7 +346,7 @@ class _AtStates:
             better = (left(other)[worse] < now[worse]) | ~np.isfinite(now[worse])
             there = self.data.mixed(there, other, worse[better])
             if of_gaps and part == 0:
-                stays[worse] = better & (left(other)[worse] <= _GROWN**2 * before[worse])
+                stays[worse] = better & (left(other)[worse] <= OPTIONS.grown**2 * before[worse])
         return there, stays
 
     def moved(self, there: _Iterate, damping: float) -> tuple[_AtStates, bool]:
@@ -347,7 +359,7 @@ class _AtStates:
         if least is not None:
             best = here = there.rescaled(self._rows, least)
             sigma = there.units.sigma
-            settled &= bool(np.allclose(here.units.sigma, sigma, rtol=_SETTLED, atol=0))
+            settled &= bool(np.allclose(here.units.sigma, sigma, rtol=OPTIONS.settled, atol=0))
         elif self.closed(here) and (not self.closed(best) or here.merit < best.merit):
             best = here
         return _AtStates(self.data, here, best), settled or not np.isfinite(here.cost)
@@ -438,7 +450,7 @@ class _Iterate:
 
     @property
     def merit(self) -> float:
-        gap = self.gap / _DEFECT
+        gap = self.gap / OPTIONS.defect
         return self.cost + gap * gap  # infinite where it overflows, which a power of 2 refuses
 
     @property
@@ -446,13 +458,13 @@ class _Iterate:
         """Merit (A,) of each arc."""
         with np.errstate(all="ignore"):
             cost = np.sum(self.units.loss.of(self.white), axis=(1, 2))
-            return cost + self.gaps / _DEFECT**2
+            return cost + self.gaps / OPTIONS.defect**2
 
     @property
     def open(self) -> np.ndarray:
         """Cost of the defects of each arc (A,) that is no orbit, and 0."""
-        most = _CLOSED**2 * self.x[0].size
-        return np.where(self.gaps <= most, 0.0, self.gaps / _DEFECT**2)
+        most = OPTIONS.closed**2 * self.x[0].size
+        return np.where(self.gaps <= most, 0.0, self.gaps / OPTIONS.defect**2)
 
     @property
     def gaps(self) -> np.ndarray:
@@ -498,7 +510,7 @@ class _Rows(NamedTuple):
 def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
     num_arcs, length, k, m = at.observed.by_state.shape
     n = at.observed.by_coefficients.shape[-1]
-    size = max(1, _BLOCK_BYTES // (8 * length * max(k, m) * (m + n + 1)))
+    size = max(1, OPTIONS.block_bytes // (8 * length * max(k, m) * (m + n + 1)))
     factor, parts = np.zeros((0, n + 1)), []
     for first in range(0, num_arcs, size):
         block = slice(first, first + size)
@@ -559,9 +571,9 @@ def _solve(rows: _Rows, defects: Defects, damping: float) -> tuple[np.ndarray, n
     units = np.max(sizes, axis=0, initial=0.0, where=np.isfinite(sizes))
     units = np.where(units > 0, units, 1.0)
     pivots = np.abs(np.diagonal(own, axis1=1, axis2=2)) / units
-    loose = pivots.min(axis=1) <= _LOOSE * pivots.max(axis=1)
+    loose = pivots.min(axis=1) <= OPTIONS.loose * pivots.max(axis=1)
     moved[~loose] = np.linalg.solve(own[~loose], right[~loose])
-    inverse = np.linalg.pinv(own[loose] / units, rcond=_LOOSE)
+    inverse = np.linalg.pinv(own[loose] / units, rcond=OPTIONS.loose)
     moved[loose] = inverse @ right[loose] / units[:, None]
     dx = [moved[..., 0]]
     for i in range(defects.closing.shape[1]):

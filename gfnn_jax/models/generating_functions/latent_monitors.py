@@ -25,13 +25,21 @@ from gfnn_jax.generating.predictor import affordable, fit_predictors
 from gfnn_jax.models.generating_functions.map_arcs import LONGEST
 from gfnn_jax.solve.latent_arcs import Readings
 
-_FEWEST = 4  # turns of an arc: of fewer, noise of the two monitors is not told apart
-_MOST_NODES = 20_000  # of all arcs: a minute and a quarter of a gigabyte at a hundred terms
-_MOST_OPERATIONS = 2e10  # of one size: about a minute
-_PASSES = 32.0  # over the rows: some ten iterations, with all derivatives
-_SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
-_LARGEST = 10  # degree of S
-_WORSE = 2  # sizes in a row that are no better end the search
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the fit to readings of two monitors (benchmarks/storage_ring.py)."""
+
+    fewest: int = 4  # turns of an arc: of fewer, noise of the two monitors is not told apart
+    most_nodes: int = 20000  # of all arcs: a minute and a quarter of a gigabyte at a hundred terms
+    most_operations: float = 20000000000.0  # of one size: about a minute
+    passes: float = 32.0  # over the rows: some ten iterations, with all derivatives
+    solved: float = 1e-10  # a step in NumPy whose residual is larger has not been solved
+    largest: int = 10  # degree of S
+    worse: int = 2  # sizes in a row that are no better end the search
+
+
+OPTIONS = Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +92,7 @@ def latent_readings(
         return None
     best, worse = None, 0
     for family in _families(piece.family):
-        if best and _PASSES * arcs.size * family.num_parameters**2 > _MOST_OPERATIONS:
+        if best and OPTIONS.passes * arcs.size * family.num_parameters**2 > OPTIONS.most_operations:
             break
         on_progress(f"latent readings, S of {family.label}, {family.num_parameters} terms")
         found = _fitted(piece, family, ends, arcs)
@@ -92,9 +100,9 @@ def latent_readings(
             best, worse = found, 0
         else:
             worse += 1
-        if worse == _WORSE:
+        if worse == OPTIONS.worse:
             break
-    if worse < _WORSE:  # larger sizes leave less and less: that is no noise
+    if worse < OPTIONS.worse:  # larger sizes leave less and less: that is no noise
         return None
     return best and dataclasses.replace(best, piece=_with_predictor(best.piece, ends, arcs))
 
@@ -102,7 +110,7 @@ def latent_readings(
 def _families(family: Any) -> Iterator[Any]:
     """Families by rising degree; none where S has no degree."""
     if isinstance(family, Products):
-        yield from (dataclasses.replace(family, degree=n) for n in range(2, _LARGEST + 1))
+        yield from (dataclasses.replace(family, degree=n) for n in range(2, OPTIONS.largest + 1))
 
 
 def _fitted(
@@ -148,7 +156,7 @@ def _with_predictor(piece: Generated, ends, arcs) -> Generated:
     """The piece with a predictor of its own images of the states that were read."""
     z0, z1 = _ends_of_steps(ends, arcs)[1]
     images, error = piece.refined_step(z0, piece.chart.evaluation_point(z0, z1))
-    solved = (error < _SOLVED) & np.isfinite(images).all(axis=1)
+    solved = (error < OPTIONS.solved) & np.isfinite(images).all(axis=1)
     fitted = fit_predictors(piece.chart, z0[solved], images[solved], piece.dt)
     return dataclasses.replace(piece, predictor=affordable(fitted, piece.family).predictor)
 
@@ -168,7 +176,7 @@ def _arcs(turns: list[np.ndarray]) -> np.ndarray | None:
     """Arcs (A, L, 2d) of one length; of very many every so many."""
     longest = max((len(y) for y in turns), default=0)
     length = min(longest, LONGEST + 1)
-    if length < _FEWEST:
+    if length < OPTIONS.fewest:
         return None
     cut = [y[i : i + length] for y in turns for i in range(0, len(y) - length + 1, length)]
-    return np.array(cut[:: -(-len(cut) * length // _MOST_NODES)])
+    return np.array(cut[:: -(-len(cut) * length // OPTIONS.most_nodes)])

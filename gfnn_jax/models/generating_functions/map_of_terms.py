@@ -41,14 +41,28 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.models.parameters import states_and_functions, walked
 
 _CHARTS = ("type2", "midpoint", "type3")  # that are tried, in this order
-_MOST_TERMS = 500
-_THRESHOLDS = (1e4, 1e3, 100.0, 30.0, 10.0)  # standard errors below which terms go, tried in turn
-_RISE, _ROUNDING = 1.1, 1e-15  # of the held-out error that this may cost
-_STRUCTURED_ROWS = 50_000  # numbers of training pairs that sites are fitted to: no more are needed
-_NULL_ROWS = 4_000  # of them, which tell whose gradients are combinations of others
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the search for S as a sum of terms (benchmarks/args.py)."""
+
+    most_terms: int = 500
+    # standard errors below which terms go, tried in turn
+    thresholds: tuple[float, ...] = (10000.0, 1000.0, 100.0, 30.0, 10.0)
+    # of the held-out error that this may cost
+    rise: float = 1.1
+    rounding: float = 1e-15
+    # numbers of training pairs that sites are fitted to: no more are needed
+    structured_rows: int = 50_000
+    null_rows: int = 4000  # of them, which tell whose gradients are combinations of others
+    flat: float = 1.2  # libraries whose errors differ by less have met the pairs' noise
+    solved: float = 1e-10  # a step in NumPy whose residual is larger has not been solved
+
+
+OPTIONS = Options()
+
 _FEWER_TERMS = "dropping the terms of S that the pairs do not ask for"
-_FLAT = 1.2  # libraries whose errors differ by less have met the pairs' noise
-_SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
 
 
 class LearnedMap(NamedTuple):
@@ -136,10 +150,12 @@ class SumOfTerms:
                 f"{' for all values of the parameters' if data.args is not None else ''}. Add "
                 "pairs, or take a smaller dt"
             )
-        chart, limit = best.piece.chart, _FLAT * best.error.relative
+        chart, limit = best.piece.chart, OPTIONS.flat * best.error.relative
         rivals = [f for f in tried if f.piece.chart is chart and f.error.relative <= limit]
         stalled = len(rivals) > 1 and best.error.bound > tolerance.bound
-        unit = budget.unit(_FEWER_TERMS, ROWS, len(_THRESHOLDS) * _work(best.piece.family, data))
+        unit = budget.unit(
+            _FEWER_TERMS, ROWS, len(OPTIONS.thresholds) * _work(best.piece.family, data)
+        )
         full = best
         sparse = within(unit, lambda: _sparse(full, data, tolerance, noisy=stalled))
         if sparse is None:
@@ -175,7 +191,7 @@ class SumOfTerms:
             attempt,
             lambda tried: tried.error.bound,
             bound=tolerance.bound,
-            most=min(len(data.training) * 2 * data.dim / ROWS_PER_TERM, _MOST_TERMS),
+            most=min(len(data.training) * 2 * data.dim / ROWS_PER_TERM, OPTIONS.most_terms),
         )
 
 
@@ -193,7 +209,7 @@ def _work(family: Any, data: Dataset) -> float:
 
 def _fewer(data: Dataset) -> Dataset:
     """Take as many training pairs as the terms of a site need."""
-    most = max(1, _STRUCTURED_ROWS // data.y0.shape[1])
+    most = max(1, OPTIONS.structured_rows // data.y0.shape[1])
     return data.trained_on(data.training[:most])
 
 
@@ -201,8 +217,8 @@ def _of_sites(data: Dataset, tolerance: Tolerance, attempt) -> Iterator[_Tried]:
     """The libraries of a structure by rising size, until one meets the tolerance."""
     assert data.structure is not None
     width = data.y0.shape[1]
-    rows = data.training[: max(1, _NULL_ROWS // width)]
-    most = min(len(data.training) * width / ROWS_PER_TERM, _MOST_TERMS)
+    rows = data.training[: max(1, OPTIONS.null_rows // width)]
+    most = min(len(data.training) * width / ROWS_PER_TERM, OPTIONS.most_terms)
     for library in data.structure.libraries(data.dim):
         family = library.take(null_terms(library, data.y0[rows])[0])
         if family.num_parameters <= most:
@@ -236,7 +252,7 @@ def _validated(piece: Generated, data: Dataset, tolerance: Tolerance) -> _Tried:
     if not matrix_free(family):
         determinant = piece.determinant(data.y0[rows], data.y1[rows], args)
         folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
-    bad = ~(off < _SOLVED) | folds
+    bad = ~(off < OPTIONS.solved) | folds
     images = np.where(bad[:, None], np.nan, images)
     images = data.whole_image(images, rows)
     error = measured_error(data, tolerance, to_user(data.coordinates, images))
@@ -260,7 +276,7 @@ def _covariance_root(piece: Generated, data: Dataset) -> np.ndarray:
     residual, noise = slopes @ np.asarray(piece.params) - aim, None
     found = _larger(family, data)
     if found is not None and ROWS_PER_TERM * found.num_parameters <= target.size:
-        some = slice(max(1, _NULL_ROWS // w.shape[1]))
+        some = slice(max(1, OPTIONS.null_rows // w.shape[1]))
         given = () if args is None else (args,)
         few = null_terms(found, w[some], args=None if args is None else args[some])[0]
         known = found.take(few)
@@ -297,7 +313,7 @@ def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance, noisy: bool) -> _
     triangle = Triangle.of(np.column_stack([terms, residual]))
     tried: set[int] = set()
     remaining_terms, thresholds = (
-        (terms_above_noise, (ABOVE_NOISE,)) if noisy else (significant, _THRESHOLDS)
+        (terms_above_noise, (ABOVE_NOISE,)) if noisy else (significant, OPTIONS.thresholds)
     )
     for threshold in thresholds:
         kept, _ = remaining_terms(triangle, piece.params, threshold)
@@ -305,6 +321,6 @@ def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance, noisy: bool) -> _
             continue
         tried.add(len(kept))
         found = _fitted(piece.chart, piece.family.take(kept.tolist()), data, tolerance)
-        if found.error.relative <= max(_RISE * full.error.relative, _ROUNDING):
+        if found.error.relative <= max(OPTIONS.rise * full.error.relative, OPTIONS.rounding):
             return found
     return full

@@ -44,11 +44,39 @@ from gfnn_jax.maps.damping import Damping
 from gfnn_jax.models.generating_functions.parity import is_even
 from gfnn_jax.models.generating_functions.size import OF_SOLVE, OF_STEPS, Generates, Size
 
-# Pairs of a block that goes to one of two halves: long beside the noise that neighbours share.
-_HALVES_BLOCK = 50
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Sizes of the sweeps, and what bounds them (benchmarks/constants.py)."""
+
+    # Pairs of a block that goes to one of two halves: long beside the noise that neighbours
+    # share.
+    halves_block: int = 50
+    noise_pairs: int = 4096  # that tell the noise of each coordinate
+    # Degrees whose numbers of terms grow by about a half from one to the next; those of a group
+    # are estimated from one factor of the rows of its largest.
+    degrees: tuple[tuple[int, ...], ...] = (
+        (2, 3),
+        (4, 5, 6),
+        (7, 8),
+        (9, 10),
+        (12, 14),
+        (16, 18, 20),
+        (24, 28, 32),
+    )
+    trial: tuple[int, ...] = (2, 3, 4, 5, 6)
+    sines: tuple[int, ...] = (100, 200, 400, 800, 1_600)
+    # Products of degree 14 in four variables: benchmarks/storage_ring.py.
+    most_terms: int = 3_100
+    # Rows × terms² of one factor: about half a minute on one core. 2,000 terms take 80,000 rows.
+    most_operations: float = 320000000000.0
+    worth_keeping: float = 1.0  # seconds
+
+
+OPTIONS = Options()
+
 # Rows per term of a larger size, by which noise is told from misfit.
 SAMPLE_ROWS = 6
-_NOISE_PAIRS = 4_096  # that tell the noise of each coordinate
 
 
 class Factors(NamedTuple):
@@ -81,17 +109,7 @@ def part_of_noise(
     return noise / (noise + uncertainty.misfit(explained, further, each) / rows)
 
 
-# Degrees whose numbers of terms grow by about a half from one to the next; those of a group are
-# estimated from one factor of the rows of its largest.
-_DEGREES = ((2, 3), (4, 5, 6), (7, 8), (9, 10), (12, 14), (16, 18, 20), (24, 28, 32))
-_TRIAL = (2, 3, 4, 5, 6)
 _EVEN_DEGREES = tuple((degree,) for degree in (2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 24, 28, 32))
-_SINES = (100, 200, 400, 800, 1_600)
-# Products of degree 14 in four variables: benchmarks/storage_ring.py.
-_MOST_TERMS = 3_100
-# Rows × terms² of one factor: about half a minute on one core. 2,000 terms take 80,000 rows.
-_MOST_OPERATIONS = 3.2e11
-_WORTH_KEEPING = 1.0  # seconds
 
 
 def sweeps_for(
@@ -117,7 +135,7 @@ def sweeps_for(
     polynomials = request in ("auto", "polynomial")
     free = polynomials and (scene is None or scene.reversor is None)
     degrees = [degree for (degree,) in _EVEN_DEGREES]
-    even = free and is_even(data, degrees, _MOST_TERMS, ROWS_PER_TERM)
+    even = free and is_even(data, degrees, OPTIONS.most_terms, ROWS_PER_TERM)
     for chart in charts:
         # Only the midpoint S inherits the parity.
         reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
@@ -188,7 +206,7 @@ class LinearSweep(Generates):
             reversor=reversor,
             args=args,
         )
-        degrees = _EVEN_DEGREES if even else _DEGREES
+        degrees = _EVEN_DEGREES if even else OPTIONS.degrees
         signs = None
         if kind != "sines" and own is None and reversor is not None:
             signs = variable_signs(inputs, reversor, w)
@@ -197,10 +215,10 @@ class LinearSweep(Generates):
             if own is not None:
                 return ([family] for family in own(inputs))
             if kind == "sines":
-                return ([Sines(inputs, count)] for count in _SINES)
+                return ([Sines(inputs, count)] for count in OPTIONS.sines)
             return ((made(inputs, degree, signs) for degree in g) for g in degrees)
 
-        known = len(_SINES) if kind == "sines" or own is not None else sum(map(len, degrees))
+        known = len(OPTIONS.sines) if kind == "sines" or own is not None else sum(map(len, degrees))
         # Test rows determine a size too: once they have stated its error, it is fitted to them.
         rows = self._train[1].size + len(data.test) * self._width
         self._groups, self._determining = groups, rows
@@ -210,7 +228,7 @@ class LinearSweep(Generates):
             for family in group
         ]
         # Else the last size is the largest there is, or the most terms are reached.
-        self.short_of_pairs = len(self.sizes) < known and rows < ROWS_PER_TERM * _MOST_TERMS
+        self.short_of_pairs = len(self.sizes) < known and rows < ROWS_PER_TERM * OPTIONS.most_terms
         self._factors: dict[Any, Factors] = {}
         self._solved: dict[int, least_squares.LeastSquaresFit] = {}  # by the number of terms
 
@@ -282,7 +300,11 @@ class LinearSweep(Generates):
         fitted = len(self._train[0]) + len(self.data.test)
         share = fitted / (fitted + len(self.data.validation))
         pairs = int(np.ceil(ROWS_PER_TERM * terms / self._width / share))
-        most = f", more than the {_MOST_TERMS:,} that are tried" if terms > _MOST_TERMS else ""
+        most = (
+            f", more than the {OPTIONS.most_terms:,} that are tried"
+            if terms > OPTIONS.most_terms
+            else ""
+        )
         return f"{label} ({terms:,} terms{most}; about {pairs:,} pairs)"
 
     def solve(
@@ -352,7 +374,9 @@ class LinearSweep(Generates):
         """Pairs that a group's factor is made of, and rows of each. They are shuffled: the first of
         them are a sample, where all would take too long."""
         count, width = self._train[1].shape
-        return min(count, max(1, int(_MOST_OPERATIONS / (group.num_parameters**2 * width)))), width
+        return min(
+            count, max(1, int(OPTIONS.most_operations / (group.num_parameters**2 * width)))
+        ), width
 
     def _larger(self, size: Size) -> Size | None:
         """The size two further, as a symmetric map gains nothing from the odd degrees; the next, or
@@ -399,7 +423,7 @@ class LinearSweep(Generates):
                 self._held,
             )
         )
-        if self._kept is not None and time.perf_counter() - started > _WORTH_KEEPING:
+        if self._kept is not None and time.perf_counter() - started > OPTIONS.worth_keeping:
             self._kept.save(
                 self._named(group),
                 inner=inner.factor,
@@ -447,7 +471,7 @@ class LinearSweep(Generates):
     def error_by_noise(self, size: Size) -> float:
         """Error of the size's ∇S by noise, in the measure of train_rms: half of the
         difference between the fits to either half of the training pairs, blocks in time."""
-        half = self.data.training // _HALVES_BLOCK % 2
+        half = self.data.training // OPTIONS.halves_block % 2
         train, held = self.factors(size.group, Budget(), lambda message: None)[:2]
         count = size.family.num_parameters
         one, other = (
@@ -467,7 +491,7 @@ class LinearSweep(Generates):
     def state_deviations(self, size: Size) -> np.ndarray:
         """(2d,) standard deviation of each coordinate's noise, ÷ its scale, from what this size
         leaves of a sample of the training pairs."""
-        (w, target, *args), goes_on = self._sample(_NOISE_PAIRS)
+        (w, target, *args), goes_on = self._sample(OPTIONS.noise_pairs)
         solved, params = self.solve(size, Budget(), lambda message: None)
         slopes = self._slopes(size.family, w, *args)
         residual = slopes @ solved.coefficients - target * self._weight
@@ -610,7 +634,7 @@ def trial_residual(data: Dataset) -> float:
         angles=tuple(a for a in coordinates.angles if a < data.dim),
         cyclic=coordinates.cyclic,
     )
-    trials = ([Products(inputs, degree)] for degree in _TRIAL)
+    trials = ([Products(inputs, degree)] for degree in OPTIONS.trial)
     groups = list(_determined(trials, w.size // 2, ROWS_PER_TERM))
     family = groups[-1][0] if groups else Products(inputs, 1)
     train, held = (
@@ -631,7 +655,7 @@ def _determined(groups: Iterable[Iterable[Any]], rows: int, each: float) -> Iter
     Sizes rise, so the first that is too large is the last that is looked at: in many dimensions the
     terms of a high degree could not even be counted.
     """
-    most = min(_MOST_TERMS, int(rows / each))
+    most = min(OPTIONS.most_terms, int(rows / each))
     for group in groups:
         kept = []
         for family in group:

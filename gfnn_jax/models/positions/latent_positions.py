@@ -21,12 +21,26 @@ from gfnn_jax.models.positions.discrete_lagrangian import Solved, residuals, sol
 from gfnn_jax.models.positions.triples import Triples
 from gfnn_jax.solve.latent_arcs import SOFT_L1, Readings
 
-_LONGEST = 24  # nodes of an arc: its own two positions cost a twelfth of what it tells
-_MOST_NODES = 20_000  # of all arcs: a minute and a quarter of a gigabyte at a hundred terms
-_MOST_NUMBERS = 3e7  # of all Jacobians (2d, 2d) along the arcs, a quarter of a gigabyte
-_SETTLED = 1.05  # a noise scale that changed by less needs no further fit
-_SCALES = 4  # fits, at most, that find it
-_GROSS = 5.0  # standard deviations: of what is not noise
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the fit to latent positions (benchmarks/positions.py)."""
+
+    longest: int = 24  # nodes of an arc: its own two positions cost a twelfth of what it tells
+    most_nodes: int = 20000  # of all arcs: a minute and a quarter of a gigabyte at a hundred terms
+    # of all Jacobians (2d, 2d) along the arcs, a quarter of a gigabyte
+    most_numbers: float = 30000000.0
+    settled: float = 1.05  # a noise scale that changed by less needs no further fit
+    scales: int = 4  # fits, at most, that find it
+    gross: float = 5.0  # standard deviations: of what is not noise
+    certain: float = 2.0  # standard errors, by which least squares has to be better to be kept
+    worse: int = 2  # sizes in a row that are no better end the search
+    passes: float = 32.0  # over the rows: some four iterations, twice, with all derivatives
+    most_operations: float = 20000000000.0  # of one size: about a minute
+
+
+OPTIONS = Options()
+
 _OF_EQUATION = np.sqrt(3)  # noise of an equation, in that of a reading, about
 
 
@@ -54,13 +68,13 @@ def arcs_of(triples: Triples) -> np.ndarray:
     many, or of many degrees of freedom, every so many."""
     stretches = triples.stretches()
     sizes = np.array([len(s) for s in stretches])
-    longest = min(int(sizes.max()) - 1, _LONGEST)
+    longest = min(int(sizes.max()) - 1, OPTIONS.longest)
     used = [np.sum(sizes // (nodes + 1)) * (nodes - 1) for nodes in range(2, longest + 1)]
     span = 3 + int(np.argmax(used))
     cut = [
         s[first : first + span] for s in stretches for first in range(0, len(s) - span + 1, span)
     ]
-    most = max(span, min(_MOST_NODES, int(_MOST_NUMBERS / (2 * triples.dim) ** 2)))
+    most = max(span, min(OPTIONS.most_nodes, int(OPTIONS.most_numbers / (2 * triples.dim) ** 2)))
     return np.array(cut[:: -(-len(cut) * span // most)])
 
 
@@ -85,13 +99,13 @@ def fit_latent(
     equations = len(arcs) * (arcs.shape[1] - 2) * dim
     # Residuals of readings are smaller than the noise by what the unknowns take of them.
     left = np.sqrt(arcs.size / max(equations - determined, 1))
-    for _ in range(_SCALES):
+    for _ in range(OPTIONS.scales):
         scale = np.tile(sigma, 2)
         found = Readings(model, y, scale).fit(p, x, scale)
         p, x = found.p, found.x
         change = _size(found.residuals, dim) * left
         sigma = sigma * change
-        if np.all(np.abs(np.log(change)) < np.log(_SETTLED)):
+        if np.all(np.abs(np.log(change)) < np.log(OPTIONS.settled)):
             break
     root = np.linalg.pinv(found.triangle).T @ solved.determined.T * np.exp(np.mean(np.log(change)))
     coefficients = solved.free + solved.determined @ p
@@ -115,14 +129,8 @@ def held_out_cost(
 def _size(residuals: np.ndarray, dim: int) -> np.ndarray:
     """(d,) root mean square of residuals (A, L, 2d) of each coordinate, gross ones left out."""
     r = residuals.reshape(-1, 2, dim)
-    gross = np.abs(r) > _GROSS * np.nanmedian(np.abs(r), axis=(0, 1)) / 0.6745
+    gross = np.abs(r) > OPTIONS.gross * np.nanmedian(np.abs(r), axis=(0, 1)) / 0.6745
     return np.sqrt(np.nanmean(np.where(gross, np.nan, r) ** 2, axis=(0, 1)))
-
-
-_CERTAIN = 2.0  # standard errors, by which least squares has to be better to be kept
-_WORSE = 2  # sizes in a row that are no better end the search
-_PASSES = 32.0  # over the rows: some four iterations, twice, with all derivatives
-_MOST_OPERATIONS = 2e10  # of one size: about a minute
 
 
 class Latent(NamedTuple):
@@ -146,8 +154,8 @@ def without_noise(
     best: Latent | None = None
     sigma, worse = None, 0
     for family in families:
-        work = _PASSES * arcs.size * (family.num_parameters + 2 * training.dim) ** 2
-        if best is not None and work > _MOST_OPERATIONS:
+        work = OPTIONS.passes * arcs.size * (family.num_parameters + 2 * training.dim) ** 2
+        if best is not None and work > OPTIONS.most_operations:
             break
         try:
             with budget.unit(f"latent positions, S of {family.label}", FLOW, work):
@@ -162,7 +170,7 @@ def without_noise(
             worse += 1
         else:
             best, sigma, worse = Latent(family, fit, solved), fit.sigma, 0
-        if worse == _WORSE:
+        if worse == OPTIONS.worse:
             break
     if best is None:
         return None
@@ -171,5 +179,5 @@ def without_noise(
         for coefficients in (best.fit.coefficients, best.solved.coefficients)
     )
     gain = latent - plain
-    plain_is_better = gain.mean() > _CERTAIN * gain.std() / np.sqrt(len(gain))
+    plain_is_better = gain.mean() > OPTIONS.certain * gain.std() / np.sqrt(len(gain))
     return best if np.isfinite(latent).all() and not plain_is_better else None
