@@ -28,6 +28,7 @@ from harness import RESULTS, TABLES, Numbers, between_markers, markdown, number,
 
 from gfnn_jax.evaluate import figures
 from gfnn_jax.jobs.compare import CAP, OURS, PAPER_GFNN, compare
+from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.progress import Progress
 
 FIGURES = harness.FIGURES / "compare"
@@ -70,7 +71,7 @@ def run(name: str, seed: int, folder: Path, work: Path, **options) -> None:
     def say(line: str) -> None:
         print(f"  [{time.perf_counter() - started:6.1f} s] {line}", flush=True)
 
-    compare(name, seed=seed, out=out, resume=True, progress=Progress(say, say), **options)
+    compare(name, Output(out, resume=True, progress=Progress(say, say)), seed=seed, **options)
     write(result_path(folder, name, seed), json.loads((out / "report.json").read_text("utf-8")))
     if folder == RESULTS and seed == SCENES[name][0][0]:
         FIGURES.mkdir(parents=True, exist_ok=True)

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import json
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from gfnn_jax import processes
-from gfnn_jax.cli_columns import column_options, masses, names_roles
-from gfnn_jax.cli_parser import fit_options, parser
+from gfnn_jax.cli_parser import column_options, fit_options, masses, names_roles, parser
 from gfnn_jax.cli_process import (
     Terminated,
     collect_garbage_seldom,
@@ -25,7 +25,14 @@ from gfnn_jax.cli_process import (
     stopped_by_sigterm,
     warnings_in_one_line,
 )
-from gfnn_jax.cli_summary import print_status, print_summary, print_table
+from gfnn_jax.cli_summary import (
+    comparison_table,
+    print_forecasts,
+    print_predicted,
+    print_record,
+    print_summary,
+    print_table,
+)
 from gfnn_jax.data.files import are_recordings
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
@@ -109,6 +116,27 @@ def _scenes(arguments: argparse.Namespace) -> None:
         print(f"{name:22} dim {scene.dim:<3} dt {scene.dt:<9g} {scene.purpose}")
 
 
+@contextlib.contextmanager
+def _output(arguments: argparse.Namespace, devices: int | str | None = None) -> Iterator[Any]:
+    """Set JAX up, and open the output of a job with its progress on standard error."""
+    set_up_jax(devices)
+    from gfnn_jax.jobs.output import Output
+
+    resume = getattr(arguments, "resume", False)
+    with progress.on_stderr() as shown:
+        yield Output(arguments.out, arguments.overwrite, resume, shown)
+
+
+@contextlib.contextmanager
+def _processes(arguments: argparse.Namespace) -> Iterator[Callable[[], processes.Share | None]]:
+    """Watch the other processes of a distributed job; what is yielded joins them."""
+    if not arguments.distributed:
+        yield lambda: None
+        return
+    with processes.watched(f"gfnn: {processes.LOST}"):
+        yield processes.join
+
+
 def _run(arguments: argparse.Namespace) -> None:
     from gfnn_jax.records import RECORDS
 
@@ -118,20 +146,11 @@ def _run(arguments: argparse.Namespace) -> None:
         ensure_new(out, arguments.overwrite, folder=True)
     if arguments.scene in RECORDS or data.is_file():
         return _run_record(arguments)
-    set_up_jax()
-    from gfnn_jax.jobs.run import run
+    with _output(arguments) as output:
+        from gfnn_jax.jobs.run import run
 
-    with progress.on_stderr() as shown:
-        ran = run(
-            arguments.scene,
-            out=out,
-            quick=arguments.quick,
-            dt=arguments.dt,
-            overwrite=arguments.overwrite,
-            resume=arguments.resume,
-            progress=shown,
-            **fit_options(arguments),
-        )
+        quick, options = arguments.quick, fit_options(arguments)
+        ran = run(arguments.scene, output, quick=quick, dt=arguments.dt, **options)
     print_summary(ran, out)
     _hold_to(arguments.strict, out / "model")
 
@@ -140,43 +159,43 @@ def _run_record(arguments: argparse.Namespace) -> None:
     """The law and the forecasts of a record of the package, or of a file."""
     others = tuple(name for name in (*_OF_MAPS, "learn", "dt") if name != "scene")
     _refuse_given(arguments, others, "not for the law of a recording")
-    set_up_jax()
-    from gfnn_jax.jobs.run_record import run_record
-    from gfnn_jax.records import RECORDS, path
+    data, columns = _record_named(Path(arguments.scene))
+    with _output(arguments) as output:
+        from gfnn_jax.jobs.run_record import run_record
 
-    data, columns = Path(arguments.scene), {}
-    if arguments.scene in RECORDS:
-        record, data = RECORDS[arguments.scene], path(arguments.scene)
-        columns = {"positions": record.positions, "angles": record.angles}
-    with progress.on_stderr() as shown:
-        ran = run_record(data, out=arguments.out, columns=columns, progress=shown)
-    print(ran.learned.fit.table)
-    ahead = ", ".join(f"{seconds:.3g}" for seconds in ran.forecasts.ahead)
-    for name, errors in ran.forecasts.median.items():
-        sizes = ", ".join(f"{error:.3g}" for error in errors)
-        unit = f" {ran.held_out.unit(name)}".rstrip()
-        print(
-            f"the last third, which no fit has seen: {name} errs by {sizes}{unit} after {ahead} "
-            "s (medians)"
-        )
-    print(f"{ran.forecasts.within:.0%} of it lies within two standard deviations (95 % expected)")
-    print(f"written to {arguments.out}")
+        ran = run_record(data, output, columns=columns)
+    print_record(ran, arguments.out)
+
+
+def _record_named(path: Path) -> tuple[Path, dict[str, Any]]:
+    """(file, columns) of a record of the package; of any other path itself."""
+    from gfnn_jax.records import RECORDS
+    from gfnn_jax.records import path as path_of
+
+    record = None if path.exists() else RECORDS.get(str(path))
+    if record is None:
+        return path, {}
+    return path_of(str(path)), {"positions": record.positions, "angles": record.angles}
 
 
 def _look(arguments: argparse.Namespace) -> None:
     if arguments.figure is not None:
         ensure_new(arguments.figure, arguments.overwrite)
-    for path in arguments.data:
+    named = [_record_named(path) for path in arguments.data]
+    paths = [path for path, _ in named]
+    for path in paths:
         _check_exists(path)
     figure = arguments.figure
     if figure is None and not arguments.json:
-        figure = Path("runs") / f"look-{arguments.data[0].stem}.png"
+        figure = Path("runs") / f"look-{paths[0].stem}.png"
     options = column_options(arguments)
     given = {"dt": arguments.dt, "mass": masses(arguments)}
     options |= {name: value for name, value in given.items() if value}
+    if len(named) == 1:
+        options = named[0][1] | options
     from gfnn_jax.jobs.look import look
 
-    summary = look(arguments.data, options, figure)
+    summary = look(paths, options, figure)
     if arguments.json:
         print(json.dumps(summary.as_json(), indent=2, ensure_ascii=False))
     else:
@@ -184,7 +203,7 @@ def _look(arguments: argparse.Namespace) -> None:
         print(f"figure: {figure}")
     wrong = sum(fault.wrong for fault in summary.faults)
     if arguments.strict and wrong:
-        raise WorkError(f"{arguments.data[0]}: mistakes found: {wrong} (--strict)")
+        raise WorkError(f"{paths[0]}: mistakes found: {wrong} (--strict)")
 
 
 def _fit(arguments: argparse.Namespace) -> None:
@@ -196,114 +215,69 @@ def _fit(arguments: argparse.Namespace) -> None:
     for path in arguments.data:
         _check_exists(path)
     columns = column_options(arguments)
-    with_roles = names_roles(columns)
-    if are_recordings(arguments.data, with_roles=with_roles):
-        if arguments.dt is not None:
-            columns["dt"] = arguments.dt
-        if options.get("learn") == "map":
-            return _fit_positions(arguments, columns, options)
-        return _fit_law(arguments, columns, options)
+    if are_recordings(arguments.data, with_roles=names_roles(columns)):
+        return _fit_recording(arguments, columns, options)
     if options.get("learn") == "lagrangian":
         raise InputError(
             f"--learn lagrangian: {arguments.data[0]} is read as states q, p. If these columns are "
             "measured positions, name them: --positions A,B"
         )
     options["angles"] = _as_indices(columns)
-    with contextlib.ExitStack() as stack:
-        group = None
-        if arguments.distributed:
-            stack.enter_context(processes.watched(f"gfnn: {processes.LOST}"))
-        set_up_jax(options.get("devices"))
-        if arguments.distributed:
-            group = processes.Group(processes.join())
-        _fit_and_report(arguments, options, group)
+    with _processes(arguments) as join:
+        with _output(arguments, options.get("devices")) as output:
+            share = join()
+            group = None if share is None else processes.Group(share)
+            from gfnn_jax.jobs.fit import fit
+
+            given = {"dt": arguments.dt, "scene_name": arguments.scene, "group": group}
+            ran = fit(arguments.data, output, **given, **options)
+        if group is not None:
+            processes.wait_for_all()
+            if not group.first:
+                sent = f"{group.sent / 1e6:.3g} MB sent"
+                print(f"process {group.share.index} of {group.share.count}: {sent}")
+                return
+    _print_fitted(arguments, ran)
 
 
-def _fit_law(
+def _print_fitted(arguments: argparse.Namespace, ran: Any) -> None:
+    """Print a map that was learned, and what to type next."""
+    print_summary(ran, arguments.out)
+    _print_next(arguments, " --num-steps 1000 --out prediction.npz")
+    _hold_to(arguments.strict, arguments.out)
+
+
+def _print_next(arguments: argparse.Namespace, options: str) -> None:
+    print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]}{options}")
+
+
+def _fit_recording(
     arguments: argparse.Namespace, columns: dict[str, Any], options: dict[str, Any]
 ) -> None:
-    """The law of a recording."""
-    _refuse_given(arguments, _OF_MAPS, "not for the law of a recording")
-    set_up_jax()
-    from gfnn_jax.jobs.fit_recording import fit_recording
+    """Learn the law of a recording, or the map of its positions."""
+    is_law = options.get("learn") != "map"
+    if arguments.dt is not None:
+        columns["dt"] = arguments.dt
+    if is_law:
+        _refuse_given(arguments, _OF_MAPS, "not for the law of a recording")
+        options["mass"] = masses(arguments)
+    with _output(arguments) as output:
+        from gfnn_jax.jobs.fit import fit_recording
 
-    with progress.on_stderr() as shown:
-        learned = fit_recording(
-            arguments.data,
-            out=arguments.out,
-            columns=columns,
-            mass=masses(arguments),
-            despite=arguments.despite,
-            progress=shown,
-            **options,
-        )
-    print(learned.fit.table)
+        given = {"columns": columns, "despite": arguments.despite}
+        ran: Any = fit_recording(arguments.data, output, **given, **options)
+    if not is_law:
+        return _print_fitted(arguments, ran)
+    gains = ran.fit.gains
+    print(ran.fit.table)
     print(f"written to {arguments.out}")
-    inputs_ahead = " --inputs FILE" if learned.fit.gains else ""
-    ahead = f" --num-steps 1000{inputs_ahead}"
     if "stop" in columns:  # what no fit has seen is in the file
-        ahead, inputs_ahead = f" --to {columns['stop']:g} --compare {arguments.data[0]}", ""
-    print(
-        f"next: gfnn predict {arguments.out} --initial {arguments.data[0]}{ahead} --out "
-        "forecast.csv"
-    )
-    if inputs_ahead:
-        print(f"      FILE holds {', '.join(learned.fit.gains)} at the times of the forecast")
-
-
-def _fit_positions(
-    arguments: argparse.Namespace, columns: dict[str, Any], options: dict[str, Any]
-) -> None:
-    """Learn the map of a recording of positions."""
-    set_up_jax()
-    from gfnn_jax.jobs.fit_positions import fit_positions
-
-    with progress.on_stderr() as shown:
-        ran = fit_positions(
-            arguments.data,
-            out=arguments.out,
-            columns=columns,
-            despite=arguments.despite,
-            progress=shown,
-            **options,
-        )
-    print_summary(ran, arguments.out)
-    print(
-        f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
-        "--out prediction.npz"
-    )
-    _hold_to(arguments.strict, arguments.out)
-
-
-def _fit_and_report(
-    arguments: argparse.Namespace, options: dict[str, Any], group: processes.Group | None
-) -> None:
-    from gfnn_jax.jobs.fit import fit
-
-    with progress.on_stderr() as shown:
-        ran = fit(
-            arguments.data,
-            out=arguments.out,
-            dt=arguments.dt,
-            scene_name=arguments.scene,
-            overwrite=arguments.overwrite,
-            resume=arguments.resume,
-            group=group,
-            progress=shown,
-            **options,
-        )
-    if group is not None:
-        processes.wait_for_all()
-        if not group.first:
-            sent = f"{group.sent / 1e6:.3g} MB sent"
-            print(f"process {group.share.index} of {group.share.count}: {sent}")
-            return
-    print_summary(ran, arguments.out)
-    print(
-        f"next: gfnn predict {arguments.out} --initial {arguments.data[0]} --num-steps 1000 "
-        "--out prediction.npz"
-    )
-    _hold_to(arguments.strict, arguments.out)
+        compared = f" --to {columns['stop']:g} --compare {arguments.data[0]}"
+        return _print_next(arguments, f"{compared} --out forecast.csv")
+    inputs = " --inputs FILE" if gains else ""
+    _print_next(arguments, f" --num-steps 1000{inputs} --out forecast.csv")
+    if inputs:
+        print(f"      FILE holds {', '.join(gains)} at the times of the forecast")
 
 
 def _as_indices(columns: dict[str, Any]) -> tuple[int, ...]:
@@ -353,6 +327,12 @@ def _refuse_given(arguments: argparse.Namespace, names: tuple[str, ...], why: st
         raise InputError(f"{', '.join(given)}: {why}")
 
 
+def _taken(kind: Any, arguments: argparse.Namespace) -> Any:
+    """A request whose fields are the options of their names."""
+    names = {field.name for field in dataclasses.fields(kind)}
+    return kind(**{name: value for name, value in vars(arguments).items() if name in names})
+
+
 def _predict(arguments: argparse.Namespace) -> None:
     if not arguments.resume:
         ensure_new(arguments.out, arguments.overwrite)
@@ -367,14 +347,17 @@ def _predict(arguments: argparse.Namespace) -> None:
     _refuse_given(arguments, _OF_FORECAST, "only for the forecast of a recording by its law")
     if arguments.num_steps is None:
         raise InputError("expected --num-steps: how many steps to predict")
-    with contextlib.ExitStack() as stack:
-        share = None
-        if arguments.distributed:
-            stack.enter_context(processes.watched(f"gfnn: {processes.LOST}"))
-        set_up_jax(arguments.devices)
-        if arguments.distributed:
-            share = processes.join()
-        _predict_and_report(arguments, share)
+    with _processes(arguments) as join, _output(arguments, arguments.devices) as output:
+        share = join()
+        from gfnn_jax.jobs.predict import Steps, predict
+
+        asked = _taken(Steps, arguments)
+        predicted = predict(arguments.model, arguments.initial, output, asked, share)
+    if share is not None and share.index:
+        lanes = f"{len(predicted.status)} trajectories, {predicted.seconds:.1f} s"
+        print(f"process {share.index} of {share.count}: {lanes}")
+        return
+    print_predicted(predicted, asked, arguments.out)
 
 
 def _is_law(model: Path) -> bool:
@@ -388,75 +371,13 @@ def _is_law(model: Path) -> bool:
 def _forecast(arguments: argparse.Namespace) -> None:
     """Forecast from the end of a recording."""
     set_up_jax()
-    from gfnn_jax.jobs.forecast import forecast_recording
+    from gfnn_jax.jobs.forecast import Ahead, forecast_recording
+    from gfnn_jax.jobs.output import Output
 
-    found, unit, compared = forecast_recording(
-        arguments.model,
-        arguments.initial,
-        out=arguments.out,
-        num_steps=arguments.num_steps,
-        save_every=arguments.save_every,
-        stop=arguments.stop,
-        estimate_from=arguments.estimate_from,
-        inputs=arguments.inputs,
-        compare=arguments.compare,
-        overwrite=arguments.overwrite,
-    )
-    times = [f.times[-1] for f in found.values()]
-    runs = "1 run" if len(found) == 1 else f"{len(found)} runs"
-    print(f"{arguments.out}: forecasts of {runs}, up to t = {max(times):g} {unit}")
-    for line in (line for one in found.values() for line in one.outside):
-        print(f"note: {line}")
-    if compared is not None:
-        for name, (rms, median, within) in compared.columns.items():
-            unit = f" {compared.units[name]}" if compared.units[name] else ""
-            print(
-                f"{name}: RMS error {rms:.4g}{unit}, median of its size {median:.4g}{unit}; "
-                f"{within:.0%} of {compared.num_samples} samples within two standard deviations "
-                "(95 % expected)"
-            )
-
-
-def _predict_and_report(arguments: argparse.Namespace, share: processes.Share | None) -> None:
-    from gfnn_jax.jobs.predict import predict
-
-    with progress.on_stderr() as shown:
-        predicted = predict(
-            arguments.model,
-            arguments.initial,
-            num_steps=arguments.num_steps,
-            save_every=arguments.save_every,
-            out=arguments.out,
-            dt=arguments.dt,
-            samples=arguments.samples,
-            horizon_size=arguments.horizon,
-            stop_outside=arguments.outside == "stop",
-            devices=arguments.devices,
-            share=share,
-            overwrite=arguments.overwrite,
-            resume=arguments.resume,
-            progress=shown,
-        )
-    num_lanes = len(predicted.status)
-    if share is not None and share.index:
-        print(
-            f"process {share.index} of {share.count}: {num_lanes} trajectories, "
-            f"{predicted.seconds:.1f} s"
-        )
-        return
-    back = " backwards" if arguments.num_steps < 0 else ""
-    print(
-        f"{arguments.out}: {num_lanes} trajectories of {abs(arguments.num_steps)} steps{back}, "
-        f"{predicted.seconds:.1f} s"
-    )
-    print_status(predicted.status, predicted.left_at)
-    if predicted.horizon is not None:
-        passed = predicted.horizon[predicted.horizon >= 0]
-        first = f", the first at step {passed.min()}" if passed.size else ""
-        print(
-            f"the band of the position (2 σ) exceeds {arguments.horizon:g} in {passed.size} of "
-            f"{num_lanes} trajectories{first}"
-        )
+    output = Output(arguments.out, arguments.overwrite)
+    asked = _taken(Ahead, arguments)
+    found = forecast_recording(arguments.model, arguments.initial, output, asked)
+    print_forecasts(found, arguments.out)
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -474,26 +395,16 @@ def _compare(arguments: argparse.Namespace) -> None:
     out = arguments.out = arguments.out or Path("runs") / f"compare-{arguments.scene}"
     if not arguments.resume:
         ensure_new(out, arguments.overwrite, folder=True)
-    set_up_jax()
-    from gfnn_jax.jobs.compare import compare
-    from gfnn_jax.jobs.comparison_table import table
+    with _output(arguments) as output:
+        from gfnn_jax.jobs.compare import compare
 
-    with progress.on_stderr() as shown:
-        compared = compare(
-            arguments.scene,
-            methods=arguments.methods,
-            out=out,
-            quick=arguments.quick,
-            seed=arguments.seed,
-            cap=arguments.cap,
-            overwrite=arguments.overwrite,
-            resume=arguments.resume,
-            progress=shown,
-        )
+        names = ("methods", "quick", "seed", "cap")
+        options = {name: getattr(arguments, name) for name in names}
+        compared = compare(arguments.scene, output, **options)
     if compared is None:
         print(f"{out}: already holds the result of this job")
         return
-    print_table(table(compared.report))
+    print_table(comparison_table(compared.report))
     print(f"written to {out}")
 
 

@@ -1,4 +1,5 @@
-"""Arguments of the command line: the commands, their options, and the text of ``--help``.
+"""Arguments of the command line: the commands, their options, and the text of ``--help``; options
+about a recording's columns and rows.
 
 JAX is not loaded.
 """
@@ -8,11 +9,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gfnn_jax.cli_columns import add_column_options, finite
+from gfnn_jax.data.recording import SECONDS
+from gfnn_jax.data.roles import ROLES
 from gfnn_jax.errors import InputError
 from gfnn_jax.learn.options import COUNT, DEVICES, OPTIONS, POSITIVE, SEED, FitOptions, Kind
 
@@ -24,6 +27,11 @@ exit status:
   2    bad usage or bad input, before any long work
   130  stopped by Ctrl-C
   143  stopped by SIGTERM"""
+# Keywords of `gfnn_jax.read` beside roles, with one value each.
+_OF_COLUMNS = (
+    *("angles", "degrees", "columns", "time_unit", "offset", "scale", "coordinates"),
+    *("start", "stop", "every"),
+)
 DISTRIBUTED_STATUS = "  134  with --distributed: another process of the job was lost"
 WORDS = """\
 the table of candidates:
@@ -53,9 +61,46 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def _with_status(options: dict[str, Any]) -> dict[str, Any]:
-    """Extend the options of a command that has --distributed."""
-    return {**options, "epilog": f"{options['epilog']}\n{DISTRIBUTED_STATUS}"}
+@dataclasses.dataclass(frozen=True)
+class _Command:
+    """Adds the options of one command."""
+
+    parser: argparse.ArgumentParser | Any
+
+    def add(self, name: str, about: str, metavar: str | None = None, **given: Any) -> None:
+        """Add an argument, or an option, with its help."""
+        self.parser.add_argument(name, help=about, metavar=metavar, **given)
+
+    def flag(self, name: str, about: str) -> None:
+        """Add an option that is given or not."""
+        self.parser.add_argument(name, help=about, action="store_true")
+
+    def add_output(self) -> None:
+        self.flag("--overwrite", "replace an existing output")
+        self.flag("--resume", "continue an unfinished output")
+
+    def add_fit(self, **defaults: str) -> None:
+        """Add the options of `FitOptions` that the command has. defaults: words for some."""
+        for field in dataclasses.fields(FitOptions):
+            name, about = field.name, OPTIONS[field.name]
+            if self.parser.prog not in about.commands:
+                continue
+            default = defaults.get(name, "" if field.default in (None, ()) else str(field.default))
+            shown = about.help.replace("%", "%%")
+            shown += f" (default {default})" if default and "default" not in shown else ""
+            given: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS}
+            given |= {"choices": about.kind.choices} if about.kind.choices else {}
+            given |= {"type": _reader(about.kind)} if about.metavar else {}
+            self.add(f"--{name.replace('_', '-')}", shown, about.metavar, **given)
+        self.add(
+            "--scalar",  # the old name of --family
+            argparse.SUPPRESS,
+            dest="family",
+            choices=OPTIONS["family"].kind.choices,
+            default=argparse.SUPPRESS,
+        )
+        self.flag("--strict", "exit status 1 where the tolerance is not met")
+        self.add_output()
 
 
 def parser() -> argparse.ArgumentParser:
@@ -69,265 +114,223 @@ def parser() -> argparse.ArgumentParser:
     )
     found.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = found.add_subparsers(required=True, metavar="COMMAND")
-    fitting: dict[str, Any] = {"epilog": f"{WORDS}\n\n{EXIT_STATUS}", **plain}
-    others: dict[str, Any] = {"epilog": EXIT_STATUS, **plain}
 
-    command = commands.add_parser("scenes", help="list the scenes")
-    command.set_defaults(command="scenes")
-    command = commands.add_parser("records", help="list the measured records of the package")
-    command.set_defaults(command="records")
+    def command(name: str, about: str, description: str = "", epilog: str = EXIT_STATUS):
+        given = {"description": description, "epilog": epilog, **plain} if description else {}
+        made = commands.add_parser(name, help=about, **given)
+        made.set_defaults(command=name)
+        return _Command(made)
 
-    command = commands.add_parser(
-        "run",
-        help="a scene from reference data to figures, or a measured record to forecasts",
-        description="Reference data of a scene, fit, rollouts, metrics, figures, report.json. Of a "
-        "measured record, or of your own recording: the law of its first two thirds, and forecasts "
-        "of its last third.",
-        **fitting,
+    command("scenes", "list the scenes")
+    command("records", "list the measured records of the package")
+    _run(
+        command(
+            "run",
+            "a scene from reference data to figures, or a measured record to forecasts",
+            "Reference data of a scene, fit, rollouts, metrics, figures, report.json. Of a "
+            "measured record, or of your own recording: the law of its first two thirds, and "
+            "forecasts of its last third.",
+            f"{WORDS}\n\n{EXIT_STATUS}",
+        )
     )
-    command.set_defaults(command="run")
-    command.add_argument(
-        "scene",
-        metavar="SCENE",
-        help="a name that `gfnn scenes` or `gfnn records` lists, or the file of a recording",
+    _look(
+        command(
+            "look",
+            "what a recording holds, before anything is learned",
+            "Runs, rates, gaps, noise, friction and mistakes of a recording, found in the file "
+            "itself: .csv and other text, .npz, .npy.",
+        )
     )
-    command.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/SCENE)")
-    command.add_argument("--quick", action="store_true", help="fewer pairs and rollouts")
-    command.add_argument("--dt", type=_positive, metavar="H", help="another time step")
-    _add_fit_options(command, tolerance="the scene's own, close to the best attainable")
-
-    command = commands.add_parser(
-        "look",
-        help="what a recording holds, before anything is learned",
-        description="Runs, rates, gaps, noise, friction and mistakes of a recording, found in the "
-        "file itself: .csv and other text, .npz, .npy.",
-        **others,
+    _fit(
+        command(
+            "fit",
+            "learn from your own recording, or from states q, p",
+            "Learn from a recording (positions over time: a law with friction and inputs) or from "
+            "states q, p (a symplectic map, or H). The columns decide which of them a file is.",
+            f"{WORDS}\n\n{EXIT_STATUS}\n{DISTRIBUTED_STATUS}",
+        )
     )
-    command.set_defaults(command="look")
-    command.add_argument("data", type=Path, metavar="FILE", nargs="+", help="one file or several")
-    add_column_options(command)
-    command.add_argument("--dt", type=_positive, metavar="H", help="seconds between rows")
-    command.add_argument("--json", action="store_true", help="print plain data, and draw nothing")
-    command.add_argument(
-        "--figure", type=Path, metavar="FILE", help="default runs/look-NAME.png, written anew"
+    _predict(
+        command(
+            "predict",
+            "predict with a learned map",
+            "Predict from initial states (.npy, .npz with z0, a trajectory file), or forecast from "
+            "the end of a recording.",
+            f"{EXIT_STATUS}\n{DISTRIBUTED_STATUS}",
+        )
     )
-    command.add_argument("--overwrite", action="store_true", help="replace an existing --figure")
-    command.add_argument(
-        "--strict", action="store_true", help="exit status 1 where something is wrong"
+    _export(
+        command(
+            "export",
+            "write a learned map for other programs",
+            "One file: step, inverse and status of a learned map, in C or as StableHLO.",
+        )
     )
-
-    command = commands.add_parser(
-        "fit",
-        help="learn from your own recording, or from states q, p",
-        description="Learn from a recording (positions over time: a law with friction and inputs) "
-        "or from states q, p (a symplectic map, or H). The columns decide which of them a file is.",
-        **_with_status(fitting),
+    _compare(
+        command(
+            "compare",
+            "the same data through other methods",
+            "A scene learned by GFNN and by the methods that the paper compares with.",
+        )
     )
-    command.set_defaults(command="fit")
-    command.add_argument(
-        "data", type=Path, metavar="DATA", nargs="+", help="one file or several, of one kind"
-    )
-    command.add_argument("--out", type=Path, metavar="MODEL", required=True, help="folder to write")
-    command.add_argument("--dt", type=_positive, metavar="H", help="time step, if DATA has none")
-    command.add_argument(
-        "--scene",
-        metavar="NAME",
-        help="scene whose coordinates and features are used; features assume the scene's units",
-    )
-    _add_fit_options(command)
-    add_column_options(command)
-    command.add_argument(
-        "--despite",
-        type=_kinds,
-        metavar="KIND",
-        default=(),
-        help="of a recording: fit although gfnn look finds these mistakes, by kind (in brackets "
-        "after the word wrong), joined by commas",
-    )
-    command.add_argument(
-        "--distributed",
-        action="store_true",
-        help="this is one of several processes that srun or another launcher has started: each "
-        "reads its own rows of DATA, or its own files",
-    )
-
-    command = commands.add_parser(
-        "predict",
-        help="predict with a learned map",
-        description="Predict from initial states (.npy, .npz with z0, a trajectory file), or "
-        "forecast from the end of a recording.",
-        **_with_status(others),
-    )
-    command.set_defaults(command="predict")
-    command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
-    command.add_argument(
-        "--initial",
-        type=Path,
-        metavar="FILE",
-        required=True,
-        help="initial states; or a trajectory file, whose sequences continue from their last "
-        "states; or a recording, whose runs continue from the states estimated at their ends (of a "
-        "map of positions, from their last two positions)",
-    )
-    command.add_argument(
-        "--to",
-        dest="stop",
-        type=finite,
-        metavar="T",
-        help="of a recording: forecast from time T, in the file's unit, as if it ended there",
-    )
-    command.add_argument(
-        "--num-steps", type=_steps, metavar="N", help="steps to predict, backwards where N < 0"
-    )
-    command.add_argument(
-        "--estimate-from",
-        type=_count,
-        metavar="K",
-        help="of a recording: estimate the state at its end from the last K samples",
-    )
-    command.add_argument(
-        "--inputs",
-        type=Path,
-        metavar="FILE",
-        help="of a recording: file of the inputs after its end, at the times of the forecast",
-    )
-    command.add_argument(
-        "--compare",
-        type=Path,
-        metavar="FILE",
-        help="of a recording: file of what was measured after its end; prints the errors",
-    )
-    command.add_argument(
-        "--save-every",
-        type=_count,
-        metavar="K",
-        default=1,
-        help="save the state of every K-th step (default %(default)s)",
-    )
-    command.add_argument(
-        "--dt",
-        type=_positive,
-        metavar="H",
-        help="time step, for a model that serves others than that of its data: H, or S of pairs "
-        "with several time steps",
-    )
-    command.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE",
-        required=True,
-        help="file to write: .npz, or for the forecast of a recording .npz or .csv",
-    )
-    command.add_argument(
-        "--samples",
-        type=_count,
-        metavar="N",
-        help="maps drawn from the model's posterior: adds std and quantiles to FILE",
-    )
-    command.add_argument(
-        "--horizon",
-        type=_positive,
-        metavar="SIZE",
-        help="with --samples: adds the first step at which the band of the position (two standard "
-        "deviations of its distance) exceeds SIZE, in the data's unit",
-    )
-    command.add_argument(
-        "--outside",
-        choices=("continue", "stop"),
-        help="what to do where a trajectory leaves the data's domain (default continue)",
-    )
-    command.add_argument(
-        "--devices",
-        type=_devices,
-        metavar="all|N",
-        help="number of devices that share the trajectories; on a CPU these are its cores",
-    )
-    command.add_argument(
-        "--distributed",
-        action="store_true",
-        help="this is one of several processes that srun or another launcher has started",
-    )
-    _add_output_options(command)
-
-    command = commands.add_parser(
-        "export",
-        help="write a learned map for other programs",
-        description="One file: step, inverse and status of a learned map, in C or as StableHLO.",
-        **others,
-    )
-    command.set_defaults(command="export")
-    command.add_argument("model", type=Path, metavar="MODEL", help="folder that `gfnn fit` wrote")
-    command.add_argument(
-        "--to",
-        choices=EXPORTS,
-        required=True,
-        help="c: C99 for one state at a time, of polynomials, Fourier harmonics and formulas; "
-        "stablehlo: batches by jax.export, of any map",
-    )
-    command.add_argument(
-        "--out", type=Path, metavar="FILE", help="default: beside MODEL, of its name"
-    )
-    command.add_argument("--overwrite", action="store_true", help="replace an existing output")
-
-    command = commands.add_parser(
-        "compare",
-        help="the same data through other methods",
-        description="A scene learned by GFNN and by the methods that the paper compares with.",
-        **others,
-    )
-    command.set_defaults(command="compare")
-    command.add_argument("scene", metavar="SCENE", help="a name that `gfnn scenes` lists")
-    command.add_argument(
-        "--methods", type=_names, default=(), metavar="A,B", help="default: all that apply"
-    )
-    command.add_argument("--out", type=Path, metavar="DIR", help="default runs/compare-SCENE")
-    command.add_argument("--quick", action="store_true", help="fewer pairs, a cap of 2 s")
-    command.add_argument("--seed", type=_seed, default=0, metavar="N")
-    command.add_argument(
-        "--cap",
-        type=_positive,
-        metavar="SECONDS",
-        help="most training of a method, counted in operations, 4e10 a second (default 60)",
-    )
-    _add_output_options(command)
     return found
 
 
-def _add_fit_options(command: argparse.ArgumentParser, **defaults: str) -> None:
-    """Add the options of `FitOptions` that the command has. defaults: words for some of them."""
-    for field in dataclasses.fields(FitOptions):
-        name, about = field.name, OPTIONS[field.name]
-        if command.prog not in about.commands:
-            continue
-        default = defaults.get(name, "" if field.default in (None, ()) else str(field.default))
-        shown = about.help.replace("%", "%%")
-        shown += f" (default {default})" if default and "default" not in shown else ""
-        given: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS}
-        given |= {"choices": about.kind.choices} if about.kind.choices else {}
-        given |= {"type": _reader(about.kind), "metavar": about.metavar} if about.metavar else {}
-        command.add_argument(f"--{name.replace('_', '-')}", help=shown, **given)
-    command.add_argument(
-        "--scalar",
-        dest="family",
-        choices=OPTIONS["family"].kind.choices,
-        default=argparse.SUPPRESS,
-        help=argparse.SUPPRESS,  # the old name of --family
+def _run(command: _Command) -> None:
+    names = "a name that `gfnn scenes` or `gfnn records` lists, or the file of a recording"
+    command.add("scene", names, "SCENE")
+    command.add("--out", "folder (default runs/SCENE)", "DIR", type=Path)
+    command.flag("--quick", "fewer pairs and rollouts")
+    command.add("--dt", "another time step", "H", type=_positive)
+    command.add_fit(tolerance="the scene's own, close to the best attainable")
+
+
+def _look(command: _Command) -> None:
+    files = "one file or several, or a name that `gfnn records` lists"
+    command.add("data", files, "FILE", type=Path, nargs="+")
+    add_column_options(command.parser)
+    command.add("--dt", "seconds between rows", "H", type=_positive)
+    command.flag("--json", "print plain data, and draw nothing")
+    command.add("--figure", "default runs/look-NAME.png, written anew", "FILE", type=Path)
+    command.flag("--overwrite", "replace an existing --figure")
+    command.flag("--strict", "exit status 1 where something is wrong")
+
+
+def _fit(command: _Command) -> None:
+    command.add("data", "one file or several, of one kind", "DATA", type=Path, nargs="+")
+    command.add("--out", "folder to write", "MODEL", type=Path, required=True)
+    command.add("--dt", "time step, if DATA has none", "H", type=_positive)
+    scene = "scene whose coordinates and features are used; features assume the scene's units"
+    command.add("--scene", scene, "NAME")
+    command.add_fit()
+    add_column_options(command.parser)
+    command.add(
+        "--despite",
+        "of a recording: fit although gfnn look finds these mistakes, by kind (in brackets after "
+        "the word wrong), joined by commas",
+        "KIND",
+        type=_split,
+        default=(),
     )
-    command.add_argument(
-        "--strict", action="store_true", help="exit status 1 where the tolerance is not met"
+    command.flag(
+        "--distributed",
+        "this is one of several processes that srun or another launcher has started: each reads "
+        "its own rows of DATA, or its own files",
     )
-    _add_output_options(command)
+
+
+def _predict(command: _Command) -> None:
+    command.add("model", "folder that `gfnn fit` wrote", "MODEL", type=Path)
+    command.add(
+        "--initial",
+        "initial states; or a trajectory file, whose sequences continue from their last states; or "
+        "a recording, whose runs continue from the states estimated at their ends (of a map of "
+        "positions, from their last two positions)",
+        "FILE",
+        type=Path,
+        required=True,
+    )
+    command.add(
+        "--to",
+        "of a recording: forecast from time T, in the file's unit, as if it ended there",
+        "T",
+        dest="stop",
+        type=finite,
+    )
+    command.add("--num-steps", "steps to predict, backwards where N < 0", "N", type=_steps)
+    command.add(
+        "--estimate-from",
+        "of a recording: estimate the state at its end from the last K samples",
+        "K",
+        type=_count,
+    )
+    command.add(
+        "--inputs",
+        "of a recording: file of the inputs after its end, at the times of the forecast",
+        "FILE",
+        type=Path,
+    )
+    command.add(
+        "--compare",
+        "of a recording: file of what was measured after its end; prints the errors",
+        "FILE",
+        type=Path,
+    )
+    saved = "save the state of every K-th step (default %(default)s)"
+    command.add("--save-every", saved, "K", type=_count, default=1)
+    command.add(
+        "--dt",
+        "time step, for a model that serves others than that of its data: H, or S of pairs with "
+        "several time steps",
+        "H",
+        type=_positive,
+    )
+    command.add(
+        "--out",
+        "file to write: .npz, or for the forecast of a recording .npz or .csv",
+        "FILE",
+        type=Path,
+        required=True,
+    )
+    command.add(
+        "--samples",
+        "maps drawn from the model's posterior: adds std and quantiles to FILE",
+        "N",
+        type=_count,
+    )
+    command.add(
+        "--horizon",
+        "with --samples: adds the first step at which the band of the position (two standard "
+        "deviations of its distance) exceeds SIZE, in the data's unit",
+        "SIZE",
+        type=_positive,
+    )
+    command.add(
+        "--outside",
+        "what to do where a trajectory leaves the data's domain (default continue)",
+        choices=("continue", "stop"),
+    )
+    command.add(
+        "--devices",
+        "number of devices that share the trajectories; on a CPU these are its cores",
+        "all|N",
+        type=_devices,
+    )
+    command.flag(
+        "--distributed",
+        "this is one of several processes that srun or another launcher has started",
+    )
+    command.add_output()
+
+
+def _export(command: _Command) -> None:
+    command.add("model", "folder that `gfnn fit` wrote", "MODEL", type=Path)
+    command.add(
+        "--to",
+        "c: C99 for one state at a time, of polynomials, Fourier harmonics and formulas; "
+        "stablehlo: batches by jax.export, of any map",
+        choices=EXPORTS,
+        required=True,
+    )
+    command.add("--out", "default: beside MODEL, of its name", "FILE", type=Path)
+    command.flag("--overwrite", "replace an existing output")
+
+
+def _compare(command: _Command) -> None:
+    command.add("scene", "a name that `gfnn scenes` lists", "SCENE")
+    command.add("--methods", "default: all that apply", "A,B", type=_split, default=())
+    command.add("--out", "default runs/compare-SCENE", "DIR", type=Path)
+    command.flag("--quick", "fewer pairs, a cap of 2 s")
+    command.add("--seed", "of the data and the trainings (default 0)", "N", type=_seed, default=0)
+    cap = "most training of a method, counted in operations, 4e10 a second (default 60)"
+    command.add("--cap", cap, "SECONDS", type=_positive)
+    command.add_output()
 
 
 def fit_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """Options of `FitOptions` that were given, by name."""
     named = [name for name, about in OPTIONS.items() if about.commands]
     return {name: getattr(arguments, name) for name in named if hasattr(arguments, name)}
-
-
-def _add_output_options(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--overwrite", action="store_true", help="replace an existing output")
-    command.add_argument("--resume", action="store_true", help="continue an unfinished output")
 
 
 def _reader(kind: Kind) -> Callable[[str], Any]:
@@ -342,7 +345,7 @@ def _reader(kind: Kind) -> Callable[[str], Any]:
     return read
 
 
-def _kinds(text: str) -> tuple[str, ...]:
+def _split(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
 
 
@@ -356,5 +359,132 @@ _positive, _count, _seed, _devices, _steps = (
 )
 
 
+# Options about columns.
+
+
+def add_column_options(command: argparse.ArgumentParser) -> None:
+    """Add the options; `column_options` takes them from what was parsed.
+
+    ``--angles`` are names of columns, or whole numbers, the indices in z of canonical states.
+    """
+    group = _Command(
+        command.add_argument_group(
+            "columns of a recording",
+            "names separated by commas; without these options the file's names and data decide",
+        )
+    )
+
+    def names(name: str, about: str) -> None:
+        group.add(name, about, "A,B", type=_names)
+
+    def pairs(name: str, about: str, read: Callable[[str], Any], metavar: str) -> None:
+        group.add(name, about, metavar, type=read, action="append")
+
+    for role in ROLES:
+        names(f"--{role}", f"columns of {role}")
+    angles = "positions with period 2π; of canonical states indices in z, as 0,2"
+    group.add("--angles", angles, "A,B", type=_names_or_indices)
+    names("--degrees", "columns in degrees")
+    names("--columns", "columns to read; names of all of them where the file has none")
+    group.add("--time-unit", "of the times (default s)", choices=tuple(SECONDS))
+    noise = "noise of a column, known: a number, or the column that holds it for each value"
+    pairs("--std", noise, _sigmas, "NAME=σ")
+    mass = "known mass, or moment of inertia, of one position, which gives L its unit"
+    pairs("--mass", mass, _numbers, "NAME=m")
+    names("--offset", "columns whose offset is fitted with the law")
+    names("--scale", "columns whose scale is fitted with the law")
+    shows = "what a sensor shows, as 'px = x0 + R*sin(theta + tilt)': its parameters are fitted"
+    pairs("--observe", shows, _formula, "COLUMN=TEXT")
+    pairs("--guess", "start values of the parameters of --observe", _guesses, "NAME=X")
+    moving = "names of coordinates that --observe is written in, where no column measures them"
+    names("--coordinates", moving)
+    group.add("--from", "rows from time T on, in the file's unit", "T", dest="start", type=finite)
+    group.add("--to", "rows up to time T, in that unit", "T", dest="stop", type=finite)
+    group.add("--every", "every K-th row", "K", type=_count)
+
+
+def column_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The options that were given, as keywords of `gfnn_jax.read`; ``mass`` is none of them."""
+    given = {name: getattr(arguments, name) for name in (*ROLES, *_OF_COLUMNS)}
+    for name in ("std", "observe", "guess"):
+        given[name] = dict(pair for pairs in getattr(arguments, name) or () for pair in pairs)
+    return {name: value for name, value in given.items() if value not in (None, {})}
+
+
+def masses(arguments: argparse.Namespace) -> dict[str, float]:
+    """The known masses by name of a position."""
+    return dict(pair for pairs in arguments.mass or () for pair in pairs)
+
+
+def names_roles(options: dict[str, Any]) -> bool:
+    """Return whether keywords of `column_options` say what columns are, which makes a file a
+    recording."""
+    return bool({*ROLES, "columns", "coordinates", "observe"} & set(options))
+
+
 def _names(text: str) -> tuple[str, ...]:
-    return tuple(part.strip() for part in text.split(","))
+    names = tuple(part.strip() for part in text.split(",") if part.strip())
+    if not names or len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(
+            f"expected different names separated by commas, got '{text}'"
+        )
+    return names
+
+
+def _names_or_indices(text: str) -> tuple[str, ...] | tuple[int, ...]:
+    names = _names(text)
+    if len(names) < len(text.split(",")):
+        raise argparse.ArgumentTypeError(
+            f"expected different names or indices separated by commas, got '{text}'"
+        )
+    return tuple(map(int, names)) if all(name.isdecimal() for name in names) else names
+
+
+def _numbers(text: str) -> list[tuple[str, float]]:
+    pairs = []
+    for part in text.split(","):
+        name, equals, number = part.partition("=")
+        value = _float(number)
+        if not (name.strip() and equals and math.isfinite(value) and value > 0):
+            raise argparse.ArgumentTypeError(f"expected NAME=NUMBER above 0, got '{part}'")
+        pairs.append((name.strip(), value))
+    return pairs
+
+
+def _sigmas(text: str) -> list[tuple[str, float | str]]:
+    """Numbers, or names of columns."""
+    named = [part.partition("=") for part in text.split(",")]
+    return [
+        (name.strip(), column.strip())
+        if name.strip() and math.isnan(_float(column)) and column.strip()
+        else _numbers(f"{name}{equals}{column}")[0]
+        for name, equals, column in named
+    ]
+
+
+def _guesses(text: str) -> list[tuple[str, float]]:
+    pairs = [part.partition("=") for part in text.split(",")]
+    if not all(name.strip() and math.isfinite(_float(number)) for name, _, number in pairs):
+        raise argparse.ArgumentTypeError(f"expected NAME=NUMBER, got '{text}'")
+    return [(name.strip(), float(number)) for name, _, number in pairs]
+
+
+def _formula(text: str) -> list[tuple[str, str]]:
+    column, _, formula = text.partition("=")
+    if not (column.strip() and formula.strip()):
+        raise argparse.ArgumentTypeError(f"expected COLUMN=FORMULA, got '{text}'")
+    return [(column.strip(), formula.strip())]
+
+
+def finite(text: str) -> float:
+    """The number that an option's text is."""
+    if not math.isfinite(_float(text)):
+        raise argparse.ArgumentTypeError(f"expected a finite number, got '{text}'")
+    return float(text)
+
+
+def _float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

@@ -99,7 +99,58 @@ def print_table(table: Any) -> None:
     wide.print(table)
 
 
-def print_status(status, left_at) -> None:
+def print_record(ran: Any, out: Path) -> None:
+    """Print a law, and its forecasts of the last third of the recording."""
+    print(ran.learned.fit.table)
+    ahead = ", ".join(f"{seconds:.3g}" for seconds in ran.forecasts.ahead)
+    for name, errors in ran.forecasts.median.items():
+        sizes = ", ".join(f"{error:.3g}" for error in errors)
+        unit = f" {ran.held_out.unit(name)}".rstrip()
+        print(
+            f"the last third, which no fit has seen: {name} errs by {sizes}{unit} after {ahead} "
+            "s (medians)"
+        )
+    print(f"{ran.forecasts.within:.0%} of it lies within two standard deviations (95 % expected)")
+    print(f"written to {out}")
+
+
+def print_forecasts(found: Any, out: Path) -> None:
+    """Print how far forecasts reach, and how they compare with what was measured."""
+    runs = "1 run" if len(found.of_runs) == 1 else f"{len(found.of_runs)} runs"
+    last = max(one.times[-1] for one in found.of_runs.values())
+    print(f"{out}: forecasts of {runs}, up to t = {last:g} {found.time_unit}")
+    for line in (line for one in found.of_runs.values() for line in one.outside):
+        print(f"note: {line}")
+    compared = found.compared
+    if compared is None:
+        return
+    for name, (rms, median, within) in compared.columns.items():
+        unit = f" {compared.units[name]}".rstrip()
+        print(
+            f"{name}: RMS error {rms:.4g}{unit}, median of its size {median:.4g}{unit}; "
+            f"{within:.0%} of {compared.num_samples} samples within two standard deviations "
+            "(95 % expected)"
+        )
+
+
+def print_predicted(predicted: Any, asked: Any, out: Path) -> None:
+    """Print the number of trajectories by status, and where their bands are wide."""
+    num_lanes, back = len(predicted.status), " backwards" if asked.num_steps < 0 else ""
+    print(
+        f"{out}: {num_lanes} trajectories of {abs(asked.num_steps)} steps{back}, "
+        f"{predicted.seconds:.1f} s"
+    )
+    _print_status(predicted.status, predicted.left_at)
+    if predicted.horizon is not None:
+        passed = predicted.horizon[predicted.horizon >= 0]
+        first = f", the first at step {passed.min()}" if passed.size else ""
+        print(
+            f"the band of the position (2 σ) exceeds {asked.horizon:g} in {passed.size} of "
+            f"{num_lanes} trajectories{first}"
+        )
+
+
+def _print_status(status, left_at) -> None:
     """Print the number of lanes by status, and the steps at which lanes left the domain."""
     from gfnn_jax.evaluate.report import status_counts
 
@@ -110,3 +161,32 @@ def print_status(status, left_at) -> None:
     if left:
         more = f", and {len(left) - 10} more" if len(left) > 10 else ""
         print(f"left the data's domain: trajectory {shown}{more}")
+
+
+def comparison_table(compared: dict[str, Any]):
+    """Make a rich table of a comparison's report, a row per method."""
+    from rich.table import Table  # loaded when first used
+
+    def number(value, form=".1e"):
+        return "–" if value is None else format(value, form)
+
+    chaotic = any(m["kl"] for m in compared["methods"].values())
+    shown = Table(box=None, pad_edge=False)
+    heads = ["method", "parameters", "training, s", "µs/step", "one step", "step 100", "step 1000"]
+    for head in [*heads, "growth", "defect", *(["KL"] if chaotic else [])]:
+        shown.add_column(head, justify="left" if head == "method" else "right")
+    for m in compared["methods"].values():
+        fit, rolled = m["fit"], m["rollout"]
+        shown.add_row(
+            m["title"],
+            f"{m['model']['num_parameters']:,}",
+            f"{fit['seconds']:.1f}" + (" (cap)" if fit["capped"] else ""),
+            f"{rolled['microseconds_per_step']:.2g}",
+            number(fit["validation_rms"]),
+            number(rolled["error"]["100"]),
+            number(rolled["error"]["1000"]),
+            number(rolled["growth_exponent"], ".2f"),
+            number(m["map"]["symplecticity_defect"]),
+            *([", ".join(number(v, ".2g") for v in m["kl"].values())] if chaotic else []),
+        )
+    return shown

@@ -13,7 +13,8 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.fitting import shared_noise, uncertainty
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
-from gfnn_jax.jobs.predict import predict
+from gfnn_jax.jobs.output import Output
+from gfnn_jax.jobs.predict import Steps, predict
 from gfnn_jax.maps.bands import bands, horizon
 from gfnn_jax.models.generating_functions.map_of_terms import SumOfTerms
 from gfnn_jax.models.generating_functions.sweeps import Linear, LinearSweep
@@ -268,16 +269,9 @@ def test_predictions_hold_bands(noisy, tmp_path, monkeypatch):
     np.save(tmp_path / "z0.npy", z0)
     np.savez(tmp_path / "noisy.npz", z0=z0, z0_std=np.full(z0.shape, 0.01))
 
-    def predicted(initial, out, **options):
-        predict(
-            tmp_path / "model",
-            tmp_path / initial,
-            num_steps=20,
-            out=tmp_path / out,
-            samples=8,
-            horizon_size=0.02,
-            **options,
-        )
+    def predicted(initial, out):
+        asked = Steps(20, samples=8, horizon=0.02)
+        predict(tmp_path / "model", tmp_path / initial, Output(tmp_path / out), asked)
         with np.load(tmp_path / out) as file:
             return dict(file)
 
@@ -303,7 +297,7 @@ def test_what_is_no_noise_of_initial_states_is_refused(noisy, tmp_path):
             read_initial_noise(path, (2, 4))
     noisy[1].map.save(tmp_path / "model")
     with pytest.raises(InputError, match="--horizon needs --samples"):
-        predict(tmp_path / "model", path, num_steps=2, out=tmp_path / "out.npz", horizon_size=1.0)
+        predict(tmp_path / "model", path, Output(tmp_path / "o.npz"), Steps(2, horizon=1.0))
 
 
 def strong_kicks(z, k):

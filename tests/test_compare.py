@@ -12,9 +12,10 @@ from gfnn_jax.baselines.paper_gfnn import paper_gfnn
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs import compare as comparison
 from gfnn_jax.jobs import shared_data
-from gfnn_jax.jobs.chaos import divergences
+from gfnn_jax.jobs.figures import divergences
+from gfnn_jax.jobs.measure import Rollouts, without_runaways
+from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.progress import Progress
-from gfnn_jax.jobs.rollouts import Rollouts, without_runaways
 from gfnn_jax.jobs.shared_data import SharedData, separable
 
 CHEAP = ("p-sympnet", "hnn")
@@ -31,8 +32,9 @@ def small():
         yield
 
 
-def compare(out, methods=CHEAP, scene="two-body", **options):
-    return comparison.compare(scene, methods=methods, out=out, quick=True, cap=0.2, **options)
+def compare(out, methods=CHEAP, scene="two-body", seed=0, **options):
+    given = {"methods": methods, "quick": True, "seed": seed, "cap": 0.2}
+    return comparison.compare(scene, Output(out, **options), **given)
 
 
 @pytest.mark.slow
@@ -98,7 +100,7 @@ def test_which_scenes_are_separable():
 
 def test_a_scene_with_parameters_is_not_compared(tmp_path):
     with pytest.raises(InputError, match="has parameters, which the other methods do not take"):
-        comparison.compare("pendulum-length", out=tmp_path / "c")
+        comparison.compare("pendulum-length", Output(tmp_path / "c"))
 
 
 def test_methods_that_apply():

@@ -18,6 +18,7 @@ from gfnn_jax.data.files import iterate_pairs
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs import fit as fit_job
+from gfnn_jax.jobs.output import Output
 from gfnn_jax.learn.refit import help_refit, refit
 from gfnn_jax.maps import saved
 from gfnn_jax.processes import Group, Share
@@ -318,7 +319,7 @@ def test_files_of_several_dt_are_all_taken(tmp_path):
         np.savez(tmp_path / f"{i}.npz", z0=own.z0, z1=own.z1, dt=dt)
     ran = fit_job.fit(
         [tmp_path / "0.npz", tmp_path / "1.npz"],
-        out=tmp_path / "m",
+        output=Output(tmp_path / "m"),
         learn="hamiltonian",
         terms=("p1**2", "q1**4"),
         tolerance=0.1,
@@ -342,7 +343,7 @@ def test_a_network_is_that_of_the_sample_and_says_so(tmp_path, monkeypatch):
     )
     names = in_files(tmp_path, noisy(image).take(slice(300)), 2)
     with pytest.warns(gfnn.FitWarning, match="is fitted to a sample of 300 pairs, not to all"):
-        ran = fit_job.fit(names, out=tmp_path / "m", family="mlp", chart="midpoint")
+        ran = fit_job.fit(names, output=Output(tmp_path / "m"), family="mlp", chart="midpoint")
     assert any("needs a family that is linear" in message for message in ran.fit.messages)
 
 
@@ -405,7 +406,7 @@ def undisturbed(data):
     """The fit of one process."""
     return fit_job.fit(
         data / "pairs.npz",
-        out=data / "one",
+        output=Output(data / "one"),
         learn="map",
         chart="midpoint",
         tolerance=3e-3,

@@ -15,7 +15,8 @@ from gfnn_jax.fitting.levenberg_marquardt import (
     levenberg_marquardt,
     levenberg_marquardt_together,
 )
-from gfnn_jax.jobs.predict import predict
+from gfnn_jax.jobs.output import Output
+from gfnn_jax.jobs.predict import Steps, predict
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.jobs.search import search
 from gfnn_jax.learn.options import FitOptions
@@ -151,7 +152,8 @@ def test_a_saved_ensemble_keeps_its_members_and_predicts_bands(fit, tmp_path):
     ):
         jax.tree.map(np.testing.assert_array_equal, ours, theirs)
     np.save(tmp_path / "z0.npy", z)
-    predict(tmp_path / "m", tmp_path / "z0.npy", num_steps=3, out=tmp_path / "p.npz", samples=3)
+    output = Output(tmp_path / "p.npz")
+    predict(tmp_path / "m", tmp_path / "z0.npy", output, Steps(3, samples=3))
     with np.load(tmp_path / "p.npz") as file:
         assert (file["std"][:, 1:] > 0).all()
 

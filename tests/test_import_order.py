@@ -50,7 +50,6 @@ ORDER = (
     "baselines",
     "evaluate",
     "jobs",
-    "cli_columns",
     "cli_parser",
     "cli_process",
     "cli_summary",

@@ -10,6 +10,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.data.files import iterate_pairs, read_trajectories
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.jobs import fit as fit_job
+from gfnn_jax.jobs.output import Output
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,11 @@ def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
     few = functools.partial(read_sample, num_pairs=200)
     monkeypatch.setattr(fit_job, "read_sample", few)
     ran = fit_job.fit(
-        file, out=tmp_path / "m", scene_name="standard-map-regular", tolerance=1e-3, chart="type2"
+        file,
+        output=Output(tmp_path / "m"),
+        scene_name="standard-map-regular",
+        tolerance=1e-3,
+        chart="type2",
     )
     assert ran is not None
     assert ran.report["data"]["num_pairs"] == 3_000
@@ -85,7 +90,7 @@ def test_a_refit_that_does_not_fit_into_the_budget_is_left_out(file, tmp_path, m
     with pytest.warns(gfnn.FitWarning, match="a sample of 200 pairs, not to all of them: no time"):
         ran = fit_job.fit(
             file,
-            out=tmp_path / "m",
+            output=Output(tmp_path / "m"),
             scene_name="standard-map-regular",
             tolerance=1e-3,
             chart="type2",

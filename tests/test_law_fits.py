@@ -25,7 +25,8 @@ from gfnn_jax.families.lagrangian import (
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.flows.motion import NODES, Form
 from gfnn_jax.flows.schedules import HOLDS, at_stages, interpolate
-from gfnn_jax.jobs.forecast import forecast_recording
+from gfnn_jax.jobs.forecast import Ahead, forecast_recording
+from gfnn_jax.jobs.output import Output
 from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate, propagate_each
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.input_rules import _costs_more, choose_again
@@ -705,13 +706,8 @@ def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs(tmp_path):
         ]
         (tmp_path / f"{name}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     out = tmp_path / "out.csv"
-    forecast_recording(
-        tmp_path / "model",
-        tmp_path / "past.csv",
-        inputs=tmp_path / "ahead.csv",
-        num_steps=99,
-        out=out,
-    )
+    asked = Ahead(99, inputs=tmp_path / "ahead.csv")
+    forecast_recording(tmp_path / "model", tmp_path / "past.csv", Output(out), asked)
     rows = np.genfromtxt(out, delimiter=",", names=True)
     assert np.abs(rows["x"] - x[500:599]).max() < 0.02
 

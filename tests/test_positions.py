@@ -19,7 +19,8 @@ from gfnn_jax.evaluate.gauge import beside_flow
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
-from gfnn_jax.jobs.forecast import forecast_recording
+from gfnn_jax.jobs.forecast import Ahead, forecast_recording
+from gfnn_jax.jobs.output import Output
 from gfnn_jax.models.positions.discrete_lagrangian import residuals, solve
 from gfnn_jax.models.positions.latent_positions import arcs_of, fit_latent, starting_noise
 from gfnn_jax.models.positions.triples import Triples, triples_of
@@ -388,8 +389,8 @@ def test_a_forecast_is_compared_with_what_was_read(of_noisy, tmp_path):
             fmt="%.17g",
         )
     of_noisy.map.save(tmp_path / "model")
-    files = {"out": tmp_path / "on.csv", "compare": tmp_path / "read.csv"}
-    found, _, judged = forecast_recording(tmp_path / "model", tmp_path / "begun.csv", **files)
+    output, asked = Output(tmp_path / "on.csv"), Ahead(compare=tmp_path / "read.csv")
+    found, _, judged = forecast_recording(tmp_path / "model", tmp_path / "begun.csv", output, asked)
     assert len(found) == 20
     rms, _, within = judged.columns["theta"]
     assert rms < 5e-3

@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gfnn_jax.data import predictions
-from gfnn_jax.data.predictions import PredictionWriter
+from gfnn_jax.data.predictions import PredictionJob, PredictionWriter
 from gfnn_jax.errors import InputError, WorkError
 
 LANES, SAVED, WIDTH = 3, 20, 4
@@ -25,11 +25,10 @@ STATES = np.random.default_rng(0).normal(size=(LANES, SAVED, WIDTH))
 STATUS, LEFT_AT = np.array([0, 1, 2]), np.array([-1, 7, 9])
 
 
-def writer(out, **options):
+def writer(out, *, resume=False, overwrite=False, **options):
     options = {"identity": {"model": "m", "initial": "z0"}, **options}
-    return PredictionWriter(
-        out, shape=(LANES, WIDTH), num_steps=99, save_every=5, dt=0.1, **options
-    )
+    asked = PredictionJob(shape=(LANES, WIDTH), num_steps=99, save_every=5, dt=0.1, **options)
+    return PredictionWriter(out, asked, resume=resume, overwrite=overwrite)
 
 
 def append(job, count):
@@ -204,9 +203,8 @@ def test_memory_is_bounded(tmp_path, monkeypatch):
     for lanes in (1, 40):
         saved, chunk = 1_600_000 // lanes, 20_000 // lanes
         tracemalloc.start()
-        job = PredictionWriter(
-            tmp_path / f"{lanes}.npz", shape=(lanes, 4), num_steps=saved - 1, dt=1.0, identity={}
-        )
+        asked = PredictionJob({}, (lanes, 4), saved - 1, 1.0)
+        job = PredictionWriter(tmp_path / f"{lanes}.npz", asked)
         for start in range(0, saved, chunk):
             part = np.broadcast_to(np.arange(start, start + chunk)[:, None], (lanes, chunk, 4))
             job.append(part, {})
@@ -222,11 +220,10 @@ WORKER = textwrap.dedent(
     """
     import sys, time
     import numpy as np
-    from gfnn_jax.data.predictions import PredictionWriter
+    from gfnn_jax.data.predictions import PredictionJob, PredictionWriter
 
-    job = PredictionWriter(
-        sys.argv[1], shape=(50, 4), num_steps=399, dt=0.1, identity={"model": "m"}, resume=True
-    )
+    asked = PredictionJob({"model": "m"}, (50, 4), 399, 0.1)
+    job = PredictionWriter(sys.argv[1], asked, resume=True)
     z = np.ones((50, 4)) if job.carry is None else job.carry["z"]
     print("started", flush=True)
     while job.saved < job.total:

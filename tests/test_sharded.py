@@ -14,8 +14,8 @@ from analytic import map_of
 from gfnn_jax import processes
 from gfnn_jax.cli import main
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.data import parts
-from gfnn_jax.data.predictions import PredictionWriter, job_of
+from gfnn_jax.data import predictions
+from gfnn_jax.data.predictions import PredictionJob, PredictionWriter
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
@@ -57,6 +57,7 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 from gfnn_jax.data.predictions import PredictionWriter
 from gfnn_jax.jobs import predict as job
+from gfnn_jax.jobs.output import Output
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.samples import Samples
 from gfnn_jax.maps.sharded import Sharded, local_devices
@@ -80,8 +81,8 @@ of = [Sharded(samples, local_devices(n)).rollout(z0, 10, save_every=5)[0] for n 
 assert of[0].tobytes() == of[1].tobytes(), "bits of samples depend on the number of devices"
 
 def predicted(name, devices, **more):
-    job.predict(folder / "m", folder / "z0.npy", num_steps=30, out=folder / name, devices=devices,
-                **more)
+    job.predict(folder / "m", folder / "z0.npy", Output(folder / name, **more),
+                job.Steps(30, devices=devices))
     return (folder / name).read_bytes()
 
 job._CHUNK_LANE_STEPS = 3_500
@@ -248,16 +249,17 @@ def test_a_killed_process_ends_the_others(killed, folder):
     assert lines[0].startswith("gfnn: this process or another one of the job was lost: their fin")
     for journal in journals:
         assert journal.read_bytes().count(b"\n") > 3
-    assert parts.number_of_parts(out, Share(0, 3), resume=True) == 2
+    assert predictions.number_of_parts(out, Share(0, 3), resume=True) == 2
     with pytest.raises(
         InputError, match="unfinished parts by 2 processes are there, and this job has 3"
     ):
-        parts.number_of_parts(out, Share(0, 3), resume=False)
+        predictions.number_of_parts(out, Share(0, 3), resume=False)
 
 
 def test_a_killed_job_resumes_to_the_same_bits(folder, alone, monkeypatch):
     """Resume where only the beginning of one of two parts is there."""
     from gfnn_jax.jobs import predict as job
+    from gfnn_jax.jobs.output import Output
 
     append = PredictionWriter.append
 
@@ -269,14 +271,9 @@ def test_a_killed_job_resumes_to_the_same_bits(folder, alone, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(job, "_CHUNK_LANE_STEPS", 3_500)
         patch.setattr(PredictionWriter, "append", stopping)
+        output = Output(folder / "again.npz")
         with pytest.raises(KeyboardInterrupt):
-            job.predict(
-                folder / "m",
-                folder / "z0.npy",
-                num_steps=STEPS,
-                out=folder / "again.npz",
-                share=Share(0, 2),
-            )
+            job.predict(folder / "m", folder / "z0.npy", output, job.Steps(STEPS), Share(0, 2))
     found = ended(started(folder, folder / "again.npz", "--resume"))
     assert [status for status, *_ in found] == [0, 0], found
     assert (folder / "again.npz").read_bytes() == alone
@@ -289,14 +286,9 @@ def test_parts_of_everything_that_a_prediction_can_hold(tmp_path):
     job = {"num_steps": 2, "dt": 0.5, "bands": True}
 
     def written(path, lanes, identity):
-        writer = PredictionWriter(
-            path,
-            shape=(len(range(5)[lanes]), 2),
-            identity=identity,
-            params=(("a",), z0[lanes]),
-            drive=(z0[lanes, 0], 2.0),
-            **job,
-        )
+        beside = {"params": (("a",), z0[lanes]), "drive": (z0[lanes, 0], 2.0)}
+        asked = PredictionJob(identity, (len(range(5)[lanes]), 2), **job, **beside)
+        writer = PredictionWriter(path, asked)
         writer.append(states[lanes], {})
         writer.finish(
             np.arange(5)[lanes], np.arange(5)[lanes], band="model", horizon=np.arange(5)[lanes]
@@ -308,7 +300,7 @@ def test_parts_of_everything_that_a_prediction_can_hold(tmp_path):
         written(tmp_path / f"{i}.npz", lanes, {"m": 1, "part": i})
         for i, lanes in enumerate((slice(0, 2), slice(2, 5)))
     ]
-    parts.put_together(own, tmp_path / "p.npz", job_of({"m": 1}, (5, 2), **job))
+    predictions.put_together(own, tmp_path / "p.npz", PredictionJob({"m": 1}, (5, 2), **job).record)
     assert (tmp_path / "p.npz").read_bytes() == whole.read_bytes()
     assert not any(path.exists() for path in own)
 
@@ -359,18 +351,12 @@ def sampled_folder(folder, tmp_path_factory):
 def test_samples_of_any_number_of_processes(sampled_folder):
     """Compare numbers of processes; a stopped job resumes on fewer than began it."""
     from gfnn_jax.jobs import predict as job
+    from gfnn_jax.jobs.output import Output
 
-    def predicted(name, **more):
-        job.predict(
-            sampled_folder / "m",
-            sampled_folder / "z0.npz",
-            num_steps=20,
-            save_every=10,
-            out=sampled_folder / name,
-            samples=3,
-            horizon_size=1e-3,
-            **more,
-        )
+    def predicted(name, share=None, devices=None, **more):
+        output = Output(sampled_folder / name, **more)
+        asked = job.Steps(20, 10, samples=3, horizon=1e-3, devices=devices)
+        job.predict(sampled_folder / "m", sampled_folder / "z0.npz", output, asked, share)
         return sampled_folder / name
 
     whole = predicted("whole.npz", devices=1)

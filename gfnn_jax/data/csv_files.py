@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 
 import numpy as np
 
@@ -90,7 +90,7 @@ class _StatesInText:
                     f"{', '.join(columns)} {what} in {','.join(self.file.names)}"
                 )
 
-    def _tables(self, rows: int) -> Iterator[dict[str, np.ndarray]]:
+    def _tables(self, rows: int) -> Generator[dict[str, np.ndarray], None, None]:
         """All columns of numbers by name, a block of rows at a time; sequences as numbers."""
         of_file = [name for name in self.names.values() if name not in self.file.text]
         for table in self.file.blocks(of_file, rows):
@@ -133,7 +133,7 @@ class _StatesInText:
             for row in np.flatnonzero(np.append(last[0], sequence[:-1]) != sequence):
                 if sequence[row] in earlier or not np.isfinite(sequence[row]):
                     raise InputError(
-                        f"{self.path}: {self.file.locate(begin + row)}: the rows of sequence "
+                        f"{self.path}: {self.file.locate(begin + int(row))}: the rows of sequence "
                         f"{sequence[row]:g} must stand together"
                     )
                 if "sequence" in table:
@@ -166,7 +166,8 @@ class _StatesInText:
 
     def _check_constant(self, values: np.ndarray, sequence: np.ndarray, begin: int) -> None:
         """Raises InputError where a parameter (n, k) changes within a sequence."""
-        changes = (values[1:] != values[:-1]) & (sequence[1:] == sequence[:-1])[:, None]
+        same = np.diff(sequence) == 0
+        changes = (np.diff(values, axis=0) != 0) & same[:, None]
         bad = changes.any(axis=1) | ~np.isfinite(values).all(axis=1)[1:]
         if bad.any():
             row = int(np.argmax(bad)) + 1

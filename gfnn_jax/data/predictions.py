@@ -9,11 +9,15 @@ at, and a chunk that is damaged or half written is found out and computed again.
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import hashlib
 import json
 import os
+import re
 import warnings
 import zipfile
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -21,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.errors import InputError
+from gfnn_jax.processes import Share
 from gfnn_jax.storage.outputs import (
     atomic_file,
     atomic_write,
@@ -30,32 +35,57 @@ from gfnn_jax.storage.outputs import (
 )
 
 _FORMAT = 2
-# Memory for assembling the output.
-_ASSEMBLY_BYTES = 64 * 2**20
+_ASSEMBLY_BYTES = 64 * 2**20  # memory for assembling the output
 _BAND_PARTS = 4  # beside a state: its std and three quantiles
+_COPIED_BYTES = 16 * 2**20  # of parts, at a time
+_AXIS_OF_LANES = {"quantiles": 1} | dict.fromkeys(
+    ("trajectories", "std", "status", "left_at", "params", "t0", "horizon"), 0
+)
 
 
-def job_of(
-    identity: dict[str, Any],
-    shape: tuple[int, int],
-    *,
-    num_steps: int,
-    save_every: int = 1,
-    dt: float,
-    bands: bool = False,
-) -> dict[str, Any]:
-    """Request of a prediction, as a file can hold it; the arguments are those of
-    `PredictionWriter`."""
-    job = {
-        **identity,
-        "format": _FORMAT,
-        "shape": [shape[0], 1 + abs(num_steps) // save_every, shape[1]],
-        **({"bands": True} if bands else {}),
-        "num_steps": num_steps,
-        "save_every": save_every,
-        "dt": float(dt),
-    }
-    return json.loads(json.dumps(job))  # as it will be read back
+@dataclasses.dataclass(frozen=True)
+class PredictionJob:
+    """Request of a prediction: all that its file depends on.
+
+    identity:  a JSON-able dict that says which job this is (digests of the model and of the initial
+               states, say): a job is resumed only if all of it agrees.
+    shape:     (B, 2d).
+    num_steps, save_every: N and K; saved are the S = 1 + |N| // K states of steps 0, ±K, ±2K, ...,
+               backwards where N < 0.
+    dt:        the time step of the map.
+    bands:     whether states come with their std and three quantiles: (B, c, 5 · 2d).
+    params:    the names (k,) and values (B, k) of the map's parameters.
+    drive:     the time t0 (B,) of the drive at the initial states, and its period.
+    """
+
+    identity: dict[str, Any]
+    shape: tuple[int, int]
+    num_steps: int
+    dt: float
+    save_every: int = 1
+    bands: bool = False
+    params: tuple[tuple[str, ...], np.ndarray] | None = None
+    drive: tuple[np.ndarray, float] | None = None
+
+    @property
+    def steps(self) -> range:
+        """The numbers of the saved steps."""
+        sign = 1 if self.num_steps > 0 else -1
+        return range(0, self.num_steps + sign, sign * self.save_every)
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The request as a file can hold it."""
+        job = {
+            **self.identity,
+            "format": _FORMAT,
+            "shape": [self.shape[0], len(self.steps), self.shape[1]],
+            **({"bands": True} if self.bands else {}),
+            "num_steps": self.num_steps,
+            "save_every": self.save_every,
+            "dt": float(self.dt),
+        }
+        return json.loads(json.dumps(job))  # as it will be read back
 
 
 def digest_of(job: dict[str, Any]) -> str:
@@ -79,15 +109,6 @@ class PredictionWriter:
     ``std`` (B, S, 2d) and ``quantiles`` (3, B, S, 2d), and ``job``, a digest of what was asked for.
 
     out:       the ``.npz`` to write; ``OUT.partial`` holds the chunks until `finish`.
-    shape:     (B, 2d).
-    num_steps, save_every: N and K; saved are the S = 1 + |N| // K states of steps 0, ±K, ±2K, ...,
-               backwards where N < 0.
-    dt:        the time step of the map.
-    params:    the names (k,) and values (B, k) of its parameters.
-    drive:     the time t0 (B,) of the drive at the initial states, and its period.
-    bands:     whether states come with their std and three quantiles: (B, c, 5 · 2d).
-    identity:  a JSON-able dict that says which job this is (digests of the model and of the initial
-               states, say): a job is resumed only if all of it agrees.
     resume:    go on with ``OUT.partial`` where there is one; else start. Where ``out`` is this very
                job, done, ``finished`` is set and there is nothing left to do.
     overwrite: replace an existing output, and discard an unfinished one.
@@ -100,35 +121,16 @@ class PredictionWriter:
     what was there before then stays, and so do the finished chunks.
     """
 
-    def __init__(
-        self,
-        out,
-        *,
-        shape: tuple[int, int],
-        num_steps: int,
-        save_every: int = 1,
-        dt: float,
-        identity: dict[str, Any],
-        params: tuple[tuple[str, ...], np.ndarray] | None = None,
-        drive: tuple[np.ndarray, float] | None = None,
-        bands: bool = False,
-        resume: bool = False,
-        overwrite: bool = False,
-    ):
-        self.out = Path(out)
+    def __init__(self, out, asked: PredictionJob, *, resume: bool = False, overwrite: bool = False):
+        self.out, self.asked = Path(out), asked
         self.partial = self.out.with_name(self.out.name + ".partial")
-        sign = 1 if num_steps > 0 else -1
-        self.steps = range(0, num_steps + sign, sign * save_every)
-        self.dt = float(dt)
-        self.params, self.drive = params, drive
-        self.lanes, self._state = shape
-        self.width = self._state * (1 + _BAND_PARTS if bands else 1)
+        self.steps = asked.steps
+        self.lanes, self._state = asked.shape
+        self.width = self._state * (1 + _BAND_PARTS if asked.bands else 1)
         self.saved = 0
         self.carry: dict[str, np.ndarray] | None = None
         self._chunks: list[dict[str, Any]] = []  # the journal's entries: file, start, stop, sha256
-        self._job = job_of(
-            identity, shape, num_steps=num_steps, save_every=save_every, dt=dt, bands=bands
-        )
+        self._job = asked.record
         if self.out.suffix != ".npz":
             raise InputError(f"{out}: a prediction is written as .npz")
         self.finished = False
@@ -202,11 +204,19 @@ class PredictionWriter:
             raise ValueError(f"{self.saved} of {self.total} states are there")
         status = np.asarray(status).astype(np.int64).reshape(self.lanes)
         left_at = np.asarray(left_at).astype(np.int64).reshape(self.lanes)
-        named = [(name, np.asarray(value)) for name, value in more.items()]
-        if self.params is not None:
-            named += [("params", self.params[1]), ("param_names", np.array(self.params[0]))]
-        if self.drive is not None:
-            named += [("t0", self.drive[0]), ("period", np.asarray(self.drive[1]))]
+        arrays = {
+            "status": status,
+            "left_at": left_at,
+            "dt": np.asarray(float(self.asked.dt)),
+            "job": np.asarray(digest_of(self._job)),
+            **{name: np.asarray(value) for name, value in more.items()},
+        }
+        if self.asked.params is not None:
+            names, values = self.asked.params
+            arrays |= {"params": values, "param_names": np.array(names)}
+        if self.asked.drive is not None:
+            t0, period = self.asked.drive
+            arrays |= {"t0": t0, "period": np.asarray(period)}
         with atomic_file(self.out) as stream, zipfile.ZipFile(stream, "w") as archive:
             shape = (self.lanes, self.total, self._state)
             with member_of(archive, "trajectories", shape, np.float64) as member:
@@ -217,13 +227,7 @@ class PredictionWriter:
                 with member_of(archive, "quantiles", (3, *shape), np.float64) as member:
                     for part in (2, 3, 4):
                         self._assemble(member, part)
-            for name, array in (
-                ("status", status),
-                ("left_at", left_at),
-                ("dt", np.asarray(self.dt)),
-                ("job", np.asarray(digest_of(self._job))),
-                *named,
-            ):
+            for name, array in arrays.items():
                 with member_of(archive, name, array.shape, array.dtype) as member:
                     member.write(np.ascontiguousarray(array).tobytes())
             with member_of(archive, "steps", (self.total,), np.int64) as member:
@@ -336,3 +340,78 @@ def member_of(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype
     }
     np.lib.format.write_array_header_1_0(member, header)
     return member
+
+
+# A prediction of several processes: each writes the file of its own lanes, one puts them together.
+# The parts, NAME.part0of2.npz and so on beside NAME.npz, are predictions themselves.
+
+
+def part_of(out: Path, share: Share) -> Path:
+    """The file that this process writes."""
+    return out.with_name(f"{out.stem}.part{share.index}of{share.count}{out.suffix}")
+
+
+def number_of_parts(out: Path, share: Share, *, resume: bool) -> int:
+    """Number of parts that the prediction is in: one of each process, or as many as an interrupted
+    job has begun, whatever its number of processes.
+
+    Raises InputError where parts of another number are there and are not to be gone on with.
+    """
+    names = [path.name for path in out.parent.glob(f"{out.stem}.part*of*{out.suffix}*")]
+    pattern = re.compile(re.escape(out.stem) + r"\.part\d+of(\d+)" + re.escape(out.suffix))
+    there = {int(found[1]) for found in map(pattern.match, names) if found}
+    if not there or (resume and len(there) == 1):
+        return there.pop() if there else share.count
+    if there == {share.count}:
+        return share.count
+    found = " and of ".join(map(str, sorted(there)))
+    raise InputError(
+        f"{out}: unfinished parts by {found} processes are there, and this job has {share.count}: "
+        + ("delete those of one kind" if resume else "--resume goes on with them, or delete them")
+    )
+
+
+def put_together(parts: Sequence[Path], out: Path, job: dict[str, Any]) -> None:
+    """One prediction, ``out``, of the parts in the order of their lanes; they are then deleted.
+
+    Memory: 16 MiB, whatever the sizes. Raises WorkError where writing fails; the parts then stay.
+    """
+    with failures_as_work_errors(out), contextlib.ExitStack() as stack:
+        archives = [stack.enter_context(zipfile.ZipFile(path)) for path in parts]
+        stream = stack.enter_context(atomic_file(out))
+        whole = stack.enter_context(zipfile.ZipFile(stream, "w"))
+        for name in (Path(n).stem for n in archives[0].namelist()):
+            if name == "job":
+                digest = np.asarray(digest_of(job))
+                with member_of(whole, name, (), digest.dtype) as member:
+                    member.write(digest.tobytes())
+            else:
+                axis = _AXIS_OF_LANES.get(name)
+                _copy(name, archives if axis is not None else archives[:1], whole, axis or 0)
+    for path in parts:
+        path.unlink()
+
+
+def _copy(name: str, archives: Sequence[zipfile.ZipFile], whole: zipfile.ZipFile, axis: int):
+    """One array, those of the parts put together along an axis."""
+    with contextlib.ExitStack() as stack:
+        streams = [stack.enter_context(archive.open(f"{name}.npy")) for archive in archives]
+        headers = []
+        for stream in streams:
+            np.lib.format.read_magic(stream)
+            headers.append(np.lib.format.read_array_header_1_0(stream))
+        shapes = [header[0] for header in headers]
+        dtype, shape = headers[0][2], shapes[0]
+        if shape:
+            shape = (*shape[:axis], sum(s[axis] for s in shapes), *shape[axis + 1 :])
+        member = stack.enter_context(member_of(whole, name, shape, dtype))
+        # Row after row of the axes before that of the lanes.
+        for _ in range(int(np.prod(shape[:axis]))):
+            for stream, own in zip(streams, shapes, strict=True):
+                left = int(np.prod(own[axis:])) * dtype.itemsize
+                while left:
+                    read = stream.read(min(left, _COPIED_BYTES))
+                    if not read:
+                        raise OSError(f"{name} of a part is shorter than its header says")
+                    member.write(read)
+                    left -= len(read)

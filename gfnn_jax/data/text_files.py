@@ -9,7 +9,7 @@ import csv
 import dataclasses
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -293,6 +293,13 @@ def from_text(
         text.notes,
         lambda row: text.locate(int(row_numbers[row])),
     )
+
+
+def to_text(columns: Mapping[str, np.ndarray]) -> str:
+    """Text of columns (n,) of numbers, with ten digits, or of words: commas between them."""
+    import pandas as pd
+
+    return pd.DataFrame(dict(columns)).to_csv(index=False, float_format="%.10g", na_rep="nan")
 
 
 def _cells(line: str, separator: str) -> list[str]:

@@ -16,15 +16,12 @@ import numpy as np
 from gfnn_jax.baselines import METHODS
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.evaluate import figures, metrics, report
-from gfnn_jax.jobs import chaos
-from gfnn_jax.jobs.comparison_figures import draw
-from gfnn_jax.jobs.measure import measure
+from gfnn_jax.jobs.figures import BINS, divergences, figures_of_comparison
+from gfnn_jax.jobs.measure import Rollouts, measure, without_runaways
 from gfnn_jax.jobs.methods import OURS, PAPER_GFNN, TITLES, learn_and_roll
-from gfnn_jax.jobs.progress import SILENT, Progress
-from gfnn_jax.jobs.rollouts import Rollouts, without_runaways
+from gfnn_jax.jobs.output import REPORT, Output, pairs_digest
 from gfnn_jax.jobs.search import scene_named
 from gfnn_jax.jobs.shared_data import SharedData, separable
-from gfnn_jax.jobs.written import REPORT, pairs_digest
 from gfnn_jax.maps.saved import versions
 from gfnn_jax.scenes import Scene
 from gfnn_jax.storage.outputs import atomic_folder, atomic_write, failures_as_work_errors
@@ -33,7 +30,7 @@ from gfnn_jax.storage.partial import unfinished
 CAP, QUICK_CAP = 60.0, 2.0  # seconds, at the rate below
 RATE = 4e10  # counted operations of a training that a quiet core makes in a second, about
 
-__all__ = ["CAP", "OURS", "PAPER_GFNN", "QUICK_CAP", "RATE", "TITLES", "Compared", "compare"]
+__all__ = ["CAP", "OURS", "PAPER_GFNN", "RATE", "TITLES", "compare"]
 
 
 class Compared(NamedTuple):
@@ -45,23 +42,21 @@ class Compared(NamedTuple):
 
 def compare(
     name: str,
+    output: Output,
     *,
     methods: Sequence[str] = (),
-    out: Path,
     quick: bool = False,
     seed: int = 0,
     cap: float | None = None,
-    overwrite: bool = False,
-    resume: bool = False,
-    progress: Progress = SILENT,
 ) -> Compared | None:
-    """Learn a scene by these methods (with none named, all that apply), into the folder out.
+    """Learn a scene by these methods (with none named, all that apply), into a folder.
 
     cap: most training of each, in seconds that stand for RATE counted operations, whatever the
-    machine; 60 by default, 2 with quick. quick: fewer pairs and test states. resume: keep the
-    methods that are done; returns None where ``out`` has them all. Raises InputError for a scene or
-    a method that cannot be compared, WorkError where a method fails.
+    machine; 60 by default, 2 with quick. quick: fewer pairs and test states. A resumed comparison
+    keeps the methods that are done, and returns None where the output has them all. Raises
+    InputError for a scene or a method that cannot be compared, WorkError where a method fails.
     """
+    progress = output.progress
     scene = scene_named(name)
     if scene.parameters:
         raise InputError(f"the scene {name} has parameters, which the other methods do not take")
@@ -77,9 +72,15 @@ def compare(
         "cap": cap,
         "version": versions()["gfnn_jax"],
     }
-    if resume and _already_done(out, job, chosen):
+    if output.resume and _already_done(output.out, job, chosen):
         return None
-    with unfinished(out, job, what="comparison", overwrite=overwrite, resume=resume) as kept_in:
+    with unfinished(
+        output.out,
+        job,
+        what="comparison",
+        overwrite=output.overwrite,
+        resume=output.resume,
+    ) as kept_in:
         data = SharedData(scene, seed, quick)
         for method in chosen:
             if _is_finished(kept_in, method):
@@ -108,7 +109,7 @@ def compare(
                 **part,
                 "rollout": m.report,
                 "curve": _curve(m.error),
-                "kl": chaos.divergences(scene, m.predicted, data.reference),
+                "kl": divergences(scene, m.predicted, data.reference),
                 "elements": _elements(scene, m.predicted, data.reference),
             }
         result = {
@@ -125,15 +126,15 @@ def compare(
                 "num_pairs": data.num_pairs,
                 "digest": pairs_digest(data.fresh),
             },
-            "kl_bins": chaos.BINS,
+            "kl_bins": BINS,
             "job": job,
             "methods": reported,
         }
-        with atomic_folder(out) as folder:
-            for file, figure in draw(scene, measured, data.reference).items():
+        with atomic_folder(output.out) as folder:
+            for file, figure in figures_of_comparison(scene, measured, data.reference).items():
                 figures.save(figure, folder / f"{file}.png")
             (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
-    return Compared(out, json.loads(report.to_json(result)))
+    return Compared(output.out, json.loads(report.to_json(result)))
 
 
 def chosen_methods(methods: Sequence[str], scene: Scene) -> tuple[str, ...]:

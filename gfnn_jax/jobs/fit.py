@@ -1,4 +1,4 @@
-"""Job of ``gfnn fit``: trajectory files in, a model folder with its report out."""
+"""Jobs of ``gfnn fit``: states or recordings in, a model folder with its report out."""
 
 from __future__ import annotations
 
@@ -11,14 +11,24 @@ import numpy as np
 
 from gfnn_jax.budget import READING
 from gfnn_jax.data.files import iterate_pairs, read_trajectories
+from gfnn_jax.data.recording import read
+from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.data.summary import summary
 from gfnn_jax.errors import InputError, OutOfTime
+from gfnn_jax.evaluate.figures_of_laws import law_figure
 from gfnn_jax.fitting import row_blocks
-from gfnn_jax.jobs.progress import SILENT, Progress
-from gfnn_jax.jobs.search import BEST, failures_of_arithmetic, refusals, scene_named, search
-from gfnn_jax.jobs.written import Ran, already_done, publish, write
+from gfnn_jax.jobs.output import Output, Ran, publish, units_of, write
+from gfnn_jax.jobs.search import (
+    BEST,
+    failures_of_arithmetic,
+    line,
+    refusals,
+    scene_named,
+    search,
+)
 from gfnn_jax.learn.check import FEWEST
+from gfnn_jax.learn.fit import fit as learn_fit
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.learn.refit import (
     can_be_refitted,
@@ -32,33 +42,31 @@ from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group, Share
 from gfnn_jax.storage.outputs import atomic_folder
-from gfnn_jax.storage.partial import unfinished
 
 # A larger file, or several files, are never in memory as a whole: candidates are chosen on a sample
 # of the pairs, and the chosen one is fitted to all of them chunk by chunk.
 _LARGE_BYTES, _FIT_CHUNK = 2**29, 50_000
+LAW_FIGURE = "law.png"
 _TO_ALL = "the fit of the chosen candidate to all pairs"
 
 
 def fit(
     data: Path | Sequence[Path],
+    output: Output,
     *,
-    out: Path,
     dt: float | None = None,
     scene_name: str | None = None,
-    overwrite: bool = False,
-    resume: bool = False,
     group: Group | None = None,
-    progress: Progress = SILENT,
     **options: Any,
 ) -> Ran | None:
-    """Learn the map of trajectory files, and write it with its report into the model folder out.
+    """Learn the map of trajectory files, and write it with its report into the model folder.
 
-    scene_name: the scene whose coordinates and features are used. resume: returns None where
-    ``out`` holds the result of this same job. group: the processes that do this job, each with its
-    own rows or files; all but the first return None. options: `FitOptions`; devices are those of
-    each process, and a job may be resumed on others.
+    scene_name: the scene whose coordinates and features are used. group: the processes that do this
+    job, each with its own rows or files; all but the first return None. options: `FitOptions`;
+    devices are those of each process, and a job may be resumed on others. Returns None where the
+    output holds the result of this same job.
     """
+    progress = output.progress
     with refusals():
         asked = FitOptions(**options)
     try:
@@ -87,8 +95,8 @@ def fit(
         with failures_of_arithmetic(), row_blocks.on_devices(own):
             help_refit(task, pairs, group, scene=scene)
         return None
-    for line in summary(trajectories):
-        progress.line(line)
+    for text in summary(trajectories):
+        progress.line(text)
     job = {
         "command": "fit",
         "data": trajectories.digest,
@@ -96,10 +104,10 @@ def fit(
         "scene": scene_name,
         **asked.deciding,
     }
-    if already_done(out, job, resume):
+    if output.holds(job):
         group.broadcast({})
         return None
-    with unfinished(out, job, what="fit", overwrite=overwrite, resume=resume) as kept_in:
+    with output.unfinished(job) as kept_in:
         try:
             fitted = search(
                 trajectories.pairs(),
@@ -146,12 +154,12 @@ def fit(
                 },
             )
         except KeyboardInterrupt as stop:
-            if note := publish(kept_in / BEST, out):
+            if note := publish(kept_in / BEST, output.out):
                 stop.add_note(note)
             raise
-        with atomic_folder(out) as folder:
+        with atomic_folder(output.out) as folder:
             write(folder, folder, fitted, result, job)
-    return Ran(fitted, out, result)
+    return Ran(fitted, output.out, result)
 
 
 class _Pairs:
@@ -167,3 +175,47 @@ class _Pairs:
 def _range(values) -> list[float]:
     """Smallest and largest value."""
     return [float(np.min(values)), float(np.max(values))]
+
+
+def fit_recording(
+    data: Sequence[Path],
+    output: Output,
+    *,
+    columns: dict[str, Any],
+    despite: Sequence[str] = (),
+    **options: Any,
+) -> Ran:
+    """Learn the law of recordings (files), or with ``learn="map"`` the map of their positions, and
+    write it with its report into the model folder.
+
+    columns: keywords of `gfnn_jax.read`. despite: kinds of mistakes that the files may show.
+    options: `FitOptions`. Raises InputError where `gfnn look` finds a mistake; WorkError where no
+    law follows the recording, or the arithmetic fails.
+    """
+    progress = output.progress
+    with refusals():
+        asked = FitOptions(**options)
+    recording = read(list(data), **columns)
+    refuse_mistakes(recording, despite)
+    job = {"command": "fit", "data": recording.source, **asked.deciding, **units_of(recording)}
+    is_law = asked.learn != "map"
+    with refusals(), failures_of_arithmetic():
+        fitted = learn_fit(
+            recording,
+            options=asked,
+            on_progress=progress.line if is_law else progress.status,
+            on_candidate=lambda candidate: progress.line(line(candidate)),
+        )
+    if is_law:
+        result = fitted.report(source=recording.source, seed=asked.seed)
+    else:
+        progress.status("the report: the derivative of a step")
+        fitted, positions = fitted.settled(), list(recording.positions)
+        about = {"source": recording.source, "positions": positions}
+        result = fitted.report(seed=asked.seed, data=about)
+        job |= {"positions": positions, "angles": list(recording.angles)}
+    with atomic_folder(output.out) as folder:
+        write(folder, folder, fitted, result, job)
+        if is_law:
+            law_figure(fitted, recording, folder / LAW_FIGURE)
+    return Ran(fitted, output.out, result)

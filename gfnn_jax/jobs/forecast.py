@@ -7,6 +7,7 @@ gone on from, and so are values; of columns that it lacks in those of the law's.
 
 from __future__ import annotations
 
+import dataclasses
 import io
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,13 +16,34 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.data.recording import SECONDS, Recording
+from gfnn_jax.data.text_files import to_text
 from gfnn_jax.errors import InputError
+from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.units import read_in_units, refuse_other_units
 from gfnn_jax.maps.estimates import Forecast
 from gfnn_jax.maps.saved import load, record
-from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
+
+
+@dataclasses.dataclass(frozen=True)
+class Ahead:
+    """Request of a forecast.
+
+    num_steps: of the model's dt; saved every so many. stop: time, in the file's unit, at which the
+    recording ends that lies in the file. estimate_from: samples of each run that the state is
+    estimated from; None: as many as the model found best. inputs: a recording of the inputs ahead.
+    compare: one of what was measured, which gives the times. columns: keywords of `gfnn_jax.read`
+    beside the roles, which the model knows.
+    """
+
+    num_steps: int | None = None
+    save_every: int = 1
+    stop: float | None = None
+    estimate_from: int | None = None
+    inputs: Path | None = None
+    compare: Path | None = None
+    columns: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
 class Comparison(NamedTuple):
@@ -42,112 +64,100 @@ class Forecasts(NamedTuple):
     compared: Comparison | None
 
 
-def forecast_recording(
-    model: Path,
-    initial: Path,
-    *,
-    out: Path,
-    num_steps: int | None = None,
-    save_every: int = 1,
-    stop: float | None = None,
-    estimate_from: int | None = None,
-    inputs: Path | None = None,
-    compare: Path | None = None,
-    columns: dict[str, Any] | None = None,
-    overwrite: bool = False,
-) -> Forecasts:
-    """Forecast from the states at the ends of a recording's runs.
-
-    num_steps: of the model's dt; saved every so many. stop: time, in the file's unit, at which the
-    recording ends that lies in the file. estimate_from: samples of each run that the
-    state is estimated from; None: as many as the model found best. inputs: a recording of the
-    inputs ahead. compare: one of what was measured, which gives the times. columns: keywords of
-    `gfnn_jax.read` beside the roles, which the model knows.
-    """
-    ensure_new(out, overwrite)
+def forecast_recording(model: Path, initial: Path, output: Output, asked: Ahead) -> Forecasts:
+    """Forecast from the states at the ends of a recording's runs."""
+    out, num_steps = output.out, asked.num_steps
+    ensure_new(out, output.overwrite)
     if out.suffix not in (".csv", ".npz"):
         raise InputError(f"{out}: a forecast is written as .csv or .npz")
     if num_steps is not None and num_steps < 0:
         raise InputError("expected --num-steps above 0: a forecast begins where a recording ends")
-    map_ = load(model)
-    if map_.sensors is None:
-        raise InputError(f"{model}: was not learned from a recording: --initial needs states q, p")
-    sensors = map_.sensors
-    job = record(model).get("job", {})
-    columns = columns or {}
-    recording, roles = _read(initial, map_, job, columns)
-    if stop is not None:
-        recording = recording.slice(stop=stop * SECONDS[recording.time_unit])
-    ahead = None
-    if inputs is not None:
-        bare = ("positions", "velocities", "sensors", "coordinates", "angles", "parameters")
-        ahead = read_in_units(inputs, job, {**roles, **dict.fromkeys(bare)})
-        refuse_other_units(ahead, job)
-    measured = None if compare is None else _read(compare, map_, job, columns)[0]
-    if num_steps is None and measured is None:
+    if num_steps is None and asked.compare is None:
         raise InputError("expected --num-steps, or --compare, whose times the forecast is for")
-    if ahead is None and sensors.inputs and measured is not None:
-        ahead = measured
+    known = _Model(model, asked.columns)
+    recording, roles = known.read(initial)
+    if asked.stop is not None:
+        recording = recording.slice(stop=asked.stop * SECONDS[recording.time_unit])
+    measured = None if asked.compare is None else known.read(asked.compare)[0]
+    ahead = measured if known.sensors.inputs else None
+    if asked.inputs is not None:
+        bare = ("positions", "velocities", "sensors", "coordinates", "angles", "parameters")
+        ahead = read_in_units(asked.inputs, known.job, {**roles, **dict.fromkeys(bare)})
+        refuse_other_units(ahead, known.job)
     found: dict[str, Forecast] = {}
     for run in recording.runs:
-        part = _last_samples(recording.slice(run=run), run, estimate_from)
-        last = float(np.max(part.times(run)))
-        if measured is not None:
-            own = measured.times(run if len(measured.runs) > 1 else next(iter(measured.runs)))
-            times = own[own > last]
-            times = times[:num_steps] if num_steps else times
+        part, times = recording.slice(run=run), recording.times(run)
+        if asked.estimate_from is not None:
+            part = part.slice(start=float(times[-min(asked.estimate_from, len(times))]))
+        last = float(times[-1])
+        if measured is None:
+            assert num_steps is not None
+            steps = np.arange(asked.save_every, num_steps + 1, asked.save_every)
+            times = last + float(np.asarray(known.map.dt)) * steps
+        else:
+            own = measured.times(_same_run(measured, run))
+            times = own[own > last][:num_steps]
             if not len(times):
                 raise InputError(
-                    f"{compare}: holds no sample of run {run} after the end of {initial}, {last:g} "
-                    "s. To forecast a part of one file: --to T ends --initial there"
+                    f"{asked.compare}: holds no sample of run {run} after the end of {initial}, "
+                    f"{last:g} s. To forecast a part of one file: --to T ends --initial there"
                 )
-        else:
-            assert num_steps is not None
-            steps = np.arange(save_every, num_steps + 1, save_every)
-            times = last + float(np.asarray(map_.dt)) * steps
-        found[run] = map_.forecast(part, times, ahead)
-    compared = None if measured is None else _compared(sensors, found, measured)
+        found[run] = known.map.forecast(part, times, ahead)
+    compared = None if measured is None else _compared(known, found, measured)
     second = SECONDS[recording.time_unit]
-    factors = dict.fromkeys(job.get("degrees", ()), np.pi / 180) | recording.factors
+    factors = dict.fromkeys(known.job.get("degrees", ()), np.pi / 180) | recording.factors
     found = {run: _in_units(one, factors, second) for run, one in found.items()}
-    _write(out, tuple(next(iter(found.values())).values), found)
+    _write(out, found)
     return Forecasts(found, recording.time_unit, compared)
 
 
-def _read(
-    path: Path, map_: SymplecticMap, job: dict[str, Any], columns: dict[str, Any]
-) -> tuple[Recording, dict[str, Any]]:
-    """Read a recording with the columns that the law was learned from, but for velocities that it
-    may lack, and return the keywords of `read` too."""
-    sensors = map_.sensors
-    assert sensors is not None
-    observation = sensors.observation_model
-    varied = () if map_.parameters is None else map_.parameters.names
-    columns = {"parameters": varied, **columns}
-    roles = _roles(sensors, observation.channels) | columns
-    try:
-        recording = read_in_units(path, job, roles)
-    except InputError:
-        if observation.needed == observation.channels:
-            raise
-        roles = _roles(sensors, observation.needed) | columns
-        recording = read_in_units(path, job, roles)
-    # Outside of ``try``: a velocity in another unit is no velocity that is lacking.
-    refuse_other_units(recording, job)
-    return recording, roles
+class _Model:
+    """A saved model of a recording: the map, its sensors, and the job that it was learned in."""
+
+    def __init__(self, folder: Path, columns: Mapping[str, Any]):
+        self.map: SymplecticMap = load(folder)
+        if self.map.sensors is None:
+            raise InputError(
+                f"{folder}: was not learned from a recording: --initial needs states q, p"
+            )
+        self.sensors = self.map.sensors
+        self.job = record(folder).get("job", {})
+        varied = () if self.map.parameters is None else self.map.parameters.names
+        self.columns = {"parameters": varied, **columns}
+
+    def read(self, path: Path) -> tuple[Recording, dict[str, Any]]:
+        """Read a recording with the columns that the law was learned from, but for velocities that
+        it may lack, and return the keywords of `gfnn_jax.read` too."""
+        observation = self.sensors.observation_model
+        roles = self._roles(observation.channels)
+        try:
+            recording = read_in_units(path, self.job, roles)
+        except InputError:
+            if observation.needed == observation.channels:
+                raise
+            roles = self._roles(observation.needed)
+            recording = read_in_units(path, self.job, roles)
+        # Outside of ``try``: a velocity in another unit is no velocity that is lacking.
+        refuse_other_units(recording, self.job)
+        return recording, roles
+
+    def _roles(self, channels: tuple[str, ...]) -> dict[str, Any]:
+        """Keywords of `gfnn_jax.read` for a recording with these columns."""
+        positions, speeds = self.sensors.positions, self.sensors.observation_model.speeds
+        return {
+            "positions": tuple(n for n in channels if n in positions),
+            "velocities": tuple(n for n in channels if n in speeds),
+            "sensors": tuple(n for n in channels if n not in (*positions, *speeds)),
+            "inputs": self.sensors.inputs,
+            "coordinates": positions,
+            "angles": self.sensors.angles,
+            **self.columns,
+        }
 
 
-def _roles(sensors: Sensors, channels: tuple[str, ...]) -> dict[str, Any]:
-    """Keywords of `read` for a recording with these columns."""
-    speeds = sensors.observation_model.speeds
-    return {
-        "positions": tuple(n for n in channels if n in sensors.positions),
-        "velocities": tuple(n for n in channels if n in speeds),
-        "sensors": tuple(n for n in channels if n not in (*sensors.positions, *speeds)),
-        "inputs": sensors.inputs,
-        "coordinates": sensors.positions,
-        "angles": sensors.angles,
-    }
+def _same_run(measured: Recording, run: str) -> str:
+    """Name of the measured run that goes on with this one: its only one, or that of this name."""
+    return run if len(measured.runs) > 1 else next(iter(measured.runs))
 
 
 def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> Forecast:
@@ -159,25 +169,17 @@ def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> For
     return Forecast(one.times / second, values, std, one.outside)
 
 
-def _last_samples(recording: Recording, run: str, count: int | None) -> Recording:
-    if count is None:
-        return recording
-    times = recording.times(run)
-    return recording.slice(start=float(np.sort(times)[-min(count, len(times)) :].min()))
-
-
-def _compared(sensors: Sensors, found: dict[str, Forecast], measured: Recording) -> Comparison:
+def _compared(known: _Model, found: dict[str, Forecast], measured: Recording) -> Comparison:
     """Forecasts, in seconds and radians, against what was measured, in the units of its file."""
     columns, count = {}, 0
-    for name in (n for n in sensors.observation_model.channels if n in measured.columns):
+    for name in (n for n in known.sensors.observation_model.channels if n in measured.columns):
         errors, stds = [], []
         for run, one in found.items():
-            own = run if len(measured.runs) > 1 else next(iter(measured.runs))
-            factor = measured.factors[name]
+            own, factor = _same_run(measured, run), measured.factors[name]
             times = measured.times(own)
             at = np.searchsorted(times, one.times - 0.5 * np.min(np.diff(times)))
             error = (one.values[name][0] - measured.values(name, own)[at]) / factor
-            if name in sensors.angles:
+            if name in known.sensors.angles:
                 half = np.pi / factor
                 error = (error + half) % (2 * half) - half
             finite = np.isfinite(error)
@@ -190,34 +192,36 @@ def _compared(sensors: Sensors, found: dict[str, Forecast], measured: Recording)
     return Comparison(columns, {name: measured.unit(name) for name in columns}, count)
 
 
-def _write(out: Path, names: tuple[str, ...], found: dict[str, Forecast]) -> None:
+def _write(out: Path, found: dict[str, Forecast]) -> None:
+    names = tuple(next(iter(found.values())).values)
+    values = {run: np.stack([f.values[n][0] for n in names], axis=1) for run, f in found.items()}
+    std = {run: np.stack([f.std[n][0] for n in names], axis=1) for run, f in found.items()}
+    times = {run: one.times for run, one in found.items()}
     if out.suffix == ".csv":
-        header = ",".join(["run", "t", *names, *(f"std_{n}" for n in names)])
-        rows = [
-            ",".join([run, *(f"{x:.10g}" for x in row)])
-            for run, f in found.items()
-            for row in np.stack(
-                [f.times, *(f.values[n][0] for n in names), *(f.std[n][0] for n in names)], axis=1
-            )
-        ]
-        atomic_write(out, "\n".join([header, *rows]) + "\n")
+        table = [np.column_stack([times[r], values[r], std[r]]) for r in found]
+        heads = ["t", *names, *(f"std_{name}" for name in names)]
+        columns = dict(zip(heads, np.concatenate(table).T, strict=True))
+        runs = np.repeat(list(found), [len(t) for t in times.values()])
+        atomic_write(out, to_text({"run": runs, **columns}))
         return
-    length = max(len(f.times) for f in found.values())
+    length = max(len(t) for t in times.values())
 
-    def padded(a: np.ndarray) -> np.ndarray:
-        return np.concatenate([a, np.full((length - len(a), *a.shape[1:]), np.nan)])
+    def padded(of_runs: Mapping[str, np.ndarray]) -> np.ndarray:
+        rows = [(0, length - len(a)) for a in of_runs.values()]
+        return np.stack(
+            [
+                np.pad(a, [row, *[(0, 0)] * (a.ndim - 1)], constant_values=np.nan)
+                for a, row in zip(of_runs.values(), rows, strict=True)
+            ]
+        )
 
     stream = io.BytesIO()
     np.savez(
         stream,
         runs=np.array(list(found)),
         columns=np.array(names),
-        times=np.stack([padded(f.times) for f in found.values()]),
-        values=np.stack(
-            [padded(np.stack([f.values[n][0] for n in names], axis=1)) for f in found.values()]
-        ),
-        std=np.stack(
-            [padded(np.stack([f.std[n][0] for n in names], axis=1)) for f in found.values()]
-        ),
+        times=padded(times),
+        values=padded(values),
+        std=padded(std),
     )
     atomic_write(out, stream.getvalue())

@@ -13,9 +13,8 @@ from gfnn_jax.baselines import METHODS, Budget
 from gfnn_jax.baselines.paper_gfnn import paper_gfnn
 from gfnn_jax.errors import FitWarning
 from gfnn_jax.evaluate.metrics import one_step_rms
-from gfnn_jax.jobs.measure import angles_of_z
+from gfnn_jax.jobs.measure import Rollouts, angles_of_z, map_rollouts, step_rollouts
 from gfnn_jax.jobs.progress import Progress
-from gfnn_jax.jobs.rollouts import Rollouts, map_rollouts, step_rollouts
 from gfnn_jax.jobs.run import QUICK_PAIRS, QUICK_TOLERANCE
 from gfnn_jax.jobs.search import search
 from gfnn_jax.jobs.shared_data import SharedData

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import hashlib
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,10 +14,16 @@ import jax
 import numpy as np
 
 from gfnn_jax.data.files import are_recordings, read_initial, read_initial_noise
-from gfnn_jax.data.parts import number_of_parts, part_of, put_together
-from gfnn_jax.data.predictions import PredictionWriter, is_done, job_of
+from gfnn_jax.data.predictions import (
+    PredictionJob,
+    PredictionWriter,
+    is_done,
+    number_of_parts,
+    part_of,
+    put_together,
+)
 from gfnn_jax.errors import InputError
-from gfnn_jax.jobs.progress import SILENT, Progress
+from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.units import read_in_units, refuse_other_units
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.bands import bands, horizon
@@ -29,10 +38,48 @@ from gfnn_jax.storage.outputs import ensure_new
 
 # A chunk of a prediction: bytes in memory at once, and steps that a kill may lose.
 _CHUNK_BYTES, _CHUNK_LANE_STEPS = 32 * 2**20, 400_000
+_OF_SAMPLES = "samples_"  # prefix of the samples' lanes in a carry
+
+
+@dataclasses.dataclass(frozen=True)
+class Steps:
+    """Request of a prediction.
+
+    num_steps:  backwards, by the inverse map, where negative, as the saved ``steps`` then are.
+    save_every: of the steps that are saved. dt: time step, where it is not that of the data; for a
+                map that can step any dt.
+    samples:    number of maps drawn from the model's posterior, whose spread becomes ``std`` and
+                ``quantiles``. Where the file of initial states has their noise ``z0_std``, the
+                spread includes it, and ``band`` says so.
+    horizon:    a length in position space, in the user's units; ``horizon`` (B,) of the file is the
+                first saved step at which two standard deviations of the position exceed it, −1
+                where none does.
+    outside:    "stop" or "continue" where a trajectory leaves the domain; None: continue.
+    devices:    number of devices of this process that share the lanes, or "all"; the bits are the
+                same on any number, and after a resume on another number.
+    """
+
+    num_steps: int
+    save_every: int = 1
+    dt: float | None = None
+    samples: int | None = None
+    horizon: float | None = None
+    outside: str | None = None
+    devices: int | str | None = None
+
+    def check(self) -> None:
+        """Raises InputError where the options contradict each other."""
+        if self.save_every > abs(self.num_steps):
+            raise InputError(
+                f"expected --save-every of at most --num-steps = {abs(self.num_steps)}, got "
+                f"{self.save_every}"
+            )
+        if self.horizon is not None and self.samples is None:
+            raise InputError("--horizon needs --samples: the band is the spread of samples")
 
 
 class Predicted(NamedTuple):
-    """Result of a prediction: status and left_at (B,), size of the map's dt, seconds of computing.
+    """Result of a prediction: status and left_at (B,), seconds of computing.
 
     horizon: (B,) where one was asked for. Among several processes the first has all lanes, the
     others have their own.
@@ -40,151 +87,120 @@ class Predicted(NamedTuple):
 
     status: np.ndarray
     left_at: np.ndarray
-    dt: float
     seconds: float
     horizon: np.ndarray | None = None
 
 
-class _Drawn(NamedTuple):
-    """Samples of a prediction, and their initial states z0 (n, B, 2d).
+class _Begin(NamedTuple):
+    """Initial states z0 (B, 2d), their parameters (B, k), and those of samples (n, B, 2d)."""
 
-    angles: indices of the angles of a state. size: that of the horizon, or None. of: uncertainties
-    that the band contains, as text.
-    """
-
-    samples: Samples | Sharded
     z0: np.ndarray
-    angles: tuple[int, ...]
-    size: float | None
-    of: str
+    params: np.ndarray | None
+    of_samples: np.ndarray | None
 
+    def of(self, lanes: slice) -> _Begin:
+        of_samples = None if self.of_samples is None else self.of_samples[:, lanes]
+        return _Begin(
+            self.z0[lanes], None if self.params is None else self.params[lanes], of_samples
+        )
 
-class _Request(NamedTuple):
-    """Request of a prediction: the map, and ``stepped``, itself or the same over devices."""
-
-    map: SymplecticMap
-    stepped: SymplecticMap | Sharded
-    num_steps: int
-    save_every: int
-    stop_outside: bool
-    overwrite: bool
-    resume: bool
+    def digest(self) -> str:
+        found = hashlib.sha256()
+        for array in self:
+            if array is not None:
+                found.update(np.ascontiguousarray(array).data)
+        return found.hexdigest()
 
 
 def predict(
-    model: Path,
-    initial: Path,
-    *,
-    num_steps: int,
-    save_every: int = 1,
-    out: Path,
-    dt: float | None = None,
-    samples: int | None = None,
-    horizon_size: float | None = None,
-    stop_outside: bool = False,
-    devices: int | str | None = None,
-    share: Share | None = None,
-    overwrite: bool = False,
-    resume: bool = False,
-    progress: Progress = SILENT,
+    model: Path, initial: Path, output: Output, asked: Steps, share: Share | None = None
 ) -> Predicted:
-    """Predict from the initial states in a file, in chunks along the steps, into ``out``.
+    """Predict from the initial states in a file, in chunks along the steps, into the output.
 
-    num_steps: backwards, by the inverse map, where it is negative, as the saved ``steps`` then are.
-    dt: time step, where it is not that of the data; for a map that can step any dt. samples: number
-    of maps drawn from the model's posterior, whose spread becomes ``std`` and ``quantiles``. Where
-    the file of initial states has their noise ``z0_std``, the spread includes it, and ``band`` says
-    so. horizon_size: a length in position space, in the user's units; ``horizon`` (B,) is the first
-    saved step at which two standard deviations of the position exceed it, −1 where none does.
-    devices: number of devices of this process that share the lanes, or "all"; the bits are the same
-    on any number, and after a resume on another number. share: share of the lanes that this process
-    predicts. It writes a part of its own, and the first process joins the parts when all are there.
-    A resumed job keeps the parts that it began with, shared out anew.
+    share: share of the lanes that this process predicts. It writes a part of its own, and the first
+    process joins the parts when all are there. A resumed job keeps the parts that it began with,
+    shared out anew.
 
     Memory is one chunk of saved states, at most 32 MiB where a saved state of all lanes is no more
-    than that, for any ``num_steps``. With ``resume`` a killed job continues where its last chunk
+    than that, for any number of steps. A killed job that is resumed continues where its last chunk
     ended, to the same bits as an uninterrupted one. Raises InputError for bad input.
     """
-    if save_every > abs(num_steps):
-        raise InputError(
-            f"expected --save-every of at most --num-steps = {abs(num_steps)}, got {save_every}"
-        )
-    if horizon_size is not None and samples is None:
-        raise InputError("--horizon needs --samples: the band is the spread of samples")
+    asked.check()
     map_ = saved.load(model)
-    if dt is not None:
-        try:
-            map_ = map_.over(dt)
-        except ValueError as error:
-            raise InputError(f"--dt: {error}") from error
-    dt = abs(float(map_.dt))
-    names = () if map_.parameters is None else map_.parameters.names
+    if asked.dt is not None:
+        with _refused_as("--dt"):
+            map_ = map_.over(asked.dt)
     if starts_from_positions(map_) and are_recordings(initial):
         z0, params = _last_states(map_, model, initial), None
     else:
+        names = () if map_.parameters is None else map_.parameters.names
         z0, params = read_initial(initial, map_.dim, names)
-    map_ = map_ if num_steps > 0 else map_.reversed()
-    digest = hashlib.sha256(np.ascontiguousarray(z0).data)
-    if params is not None:
-        digest.update(np.ascontiguousarray(params).data)
-    drawn = None
-    if samples is not None:
-        drawn = _drawn(map_, samples, z0, read_initial_noise(initial, z0.shape), horizon_size)
-        digest.update(np.ascontiguousarray(drawn.z0).data)
+    map_ = map_ if asked.num_steps > 0 else map_.reversed()
+    drawn, begun, band = None, None, "model"
+    if asked.samples is not None:
+        with _refused_as("--samples"):
+            drawn = map_.sample(jax.random.key(0), asked.samples)
+        begun = np.broadcast_to(z0, (asked.samples, *z0.shape))
+        std = read_initial_noise(initial, z0.shape)
+        if std is not None:
+            begun = begun + std * np.random.default_rng(1).normal(size=begun.shape)
+            band = "model and initial state"
+    begin = _Begin(z0, params, begun)
     stepped: SymplecticMap | Sharded = map_
-    if devices is not None or share is not None:
-        try:
-            stepped = map_.sharded(devices or "all")
-        except ValueError as error:
-            raise InputError(f"--devices: {error}") from error
-        if drawn is not None and isinstance(drawn.samples, Samples):
-            drawn = drawn._replace(samples=Sharded(drawn.samples, stepped.devices))
+    if asked.devices is not None or share is not None:
+        with _refused_as("--devices"):
+            stepped = map_.sharded(asked.devices or "all")
+        if isinstance(drawn, Samples):
+            drawn = Sharded(drawn, stepped.devices)
     identity = {
         "model": saved.digest(model),
-        "initial": digest.hexdigest(),
-        "outside": "stop" if stop_outside else "continue",
-        **({} if drawn is None else {"samples": samples, "horizon_size": horizon_size}),
+        "initial": begin.digest(),
+        "outside": asked.outside or "continue",
+        **({} if drawn is None else {"samples": asked.samples, "horizon_size": asked.horizon}),
         **({"block": stepped.block} if isinstance(stepped, Sharded) else {}),
     }
-    request = _Request(map_, stepped, num_steps, save_every, stop_outside, overwrite, resume)
+    job = _Prediction(map_, stepped, drawn, band, asked, output)
     if share is None or not isinstance(stepped, Sharded):
-        return _written(request, out, z0, params, identity, drawn, progress)
-    job = job_of(
-        identity,
-        z0.shape,
-        num_steps=num_steps,
-        save_every=save_every,
-        dt=dt,
-        bands=drawn is not None,
-    )
-    if not overwrite and resume and is_done(out, job):
+        return job.written(output.out, begin, identity)
+    return _in_parts(job, begin, identity, share, stepped.block)
+
+
+def _in_parts(
+    job: _Prediction, begin: _Begin, identity: dict[str, Any], share: Share, block: int
+) -> Predicted:
+    """Predict the lanes of this process into a part, or several; the first process joins all."""
+    output, whole = job.output, job.request(begin, identity).record
+    if not output.overwrite and output.resume and is_done(output.out, whole):
         wait_for_all()
-        return _finished(out, dt)
-    ensure_new(out, overwrite)
-    many = number_of_parts(out, share, resume=resume and not overwrite)
-    lanes = [Share(i, many).of(len(z0), stepped.block) for i in range(many)]
-    parts = [part_of(out, Share(i, many)) for i in range(many)]
-    predicted = [Predicted(np.zeros(0, int), np.zeros(0, int), dt, 0.0)]
-    for own, part in [*zip(lanes, parts, strict=True)][share.index :: share.count]:
+        return _finished(output.out)
+    ensure_new(output.out, output.overwrite)
+    many = number_of_parts(output.out, share, resume=output.resume and not output.overwrite)
+    shares = [Share(i, many) for i in range(many)]
+    lanes = {part_of(output.out, one): one.of(len(begin.z0), block) for one in shares}
+    predicted = [Predicted(np.zeros(0, int), np.zeros(0, int), 0.0)]
+    for part, own in [*lanes.items()][share.index :: share.count]:
         if own.stop > own.start:
-            own_params = None if params is None else params[own]
-            own_drawn = None if drawn is None else drawn._replace(z0=drawn.z0[:, own])
             of_part = identity | {"lanes": [own.start, own.stop]}
-            predicted.append(
-                _written(request, part, z0[own], own_params, of_part, own_drawn, progress)
-            )
-    progress.status("waiting for the other processes")
+            predicted.append(job.written(part, begin.of(own), of_part))
+    output.progress.status("waiting for the other processes")
     wait_for_all()
+    seconds = sum(part.seconds for part in predicted)
     if share.index == 0:
-        there = [part for part, own in zip(parts, lanes, strict=True) if own.stop > own.start]
-        progress.status(f"writing {out}")
-        put_together(there, out, job)
-        return _finished(out, dt)._replace(seconds=sum(part.seconds for part in predicted))
-    status, left_at = (
-        np.concatenate([getattr(part, name) for part in predicted])
-        for name in ("status", "left_at")
-    )
-    return Predicted(status, left_at, dt, sum(part.seconds for part in predicted))
+        output.progress.status(f"writing {output.out}")
+        there = [part for part, own in lanes.items() if own.stop > own.start]
+        put_together(there, output.out, whole)
+        return _finished(output.out)._replace(seconds=seconds)
+    status = np.concatenate([part.status for part in predicted])
+    return Predicted(status, np.concatenate([part.left_at for part in predicted]), seconds)
+
+
+@contextlib.contextmanager
+def _refused_as(option: str) -> Iterator[None]:
+    """Turn the ValueError of what an option asks for into an InputError that names it."""
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(f"{option}: {error}") from error
 
 
 def _last_states(map_: SymplecticMap, model: Path, initial: Path) -> np.ndarray:
@@ -202,124 +218,116 @@ def _last_states(map_: SymplecticMap, model: Path, initial: Path) -> np.ndarray:
     return np.asarray(map_.step(map_.from_positions(ends[:, 0], ends[:, 1]))[0])
 
 
-def _written(
-    request: _Request, out: Path, z0, params, identity, drawn: _Drawn | None, progress
-) -> Predicted:
-    """Predict these lanes into one file."""
-    map_ = request.map
-    dt, parameters = abs(float(map_.dt)), map_.parameters
-    own, drive = None, None
-    if parameters is not None and params is not None:
-        names = parameters.names
-        own = names, params
-        if TIME in names:
-            drive = params[:, -1], float(np.asarray(parameters.period))
-            own = (names[:-1], params[:, :-1]) if len(names) > 1 else None
-    writer = PredictionWriter(
-        out,
-        shape=z0.shape,
-        num_steps=request.num_steps,
-        save_every=request.save_every,
-        dt=dt,
-        identity=identity,
-        params=own,
-        drive=drive,
-        bands=drawn is not None,
-        overwrite=request.overwrite,
-        resume=request.resume,
-    )
-    started = time.perf_counter()
-    if writer.finished:
-        return _finished(out, dt)
-    try:
-        lanes = _go_on(request, z0, params, writer, drawn, progress)
-        progress.status(f"writing {out}")
-        status, left_at = np.asarray(lanes.status), np.asarray(lanes.left_at)
-        more: dict[str, Any] = {} if drawn is None else {"band": drawn.of}
-        passed = None
-        if drawn is not None and drawn.size is not None:
-            assert writer.carry is not None
-            passed = writer.carry["horizon"]
-            more |= {"horizon": passed, "horizon_size": drawn.size}
-        writer.finish(status, left_at, **more)
-    except KeyboardInterrupt as stop:
-        if not writer.finished:
-            done = max(0, writer.saved - 1) * request.save_every
-            stop.add_note(
-                f"{writer.partial} keeps {done} of {abs(request.num_steps)} steps: --resume goes "
-                "on with it"
-            )
-        raise
-    return Predicted(status, left_at, dt, time.perf_counter() - started, passed)
-
-
-def _finished(out: Path, dt: float) -> Predicted:
+def _finished(out: Path) -> Predicted:
     """Read the result of a prediction that is already there."""
     with np.load(out, allow_pickle=False) as done:
-        return Predicted(done["status"], done["left_at"], dt, 0.0, done.get("horizon"))
+        return Predicted(done["status"], done["left_at"], 0.0, done.get("horizon"))
 
 
-def _drawn(map_: SymplecticMap, count: int, z0, std, size: float | None) -> _Drawn:
-    """Draw the samples of a prediction, the same for the same model and initial states."""
-    try:
-        samples = map_.sample(jax.random.key(0), count)
-    except ValueError as error:
-        raise InputError(f"--samples: {error}") from error
-    begun = np.broadcast_to(z0, (count, *z0.shape))
-    of = "model"
-    if std is not None:
-        begun = begun + std * np.random.default_rng(1).normal(size=begun.shape)
-        of = "model and initial state"
-    return _Drawn(samples, begun, map_.angles_of_z, size, of)
+@dataclasses.dataclass(frozen=True)
+class _Prediction:
+    """A prediction: the map, and ``stepped``, itself or the same over devices; the samples drawn,
+    and what their band contains, as text."""
 
+    map: SymplecticMap
+    stepped: SymplecticMap | Sharded
+    drawn: Samples | Sharded | None
+    band: str
+    asked: Steps
+    output: Output
 
-def _go_on(
-    request: _Request, z0, params, writer: PredictionWriter, drawn: _Drawn | None, progress
-) -> Lanes:
-    """Compute all chunks that are not yet written; return the lanes after the last step."""
-    map_, save_every, stop_outside = request.stepped, request.save_every, request.stop_outside
-    of_samples = None
-    passed = np.full(len(z0), -1)
-    if writer.carry is None:
-        lanes = map_.start(z0, params=params, stop_outside=stop_outside)
-        states = z0[:, None]
-        if drawn is not None:
-            of_samples = drawn.samples.start(drawn.z0, params=params, stop_outside=stop_outside)
-            states, passed = _with_bands(drawn, states, drawn.z0[:, :, None], [0], passed)
-        writer.append(states, _carry(lanes, of_samples, passed))
-    else:
-        carry = {name: jax.device_put(value) for name, value in writer.carry.items()}
-        lanes = Lanes(**{name: carry[name] for name in Lanes._fields})
-        if drawn is not None:
-            of_samples = Lanes(**{name: carry[_OF_SAMPLES + name] for name in Lanes._fields})
-            passed = writer.carry["horizon"]
-    many = 1 if drawn is None else 1 + len(drawn.z0)
-    chunk = _chunk_length(z0.shape[0] * many, z0.shape[1], save_every)
-    options = {"params": params, "save_every": save_every, "stop_outside": stop_outside}
-    started, begun = time.perf_counter(), writer.saved
-    while writer.saved < writer.total:
-        progress.status(
-            f"step {(writer.saved - 1) * save_every} of {abs(request.num_steps)}"
-            + _time_left(time.perf_counter() - started, writer.saved - begun, writer)
+    def request(self, begin: _Begin, identity: dict[str, Any]) -> PredictionJob:
+        """Request of these lanes, for their file."""
+        parameters, params, own, drive = self.map.parameters, begin.params, None, None
+        if parameters is not None and params is not None:
+            names = parameters.names
+            own = names, params
+            if TIME in names:
+                drive = params[:, -1], float(np.asarray(parameters.period))
+                own = (names[:-1], params[:, :-1]) if len(names) > 1 else None
+        return PredictionJob(
+            identity,
+            begin.z0.shape,
+            self.asked.num_steps,
+            abs(float(self.map.dt)),
+            self.asked.save_every,
+            self.drawn is not None,
+            own,
+            drive,
         )
-        count = min(chunk, writer.total - writer.saved)
-        lanes, states = map_.advance(lanes, count, **options)
-        if drawn is not None and of_samples is not None:
-            of_samples, others = drawn.samples.advance(of_samples, count, **options)
-            steps = np.abs(writer.steps[writer.saved : writer.saved + count])
-            states, passed = _with_bands(drawn, states, others, steps, passed)
-        writer.append(states, _carry(lanes, of_samples, passed))
-    return lanes
 
+    def written(self, out: Path, begin: _Begin, identity: dict[str, Any]) -> Predicted:
+        """Predict these lanes into one file."""
+        output, asked = self.output, self.asked
+        job = self.request(begin, identity)
+        writer = PredictionWriter(out, job, resume=output.resume, overwrite=output.overwrite)
+        started = time.perf_counter()
+        if writer.finished:
+            return _finished(out)
+        try:
+            lanes = self._go_on(begin, writer)
+            output.progress.status(f"writing {out}")
+            status, left_at = np.asarray(lanes.status), np.asarray(lanes.left_at)
+            more: dict[str, Any] = {} if self.drawn is None else {"band": self.band}
+            passed = None
+            if asked.horizon is not None:
+                assert writer.carry is not None
+                passed = writer.carry["horizon"]
+                more |= {"horizon": passed, "horizon_size": asked.horizon}
+            writer.finish(status, left_at, **more)
+        except KeyboardInterrupt as stop:
+            if not writer.finished:
+                done = max(0, writer.saved - 1) * asked.save_every
+                stop.add_note(
+                    f"{writer.partial} keeps {done} of {abs(asked.num_steps)} steps: --resume goes "
+                    "on with it"
+                )
+            raise
+        return Predicted(status, left_at, time.perf_counter() - started, passed)
 
-def _time_left(seconds: float, done: int, writer: PredictionWriter) -> str:
-    """Message about the time left, at the rate of ``done`` saved states in these seconds."""
-    if not done:
-        return ""
-    return f", about {seconds * (writer.total - writer.saved) / done:.0f} s left"
+    def _go_on(self, begin: _Begin, writer: PredictionWriter) -> Lanes:
+        """Compute all chunks that are not yet written; return the lanes after the last step."""
+        asked, drawn, z0 = self.asked, self.drawn, begin.z0
+        options = {"params": begin.params, "stop_outside": asked.outside == "stop"}
+        of_samples, passed = None, np.full(len(z0), -1)
+        if writer.carry is None:
+            lanes, states = self.stepped.start(z0, **options), z0[:, None]
+            if drawn is not None and begin.of_samples is not None:
+                of_samples = drawn.start(begin.of_samples, **options)
+                others = begin.of_samples[:, :, None]
+                states, passed = self._with_bands(states, others, [0], passed)
+            writer.append(states, _carry(lanes, of_samples, passed))
+        else:
+            carry = {name: jax.device_put(value) for name, value in writer.carry.items()}
+            lanes = Lanes(**{name: carry[name] for name in Lanes._fields})
+            if drawn is not None:
+                of_samples = Lanes(**{name: carry[_OF_SAMPLES + name] for name in Lanes._fields})
+                passed = writer.carry["horizon"]
+        chunk = _chunk_length(z0.shape[0] * (1 + (asked.samples or 0)), z0.shape[1], asked)
+        options["save_every"] = asked.save_every
+        started, begun = time.perf_counter(), writer.saved
+        while writer.saved < writer.total:
+            done = writer.saved - begun
+            left = (time.perf_counter() - started) * (writer.total - writer.saved) / max(done, 1)
+            self.output.progress.status(
+                f"step {(writer.saved - 1) * asked.save_every} of {abs(asked.num_steps)}"
+                + (f", about {left:.0f} s left" if done else "")
+            )
+            count = min(chunk, writer.total - writer.saved)
+            lanes, states = self.stepped.advance(lanes, count, **options)
+            if drawn is not None and of_samples is not None:
+                of_samples, others = drawn.advance(of_samples, count, **options)
+                steps = np.abs(writer.steps[writer.saved : writer.saved + count])
+                states, passed = self._with_bands(states, others, steps, passed)
+            writer.append(states, _carry(lanes, of_samples, passed))
+        return lanes
 
-
-_OF_SAMPLES = "samples_"  # prefix of the samples' lanes in a carry
+    def _with_bands(self, states, others, steps, passed) -> tuple[np.ndarray, np.ndarray]:
+        """Join states with their std and quantiles (B, c, 5 · 2d); update the horizons (B,)."""
+        found = bands(others, states, self.map.angles_of_z)
+        if self.asked.horizon is not None:
+            passed = np.where(passed < 0, horizon(found.std, steps, self.asked.horizon), passed)
+        return np.concatenate([states, found.std, *found.quantiles], axis=-1), passed
 
 
 def _carry(lanes: Lanes, of_samples: Lanes | None, passed) -> dict[str, Any]:
@@ -330,16 +338,8 @@ def _carry(lanes: Lanes, of_samples: Lanes | None, passed) -> dict[str, Any]:
     return {**lanes._asdict(), **others, "horizon": passed}
 
 
-def _with_bands(drawn: _Drawn, states, others, steps, passed) -> tuple[np.ndarray, np.ndarray]:
-    """Join states with their std and quantiles (B, c, 5 · 2d); update the horizons (B,)."""
-    found = bands(others, states, drawn.angles)
-    if drawn.size is not None:
-        passed = np.where(passed < 0, horizon(found.std, steps, drawn.size), passed)
-    return np.concatenate([states, found.std, *found.quantiles], axis=-1), passed
-
-
-def _chunk_length(num_lanes: int, width: int, save_every: int) -> int:
+def _chunk_length(num_lanes: int, width: int, asked: Steps) -> int:
     """Number of saved states per chunk, a function of the job alone: a resumed job has the same."""
     by_memory = _CHUNK_BYTES // (8 * num_lanes * width)
-    by_operations = _CHUNK_LANE_STEPS // (num_lanes * save_every)
+    by_operations = _CHUNK_LANE_STEPS // (num_lanes * asked.save_every)
     return max(1, min(by_memory, by_operations))

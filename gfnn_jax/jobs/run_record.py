@@ -13,9 +13,9 @@ from gfnn_jax.data.recording import SECONDS, Recording, read
 from gfnn_jax.evaluate import report
 from gfnn_jax.evaluate.figures_of_laws import forecasts_figure
 from gfnn_jax.evaluate.forecasts import Forecasts, forecasts_along
-from gfnn_jax.jobs.fit_recording import Learned, fit_recording
-from gfnn_jax.jobs.progress import SILENT, Progress
-from gfnn_jax.jobs.written import REPORT
+from gfnn_jax.jobs.fit import fit_recording
+from gfnn_jax.jobs.output import REPORT, Output
+from gfnn_jax.jobs.output import Ran as Learned
 from gfnn_jax.storage.outputs import atomic_folder
 
 FIGURE = "forecasts.png"
@@ -31,15 +31,8 @@ class Ran(NamedTuple):
     held_out: Recording
 
 
-def run_record(
-    data: Path,
-    *,
-    out: Path,
-    columns: Mapping[str, Any],
-    progress: Progress = SILENT,
-    **options: Any,
-) -> Ran:
-    """Write the model, its report and the figures of law and forecasts into the folder ``out``.
+def run_record(data: Path, output: Output, *, columns: Mapping[str, Any], **options: Any) -> Ran:
+    """Write the model, its report and the figures of law and forecasts into the output's folder.
 
     columns: keywords of `gfnn_jax.read`. options: `FitOptions`. Raises InputError where the file is
     no recording, or its last third is too short to forecast.
@@ -48,17 +41,16 @@ def run_record(
     times = np.concatenate([whole.times(run) for run in whole.runs])
     end = float(times.min() + _PART * np.ptp(times))
     stop = end / SECONDS[whole.time_unit]
-    with atomic_folder(out) as folder:
+    with atomic_folder(output.out) as folder:
         learned = fit_recording(
             [data],
-            out=folder / "model",
+            Output(folder / "model", progress=output.progress),
             columns={**columns, "stop": stop},
-            progress=progress,
             **options,
         )
         map_ = learned.fit.map
         assert map_.sensors is not None
-        progress.line("forecasting the last third, which no fit has seen")
+        output.progress.line("forecasting the last third, which no fit has seen")
         held_out = whole.slice(start=np.nextafter(end, np.inf))
         half = max(np.ptp(held_out.times(run)) for run in held_out.runs) / 2
         ahead = [periods * 2 * np.pi / map_.sensors.omega for periods in _PERIODS]

@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.baselines import Sequences
-from gfnn_jax.jobs.measure import angles_of_z
-from gfnn_jax.jobs.rollouts import NUM_STEPS, NUM_TRAJECTORIES
+from gfnn_jax.jobs.measure import NUM_STEPS, NUM_TRAJECTORIES, angles_of_z
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
 from gfnn_jax.scenes.draws import sample_pairs, sample_sequences, sample_test_states

@@ -10,15 +10,6 @@ from gfnn_jax.errors import InputError
 _ANGLES = ("deg", "°", "rad")  # begins of the units that `read` turns into radians
 
 
-def units_of(recording: Recording) -> dict[str, Any]:
-    """Entries of a model's job that `read_in_units` and `refuse_other_units` need."""
-    return {
-        "degrees": [name for name, factor in recording.factors.items() if factor != 1],
-        "time_unit": recording.time_unit,
-        "units": {name: recording.unit(name) for name in recording.columns},
-    }
-
-
 def read_in_units(path: Any, job: dict[str, Any], roles: dict[str, Any]) -> Recording:
     """Read a recording in the units of its header and, where that is silent about times or about
     degrees, in those of the recording that the model was learned from.

@@ -1,0 +1,103 @@
+"""Output of a job: where it goes, what may stand there, its progress; a model with its record."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import shutil
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.errors import InputError
+from gfnn_jax.evaluate import report
+from gfnn_jax.jobs.progress import SILENT, Progress
+from gfnn_jax.learn.fitted import Fit
+from gfnn_jax.learn.saved import save
+from gfnn_jax.maps import saved
+from gfnn_jax.phase_space import Pairs
+from gfnn_jax.storage.outputs import atomic_folder
+from gfnn_jax.storage.partial import unfinished
+
+REPORT, MODEL = "report.json", "model"
+
+
+@dataclasses.dataclass(frozen=True)
+class Output:
+    """Output of a job.
+
+    out: the file or folder that it writes. overwrite: replace what is there. resume: go on with an
+    unfinished job; one that is done is known again. progress: shows its messages.
+    """
+
+    out: Path
+    overwrite: bool = False
+    resume: bool = False
+    progress: Progress = SILENT
+
+    def unfinished(self, job: dict[str, Any]) -> AbstractContextManager[Path]:
+        """Open the folder in which this job keeps its work (`storage.partial.unfinished`)."""
+        return unfinished(
+            self.out, job, what=job["command"], overwrite=self.overwrite, resume=self.resume
+        )
+
+    def holds(self, job: dict[str, Any], model: str = ".") -> bool:
+        """Return whether a resumed job had already finished, by the record of its model."""
+        folder = self.out / model
+        return self.resume and folder.is_dir() and _recorded(folder, "job") == job
+
+
+class Ran(NamedTuple):
+    """Result of a job: the fit, the folder where it was written, and its report."""
+
+    fit: Fit
+    out: Path
+    report: dict[str, Any]
+
+
+def write(folder: Path, model: Path, fit: Fit, result: dict[str, Any], job: dict[str, Any]) -> None:
+    """Write the fit into the folder ``model``, and its report into ``folder``."""
+    save(fit, model, record={"job": job, **report.finite(result)})
+    (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
+
+
+def publish(best: Path, model: Path) -> str:
+    """Copy the best map of an interrupted fit into the folder ``model``; return a message or "".
+
+    An existing folder is left as it is, unless the same fit, interrupted before, wrote it.
+    """
+    if not best.is_dir():
+        return ""
+    if model.exists() and _recorded(model, "unfinished") != _recorded(best, "unfinished"):
+        return f"{model} is as it was before; the best map so far is in {best}"
+    with atomic_folder(model) as folder:
+        shutil.copytree(best, folder, dirs_exist_ok=True)
+    return f"the best map so far is in {model} and can be used"
+
+
+def _recorded(model: Path, what: str) -> Any:
+    """A part of a model's record; None where it has none."""
+    try:
+        return saved.record(model).get(what)
+    except InputError:
+        return None
+
+
+def pairs_digest(pairs: Pairs) -> str:
+    """SHA-256 of the pairs' states, and of the parameters where there are any."""
+    digest = hashlib.sha256(np.ascontiguousarray(pairs.z0).data)
+    for array in (pairs.z1, *(pairs.args or {}).values()):
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def units_of(recording: Recording) -> dict[str, Any]:
+    """Entries of a model's job by which another recording is read in its units (`units`)."""
+    return {
+        "degrees": [name for name, factor in recording.factors.items() if factor != 1],
+        "time_unit": recording.time_unit,
+        "units": {name: recording.unit(name) for name in recording.columns},
+    }
