@@ -166,8 +166,8 @@ class _StatesInText:
 
     def _check_constant(self, values: np.ndarray, sequence: np.ndarray, begin: int) -> None:
         """Raises InputError where a parameter (n, k) changes within a sequence."""
-        same = np.diff(sequence) == 0
-        changes = (np.diff(values, axis=0) != 0) & same[:, None]
+        same = np.asarray(np.diff(sequence) == 0)
+        changes = (np.diff(values, axis=0) != 0) & same.reshape(-1, 1)
         bad = changes.any(axis=1) | ~np.isfinite(values).all(axis=1)[1:]
         if bad.any():
             row = int(np.argmax(bad)) + 1
