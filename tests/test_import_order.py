@@ -71,7 +71,6 @@ SHORTHANDS = {
 }
 SHORTHANDS |= {
     ("data.recording", "data.recording_summary"),
-    ("data.recording_summary", "data.summary_screen"),
     ("learn.fitted", "learn.accelerate"),
     ("learn.fitted", "learn.saved"),
     ("learn.fitted", "evaluate.law_report"),

@@ -166,9 +166,8 @@ class _StatesInText:
 
     def _check_constant(self, values: np.ndarray, sequence: np.ndarray, begin: int) -> None:
         """Raises InputError where a parameter (n, k) changes within a sequence."""
-        same = np.asarray(np.diff(sequence) == 0)
-        changes = (np.diff(values, axis=0) != 0) & same.reshape(-1, 1)
-        bad = changes.any(axis=1) | ~np.isfinite(values).all(axis=1)[1:]
+        changes = np.any(np.diff(values, axis=0) != 0, axis=1) & (np.diff(sequence) == 0)
+        bad = changes | ~np.isfinite(values[1:]).all(axis=1)
         if bad.any():
             row = int(np.argmax(bad)) + 1
             now, before = (", ".join(f"{v:g}" for v in values[r]) for r in (row, row - 1))

@@ -1,13 +1,17 @@
-"""The summary of a recording: what its samples tell before anything is fitted."""
+"""The summary of a recording: what its samples tell before anything is fitted; on one screen."""
 
 from __future__ import annotations
 
 import dataclasses
+import io
 import shlex
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich.console import Console, Group
+from rich.table import Table
+from rich.text import Text
 
 from gfnn_jax.data.faults import WRONG, Fault, faults
 from gfnn_jax.data.roles import ROLES
@@ -21,8 +25,24 @@ from gfnn_jax.signals.steps import gaps
 if TYPE_CHECKING:
     from gfnn_jax.data.recording import Recording
 
-_RELATED = 0.8  # of a column's variance that a derivative must explain
-_OF_NOISE_WINDOW = 12  # samples that tell a polynomial of degree 5 about as well as all of them
+_NOTEBOOK = '<pre style="line-height:normal;white-space:pre">{code}</pre>'
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shown:
+    """width: of the screen, in characters. most: columns (twice as many), faults or runs shown.
+    unknown_loss: standard error of a loss per period, above which its absence is not reported.
+    related: part of a column's variance that a derivative must explain. window: samples that tell a
+    polynomial of degree 5 about as well as all of them."""
+
+    width: int = 110
+    most: int = 12
+    unknown_loss: float = 0.02
+    related: float = 0.8
+    window: int = 12
+
+
+_SHOWN = _Shown()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,20 +132,20 @@ class RecordingSummary:
         }
         return _without_nan(plain)
 
-    def __rich__(self):
-        from gfnn_jax.data.summary_screen import screen
+    def __rich__(self) -> Group:
+        return _screen(self)
 
-        return screen(self)
+    def _printed(self) -> Console:
+        # A notebook would take it for its own display.
+        console = Console(file=io.StringIO(), width=_SHOWN.width, record=True, force_jupyter=False)
+        console.print(_screen(self))
+        return console
 
     def __str__(self) -> str:
-        from gfnn_jax.data.summary_screen import as_text
-
-        return as_text(self)
+        return self._printed().export_text().rstrip()
 
     def _repr_html_(self) -> str:
-        from gfnn_jax.data.summary_screen import as_html
-
-        return as_html(self)
+        return self._printed().export_html(inline_styles=True, code_format=_NOTEBOOK)
 
 
 def _without_nan(value: Any) -> Any:
@@ -211,7 +231,7 @@ def _motion(known: Traits) -> tuple[float | None, energy.Loss | None]:
 def _coarsest(known: Traits) -> float | None:
     """The step, in s, at which a window that the noise allows still has enough samples."""
     sizes = [known.noise[name].size for name in known.recording.positions]
-    return known.step * max(min(sizes) // _OF_NOISE_WINDOW, 1) if sizes else None
+    return known.step * max(min(sizes) // _SHOWN.window, 1) if sizes else None
 
 
 def _column(known: Traits, name: str) -> Column:
@@ -262,7 +282,7 @@ def _derivative_of(known: Traits, name: str):
     if name in recording.positions:
         return None, None
     related = [(of, known.relation(of, name)) for of in recording.positions]
-    good = [(of, r) for of, r in related if r is not None and r.explained > _RELATED]
+    good = [(of, r) for of, r in related if r is not None and r.explained > _SHOWN.related]
     return max(good, key=lambda pair: pair[1].explained, default=(None, None))
 
 
@@ -297,3 +317,115 @@ def as_typed(options: Mapping[str, Any]) -> str:
             value = ",".join(map(str, value))
         parts.append(f" --{words.get(option, option)} {shlex.quote(str(value))}")
     return "".join(parts)
+
+
+# The screen.
+
+
+def _screen(summary: RecordingSummary) -> Group:
+    """Screen that `gfnn look` prints."""
+    lines = [Text(line) for line in (_samples(summary), _times(summary), _moving(summary)) if line]
+    found = [_fault(fault) for fault in summary.faults[: _SHOWN.most]]
+    more = len(summary.faults) - _SHOWN.most
+    found += [Text(f"and {more} more")] if more > 0 else []
+    return Group(*lines, _columns(summary), *found, Text(f"next: {summary.command}"))
+
+
+def _samples(summary: RecordingSummary) -> str:
+    counts = [count for count, _, _ in summary.runs.values()]
+    spans = [end - begin for _, begin, end in summary.runs.values()]
+    names = ", ".join([*summary.runs][: _SHOWN.most]) + ", …" * (len(counts) > _SHOWN.most)
+    runs = f"{len(counts)} run{'s' * (len(counts) > 1)}"
+    of = f"{sum(counts)} samples in {sum(spans):.4g} s"
+    each = f" ({min(counts)} to {max(counts)} samples each: {names})" if len(counts) > 1 else ""
+    return f"{summary.source}: {runs}, {of}{each}"
+
+
+def _times(summary: RecordingSummary) -> str:
+    low, usual, high = summary.steps
+    even = high - low < 1e-3 * usual
+    steps = f"{usual:.6g} s" if even else f"{usual:.6g} s, {low:.4g} to {high:.4g}"
+    holes = summary.gaps
+    if not holes:
+        return f"steps: {steps}; no gaps"
+    run, begin, end = max(holes, key=lambda hole: hole[2] - hole[1])
+    longest = f"the longest {end - begin:.3g} s at {begin:.5g} s"
+    return f"steps: {steps}; {len(holes)} gaps, {longest}" + f" of run {run}" * (
+        len(summary.runs) > 1
+    )
+
+
+def _moving(summary: RecordingSummary) -> str:
+    if summary.period is None:
+        return ""
+    per = summary.period / summary.dt_median
+    parts = [f"motion: mean period {summary.period:.4g} s, {per:.3g} samples"]
+    if summary.coarsest and summary.coarsest > 1.5 * summary.dt_median:
+        parts.append(f"steps of {summary.coarsest:.3g} s would suffice")
+    return "; ".join([*parts, _loss(summary)])
+
+
+def _loss(summary: RecordingSummary) -> str:
+    loss = summary.loss
+    if loss is None:
+        return "friction: not estimated, for the samples allow no balance of energy"
+    beside = " beside what the inputs supply" if summary.driven else ""
+    size = f"{100 * abs(loss.per_period):.2g} ± {100 * loss.error:.1g} % of the energy per period"
+    if not loss.significant and loss.error > _SHOWN.unknown_loss:
+        return f"friction{beside} not determined ({size})"
+    if not loss.significant:
+        return f"no friction found{beside} ({size})"
+    if loss.per_period < 0:
+        return f"a gain of {size}{beside}: a drive is missing (--inputs)"
+    kind = f"; {loss.kind} friction fits best" if loss.kind else ""
+    return f"friction takes {size}{beside}{kind}"
+
+
+def _columns(summary: RecordingSummary) -> Table:
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
+    for head in ("column", "role", "from", "to", "unit", "resolution", "noise σ", "Hz", "remarks"):
+        table.add_column(head, justify="right" if head in ("from", "to", "noise σ") else "left")
+    for column in summary.columns[: 2 * _SHOWN.most]:
+        table.add_row(
+            column.name,
+            column.role,
+            f"{column.low:.4g}",
+            f"{column.high:.4g}",
+            column.unit,
+            _digits(column.resolution),
+            _digits(column.sigma),
+            " ".join(f"{f:.3g}" for f in column.frequencies),
+            _remarks(column),
+            style="dim" if column.role == "ignored" else None,
+        )
+    return table
+
+
+def _digits(value: float | None) -> str:
+    return "" if value is None else f"{value:.2g}"
+
+
+def _remarks(column: Column) -> str:
+    parts = ["angle"] if column.angle else []
+    if column.sigma is not None and not column.white:
+        parts.append("coloured noise")
+    if column.sigma and column.resolution and column.resolution > 0.25 * column.sigma:
+        parts.append("quantised")
+    if column.derivative_of is not None and column.factor is not None:
+        late = f", lag {1e3 * column.lag:.2g} ms" if column.lag is not None else ""
+        parts.append(f"{column.factor:.3g} × d{column.derivative_of}/dt{late}")
+    if column.missing:
+        parts.append(f"{column.missing} missing")
+    if column.outliers:
+        parts.append(f"{column.outliers} outlier{'s' * (column.outliers > 1)}")
+    if column.stuck:
+        parts.append(f"{column.stuck} stuck")
+    return ", ".join(parts)
+
+
+def _fault(fault) -> Text:
+    text = Text(
+        f"wrong ({fault.kind}): " if fault.wrong else "note: ",
+        style="bold red" if fault.wrong else "yellow",
+    )
+    return text.append(str(fault), style="not bold default")

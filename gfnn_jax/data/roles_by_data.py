@@ -9,11 +9,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.signals.derivatives import derivatives
+from gfnn_jax.signals.derivatives import NARROWEST, derivatives
 from gfnn_jax.signals.noise import noise
 
 _LIKE = 0.85  # likeness of a column to the derivative of another, that tells
-_NARROWEST = 7  # samples of a window for derivatives
 _MOST = 12  # columns
 
 Runs = Mapping[str, tuple[np.ndarray, dict[str, np.ndarray]]]
@@ -59,7 +58,7 @@ def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tupl
     """(position, velocity), the most alike first taken, in the order of the columns."""
     names, table = list(columns), np.stack(list(columns.values()))
     noises = noise(times, table)
-    size = max(min(n.size for n in noises) // 2, _NARROWEST)
+    size = max(min(n.size for n in noises) // 2, NARROWEST)
     local = derivatives(times, table, size, [n.sigma for n in noises])
     if local is None:
         return []

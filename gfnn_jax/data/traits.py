@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gfnn_jax.data.wrong_values import WrongValues, wrong_values_of
-from gfnn_jax.signals.derivatives import Derivatives, Relation, derivatives
+from gfnn_jax.signals.derivatives import NARROWEST, Derivatives, Relation, derivatives
 from gfnn_jax.signals.noise import Noise, noise, resolution
 from gfnn_jax.signals.steps import median_step
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from gfnn_jax.data.recording import Recording
 
 _MOST_IGNORED = 8  # columns without a role that are looked at
-_NARROWEST = 7  # samples of a window for derivatives
 _MOST_GONE = 0.5  # of the rows; where more lack a position, columns take turns, and all rows count
 
 
@@ -48,6 +47,19 @@ class Traits:
         if self.local is None or not {of, name} <= set(self.moving):
             return None
         return self.local.relation(self.moving.index(of), self.moving.index(name))
+
+    def range(self, name: str) -> tuple[float, float]:
+        """The smallest and the largest value of a column, NaN where it has none."""
+        known = self.columns[name][np.isfinite(self.columns[name])]
+        return (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
+
+    def raw(self, name: str) -> list[np.ndarray]:
+        """A column as it came, in radians, without what is missing or wrong, run by run."""
+        recording = self.recording
+        if wrong := [stretch.rows for stretch in self.wrong.get(name, ())]:
+            recording = recording.without({name: np.concatenate(wrong)})
+        found = [recording.values(name, run) for run in recording.runs]
+        return [x[np.isfinite(x)] for x in found]
 
     def by_run(self, name: str) -> list[np.ndarray]:
         """A column of `columns`, (n_r,) of each run."""
@@ -85,26 +97,15 @@ def traits(recording: Recording) -> Traits:
             found = noise(sound_times, np.stack([columns[n][sound] for n in group]), by)
             noises |= dict(zip(group, found, strict=True))
     positions = [noises[n].size for n in recording.positions]
-    size = max(min(positions, default=0) // 2, _NARROWEST)
+    size = max(min(positions, default=0) // 2, NARROWEST)
     moving = tuple(driven)
     local = None
     if moving:
         sigmas = [noises[n].sigma for n in moving]
         table = np.stack([columns[n][sound] for n in moving])
         local = derivatives(sound_times, table, size, sigmas)
-    return Traits(
-        recording,
-        times,
-        columns,
-        wrong,
-        seen,
-        sound,
-        noises,
-        steps,
-        moving,
-        local,
-        median_step(times),
-    )
+    step = median_step(times)
+    return Traits(recording, times, columns, wrong, seen, sound, noises, steps, moving, local, step)
 
 
 def of_rows(times: list[np.ndarray], rows: np.ndarray) -> list[np.ndarray]:

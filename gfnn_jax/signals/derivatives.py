@@ -18,6 +18,7 @@ import numpy as np
 
 from gfnn_jax.signals.local_polynomials import LocalFits, local_fits
 
+NARROWEST = 7  # samples of a window for derivatives
 _DEGREE = 3
 _FEWEST = 12  # windows
 

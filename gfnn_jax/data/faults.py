@@ -1,0 +1,564 @@
+"""Mistakes in a recording that its own data show: columns against each other, times, sensors.
+
+Each check yields faults, one line each: what was found, and what mends it. A fault is *wrong* where
+the recording cannot be learned from as it is read; the others are notes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy import signal
+
+from gfnn_jax.data.columns import SECONDS
+from gfnn_jax.data.traits import Traits
+from gfnn_jax.data.wrong_values import in_words
+from gfnn_jax.signals.derivatives import Relation, difference
+from gfnn_jax.signals.local_polynomials import local_fits
+from gfnn_jax.signals.steps import drift
+
+TURN = 2 * np.pi
+WRONG = (
+    "constant",
+    "repeated",
+    "order",
+    "time unit",
+    "no derivative",
+    "degrees",
+    "sign",
+    "factor",
+    "wrapped",
+    "interpolated jump",
+    "clipped",
+    "drifting clock",
+    "different systems",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Thresholds of the checks, chosen on recordings of test systems with and without mistakes
+    (`benchmarks/random_recordings.py`, tests of mistakes).
+
+    wide: step of an angle, in rad, that may as well be one the other way round. swing: in rad,
+    beyond which the unit of an angle that swings is doubted. flat: equal extremes in a row that a
+    sensor's limit makes. drift: relative change of the step over a run. derivative: part of a
+    velocity's variance that the position's derivative must explain. better: score by which other
+    pairs of columns must be better than the declared ones. near: relative, to a factor like 180/π
+    or 1000. off: logarithm of a factor that no filter makes. filtered: deviation of a factor from
+    1, and late: steps of lag, that are reported.
+
+    For different systems: most runs, fewest windows of a run, windows fitted or judged together; a
+    run moves by another law where the common fit misses its accelerations by ``worse`` times its
+    own residual, and by ``missed`` of their spread. ridge: of the fits.
+    """
+
+    wide: float = 0.75 * np.pi
+    swing: float = 2 * TURN
+    flat: int = 3
+    drift: float = 5e-3
+    derivative: float = 0.8
+    better: float = 0.25
+    near: float = 0.1
+    off: float = 0.2
+    filtered: float = 0.03
+    late: float = 0.4
+    most_runs: int = 40
+    fewest_windows: int = 40
+    block: int = 8
+    worse: float = 6.0
+    missed: float = 0.04
+    ridge: float = 1e-8
+
+
+_OPTIONS = _Options()
+
+
+@dataclasses.dataclass(frozen=True)
+class Fault:
+    """A mistake in a recording.
+
+    kind: one of WRONG, or of a note. message: what was found. remedy: what mends it, "" for nothing
+    to do. options: those of `gfnn_jax.read` that do, if any. wrong: whether a fit must not begin.
+    """
+
+    kind: str
+    message: str
+    remedy: str = ""
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    wrong: bool = True
+
+    def __str__(self) -> str:
+        return f"{self.message}. {self.remedy}" if self.remedy else self.message
+
+
+def faults(traits: Traits) -> tuple[Fault, ...]:
+    """All mistakes that are found, the wrong ones first."""
+    found = [fault for check in _CHECKS for fault in check(traits)]
+    return tuple(sorted(found, key=lambda fault: not fault.wrong))
+
+
+def _note(kind: str, message: str, remedy: str = "", options: Mapping[str, Any] | None = None):
+    return Fault(kind, message, remedy, options or {}, wrong=False)
+
+
+def _typed(names: Sequence[str] | str) -> str:
+    """Names as one word of a command line."""
+    return shlex.quote(names if isinstance(names, str) else ",".join(names))
+
+
+# Columns that a sensor did not measure, or measured badly.
+
+
+def _constant(traits: Traits) -> Iterator[Fault]:
+    recording = traits.recording
+    for role in ("positions", "velocities", "momenta", "inputs"):
+        for name in getattr(recording, role):
+            low, high = traits.range(name)
+            if low == high:
+                shown = f"{low / recording.factors[name]:g} {recording.unit(name)}".rstrip()
+                found = f"{name} is {shown} in all rows"
+                remedy = f"Leave it out of --{role}"
+                yield Fault("constant", found, remedy, wrong=role != "inputs")
+
+
+def _repeated(traits: Traits) -> Iterator[Fault]:
+    for one, other in itertools.combinations(traits.recording.columns, 2):
+        low, high = traits.range(one)
+        if low < high and np.array_equal(
+            traits.columns[one], traits.columns[other], equal_nan=True
+        ):
+            found = f"{one} and {other} are equal in all rows"
+            yield Fault("repeated", found, f"Leave {other} out")
+
+
+def _clipped(traits: Traits) -> Iterator[Fault]:
+    """Columns that stay at their very extreme, entering it by steps that a smooth turn has not."""
+    recording = traits.recording
+    for name in (*recording.positions, *recording.velocities):
+        low, high = traits.range(name)
+        if name in recording.angles and high - low > 0.95 * TURN:
+            continue
+        least = max(
+            4 * (traits.resolution[name] or 0.0), 1e-9 * float(np.nanstd(traits.columns[name]))
+        )
+        for extreme in (low, high):
+            count = sum(_flats(x, extreme, least) for x in traits.by_run(name))
+            if count > 1:
+                shown = f"{extreme / recording.factors[name]:.6g} {recording.unit(name)}".rstrip()
+                found = f"{name} saturates: {count} times it stays at its extreme, {shown}"
+                yield Fault(
+                    "clipped", found, "Leave these samples out: --from, --to, or NaN in them"
+                )
+
+
+def _flats(x: np.ndarray, extreme: float, step: float) -> int:
+    """Stretches of equal extremes whose neighbours are more than a step away."""
+    at = np.concatenate([[False], x == extreme, [False]])
+    begins, ends = np.flatnonzero(at[1:] & ~at[:-1]), np.flatnonzero(~at[1:] & at[:-1])
+    count = 0
+    for begin, end in zip(begins, ends, strict=True):
+        sides = [abs(x[k] - extreme) for k in (begin - 1, end) if 0 <= k < len(x)]
+        count += int(end - begin >= _OPTIONS.flat and max(sides, default=0.0) > step)
+    return count
+
+
+def _missing(traits: Traits) -> Iterator[Fault]:
+    recording = traits.recording
+    for name in recording.columns:
+        of_runs = zip(recording.runs, traits.by_run(name), strict=True)
+        gone = [run for run, x in of_runs if not np.isfinite(x).any()]
+        cells = int(np.sum(~np.isfinite(traits.columns[name])))
+        if gone:
+            yield _note("missing column", f"{name} has no values in run {', '.join(gone[:8])}")
+        elif cells:
+            rows = "1 row, which is" if cells == 1 else f"{cells} rows, which are"
+            yield _note("missing", f"{name} has no value in {rows} not used for it")
+
+
+def _wrong_values(traits: Traits) -> Iterator[Fault]:
+    """Sensors that repeat one value while the motion goes on, and samples far from where those
+    around them lead."""
+    each = (in_words(traits.recording, name, of) for name, of in traits.wrong.items())
+    told = [one for of_column in each for one in of_column]
+    for kind in ("stuck", "outliers"):
+        for one in told:
+            if one.kind == kind:
+                yield _note(kind, one.text, "Left out of a fit")
+
+
+# Velocities that are not the derivatives of their positions.
+
+
+def _related(traits: Traits) -> Iterator[Fault]:
+    """The pairs of position and velocity: columns in another order, or factors that mend one."""
+    recording = traits.recording
+    still = {name for name in recording.columns if np.ptp(traits.range(name)) == 0}
+    excluded = still | recording.explained  # what a sensor shows is fitted with the law
+    pairs = zip(recording.positions, recording.velocities, strict=False)
+    declared = [p for p in pairs if not excluded & set(p) and not _leaps(traits, p[0])]
+    known = {pair: r for pair in declared if (r := traits.relation(*pair)) is not None}
+    if not known or len(known) < len(declared):
+        return
+    other = _other_order(traits, declared)
+    if other is not None:
+        positions, velocities = zip(*other, strict=True)
+        finding = ", ".join(f"{v} is the derivative of {x}" for x, v in other)
+        yield Fault(
+            "order",
+            f"the columns are in another order than their names say: {finding}",
+            f"--positions {_typed(positions)} --velocities {_typed(velocities)}",
+            {"positions": positions, "velocities": velocities},
+        )
+        return
+    unit = _time_unit(recording.time_unit, [relation.factor for relation in known.values()])
+    if unit is not None:
+        finding = ", ".join(f"{v} is {r.factor:.4g} × d{x}/dt" for (x, v), r in known.items())
+        remedy = f"The times are in {unit}: --time-unit {unit}"
+        yield Fault("time unit", finding, remedy, {"time_unit": unit})
+        return
+    for (x, v), relation in known.items():
+        yield from _of_pair(traits, x, v, relation)
+
+
+def _leaps(traits: Traits, x: str) -> bool:
+    """Return whether a column that jumps by turns has not been lifted, so that it has no
+    derivative."""
+    found = _jumps(traits, x)
+    return found is not None and not (x in traits.recording.angles and found[0] < 10)
+
+
+def _other_order(traits: Traits, declared: list[tuple[str, str]]) -> list[tuple[str, str]] | None:
+    """The pairs of the same columns that fit much better than the declared ones, or None."""
+    if not 1 <= len(declared) <= 3:
+        return None
+    names = [name for pair in declared for name in pair]
+    related = {pair: traits.relation(*pair) for pair in itertools.permutations(names, 2)}
+    scores = {pair: 0.0 if r is None else r.likeness for pair, r in related.items()}
+    best = max(_pairings(names), key=lambda pairs: sum(scores[pair] for pair in pairs))
+    gain = sum(scores[pair] for pair in best) - sum(scores[pair] for pair in declared)
+    good = gain > _OPTIONS.better and all(scores[pair] > 0.9 for pair in best)
+    if not good or set(best) == set(declared):
+        return None
+    return sorted(best, key=lambda pair: names.index(pair[0]))
+
+
+def _pairings(names: list[str]) -> Iterator[list[tuple[str, str]]]:
+    """All ways to make ordered pairs of an even number of names."""
+    if not names:
+        yield []
+        return
+    first = names[0]
+    for other in names[1:]:
+        for pairs in _pairings([name for name in names[1:] if name != other]):
+            yield [(first, other), *pairs]
+            yield [(other, first), *pairs]
+
+
+def _time_unit(unit: str, factors: list[float]) -> str | None:
+    """The unit of time that makes all velocities derivatives, if factors are a power of 1000."""
+    power = np.round(np.log10(np.abs(factors)) / 3) * 3
+    near = np.abs(np.array(factors) / 10.0**power - 1) < _OPTIONS.near
+    if not near.all() or len(set(power)) > 1 or power[0] == 0:
+        return None
+    second = SECONDS[unit] / 10.0 ** power[0]
+    return next((name for name, s in SECONDS.items() if np.isclose(s, second)), None)
+
+
+def _of_pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
+    factor, degree, near = relation.factor, 180 / np.pi, _OPTIONS.near
+    positions = traits.recording.positions
+    without = f"or ignore {v}: --positions {_typed(positions)}"
+    alone, typed = {"positions": positions}, _typed(v)
+    finding = f"{v} is {factor:.4g} × d{x}/dt"
+    if relation.explained < _OPTIONS.derivative:
+        part = f"{100 * relation.explained:.0f} % of its variance"
+        finding = f"{v} is not the derivative of {x}: d{x}/dt explains {part}"
+        remedy = f"Name {v} as an input (--inputs {typed}), {without}"
+        yield Fault("no derivative", finding, remedy, alone)
+    elif abs(factor * degree - 1) < near:
+        remedy = f"The unit of {x} is degrees: --degrees {_typed(x)}"
+        yield Fault("degrees", finding, remedy, {"degrees": (x,)})
+    elif abs(factor / degree - 1) < near:
+        remedy = f"The unit of {v} is degrees per second: --degrees {typed}"
+        yield Fault("degrees", finding, remedy, {"degrees": (v,)})
+    elif abs(factor + 1) < near:
+        yield Fault("sign", finding, f"Change the sign of {v} in the file, {without}", alone)
+    elif factor < 0 or abs(np.log(factor)) > _OPTIONS.off:
+        remedy = f"Check its unit, fit its scale (--scale {typed}), {without}"
+        yield Fault("factor", finding, remedy, alone)
+    else:
+        yield from _derived(traits, x, v, relation)
+
+
+def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
+    """Notes about a velocity that was made of the position."""
+    alone = {"positions": traits.recording.positions}
+    without = f"To ignore {v}: --positions {_typed(traits.recording.positions)}"
+    kind = difference(traits.times, traits.columns[x], traits.columns[v])
+    if kind is not None:
+        found = f"{v} is the {kind} difference of {x} and adds no information"
+        yield _note("difference", found, without, alone)
+        return
+    error = max(5 * relation.factor_error, _OPTIONS.filtered)
+    late = max(5 * relation.lag_error, _OPTIONS.late * traits.step)
+    if abs(relation.factor - 1) > error or abs(relation.lag) > late:
+        found = (
+            f"{v} looks filtered: it is {relation.factor:.3g} × d{x}/dt with a lag of "
+            f"{1e3 * relation.lag:.2g} ms"
+        )
+        yield _note("filtered", found, without, alone)
+
+
+# Angles in other units, wrapped angles, and jumps that interpolation has cut.
+
+
+def _jumps(traits: Traits, name: str) -> tuple[float, int] | None:
+    """(2π or 360, how often) where a column that was not lifted jumps by a turn, and else moves by
+    much less; None where it does not."""
+    raw = traits.raw(name)
+    steps = _steps(raw)
+    for turn in (TURN, 360.0):
+        near = np.abs(steps - turn) < 0.1 * turn
+        others = np.sum((steps > 0.3 * turn) & ~near)
+        small = len(steps) > 0 and np.quantile(steps, 0.9) < 0.2 * turn
+        if near.sum() > 2 * others and small and np.ptp(np.concatenate(raw)) < 1.1 * turn:
+            return turn, int(near.sum())
+    return None
+
+
+def _steps(runs: list[np.ndarray]) -> np.ndarray:
+    """The sizes of the steps between neighbours."""
+    return np.abs(np.concatenate([np.diff(x) for x in runs]))
+
+
+def _angles(traits: Traits) -> list[str]:
+    """Positions that are angles; a coordinate that no column shows directly is none of them."""
+    return [name for name in traits.recording.positions if name in traits.recording.angles]
+
+
+def _units_of_angles(traits: Traits) -> Iterator[Fault]:
+    """Angles whose jumps, or whose swings, are too wide for radians."""
+    recording = traits.recording
+    for name in _angles(traits):
+        if recording.factors[name] != 1 or name in recording.explained:
+            continue
+        option, degrees = {"degrees": (name,)}, f"--degrees {_typed(name)}"
+        raw = traits.raw(name)
+        jump, swing = _jumps(traits, name), _swing(raw)
+        wide = swing > _OPTIONS.swing and np.ptp(np.concatenate(raw)) < 720
+        if jump is not None and jump[0] == 360:
+            found = f"{name} jumps by 360 ({jump[1]} times)"
+            yield Fault("degrees", found, f"Its unit is degrees: {degrees}", option)
+        elif wide and not _settled(traits, name):
+            found = f"{name} swings by {swing:.3g}, degrees or {swing / TURN:.0f} turns in radians"
+            remedy = f"If degrees: {degrees}. If radians: --angles {_typed(recording.angles)}"
+            yield Fault("degrees", found, remedy, option)
+
+
+def _settled(traits: Traits, name: str) -> bool:
+    """Return whether a velocity, or the file's unit, has told the unit of this angle already."""
+    recording = traits.recording
+    place = recording.positions.index(name)
+    unit = recording.units.get(name, "")
+    return place < len(recording.velocities) or unit.startswith("rad") or recording.angles_given
+
+
+def _swing(runs: list[np.ndarray]) -> float:
+    """The median way between turning points, the ends of runs among them; 0 where nothing turns."""
+    ways = [np.empty(0)]
+    for x in runs:
+        prominence = 0.05 * np.ptp(x) if len(x) else 0.0
+        if prominence > 0:
+            turns = [signal.find_peaks(sign * x, prominence=prominence)[0] for sign in (1, -1)]
+            found = np.sort(np.concatenate(turns))
+            ways.append(np.abs(np.diff(x[[0, *found, -1]] if len(found) else [])))
+    every = np.concatenate(ways)
+    return float(np.median(every)) if len(every) else 0.0
+
+
+def _wraps(traits: Traits) -> Iterator[Fault]:
+    """Positions that jump by a turn and were not called angles."""
+    for name in traits.recording.positions:
+        jump = None if name in traits.recording.angles else _jumps(traits, name)
+        if jump is not None:
+            option = "degrees" if jump[0] == 360 else "angles"
+            found = f"{name} jumps by {jump[0]:.3g} ({jump[1]} times)"
+            remedy = f"Name it as an angle: --{option} {_typed(name)}"
+            yield Fault("wrapped", found, remedy, {option: (name,)})
+
+
+def _interpolated_jumps(traits: Traits) -> Iterator[Fault]:
+    """Wrapped angles that were interpolated across their jump: a few steps make a whole turn."""
+    for name in _angles(traits):
+        count = sum(_cuts(x) for x in traits.raw(name))
+        if count:
+            jump = "1 jump by a turn takes" if count == 1 else f"{count} jumps by a turn take"
+            found = f"{name} was resampled across its wraps: {jump} several samples"
+            remedy = "Unwrap the angle before resampling, or resample its sine and cosine"
+            yield Fault("interpolated jump", found, remedy)
+
+
+def _cuts(x: np.ndarray) -> int:
+    """Jumps of one turn that are spread over 2 to 6 steps."""
+    if len(x) < 16 or np.ptp(x) > 1.02 * TURN:
+        return 0
+    steps = np.diff(x)
+    usual = np.median(np.abs(np.angle(np.exp(1j * steps))))
+    small = max(6 * usual, 1e-3 * TURN)
+    if small > 0.12 * TURN:  # a coarse motion makes such steps by itself
+        return 0
+    found = np.zeros(len(steps), bool)
+    for count in range(2, 7):
+        windows = np.lib.stride_tricks.sliding_window_view(steps, count)
+        way = windows.sum(axis=1)
+        same = np.all(windows > small, axis=1) | np.all(windows < -small, axis=1)
+        whole = np.abs(windows).max(axis=1) < 0.93 * TURN
+        turn = np.abs(np.abs(way) - TURN) < count * small
+        found[: len(way)] |= same & whole & turn
+    return int(found.sum())
+
+
+def _coarse(traits: Traits) -> Iterator[Fault]:
+    """Angles whose steps are so wide that their lift is a guess."""
+    for name in _angles(traits):
+        raw = traits.raw(name)
+        steps = _steps(raw)
+        wide = int(np.sum(np.abs(np.angle(np.exp(1j * steps))) > _OPTIONS.wide))
+        is_lift = np.ptp(np.concatenate(raw)) > 1.02 * TURN
+        if wide > max(3, 0.01 * len(steps)) and not is_lift:
+            found = f"{name} moves by more than 135° in {wide} steps, in an ambiguous direction"
+            yield _note("coarse", found, "Sample faster, or give the unwrapped angle")
+
+
+# Times in several units, clocks that drift, and runs that do not belong together.
+
+
+def _time_units(traits: Traits) -> Iterator[Fault]:
+    """Runs whose steps are a thousandfold those of the others."""
+    for run, t in zip(traits.recording.runs, traits.times, strict=True):
+        step = float(np.median(np.diff(t))) if len(t) > 2 else traits.step
+        power = np.log10(step / traits.step) / 3
+        if abs(power) > 0.9 and abs(power - round(power)) < 0.02:
+            found = f"the steps of run {run} are {step:g} s, those of others {traits.step:g} s"
+            yield Fault("time unit", found, "Give its times in the unit of the others")
+
+
+def _drifting(traits: Traits) -> Iterator[Fault]:
+    drifts = {run: drift(t) for run, t in zip(traits.recording.runs, traits.times, strict=True)}
+    run = max(drifts, key=lambda name: abs(drifts[name]))
+    if abs(drifts[run]) > _OPTIONS.drift:
+        found = f"the time step drifts by {100 * drifts[run]:.2g} % along run {run}"
+        remedy = "If the samples are even and the clock drifts, give even steps: --dt"
+        yield Fault("drifting clock", found, f"{remedy} {traits.step:g}")
+
+
+def _systems(traits: Traits) -> Iterator[Fault]:
+    runs = _of_other_systems(traits)
+    if runs:
+        found = f"runs {', '.join(runs[:8])} do not follow the law of the others"
+        remedy = "Check their units and signs, name what differs (--parameters), or fit them apart"
+        yield Fault("different systems", found, remedy)
+
+
+def _of_other_systems(traits: Traits) -> list[str]:
+    """Names of runs that move by another law than the rest does; none where that cannot be told.
+
+    Accelerations by local polynomials are fitted with functions that small mechanical systems have:
+    once for all runs together, and for each run by itself, where one half of its windows is fitted
+    and the other judged. Runs of one system lose nothing by being fitted together. Where the
+    functions do not describe the runs one by one, nothing can be told.
+    """
+    recording, dim = traits.recording, traits.recording.dim
+    varied = any(np.ptp(traits.range(name)) > 0 for name in recording.parameters)
+    if len(recording.runs) < 2 or not recording.positions or dim > 3 or varied:
+        return []
+    # Second derivatives want narrower windows than values do.
+    size = max(2 * min(traits.noise[n].size for n in recording.positions) // 3, 9)
+    columns = np.stack([traits.columns[n] for n in (*recording.positions, *recording.inputs)])
+    fits = local_fits(traits.times, columns, size, 5)
+    if fits is None:
+        return []
+    angles = [n in recording.angles for n in recording.positions]
+    table = _functions(fits.values[:dim], fits.slopes[:dim], angles, fits.values[dim:])
+    target = fits.curvatures[:dim].T
+    known = np.isfinite(table).all(axis=1) & np.isfinite(target).all(axis=1)
+    table, target, run = table[known], target[known], fits.run[known]
+    fewest, most = _OPTIONS.fewest_windows, _OPTIONS.most_runs
+    runs = [r for r in range(len(recording.runs)) if np.sum(run == r) >= fewest][:most]
+    if len(runs) < 2:
+        return []
+    table = table / np.maximum(table.std(axis=0) + np.abs(table.mean(axis=0)), 1e-300)
+    rows = [np.flatnonzero(run == r) for r in runs]
+    missed = _OPTIONS.missed * target.std(axis=0)
+    own = np.array([_own(table[k], target[k]) for k in rows])
+    if np.any(own > missed):
+        return []
+    together = np.concatenate(rows)
+    common = _fitted(table[together], target[together])
+    shared = np.array([_missed(table[k], target[k], common) for k in rows])
+    apart = np.any((shared > _OPTIONS.worse * own) & (shared > missed), axis=1)
+    return [recording.runs[r] for r, is_apart in zip(runs, apart, strict=True) if is_apart]
+
+
+def _fitted(table: np.ndarray, target: np.ndarray) -> np.ndarray:
+    normal = table.T @ table / len(table) + _OPTIONS.ridge * np.eye(table.shape[1])
+    return np.linalg.solve(normal, table.T @ target / len(table))
+
+
+def _missed(table: np.ndarray, target: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """RMS (dim,) of the accelerations that coefficients leave."""
+    return np.sqrt(np.mean((target - table @ c) ** 2, axis=0))
+
+
+def _own(table: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """RMS (dim,) that fits to every other block of windows leave of the blocks between."""
+    half = np.arange(len(table)) // _OPTIONS.block % 2
+    left = [
+        _missed(table[half == b], target[half == b], _fitted(table[half != b], target[half != b]))
+        for b in (0, 1)
+    ]
+    return np.sqrt(np.mean(np.square(left), axis=0))
+
+
+def _functions(q: np.ndarray, v: np.ndarray, angles: list[bool], u: np.ndarray) -> np.ndarray:
+    """(W, k) functions of positions, speeds and inputs that accelerations are made of."""
+    found = [np.ones_like(q[0]), *v, *(x * np.abs(x) for x in v), *u]
+    scaled = (q - q.mean(axis=1, keepdims=True)) / np.maximum(q.std(axis=1, keepdims=True), 1e-300)
+    for x, s, angle in zip(q, scaled, angles, strict=True):
+        found += [np.sin(x), np.cos(x), np.sin(2 * x), np.cos(2 * x)] if angle else [s, s**2, s**3]
+    for i, j in itertools.combinations(range(len(q)), 2):
+        if not (angles[i] and angles[j]):
+            found.append(scaled[i] * scaled[j])
+            continue
+        apart, products = q[i] - q[j], (v[i] ** 2, v[j] ** 2, v[i] * v[j])
+        found += [f(m * apart) for m in (1, 2) for f in (np.sin, np.cos)]
+        found += [f(apart) * w for f in (np.sin, np.cos) for w in products]
+    return np.stack(found, axis=1)
+
+
+def _reading(traits: Traits) -> Iterator[Fault]:
+    return (_note("reading", note) for note in traits.recording.notes)
+
+
+_CHECKS = (
+    _constant,
+    _repeated,
+    _related,
+    _units_of_angles,
+    _wraps,
+    _interpolated_jumps,
+    _clipped,
+    _time_units,
+    _drifting,
+    _systems,
+    _missing,
+    _wrong_values,
+    _coarse,
+    _reading,
+)
