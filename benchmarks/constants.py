@@ -203,9 +203,9 @@ CONSTANTS = tuple(
         ("solve.latent_arcs", "OUTLYING", ("sequences",), "standard deviations"),
         ("solve.latent_arcs", "OPTIONS.defect", ("record",), "standard deviations"),
         ("solve.latent_arcs", "SOFT_L1.k", ("record",), "standard deviations"),
-        (f"{L}.search", "SearchOptions.significant", ("record",), "standard errors"),
-        (f"{L}.search", "SearchOptions.asked_for", ("record",), "standard errors"),
-        (f"{L}.search", "SearchOptions.gain", ("record",), "part of the held-out cost"),
+        ("fitting.evidence", "EVIDENCE.significant", ("record",), "standard errors"),
+        ("fitting.evidence", "EVIDENCE.scored", ("record",), "standard errors"),
+        ("fitting.evidence", "EVIDENCE.gain", ("record",), "part of the held-out cost"),
     )
 )
 

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax.dataset.stretches import arcs_of, measure, nodes_of, stretches
-from gfnn_jax.maps.observation import Observation
-from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.given_law import fit_given
+from gfnn_jax.dataset.stretches import Arcs, arcs_of
+from gfnn_jax.models.lagrangians.fit import ArcProblem, SearchOptions
 from gfnn_jax.models.lagrangians.given_terms import given_terms
-from gfnn_jax.models.lagrangians.search import SearchOptions, search, to_longer_arcs
+from gfnn_jax.models.lagrangians.recordings import samples_of
+from gfnn_jax.models.lagrangians.search import fit_given, search, to_longer_arcs
 
 GIVEN = given_terms(
     ["w1**2 + w1*w2*cos(q1 - q2) + w2**2 + cos(q1) + cos(q2)", "R: w1**2 + w2**2"],
@@ -61,19 +60,14 @@ def swung(torque, seed=0, runs=4, end=12.0):
 
 
 def searched(recording, search=search):
-    found = stretches(recording)
-    scales = measure(found)
-    nodes = nodes_of(found, scales)
-    inputs = {"hold": ArcInputs(nodes, scales.substeps, "hold")}
     options = SearchOptions(frictions=("linear",), choose_friction=False)
-    seen = Observation.plain(recording.positions)
-    return search(nodes, scales, (0, 1), 0, inputs, seen, lambda line: None, options)
+    return search(samples_of(recording, options=options).problem)
 
 
 def pulls_of(found):
     """The coefficients of cos θ₁ and cos θ₂."""
     waves = ((0, 0), (0, 0), (1, 0), 0.0), ((0, 0), (0, 0), (0, 1), 0.0)
-    return np.array([found.acting.fit.values["term", wave] for wave in waves])
+    return np.array([found.fit.values["term", wave] for wave in waves])
 
 
 def test_longer_arcs_tell_more_where_the_law_is_all_that_acts():
@@ -87,18 +81,19 @@ def test_arcs_that_no_orbit_follows_are_not_taken(longest, followed):
     """Of a law whose orbits end after some nodes longer arcs cost infinitely much."""
 
     @dataclasses.dataclass
-    class Bench:
-        def fit(self, structure, known, arcs, sigma):
-            cost = 1.0 if arcs.t.shape[1] <= longest else np.inf
-            fitted = dataclasses.make_dataclass("Fitted", ["cost"])(cost)
-            return dataclasses.make_dataclass(
-                "Fit", ["structure", "values", "sigma", "arcs", "fitted"]
-            )(structure, known, sigma, arcs, fitted)
+    class Fit:
+        problem: ArcProblem
+        arcs: Arcs
 
-    found = stretches(swung(0.0, runs=1))
-    nodes = nodes_of(found, measure(found))
-    begun = Bench().fit(None, {}, arcs_of(nodes, 20), np.ones(2))
-    longer = to_longer_arcs(Bench(), nodes, begun, 80)
+        @property
+        def follows(self):
+            return self.arcs.t.shape[1] <= longest
+
+        def again(self, arcs):
+            return Fit(self.problem, arcs)
+
+    problem = samples_of(swung(0.0, runs=1)).problem
+    longer = to_longer_arcs(Fit(problem, arcs_of(problem.nodes, 20)), 80)
     assert (longer is not None and longer.arcs.t.shape[1] > 40) == followed
 
 
@@ -108,7 +103,7 @@ def test_shorter_arcs_tell_more_where_unknown_torques_act(search):
     # Of these runs two processors take the same terms; of those of seed 0 one leaves friction out.
     found = searched(swung(0.03, seed=3), search)
     assert found.shorter is not None
-    fit, other = found.acting.fit, found.shorter.acting.fit
+    fit, other = found.fit, found.shorter.fit
     assert other.arcs.t.shape[1] < fit.arcs.t.shape[1]
     far, near = (np.abs(pulls_of(f) / PULLS - 1).max() for f in (found, found.shorter))
     assert near < 0.5 * far

@@ -5,14 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gfnn_jax.dataset.stretches import Arcs
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC
-from gfnn_jax.fitting.linearised import Linearised
-from gfnn_jax.fitting.triangle import Triangle
-from gfnn_jax.models.lagrangians.friction_choice import Table, chosen
-from gfnn_jax.models.lagrangians.search import _likeliest, _without_drives
+from gfnn_jax.models.lagrangians.friction_choice import Table, WhichFriction, chosen
+from gfnn_jax.models.lagrangians.search import likeliest, without_drives
 from gfnn_jax.models.lagrangians.structure import Structure
-from gfnn_jax.models.lagrangians.text import WhichFriction
 from gfnn_jax.solve.latent_arcs import SOFT_L1
 
 CANDIDATES = tuple(
@@ -99,26 +95,22 @@ def test_friction_that_falls_below_zero_by_longer_arcs_is_dropped():
     rows = tuple(((1,), kind, 0.0) for kind in (LINEAR, QUADRATIC, DRY))
     of = {rows: [0.2, -0.1, -0.2], rows[:2]: [0.2, 0.1]}
 
-    def fit(structure, *_):
-        p = np.array(of[structure.friction])
+    told = []
+
+    def fit(structure):
+        values = dict(zip(structure.keys(), of[structure.friction], strict=True))
         return SimpleNamespace(
             structure=structure,
-            p=p,
-            values=dict(zip(structure.keys(), p, strict=True)),
-            linearised=Linearised(p, Triangle(100 * np.eye(len(p) + 1), 9)),
-            arcs=Arcs(*5 * [None]),
-            sigma=None,
-            fitted=SimpleNamespace(cost=1.0, x=None),
+            values=values,
+            significance={key: 100 * value for key, value in values.items()},
+            follows=True,
+            again=fit,
+            problem=SimpleNamespace(word=lambda key: key[1], on_progress=told.append),
         )
 
-    plain = SimpleNamespace(coordinates=("x",), speeds=("v",))
-    bench = SimpleNamespace(fit=fit, systems=None, observation=plain)
-    told = []
-    left = _without_drives(
-        bench, fit(Structure(1, (((2,), (0,), (0,), 0.0),), rows, (), 0, ())), told.append
-    )
+    left = without_drives(fit(Structure(1, (((2,), (0,), (0,), 0.0),), rows, (), 0, ())))
     assert left.structure.friction == rows[:2]
-    assert told == ["  dropped R: abs(v): -20.0 standard errors"]
+    assert told == [f"  dropped {rows[2]}: -20.0 standard errors"]
 
 
 def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():
@@ -136,15 +128,14 @@ def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():
             p=np.array(losses),
             correlation=2.0,
             arcs=SimpleNamespace(y=x[..., :1]),
-            fitted=SimpleNamespace(
-                residuals=size * noise / sigma, cost=cost, sigma=np.array([sigma])
-            ),
+            follows=bool(np.isfinite(cost)),
+            problem=SimpleNamespace(observation=SimpleNamespace(loss=SOFT_L1)),
+            fitted=SimpleNamespace(residuals=size * noise / sigma, sigma=np.array([sigma])),
         )
 
-    bench = SimpleNamespace(observation=SimpleNamespace(loss=SOFT_L1))
     drives, lost, two = fit(0.5, [0.3, -0.1]), fit(0.4, [0.1], cost=np.inf), fit(1.0, [0.2, 0.1])
     one, last = fit(1.001, [0.2], sigma=3.0), fit(1.2, [0.3])
     tried = [(each, None) for each in (drives, lost, two, one, last)]
-    assert _likeliest(bench, tried)[0] is one
-    assert _likeliest(bench, [(two, None), (last, None)])[0] is two
-    assert _likeliest(bench, [(drives, None), (lost, None)])[0] is lost  # none can be: the last
+    assert likeliest(tried)[0] is one
+    assert likeliest([(two, None), (last, None)])[0] is two
+    assert likeliest([(drives, None), (lost, None)])[0] is lost  # none can be: the last

@@ -7,13 +7,11 @@ import pytest
 from test_law_fits import chain, pendulum
 
 import gfnn_jax as gfnn
-from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
-from gfnn_jax.maps.observation import Observation
 from gfnn_jax.maps.sensors import Sensors
-from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.calibration import Thirds, _with_size
-from gfnn_jax.models.lagrangians.fit import Workbench, in_thirds
-from gfnn_jax.models.lagrangians.search import SearchOptions, search
+from gfnn_jax.models.lagrangians.fit import SearchOptions
+from gfnn_jax.models.lagrangians.recordings import samples_of
+from gfnn_jax.models.lagrangians.search import search
 
 
 def recorded(t, theta):
@@ -41,20 +39,14 @@ def covered(fit, recording, starts, ahead):
 def test_a_fit_without_a_third_is_that_of_the_other_two():
     """One linear step against a fit of the arcs of the other thirds."""
     recording = chain(noise=2e-3, runs=3, end=4.0)
-    found = stretches(recording)
-    scales = measure(found)
-    nodes = nodes_of(found, scales)
-    seen, inputs = Observation.plain(recording.positions), ArcInputs(nodes, scales.substeps, "hold")
     options = SearchOptions(frictions=("linear",), choose_friction=False)
-    result = search(nodes, scales, (0, 1), 0, {"hold": inputs}, seen, options=options)
-    gauge = np.concatenate([n.x[:, :2] for n in nodes])
-    bench, fit = Workbench(gauge, inputs, scales.omega, seen), result.acting.fit
-    arcs, third = in_thirds(result.nodes, fit)
+    fit = search(samples_of(recording, options=options).problem).fit
+    arcs, third = fit.in_thirds()
     error = fit.linearised.errors
-    without = bench.without_thirds(result.nodes, fit)
+    without = fit.without_thirds()
     assert [w.run for w in without] == ["0", "1", "2"]
     for k, (other, _, _) in enumerate(without):
-        own = bench.fit(fit.structure, fit.values, arcs.take(third != k), fit.sigma, rescale=False)
+        own = fit.again(arcs=arcs.take(third != k), rescale=False)
         np.testing.assert_allclose((other.p - own.p) / error, 0.0, atol=0.3)
     assert max(np.max(np.abs(other.p - fit.p) / error) for other, _, _ in without) > 0.5
 

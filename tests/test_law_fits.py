@@ -1,5 +1,6 @@
 """From simulated positions to the law: the engine, the start, the search, forecasts and files."""
 
+import dataclasses
 import json
 import re
 
@@ -11,7 +12,6 @@ from scipy.linalg import expm
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
-from gfnn_jax.dataset.stretches import nodes_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import (
     DRY,
@@ -22,15 +22,15 @@ from gfnn_jax.families.lagrangian import (
     Lagrangian,
     Terms,
 )
+from gfnn_jax.fitting.evidence import Comparison
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.flows.motion import NODES, Form
 from gfnn_jax.flows.schedules import HOLDS, at_stages, interpolate
 from gfnn_jax.jobs.forecast import Ahead, forecast_recording
 from gfnn_jax.jobs.output import Output
 from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate, propagate_each
-from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
-from gfnn_jax.models.lagrangians.input_rules import _costs_more, choose_again
-from gfnn_jax.models.lagrangians.recordings import _samples
+from gfnn_jax.models.lagrangians.input_rules import choose_again
+from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.search import search, search_on
 from gfnn_jax.models.lagrangians.text import speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
@@ -590,27 +590,19 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     for k, one in enumerate(u):
         x[k + 1] = (step @ np.append(x[k], one))[:2]
     table = {"t": dt * np.arange(300), "x": x[:-1, 0] + 1e-4 * rng.normal(size=300), "u": u}
-    samples = _samples(gfnn.Recording(table), None, print, ())
-    nodes = nodes_of(samples.stretches, samples.scales)
-    inputs = {hold: ArcInputs(nodes, samples.scales.substeps, hold) for hold in HOLDS}
-    found = {
-        hold: search(nodes, samples.scales, (), 1, {hold: inputs[hold]}, samples.observation)
-        for hold in ("linear", "hold")
-    }
-    of = {
-        hold: choose_again(one.acting, HOLDS, one.nodes, 30, samples.scales.dt)
-        for hold, one in found.items()
-    }
+    problem = dataclasses.replace(samples_of(gfnn.Recording(table)).problem, rules=HOLDS)
+    found = {hold: search(problem.by_rule(hold)) for hold in ("linear", "hold")}
+    of = {hold: choose_again(one.model, HOLDS, 30) for hold, one in found.items()}
     assert [one.hold for one in of.values()] == ["hold", "hold"]
-    assert of["hold"].fit is found["hold"].acting.fit  # chosen before: as it was
+    assert of["hold"].fit is found["hold"].fit  # chosen before: as it was
     assert set(of["hold"].others) == {"linear", "band"}
     assert min(of["hold"].others.values()) > 1.5
-    on = search_on(of["linear"], found["linear"].nodes, samples.scales, (), 1)
-    assert on.acting.hold == "hold"
-    p, error = on.acting.fit.p, on.acting.fit.linearised.errors
+    on = search_on(of["linear"])
+    assert on.model.hold == "hold"
+    p, error = on.fit.p, on.fit.linearised.errors
     # L = ½ẋ² − 4.5 x², R = 0.3 ½ẋ², in the order of the terms, the losses and the gain.
     np.testing.assert_array_less(np.abs(p - [-4.5, 0.3, 2.0]), 4 * error)
-    np.testing.assert_allclose(p, found["hold"].acting.fit.p, atol=2 * error.max())
+    np.testing.assert_allclose(p, found["hold"].fit.p, atol=2 * error.max())
 
 
 @pytest.mark.parametrize("hold", ["hold", "linear"])
@@ -715,5 +707,5 @@ def test_a_driven_oscillator_keeps_the_gains_of_all_its_inputs(tmp_path):
 def test_costs_that_are_both_infinite_are_alike():
     """Of arcs that no rule between samples follows."""
     one, other = np.array([np.inf, 1.0, 2.0]), np.array([np.inf, 1.0, 2.1])
-    assert not _costs_more(other, one)
-    assert _costs_more(np.array([np.inf, np.inf, 2.0]), one)
+    assert not Comparison.of(other, one).is_higher()
+    assert Comparison.of(np.array([np.inf, np.inf, 2.0]), one).is_higher()

@@ -14,8 +14,8 @@ from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Lagrangian, Term
 from gfnn_jax.flows.legendre import family_of, law_of
 from gfnn_jax.flows.systems import OfSystems
 from gfnn_jax.maps.laws import map_of_law
-from gfnn_jax.models.lagrangians.dependence import Seen, dependence, functions_tried
-from gfnn_jax.models.lagrangians.fit import Systems, a_third, thirds_of
+from gfnn_jax.models.lagrangians.dependence import GroupEstimate, dependence, functions_tried
+from gfnn_jax.models.lagrangians.fit import Systems
 from gfnn_jax.models.lagrangians.structure import Structure
 
 G = 9.81
@@ -171,7 +171,7 @@ def test_coefficients_of_a_run_are_linear_in_those_of_the_law():
 def seen_of(args, coefficients, errors):
     """What runs of each value would tell of these coefficients (V, n)."""
     return [
-        Seen(np.atleast_1d(a), c, np.diag(1 / errors))
+        GroupEstimate(np.atleast_1d(a), c, np.diag(1 / errors))
         for a, c in zip(args, coefficients, strict=True)
     ]
 
@@ -206,14 +206,13 @@ def test_a_third_of_a_few_systems_has_a_part_of_each():
     found = stretches(recording, parameters=("l",))
     nodes = nodes_of(found, measure(found))
     systems = Systems.of(("l",), nodes)
-    assert systems is not None
     assert systems.few
-    length = a_third(nodes, systems)
+    length = systems.a_third(nodes)
     assert length == len(nodes[0].t) // 3
     from gfnn_jax.dataset.stretches import arcs_of
 
     arcs = arcs_of(nodes, length)
-    third = thirds_of(arcs, systems)
+    third = systems.thirds(arcs)
     for k in range(3):
         assert {
             i for i, own in zip((i for i, _, _ in arcs.home), third, strict=True) if own == k

@@ -21,12 +21,12 @@ from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
 from gfnn_jax.errors import FitWarning, OutOfTime
 from gfnn_jax.exports.symbolic import Formula
+from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.learn.positions import OfPositions
 from gfnn_jax.learn.posterior import work_of_posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.hamiltonians.formula import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
-from gfnn_jax.models.lagrangians.friction_choice import DECIDED
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS
 from gfnn_jax.phase_space import Pairs, sizes
@@ -116,7 +116,7 @@ class Choice:
             return f"partly: the tolerance is missed, for {self.ended}"
         if law.null_terms:
             return f"one of several: the pairs do not tell {', '.join(law.null_terms)} apart"
-        rivals = [rival.formula for rival in law.rivals if rival.odds < DECIDED]
+        rivals = [rival.formula for rival in law.rivals if rival.odds < EVIDENCE.decided]
         return f"one of several: {'; '.join(rivals)} is as likely" if rivals else "identified"
 
     @property

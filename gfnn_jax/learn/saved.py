@@ -23,9 +23,9 @@ from gfnn_jax.models.hamiltonians.fitted_law import Dropped
 from gfnn_jax.models.hamiltonians.formula import PartialLaw, Proposal, Rival
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.calibration import Horizon
+from gfnn_jax.models.lagrangians.friction_choice import WhichFriction
 from gfnn_jax.models.lagrangians.learned_law import Hamiltonian, LearnedLaw, NextMotion
 from gfnn_jax.models.lagrangians.residuals import OfInput, Whiteness
-from gfnn_jax.models.lagrangians.text import WhichFriction
 from gfnn_jax.models.lagrangians.velocities import Velocity
 from gfnn_jax.scenes.scene import Scene
 

@@ -40,10 +40,14 @@ from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.legendre import lagrangian_of
 from gfnn_jax.models.hamiltonians.libraries import libraries_of, modes_of
 from gfnn_jax.models.hamiltonians.problem import LawProblem
-from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, Table, chosen
+from gfnn_jax.models.lagrangians.friction_choice import (
+    FrictionChoice,
+    Table,
+    WhichFriction,
+    chosen,
+)
 from gfnn_jax.models.lagrangians.libraries import losses
 from gfnn_jax.models.lagrangians.structure import Loss
-from gfnn_jax.models.lagrangians.text import WhichFriction, which_friction_line
 from gfnn_jax.phase_space import split
 
 
@@ -336,7 +340,7 @@ def kinds_of_friction(problem: LawProblem, law: FittedLaw, steps: Steps) -> Whic
         limits = {} if table is None else table.limits(taken)
     sharp = {(c, kind, 0.0): limit for (c, kind, _), limit in limits.items()}
     choice = FrictionChoice(taken, law.odds or {}, sharp, gains=False)
-    return which_friction_line(choice, 1.0, data.dim, [f"v{i + 1}" for i in range(data.dim)])
+    return choice.in_words(1.0, data.dim, [f"v{i + 1}" for i in range(data.dim)])
 
 
 def _rows_of(family) -> tuple[Loss, ...]:

@@ -19,7 +19,7 @@ from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.models.hamiltonians.cost_of_flow import FAST
 from gfnn_jax.models.hamiltonians.fitted_law import Dropped
 from gfnn_jax.models.hamiltonians.formula import Proposal, Rival, Term, as_code
-from gfnn_jax.models.lagrangians.text import WhichFriction, odds_text
+from gfnn_jax.models.lagrangians.friction_choice import WhichFriction, odds_text
 from gfnn_jax.phase_space import apply_j
 
 

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Scales, Stretch
+from gfnn_jax.fitting.evidence import Comparison
 from gfnn_jax.maps.estimates import (
     Law,
     Window,
@@ -31,15 +32,34 @@ from gfnn_jax.maps.estimates import (
 )
 from gfnn_jax.maps.sensors import Sensors
 
-_WINDOWS, _TRIED = 96, 16  # starts of forecasts; of those that choose the window
-_CHOICES = (0.25, 0.5, 1.0, 2.0)  # periods from which a state may be estimated
-_FIRST, _LAST, _LEADS = 1 / 32, 8.0, 24  # periods ahead, and how many times between these
-_NEAR = 2  # leads to either side that share their errors
-_SHORT = 20  # samples, at least, of the shortest window
-_FEWEST = 20  # errors that tell a quantile of 95 %
-_INSIDE = 0.95  # of the errors, within two standard deviations
-_PARTS = 8  # of the record, in the jackknife of its errors
-FRACTIONS = (0.01, 0.05, 0.20)  # of the spread, that horizons are told for
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationOptions:
+    """Options of the calibration of forecasts (`benchmarks/measured.py`, `bands.py`).
+
+    windows, tried: starts of forecasts, and those that choose the window. choices: periods from
+    which a state may be estimated. first, last, leads: periods ahead, and how many times between
+    these. near: leads to either side that share their errors. short: samples, at least, of the
+    shortest window. fewest: errors that determine a quantile ``inside``, which are within two
+    standard deviations. parts: of the record, in the jackknife of its errors. fractions: of the
+    spread, that horizons are stated for.
+    """
+
+    windows: int = 96
+    tried: int = 16
+    choices: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0)
+    first: float = 1 / 32
+    last: float = 8.0
+    leads: int = 24
+    near: int = 2
+    short: int = 20
+    fewest: int = 20
+    inside: float = 0.95
+    parts: int = 8
+    fractions: tuple[float, ...] = (0.01, 0.05, 0.20)
+
+
+OPTIONS = CalibrationOptions()
 
 
 class Horizon(NamedTuple):
@@ -63,21 +83,16 @@ class Calibration(NamedTuple):
     median: np.ndarray
     parts: np.ndarray
 
-    def against(self, other: Calibration) -> float:
-        """Median errors as a multiple of another's, in the geometric mean; 1 where they are of
-        other times."""
+    def against(self, other: Calibration) -> Comparison:
+        """Median errors as a multiple of another's, in the geometric mean, and the standard error
+        of this ratio, of the jackknife over parts of the record; 1 where they are of other
+        times."""
         if self.median.shape != other.median.shape or not self.median.size:
-            return 1.0
-        return float(np.exp(np.mean(np.log(self.median / other.median))))
-
-    def errs_more(self, other: Calibration) -> bool:
-        """Return whether median errors are larger than another's by more than a standard error of
-        their ratio, of the jackknife over parts of the record."""
-        if not np.log(self.against(other)) > 0:
-            return False
+            return Comparison(1.0, 1.0, 0.0, 0.0)
+        ratio = float(np.exp(np.mean(np.log(self.median / other.median))))
         logs = np.nanmean(np.log(self.parts / other.parts), axis=(1, 2))
         error = np.sqrt((len(logs) - 1) * np.mean((logs - logs.mean()) ** 2))
-        return bool(np.log(self.against(other)) > error)
+        return Comparison(ratio, 1.0, ratio - 1.0, float(error))
 
 
 class Thirds(NamedTuple):
@@ -99,9 +114,9 @@ def calibrated(
     starts = _starts(found, scales)
     if not starts:
         return _unknown(law, spread)
-    short = (_SHORT - 1) * scales.dt
-    tried = np.unique(np.maximum(np.array(_CHOICES) * scales.period, short))
-    some = starts[:: -(-len(starts) // _TRIED)]
+    short = (OPTIONS.short - 1) * scales.dt
+    tried = np.unique(np.maximum(np.array(OPTIONS.choices) * scales.period, short))
+    some = starts[:: -(-len(starts) // OPTIONS.tried)]
     leads = np.array([0.5, 1.0]) * scales.period
     windows = np.repeat(tried, len(some))
     errors, _, _ = _forecasts(thirds, found, some * len(tried), windows, leads)
@@ -110,30 +125,33 @@ def calibrated(
         middle = np.nan_to_num(np.nanmedian(sizes, axis=1), nan=np.inf)
     best = float(tried[np.argmin(middle)])
     longest = max(s.t[-1] - s.t[0] for s in found)
-    leads = np.geomspace(max(_FIRST * scales.period, scales.dt), _LAST * scales.period, _LEADS)
+    leads = np.geomspace(
+        max(OPTIONS.first * scales.period, scales.dt), OPTIONS.last * scales.period, OPTIONS.leads
+    )
     leads = leads[leads <= 0.9 * longest]
     windows = np.where(np.arange(len(starts)) % 2, short, best)
     errors, deviations, x = _forecasts(thirds, found, starts, windows, leads)
     errors, deviations = _shared(errors), _shared(deviations)
     sensors, large = _with_size(law.sensors, x, errors, deviations)
-    enough = np.isfinite(errors).all(axis=-1).sum(axis=0) >= _FEWEST
+    enough = np.isfinite(errors).all(axis=-1).sum(axis=0) >= OPTIONS.fewest
     leads, errors, deviations = leads[enough], errors[:, enough], deviations[:, enough]
     if not len(leads):
         return _unknown(law, spread)
-    missed = np.nanquantile((errors**2 / 4 - deviations**2) / large**2, _INSIDE, axis=0)
+    missed = np.nanquantile((errors**2 / 4 - deviations**2) / large**2, OPTIONS.inside, axis=0)
     misfit = np.sqrt(np.maximum(missed, 0.0))
     sensors = dataclasses.replace(sensors, window=best, leads=leads, misfit=misfit)
     bands = np.where(np.isfinite(errors), 2 * np.hypot(deviations, misfit * large), np.nan)
-    measured = np.max(np.nanquantile(np.abs(errors), _INSIDE, axis=0) / spread, axis=1)
+    measured = np.max(np.nanquantile(np.abs(errors), OPTIONS.inside, axis=0) / spread, axis=1)
     predicted = np.max(np.nanmedian(bands, axis=0) / spread, axis=1)
     horizons = [
-        Horizon(f, _passed(measured, leads, f), _passed(predicted, leads, f)) for f in FRACTIONS
+        Horizon(f, _passed(measured, leads, f), _passed(predicted, leads, f))
+        for f in OPTIONS.fractions
     ]
     sizes = np.abs(errors) / spread
-    part = np.tile(np.arange(len(starts)) * _PARTS // len(starts), len(sizes) // len(starts))
+    part = np.tile(np.arange(len(starts)) * OPTIONS.parts // len(starts), len(sizes) // len(starts))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # times of one part alone
-        parts = np.stack([np.nanmedian(sizes[part != k], axis=0) for k in range(_PARTS)])
+        parts = np.stack([np.nanmedian(sizes[part != k], axis=0) for k in range(OPTIONS.parts)])
     median = np.nanmedian(sizes, axis=0)
     return Calibration(law._replace(sensors=sensors), horizons, median, parts)
 
@@ -166,8 +184,8 @@ def _with_size(
 
 def _shared(values: np.ndarray) -> np.ndarray:
     """Values (B, n, k) together with those of near leads (B (2 near + 1), n, k)."""
-    far = np.pad(values, ((0, 0), (_NEAR, _NEAR), (0, 0)), constant_values=np.nan)
-    return np.concatenate([far[:, k : k + values.shape[1]] for k in range(2 * _NEAR + 1)])
+    far = np.pad(values, ((0, 0), (OPTIONS.near, OPTIONS.near), (0, 0)), constant_values=np.nan)
+    return np.concatenate([far[:, k : k + values.shape[1]] for k in range(2 * OPTIONS.near + 1)])
 
 
 def _passed(error: np.ndarray, leads: np.ndarray, fraction: float) -> float:
@@ -185,9 +203,9 @@ def _window(s: Stretch, begin: int, end: int) -> Window:
 
 def _starts(found: Sequence[Stretch], scales: Scales) -> list[tuple[int, int]]:
     """(stretch, sample) of the last samples of windows, evenly over the record."""
-    fewest = max(_SHORT, round(0.25 * scales.period / scales.dt))
+    fewest = max(OPTIONS.short, round(0.25 * scales.period / scales.dt))
     places = [(i, k) for i, s in enumerate(found) for k in range(fewest - 1, len(s.t) - 1)]
-    every = max(1, len(places) // _WINDOWS)
+    every = max(1, len(places) // OPTIONS.windows)
     return places[::every] if places else []
 
 
@@ -205,7 +223,7 @@ def _forecasts(
     cut, times, measured = [], [], []
     for (i, k), window in zip(starts, windows.tolist(), strict=True):
         s = found[i]
-        first = min(int(np.searchsorted(s.t, s.t[k] - window)), max(0, k - _SHORT + 1))
+        first = min(int(np.searchsorted(s.t, s.t[k] - window)), max(0, k - OPTIONS.short + 1))
         cut.append(thinned(_window(s, first, k + 1)))
         at = np.minimum(np.searchsorted(s.t, s.t[k] + leads), len(s.t) - 1)
         inside = s.t[k] + leads <= s.t[-1]

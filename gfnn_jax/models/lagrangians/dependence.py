@@ -1,8 +1,14 @@
-"""The dependence of a law's coefficients on parameters of the system: which functions of these.
+"""One law of several systems, which differ in parameters: a length, an added mass.
 
-Runs of one value v of the parameters are fitted by themselves, with the terms that one of them
-shows: coefficients p_v, and the triangle R_v of their information. Close to these fits the
-residuals of any law are R_v (p − p_v), so that sets of functions for all coefficients,
+The runs of the value with most samples are searched for terms as any recording is. These terms are
+then fitted to the runs of each value by themselves, and the coefficients tell on which functions of
+the parameters they depend. That law is fitted to all runs at once, and from there on terms are
+dropped and added, and friction is chosen, as ever. Where arcs that a fit has not seen do not gain
+by the dependence, there is none.
+
+The fit of the runs of one value v has coefficients p_v, and the triangle R_v of their information.
+Close to these fits the residuals of any law are R_v (p − p_v), so that sets of functions for all
+coefficients,
 
     p_j(μ) = Σ_a x_ja ∏ μ^a / c(μ),      a whole powers from −2 to 2,
 
@@ -23,23 +29,49 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import UNIFORM, functions_of
-from gfnn_jax.models.lagrangians.fit import LawFit
+from gfnn_jax.fitting.evidence import EVIDENCE, Comparison
+from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
+from gfnn_jax.models.lagrangians.input_rules import InputModel
+from gfnn_jax.models.lagrangians.search import (
+    SearchResult,
+    TermSearch,
+    search,
+    to_arcs_of_periods,
+)
+from gfnn_jax.models.lagrangians.starts import no_law
 from gfnn_jax.models.lagrangians.structure import Key, Structure, with_powers
+from gfnn_jax.models.lagrangians.weak_form import weak_start
+from gfnn_jax.models.lagrangians.zeros import with_zeros_of_runs
 from gfnn_jax.models.parameters import keeps_away
 
-# Powers of one parameter, and of all of them: of the lengths of a double pendulum l₂²/l₁² is one.
-_LARGEST, _TOTAL = 2, 4
-_SIGNIFICANT = 4.0  # standard errors of a coefficient that is one more
-_BELOW = 0.5  # of a power, that a negative one counts more
-_STEPS = 8  # of Gauss and Newton
-_MOST = 30  # changes of a set
+
+@dataclasses.dataclass(frozen=True)
+class DependenceOptions:
+    """Limits of the functions of parameters that are tried (`benchmarks/parameters.py`).
+
+    largest, total: powers of one parameter, and of all of them: of the lengths of a double pendulum
+    l₂²/l₁² is one. below: of a power, that a negative one counts more. steps: of Gauss and Newton.
+    most: changes of a set.
+    """
+
+    largest: int = 2
+    total: int = 4
+    below: float = 0.5
+    steps: int = 8
+    most: int = 30
+
+
+OPTIONS = DependenceOptions()
 
 Function = tuple[int, ...]  # whole powers of the parameters
 Sets = tuple[tuple[Function, ...], ...]  # the functions of each coefficient
 
 
-class Seen(NamedTuple):
+class GroupEstimate(NamedTuple):
     """Findings from the runs of one value args (k,) of the parameters: coefficients p (n,), and the
     triangle (n, n) of their information, residuals in units of their scatter."""
 
@@ -57,25 +89,133 @@ class Dependent(NamedTuple):
     gain: float
 
 
+def search_of_systems(problem: ArcProblem) -> SearchResult | None:
+    """The law of runs that differ in parameters; None where no coefficient depends on them."""
+    groups, nodes = _of_one_value(problem), problem.nodes
+    rule = _first_law(problem, groups)
+    structure = rule.fit.structure
+    if len(structure.uncoupled) > 1:
+        parts = "; ".join(
+            ", ".join(problem.observation.coordinates[i] for i in part)
+            for part in structure.uncoupled
+        )
+        raise FitError(
+            f"nothing couples {parts}: where runs differ in a parameter, expected the positions of "
+            "one of these (--positions)"
+        )
+    inputs = ArcInputs(nodes, problem.scales.substeps, rule.hold, rule.delay)
+    problem = dataclasses.replace(problem, inputs=inputs, rules=(rule.hold,))
+    fits, followed = [], list(nodes)
+    for places in groups:
+        fit = _fitted(problem, places, structure)
+        if fit is not None:
+            fits.append(fit)
+            for i, node in zip(places, fit.problem.nodes, strict=True):
+                followed[i] = node
+    if len(fits) < 2:
+        return None
+    values = [seen(fit, fit.problem.nodes[0].stretch.args) for fit in fits]
+    found = dependence(structure, _inertia(structure, problem.gauge), values)
+    if found.structure == structure:
+        problem.on_progress(f"no coefficient depends on {', '.join(problem.parameters)}")
+        return None
+    problem = dataclasses.replace(problem, nodes=followed)
+    sigma = np.median([fit.sigma for fit in fits], axis=0)
+    arcs = problem.arcs(problem.options.periods[-1])
+    fit = problem.fit(found.structure, found.known, arcs, sigma)
+    problem.on_progress(f"depending on {', '.join(problem.parameters)}: {fit}")
+    fit = with_zeros_of_runs(fit)
+    mean = np.mean([one.p for one in values], axis=0).tolist()
+    alike = fit.cross_validate(structure, dict(zip(structure.keys(), mean, strict=True)))
+    apart = Comparison.of(fit.cross_validate(), alike)
+    problem.on_progress(f"  cost of held-out arcs {apart.other:.5g} → {apart.cost:.5g}")
+    if not apart.is_lower(problem.options.evidence.gain):
+        return None
+    every = TermSearch.of(problem).every
+    assert every is not None  # terms are searched
+    every = _depending(every, fit.structure, (0,) * len(problem.parameters))
+    return TermSearch(every, every.friction).finished(fit)
+
+
+def _depending(every: Structure, found: Structure, none: Function) -> Structure:
+    """All terms and frictions, each with the functions of parameters that the law which was found
+    has. Friction of a sum of speeds is among them where one system showed it."""
+    shown = {row[:3] for row in found.friction}
+    sums = {libraries.opposite(row) for row in every.friction} - shown
+    directed = [row for row in every.friction if row[1] != UNIFORM and row not in sums]
+    uniform = [row for row in every.friction if row[1] == UNIFORM]
+    terms = with_functions(every.terms, functions_in(found.terms, none))
+    return dataclasses.replace(
+        every,
+        terms=tuple(dict.fromkeys((found.terms[0], *terms))),
+        friction=(*with_functions(directed, functions_in(found.friction, none)), *uniform),
+    )
+
+
+def _of_one_value(problem: ArcProblem) -> list[list[int]]:
+    """Places of the nodes of each value of the parameters, most samples first."""
+    groups: dict[tuple[float, ...], list[int]] = {}
+    for i, node in enumerate(problem.nodes):
+        groups.setdefault(tuple(node.stretch.args.tolist()), []).append(i)
+    return sorted(groups.values(), key=lambda places: -sum(len(problem.nodes[i].t) for i in places))
+
+
+def _first_law(problem: ArcProblem, groups: Sequence[Sequence[int]]) -> InputModel:
+    """The law of the runs of one value, with the inputs as they act in it: of the value with most
+    samples that has one."""
+    for places in groups:
+        some = [problem.nodes[i] for i in places]
+        own = dataclasses.replace(problem, nodes=some, parameters=(), gauge=None, inputs=None)
+        try:
+            found = search(own)
+        except FitError:
+            continue
+        if found.fit.follows:
+            return found.model
+    raise no_law(problem.scales)
+
+
+def _fitted(problem: ArcProblem, places: Sequence[int], structure: Structure) -> LawFit | None:
+    """A structure fitted to the nodes at these places; None where it cannot be."""
+    some = [problem.nodes[i] for i in places]
+    inputs = ArcInputs(some, problem.scales.substeps, problem.inputs.hold, problem.inputs.delay)
+    own = dataclasses.replace(problem, nodes=some, parameters=(), inputs=inputs)
+    try:
+        known = weak_start(dataclasses.replace(structure, zeros=()), own, prune=False)[1]
+    except FitError:
+        return None
+    fit = to_arcs_of_periods(own, structure, known)
+    return fit if fit.follows else None
+
+
+def _inertia(structure: Structure, gauge: np.ndarray) -> np.ndarray:
+    """(P,) each term's part in the mean of M₁₁, for a coefficient of 1."""
+    form = structure.form(gauge)
+    return np.concatenate([[1.0], -form.basis[0]]) / form.fixed[0]
+
+
 def functions_tried(args: np.ndarray) -> list[Function]:
     """Powers of parameters args (n, k), the plainest first: negative ones where a parameter keeps
     away from 0."""
-    ranges = [range(-_LARGEST if keeps_away(a) else 0, _LARGEST + 1) for a in args.T]
-    found = [powers for powers in product(*ranges) if sum(map(abs, powers)) <= _TOTAL]
+    most = OPTIONS.largest
+    ranges = [range(-most if keeps_away(a) else 0, most + 1) for a in args.T]
+    found = [powers for powers in product(*ranges) if sum(map(abs, powers)) <= OPTIONS.total]
     return sorted(found, key=_size_of)
 
 
 def _size_of(function: Function) -> float:
     """The size of the powers: that of the plainest function is 0."""
-    return sum(abs(n) + _BELOW * (n < 0) for n in function)
+    return sum(abs(n) + OPTIONS.below * (n < 0) for n in function)
 
 
-def seen(fit: LawFit, args: np.ndarray) -> Seen:
+def seen(fit: LawFit, args: np.ndarray) -> GroupEstimate:
     """Take them from a fit to the runs of one value."""
-    return Seen(args, fit.p, fit.fitted.triangle / np.sqrt(fit.correlation))
+    return GroupEstimate(args, fit.p, fit.fitted.triangle / np.sqrt(fit.correlation))
 
 
-def dependence(structure: Structure, inertia: np.ndarray, values: Sequence[Seen]) -> Dependent:
+def dependence(
+    structure: Structure, inertia: np.ndarray, values: Sequence[GroupEstimate]
+) -> Dependent:
     """The functions of the parameters that these values show. inertia (P,): each term's part in
     M₁₁, for a coefficient of 1."""
     every = functions_tried(np.stack([one.args for one in values]))
@@ -103,7 +243,7 @@ class _Problem:
 
     structure: Structure
     inertia: np.ndarray
-    values: tuple[Seen, ...]
+    values: tuple[GroupEstimate, ...]
     every: tuple[Function, ...]
 
     @property
@@ -142,7 +282,7 @@ class _Problem:
         R = np.stack([one.triangle for one in self.values])
         p = np.stack([one.p for one in self.values])
         cost, best = np.inf, x
-        for _ in range(_STEPS):
+        for _ in range(OPTIONS.steps):
             with np.errstate(all="ignore"):  # of no inertia in some run
                 shares = np.where(scaled, 1 / (by_inertia @ x)[:, None], 1.0)
                 own = (turn @ x) * shares
@@ -158,7 +298,7 @@ class _Problem:
             x = x.copy()
             x[open_] -= np.linalg.lstsq(J / size, off.ravel(), rcond=1e-10)[0] / size
         rare = sum(_size_of(function) for functions in sets for function in functions)
-        return _Solved(sets, best, cost + _SIGNIFICANT**2 * len(open_) + rare)
+        return _Solved(sets, best, cost + EVIDENCE.significant**2 * len(open_) + rare)
 
     def _begun(self, home: np.ndarray, further: int) -> np.ndarray:
         """Coefficients to start from: the mean of the values."""
@@ -191,7 +331,7 @@ class _Problem:
         """The sets of the lowest score that single changes lead to, M₁₁ with these functions."""
         none = self.every[0]
         here = self.solved((first, *((none,),) * (self.count - 1)))
-        for _ in range(_MOST):
+        for _ in range(OPTIONS.most):
             best = min(
                 (self.solved(sets, here) for sets in self._changed(here.sets)),
                 key=lambda one: one.score,

@@ -36,27 +36,36 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
+from gfnn_jax.families.lagrangian import LINEAR, UNIFORM, Friction
+from gfnn_jax.families.text import in_letters
+from gfnn_jax.fitting.evidence import EVIDENCE, correlation_time, criterion
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.triangle import Triangle
-from gfnn_jax.models.lagrangians.fit import (
-    FOLDS,
-    LawFit,
-    Workbench,
-    correlation_time,
-    thirds_of,
-)
+from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit
+from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, losses
 from gfnn_jax.models.lagrangians.structure import Loss
+from gfnn_jax.models.lagrangians.text import friction_of
 from gfnn_jax.solve.linear import non_negative
 
-DECIDED = 20.0  # odds, below which two sets are as good
-_NEEDED = 3.0  # odds, below which a direction is left out
-_LARGEST = 1e100  # of a residual, or of its derivatives
-_SURE = 20.0  # the logarithm of the largest odds that are told
-_GAINS = 5.0  # standard errors below zero, at which friction would have to drive
-_RCOND = 1e-10  # of coefficients that a record tells only together
-_IMITATED = 1e-3  # of what a friction changes, that no other coefficient does
-_LIMIT = 2.0  # standard errors of a coefficient, above its value: its upper limit
+
+@dataclasses.dataclass(frozen=True)
+class FrictionOptions:
+    """Limits of the choice (`benchmarks/friction_kinds.py`).
+
+    largest: of a residual, or of its derivatives, on arcs that count. drives: standard errors below
+    zero, at which friction would have to drive. rank: of coefficients that a record determines only
+    together. imitated: share of what a friction changes that no other coefficient does. limit:
+    standard errors of a coefficient above its value, of its upper limit.
+    """
+
+    largest: float = 1e100
+    drives: float = 5.0
+    rank: float = 1e-10
+    imitated: float = 1e-3
+    limit: float = 2.0
+
+
+OPTIONS = FrictionOptions()
 
 
 class FrictionChoice(NamedTuple):
@@ -73,15 +82,55 @@ class FrictionChoice(NamedTuple):
     def kinds(self) -> tuple[int, ...]:
         return kinds_of(self.rows)
 
+    def in_words(self, scale: float, dim: int, speeds: Sequence[str]) -> WhichFriction:
+        """The choice by the names of speeds; ``scale`` is that of L."""
+
+        def named(kinds: tuple[int, ...]) -> str:
+            return "+".join(FRICTIONS[KINDS.index(k)] for k in kinds) or "none"
+
+        plain = {direction for direction, _, _ in losses(dim, KINDS, 0.0)}
+        rows = [r for r in self.limits if r[1] not in self.kinds and r[0] in plain and len(r) == 3]
+        largest = scale * np.array([self.limits[row] for row in rows])
+        terms = friction_of(Friction.of(rows, dim), largest, 0 * largest, speeds).terms
+        return WhichFriction(
+            tuple(FRICTIONS[KINDS.index(k)] for k in self.kinds),
+            {named(kinds): odds for kinds, odds in self.odds.items()},
+            {t.term: t.coefficient for t in terms},
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class WhichFriction:
+    """The kinds of friction that a record shows. odds: that they forecast better than other kinds
+    ("none", "quadratic", "linear+dry", …). limits: of terms of R of kinds that were not seen, the
+    largest coefficients that the record allows (two standard errors)."""
+
+    kinds: tuple[str, ...]
+    odds: dict[str, float]
+    limits: dict[str, float]
+
+    def __str__(self) -> str:
+        text = "+".join(self.kinds) or "none"
+        if self.odds:
+            rival = min(self.odds, key=lambda name: self.odds[name])
+            text += f", on held-out arcs odds of {odds_text(self.odds[rival])} against {rival}"
+            if self.odds[rival] < 1:
+                decided = EVIDENCE.decided
+                text += f"; of sets within odds of {decided:.0f} : 1 that of fewest kinds is kept"
+        below = [f"of {in_letters(term)} below {limit:.2g}" for term, limit in self.limits.items()]
+        return text + (f"; not seen, coefficients in R (2 σ): {', '.join(below)}" if below else "")
+
+
+def odds_text(odds: float) -> str:
+    """12 : 1, 1 : 3; those above a million are not told apart."""
+    if odds >= 1e6:
+        return "> 10⁶ : 1"
+    return f"{odds:,.2g} : 1" if odds >= 1 else f"1 : {1 / odds:,.2g}"
+
 
 def kinds_of(rows: Sequence[Loss]) -> tuple[int, ...]:
     """The kinds of friction among these, in their order."""
     return tuple(sorted({row[1] for row in rows}))
-
-
-def _plainness(kinds: tuple[int, ...]) -> tuple[int, ...]:
-    """The rank of kinds among as many others, uniform friction first."""
-    return tuple(sorted(-1 if kind == UNIFORM else kind for kind in kinds))
 
 
 class _Judged(NamedTuple):
@@ -100,24 +149,22 @@ class _Judged(NamedTuple):
         return kinds_of(self.rows)
 
     @property
+    def plainness(self) -> tuple[int, ...]:
+        """The rank of its kinds among as many others, uniform friction first."""
+        return tuple(sorted(-1 if kind == UNIFORM else kind for kind in self.kinds))
+
+    @property
     def cost(self) -> float:
         return float(np.sum(self.residuals**2) + self.residuals.size * self.rounding**2)
 
     @property
+    def independent(self) -> float:
+        """Residuals that are independent."""
+        return np.count_nonzero(self.residuals) / correlation_time(self.residuals)
+
+    @property
     def is_seen(self) -> bool:
         return bool(np.all(self.sizes > 1))
-
-
-def which_friction(
-    bench: Workbench,
-    fit: LawFit,
-    candidates: Sequence[Loss],
-    choose: bool = True,
-    before: FrictionChoice | None = None,
-    rows: Sequence[Loss] | None = None,
-) -> FrictionChoice:
-    """The choice by the arcs of a fit (`chosen`)."""
-    return chosen(_table_of(bench, fit, candidates), choose, before, rows)
 
 
 def chosen(
@@ -139,52 +186,37 @@ def chosen(
         sets = [min((s for s in sets if len(s.kinds) == most), key=lambda s: s.cost)]
     seen = [s for s in sets if s.is_seen] if choose else sets
     best = min(seen, key=lambda s: s.cost)
-    evidence = _Evidence(best)
-    tied = [s for s in seen if evidence.odds(best, s) < DECIDED]
+    count = best.independent
+
+    def odds(one: _Judged, other: _Judged) -> float:
+        return EVIDENCE.odds(one.cost, other.cost, count)
+
+    tied = [s for s in seen if odds(best, s) < EVIDENCE.decided]
     known = before.kinds if before else ()
-    taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, _plainness(s.kinds)))
+    taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, s.plainness))
     if rows is not None and set(rows) <= set(table.candidates):
         taken = table.judged([table.candidates.index(row) for row in rows])
         seen = [s for s in seen if s.kinds != taken.kinds]
-    odds = {s.kinds: evidence.odds(taken, s) for s in seen if s is not taken}
-    others = table.others(taken.rows)
-    gains = not taken.rows and any(rho < -_GAINS * error for rho, error in others.values())
-    return FrictionChoice(taken.rows, odds, table.limits(taken.rows), gains)
+    against = {s.kinds: odds(taken, s) for s in seen if s is not taken}
+    alone = table.others(taken.rows).values()
+    gains = not taken.rows and any(rho < -OPTIONS.drives * error for rho, error in alone)
+    return FrictionChoice(taken.rows, against, table.limits(taken.rows), gains)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Evidence:
-    """Odds between sets, by the correlation time of the residuals of the ``best`` of them."""
-
-    best: _Judged
-
-    @functools.cached_property
-    def count(self) -> float:
-        """Residuals that are independent."""
-        residuals = self.best.residuals
-        return np.count_nonzero(residuals) / correlation_time(residuals)
-
-    def odds(self, one: _Judged, other: _Judged) -> float:
-        """Odds that the first forecasts better than the other."""
-        log = 0.5 * self.count * np.log(max(other.cost, 1e-300) / max(one.cost, 1e-300))
-        return float(np.exp(np.clip(log, -_SURE, _SURE)))
-
-
-def _table_of(bench: Workbench, fit: LawFit, candidates: Sequence[Loss]) -> Table:
+def table_of(fit: LawFit, candidates: Sequence[Loss]) -> Table:
     """The arcs of a fit, a third of the record held out at a time."""
     structure = fit.structure
     others = tuple(row for row in candidates if row not in structure.friction)
     larger = structure.plus([("loss", row) for row in others])
-    p = larger.start(fit.values)
-    rows = bench.rows(larger, fit)
+    p, rows = larger.start(fit.values), fit.problem.rows(larger, fit)
     # Arcs that the larger law cannot follow: their squares would overflow.
-    rows[~(np.abs(rows) < _LARGEST).all(axis=(1, 2, 3))] = 0.0
+    rows[~(np.abs(rows) < OPTIONS.largest).all(axis=(1, 2, 3))] = 0.0
     keys = larger.keys()
     own = [keys.index(("loss", row)) for row in candidates]
     rest = [k for k in range(len(keys)) if k not in own]
     rows = rows[..., [*rest, *own, len(keys)]]
     rows[..., -1] += rows[..., len(rest) : -1] @ p[own]  # as if there were no friction
-    thirds = thirds_of(fit.arcs, bench.systems)
+    thirds = fit.problem.systems.thirds(fit.arcs)
     return Table(tuple(candidates), rows, fit.correlation, thirds=thirds)
 
 
@@ -214,6 +246,11 @@ class Table:
         return self.rows.shape[-1] - 1 - len(self.candidates)
 
     @functools.cached_property
+    def count(self) -> int:
+        """The number of residuals."""
+        return int(np.count_nonzero(self.rows[..., -1]))
+
+    @functools.cached_property
     def triangles(self) -> list[np.ndarray]:
         """Triangles of the arcs without each third, and of all."""
         kept = [*~self.folds, np.ones(self.folds.shape[1], bool)]
@@ -235,25 +272,19 @@ class Table:
         for triangle, held in zip(self.triangles[:-1], self.folds, strict=True):
             losses = self.solve(triangle, subset)
             aim = triangle[:f, -1] - triangle[:f, f:-1] @ losses
-            others = np.linalg.lstsq(triangle[:f, :f], aim, rcond=_RCOND)[0]
+            others = np.linalg.lstsq(triangle[:f, :f], aim, rcond=OPTIONS.rank)[0]
             residuals[held] = self.rows[held] @ np.concatenate([-others, -losses, [1.0]])
         rows = tuple(self.candidates[k] for k in subset)
-        n = max(self.independent, np.e)
+        n = max(self.count / self.correlation, np.e)
         rest = self._rest(self.solve(self.triangles[-1], subset)) ** 2
-        rest += np.count_nonzero(self.rows[..., -1]) * self.rounding**2
-        criterion = float(n * np.log(max(rest, 1e-300)) + len(rows) * np.log(n))
+        rest += self.count * self.rounding**2
         sizes = self.significance(subset) / np.sqrt(np.log(n))
-        return _Judged(rows, residuals, self.rounding, sizes, criterion)
+        return _Judged(rows, residuals, self.rounding, sizes, criterion(rest, n, len(rows)))
 
     def _rest(self, losses: np.ndarray) -> float:
         """Norm of the residuals of all arcs with these ρ."""
         own = self.triangles[-1][self.width :, self.width :]
         return float(np.linalg.norm(own[:, -1] - own[:, :-1] @ losses))
-
-    @property
-    def independent(self) -> float:
-        """The number of residuals, of which those that are correlated in the fit count once."""
-        return np.count_nonzero(self.rows[..., -1]) / self.correlation
 
     def significance(self, subset: Sequence[int]) -> np.ndarray:
         """ρ of these candidates from all arcs, in standard errors."""
@@ -263,7 +294,7 @@ class Table:
             return np.zeros(len(columns))  # nothing sets their errors
         losses = self.solve(triangle, columns)
         norms = np.maximum(np.linalg.norm(own[:, columns], axis=0), 1e-300)
-        inverse = np.linalg.pinv(own[:, columns] / norms, rcond=_RCOND)
+        inverse = np.linalg.pinv(own[:, columns] / norms, rcond=OPTIONS.rank)
         variance = self.correlation * (self._variance(self._rest(losses)) + self.rounding**2)
         errors = np.linalg.norm(inverse, axis=1) * np.sqrt(variance)
         return losses[columns] * norms / np.maximum(errors, 1e-300)
@@ -283,14 +314,14 @@ class Table:
         here, other = self._lean(subset, False), self._lean(subset, True)
         if here.is_seen != other.is_seen:
             return here if here.is_seen else other
-        likelier = here.criterion - other.criterion > 2 * np.log(DECIDED)
+        likelier = here.criterion - other.criterion > 2 * np.log(EVIDENCE.decided)
         return other if likelier else here
 
     def _lean(self, subset: list[int], seen_first: bool) -> _Judged:
         """The set without its spare directions: first those that are not seen, or first those that
         held-out arcs do not miss. Each of its kinds keeps one."""
         here = self.judged(subset)
-        evidence = _Evidence(here)
+        count = here.independent
         while True:
             fewer = {k: self.judged([other for other in subset if other != k]) for k in subset}
             fewer = {k: s for k, s in fewer.items() if s.kinds == here.kinds}
@@ -300,7 +331,7 @@ class Table:
             smallest = min(fewer, key=lambda k: sizes[k])
             missed_least = min(fewer, key=lambda k: fewer[k].cost)
             spare = [smallest] if sizes[smallest] <= 1 else []
-            if evidence.odds(here, fewer[missed_least]) <= _NEEDED:
+            if EVIDENCE.odds(here.cost, fewer[missed_least].cost, count) <= EVIDENCE.needed:
                 spare = [*spare, missed_least] if seen_first else [missed_least, *spare]
             if not spare:
                 return here
@@ -312,24 +343,19 @@ class Table:
         places = {row: self.width + k for k, row in enumerate(self.candidates)}
         base = [*range(self.width), *(k for row, k in places.items() if row in taken)]
         new = [row for row in places if row not in taken]
-        triangle = Triangle(self.triangles[-1], np.count_nonzero(self.rows[..., -1]))
-        whole = Linearised(np.zeros(self.rows.shape[-1] - 1), triangle)
-        one = whole.added(base, [places[row] for row in new])
-        found = {}
-        for row, rho, size, share, left in zip(
-            new, one.value, one.size, one.share, one.left, strict=True
-        ):
-            if share >= _IMITATED:  # else the others imitate it: the record sets no limit
-                error = np.sqrt(self.correlation * self._variance(left)) / size
-                found[row] = float(rho), float(error)
+        whole = Linearised(np.zeros(self.rows.shape[-1] - 1), Triangle(self.triangles[-1], 0))
+        one, found = whole.added(base, [places[row] for row in new]), {}
+        for k, row in enumerate(new):
+            if one.share[k] >= OPTIONS.imitated:  # else others imitate it: there is no limit
+                error = np.sqrt(self.correlation * self._variance(one.left[k])) / one.size[k]
+                found[row] = float(one.value[k]), float(error)
         return found
 
     def limits(self, taken: tuple[Loss, ...]) -> dict[Loss, float]:
         """Upper limits of ρ of the candidates that were not taken."""
         others = self.others(taken).items()
-        return {row: max(rho, 0.0) + _LIMIT * error for row, (rho, error) in others}
+        return {row: max(rho, 0.0) + OPTIONS.limit * error for row, (rho, error) in others}
 
     def _variance(self, rest: float) -> float:
         """Variance of the residuals, by their norm."""
-        count = np.count_nonzero(self.rows[..., -1]) - self.rows.shape[-1]
-        return float(rest**2 / max(count, 1))
+        return float(rest**2 / max(self.count - self.rows.shape[-1], 1))

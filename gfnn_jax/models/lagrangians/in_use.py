@@ -7,35 +7,49 @@ wander is taken where its forecasts of held-out data do not err more than chance
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.data.channels import parameters_of
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.dataset.stretches import Nodes, Scales, Stretch
+from gfnn_jax.dataset.stretches import Stretch
 from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.maps.estimates import law_in_use
 from gfnn_jax.maps.laws import conformal
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.lagrangians.calibration import Calibration, Thirds, calibrated
-from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit, Workbench
+from gfnn_jax.models.lagrangians.fit import FOLDS, ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.learned_law import in_columns, scaled
-from gfnn_jax.models.lagrangians.structure import Structure
-from gfnn_jax.models.lagrangians.wandering import wander_of
-from gfnn_jax.models.lagrangians.zeros_of_runs import wander_of_runs
+from gfnn_jax.models.lagrangians.zeros import wander_of, wander_of_runs
 from gfnn_jax.solve.latent_arcs import SOFT_L1
 from gfnn_jax.solve.linear import covariance_root
 
 
-class InUse(NamedTuple):
-    """A fit on its workbench, how its friction was chosen, its law and covariance in the columns'
-    units, the law that moves with a root of its covariance, the factor of L and what fixes it, and
-    its calibration."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class RecordingData:
+    """Samples of a recording as a fit sees them: the problem of its law, segments without gaps, the
+    known mass, and what was left out."""
 
-    bench: Workbench
+    recording: Recording
+    problem: ArcProblem
+    segments: Sequence[Stretch]
+    mass: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    messages: tuple[str, ...] = ()
+
+    @property
+    def given(self) -> np.ndarray:
+        """σ (k,) of the channels as given, NaN where none is."""
+        channels = self.problem.observation.channels
+        return np.array([self.recording.std[name] or np.nan for name in channels])
+
+
+class CalibratedLaw(NamedTuple):
+    """A fit, how its friction was chosen, its law and covariance in the columns' units, the law
+    that moves with a root of its covariance, the factor of L and what fixes it, and its
+    calibration."""
+
     fit: LawFit
     choice: FrictionChoice
     law: Lagrangian
@@ -46,149 +60,116 @@ class InUse(NamedTuple):
     gauge: str
     calibration: Calibration
 
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Record:
-    """The data that all fits of a recording share: its nodes, stretches and scales, σ of channels
-    as given (NaN where not), the known mass, and how inputs act between samples."""
-
-    recording: Recording
-    nodes: Sequence[Nodes]
-    found: Sequence[Stretch]
-    scales: Scales
-    given: np.ndarray
-    mass: Mapping[str, float]
-    hold: str
-    delay: float
-
-    @property
-    def args(self) -> np.ndarray:
-        """Parameters (n, k) of the system of each of the nodes' states."""
-        return np.concatenate([np.tile(n.stretch.args, (len(n.t), 1)) for n in self.nodes])
-
-    def in_use(self, bench: Workbench, fit: LawFit, choice: FrictionChoice) -> InUse:
-        """The fit made ready for forecasts."""
-        law, covariance = in_columns(fit)
-        names, scale = self.recording.coordinates, 1.0
-        gauge = (
-            f"the mean inertia M11 (of {names[0]}) over the data is 1, the unit of L, R, gains and "
-            f"energies; --mass {names[0]}=VALUE (mass=) gives them theirs"
-        )
-        for name, value in self.mass.items():
-            q = np.concatenate([n.x[:, : fit.form.dim] for n in self.nodes])
-            i, of_systems = names.index(name), law.at(self.args)
-            scale = value / float(np.mean(of_systems.masses(q)[:, i, i]))
-            law, covariance = scaled(law, covariance, scale)
-            gauge = f"the mean inertia of {name} over the data is {value:g}, as given"
-        gauge += _of_uncoupled(fit.structure, names, scale) + self._of_systems(law)
+    @classmethod
+    def of(cls, data: RecordingData, fit: LawFit, choice: FrictionChoice) -> CalibratedLaw:
+        """Make a fit ready for forecasts."""
+        law, covariance, scale, gauge = _in_gauge(data, fit)
         moving, of_moving = conformal(law, covariance)
-        root, sensors = covariance_root(of_moving), self.sensors(bench, fit)
-        spread = np.nanstd(np.concatenate([s.y for s in self.found]), axis=0)
-        thirds = self.thirds(bench, fit, sensors)
+        root, sensors = covariance_root(of_moving), _sensors(data, fit)
+        spread = np.nanstd(np.concatenate([s.y for s in data.segments]), axis=0)
         used = law_in_use(moving, root, sensors)
-        calibration = calibrated(used, thirds, self.found, self.scales, spread)
-        return InUse(bench, fit, choice, law, covariance, moving, root, scale, gauge, calibration)
-
-    def _of_systems(self, law: Lagrangian) -> str:
-        """Clause on what fixes the scale of L in each run, where these are of different systems."""
-        if law.powers is None:
-            return ""
-        names = ", ".join(parameters_of(self.recording))
-        inertia = [
-            row for row, term in zip(law.powers, law.terms.rows(), strict=False) if term[0][0] == 2
-        ]
-        if law.num_inputs:
-            return f"; gains of inputs are the same for all values of {names}"
-        if any(map(any, inertia)):
-            return (
-                f"; a run determines only ratios of coefficients: of the laws with the same ratios "
-                f"for every {names} this has the fewest terms"
-            )
-        return f"; for every {names}, since a run determines only ratios of coefficients"
-
-    def sensors(self, bench: Workbench, fit: LawFit) -> Sensors:
-        """The sensors, as yet without a misfit."""
-        scales, recording, observation = self.scales, self.recording, bench.observation
-        noise = np.where(self.given > 0, self.given, np.minimum(scales.sigma, fit.rms()))
-        wander = wander_of_runs(self.nodes, noise)
-        if bench.wander is not None:  # sizes of wanders are in units of the white part
-            noise, wander = fit.sigma, bench.wander
-        plain = observation.is_plain and observation.loss == SOFT_L1
-        x = np.concatenate([n.x for n in self.nodes])
-        x[:, : observation.dim] += fit.zeros
-        own = Sensors(
-            recording.coordinates,
-            recording.inputs,
-            recording.angles,
-            noise,
-            scales.omega,
-            scales.period,
-            self.hold,
-            self.delay,
-            np.array([scales.period]),
-            np.zeros((1, len(noise))),
-            None if plain else dataclasses.replace(observation, values=fit.sensors),
-            wander,
-            float(np.min(bench.state_scale(noise)[: observation.dim]) / scales.period),
-            x[:, : observation.dim].mean(axis=0),
-        )
-        reach = np.sqrt(np.mean(own.distances(x) ** 2, axis=0))
-        return dataclasses.replace(own, reach=np.maximum(reach, 1e-300))
-
-    def thirds(self, bench: Workbench, fit: LawFit, sensors: Sensors) -> Thirds:
-        """The laws of the record without each third, of which less data tell less."""
-        fewer, laws, begins = np.sqrt(FOLDS / (FOLDS - 1)), [], []
-        for other, run, t in bench.without_thirds(self.nodes, fit):
-            law, covariance = in_columns(other)
-            own = sensors
-            if sensors.observation is not None:
-                shown = dataclasses.replace(sensors.observation, values=other.sensors)
-                own = dataclasses.replace(sensors, observation=shown)
-            laws.append(law_in_use(law, fewer * covariance_root(covariance), own))
-            begins.append(
-                next(
-                    (i, t)
-                    for i, s in enumerate(self.found)
-                    if s.run == run and s.t[0] <= t <= s.t[-1]
-                )
-            )
-        return Thirds(tuple(laws), tuple(begins))
+        thirds, scales = _thirds(data, fit, sensors), fit.problem.scales
+        calibration = calibrated(used, thirds, data.segments, scales, spread)
+        return cls(fit, choice, law, covariance, moving, root, scale, gauge, calibration)
 
 
-def _of_uncoupled(structure: Structure, names: Sequence[str], scale: float) -> str:
-    """Clause on coordinates that nothing couples with the first one: each part of L has a scale of
-    its own."""
-    parts = structure.uncoupled[1:]
-    if not parts:
-        return ""
-    firsts = ", ".join(names[part[0]] for part in parts)
-    return (
-        f"; nothing couples {names[0]} with {firsts}: whatever their masses are, the motion is the "
-        f"same, and the mean inertia of {firsts} is set to {scale:g} too"
-    )
-
-
-def best_in_use(
-    record: Record,
-    bench: Workbench,
-    fit: LawFit,
-    choice: FrictionChoice,
-    on_progress: Callable[[str], object],
-) -> InUse:
+def best_in_use(data: RecordingData, fit: LawFit, choice: FrictionChoice) -> CalibratedLaw:
     """The fit as it is, or fitted anew with zeros of channels that wander: where its residuals show
     these (the likelihood's evidence) and forecasts of held-out data do not err more with them than
     chance makes."""
-    steady = record.in_use(bench, fit, choice)
-    wander = wander_of(bench, fit)
+    steady = CalibratedLaw.of(data, fit, choice)
+    wander = wander_of(fit)
     if wander is None:
         return steady
-    bench = dataclasses.replace(bench, wander=wander)
-    arcs = dataclasses.replace(fit.arcs, x=fit.fitted.x)
-    fit = bench.fit(fit.structure, fit.values, arcs, fit.sigma)
-    wandering = record.in_use(bench, fit, choice)
-    share = wandering.calibration.against(steady.calibration)
-    on_progress(
+    fit = fit.again(problem=dataclasses.replace(fit.problem, wander=wander))
+    wandering = CalibratedLaw.of(data, fit, choice)
+    apart = wandering.calibration.against(steady.calibration)
+    fit.problem.on_progress(
         f"zeros that wander by {wander.size:.2g} σ over {wander.time:.3g} s: held-out forecasts "
-        f"err by {share:.3g} times as much"
+        f"err by {apart.cost:.3g} times as much"
     )
-    return steady if wandering.calibration.errs_more(steady.calibration) else wandering
+    return steady if apart.is_higher(1.0) else wandering
+
+
+def _in_gauge(data: RecordingData, fit: LawFit) -> tuple[Lagrangian, np.ndarray, float, str]:
+    """The law and its covariance in the columns' units, the factor of L, and what fixes it."""
+    law, covariance = in_columns(fit)
+    names, scale = data.recording.coordinates, 1.0
+    gauge = (
+        f"the mean inertia M11 (of {names[0]}) over the data is 1, the unit of L, R, gains and "
+        f"energies; --mass {names[0]}=VALUE (mass=) gives them theirs"
+    )
+    for name, value in data.mass.items():
+        q, i = fit.problem.states[:, : fit.form.dim], names.index(name)
+        scale = value / float(np.mean(law.at(fit.problem.args).masses(q)[:, i, i]))
+        law, covariance = scaled(law, covariance, scale)
+        gauge = f"the mean inertia of {name} over the data is {value:g}, as given"
+    parts = fit.structure.uncoupled[1:]
+    if parts:
+        firsts = ", ".join(names[part[0]] for part in parts)
+        gauge += (
+            f"; nothing couples {names[0]} with {firsts}: whatever their masses are, the motion is "
+            f"the same, and the mean inertia of {firsts} is set to {scale:g} too"
+        )
+    return law, covariance, scale, gauge + _of_systems(law, fit.problem.parameters)
+
+
+def _of_systems(law: Lagrangian, parameters: Sequence[str]) -> str:
+    """Clause on what fixes the scale of L in each run, where these are of different systems."""
+    if law.powers is None:
+        return ""
+    names, rows = ", ".join(parameters), zip(law.powers, law.terms.rows(), strict=False)
+    if law.num_inputs:
+        return f"; gains of inputs are the same for all values of {names}"
+    if any(any(powers) for powers, term in rows if term[0][0] == 2):
+        return (
+            f"; a run determines only ratios of coefficients: of the laws with the same ratios "
+            f"for every {names} this has the fewest terms"
+        )
+    return f"; for every {names}, since a run determines only ratios of coefficients"
+
+
+def _sensors(data: RecordingData, fit: LawFit) -> Sensors:
+    """The sensors, as yet without a misfit."""
+    problem, recording = fit.problem, data.recording
+    scales, observation, inputs = problem.scales, problem.observation, problem.inputs
+    noise = np.where(data.given > 0, data.given, np.minimum(scales.sigma, fit.rms()))
+    wander = wander_of_runs(problem.nodes, noise)
+    if problem.wander is not None:  # sizes of wanders are in units of the white part
+        noise, wander = fit.sigma, problem.wander
+    plain = observation.is_plain and observation.loss == SOFT_L1
+    x = problem.states.copy()
+    x[:, : observation.dim] += fit.zeros
+    own = Sensors(
+        recording.coordinates,
+        recording.inputs,
+        recording.angles,
+        noise,
+        scales.omega,
+        scales.period,
+        inputs.hold,
+        inputs.delay,
+        np.array([scales.period]),
+        np.zeros((1, len(noise))),
+        None if plain else dataclasses.replace(observation, values=fit.sensors),
+        wander,
+        float(np.min(problem.state_scale(noise)[: observation.dim]) / scales.period),
+        x[:, : observation.dim].mean(axis=0),
+    )
+    reach = np.sqrt(np.mean(own.distances(x) ** 2, axis=0))
+    return dataclasses.replace(own, reach=np.maximum(reach, 1e-300))
+
+
+def _thirds(data: RecordingData, fit: LawFit, sensors: Sensors) -> Thirds:
+    """The laws of the record without each third, of which less data tell less."""
+    fewer, laws, begins = np.sqrt(FOLDS / (FOLDS - 1)), [], []
+    for other, run, t in fit.without_thirds():
+        law, covariance = in_columns(other)
+        own = sensors
+        if sensors.observation is not None:
+            shown = dataclasses.replace(sensors.observation, values=other.sensors)
+            own = dataclasses.replace(sensors, observation=shown)
+        laws.append(law_in_use(law, fewer * covariance_root(covariance), own))
+        inside = (s.run == run and s.t[0] <= t <= s.t[-1] for s in data.segments)
+        begins.append((list(inside).index(True), t))
+    return Thirds(tuple(laws), tuple(begins))

@@ -15,8 +15,8 @@ from gfnn_jax.families.lagrangian import Powers
 from gfnn_jax.families.text import Term
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.fit import LawFit
-from gfnn_jax.models.lagrangians.in_use import InUse
-from gfnn_jax.models.lagrangians.input_rules import Acting
+from gfnn_jax.models.lagrangians.in_use import CalibratedLaw
+from gfnn_jax.models.lagrangians.input_rules import InputModel
 from gfnn_jax.models.lagrangians.learned_law import (
     ONLY_TOGETHER,
     LearnedLaw,
@@ -30,7 +30,6 @@ from gfnn_jax.models.lagrangians.text import (
     of_systems,
     speed_names,
     terms_of,
-    which_friction_line,
     word_of,
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity
@@ -43,26 +42,26 @@ _ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apa
 Gains = dict[str, dict[str, tuple[float, float]]]
 
 
-def in_words(
-    recording: Recording,
-    best: InUse,
-    map_: SymplecticMap,
-    traces: tuple[Trace, ...],
-    motions: Sequence[Motion],
-    measured: Mapping[str, Velocity],
-    acting: Acting,
-    messages: Sequence[str],
-    steps: tuple[str, ...],
-    seconds: float,
-) -> LearnedLaw:
-    """The law, its sensors and what its fit showed, by names of columns and in the file's units.
+class Findings(NamedTuple):
+    """Findings of a fit beside the law: its map, traces of its arcs, motions to record next,
+    columns of velocities against the law, how the inputs act, warnings that come before those of
+    the law, what the search did, and seconds of the processor."""
 
-    measured: columns of velocities against the law. acting: how the inputs act. messages: warnings
-    that come before those of the fit.
-    """
-    names = _names(recording)
+    map: SymplecticMap
+    traces: tuple[Trace, ...]
+    motions: Sequence[Motion]
+    velocities: Mapping[str, Velocity]
+    inputs: InputModel
+    messages: Sequence[str]
+    steps: tuple[str, ...]
+    seconds: float
+
+
+def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> LearnedLaw:
+    """The law, its sensors and what its fit showed, by names of columns and in the file's units."""
+    names, traces, inputs = _names(recording), findings.traces, findings.inputs
     fit, law = best.fit, best.law
-    sensors = map_.sensors
+    sensors = findings.map.sensors
     assert sensors is not None  # of every map of a recording
     channels = sensors.observation_model.channels
     factors = np.array([recording.factors[name] for name in channels])
@@ -71,32 +70,32 @@ def in_words(
     zeros, parameters = _zeros_and_sensors(fit, recording)
     shown = dict(zip(channels, sensors.observation_model.formulas, strict=True))
     return LearnedLaw(
-        map=map_,
+        map=findings.map,
         lagrangian=lagrangian,
         friction=friction,
         gains=gains,
-        delay=(acting.delay, acting.error) if recording.inputs else None,
-        input_rules=dict(acting.others),
-        which_friction=which_friction_line(best.choice, best.scale, law.dim, names.speeds),
+        delay=(inputs.delay, inputs.error) if recording.inputs else None,
+        input_rules=dict(inputs.others),
+        which_friction=best.choice.in_words(best.scale, law.dim, names.speeds),
         hamiltonian=hamiltonian_of(law, lagrangian, names.coordinates, names.parameters),
         zeros=zeros,
         noise=dict(zip(channels, map(float, sensors.sigma / factors), strict=True)),
         residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)),
         gauge=best.gauge,
         units={n: recording.unit(n) for n in (*recording.columns, *recording.coordinates)},
-        velocities={n: one.in_file(recording, n) for n, one in measured.items()},
+        velocities={n: one.in_file(recording, n) for n, one in findings.velocities.items()},
         whiteness=found,
         traces=traces,
-        next_motions=_next_motions(motions, recording, names),
+        next_motions=_next_motions(findings.motions, recording, names),
         observe={n: f for n, f in shown.items() if n != f},
         sensors=parameters,
         alike=_alike(fit, lagrangian, friction),
         horizon=tuple(best.calibration.horizons),
         energy=_energy(traces, friction, recording.inputs),
-        messages=(*messages, *_not_followed(found), *_warnings(best, recording, gains)),
-        steps=steps,
+        messages=(*findings.messages, *_not_followed(found), *_warnings(best, recording, gains)),
+        steps=findings.steps,
         num_samples=len(recording),
-        seconds=seconds,
+        seconds=findings.seconds,
         ended="every length of arcs was fitted",
         flaws=_flaws(best, found),
     )
@@ -117,7 +116,7 @@ def _names(recording: Recording) -> _Names:
     return _Names(listed[:d], listed[d : 2 * d], listed[2 * d :])
 
 
-def _standard_errors(best: InUse) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def _standard_errors(best: CalibratedLaw) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Standard errors of the terms of L, of R, of the gains (d, m), and of the last coefficient,
     the rate γ of uniform friction where there is one."""
     std = np.sqrt(np.maximum(np.diag(best.covariance), 0.0))
@@ -126,7 +125,7 @@ def _standard_errors(best: InUse) -> tuple[np.ndarray, np.ndarray, np.ndarray, f
     return of_terms, of_losses, rest[: law.gains.size].reshape(law.gains.shape), float(std[-1])
 
 
-def _expressions(best: InUse, names: _Names) -> tuple[Formula, Formula]:
+def _expressions(best: CalibratedLaw, names: _Names) -> tuple[Formula, Formula]:
     """L and Rayleigh's R; uniform friction enters R as γ T."""
     law = best.law
     of_terms, of_losses, _, of_rate = _standard_errors(best)
@@ -145,7 +144,7 @@ def _expressions(best: InUse, names: _Names) -> tuple[Formula, Formula]:
     return lagrangian, Formula((*friction.terms, uniform))
 
 
-def _gains(best: InUse, recording: Recording) -> Gains:
+def _gains(best: CalibratedLaw, recording: Recording) -> Gains:
     """Input -> its force on each position, with the standard error."""
     gains, std = best.law.gains, _standard_errors(best)[2]
     return {
@@ -167,7 +166,7 @@ def _zeros_and_sensors(
     return zeros, {name: one for (_, name), one in zip(keys, fitted[len(where) :], strict=True)}
 
 
-def _flaws(best: InUse, found: Mapping[str, Whiteness]) -> tuple[str, ...]:
+def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> tuple[str, ...]:
     """Reasons why the law is not all of the motion, or is not reliable."""
     converged, driven = best.fit.fitted.converged, best.choice.gains
     return (
@@ -193,7 +192,7 @@ def _not_followed(found: Mapping[str, Whiteness]) -> list[str]:
     ]
 
 
-def _warnings(best: InUse, recording: Recording, gains: Gains) -> list[str]:
+def _warnings(best: CalibratedLaw, recording: Recording, gains: Gains) -> list[str]:
     """Reasons not to rely on the law, each with its remedy."""
     found = []
     if not best.fit.fitted.converged:

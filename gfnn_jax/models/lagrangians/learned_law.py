@@ -11,14 +11,15 @@ from gfnn_jax.exports import symbolic
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.lagrangian import DRY, Lagrangian
 from gfnn_jax.families.text import Term, measured
+from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.calibration import Horizon
 from gfnn_jax.models.lagrangians.fit import LawFit
-from gfnn_jax.models.lagrangians.friction_choice import DECIDED
+from gfnn_jax.models.lagrangians.friction_choice import WhichFriction
 from gfnn_jax.models.lagrangians.input_rules import RULES
 from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness
-from gfnn_jax.models.lagrangians.text import WhichFriction, of_systems, terms_of
+from gfnn_jax.models.lagrangians.text import of_systems, terms_of
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
 ONLY_TOGETHER = "only together"  # end of a line about coefficients that are identified as a sum
@@ -114,7 +115,11 @@ class LearnedLaw:
         if together:
             return f"one of several: {'; '.join(together)}"
         kinds, odds = set(self.which_friction.kinds), self.which_friction.odds
-        rivals = [name for name in odds if odds[name] < DECIDED and not kinds < {*name.split("+")}]
+        rivals = [
+            name
+            for name in odds
+            if odds[name] < EVIDENCE.decided and not kinds < {*name.split("+")}
+        ]
         if rivals:
             return f"one of several: friction may be {' or '.join(['+'.join(kinds), *rivals])}"
         return "identified"

@@ -18,14 +18,27 @@ import numpy as np
 from gfnn_jax.dataset.stretches import Arcs
 from gfnn_jax.flows import coulomb
 from gfnn_jax.models.lagrangians import libraries
-from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, places
+from gfnn_jax.models.lagrangians.fit import LawFit, places
 from gfnn_jax.models.lagrangians.structure import Key
 
-_FURTHER = (0.5, 1.0, 1.5, 2.0, 4.0)  # of the largest deflections of the record
-_NEARLY_OVER = 3.0  # radians: an angle is let go no higher
-_IMITATED = 0.1  # share of what a term does that others do not, below which it is hardly told
-_MOST_TERMS = 40  # that are looked at: of larger libraries the first alone
-_MOST = 3
+
+@dataclasses.dataclass(frozen=True)
+class MotionOptions:
+    """Options of the motions that are compared (`tests/test_next_motion.py`).
+
+    further: of the largest deflections of the record. highest: radians, that an angle is let go.
+    imitated: share of what a term does that others do not, below which it is hardly identifiable.
+    most_terms: that are looked at: of larger libraries the first alone. most: motions.
+    """
+
+    further: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 4.0)
+    highest: float = 3.0
+    imitated: float = 0.1
+    most_terms: int = 40
+    most: int = 3
+
+
+OPTIONS = MotionOptions()
 
 
 class Motion(NamedTuple):
@@ -36,62 +49,62 @@ class Motion(NamedTuple):
     gains: dict[Key, float]
 
 
-def next_motions(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[Motion]:
+def next_motions(fit: LawFit) -> list[Motion]:
     """The best motions to record next, the best first; each as long as an arc of the fit."""
-    structure, d = fit.structure, fit.form.dim
-    rows, more = (library(d, tuple(angles)) for library in (libraries.first, libraries.more))
-    rows = [*rows, *more] if len(rows) + len(more) <= _MOST_TERMS else rows
-    library = libraries.without_forces(rows, bench.observation.shifts())
+    structure, d, problem = fit.structure, fit.form.dim, fit.problem
+    rows, more = (library(d, problem.angles) for library in (libraries.first, libraries.more))
+    rows = [*rows, *more] if len(rows) + len(more) <= OPTIONS.most_terms else rows
+    library = libraries.without_forces(rows, problem.observation.shifts())
     lacking = [("term", row) for row in library if row not in structure.terms]
     larger = structure.plus(lacking)
-    keys, whole = larger.keys(), bench.linearised(larger, fit)
+    keys, whole = larger.keys(), problem.linearised(larger, fit)
     own, others = places(larger, structure, lacking)
     own = [k for k in own if keys[k][0] != "sensor"]
     share = whole.added(own, others).share
-    hardly = {k for k, one in zip(others, share, strict=True) if one < _IMITATED}
+    hardly = {k for k, one in zip(others, share, strict=True) if one < OPTIONS.imitated}
     kept = [k for k in range(len(keys)) if k in own or k in hardly]
     here = whole.among(kept)
     if not here.columns.any():
         return []  # the law moves no residual, nor would it elsewhere
-    without_inputs = dataclasses.replace(
-        bench, inputs=lambda arcs: np.zeros((1, *bench.inputs(fit.arcs).shape[1:]))
-    )
+    still = np.zeros((1, *problem.inputs(fit.arcs).shape[1:]))
+    without_inputs = dataclasses.replace(problem, inputs=lambda arcs: still)
     found = []
-    for arcs in _followed(bench, fit, _starts(bench, fit, angles)):
+    for arcs in _followed(fit, _starts(fit)):
         less = here.sharpened_by(without_inputs.linearised(larger, fit, arcs).among(kept))
         order = np.argsort(-less)
         found.append(Motion(arcs.x[0, 0, :d], {keys[kept[k]]: float(less[k]) for k in order}))
     found.sort(key=lambda motion: -sum(np.log(list(motion.gains.values()))))
-    return found[:_MOST]
+    return found[: OPTIONS.most]
 
 
-def _starts(bench: Workbench, fit: LawFit, angles: Sequence[int]) -> list[np.ndarray]:
+def _starts(fit: LawFit) -> list[np.ndarray]:
     """One coordinate, or all of them with either sign, let go from rest at some deflections."""
-    d = fit.form.dim
-    middle = np.median(bench.gauge, axis=0)
-    reach = np.max(np.abs(bench.gauge - middle), axis=0)
+    d, angles = fit.form.dim, list(fit.problem.angles)
+    middle = np.median(fit.problem.gauge, axis=0)
+    reach = np.max(np.abs(fit.problem.gauge - middle), axis=0)
     shapes = [np.eye(d)[i] for i in range(d)]
     if d > 1:
         shapes += [np.array((1.0, *signs)) for signs in product((1.0, -1.0), repeat=d - 1)]
     starts = []
-    for shape, further in product(shapes, _FURTHER):
+    for shape, further in product(shapes, OPTIONS.further):
         q = middle + further * reach * shape
-        q[list(angles)] = np.clip(q[list(angles)], -_NEARLY_OVER, _NEARLY_OVER)
+        q[angles] = np.clip(q[angles], -OPTIONS.highest, OPTIONS.highest)
         if not any(np.allclose(q, other) for other in starts):
             starts.append(q)
     return starts
 
 
-def _followed(bench: Workbench, fit: LawFit, starts: Sequence[np.ndarray]) -> list[Arcs]:
+def _followed(fit: LawFit, starts: Sequence[np.ndarray]) -> list[Arcs]:
     """The motions from these starts as arcs, without inputs; those that leave for far away are left
     out."""
-    d, length = fit.form.dim, fit.arcs.t.shape[1]
+    d, length, problem = fit.form.dim, fit.arcs.t.shape[1], fit.problem
     steps = np.diff(fit.arcs.t, axis=1)
     h = np.full(len(starts), np.median(steps[steps > 0]))
-    still = np.zeros((len(starts), *bench.inputs(fit.arcs).shape[2:]))
+    still = np.zeros((len(starts), *problem.inputs(fit.arcs).shape[2:]))
     form, coefficients = fit.form, fit.p[: fit.form.count]
-    if form.powers is not None and bench.systems is not None:  # of the first arc's system
-        form, each, _ = form.in_systems(coefficients, bench.systems(fit.arcs)[:1])
+    if form.powers is not None and problem.systems.names:  # of the first arc's system
+        args = problem.systems.of_nodes[[fit.arcs.home[0][0]]]
+        form, each, _ = form.in_systems(coefficients, args)
         coefficients = each[0]
     first = np.array(starts)
     x = [np.concatenate([first, np.zeros((len(starts), d))], axis=1)]
@@ -100,10 +113,10 @@ def _followed(bench: Workbench, fit: LawFit, starts: Sequence[np.ndarray]) -> li
             x.append(coulomb.step(form, coefficients, x[-1], h, still, order=0)[0].states)
     states = np.stack(x, axis=1)
     off = np.abs(states[..., :d] - first[:, None])
-    far = 10 * (np.ptp(bench.gauge, axis=0) + np.abs(first))
+    far = 10 * (np.ptp(fit.problem.gauge, axis=0) + np.abs(first))
     home, t = ((fit.arcs.home[0][0], 0, length),), h[0] * np.arange(length)[None]
     arcs = []
     for lane in states[np.all(off < far[:, None], axis=(1, 2))]:  # no NaN either
-        y = bench.observation(lane[None]).values
+        y = problem.observation(lane[None]).values
         arcs.append(Arcs(t, y, lane[None], np.ones(y.shape), home))
     return arcs

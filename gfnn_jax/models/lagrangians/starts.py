@@ -10,32 +10,45 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from gfnn_jax.dataset.stretches import Nodes, Scales, arcs_of
+from gfnn_jax.dataset.stretches import Scales
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import LINEAR
-from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians import libraries
-from gfnn_jax.models.lagrangians.fit import LawFit, Workbench, describe
+from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.input_rules import choose_rule
-from gfnn_jax.models.lagrangians.structure import Loss, Row, Structure
-from gfnn_jax.models.lagrangians.weak_start import weak_start, zeros_of_angles
+from gfnn_jax.models.lagrangians.structure import Row, Structure
+from gfnn_jax.models.lagrangians.weak_form import weak_start, zeros_of_angles
 
-# What a start leaves over, above which others are tried: times the noise, or of the variation.
-_FOLLOWED, _SHARE = 10.0, 0.2
-_FAR = 0.3  # radians: a zero of an angle that a fit from 0 may not reach
-_FEW = 8.0  # samples a period, below which more of them are the remedy
-_PLAIN_IS_ENOUGH = 1.5  # times the residual of the larger library, the textbook's may have
+
+@dataclasses.dataclass(frozen=True)
+class StartOptions:
+    """Limits at which other starts are tried (`benchmarks/random_recordings.py`).
+
+    followed, share: residual of a start, times the noise or of the variation, above which others
+    are tried. far: zero of an angle, in radians, that a fit from 0 may not reach. few: samples a
+    period, below which more of them are the remedy. plain: times the residual of the larger
+    library, that the textbook's may have.
+    """
+
+    followed: float = 10.0
+    share: float = 0.2
+    far: float = 0.3
+    few: float = 8.0
+    plain: float = 1.5
+
+
+OPTIONS = StartOptions()
 
 
 def no_law(scales: Scales) -> FitError:
     """Error where no law follows a recording of these scales."""
     few = (
         f"; sample more often: it has about {scales.samples:.1f} samples in a period"
-        if scales.samples < _FEW
+        if scales.samples < OPTIONS.few
         else ""
     )
     return FitError(
@@ -46,25 +59,13 @@ def no_law(scales: Scales) -> FitError:
     )
 
 
-def best_start(
-    nodes: Sequence[Nodes],
-    scales: Scales,
-    angles: tuple[int, ...],
-    num_inputs: int,
-    benches: Mapping[str, Workbench],
-    observation: Observation,
-    periods: float,
-    on_progress: Callable[[str], object],
-) -> tuple[Workbench, LawFit]:
-    """The start that leaves least of arcs of so many ``periods``, or of those that leave about as
-    much the plainest; on the bench (hold -> it) of the rule by which inputs act.
+def best_start(problem: ArcProblem) -> LawFit:
+    """The start that leaves least of short arcs, or of those that leave about as much the plainest,
+    by the best of the rules by which inputs act.
 
     Raises FitError where there is none.
     """
-    d, some = (
-        observation.dim,
-        _Starts(nodes, scales, angles, num_inputs, benches, observation, periods, on_progress),
-    )
+    d, angles, some = problem.dim, problem.angles, _Starts(problem)
     plain = [some.add(libraries.textbook(d, angles))]
     if d > 1 and len(angles) == d:
         plain.append(some.add(libraries.relative(d, angles)))
@@ -76,41 +77,18 @@ def best_start(
         plain.append(some.add(libraries.uncoupled(d, angles), apart=True))
         some.add(libraries.bodies(d, angles), apart=True)
     if not some.fits:
-        raise no_law(scales)
-    best = min(map(some.misfit, some.fits))
-    simple = [
-        fit
-        for fit in some.fits
-        if fit.structure.terms in plain and some.misfit(fit) <= _PLAIN_IS_ENOUGH * best
-    ]
-    (bench,) = some.benches.values()
-    return bench, min(simple or some.fits, key=some.misfit)
+        raise no_law(problem.scales)
+    most = OPTIONS.plain * min(map(some.misfit, some.fits))
+    simple = [f for f in some.fits if f.structure.terms in plain and some.misfit(f) <= most]
+    return min(simple or some.fits, key=some.misfit)
 
 
 class _Starts:
-    """The starts so far, and the bench of each rule by which inputs may act, after the first of the
-    one that was chosen."""
+    """The starts so far, and the problem: after the first of the rule by which inputs act."""
 
-    def __init__(
-        self,
-        nodes: Sequence[Nodes],
-        scales: Scales,
-        angles: tuple[int, ...],
-        num_inputs: int,
-        benches: Mapping[str, Workbench],
-        observation: Observation,
-        periods: float,
-        on_progress: Callable[[str], object],
-    ):
-        self.nodes, self.scales, self.benches, self.fits = nodes, scales, benches, []
-        self.num_inputs, self.periods, self.on_progress = num_inputs, periods, on_progress
-        self.dim, self.shifted = observation.dim, observation.shifts()
-        self.sensors = tuple(
-            zip(observation.parameters, map(float, observation.values), strict=True)
-        )
-        with_zero = (i in observation.direct and i not in self.shifted for i in angles)
-        self.turned = tuple(i for i, has in zip(angles, with_zero, strict=True) if has)
-        self.angles, self.linear = angles, libraries.losses(self.dim, (LINEAR,), 0.0)
+    def __init__(self, problem: ArcProblem):
+        self.problem, self.fits = problem, []
+        self.linear = libraries.losses(problem.dim, (LINEAR,), 0.0)
 
     def add(
         self, rows: Sequence[Row], zero: np.ndarray | None = None, apart: bool = False
@@ -118,18 +96,19 @@ class _Starts:
         """Start from the terms of this library that the weak form shows, and return them; None
         where it does not determine them. zero: (d,) of angles, from which the fit begins. apart:
         without friction between coordinates."""
-        d = self.dim
-        friction: list[Loss] = self.linear[:d] if apart else self.linear
-        terms, seen = libraries.without_forces(rows, self.shifted), self.nodes
+        problem, d = self.problem, self.problem.dim
+        friction = tuple(self.linear[:d] if apart else self.linear)
+        terms, seen = libraries.without_forces(rows, problem.observation.shifts()), problem
         if zero is not None:
             about = np.concatenate([zero, np.zeros(d)])
-            seen = [dataclasses.replace(n, x=n.x - about) for n in seen]
-        library = Structure(d, terms, tuple(friction), (), self.num_inputs, self.sensors)
+            moved = [dataclasses.replace(n, x=n.x - about) for n in problem.nodes]
+            seen = dataclasses.replace(problem, nodes=moved)
+        library = Structure(d, terms, friction, (), problem.num_inputs, problem.sensors)
         try:
-            structure, known = weak_start(library, seen, self.scales)
+            structure, known = weak_start(library, seen)
         except FitError:
             return None
-        zeros = tuple(i for i in self.turned if any(row[2][i] for row in structure.terms))
+        zeros = tuple(i for i in problem.turned if any(row[2][i] for row in structure.terms))
         structure = structure.plus(
             [("loss", row) for row in self.linear[:d]] + [("zero", i) for i in zeros]
         )
@@ -137,40 +116,34 @@ class _Starts:
             known = known | {("zero", i): float(zero[i]) for i in zeros}
         elif any(structure.terms == other.structure.terms for other in self.fits):
             return structure.terms
-        length = max(6, round(self.periods * self.scales.per_period))
-        rule = choose_rule(
-            self.benches,
-            self.nodes,
-            structure,
-            known,
-            arcs_of(self.nodes, length),
-            self.scales.sigma,
-            self.scales.dt,
-        )
-        self.benches = {rule.hold: rule.bench}  # inputs act so in the other libraries too
+        periods = problem.options.periods[0]
+        rule = choose_rule(problem, structure, known, problem.arcs(periods), problem.scales.sigma)
+        # Inputs act so in the other libraries too.
+        inputs = rule.fit.problem.inputs
+        self.problem = dataclasses.replace(problem, inputs=inputs, rules=(rule.hold,))
         self.fits.append(rule.fit)
-        self.on_progress(f"{self.periods:g} periods: {describe(rule.fit)}")
+        problem.on_progress(f"{periods:g} periods: {rule.fit}")
         return structure.terms
 
     def misfit(self, fit: LawFit) -> float:
         """The largest residual of a channel, in units of its noise."""
-        finite = np.isfinite(fit.fitted.cost)
-        return float(np.max(fit.rms() / self.scales.sigma)) if finite else np.inf
+        return float(np.max(fit.rms() / self.problem.scales.sigma)) if fit.follows else np.inf
 
     @property
     def followed(self) -> bool:
         """Return whether some start follows its arcs."""
-        variation = np.nanstd(np.concatenate([n.y - n.zero for n in self.nodes]), axis=0)
+        y = np.concatenate([n.y - n.zero for n in self.problem.nodes])
+        most = OPTIONS.share * np.nanstd(y, axis=0)
         return any(
-            self.misfit(fit) < _FOLLOWED and np.all(fit.rms() < _SHARE * variation)
-            for fit in self.fits
+            self.misfit(fit) < OPTIONS.followed and np.all(fit.rms() < most) for fit in self.fits
         )
 
     def far_zeros(self) -> np.ndarray:
         """Zeros (d,) of angles, by the weak form; 0 where none is far off, or none determined."""
-        terms = libraries.without_forces(libraries.first(self.dim, self.angles), self.shifted)
-        zero = np.zeros(self.dim)
+        problem, zero = self.problem, np.zeros(self.problem.dim)
+        rows = libraries.first(problem.dim, problem.angles)
+        terms = libraries.without_forces(rows, problem.observation.shifts())
         with contextlib.suppress(FitError):
-            found = zeros_of_angles(terms, self.linear, self.num_inputs, self.nodes, self.scales)
-            zero[list(self.turned)] = found[list(self.turned)]
-        return zero if np.max(np.abs(zero)) > _FAR else 0 * zero
+            found, turned = zeros_of_angles(terms, self.linear, problem), list(problem.turned)
+            zero[turned] = found[turned]
+        return zero if np.max(np.abs(zero)) > OPTIONS.far else 0 * zero

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Sequence
 from typing import Any
@@ -11,9 +10,7 @@ import numpy as np
 
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.lagrangian import Friction, Powers, Terms
-from gfnn_jax.families.text import Term, in_letters, power
-from gfnn_jax.models.lagrangians.friction_choice import DECIDED, FrictionChoice
-from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, losses
+from gfnn_jax.families.text import Term, power
 from gfnn_jax.models.lagrangians.structure import powers_of
 
 
@@ -77,46 +74,6 @@ def word_of(
     return f"{'gain' if kind == 'gain' else 'zero'} of {names[rest[0]]}"
 
 
-@dataclasses.dataclass(frozen=True)
-class WhichFriction:
-    """The kinds of friction that a record shows. odds: that they forecast better than other kinds
-    ("none", "quadratic", "linear+dry", …). limits: of terms of R of kinds that were not seen, the
-    largest coefficients that the record allows (two standard errors)."""
-
-    kinds: tuple[str, ...]
-    odds: dict[str, float]
-    limits: dict[str, float]
-
-    def __str__(self) -> str:
-        text = "+".join(self.kinds) or "none"
-        if self.odds:
-            rival = min(self.odds, key=lambda name: self.odds[name])
-            text += f", on held-out arcs odds of {odds_text(self.odds[rival])} against {rival}"
-            if self.odds[rival] < 1:
-                text += f"; of sets within odds of {DECIDED:.0f} : 1 that of fewest kinds is kept"
-        below = [f"of {in_letters(term)} below {limit:.2g}" for term, limit in self.limits.items()]
-        return text + (f"; not seen, coefficients in R (2 σ): {', '.join(below)}" if below else "")
-
-
-def which_friction_line(
-    choice: FrictionChoice, scale: float, dim: int, speeds: Sequence[str]
-) -> WhichFriction:
-    """The choice in the recording's words; ``scale`` is that of L."""
-
-    def named(kinds: tuple[int, ...]) -> str:
-        return "+".join(FRICTIONS[KINDS.index(k)] for k in kinds) or "none"
-
-    plain = {direction for direction, _, _ in losses(dim, KINDS, 0.0)}
-    rows = [r for r in choice.limits if r[1] not in choice.kinds and r[0] in plain and len(r) == 3]
-    largest = scale * np.array([choice.limits[row] for row in rows])
-    terms = friction_of(Friction.of(rows, dim), largest, 0 * largest, speeds).terms
-    return WhichFriction(
-        tuple(FRICTIONS[KINDS.index(k)] for k in choice.kinds),
-        {named(kinds): odds for kinds, odds in choice.odds.items()},
-        {t.term: t.coefficient for t in terms},
-    )
-
-
 def speed_names(positions: Sequence[str], velocities: Sequence[str]) -> tuple[str, ...]:
     """Names of the velocities: of their columns, or omega1 of theta1 and v1 of x1; q_dot of q, and
     of all where one is named otherwise."""
@@ -127,10 +84,3 @@ def speed_names(positions: Sequence[str], velocities: Sequence[str]) -> tuple[st
     if len(named) < len(positions) or set(named) & set(positions):
         return tuple(f"{name}_dot" for name in positions)
     return tuple(named)
-
-
-def odds_text(odds: float) -> str:
-    """12 : 1, 1 : 3; those above a million are not told apart."""
-    if odds >= 1e6:
-        return "> 10⁶ : 1"
-    return f"{odds:,.2g} : 1" if odds >= 1 else f"1 : {1 / odds:,.2g}"

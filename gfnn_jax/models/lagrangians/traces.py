@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.dataset.stretches import Nodes
 from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.flows.motion import WEIGHTS
-from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.residuals import Trace
 
 
-def traces_of(
-    recording: Recording,
-    channels: tuple[str, ...],
-    fit: LawFit,
-    law: Lagrangian,
-    nodes: Sequence[Nodes],
-    inputs: ArcInputs,
-) -> tuple[Trace, ...]:
+def traces_of(recording: Recording, fit: LawFit, law: Lagrangian) -> tuple[Trace, ...]:
     """The arcs of a fit, channels in the file's units. An input supplies the mean of its force over
     a step times the way; friction takes the mean of its power at the ends."""
     arcs, found, d = fit.arcs, [], fit.form.dim
+    nodes, channels = fit.problem.nodes, fit.problem.observation.channels
     factors = np.array([recording.factors[name] for name in channels])
     left = fit.fitted.residuals * fit.sigma * arcs.noise
-    acting = np.tensordot(inputs(arcs), WEIGHTS, axes=(3, 0)).mean(axis=2)  # (A, L − 1, m)
+    acting = np.tensordot(fit.problem.inputs(arcs), WEIGHTS, axes=(3, 0)).mean(
+        axis=2
+    )  # (A, L − 1, m)
     for k, (i, a, b) in enumerate(arcs.home):
         n, stretch = b - a, nodes[i].stretch
         t, y, x = arcs.t[k, :n], arcs.y[k, :n] + nodes[i].zero, fit.fitted.x[k, :n]

@@ -21,7 +21,8 @@ import numpy as np
 from gfnn_jax.data.channels import channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.stretches import Arcs, Nodes, Stretch
-from gfnn_jax.models.lagrangians.fit import LawFit, correlation_time
+from gfnn_jax.fitting.evidence import correlation_time
+from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.signals.derivatives import difference
 
 _WRONG = 0.2  # of the noise, that scale, lag and bias may make up
@@ -61,9 +62,9 @@ class Velocity(NamedTuple):
         )
 
 
-def velocities(recording: Recording, fit: LawFit, nodes: Sequence[Nodes]) -> dict[str, Velocity]:
+def velocities(recording: Recording, fit: LawFit) -> dict[str, Velocity]:
     """Each column of velocities that no sensor explains, against the law of the positions."""
-    d, arcs, x = fit.form.dim, fit.arcs, fit.fitted.x
+    d, arcs, x, nodes = fit.form.dim, fit.arcs, fit.fitted.x, fit.problem.nodes
     if recording.coordinates != recording.positions:
         return {}
     law = fit.form.lagrangian(fit.p[: fit.form.count])
@@ -128,9 +129,9 @@ def _copied(recording: Recording, place: int, name: str) -> bool:
 
 
 def with_channels(
-    recording: Recording, nodes: Sequence[Nodes], arcs: Arcs, x: np.ndarray, names: Sequence[str]
+    recording: Recording, nodes: Sequence[Nodes], arcs: Arcs, names: Sequence[str]
 ) -> tuple[list[Nodes], Arcs]:
-    """Nodes and arcs, at the states x, that show these columns too."""
+    """Nodes and arcs that show these columns too."""
     wider: dict[int, Stretch] = {}
     extended = []
     for node in nodes:
@@ -147,7 +148,7 @@ def with_channels(
     y = _at_nodes(arcs, extended, [node.stretch.y - node.zero for node in extended])
     y = np.where(np.isfinite(arcs.y).any(axis=-1, keepdims=True), y, np.nan)
     noise = _at_nodes(arcs, extended, [node.stretch.noise for node in extended])
-    return extended, dataclasses.replace(arcs, y=y, noise=noise, x=x)
+    return extended, dataclasses.replace(arcs, y=y, noise=noise)
 
 
 def _column(recording: Recording, s: Stretch, name: str, which: int = 0) -> np.ndarray:

@@ -1,47 +1,139 @@
-"""The equation of motion in weak form: linear in the coefficients, and free of accelerations.
+"""Start of the fit of a law: the equation of motion in weak form, which is linear in the
+coefficients and free of accelerations.
 
     ∫ (−φ̇ ∂ℓ_j/∂v − φ ∂ℓ_j/∂q) dt        for a term of L,
     ∫ φ ∂r_k/∂v dt                         for a friction,      −∫ φ u dt   for a gain
 
 with bumps φ = (s(1 − s))³ along windows of the record, in which the term d/dt was integrated by
-parts.
+parts. Terms are eliminated until all are seen.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+
 import numpy as np
 
+from gfnn_jax.dataset.stretches import Nodes
+from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import functions_of
 from gfnn_jax.flows.motion import Form
+from gfnn_jax.models.lagrangians.fit import ArcProblem
+from gfnn_jax.models.lagrangians.libraries import SINE
+from gfnn_jax.models.lagrangians.structure import Key, Loss, Row, Structure
 
-_SPACING = 0.25  # of a window's length, from one window to the next
+
+@dataclasses.dataclass(frozen=True)
+class WeakOptions:
+    """Options of the weak form (`benchmarks/random_recordings.py`).
+
+    lengths: of the windows, in periods. spacing: of a window's length, to the next. overlap: rows
+    that share samples, of which as many count as one. apart: ratio of the weights of coordinates,
+    at most, since a wrong library would make one of them all. rounding: residual of a coordinate to
+    the sizes of its terms, below which a law without mass and force solves the equations.
+    """
+
+    lengths: tuple[float, ...] = (0.5, 1.0)
+    spacing: float = 0.25
+    overlap: float = 3.0
+    apart: float = 100.0
+    rounding: float = 1e-9
+    rank: float = 1e-12
 
 
-def weak_rows(
-    form: Form,
-    t: np.ndarray,
-    q: np.ndarray,
-    v: np.ndarray,
-    u: np.ndarray,
-    length: float,
-    args: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+OPTIONS = WeakOptions()
+
+
+def protected(structure: Structure) -> set[Key]:
+    """Constant masses of each coordinate, without which there would be no motion; of several that
+    depend on parameters of the system none alone."""
+    masses = [
+        row for row in structure.terms if max(row[0]) == 2 and not any(row[1]) and not any(row[2])
+    ]
+    alone = [row for row in masses if sum(other[0] == row[0] for other in masses) == 1]
+    return {("term", row) for row in alone}
+
+
+def weak_start(
+    structure: Structure, problem: ArcProblem, prune: bool = True
+) -> tuple[Structure, dict[Key, float]]:
+    """The structure less what is not seen at four standard errors (if ``prune``), and its
+    coefficients.
+
+    Raises FitError where a coordinate without mass and force solves the equations.
+    """
+    d, nodes = structure.dim, problem.nodes
+    args = np.repeat([n.stretch.args for n in nodes], [len(n.t) for n in nodes], axis=0)
+    form = structure.form(np.concatenate([n.x[:, :d] for n in nodes]), args)
+    lengths = [length * problem.scales.period for length in OPTIONS.lengths]
+    parts = [weak_rows(form, node, length) for node in nodes for length in lengths]
+    rows, targets = zip(*parts, strict=True)
+    X, Y = np.concatenate(rows), -np.concatenate(targets)
+    keys = structure.keys()[: form.count]
+    keep = [k for k in range(form.count) if np.any(X[..., k])]
+    fixed, significant = protected(structure), problem.options.evidence.significant
+    weight = np.ones(d)
+    while True:
+        for _ in range(2):  # each coordinate's rows in units of their own residual
+            c, residual, inverse = _solve(X[..., keep] * weight[:, None], Y * weight)
+            size = np.sqrt(np.mean(residual**2, axis=0))
+            if not np.min(size) > OPTIONS.rounding * np.linalg.norm(X[..., keep] * c):
+                raise FitError(
+                    "terms: a combination of them vanishes all along the recording, so that their "
+                    "coefficients are not determined. Leave one out, or add a force"
+                )
+            weight = np.maximum(weight / size, np.max(weight / size) / OPTIONS.apart)
+        error = np.sqrt(OPTIONS.overlap * np.mean(residual**2)) * np.linalg.norm(inverse, axis=1)
+        z = [
+            np.inf if keys[k] in fixed else abs(value) / e
+            for k, value, e in zip(keep, c, error, strict=True)
+        ]
+        if not prune or not z or min(z) > significant:
+            break
+        del keep[int(np.argmin(z))]
+    kept = {keys[k]: float(value) for k, value in zip(keep, c, strict=True)}
+    return structure.without({k for k in keys if k not in kept}), kept
+
+
+def zeros_of_angles(
+    terms: Sequence[Row], friction: Sequence[Loss], problem: ArcProblem
+) -> np.ndarray:
+    """Zeros (d,) of angles, up to a quarter of a turn, from which their own potentials cos q_i have
+    no sine; 0 of coordinates without.
+
+    Raises FitError as `weak_start`.
+    """
+    sines = [(*row[:3], row[3] + SINE) for row in terms if any(row[2])]
+    structure = Structure(problem.dim, (*terms, *sines), tuple(friction), (), problem.num_inputs)
+    known = weak_start(structure, problem, prune=False)[1]
+    zeros = np.zeros(structure.dim)
+    for row in terms:
+        speeds, powers, wave, phase = row
+        if any(speeds) or any(powers) or sum(map(abs, wave)) != 1:
+            continue
+        own = known.get(("term", row), 0.0), known.get(("term", (*row[:3], phase + SINE)), 0.0)
+        if any(own):
+            zeros[list(map(abs, wave)).index(1)] = np.arctan2(own[1], own[0])
+    return np.where(np.abs(zeros) > np.pi / 2, zeros - np.pi * np.sign(zeros), zeros)
+
+
+def weak_rows(form: Form, node: Nodes, length: float) -> tuple[np.ndarray, np.ndarray]:
     """Rows (windows, d, count) of the coefficients, and what the fixed part of the law gives
-    (windows, d); their sum with the coefficients is zero for the law. Along one stretch: t (n,),
-    q and v (n, d), u (n, inputs); ``length`` of the windows in units of t; args (k,) the parameters
-    of the system, where the law has such."""
-    terms, d = form.terms, form.dim
+    (windows, d); their sum with the coefficients is zero for the law. Along the nodes of one
+    segment; ``length`` of the windows in units of t."""
+    terms, d, t = form.terms, form.dim, node.t
+    q, v, u = node.x[:, :d], node.x[:, d:], node.stretch.u[node.at]
     weights = np.ones(terms.count + form.friction.count)
     if form.powers is not None:
-        weights = functions_of(form.powers, args)[: len(weights)]
+        weights = functions_of(form.powers, node.stretch.args)[: len(weights)]
     f, df, _ = terms.potentials(q, order=1)
     g, dg = terms.motion(v)
     momentum = (dg * f[..., None]).swapaxes(1, 2)  # (n, d, P)
     force = (df * g[..., None]).swapaxes(1, 2)
     lost = form.friction.residuals(v).swapaxes(1, 2)
-    starts = np.arange(t[0], t[-1] - length, _SPACING * length)
     columns, targets = [], []
-    for start in starts:
+    for start in np.arange(t[0], t[-1] - length, OPTIONS.spacing * length):
         i, j = np.searchsorted(t, (start, start + length))
         if j - i < 7:
             continue
@@ -62,3 +154,14 @@ def weak_rows(
     if not columns:
         return np.zeros((0, d, form.count)), np.zeros((0, d))
     return np.array(columns), np.array(targets)
+
+
+def _solve(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least squares X c = Y: c, residuals in the shape of Y, and R⁻¹ of the factor."""
+    flat = X.reshape(X.shape[0] * X.shape[1], X.shape[2])
+    scale = np.linalg.norm(flat, axis=0)
+    Q, R = np.linalg.qr(flat / scale)
+    inverse = np.linalg.pinv(R, rcond=OPTIONS.rank)
+    c = inverse @ (Q.T @ Y.reshape(-1))
+    residual = Y - (flat / scale @ c).reshape(Y.shape)
+    return c / scale, residual, inverse / scale[:, None]

@@ -1,0 +1,99 @@
+"""Is model B better than model A? One rule of evidence for terms, frictions, inputs and offsets.
+
+- *Parts of the data that neither fit has seen* say it where they can: the cost of B over that of A,
+  and the standard error of their difference, which is that of the paired differences of the parts.
+- A coefficient in units of its *standard error*, and *Schwarz's criterion* n log S + k log n of the
+  sum of squares S and k coefficients (Ann. Statist. 6 (1978) 461), say it where they cannot: they
+  choose what is compared, and decide where one part alone determines a coefficient.
+- Two models whose scale of residuals is found from them have *odds* of (S_A / S_B)^(n/2), n the
+  number of independent residuals.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """Evidence that a change of a model needs (`benchmarks/random_recordings.py`, `measured.py`).
+
+    In standard errors: significant: below it a coefficient may go; nothing: below it the
+    coefficient goes without a look at held-out parts; scored: above it one that is omitted is
+    tried. gain: share of the held-out cost by which a change has to lower it. chance: standard
+    errors of a difference of held-out costs that chance makes. decided: odds below which two models
+    are as good; needed: odds below which a direction of friction is left out. log_odds: the largest
+    logarithm of odds that is stated. logarithm: of the ratio of likelihoods, that a model of
+    correlated residuals has to gain.
+    """
+
+    significant: float = 4.0
+    nothing: float = 1.0
+    scored: float = 5.0
+    gain: float = 0.05
+    chance: float = 2.0
+    decided: float = 20.0
+    needed: float = 3.0
+    log_odds: float = 20.0
+    logarithm: float = 10.0
+
+    def odds(self, cost: float, other: float, count: float) -> float:
+        """Odds of a model of this held-out sum of squares over another, by ``count`` independent
+        residuals."""
+        log = 0.5 * count * np.log(max(other, 1e-300) / max(cost, 1e-300))
+        return float(np.exp(np.clip(log, -self.log_odds, self.log_odds)))
+
+
+EVIDENCE = Evidence()
+
+
+class Comparison(NamedTuple):
+    """Costs of a model on parts that it has not seen, beside those of another: the sums, their
+    difference, which parts that cost the same have none of, and its standard error."""
+
+    cost: float
+    other: float
+    apart: float
+    error: float
+
+    @classmethod
+    def of(cls, costs: np.ndarray, others: np.ndarray) -> Comparison:
+        """Compare costs (n,) of the same parts; infinite where a fit failed."""
+        with np.errstate(invalid="ignore"):
+            apart = np.where(costs == others, 0.0, costs - others)
+            error = np.sqrt(len(apart)) * np.std(apart, ddof=min(1, len(apart) - 1))
+        return cls(float(np.sum(costs)), float(np.sum(others)), float(np.sum(apart)), float(error))
+
+    def is_lower(self, share: float = 0.0) -> bool:
+        """Return whether the model costs less than the other, by this share of it at least."""
+        return self.cost < self.other * (1 - share)
+
+    def is_higher(self, errors: float = EVIDENCE.chance) -> bool:
+        """Return whether the model costs more than the other, by more than these standard errors,
+        of which infinite costs have none."""
+        return not self.apart <= errors * self.error
+
+
+def criterion(cost: float, count: float, coefficients: int) -> float:
+    """Schwarz's criterion of a model with so many coefficients, by its sum of squares and the
+    number of independent residuals: the least is the likeliest."""
+    return float(count * np.log(max(cost, 1e-300)) + coefficients * np.log(count))
+
+
+def correlation_time(residuals: np.ndarray) -> float:
+    """1 + 2 Σ ρ_k of residuals (A, L, d) along arcs, until ρ_k falls below 0.05; at least 1: among
+    so many neighbours a residual counts as one."""
+    r = np.where(np.isfinite(residuals), residuals, 0.0)
+    finite = np.isfinite(residuals).astype(float)
+    power = np.sum(r * r) / max(np.sum(finite), 1.0)
+    total = 1.0
+    for k in range(1, r.shape[1]):
+        pairs = np.sum(finite[:, k:] * finite[:, :-k])
+        rho = np.sum(r[:, k:] * r[:, :-k]) / max(pairs, 1.0) / max(power, 1e-300)
+        if rho < 0.05:
+            break
+        total += 2 * rho
+    return total
