@@ -61,7 +61,7 @@ from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.terms import polynomial_terms
 from gfnn_jax.fitting import gauss_newton, least_squares, linear_starts, row_blocks
-from gfnn_jax.fitting.levenberg_marquardt import Limits, levenberg_marquardt_together
+from gfnn_jax.fitting.levenberg_marquardt import GradientFit, Limits
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.learn.refit import help_refit, refit
@@ -146,15 +146,12 @@ def problem(task: str, quick: bool) -> Callable[[], Any]:
     held = len(w) // 5
 
     def trained():
-        result = levenberg_marquardt_together(
-            network,
-            starts,
+        result = GradientFit(
             w[held:],
             target[held:],
             validation=(w[:held], target[:held]),
-            shares=np.ones((size, len(w) - held)),
             limits=Limits(2 if quick else 5),
-        )
+        ).train_together(network, starts, np.ones((size, len(w) - held)))
         return np.concatenate([np.ravel(a) for a in jax.tree.leaves(result.params)])
 
     return trained

@@ -10,10 +10,9 @@ import gfnn_jax as gfnn
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.fitting.levenberg_marquardt import (
+    GradientFit,
     Limits,
     LMState,
-    levenberg_marquardt,
-    levenberg_marquardt_together,
 )
 from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.predict import Steps, predict
@@ -68,27 +67,22 @@ def test_members_are_trained_as_they_are_alone():
         return LMState(theta, theta, damping, 0, np.nan, np.inf, np.inf, np.inf, 0, 0.0)
 
     options, together = {"validation": held, "chunk": 40}, []
-    levenberg_marquardt_together(
-        family,
-        starts,
+    GradientFit(
         w,
         target,
-        shares=np.ones((3, 90)),
         limits=Limits(3, reports=(together.append,)),
         resume=begun(theta, np.full(3, 1e3)),
         **options,
-    )
+    ).train_together(family, starts, np.ones((3, 90)))
     for i, start in enumerate(starts):
         alone = []
-        levenberg_marquardt(
-            family,
-            start,
+        GradientFit(
             w,
             target,
             limits=Limits(3, reports=(alone.append,)),
             resume=begun(theta[i], 1e3),
             **options,
-        )
+        ).train(family, start)
         for ours, its in zip(together, alone, strict=True):
             np.testing.assert_allclose(ours.theta[i], its.theta, rtol=1e-6, atol=1e-9)
             assert ours.damping[i] == pytest.approx(its.damping)
@@ -101,10 +95,10 @@ def test_shares_are_the_weights_of_the_pairs():
     start = family.init(jax.random.key(0), np.float64)
     shares = np.repeat([[2.0, 0.0, 1.0]], 20, axis=1)
     options = {"validation": held, "limits": Limits(4)}
-    found = levenberg_marquardt_together(family, [start], w, target, shares=shares, **options)
+    found = GradientFit(w, target, **options).train_together(family, [start], shares)
     rows = np.repeat(np.arange(60), shares[0].astype(int))
-    other = levenberg_marquardt_together(
-        family, [start], w[rows], target[rows], shares=np.ones((1, len(rows))), **options
+    other = GradientFit(w[rows], target[rows], **options).train_together(
+        family, [start], np.ones((1, len(rows)))
     )
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), found.params, other.params

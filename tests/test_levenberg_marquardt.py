@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.family import DifferentiatedByJax, from_function
 from gfnn_jax.fitting import levenberg_marquardt as lm
-from gfnn_jax.fitting.levenberg_marquardt import BLOCK, Limits, levenberg_marquardt
+from gfnn_jax.fitting.levenberg_marquardt import BLOCK, GradientFit, Limits
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("amplitude",), meta_fields=())
@@ -66,15 +66,13 @@ TRAINING, VALIDATION = gradient_data(pendulum, 130, 0), gradient_data(pendulum, 
 
 def fit_pendulum(*, chunk=40, resume=None, **limits):
     """13 hidden units; 130 pairs in chunks of 40 need padding."""
-    return levenberg_marquardt(
-        NETWORK,
-        network_params(2, 13),
+    return GradientFit(
         *TRAINING,
         validation=VALIDATION,
         chunk=chunk,
         resume=resume,
         limits=Limits(**{"max_iterations": 12, **limits}),
-    )
+    ).train(NETWORK, network_params(2, 13))
 
 
 def test_recovers_an_exactly_representable_function_to_roundoff():
@@ -83,7 +81,7 @@ def test_recovers_an_exactly_representable_function_to_roundoff():
     training, validation = (
         gradient_data(partial(NETWORK.value, exact), num, seed) for num, seed in ((101, 1), (50, 2))
     )
-    result = levenberg_marquardt(NETWORK, start, *training, validation=validation, chunk=30)
+    result = GradientFit(*training, validation=validation, chunk=30).train(NETWORK, start)
     assert result.stopped_because == "no progress"
     assert result.iterations < 100
     assert result.train_rms < 1e-13
@@ -107,7 +105,7 @@ def test_finds_the_optimum_that_scipy_finds():
     oracle = scipy.optimize.least_squares(
         residual, theta, jac=jax.jit(jax.jacfwd(residual)), method="lm", xtol=1e-14, ftol=1e-14
     )
-    result = levenberg_marquardt(NETWORK, start, w, target, validation=(w, target))
+    result = GradientFit(w, target, validation=(w, target)).train(NETWORK, start)
     np.testing.assert_allclose(result.train_rms**2, 2 * oracle.cost / target.size, rtol=1e-6)
 
 
@@ -124,14 +122,9 @@ def test_the_best_parameters_on_validation_are_returned():
     states = []
     w, target = (a[:12] for a in TRAINING)  # 24 numbers, 52 parameters: overfits the noise
     target = target + 0.3 * np.random.default_rng(6).standard_normal(target.shape)
-    result = levenberg_marquardt(
-        NETWORK,
-        network_params(2, 13),
-        w,
-        target,
-        validation=VALIDATION,
-        limits=Limits(15, reports=(states.append,)),
-    )
+    result = GradientFit(
+        w, target, validation=VALIDATION, limits=Limits(15, reports=(states.append,))
+    ).train(NETWORK, network_params(2, 13))
     best = min(states, key=lambda state: state.validation_rms)
     assert best.iteration < result.iterations
     assert result.validation_rms == best.validation_rms
@@ -157,14 +150,8 @@ def test_a_second_fit_of_the_same_shapes_compiles_nothing(compilations):
     w, target = gradient_data(pendulum, 130, 8)
     start = network_params(5, 13)
     with compilations() as found:
-        result = levenberg_marquardt(
-            Network(amplitude=2.0),
-            start,
-            w,
-            target,
-            validation=VALIDATION,
-            limits=Limits(2),
-            chunk=40,
+        result = GradientFit(w, target, validation=VALIDATION, limits=Limits(2), chunk=40).train(
+            Network(amplitude=2.0), start
         )
     assert found.count == 0
     assert result.compile_seconds < 0.1
@@ -193,7 +180,7 @@ def test_a_step_into_non_finite_values_is_rejected():
     family = from_function(lambda params, w: -jnp.log(params) @ w)
     w = np.zeros((3, 2))
     target = np.full((3, 2), 6.0)
-    result = levenberg_marquardt(family, jnp.ones(2), w, target, validation=(w, target))
+    result = GradientFit(w, target, validation=(w, target)).train(family, jnp.ones(2))
     assert result.train_rms < 1e-10
     np.testing.assert_allclose(result.params, np.exp(-6.0), rtol=1e-9)
 
@@ -224,7 +211,7 @@ def test_non_finite_data_are_refused_by_name(bad, where):
     data[where][3, 1] = bad
     names = ("w", "target_gradient", "the validation's w", "the validation's target_gradient")
     with pytest.raises(ValueError, match=rf"^{names[where]} has entries that are NaN or infinite"):
-        levenberg_marquardt(NETWORK, network_params(0, 3), *data[:2], validation=tuple(data[2:]))
+        GradientFit(*data[:2], validation=tuple(data[2:])).train(NETWORK, network_params(0, 3))
 
 
 def test_other_bad_input_is_refused():
@@ -232,10 +219,10 @@ def test_other_bad_input_is_refused():
     w, target = TRAINING
     single = jax.tree.map(lambda a: a.astype(jnp.float32), params)
     with pytest.raises(TypeError, match=r"params must be float64, not float32"):
-        levenberg_marquardt(NETWORK, single, w, target, validation=VALIDATION)
+        GradientFit(w, target, validation=VALIDATION).train(NETWORK, single)
     with pytest.raises(ValueError, match=r"must be \(N, 2d\)"):
-        levenberg_marquardt(NETWORK, params, w, target[:-1], validation=VALIDATION)
+        GradientFit(w, target[:-1], validation=VALIDATION).train(NETWORK, params)
 
     imaginary = from_function(lambda params, w: jnp.sqrt(-w @ w) * params["outer"][0])
     with pytest.raises(ValueError, match=r"not finite on the training pairs"):
-        levenberg_marquardt(imaginary, params, w, target, validation=VALIDATION)
+        GradientFit(w, target, validation=VALIDATION).train(imaginary, params)

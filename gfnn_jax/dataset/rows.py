@@ -8,8 +8,17 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.families.inputs import Inputs, box_inputs
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.generating.charts import AnyChart
+
+
+def inputs_of(data: Dataset, w: np.ndarray, **more: Any) -> Inputs:
+    """The variables of S at points w (N, 2d), as these coordinates have them; the angles among q
+    alone enter by harmonics. more: as of `box_inputs`."""
+    coordinates = data.coordinates
+    angles = tuple(a for a in coordinates.angles if a < data.dim)
+    return box_inputs(w, angles=angles, cyclic=coordinates.cyclic, **more)
 
 
 def rows_of(data: Dataset, chart: AnyChart, rows) -> tuple[Any, np.ndarray]:

@@ -92,21 +92,16 @@ def as_varied(
     came = [f"{name}={value!r}" for name, value in asked.items() if value != "auto"]
     came += ["a base"] if base is not None else []
     if differs == "parameters":
-        expected = f"family {' or '.join(map(repr, families))} and no base"
-        got = f"family={family!r}" + " and a base" * (base is not None)
-        raise FitError(f"the pairs differ in their parameters: expected {expected}, got {got}")
-    if of_dt:
-        raise FitError(
-            "the pairs differ in their dt: expected family 'auto' or 'polynomial', chart 'auto' or "
-            f"'midpoint' and no base, got {', '.join(came)}"
-        )
+        what, expected = "parameters", f"family {' or '.join(map(repr, families))} and no base"
+    elif of_dt:
+        what = "dt"
+        expected = "family 'auto' or 'polynomial', chart 'auto' or 'midpoint' and no base"
+    else:
+        what = f"dt{' and in parameters' * bool(pairs.args)}{' of a structure' * (structure is not None)}"
+        expected = "learn='hamiltonian', and no family, chart or base"
     if came and came != ["learn='hamiltonian'"]:
-        beside = " and in parameters" if pairs.args else ""
-        raise FitError(
-            f"the pairs differ in their dt{beside}{' of a structure' * (structure is not None)}: "
-            "only H is learned of them, expected no family, chart or base, and no learn='map'; got "
-            + ", ".join(came)
-        )
+        got = ", ".join(came)
+        raise FitError(f"the pairs differ in their {what}: expected {expected}, got {got}")
     return pairs, "hamiltonian", messages
 
 

@@ -65,14 +65,30 @@ class LMState(NamedTuple):
 
     theta: Any
     best_theta: Any
-    damping: Any
-    iteration: int
-    train_rms: float
-    validation_rms: float
-    best_validation_rms: float
-    landmark_rms: float
-    landmark_iteration: int
-    seconds: float
+    damping: Any = math.nan
+    iteration: int = 0
+    train_rms: float = math.nan
+    validation_rms: float = math.inf
+    best_validation_rms: float = math.inf
+    landmark_rms: float = math.inf
+    landmark_iteration: int = 0
+    seconds: float = 0.0
+
+    def after(self, theta, damping, train_rms: float, validation_rms: float) -> LMState:
+        """The state after a step to θ."""
+        theta, iteration = np.asarray(theta), self.iteration + 1
+        found = self._replace(
+            theta=theta,
+            damping=damping,
+            iteration=iteration,
+            train_rms=train_rms,
+            validation_rms=validation_rms,
+        )
+        if validation_rms < self.best_validation_rms:
+            found = found._replace(best_theta=theta, best_validation_rms=validation_rms)
+        if train_rms < 0.99 * self.landmark_rms:
+            found = found._replace(landmark_rms=train_rms, landmark_iteration=iteration)
+        return found
 
 
 class LMResult(NamedTuple):
@@ -148,8 +164,8 @@ class _Training:
         """The training at θ and F of a step, validated and reported."""
         theta, loss = there
         train_rms, held_rms = math.sqrt(loss / self.size), self.validation_rms(theta)
-        seconds = time.perf_counter() - self.started
-        state = _next_state(self.state, theta, damping, train_rms, held_rms, seconds)
+        state = self.state.after(theta, damping, train_rms, held_rms)
+        state = state._replace(seconds=time.perf_counter() - self.started)
         for report in self.limits.reports:
             report(state)
         further = dataclasses.replace(self, state=state)
@@ -186,61 +202,17 @@ def result_of(state: LMState, params, compile_seconds: float, stopped_because: s
     )
 
 
-def first_state(theta, damping, validation_rms):
-    return LMState(
-        theta=np.asarray(theta),
-        best_theta=np.asarray(theta),
-        damping=damping,
-        iteration=0,
-        train_rms=math.nan,
-        validation_rms=validation_rms,
-        best_validation_rms=validation_rms,
-        landmark_rms=math.inf,
-        landmark_iteration=0,
-        seconds=0.0,
-    )
-
-
-def _next_state(state, theta, damping, train_rms, validation_rms, seconds):
-    theta, iteration = np.asarray(theta), state.iteration + 1
-    better = validation_rms < state.best_validation_rms
-    progress = train_rms < 0.99 * state.landmark_rms
-    return LMState(
-        theta=theta,
-        best_theta=theta if better else state.best_theta,
-        damping=damping,
-        iteration=iteration,
-        train_rms=train_rms,
-        validation_rms=validation_rms,
-        best_validation_rms=validation_rms if better else state.best_validation_rms,
-        landmark_rms=train_rms if progress else state.landmark_rms,
-        landmark_iteration=iteration if progress else state.landmark_iteration,
-        seconds=seconds,
-    )
-
-
 # δ₂ is a correction: where it is not small beside δ₁ the expansion has failed and δ₁ goes alone.
 LARGEST_ACCELERATION = 0.75
 OF_LARGEST = 1e-3  # the first damping, of the largest entry on AᵀA's diagonal
 Rows = Float[Array | np.ndarray, "_ _"]
 
 
-def levenberg_marquardt(
-    family: Family,
-    params: Any,
-    w: Rows,
-    target_gradient: Rows,
-    *,
-    validation: tuple[Rows, Rows],
-    weight: Any = 1.0,
-    limits: Limits = Limits(),  # noqa: B008, it is frozen
-    chunk: int = 500,
-    resume: LMState | None = None,
-) -> LMResult:
-    """Minimise the mean of ‖weight · (∇S(params, w) − target_gradient)‖² over the pairs.
+@dataclasses.dataclass(frozen=True, eq=False)
+class GradientFit:
+    """Pairs whose target gradients a family is fitted to: it minimises the mean of
+    ‖weight · (∇S(params, w) − target_gradient)‖².
 
-    family:      what is compiled for it serves every set of data of the same shape.
-    params:      any pytree of float64 arrays: the start.
     w, target_gradient: (N, 2d) each, as a chart makes them from pairs of states.
     validation:  (w, target_gradient) of pairs kept apart; the parameters that fit them best are
                  returned.
@@ -248,40 +220,121 @@ def levenberg_marquardt(
     limits:      when to stop, and what is called with the states.
     chunk:       at most so many pairs have their Jacobian in memory at once.
     resume:      a state that was reported: the fit goes on from there as though it had never
-                 stopped, bit for bit (``params`` then only lends its structure).
+                 stopped, bit for bit (the params then only lend their structure).
+
+    What is compiled for a family serves every set of data of the same shape.
     """
-    theta, layout = flattened(params)
-    w, target_gradient, weight, held = prepared(theta, w, target_gradient, validation, weight)
-    # On the device once, not in every iteration.
-    chunks = jax.device_put(chunked(w, target_gradient, weight, chunk))
 
-    def linearised(theta):
-        """Trial steps from θ, of any damping: all of them share one linearisation."""
-        matrix, slope, loss = linearize(family, chunks, theta, layout=layout)
-        if not math.isfinite(float(loss)):
-            raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
+    w: Rows
+    target_gradient: Rows
+    validation: tuple[Rows, Rows]
+    weight: Any = 1.0
+    limits: Limits = Limits()  # noqa: RUF009, it is frozen
+    chunk: int = 500
+    resume: LMState | None = None
 
-        def tried(damping) -> Tried:
-            if math.isnan(damping):
-                damping = OF_LARGEST * float(np.max(np.diagonal(np.asarray(matrix))))
-            trial, trial_loss, promised = attempt(
-                family, chunks, theta, (matrix, slope), np.float64(damping), layout=layout
-            )
-            decrease = float(loss - trial_loss)
-            return Tried((trial, float(trial_loss)), decrease, damping, float(promised))
+    def train(self, family: Family, params: Any) -> LMResult:
+        """Train one network from ``params``, any pytree of float64 arrays."""
+        theta, layout = flattened(params)
+        w, target_gradient, weight, held = self._prepared(theta)
+        # On the device once, not in every iteration.
+        chunks = jax.device_put(chunked(w, target_gradient, weight, self.chunk))
 
-        return tried
+        def linearised(theta):
+            """Trial steps from θ, of any damping: all of them share one linearisation."""
+            matrix, slope, loss = linearize(family, chunks, theta, layout=layout)
+            if not math.isfinite(float(loss)):
+                raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
 
-    def validation_rms(theta):
-        return math.sqrt(float(_loss(family, held, theta, layout=layout)))
+            def tried(damping) -> Tried:
+                if math.isnan(damping):
+                    damping = OF_LARGEST * float(np.max(np.diagonal(np.asarray(matrix))))
+                trial, trial_loss, promised = attempt(
+                    family, chunks, theta, (matrix, slope), np.float64(damping), layout=layout
+                )
+                decrease = float(loss - trial_loss)
+                return Tried((trial, float(trial_loss)), decrease, damping, float(promised))
 
-    started = time.perf_counter()
-    _compile(family, chunks, held, theta, layout)
-    compile_seconds = time.perf_counter() - started
-    first = first_state(theta, math.nan, validation_rms(theta)) if resume is None else resume
-    state, why = trained(first, linearised, Nielsen(), validation_rms, w.size, limits)
-    params = unflattened(np.asarray(state.best_theta), layout)
-    return result_of(state, params, compile_seconds, why)
+            return tried
+
+        def validation_rms(theta):
+            return math.sqrt(float(_loss(family, held, theta, layout=layout)))
+
+        started = time.perf_counter()
+        _compile(family, chunks, held, theta, layout)
+        compile_seconds = time.perf_counter() - started
+        state, why = self._trained(theta, math.nan, linearised, Nielsen(), validation_rms)
+        params = unflattened(np.asarray(state.best_theta), layout)
+        return result_of(state, params, compile_seconds, why)
+
+    def train_together(
+        self, family: Family, members: Sequence[Any], shares: Float[np.ndarray, "_ _"]
+    ) -> LMResult:
+        """Train E members of a family at once, each from its own start and with its own shares of
+        the pairs; one program linearises and tries a step of all of them.
+
+        members: E starts, pytrees of one structure. shares: (E, N), 0 or more, of mean 1: what the
+        square of a pair's residual counts in each member's loss. All else is as for ``train``, but
+        for this: a member whose step does not lower its loss waits with four times the damping for
+        the next iteration; validation errors are those of the members' mean ∇S; theta and
+        best_theta of a state are (E, P), its damping (E,); the params that are returned have a
+        leading axis E. The memory is E times as much.
+
+        On the devices of the fit (`fitting.row_blocks`) members are trained one at a time on each:
+        to the same bits on any number of devices, which one batch of all members would not give.
+        """
+        flat = [flattened(member) for member in members]
+        theta, layout = np.stack([t for t, _ in flat]), flat[0][1]
+        w, target_gradient, weight, held = self._prepared(theta)
+        *points, weights = chunked(w, target_gradient, weight, self.chunk)
+        padding = weights.shape[0] * weights.shape[1] - len(w)
+        parts = np.pad(np.sqrt(shares), ((0, 0), (0, padding))).reshape(-1, *weights.shape[:2], 1)
+        on_device = tuple(points), parts * weights
+
+        def linearised(theta):
+            """The trial step of every member from θ (E, P)."""
+
+            def tried(damping) -> Tried:
+                theta_, losses, decrease, promised, used = program(theta, damping)
+                if not np.isfinite(losses).all():
+                    raise ValueError(
+                        "∇S(params, w) is not finite on the training pairs at the start"
+                    )
+                there = theta_, float(np.mean(losses))
+                return Tried(there, np.asarray(decrease), np.asarray(used), np.asarray(promised))
+
+            return tried
+
+        def validation_rms(theta):
+            return math.sqrt(float(_loss_of_mean(family, held, theta, layout=layout)))
+
+        started, unknown = time.perf_counter(), np.full(len(theta), math.nan)
+        compiled = _compiled_on_devices if row_blocks.devices() else _compiled_together
+        program = compiled(family, on_device, theta, layout)
+        _loss_of_mean.lower(family, held, theta, layout=layout).compile()
+        compile_seconds = time.perf_counter() - started
+        state, why = self._trained(theta, unknown, linearised, WAITING, validation_rms)
+        each = [unflattened(one, layout) for one in np.asarray(state.best_theta)]
+        params = jax.tree.map(lambda *a: np.stack(a), *each)
+        return result_of(state, params, compile_seconds, why)
+
+    def _trained(
+        self, theta, damping, linearised, rule: Rule, validation_rms
+    ) -> tuple[LMState, str]:
+        state, theta = self.resume, np.asarray(theta)
+        if state is None:
+            rms = validation_rms(theta)
+            state = LMState(theta, theta, damping, validation_rms=rms, best_validation_rms=rms)
+        return trained(state, linearised, rule, validation_rms, np.size(self.w), self.limits)
+
+    def _prepared(self, theta):
+        """Rows w, target_gradient (N, 2d) and weight (2d,) as arrays, and on the device those that
+        validate, with their weight. Raises as `_check_rows` does."""
+        data = (self.w, self.target_gradient, *self.validation)
+        w, target_gradient, *held = (np.asarray(a) for a in data)
+        _check_rows(theta, w, target_gradient, *held)
+        weight = np.broadcast_to(np.asarray(self.weight, theta.dtype), w.shape[-1:])
+        return w, target_gradient, weight, jax.device_put((*held, weight[None, :]))
 
 
 def flattened(params):
@@ -393,15 +446,6 @@ def chunked(w, target_gradient, weight, chunk):
     return tuple(a.reshape(num_chunks, rows, -1) for a in (w[take], target_gradient[take], weights))
 
 
-def prepared(theta, w, target_gradient, validation, weight):
-    """Rows w, target_gradient (N, 2d) and weight (2d,) as arrays, and on the device those that
-    validate, with their weight. Raises as `_check_rows` does."""
-    w, target_gradient, *held = (np.asarray(a) for a in (w, target_gradient, *validation))
-    _check_rows(theta, w, target_gradient, *held)
-    weight = np.broadcast_to(np.asarray(weight, theta.dtype), w.shape[-1:])
-    return w, target_gradient, weight, jax.device_put((*held, weight[None, :]))
-
-
 def _check_rows(theta, *data):
     names = ("w", "target_gradient", "the validation's w", "the validation's target_gradient")
     for name, array in zip(("params", *names), (theta, *data), strict=True):
@@ -423,66 +467,6 @@ def _check_rows(theta, *data):
 
 # One trial in an iteration: a member whose step fails waits with four times the damping.
 WAITING = Nielsen(growth=4.0, trials=1)
-
-
-def levenberg_marquardt_together(
-    family: Family,
-    members: Sequence[Any],
-    w: Rows,
-    target_gradient: Rows,
-    *,
-    validation: tuple[Rows, Rows],
-    weight: Any = 1.0,
-    shares: Float[np.ndarray, "_ _"],
-    limits: Limits = Limits(),  # noqa: B008, it is frozen
-    chunk: int = 500,
-    resume: LMState | None = None,
-) -> LMResult:
-    """Minimise that loss for E members of a family at once, each from its own start and with its
-    own shares of the pairs; one program linearises and tries a step of all of them.
-
-    members: E starts, pytrees of one structure. shares: (E, N), 0 or more, of mean 1: what the
-    square of a pair's residual counts in each member's loss. All else is as for
-    `levenberg_marquardt`, but for this: a member whose step does not lower its loss waits with four
-    times the damping for the next iteration; validation errors are those of the members' mean ∇S;
-    theta and best_theta of a state are (E, P), its damping (E,); the params that are returned have
-    a leading axis E. The memory is E times as much.
-
-    On the devices of the fit (`fitting.row_blocks`) members are trained one at a time on each: to
-    the same bits on any number of devices, which one batch of all members would not give.
-    """
-    flat = [flattened(member) for member in members]
-    theta, layout = np.stack([t for t, _ in flat]), flat[0][1]
-    w, target_gradient, weight, held = prepared(theta, w, target_gradient, validation, weight)
-    *points, weights = chunked(w, target_gradient, weight, chunk)
-    padding = weights.shape[0] * weights.shape[1] - len(w)
-    parts = np.pad(np.sqrt(shares), ((0, 0), (0, padding))).reshape(-1, *weights.shape[:2], 1)
-    on_device = tuple(points), parts * weights
-
-    def linearised(theta):
-        """The trial step of every member from θ (E, P)."""
-
-        def tried(damping) -> Tried:
-            theta_, losses, decrease, promised, used = program(theta, damping)
-            if not np.isfinite(losses).all():
-                raise ValueError("∇S(params, w) is not finite on the training pairs at the start")
-            there = theta_, float(np.mean(losses))
-            return Tried(there, np.asarray(decrease), np.asarray(used), np.asarray(promised))
-
-        return tried
-
-    def validation_rms(theta):
-        return math.sqrt(float(_loss_of_mean(family, held, theta, layout=layout)))
-
-    started, unknown = time.perf_counter(), np.full(len(theta), math.nan)
-    compiled = _compiled_on_devices if row_blocks.devices() else _compiled_together
-    program = compiled(family, on_device, theta, layout)
-    _loss_of_mean.lower(family, held, theta, layout=layout).compile()
-    compile_seconds = time.perf_counter() - started
-    first = first_state(theta, unknown, validation_rms(theta)) if resume is None else resume
-    state, why = trained(first, linearised, WAITING, validation_rms, w.size, limits)
-    each = [unflattened(one, layout) for one in np.asarray(state.best_theta)]
-    return result_of(state, jax.tree.map(lambda *a: np.stack(a), *each), compile_seconds, why)
 
 
 def _compiled_together(family, rows, theta, layout):

@@ -24,16 +24,14 @@ from gfnn_jax.budget import NETWORK, Budget
 from gfnn_jax.candidates.candidate import Candidate, validated
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
-from gfnn_jax.dataset.rows import rows_of
+from gfnn_jax.dataset.rows import inputs_of, rows_of
 from gfnn_jax.families.ensemble import Ensemble
-from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.fitting.levenberg_marquardt import (
+    GradientFit,
     Limits,
     LMResult,
     LMState,
-    levenberg_marquardt,
-    levenberg_marquardt_together,
 )
 from gfnn_jax.models.generating_functions.size import OF_STEPS, Generates, Size
 from gfnn_jax.models.generating_functions.sweeps import trial_residual
@@ -56,12 +54,7 @@ class NetworkSweep(Generates):
         self.data, self.tolerance, self.chart = data, tolerance, chart
         self._max_iterations, self._seed, self._checkpoints = max_iterations, seed, checkpoints
         (w, target), self._weight = rows_of(data, chart, data.training[:_MLP_PAIRS])
-        coordinates = data.coordinates
-        inputs = box_inputs(
-            w,
-            angles=tuple(a for a in coordinates.angles if a < data.dim),
-            cyclic=coordinates.cyclic,
-        )
+        inputs = inputs_of(data, w)
         family = Mlp(inputs, _MLP_HIDDEN, _MLP_ACTIVATION, amplitude_of(w, target))
         self._train, self.sizes = (w, target), [Size(family, family, 0.0)]
         self._params: Any = None
@@ -140,13 +133,13 @@ class NetworkSweep(Generates):
     def _like(self) -> LMState:
         """A state whose structure is that of this training's."""
         theta = np.zeros(self.sizes[0].family.num_parameters)
-        return LMState(theta, theta, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0, 0.0)
+        return LMState(theta, theta, 0.0)
 
     def _trained(self, **options: Any) -> LMResult:
         """The training; its params are then those of the sweep."""
         family = self.sizes[0].family
         start = family.init(jax.random.key(self._seed), np.float64)
-        result = levenberg_marquardt(family, start, *self._train, **options)
+        result = GradientFit(*self._train, **options).train(family, start)
         self._params = jax.tree.map(np.asarray, result.params)
         return result
 
@@ -211,8 +204,8 @@ class EnsembleSweep(NetworkSweep):
     def _trained(self, **options: Any) -> LMResult:
         count, pairs = len(self._starts), len(self._train[0])
         shares = np.random.default_rng(self._seed).exponential(size=(count, pairs))
-        result = levenberg_marquardt_together(
-            self._network, self._starts, *self._train, shares=shares, **options
+        result = GradientFit(*self._train, **options).train_together(
+            self._network, self._starts, shares
         )
         self._take(result.params)
         return result

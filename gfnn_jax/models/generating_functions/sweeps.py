@@ -27,10 +27,10 @@ from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
 from gfnn_jax.dataset.noise import of_pairs
-from gfnn_jax.dataset.rows import of_rows, rows_of, weighted_rows_of
+from gfnn_jax.dataset.rows import inputs_of, of_rows, rows_of, weighted_rows_of
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.dataset.split import outermost
-from gfnn_jax.families.inputs import Inputs, box_inputs, variable_signs
+from gfnn_jax.families.inputs import Inputs, variable_signs
 from gfnn_jax.families.own import own_families
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
@@ -194,18 +194,10 @@ class LinearSweep(Generates):
         self._held, _ = weighted_rows_of(data, chart, data.validation)
         free = (*data.coordinates.cyclic, *data.whole)
         self._outermost = outermost(data.y0[data.training], free)
-        coordinates = data.coordinates
         w, made, args = self._train[0], Products, data.given(data.training)[1]
         if data.own_dt is not None:
             made, args = _of_time_step, data.own_dt[data.training, None] ** 2
-        inputs = box_inputs(
-            w,
-            angles=tuple(a for a in coordinates.angles if a < data.dim),
-            cyclic=coordinates.cyclic,
-            features=of.features,
-            reversor=reversor,
-            args=args,
-        )
+        inputs = inputs_of(data, w, features=of.features, reversor=reversor, args=args)
         degrees = _EVEN_DEGREES if even else OPTIONS.degrees
         signs = None
         if kind != "sines" and own is None and reversor is not None:
@@ -628,12 +620,7 @@ def trial_residual(data: Dataset) -> float:
     (w, target), weight = rows_of(data, MIDPOINT, slice(None))
     if not np.isfinite(w + target).all():
         return float("inf")
-    coordinates = data.coordinates
-    inputs = box_inputs(
-        w,
-        angles=tuple(a for a in coordinates.angles if a < data.dim),
-        cyclic=coordinates.cyclic,
-    )
+    inputs = inputs_of(data, w)
     trials = ([Products(inputs, degree)] for degree in OPTIONS.trial)
     groups = list(_determined(trials, w.size // 2, ROWS_PER_TERM))
     family = groups[-1][0] if groups else Products(inputs, 1)

@@ -23,7 +23,7 @@ from gfnn_jax.dataset.rows import residual_weight
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
-from gfnn_jax.fitting.levenberg_marquardt import Limits, levenberg_marquardt
+from gfnn_jax.fitting.levenberg_marquardt import GradientFit, Limits
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.rates import rates, substeps_for
@@ -86,9 +86,7 @@ def learn_network(problem: LawProblem, *, seed: int, max_iterations: int) -> Lea
     best = None
     idle = done = 0
     while idle < OPTIONS.idle and done < max_iterations and not budget.over:
-        result = levenberg_marquardt(
-            family,
-            params,
+        result = GradientFit(
             w[:count],
             target[:count],
             validation=(w[count:], target[count:]),
@@ -98,7 +96,7 @@ def learn_network(problem: LawProblem, *, seed: int, max_iterations: int) -> Lea
                 block=lambda n: budget.unit(f"{n} iterations of {label}", NETWORK, n * work),
                 target_rms=OPTIONS.resolved * tolerance.bound,
             ),
-        )
+        ).train(family, params)
         params, done = jax.tree.map(np.asarray, result.params), done + max(result.iterations, 1)
         substeps = substeps_for(family, params, y0[: OPTIONS.states], dt, OPTIONS.reach)
         flow = Flow(family, params, dt, scale, OPTIONS.stages, substeps)
