@@ -97,7 +97,7 @@ def as_varied(
         what = "dt"
         expected = "family 'auto' or 'polynomial', chart 'auto' or 'midpoint' and no base"
     else:
-        what = f"dt{' and in parameters' * bool(pairs.args)}{' of a structure' * (structure is not None)}"
+        what = "dt and in parameters" if pairs.args else "dt"
         expected = "learn='hamiltonian', and no family, chart or base"
     if came and came != ["learn='hamiltonian'"]:
         got = ", ".join(came)
