@@ -16,7 +16,7 @@ from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.models.hamiltonians import choose_law
 from gfnn_jax.models.hamiltonians import search as flows
-from gfnn_jax.models.hamiltonians.arcs import arcs_of
+from gfnn_jax.models.hamiltonians.sequences import arcs_of
 
 LAW, TRUE = given_terms(1, ["p**2", "q**2", "q**4"]), np.array([0.5, 0.5, 0.25])
 QUIETLY = pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")

@@ -15,8 +15,8 @@ from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.linear_starts import log_start, midpoint_start
 from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.flows.collocation import Steps, images, truncation
-from gfnn_jax.models.hamiltonians.formula import formula
-from gfnn_jax.models.hamiltonians.law_candidate import assembled
+from gfnn_jax.models.hamiltonians.fitted_law import formula
+from gfnn_jax.models.hamiltonians.learned_law import assembled
 from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.phase_space import Pairs

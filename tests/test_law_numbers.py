@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.families.terms import given_terms
-from gfnn_jax.models.hamiltonians.formula import Term, fraction_near, proposals
-from gfnn_jax.models.hamiltonians.symmetries import Known, restricted, symmetries_of
+from gfnn_jax.models.hamiltonians.fitted_law import Term, fraction_near, proposals
+from gfnn_jax.models.hamiltonians.symmetries import LawNumbers, restricted, symmetries_of
 
 R = "sqrt(q1**2 + q2**2)"
 
@@ -66,7 +66,7 @@ def test_numbers_within_their_errors_of_a_symmetry_are_given_it():
     family = given_terms(2, ["p1**2", "p2**2", f"1/{R}"])
     p = np.array([0.50003, 0.49998, -1.0001])
     covariance = np.diag([3e-5, 3e-5, 1e-4]) ** 2
-    found = restricted(family, Known(p, covariance, 3_000), states(2), ())
+    found = restricted(family, LawNumbers(p, covariance, 3_000), states(2), ())
     assert any(text.startswith("rotation in") for text in found.symmetries)
     assert found.numbers[0] == pytest.approx(found.numbers[1], rel=1e-14)
     assert found.numbers[0] == pytest.approx(p[:2].mean(), rel=1e-12)
@@ -77,7 +77,7 @@ def test_numbers_within_their_errors_of_a_symmetry_are_given_it():
 def test_numbers_that_their_errors_tell_apart_are_left_so():
     family = given_terms(2, ["p1**2", "p2**2", f"1/{R}"])
     p, covariance = np.array([0.5003, 0.4998, -1.0001]), np.diag([3e-5, 3e-5, 1e-4]) ** 2
-    found = restricted(family, Known(p, covariance, 3_000), states(2), ())
+    found = restricted(family, LawNumbers(p, covariance, 3_000), states(2), ())
     assert not any("rotation" in text for text in found.symmetries)
     np.testing.assert_array_equal(found.numbers, p)
 

@@ -12,7 +12,7 @@ from gfnn_jax.dataset.runs import identified
 from gfnn_jax.families.terms import given_terms, polynomial_terms
 from gfnn_jax.fitting.linear_starts import midpoint_start
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.models.hamiltonians.library_search import too_dear
+from gfnn_jax.models.hamiltonians.library_search import exceeds_cost
 from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.phase_space import Pairs
 
@@ -38,7 +38,7 @@ def test_a_few_terms_of_many_are_told_from_many(terms, coefficients, dear):
 
     def told(dearest):
         beside = dataclasses.replace(problem, dearest=dearest)
-        return too_dear(beside, polynomial_terms(2, 4), last)
+        return exceeds_cost(beside, polynomial_terms(2, 4), last)
 
     assert told(5e3) == dear
     assert not told(np.inf)

@@ -19,8 +19,8 @@ from gfnn_jax.families.text import Term
 from gfnn_jax.learn import searches
 from gfnn_jax.models.hamiltonians import choose_law
 from gfnn_jax.models.hamiltonians.choose_law import preferred
-from gfnn_jax.models.hamiltonians.formula import formula
-from gfnn_jax.models.maps_of_laws.draw import drawn
+from gfnn_jax.models.hamiltonians.fitted_law import formula
+from gfnn_jax.models.maps_of_laws.draw import Drawing, drawn
 
 FORMULA = "0.5 q1² + 0.5 q2² + 0.5 p1² + 0.5 p2² + q1² q2 - 0.333333333333 q2³"
 
@@ -312,7 +312,7 @@ def test_a_law_is_made_a_map_at_another_time_step(law):
 
 def test_pairs_are_drawn_in_the_region_that_is_named(law):
     region = [[-0.2, 0.1, -0.3, 0.0], [0.2, 0.4, 0.3, 0.1]]
-    pairs = drawn(law.hamiltonian.flow, CARTESIAN, None, 0.3, region=region, num_pairs=500)
+    pairs = drawn(law.hamiltonian.flow, CARTESIAN, None, 0.3, Drawing(500, region=region))
     assert pairs.dt == 0.3
     np.testing.assert_allclose(pairs.z0.min(axis=0), region[0], atol=0.02)
     np.testing.assert_allclose(pairs.z0.max(axis=0), region[1], atol=0.02)

@@ -11,8 +11,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.models.hamiltonians.sequences import FlowOnArcs
-from gfnn_jax.models.textbook.noisy_search import NoisyTextbook
-from gfnn_jax.models.textbook.weak_gradients import weak_gradients
+from gfnn_jax.models.textbook.noisy_search import NoisyTextbook, weak_gradients
 from gfnn_jax.phase_space import apply_j
 
 

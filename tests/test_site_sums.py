@@ -8,7 +8,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.families.expressions import parse, window_terms
 from gfnn_jax.families.sums import body_terms, site_terms
 from gfnn_jax.families.terms import given_terms
-from gfnn_jax.models.hamiltonians.formula import Term, as_code
+from gfnn_jax.models.hamiltonians.fitted_law import Term, as_code
 
 RNG = np.random.default_rng(0)
 FAMILIES = {

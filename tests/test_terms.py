@@ -15,7 +15,7 @@ from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms, given_terms, joined, polynomial_terms
 from gfnn_jax.families.text import Term, plain
 from gfnn_jax.families.traced import traced
-from gfnn_jax.models.hamiltonians.formula import formula
+from gfnn_jax.models.hamiltonians.fitted_law import formula
 from gfnn_jax.models.lagrangians.learned_law import Hamiltonian
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.systems import pcr3bp_features as features

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -89,6 +90,16 @@ def terms_above_noise(
     return min(found, key=cost)
 
 
+def terms_with_constants(
+    triangle: Triangle, p: np.ndarray, threshold: float, inside: Sequence[Sequence[int]]
+) -> list[int]:
+    """The terms that are left when those below ``threshold`` standard errors go, as
+    `significant_terms`, each with the constants inside it: ``inside`` has their places among the
+    numbers p (n,), the coefficients first, of each term."""
+    limit, every = threshold * _noise(triangle, len(p), None), np.arange(len(inside))
+    return _eliminated(triangle.rebased(p), every, p, limit, inside)[0].tolist()
+
+
 def _noise(triangle: Triangle, count: int, rms: float | None) -> float:
     rows = triangle.rows
     unexplained = triangle.residual_norm(count) / np.sqrt(rows) if rms is None else rms
@@ -117,14 +128,20 @@ def _matched(factor: np.ndarray, limit: float) -> np.ndarray:
 
 
 def _eliminated(
-    problem: Triangle, kept: np.ndarray, c: np.ndarray, limit: float
+    problem: Triangle,
+    kept: np.ndarray,
+    c: np.ndarray,
+    limit: float,
+    inside: Sequence[Sequence[int]] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(kept, their coefficients) when of these terms those go whose absence leaves less than
-    ``limit`` over, the others solved for again, until there are none."""
+    ``limit`` over, the others solved for again, until there are none. inside: further columns that
+    each term has and loses."""
     while kept.size:
-        spectrum = problem.pruned(kept).spectrum()
-        c = spectrum.solution(spectrum.inverse)
-        ratio = np.abs(c) / spectrum.deviations()
+        beside = [k for j in kept for k in inside[j]] if inside else []
+        spectrum = problem.pruned(np.append(kept, beside).astype(int)).spectrum()
+        c = spectrum.solution(spectrum.inverse)[: kept.size]
+        ratio = np.abs(c) / spectrum.deviations()[: kept.size]
         weak = ratio < limit
         if not weak.any():
             break

@@ -11,7 +11,7 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.learn.fit import fit
 from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.maps.domain import Ranges
-from gfnn_jax.models.maps_of_laws.draw import drawn
+from gfnn_jax.models.maps_of_laws.draw import Drawing, drawn
 
 
 def accelerated(
@@ -41,9 +41,8 @@ def accelerated(
     dt = float(np.asarray(fitted.map.dt)) if dt is None else dt
     if not (isinstance(dt, (int, float)) and 0 < dt < np.inf):
         raise FitError(f"expected a time step that is finite and above 0, got {dt!r}")
-    pairs = drawn(
-        flow, coordinates, fitted.pairs.z0, dt, region=region, num_pairs=num_pairs, seed=seed
-    )
+    how = Drawing(num_pairs, seed, region)
+    pairs = drawn(flow, coordinates, fitted.pairs.z0, dt, how)
     return fit(
         pairs,
         fitted.scene,

@@ -17,7 +17,7 @@ from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.map_of_terms import assembled as map_assembled
 from gfnn_jax.models.hamiltonians.choose_law import preferred
-from gfnn_jax.models.hamiltonians.law_candidate import assembled as flow_assembled
+from gfnn_jax.models.hamiltonians.learned_law import assembled as flow_assembled
 from gfnn_jax.search.search import Entry
 
 _CONFIRMED = 1.1  # of the error that the search measured

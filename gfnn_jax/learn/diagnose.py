@@ -8,7 +8,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed, lossy, undiagnosed
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.learn.request import Request
-from gfnn_jax.models.maps_of_laws.factor_out import factored_out, flow_of
+from gfnn_jax.models.maps_of_laws.law_maps import factored_out, flow_of
 
 
 def diagnose_request(request: Request, plain: Dataset) -> Diagnosis:

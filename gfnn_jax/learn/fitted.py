@@ -25,7 +25,7 @@ from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.learn.positions import OfPositions
 from gfnn_jax.learn.posterior import work_of_posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.hamiltonians.formula import PartialLaw
+from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS

@@ -26,7 +26,7 @@ from gfnn_jax.learn.refit_rows import RowsOfRefit, fitted_piece
 from gfnn_jax.learn.stated import FEWEST_RUNS_TESTED
 from gfnn_jax.maps.saved import packed, unpacked
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.hamiltonians.formula import Term, formula
+from gfnn_jax.models.hamiltonians.fitted_law import Term, formula
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group

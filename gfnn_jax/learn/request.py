@@ -22,7 +22,7 @@ from gfnn_jax.learn.check import (
     unnamed_angles,
 )
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.models.hamiltonians.formula import PartialLaw
+from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
 

@@ -19,8 +19,7 @@ from gfnn_jax.families.text import Term
 from gfnn_jax.learn.fitted import Choice, Fit
 from gfnn_jax.learn.positions import OfPositions
 from gfnn_jax.maps import saved as maps
-from gfnn_jax.models.hamiltonians.fitted_law import Dropped
-from gfnn_jax.models.hamiltonians.formula import PartialLaw, Proposal, Rival
+from gfnn_jax.models.hamiltonians.fitted_law import Dropped, PartialLaw, Proposal, Rival
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.calibration import Horizon
 from gfnn_jax.models.lagrangians.friction_choice import WhichFriction

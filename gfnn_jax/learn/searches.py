@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -27,13 +28,7 @@ from gfnn_jax.models.hamiltonians.choose_law import MAX_COST_RATIO, law_of, pref
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.networks import learn_network
 from gfnn_jax.models.hamiltonians.problem import LawProblem
-from gfnn_jax.models.maps_of_laws.law_maps import (
-    better_than,
-    law_explains_most,
-    more_pairs_would_help,
-    search_around,
-    search_of_law,
-)
+from gfnn_jax.models.maps_of_laws.law_maps import LawMaps, LawMapSearch
 from gfnn_jax.search.search import Entry, Found, Search
 
 # Operations of a size of S that is estimated before H is looked for: a fifth of a second.
@@ -81,9 +76,19 @@ def searched(
     climb.climb(most=_SMALL)
     # H with friction that depends on args is not learned.
     lossy_by_args = diagnosis.damping is not None and data.args is not None
+    problem = LawProblem(
+        data,
+        tolerance,
+        budget,
+        scene=scene,
+        terms=options.terms,
+        on_progress=on_progress,
+        partly=request.partly,
+    )
     law = None
     if not lossy_by_args:
-        law = _law(request, data, better, MAX_COST_RATIO * climb.cheapest)
+        dearest = MAX_COST_RATIO * climb.cheapest  # of a law that is chosen beside the maps
+        law = _law(request, dataclasses.replace(problem, dearest=dearest), better)
     of_terms, failed = None, None
     met_by_law = law is not None and tolerance.met_by(law.candidate)
     wanted = not early and options.learn != "hamiltonian" and not met_by_law
@@ -109,31 +114,10 @@ def searched(
     found = climb.found()
     dearest /= MAX_COST_RATIO  # of maps that would be chosen
     lossy = diagnosis.damping is not None or (law is not None and bool(law.friction))
-    if data.varied or lossy:  # pairs of H's flow are drawn, and factored out, at one dt
-        pass
-    elif (
-        law is not None
-        and met_by_law
-        and more_pairs_would_help(climb.sweeps, found, tolerance, dearest)
-    ):
-        on_progress("drawing pairs from the flow of H")
-        drawn = search_of_law(
-            law, data, tolerance, scene, dearest, budget, on_progress, on_candidate, options.seed
-        )
-        if drawn is not None:
-            found, charts = drawn
-    elif (
-        law is not None
-        and not met_by_law
-        and data.args is None
-        and law_explains_most(law, found, tolerance, budget)
-    ):
-        on_progress(f"learning the residual of the flow of {law.candidate.label}")
-        around = search_around(
-            law, data, tolerance, scene, budget, on_progress, on_candidate, better, options.seed
-        )
-        if around is not None and better_than(around.found, found, law):
-            found, charts = around
+    # Pairs of H's flow are drawn, and factored out, at one dt.
+    if law is not None and not data.varied and not lossy:
+        helper = LawMapSearch(law, problem, on_candidate, better, options.seed)
+        found, charts = helper.improved(LawMaps(found, charts), climb.sweeps, dearest)
     known = [f.candidate for f in (law, of_terms, *found.ranking[:1]) if f is not None]
     best = min((c.validation_bound for c in known), default=np.inf)
     linear = None
@@ -170,30 +154,19 @@ def _of_terms(data: Dataset) -> bool:
 
 
 def _law(
-    request: Request, data: Dataset, better: _Better | None, dearest: float
+    request: Request, problem: LawProblem, better: _Better | None
 ) -> LearnedHamiltonian | None:
-    """H, where one is looked for and found. dearest: operations of a step of a law that is chosen
-    beside the maps at hand."""
+    """H, where one is looked for and found."""
     options = request.options
     if not request.seeks_law:
         return None
-    problem = LawProblem(
-        data,
-        request.tolerance,
-        request.budget,
-        scene=request.scene,
-        terms=options.terms,
-        dearest=dearest,
-        on_progress=request.on_progress,
-        partly=request.partly,
-    )
     if request.of_network:
         law = learn_network(problem, seed=options.seed, max_iterations=options.max_iterations)
     else:
         law = law_of(problem, options.learn)
     if law is not None:
         if better is not None:
-            better.offer(law.candidate, lambda: composed(law.flow, data))
+            better.offer(law.candidate, lambda: composed(law.flow, problem.data))
         request.on_candidate(law.candidate)
     return law
 

@@ -1,34 +1,68 @@
-"""Laws of physics, tried before libraries of terms: see `models.textbook.search`.
+"""Laws of physics, tried before libraries of terms: see `models.textbook.search`, `noisy_search`.
 
-What the search finds is fitted through its flow as any library is, and taken where held-out pairs
-bear it out to the tolerance: an H of few terms, with the constants inside them, or none at all.
+What the search finds behind clean pairs is fitted through its flow as any library is, and taken
+where held-out pairs bear it out to the tolerance: an H of few terms, with the constants inside
+them, or none at all. What it finds behind noisy sequences is fitted to whole ones: coefficients,
+constants inside and latent states together. Among the laws within the noise the one of least
+description length is taken,
+
+    Σ_i n_i ln σ_i + ½ k ln n + what there is to say of its atoms,
+
+σ_i what it leaves over of each coordinate (n_i numbers), k its own numbers (Rissanen 1978).
 """
 
 from __future__ import annotations
 
-import copy
+import contextlib
 import dataclasses
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.budget import MATCHING
-from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
-from gfnn_jax.errors import OutOfTime
-from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
-from gfnn_jax.models.hamiltonians.formula import PartialLaw, Term, formula
+from gfnn_jax.budget import FLOW, MATCHING
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.dataset.noise import of_differences
+from gfnn_jax.dataset.runs import next_of
+from gfnn_jax.errors import InputError, OutOfTime
+from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_with_constants
+from gfnn_jax.flows.collocation import Steps, operations
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw, PartialLaw, Rival, Term, proposals
+from gfnn_jax.models.hamiltonians.fitted_law import formula as formula_of
 from gfnn_jax.models.hamiltonians.problem import LawProblem
-from gfnn_jax.models.textbook.search import OPTIONS, Law, Textbook
+from gfnn_jax.models.hamiltonians.sequences import OPTIONS as ARCS
+from gfnn_jax.models.hamiltonians.sequences import (
+    Measured,
+    Sequences,
+    covariance_root_of,
+    noise_of,
+    summary_of,
+    triangle_of,
+)
+from gfnn_jax.models.hamiltonians.symmetries import LawNumbers, restricted
+from gfnn_jax.models.textbook.noisy_search import OPTIONS as NOISY
+from gfnn_jax.models.textbook.noisy_search import Formula, NoisyTextbook, weak_gradients
+from gfnn_jax.models.textbook.search import OPTIONS as CLEAN
+from gfnn_jax.models.textbook.search import Law, Textbook
+from gfnn_jax.solve.latent_arcs import Fitted
+from gfnn_jax.solve.linear import covariance_root
 
 
 @dataclasses.dataclass(frozen=True)
 class DictionaryOptions:
-    """Tuned on the laws of benchmarks/textbook.py.
+    """Tuned on the laws of benchmarks/textbook.py, and of textbook_noise.py.
 
-    dictionaries: name, contents, and operations of a search by degrees of freedom from 1, in the
-    order in which they are tried: about the longest of the laws. fewest: pairs. nothing: of the
-    largest term, one so small is roundoff. shown: of a coefficient of a partial law, what is not
-    shown of it. certain: of the spread, that a law of the pairs' symmetries may leave over. exact:
-    of the spread, the error of a law that is no approximation.
+    dictionaries: of clean pairs, name, contents, and operations of a search by degrees of freedom
+    from 1, in the order in which they are tried: about the longest of the laws. fewest: pairs.
+    nothing: of the largest term, one so small is roundoff. shown: of a coefficient of a partial
+    law, what is not shown of it. exact: of the spread, the error of a law that is no approximation.
+
+    Behind noise: operations: of a search, by degrees of freedom from 1. least: of the spread, less
+    noise than that is not what weak gradients leave over. looked_at: rows by which laws are
+    compared. behind: natural logarithms of likelihood by which a law is behind that is not fitted;
+    brought: that further terms must bring. fitted: laws. evaluations: of the flow at each state,
+    that the fits of a law to sequences take together. screened, iterations: part of the cost from
+    which one counts, and how many, while laws are compared. as_noise: times the noise, that a law
+    may leave over. sure: logarithm of the largest odds that are told.
     """
 
     dictionaries: tuple[tuple[str, tuple[str, ...], tuple[float, ...]], ...] = (
@@ -39,11 +73,22 @@ class DictionaryOptions:
     fewest: int = 60
     nothing: float = 1e-9
     shown: float = 1e-5
-    certain: float = 1e-12
     exact: float = 1e-9
+    operations: tuple[float, ...] = (2e8, 4e8, 8e8, 1.6e9)
+    least: float = 3e-6
+    looked_at: int = 20_000
+    behind: float = 40.0
+    brought: float = 3.0
+    fitted: int = 4
+    evaluations: int = 3
+    screened: float = 3e-4
+    iterations: int = 12
+    as_noise: float = 1.1
+    sure: float = 40.0
 
 
-OF_LAWS = DictionaryOptions()
+OPTIONS = DictionaryOptions()
+_STEPS = Steps(6, 1)
 
 
 def law_of_physics(problem: LawProblem) -> FittedLaw | None:
@@ -51,29 +96,20 @@ def law_of_physics(problem: LawProblem) -> FittedLaw | None:
     of freedom in plain coordinates and angles. ``partly`` is called with the three laws that come
     closest, where none is exact."""
     data, rows, work = problem.data, problem.data.training, problem.work
-    if not problem.simple or data.dim > OPTIONS.most_dim or len(rows) < OF_LAWS.fewest:
+    if not problem.simple or data.dim > CLEAN.most_dim or len(rows) < OPTIONS.fewest:
         return None
-    own = copy.copy(problem.flows)  # its flows are no part of what libraries may take
-    own.allowance = dataclasses.replace(own.allowance, cap=None)
+    allowance = dataclasses.replace(problem.flows.allowance, cap=None)
+    own = dataclasses.replace(problem.flows, allowance=allowance)  # no part of what libraries take
     angles = tuple(a for a in data.coordinates.angles if a < data.dim)
-    symmetric, search = (
-        Textbook(
-            own,
-            rows,
-            angles=angles,
-            cyclic=data.coordinates.cyclic,
-            on_progress=problem.on_progress,
-            symmetries=symmetries,
-        )
-        for symmetries in (symmetries_of_pairs(data), ())
-    )
+    cyclic = data.coordinates.cyclic
+    search = Textbook(own, rows, angles=angles, cyclic=cyclic, on_progress=problem.on_progress)
     law = None
-    for name, contents, operations in OF_LAWS.dictionaries:
-        if law is not None or not operations[data.dim - 1]:
+    for name, contents, allowed in OPTIONS.dictionaries:
+        if law is not None or not allowed[data.dim - 1]:
             continue
         try:
-            with work.budget.unit(name, MATCHING, operations[data.dim - 1]):
-                law = _found(symmetric, search, dict.fromkeys(contents, True))
+            with work.budget.unit(name, MATCHING, allowed[data.dim - 1]):
+                law = search.law(**dict.fromkeys(contents, True))
         except OutOfTime:
             work.budget.leave_out(name, work.ended)
             return None
@@ -83,7 +119,7 @@ def law_of_physics(problem: LawProblem) -> FittedLaw | None:
         for partial in search.partial:
             family, c = _without_nothing(partial, data.y0[rows], data.scale)
             named = zip(family.term_names, c.tolist(), strict=True)
-            shown = formula([Term(name, x, OF_LAWS.shown * abs(x)) for name, x in named])
+            shown = formula_of([Term(name, x, OPTIONS.shown * abs(x)) for name, x in named])
             problem.partly(PartialLaw(shown, partial.left, "of the spread"))
         return None
     family, start = _without_nothing(law, data.y0[rows], data.scale)
@@ -94,21 +130,252 @@ def law_of_physics(problem: LawProblem) -> FittedLaw | None:
     except OutOfTime:
         work.budget.leave_out("the law of physics that was found", work.ended)
         return None
-    if not (problem.met_by(found) and found.error.relative <= OF_LAWS.exact):
+    if not (problem.met_by(found) and found.error.relative <= OPTIONS.exact):
         return None
     return found._replace(null=search.null, undetermined=search.null)
-
-
-def _found(symmetric: Textbook, search: Textbook, contents: dict[str, bool]) -> Law | None:
-    """The law of a dictionary: of the atoms that have the pairs' symmetries, where it is as exact
-    as clean pairs are, else of all atoms."""
-    law = symmetric.law(**contents) if symmetric.symmetric else None
-    return law if law is not None and law.left <= OF_LAWS.certain else search.law(**contents)
 
 
 def _without_nothing(law: Law, z: np.ndarray, scale: np.ndarray):
     """(family, coefficients) of the terms whose part in the gradients is not roundoff."""
     gradients = law.family.term_gradients(z) * scale[:, None]
     part = np.abs(law.coefficients) * np.sqrt(np.mean(gradients**2, axis=(0, 1)))
-    kept = np.flatnonzero(part > OF_LAWS.nothing * part.max())
+    kept = np.flatnonzero(part > OPTIONS.nothing * part.max())
     return law.family.take(kept.tolist()), law.coefficients[kept]
+
+
+class _LawOfSequences(NamedTuple):
+    """A law as whole sequences tell it, and its description length."""
+
+    formula: Formula
+    fitted: Fitted
+    length: float
+
+
+def law_of_sequences(problem: LawProblem) -> FittedLaw | None:
+    """The law, or None where the pairs are no noisy sequences of one dt, or nothing in the
+    dictionary leaves no more than their noise. ``partly`` is called with the three laws that come
+    closest, where none does."""
+    data, budget = problem.data, problem.budget
+    if data.varied or data.structure is not None or data.dim > len(OPTIONS.operations):
+        return None
+    stretches = _stretches(data)
+    noise = _noise_of(stretches, data.scale)
+    weak = None if noise is None else weak_gradients(stretches, data.dt, noise)
+    if noise is None or weak is None:
+        return None
+    angles = tuple(a for a in data.coordinates.angles if a < data.dim)
+    cyclic = data.coordinates.cyclic
+    search = NoisyTextbook(weak, angles=angles, cyclic=cyclic, on_progress=problem.on_progress)
+    name = "laws of physics behind noise"
+    try:
+        with budget.unit(name, MATCHING, OPTIONS.operations[data.dim - 1]):
+            formulas = _worth(search.formulas())
+        family = formulas[0].family(formulas[0].constants)
+        states = len(formulas) * len(data.training)
+        one = operations(family, 2 * data.dim, _STEPS, family)
+        with budget.unit(name, FLOW, OPTIONS.evaluations * states * one):
+            return _chosen(problem, formulas, noise)
+    except OutOfTime:
+        budget.leave_out(name, problem.work.ended)
+    except (np.linalg.LinAlgError, InputError):
+        pass
+    return None
+
+
+def _stretches(data: Dataset) -> list[np.ndarray]:
+    """States (L, 2d) of the training sequences without gaps, their angles going on over turns."""
+    rows = np.sort(data.training)[: OPTIONS.looked_at]
+    goes_on = next_of(data.pairs, rows)
+    if not goes_on.any():
+        return []
+    breaks = np.flatnonzero(~goes_on) + 1
+    moved = data.y1 - data.y0
+    return [
+        np.concatenate([data.y0[own[:1]], data.y0[own[0]] + np.cumsum(moved[own], axis=0)])
+        for own in np.split(rows, breaks)
+    ]
+
+
+def _noise_of(stretches: list[np.ndarray], scale: np.ndarray) -> np.ndarray | None:
+    """(2d,) the noise of each coordinate; None where differences of the states do not tell it."""
+    found, order = [], ARCS.order
+    for i, size in enumerate(scale):
+        moves = [np.diff(own[:, i : i + 1], axis=0) / size for own in stretches]
+        if not any(len(own) > order for own in moves):
+            return None
+        found.append(of_differences(moves, order, ARCS.alike))
+    if None in found or min(found) < OPTIONS.least:
+        return None
+    return np.array(found, float) * scale
+
+
+def _chosen(problem: LawProblem, formulas: list[Formula], noise: np.ndarray) -> FittedLaw | None:
+    """The law of least description length, where it leaves no more than noise."""
+    first, data = formulas[0], problem.data
+    family = first.family(first.constants)
+    sequences = Sequences.along(problem, family, first.coefficients, _STEPS)
+    if sequences is None:
+        return None
+    train, held = (
+        sequences.arcs(np.sort(rows)[: OPTIONS.looked_at])
+        for rows in (data.training, data.validation)
+    )
+    if train is None or held is None:
+        return None
+    laws: list[_LawOfSequences] = []
+    for tried, formula in enumerate(formulas):
+        with contextlib.suppress(np.linalg.LinAlgError, InputError):  # constants have run away
+            found = _significant(sequences, train, formula)
+            laws += [] if found is None else [found]
+        if tried and not laws:  # none of the likeliest two can be followed along its arcs
+            return None
+    if not laws:
+        return None
+    laws.sort(key=lambda law: law.length)
+    best = laws[0]
+    formula, fitted = best.formula, best.fitted
+    on_held_out = _fitted(sequences, held, formula, fitted.p, fix_coefficients=True)
+    for found in (fitted, on_held_out):
+        if found is None or not _rms(noise_of(found) / noise) <= OPTIONS.as_noise:
+            for law in laws[:3]:
+                left = _rms(noise_of(law.fitted) / noise)
+                problem.partly(PartialLaw(_shown(law), left, "times the noise"))
+            return None
+    fitted = sequences.refitted(fitted, formula.family, len(formula.coefficients))
+    return _law(problem, formula, fitted)._replace(rivals=_rivals(laws))
+
+
+def _rivals(laws: list[_LawOfSequences]) -> tuple[Rival, ...]:
+    """The next two laws of least description length, with the odds of the first against them."""
+    others: dict[frozenset, _LawOfSequences] = {}
+    for law in laws:
+        if law.formula.kind != laws[0].formula.kind:
+            others.setdefault(law.formula.kind, law)
+    return tuple(
+        Rival(_shown(law), float(np.exp(min(law.length - laws[0].length, OPTIONS.sure))))
+        for law in list(others.values())[:2]
+    )
+
+
+def _shown(law: _LawOfSequences) -> str:
+    """The law as people read it."""
+    formula, p = law.formula, law.fitted.p
+    terms = len(formula.coefficients)
+    deviations = np.linalg.norm(covariance_root_of(law.fitted), axis=0)
+    inside = map(_readable, p[terms:].tolist(), deviations[terms:].tolist())
+    names = formula.family(np.array(list(inside))).term_names
+    return formula_of(list(map(Term, names, p[:terms].tolist(), deviations[:terms].tolist())))
+
+
+def _worth(formulas: list[Formula]) -> list[Formula]:
+    """The laws that are not far behind the first, nor one before them with terms that bring
+    nothing."""
+
+    def behind(formula: Formula, other: Formula) -> float:
+        """Logarithm of the odds by which the other law's weak residuals are likelier."""
+        return formula.rows * float(np.log(formula.left / other.left))
+
+    kept: list[Formula] = []
+    for formula in formulas:
+        if behind(formula, formulas[0]) > OPTIONS.behind:
+            continue
+        if any(o.kind < formula.kind and behind(formula, o) > -OPTIONS.brought for o in kept):
+            continue
+        kept.append(formula)
+    return kept[: OPTIONS.fitted]
+
+
+def _significant(
+    sequences: Sequences, measured: Measured, formula: Formula
+) -> _LawOfSequences | None:
+    """The terms of a law that whole sequences tell from noise, fitted to them."""
+    p = np.concatenate([formula.coefficients, formula.constants])
+    while True:
+        found = _fitted(
+            sequences, measured, formula, p, gained=OPTIONS.screened, iterations=OPTIONS.iterations
+        )
+        if found is None:
+            return None
+        triangle = triangle_of(found)
+        kept = terms_with_constants(triangle, found.p, ABOVE_NOISE, formula.numbers)
+        if len(kept) == len(formula.coefficients):
+            break
+        if not kept:
+            return None
+        c = found.p[: len(formula.coefficients)]
+        formula = formula.with_constants(found.p[len(c) :]).take(kept, c[kept])
+        p = np.concatenate([formula.coefficients, formula.constants])
+    formula = formula.with_constants(found.p[len(formula.coefficients) :])
+    count = np.isfinite(found.residuals).sum(axis=(0, 1))
+    length = float(
+        np.sum(count * np.log(noise_of(found)))
+        + 0.5 * np.log(count.sum()) * len(found.p)
+        + NOISY.penalty * formula.complexity
+    )
+    return _LawOfSequences(formula, found, length)
+
+
+def _fitted(
+    sequences: Sequences, measured: Measured, formula: Formula, p: np.ndarray, **options: Any
+) -> Fitted | None:
+    terms = len(p) - len(formula.constants)
+    return sequences.fitted(measured, formula.family, p, terms, **options)
+
+
+def _law(problem: LawProblem, formula: Formula, fitted: Fitted) -> FittedLaw:
+    """The law as any other that was fitted to pairs, with what its sequences tell.
+
+    Standard errors are marginal: those of the constants inside widen them. A sample of the
+    posterior has the constants as they are; its covariance is that of the coefficients alone,
+    times (m + k)/m for k constants beside m coefficients, which leaves the mean variance of the
+    images at the states as it is.
+    """
+    root, terms, data = covariance_root_of(fitted), len(formula.coefficients), problem.data
+    known = restricted(
+        formula.family(fitted.p[terms:]),
+        LawNumbers(fitted.p, root.T @ root, triangle_of(fitted).rows),
+        data.y0[data.training],
+        data.coordinates.angles,
+    )
+    c, covariance = known.numbers[:terms], known.covariance
+    deviations = np.sqrt(np.diag(covariance).clip(0.0))
+    constants = list(map(_readable, known.numbers[terms:].tolist(), deviations[terms:].tolist()))
+    family = formula.family(np.array(constants))
+    inside = [j for j, places in enumerate(formula.numbers) for _ in places]
+    names = [family.term_names[j] for j in inside]
+    inner = tuple(map(Term, names, constants, deviations[terms:].tolist()))
+    coefficients = map(Term, family.term_names, c.tolist(), deviations.tolist())
+    near = proposals([*coefficients, *inner], covariance, len(inner))
+    fit = problem.flows.fit(family, c, data.training, rounds=False)
+    fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
+    return FittedLaw(
+        family,
+        fit,
+        data.training,
+        problem.error_of(family, fit),
+        noisy=True,
+        stalled=True,
+        whole=summary_of(fitted, _covariance_root_of_coefficients(covariance, terms)),
+        constants=inner,
+        symmetries=known.symmetries,
+        proposals=near,
+    )
+
+
+def _covariance_root_of_coefficients(covariance: np.ndarray, terms: int) -> np.ndarray:
+    """(terms, terms), rootᵀ root that of the coefficients with the constants as they are, times
+    (m + k)/m. The covariance may be singular."""
+    own, across = covariance[:terms, :terms], covariance[:terms, terms:]
+    inverse = np.linalg.pinv(covariance[terms:, terms:], hermitian=True)
+    more = len(covariance) / terms
+    return np.sqrt(more) * covariance_root(own - across @ inverse @ across.T)
+
+
+def _readable(constant: float, deviation: float) -> float:
+    """The constant to a hundredth of its standard error."""
+    digits = int(np.clip(np.ceil(np.log10(abs(constant) / deviation)) + 2, 2, 16))
+    return float(f"{constant:.{digits}g}")
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,9 @@ from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.significance import CERTAIN
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
@@ -148,15 +150,12 @@ def _of_kinds(
     family = with_friction(without_forces(full.family), choice.rows)
     start = full.start_of(family)
     steady = without_turns(data, family, start)
-    with problem.work.again("H with the friction that was chosen", family, len(steady.training)):
-        fit = problem.flows.fit(family, start, steady.training, rounds=False)
     judged = problem.on(steady)
-    error = judged.error_of(family, fit)
-    law = full._replace(
-        family=family, fit=fit, rows=steady.training, error=error, larger=None, odds=odds
-    )
+    with problem.work.again("H with the friction that was chosen", family, len(steady.training)):
+        own = judged.fitted(family, start, steady.training, rounds=False)
+    law = full.with_fit(own)._replace(larger=None, odds=odds)
     before = judged.error_of(alone.family, alone.fit)
-    worth_it = error.relative < OPTIONS.gained * before.relative
+    worth_it = law.error.relative < OPTIONS.gained * before.relative
     return law if _certain(law) and worth_it else None
 
 
@@ -183,7 +182,7 @@ def mechanical(problem: LawProblem) -> FittedLaw | None:
 
 def libraries_with(forces: Forces, problem: LawProblem) -> Iterator[Any]:
     """The families of H by rising size, each with these forces; of angles their shortest modes."""
-    basis = modes_of(problem, problem.terms)
+    basis = modes_of(problem)
     if basis is None:
         yield from map(forces, libraries_of(problem))
         return
@@ -202,15 +201,13 @@ def _certain(law: FittedLaw) -> bool:
 
 def _explains(flows: Problem, alone: FittedLaw, rows) -> bool:
     """Return whether γ, in the problem linearised about H alone, is certain to be above 0."""
-    family = Uniform(alone.family)
     c = np.append(alone.fit.coefficients, 0.0)
-    found = flows.linearised(family, c, alone.fit.steps, rows)
+    found = flows.linearised(Uniform(alone.family), c, alone.fit.steps, rows)
     if not found.finite:
         return False
-    # The last row of R but one is what γ alone explains, the last what nothing does.
-    size, along, left = found.factor[-2, -2], found.factor[-2, -1], found.factor[-1, -1]
-    noise = abs(left) / np.sqrt(max(found.rows - len(c), 1))
-    return bool(-along / size > CERTAIN * noise / abs(size))
+    gamma = Linearised.of_derivatives(c, found).added(range(len(c) - 1), [len(c) - 1])
+    noise = gamma.left / np.sqrt(max(found.rows - len(c), 1))
+    return bool(np.all(gamma.value * gamma.size > CERTAIN * noise))
 
 
 def _alike(flows: Problem, law: FittedLaw, rows) -> bool:
@@ -218,30 +215,17 @@ def _alike(flows: Problem, law: FittedLaw, rows) -> bool:
     does."""
     if not isinstance(law.family, Uniform) or law.family.dim == 1:
         return True
-    c, steps = law.fit.coefficients, law.fit.steps
+    c, steps, unit = law.fit.coefficients, law.fit.steps, flows.scale[:, None]
     found = flows.images(law.family, c, rows, steps, derivatives=True)
     own = flows.images(law.family, c, rows, steps, derivatives=True, along=Rates(law.family.dim))
-    residual = ((found.states - flows.z1[rows]) / flows.scale).ravel()
-    columns = [f.by_coefficient / flows.scale[:, None] for f in (found, own)]
-    if not all(np.isfinite(a).all() for a in (residual, *columns)):
+    others = own.by_coefficient[..., 1:]  # with γ they span all of the rates
+    residual = (found.states - flows.z1[rows])[..., None]
+    columns = np.concatenate([found.by_coefficient, others, residual], axis=-1) / unit
+    if not np.isfinite(columns).all():
         return True
-
-    def left(*columns) -> float:
-        matrix = np.concatenate([a.reshape(len(residual), -1) for a in columns], axis=1)
-        size = np.linalg.norm(matrix, axis=0)
-        scaled = matrix / np.where(size > 0, size, 1.0)
-        return float(np.linalg.norm(scaled @ np.linalg.lstsq(scaled, residual)[0] - residual))
-
-    return left(*columns) > OPTIONS.alike * left(columns[0])
-
-
-class Smoothed(NamedTuple):
-    """A family as a map steps it, the substeps that it needs, and the widths ε (F,) of its dry
-    friction, () without any."""
-
-    family: Any
-    substeps: int
-    widths: tuple[float, ...]
+    triangle = Triangle.of(columns.reshape(-1, columns.shape[-1]))
+    left = triangle.residual_norm(len(c) + others.shape[-1])
+    return left > OPTIONS.alike * triangle.residual_norm(len(c))
 
 
 def candidates(data: Dataset, family, coefficients) -> Friction:
@@ -290,8 +274,11 @@ def with_friction(own, rows: Sequence[Loss]) -> Any:
     return Uniform(family) if len(losses_of_r) < len(rows) else family
 
 
-def followed(family, coefficients, data: Dataset, noise: float) -> Smoothed:
-    """The family as steps over dt follow it. noise: of the scale, that the map may err by.
+def followed(
+    family, coefficients, data: Dataset, noise: float
+) -> tuple[Any, int, tuple[float, ...]]:
+    """The family as steps over dt follow it, the substeps that it needs, and the widths ε (F,) of
+    its dry friction, () without any. noise: of the scale, that the map may err by.
 
     A body that dry friction holds creeps at up to ε. That is noise ÷ dt, or, where it is more, the
     width over which the most substeps that a flow may have are no stiffer than Newton's method
@@ -299,7 +286,7 @@ def followed(family, coefficients, data: Dataset, noise: float) -> Smoothed:
     """
     friction = friction_of(family)
     if friction is None or not np.any(friction.kinds == DRY):
-        return Smoothed(family, 1, ())
+        return family, 1, ()
     own, dry = without_forces(family), friction.kinds == DRY
     directions = friction.directions.astype(float)
     rho = coefficients[own.num_parameters :][: friction.count]
@@ -312,8 +299,7 @@ def followed(family, coefficients, data: Dataset, noise: float) -> Smoothed:
     widths = np.maximum(creeping, rates / (STIFFEST * MOST_SUBSTEPS))
     substeps = int(np.ceil(np.max(rates[dry] / widths[dry]) / STIFFEST))
     wide = dataclasses.replace(friction, widths=np.where(dry, widths, friction.widths))
-    smoothed = _replaced(family, wide)
-    return Smoothed(smoothed, max(substeps, 1), tuple(map(float, widths[dry])))
+    return _replaced(family, wide), max(substeps, 1), tuple(map(float, widths[dry]))
 
 
 def kinds_of_friction(problem: LawProblem, law: FittedLaw, steps: Steps) -> WhichFriction | None:

@@ -10,7 +10,7 @@ of a pair: to O(dt²) that is where the fit through the flow starts.
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import combinations_with_replacement, product
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.lagrangians.libraries import SINE, modes, unit
 from gfnn_jax.phase_space import split
 
 # Σ|m_i| of the modes of angles and the degree of the powers of lengths in a mass; the degree of
@@ -47,37 +48,24 @@ def lagrangian_of(
         family = forces(family)
         start = np.concatenate([start, np.zeros(family.num_parameters - len(start))])
     with problem.work.library(family.label, family, len(rows)), np.errstate(all="ignore"):
-        fit = problem.flows.fit(family, start, rows)
-    return FittedLaw(family, fit, rows, problem.error_of(family, fit))
+        return problem.fitted(family, start, rows)
 
 
 def library(dim: int, angles: tuple[int, ...]) -> Terms:
     """Masses of modes of the angles and powers of the lengths, potentials of both."""
     none, lengths = (0,) * dim, [i for i in range(dim) if i not in angles]
-    waves, sine = [none], -np.pi / 2
-    for mode in product(range(-_SHORTEST, _SHORTEST + 1), repeat=len(angles)):
-        first = next((m for m in mode if m), 0)
-        if first > 0 and sum(map(abs, mode)) <= _SHORTEST:
-            wave = [0] * dim
-            for angle, m in zip(angles, mode, strict=True):
-                wave[angle] = m
-            waves.append(tuple(wave))
+    waves = [none, *sorted(modes(dim, angles, _SHORTEST))]
 
     def functions(degree: int) -> list[tuple]:
         powers = [
-            tuple(chosen.count(i) for i in range(dim))
+            unit(dim, *axes)
             for n in range(degree + 1)
-            for chosen in combinations_with_replacement(lengths, n)
+            for axes in combinations_with_replacement(lengths, n)
         ]
-        return [
-            (power, wave, phase)
-            for power in powers
-            for wave in waves
-            for phase in ((0.0, sine) if any(wave) else (0.0,))
-        ]
+        phases = {wave: (0.0, SINE) if any(wave) else (0.0,) for wave in waves}
+        return [(n, wave, phase) for n in powers for wave in waves for phase in phases[wave]]
 
-    pairs = combinations_with_replacement(range(dim), 2)
-    speeds = [tuple((i == a) + (i == b) for i in range(dim)) for a, b in pairs]
+    speeds = [unit(dim, *pair) for pair in combinations_with_replacement(range(dim), 2)]
     masses = [(speed, *rest) for speed in speeds for rest in functions(_SHORTEST)]
     potentials = [(none, *rest) for rest in functions(_POTENTIAL)]
     return Terms.of([*masses, *(row for row in potentials if any(row[1]) or any(row[2]))], dim)

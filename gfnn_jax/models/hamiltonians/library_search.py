@@ -7,8 +7,9 @@ are angles, one library grows mode by mode.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,6 @@ from gfnn_jax.models.hamiltonians.cost_of_flow import FAST, FREQUENCY_STATES, op
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.friction import Forces, beside_friction, libraries_with
 from gfnn_jax.models.hamiltonians.libraries import (
-    centrifugal_terms,
     libraries_of,
     own_terms,
     promising,
@@ -36,8 +36,12 @@ from gfnn_jax.models.hamiltonians.libraries import (
 from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.parameters import states_and_functions, walked
 
+NONE: Mapping[int, FittedLaw] = MappingProxyType({})
 
-def of_libraries(problem: LawProblem, basis: Modes | None, early: Sequence[FittedLaw]) -> FittedLaw:
+
+def of_libraries(
+    problem: LawProblem, basis: Modes | None, early: Mapping[int, FittedLaw]
+) -> FittedLaw:
     """The best library of terms of H, without friction or with it.
 
     basis: of the library that grows, where one does. early: the first libraries without friction,
@@ -45,7 +49,7 @@ def of_libraries(problem: LawProblem, basis: Modes | None, early: Sequence[Fitte
     """
 
     def search(forces: Forces | None = None, data=problem.data) -> FittedLaw:
-        return _searched(problem.on(data), forces, early if forces is None else ())
+        return _searched(problem.on(data), forces, early if forces is None else NONE)
 
     if problem.data.args is not None:
         found = _walked(problem)
@@ -53,32 +57,23 @@ def of_libraries(problem: LawProblem, basis: Modes | None, early: Sequence[Fitte
         found = _grown(problem, basis)
     else:
         found = search()
-        if not problem.terms and problem.data.structure is None:
-            found = _beside_centrifugal(problem, found)
     return beside_friction(problem, found, search)
 
 
-def small_polynomials(problem: LawProblem) -> list[FittedLaw]:
-    """The smallest polynomials that a search for H begins with, up to the first that is exact.
+def small_polynomials(problem: LawProblem) -> dict[int, FittedLaw]:
+    """The smallest polynomials that a search for H begins with, up to the first that is exact, by
+    the number of their terms.
 
     They are soon fitted, at steps too long for the matching of atoms too, and the search goes on
     from them.
     """
-    fitted: list[FittedLaw] = []
-    libraries, _ = _libraries(problem)
-    for family in libraries:
-        if family.num_parameters > problem.options.small:
-            break
-        last = fitted[-1] if fitted else None
-        if last is not None and too_dear(problem, family, last):
-            break
-        problem.on_progress(f"H: {family.num_parameters} terms")
-        try:
-            fitted.append(fitted_library(problem, family, last))
-        except OutOfTime:  # whatever follows finds no time either
-            break
-        if is_exact(problem, fitted[-1]):
-            break
+    laws = _laws(problem, _libraries(problem)[0], most=problem.options.small)
+    fitted: dict[int, FittedLaw] = {}
+    with contextlib.suppress(OutOfTime):  # whatever follows finds no time either
+        for count, _, law in laws:
+            fitted[count] = law
+            if is_exact(problem, law):
+                break
     return fitted
 
 
@@ -87,8 +82,34 @@ def is_exact(problem: LawProblem, law: FittedLaw) -> bool:
     return problem.met_by(law) and law.error.relative <= problem.options.exact
 
 
+def _laws(
+    problem: LawProblem,
+    libraries: Sequence[Any],
+    early: Mapping[int, FittedLaw] = NONE,
+    most: float = np.inf,
+) -> Iterator[tuple[int, int, FittedLaw]]:
+    """The laws of libraries of up to so many terms, each fitted from the one before, with the
+    number of terms and how many libraries are left. early: of them, those that are fitted already.
+    """
+    last: FittedLaw | None = None
+    for i, family in enumerate(libraries):
+        count = family.num_parameters
+        name = f"H: {count} terms"
+        if count > most:
+            return
+        if last is not None and exceeds_cost(problem, family, last):
+            problem.on_progress(f"{name} skipped, costlier per step than the map")
+            continue
+        if count in early:
+            last = early[count]
+        else:
+            problem.on_progress(name)
+            last = fitted_library(problem, family, last)
+        yield count, len(libraries) - 1 - i, last
+
+
 def _searched(
-    problem: LawProblem, forces: Forces | None = None, early: Sequence[FittedLaw] = ()
+    problem: LawProblem, forces: Forces | None = None, early: Mapping[int, FittedLaw] = NONE
 ) -> FittedLaw:
     """The smallest library that meets the tolerance, else the best; no fewer of its terms are tried
     where the tolerance is out of reach. forces: friction, that libraries have too.
@@ -97,37 +118,24 @@ def _searched(
     most_poor = options.poor_given if problem.terms else options.poor
     most_poor = options.poor_structured if structured else most_poor
     tried: list[FittedLaw] = []
-    best: FittedLaw | None = None
     poor, no_law = 0, False
     libraries, errors = _libraries(problem, forces)
     try:
-        for i, family in enumerate(libraries):
-            name = f"H: {family.num_parameters} terms"
-            last = tried[-1] if tried else None
-            if last is not None and too_dear(problem, family, last):
-                problem.on_progress(f"{name} skipped, costlier per step than the map")
-                continue
-            if i < len(early):
-                found = early[i]
-            else:
-                problem.on_progress(name)
-                found = fitted_library(problem, family, last)
-            better = best is None or found.error.relative < options.gained * best.error.relative
-            poor = 0 if better else poor + 1
-            best = _lower(best, found)
-            tried.append(found)
-            errors.append(found.error.bound)
-            if problem.met_by(best) or poor == most_poor:
+        for _, left, law in _laws(problem, libraries, early):
+            before = min((t.error.relative for t in tried), default=np.inf)
+            poor = 0 if not tried or law.error.relative < options.gained * before else poor + 1
+            tried.append(law)
+            errors.append(law.error.bound)
+            if problem.met_by(_best(problem, tried)) or poor == most_poor:
                 break
-            left = len(libraries) - 1 - i
             no_law = not structured and options.only_within
             no_law = no_law and _out_of_reach(errors, left, problem.tolerance.bound)
             if no_law:
                 break
     except OutOfTime:
-        if best is None:
+        if not tried:
             raise
-    best = _any(problem, best)._replace(stalled=poor == most_poor)
+    best = _best(problem, tried)._replace(stalled=poor == most_poor)
     if no_law:  # nothing to read
         best = best._replace(thresholds=())
     if problem.met_by(best):
@@ -137,17 +145,12 @@ def _searched(
     return found._replace(stalled=True) if found.noisy else found
 
 
-def _lower(best: FittedLaw | None, found: FittedLaw) -> FittedLaw:
-    """The law of the lower error."""
-    return found if best is None or found.error.relative < best.error.relative else best
-
-
-def _any(problem: LawProblem, best: FittedLaw | None) -> FittedLaw:
-    """The best law. Raises FitError where there is none."""
-    if best is None:
+def _best(problem: LawProblem, tried: Sequence[FittedLaw]) -> FittedLaw:
+    """The first of the laws of the lowest error. Raises FitError where there is none."""
+    if not tried:
         count = len(problem.data.y0)
         raise FitError(f"expected more pairs: {count} are too few for any library of terms")
-    return best
+    return min(tried, key=lambda law: law.error.relative)
 
 
 def simplest_where_few_decide(
@@ -199,28 +202,6 @@ def _libraries(problem: LawProblem, forces: Forces | None = None) -> tuple[list[
     return libraries, []
 
 
-def _beside_centrifugal(problem: LawProblem, best: FittedLaw) -> FittedLaw:
-    """The best of libraries with centrifugal terms, where ``best`` misses the tolerance, the pairs
-    ask for such terms and these libraries are better; else ``best``."""
-    if problem.met_by(best):
-        return best
-    own = centrifugal_terms(problem.data, problem.data.training, best.family)
-    if not own:
-        return best
-    options = problem.options
-    options = dataclasses.replace(options, given_degrees=options.given_degrees[1:])
-    try:
-        with_them = dataclasses.replace(problem, scene=None, terms=own, options=options)
-        found = _searched(with_them)
-    except OutOfTime:
-        what = "libraries of H with centrifugal terms"
-        problem.budget.leave_out(what, problem.work.ended)
-        return best
-    except FitError:
-        return best
-    return _lower(best, found)
-
-
 def _walked(problem: LawProblem) -> FittedLaw:
     """The best of the libraries of states and parameters, which grow together; as `_searched`."""
     scene, data = problem.scene, problem.data
@@ -231,30 +212,29 @@ def _walked(problem: LawProblem) -> FittedLaw:
         reversor=scene.reversor if scene is not None else None,
         own=own_terms(problem),
     )
-    best: FittedLaw | None = None
     tried: list[FittedLaw] = []
 
     def attempt(family) -> FittedLaw:
         problem.on_progress(f"H: {family.num_parameters} terms")
-        return fitted_library(problem, family, best)
+        return fitted_library(problem, family, _best(problem, tried) if tried else None)
 
+    most, stalled = min(problem.most_terms, problem.options.most_terms), False
+    laws = walked(
+        states,
+        functions,
+        attempt,
+        lambda law: law.error.bound,
+        bound=problem.tolerance.bound,
+        most=most,
+    )
     try:
-        for found in walked(
-            states,
-            functions,
-            attempt,
-            lambda found: found.error.bound,
-            bound=problem.tolerance.bound,
-            most=min(problem.most_terms, problem.options.most_terms),
-        ):
-            tried.append(found)
-            best = _lower(best, found)
+        for law in laws:
+            tried.append(law)
         stalled = True
     except OutOfTime:
-        if best is None:
+        if not tried:
             raise
-        stalled = False
-    best = _any(problem, best)
+    best = _best(problem, tried)
     if problem.met_by(best):
         return best
     return _simplest_within_noise(problem, tried, best._replace(stalled=stalled))
@@ -321,7 +301,7 @@ def _out_of_reach(errors: list[float], left: int, bound: float) -> bool:
     return errors[-1] * gain**left > bound
 
 
-def too_dear(problem: LawProblem, family, last: FittedLaw) -> bool:
+def exceeds_cost(problem: LawProblem, family, last: FittedLaw) -> bool:
     """Return whether a step of no law of this library costs up to the ``dearest`` operations.
 
     One Gauss–Newton problem at the last law tells which terms the tolerance asks for: those whose
@@ -365,18 +345,19 @@ def fitted_library(problem: LawProblem, family, last: FittedLaw | None) -> Fitte
     family = family.take(kept)
     count = int(np.ceil(options.rows_compared * family.num_parameters / z.shape[1]))
     rows = data.training[: max(count, fewest)]
-    best: FittedLaw | None = None
+    fitted: list[FittedLaw] = []
     # Nothing but H is learned of such pairs.
     first = last is None and (data.varied or data.structure is not None)
     name = f"H of {family.num_parameters} terms"
     with problem.work.library(name, family, len(rows), first=first):
         for start in _starts(problem, family, rows, last):
-            found = problem.fitted(family, start, rows, on_progress=problem.on_progress)
-            best = _lower(best, found)
-            if found.error.relative <= options.on_branch:
+            law = problem.fitted(family, start, rows, on_progress=problem.on_progress)
+            fitted.append(law)
+            if law.error.relative <= options.on_branch:
                 break
-    assert best is not None
-    return best._replace(null=tuple(names[j] for j in null), undetermined=undetermined)
+    return _best(problem, fitted)._replace(
+        null=tuple(names[j] for j in null), undetermined=undetermined
+    )
 
 
 def _scattered(z) -> np.ndarray:

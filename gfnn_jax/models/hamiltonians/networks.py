@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.budget import NETWORK
-from gfnn_jax.candidates.candidate import Candidate, with_error
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.measured_error import measured_error
 from gfnn_jax.dataset.rows import residual_weight
@@ -115,16 +115,14 @@ def learn_network(problem: LawProblem, *, seed: int, max_iterations: int) -> Lea
     flow, error, train_rms = best
     fastest = rates(family, flow.params, y0[: OPTIONS.states])
     steps = Steps(flow.stages, flow.substeps)
-    candidate = Candidate(
+    candidate = Candidate.of(
+        error,
+        validated=True,
         label=label,
         family=family.name,
         chart="flow",
         num_parameters=family.num_parameters,
         operations=operations_of(family, y0.shape[1], fastest, dt, steps),
-        validation_rms=error.rms,
-        validation_relative=error.relative,
-        validation_bound=error.bound,
-        deviations=error.deviations,
         train_rms=train_rms,
         fit_seconds=time.perf_counter() - started,
         learns="hamiltonian",
@@ -136,7 +134,7 @@ def learn_network(problem: LawProblem, *, seed: int, max_iterations: int) -> Lea
             f"a network H learns little from steps that turn by {omega_h:.2g} radians (ωh): sample "
             "with a smaller dt, or learn H as terms",
         )
-    return LearnedHamiltonian(with_error(candidate, error), flow, (), None, omega_h, messages)
+    return LearnedHamiltonian(candidate, flow, (), None, omega_h, messages)
 
 
 @jax.jit

@@ -17,8 +17,7 @@ from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
 from gfnn_jax.flows.collocation import Steps, images, operations, truncation
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.models.hamiltonians.cost_of_flow import operations_of
-from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
-from gfnn_jax.models.hamiltonians.formula import OnPartial
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw, OnPartial
 from gfnn_jax.models.hamiltonians.options import OPTIONS, LawOptions
 
 
@@ -175,8 +174,7 @@ class LawProblem:
 
     def refitted(self, law: FittedLaw, rows) -> FittedLaw:
         """Fitted to these rows, from where it is: each of them averages the noise."""
-        found = self.fitted(law.family, law.fit.coefficients, rows, rounds=False)
-        return law._replace(fit=found.fit, rows=rows, error=found.error)
+        return law.with_fit(self.fitted(law.family, law.fit.coefficients, rows, rounds=False))
 
     def error_of(self, family, fit: FlowFit) -> OneStepError:
         """Error by steps that resolve the held-out pairs: an unresolved passage says nothing of the

@@ -22,26 +22,22 @@ from gfnn_jax.dataset.split import outermost
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting.significance import ABOVE_NOISE, significant_terms, terms_above_noise
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
-from gfnn_jax.models.hamiltonians.arcs import arcs_of
 from gfnn_jax.models.hamiltonians.covariance import covariance_root
-from gfnn_jax.models.hamiltonians.dictionary import law_of_physics
-from gfnn_jax.models.hamiltonians.fewer_terms import sparse, without_noise
-from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
+from gfnn_jax.models.hamiltonians.dictionary import law_of_physics, law_of_sequences
+from gfnn_jax.models.hamiltonians.fitted_law import Dropped, FittedLaw
 from gfnn_jax.models.hamiltonians.friction import is_smooth, mechanical, without_turns
-from gfnn_jax.models.hamiltonians.law_candidate import learned_from
-from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian, learned_from
 from gfnn_jax.models.hamiltonians.libraries import (
-    centrifugal_terms,
     check_finite,
     modes_of,
     own_terms,
 )
 from gfnn_jax.models.hamiltonians.library_search import is_exact, of_libraries, small_polynomials
-from gfnn_jax.models.hamiltonians.noisy_dictionary import law_of_sequences
 from gfnn_jax.models.hamiltonians.options import OPTIONS
 from gfnn_jax.models.hamiltonians.problem import LawProblem
-from gfnn_jax.models.hamiltonians.sequences import fitted_to_sequences
+from gfnn_jax.models.hamiltonians.sequences import arcs_of, fitted_to_sequences
 from gfnn_jax.models.hamiltonians.symmetries import imposed
 
 
@@ -51,10 +47,7 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
     Raises FitError where no library can be tried, OutOfTime where the budget ends before the first.
     """
     started, data, options = time.perf_counter(), problem.data, problem.options
-    basis = modes_of(problem, problem.terms)
-    if basis is not None and not problem.terms:
-        own = centrifugal_terms(data, data.training, basis.terms(basis.box()))
-        basis = modes_of(problem, own)
+    basis = modes_of(problem)
     if data.before or data.after:
         raise FitError("expected pairs without a base map: it is no part of a flow")
     own = own_terms(problem)
@@ -102,11 +95,12 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
 def _best_law(problem: LawProblem, basis: Modes | None) -> FittedLaw:
     """The law of the smallest polynomials, of physics, of a mechanical system or of the libraries,
     the first within the tolerance, else the best."""
-    with_masses, best, early = None, None, list[FittedLaw]()
+    with_masses, best, early = None, None, dict[int, FittedLaw]()
     if not problem.terms and problem.scene is None:
         if basis is None and problem.simple:
             early = small_polynomials(problem)
-            best = early[-1] if early and is_exact(problem, early[-1]) else None
+            last = next(reversed(early.values()), None)
+            best = last if last is not None and is_exact(problem, last) else None
         if best is None:
             best = law_of_physics(problem)
         if best is None:
@@ -199,3 +193,67 @@ def _with_symmetries(best: FittedLaw, data: Dataset) -> FittedLaw:
         c = imposed(best.family, c, deviations, z, data.coordinates.angles)
         best = best._replace(fit=best.fit._replace(coefficients=c))
     return best
+
+
+def without_noise(problem: LawProblem, smallest: FittedLaw) -> FittedLaw:
+    """The terms that the training pairs tell from noise: of the smallest library whose error is
+    that of the noise, and those of the largest that they tell beside them. An error that is noise
+    for the most part hides terms which 10,000 pairs tell."""
+    rows = problem.data.training
+    found, few = _significant(problem, smallest), None
+    if found is not None:
+        found = problem.refitted(found, rows)
+    if found is None or not found.error.relative <= problem.options.rise * smallest.error.relative:
+        found = problem.refitted(smallest, rows)
+    if smallest.larger is not None:
+        few = _significant(problem, smallest.larger)
+    more = 0 if few is None else few.family.num_parameters - found.family.num_parameters
+    if few is None or more <= 0:
+        return found
+    few = problem.refitted(few, rows)
+    # Twice the logarithm of the likelihood's ratio.
+    gained = 2 * few.fit.triangle.rows * np.log(found.fit.rms / few.fit.rms)
+    if gained > ABOVE_NOISE**2 * more and few.error.relative <= found.error.relative:
+        return few._replace(noisy=True, thresholds=found.thresholds)
+    return found
+
+
+def _significant(problem: LawProblem, full: FittedLaw) -> FittedLaw | None:
+    """The terms that the training pairs tell from noise, which one Gauss–Newton problem of all
+    terms says, so that only a few are fitted to many pairs; None where it tells none."""
+    c, rows = full.fit.coefficients, problem.data.training
+    resolved = np.setdiff1d(rows, np.setdiff1d(full.rows, full.fit.used))
+    found = problem.flows.linearised(full.family, c, full.fit.steps, resolved)
+    if not np.isfinite(found.norm):
+        return None
+    kept, start = terms_above_noise(found, c, ABOVE_NOISE)
+    if not len(kept):
+        return None
+    family = full.family.take(tuple(kept.tolist()))
+    return full._replace(family=family, fit=full.fit._replace(coefficients=start))
+
+
+def sparse(problem: LawProblem, full: FittedLaw) -> FittedLaw:
+    """Drop the terms that the pairs do not ask for, as far as the held-out error allows."""
+    options, count, before = problem.options, full.family.num_parameters, full.error.relative
+    tried: set[tuple[int, ...]] = set()
+    thresholds = options.thresholds if full.thresholds is None else full.thresholds
+    for threshold in thresholds:
+        kept = tuple(significant_terms(full.fit, threshold).tolist())
+        if len(kept) == count:
+            break
+        if not kept or kept in tried:
+            continue
+        tried.add(kept)
+        problem.on_progress(f"H: {len(kept)} of {count} terms")
+        start = full.fit.coefficients[list(kept)]
+        few = problem.fitted(
+            full.family.take(kept), start, full.fit.used, rounds=False, steps=full.fit.steps
+        )
+        after = few.error.relative
+        if after <= max(options.rise * before, options.rounding):
+            dropped = Dropped(count - len(kept), before, after)
+            change = f"error {after:.2e}, before {before:.2e}"
+            problem.on_progress(f"H without {dropped.terms} terms: {change}")
+            return full._replace(family=few.family, fit=few.fit, error=few.error, dropped=dropped)
+    return full

@@ -4,25 +4,31 @@ Both states of a noisy pair are measured, so that noise stands among the regress
 of the coefficients that a pair hides beneath its noise grows along a sequence. An arc of measured
 states is that of latent ones, each the image of the one before: the maximum of the likelihood where
 noise is normal (`solve.latent_arcs`). An arc ends where noise would have grown beyond the linear.
+
+A pair that is noise for the most part says little: over k steps the states move k times as far, and
+the noise is the same. Terms of H are then looked for in the pairs (z_i, z_{i+k}), k dt apart.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gfnn_jax.budget import UNBOUNDED, Allowance
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.runs import Arcs, arcs_of_pairs, onward
+from gfnn_jax.dataset.noise import of_differences
+from gfnn_jax.dataset.runs import Arcs, arcs_of_pairs, onward, steps_between
+from gfnn_jax.dataset.split import Split
 from gfnn_jax.errors import InputError
 from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_above_noise
 from gfnn_jax.fitting.triangle import Triangle
-from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.flows.collocation import Images, Steps, images
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw, SequenceFit
 from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.phase_space import Pairs
 from gfnn_jax.solve.latent_arcs import (
     OUTLYING,
     Defects,
@@ -37,7 +43,13 @@ from gfnn_jax.solve.noise import Biweight, robust
 
 @dataclasses.dataclass(frozen=True)
 class SequenceOptions:
-    """Tuned on Hénon–Heiles at dt 0.5 and 0.05 with noise of 1e-3 to 1e-2 (benchmarks/bands.py).
+    """Tuned on Hénon–Heiles at dt 0.005 to 0.5 with noise of 1e-3 to 1e-2 (benchmarks/bands.py).
+
+    Of pairs several steps apart: quiet: displacements, in units of their noise, of a step that
+    needs none, and of those that are made. part: of a sequence, that one may be as long as. short:
+    displacement of a step, in units of the coordinates' sizes, up to which the noise is told by the
+    sequences' differences, of this order; alike: a factor within which those of the order before
+    tell the same noise. fewest: of them for each set of pairs.
 
     longest: steps of an arc; shortest: of one that says more than its pairs do. grown: noise ÷
     spread at its end, if that of its first state goes on along it. states: from which the noise and
@@ -53,6 +65,12 @@ class SequenceOptions:
     errors of the arcs' variation, and ``clear`` of that of noise, which alone varies by a quarter.
     """
 
+    quiet: float = 100.0
+    part: float = 0.5
+    short: float = 0.2
+    order: int = 6
+    alike: float = 1.5
+    fewest: int = 50
     longest: int = 100
     shortest: int = 3
     grown: float = 0.1
@@ -72,6 +90,79 @@ class SequenceOptions:
 OPTIONS, BIWEIGHT = SequenceOptions(), Biweight()
 
 
+class LongPairs(NamedTuple):
+    """The arcs as a data set, in chains whose images are the states of the next, and k."""
+
+    data: Dataset
+    length: int
+
+
+def arcs_of(data: Dataset) -> LongPairs | None:
+    """The arcs that H is to be learned from; None where the pairs themselves serve: where no
+    sequences are, where a step is long against its noise, and for pairs of many dt or parameters,
+    or of a structure."""
+    if data.varied or data.structure is not None:
+        return None
+    starts, lengths = _runs(data.pairs)
+    usual = int(np.median(np.repeat(lengths, lengths)))  # that a pair stands in
+    if usual <= OPTIONS.order:
+        return None
+    moved = (data.y1 - data.y0) / data.scale
+    displacement = float(np.sqrt(np.mean(moved**2)))
+    runs = [moved[first : first + count] for first, count in zip(starts, lengths, strict=True)]
+    noise = of_differences(runs, OPTIONS.order, OPTIONS.alike)
+    if noise is None or displacement > OPTIONS.short:
+        return None
+    wanted = int(np.ceil(OPTIONS.quiet * np.sqrt(2) * noise / displacement))
+    length = min(wanted, int(OPTIONS.part * usual))
+    if length < 2:
+        return None
+    return _strided(data, starts, lengths, length)
+
+
+def _runs(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
+    """First row and number of rows of each stretch of a run without a gap."""
+    starts = np.flatnonzero(np.append(True, steps_between(pairs) != 1))
+    return starts, np.diff(np.append(starts, len(pairs)))
+
+
+def _strided(data: Dataset, starts, lengths, length: int) -> LongPairs | None:
+    """The arcs of so many steps that are wholly in the training pairs, or in those held out."""
+    first = np.concatenate(
+        [
+            np.arange(begin + offset, begin + count - length + 1, length)
+            for begin, count in zip(starts, lengths, strict=True)
+            for offset in range(length)
+        ]
+    )
+    along = first[:, None] + np.arange(length)
+    pairs, moved = data.pairs, data.y1 - data.y0
+    last = first + length - 1
+    # In chains of arcs that follow one another, one for each offset in a run.
+    begin = np.repeat(starts, lengths)[first]
+    strided = Pairs(
+        np.asarray(pairs.z0)[first],
+        np.asarray(pairs.z1)[last],
+        length * data.dt,
+        run=begin + (first - begin) % length,
+        place=(first - begin) // length,
+    )
+    angles = np.isin(np.arange(moved.shape[1]), data.coordinates.angles)
+    # Angles go on over turns; what is no angle is as measured, without a sum's rounding.
+    y0 = data.y0[first]
+    y1 = np.where(angles, y0 + moved[along].sum(axis=1), data.y1[last])
+    rows = []
+    for own in (data.training, data.validation):
+        inside = np.zeros(len(moved), bool)
+        inside[own] = True
+        rows.append(np.random.default_rng(0).permutation(np.flatnonzero(inside[along].all(axis=1))))
+    if min(map(len, rows)) < OPTIONS.fewest:
+        return None
+    split = Split(rows[0], rows[1], np.zeros(0, int), np.arange(len(first)))
+    arcs = dataclasses.replace(data, pairs=strided, row=data.row[first], y0=y0, y1=y1, split=split)
+    return LongPairs(arcs, length)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class FlowOnArcs:
     """The flow over dt of H = Σ c_j φ_j(z) on arcs in which these steps ``moves`` (A, L − 1); what
@@ -89,23 +180,16 @@ class FlowOnArcs:
     terms: int | None = None
 
     def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
-        c, constants = p[: self.terms], p[len(p) if self.terms is None else self.terms :]
+        width, lanes = x.shape[-1], np.flatnonzero(self.moves)
+        found = np.zeros((*self.moves.shape, width, 1 + width + len(p)))
+        found[..., 0], found[..., 1 : 1 + width] = x[:, :-1] - x[:, 1:], np.eye(width)
         try:
-            found = self._at(constants)._defects(c, x)
-            if not len(constants):
-                return found
-            slopes = [*np.moveaxis(found.by_coefficients, -1, 0)]
-            for k, theta in enumerate(constants):
-                moved, slope = constants.copy(), np.zeros(found.closing.shape)
-                moved[k] += OPTIONS.difference * abs(theta)
-                ends = self._at(moved).images(c, x[:, :-1][self.moves])
-                slope[self.moves] = ends - (found.closing + x[:, 1:])[self.moves]
-                slopes.append(slope / (OPTIONS.difference * abs(theta)))
+            for first in range(0, len(lanes), OPTIONS.block):
+                some = np.unravel_index(lanes[first : first + OPTIONS.block], self.moves.shape)
+                found[some] = self._linearised(p, x[:, :-1][some], x[:, 1:][some])
         except InputError:
-            arcs, length, width = x.shape
-            lost = np.full((arcs, length - 1, width, max(width, len(p))), np.nan)
-            return Defects(lost[..., 0], lost[..., :width], lost[..., : len(p)])
-        return found._replace(by_coefficients=np.stack(slopes, axis=-1))
+            found[:] = np.nan
+        return Defects(found[..., 0], found[..., 1 : 1 + width], found[..., 1 + width :])
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         return observed_whole(x, len(p))
@@ -115,31 +199,24 @@ class FlowOnArcs:
 
     def images(self, p: np.ndarray, z: np.ndarray, direction: int = 1) -> np.ndarray:
         """Images of states z (n, 2d), a step ahead or back."""
-        if self.terms is not None:
-            return self._at(p[self.terms :]).images(p[: self.terms], z, direction)
+        return self._step(p, z, direction * self.dt).states
+
+    def _step(self, p: np.ndarray, z: np.ndarray, dt: float, **options: Any) -> Images:
+        """`flows.collocation.images` with these numbers. Raises InputError for constants without
+        terms."""
         self.allowance.check()
-        return images(self.family, p, z, direction * self.dt, self.how).states
+        family = self.family if self.terms is None else self.family(p[self.terms :])
+        return images(family, p[: self.terms], z, dt, self.how, **options)
 
-    def _at(self, constants: np.ndarray) -> FlowOnArcs:
-        """The flow with these constants inside."""
-        if self.terms is None:
-            return self
-        return dataclasses.replace(self, family=self.family(constants), terms=None)
-
-    def _defects(self, c: np.ndarray, x: np.ndarray) -> Defects:
-        arcs, length, width = x.shape
-        ends = x[:, :-1].copy()
-        by_state = np.empty((arcs, length - 1, width, width))
-        by_state[:] = np.eye(width)
-        by_c = np.zeros((arcs, length - 1, width, len(c)))
-        lanes = np.flatnonzero(self.moves)
-        for first in range(0, len(lanes), OPTIONS.block):
-            self.allowance.check()
-            some = np.unravel_index(lanes[first : first + OPTIONS.block], self.moves.shape)
-            found = images(self.family, c, x[some], self.dt, self.how, derivatives=True)
-            ends[some], by_state[some] = found.states, found.by_state
-            by_c[some] = found.by_coefficient
-        return Defects(ends - x[:, 1:], by_state, by_c)
+    def _linearised(self, p: np.ndarray, y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
+        """[c, Φ, Γ] (n, 2d, 1 + 2d + numbers) of steps from y0 to y1 (n, 2d)."""
+        found = self._step(p, y0, self.dt, derivatives=True)
+        columns = [(found.states - y1)[..., None], found.by_state, found.by_coefficient]
+        for k in range(len(p) if self.terms is None else self.terms, len(p)):
+            moved, change = p.copy(), OPTIONS.difference * abs(p[k])
+            moved[k] += change
+            columns.append(((self.images(moved, y0) - found.states) / change)[..., None])
+        return np.concatenate(columns, axis=-1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -158,12 +235,12 @@ class Measured:
         model: FlowOnArcs,
         p,
         *,
-        only_states: bool = False,
+        fix_coefficients: bool = False,
         gained: float = OPTIONS.gained,
         iterations: int = 30,
     ) -> Fitted | None:
         """The model's numbers, states and noise, from numbers p that are close, or with these as
-        they are (``only_states``). None where the flow fails. gained: as of the options;
+        they are (``fix_coefficients``). None where the flow fails. gained: as of the options;
         iterations: at most."""
         p = np.array(p, float)
         lifted = dataclasses.replace(self, arcs=self.arcs._replace(states=self._lifted(model, p)))
@@ -171,14 +248,14 @@ class Measured:
         noise = np.hypot(noise, self.least)
         if not (np.isfinite(x).all() and np.isfinite(noise).all()):
             return None
-        given, free = (Known(model, p), p[:0]) if only_states else (model, p)
+        given, free = (Known(model, p), p[:0]) if fix_coefficients else (model, p)
         readings = Readings(given, lifted.arcs.states, noise * self.relative, BIWEIGHT)
         found = readings.fit(
             free, x, noise, max_iterations=iterations, tolerance=gained, least=self.least
         )
         if not np.isfinite(found.cost):
             return None
-        return dataclasses.replace(found, p=p) if only_states else found
+        return dataclasses.replace(found, p=p) if fix_coefficients else found
 
     def _lifted(self, model: FlowOnArcs, p) -> np.ndarray:
         """The measured states with angles that go on over turns, as the flow leads from each to the
@@ -322,7 +399,7 @@ def fitted_to_sequences(problem: LawProblem, law: FittedLaw) -> FittedLaw | None
 
     def left(terms, coefficients) -> float:
         """Noise of the held-out arcs, each from the state that suits it."""
-        found = sequences.fitted(held, terms, coefficients, only_states=True)
+        found = sequences.fitted(held, terms, coefficients, fix_coefficients=True)
         scale = problem.data.scale
         return np.inf if found is None else float(np.linalg.norm(noise_of(found) / scale))
 

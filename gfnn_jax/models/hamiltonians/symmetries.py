@@ -8,6 +8,7 @@ restricted where these allow it; a law then has the symmetry to roundoff, and co
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -15,14 +16,29 @@ import numpy as np
 
 from gfnn_jax.diagnosis.symmetries import generators, reflections
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.models.textbook.invariance import restrictions
+from gfnn_jax.phase_space import symplectic_form
 
-_HOLDS = 1e-10  # of the restriction's parts, that a symmetry leaves over
-_STATES = 200
-_ALLOWED = 4.0  # standard errors by which a symmetry may move a coefficient
-_DIGITS = 1e-14  # of a coefficient: it may always move by so much
-_KNOWN = 1e-12  # of a number's size, or of the largest variance: an error below it is none
-_NULL = 1e-8  # of the largest restriction: below it a combination of terms has the symmetry
+
+@dataclasses.dataclass(frozen=True)
+class SymmetryOptions:
+    """Chosen on the laws of benchmarks/textbook.py and textbook_noise.py.
+
+    holds: of the restriction's parts, that a symmetry leaves over. states: at which it is tried.
+    allowed: standard errors by which a symmetry may move a coefficient; digits: of a coefficient,
+    by which it may always move. known: of a number's size, or of the largest variance, an error
+    below it is none. null: of the largest restriction, below it a combination of terms has the
+    symmetry.
+    """
+
+    holds: float = 1e-10
+    states: int = 200
+    allowed: float = 4.0
+    digits: float = 1e-14
+    known: float = 1e-12
+    null: float = 1e-8
+
+
+OPTIONS = SymmetryOptions()
 
 
 class Symmetry(NamedTuple):
@@ -32,7 +48,7 @@ class Symmetry(NamedTuple):
     rows: np.ndarray
 
 
-class Known(NamedTuple):
+class LawNumbers(NamedTuple):
     """Numbers p (n,) of a law, coefficients first, their covariance, from so many rows, and the
     symmetries that the law has by them."""
 
@@ -50,8 +66,8 @@ def symmetries_of(family: Terms, c: np.ndarray, z: np.ndarray, angles: Sequence[
 def _held(family: Terms, c: np.ndarray, z: np.ndarray, angles: Sequence[int]) -> list[Symmetry]:
     return [
         s
-        for s in _candidates(family, z[:_STATES], tuple(angles))
-        if np.abs(s.rows @ c).max() <= _HOLDS * (np.abs(s.rows) @ np.abs(c)).max()
+        for s in _candidates(family, z[: OPTIONS.states], tuple(angles))
+        if np.abs(s.rows @ c).max() <= OPTIONS.holds * (np.abs(s.rows) @ np.abs(c)).max()
     ]
 
 
@@ -65,25 +81,27 @@ def imposed(
         return c
     size = np.where(c != 0, np.abs(c), 1.0)
     rows = np.concatenate([_independent(s.rows, c) for s in held]) * size
-    moved = c - size * (np.linalg.pinv(rows, rcond=_NULL) @ (rows @ (c / size)))
-    most = np.maximum(_ALLOWED * deviations, _DIGITS * np.abs(c))
+    moved = c - size * (np.linalg.pinv(rows, rcond=OPTIONS.null) @ (rows @ (c / size)))
+    most = np.maximum(OPTIONS.allowed * deviations, OPTIONS.digits * np.abs(c))
     return moved if np.all(np.abs(moved - c) <= most) else c
 
 
-def restricted(family: Terms, known: Known, z: np.ndarray, angles: Sequence[int]) -> Known:
+def restricted(
+    family: Terms, known: LawNumbers, z: np.ndarray, angles: Sequence[int]
+) -> LawNumbers:
     """The numbers with every symmetry that shortens the description.
 
     A restriction of r coefficients raises half the misfit by ½χ² and saves ½ r ln(rows). It is the
     linear problem of the least change of p in units of its covariance.
     """
     terms, texts, (p, covariance, rows, _) = family.num_parameters, [], known
-    for symmetry in _candidates(family, z[:_STATES], tuple(angles)):
+    for symmetry in _candidates(family, z[: OPTIONS.states], tuple(angles)):
         a = np.zeros((terms, len(p)))
         a[:, :terms] = _independent(symmetry.rows, p[:terms])
         deviation = np.sqrt(np.einsum("ij,jk,ik->i", a, covariance, a).clip(0.0))
         parts = np.linalg.norm(a * p, axis=1)
-        same = deviation <= _KNOWN * parts  # these terms have it, or those before imply it
-        if np.any(np.abs(a @ p)[same] > _HOLDS * parts[same]) or (~same).sum() == terms:
+        same = deviation <= OPTIONS.known * parts  # these terms have it, or those before imply it
+        if np.any(np.abs(a @ p)[same] > OPTIONS.holds * parts[same]) or (~same).sum() == terms:
             continue
         if same.all():
             texts.append(symmetry.text)
@@ -91,7 +109,7 @@ def restricted(family: Terms, known: Known, z: np.ndarray, angles: Sequence[int]
         a = a[~same]
         of_rows = a @ covariance @ a.T
         values, vectors = np.linalg.eigh(of_rows)
-        free = values > _KNOWN * values.max()
+        free = values > OPTIONS.known * values.max()
         inverse = (vectors[:, free] / values[free]) @ vectors[:, free].T
         off = a @ p
         if off @ inverse @ off > free.sum() * np.log(rows):
@@ -99,7 +117,7 @@ def restricted(family: Terms, known: Known, z: np.ndarray, angles: Sequence[int]
         gain = covariance @ a.T @ inverse
         p, covariance = p - gain @ off, covariance - gain @ a @ covariance
         texts.append(symmetry.text)
-    return Known(p, covariance, rows, tuple(texts))
+    return LawNumbers(p, covariance, rows, tuple(texts))
 
 
 def _independent(rows: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -110,17 +128,20 @@ def _independent(rows: np.ndarray, c: np.ndarray) -> np.ndarray:
     _, singular, across = np.linalg.svd(triangle)
     parts = np.abs(rows * size).max(initial=0.0) * np.sqrt(len(rows))
     kept = np.zeros(len(c))
-    kept[: len(singular)] = singular > _NULL * parts
+    kept[: len(singular)] = singular > OPTIONS.null * parts
     return kept[:, None] * across / size
 
 
 def _candidates(family: Terms, z: np.ndarray, angles: tuple[int, ...]) -> Iterator[Symmetry]:
     """Symmetries that are looked for, at states z where every term is finite."""
-    continuous = list(generators(family.dim, angles))
-    discrete = list(reflections(family.dim, angles))
-    matrices = [matrix for _, matrix in continuous], [matrix for _, matrix in discrete]
     with np.errstate(all="ignore"):
-        rows = restrictions(family, z, *matrices)
-        for (text, _), found in zip([*continuous, *discrete], rows, strict=True):
-            if np.isfinite(found).all():
-                yield Symmetry(text, found)
+        gradients = family.term_gradients(z)
+        for text, generator in generators(family.dim, angles):
+            # {φ, I} = ∇φᵀ J ∇I, of a quadratic or linear I with ∇I = A z + b.
+            moved = (z @ generator[:, :-1].T + generator[:, -1]) @ symplectic_form(family.dim).T
+            yield Symmetry(text, np.einsum("nij,ni->nj", gradients, moved))
+        for text, matrix in reflections(family.dim, angles):
+            there = np.einsum("ki,nkj->nij", matrix, family.term_gradients(z @ matrix.T))
+            rows = (gradients - there).reshape(-1, gradients.shape[-1])
+            if np.isfinite(rows).all():
+                yield Symmetry(text, rows)

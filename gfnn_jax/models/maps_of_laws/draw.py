@@ -6,7 +6,9 @@ where the data were and where the law takes them, or in a region that a user nam
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -18,39 +20,46 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.phase_space import Pairs
 
 NUM_PAIRS = 4_000
-_LONGEST = 30  # steps of the law's own rollouts
-_BEYOND = 0.1  # of the data's extent, on either side: as far as what is drawn may go
-_JITTER = 0.05  # of the spread of what they visit: orbits are thin, a map has to hold between them
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawing:
+    """Draw of pairs; tuned on benchmarks/auto.py.
+
+    region: (2, 2d), lowest and highest values of the user's coordinates, in which states are drawn
+    uniformly; None: around given states. longest: steps of the law's own rollouts. beyond: of the
+    data's extent, on either side, as far as what is drawn may go. jitter: of the spread of what
+    they visit: orbits are thin, a map has to hold between them.
+    """
+
+    num_pairs: int = NUM_PAIRS
+    seed: int = 0
+    region: Any = None
+    longest: int = 30
+    beyond: float = 0.1
+    jitter: float = 0.05
 
 
 def drawn(
-    flow: Flow,
-    coordinates: Coordinates,
-    states,
-    dt: float,
-    *,
-    region=None,
-    num_pairs: int = NUM_PAIRS,
-    seed: int = 0,
+    flow: Flow, coordinates: Coordinates, states, dt: float, how: Drawing = Drawing()
 ) -> Pairs:
     """Pairs a time ``dt`` apart, in the user's coordinates.
 
     flow: the law, in the inner ``coordinates``. states: (N, 2d) of the user, around which pairs are
-    drawn: each is taken a few steps along first. region: (2, 2d), lowest and highest values of the
-    user's coordinates, in which states are drawn uniformly instead.
+    drawn, where no region is given: each is taken a few steps along first.
 
     Raises FitError where the law gives most of these states no image.
     """
-    rng = np.random.default_rng(seed)
+    rng, num_pairs = np.random.default_rng(how.seed), how.num_pairs
     scale = np.asarray(flow.scale)
-    if region is None:
+    if how.region is None:
         y = to_inner(coordinates, np.asarray(states, np.float64))
-        inside = _near(y, coordinates)
-        y = _visited(flow, y[rng.integers(0, len(y), num_pairs)], inside, rng)
-        moved = y + _JITTER * np.nanstd(y, axis=0) * rng.standard_normal(y.shape)
+        inside, start = _near(y, coordinates, how), y[rng.integers(0, len(y), num_pairs)]
+        y = _visited(flow, start, inside, rng.integers(0, how.longest + 1, num_pairs))
+        moved = y + how.jitter * np.nanstd(y, axis=0) * rng.standard_normal(y.shape)
         y = np.unique(np.where(inside(moved)[:, None], moved, y), axis=0)
     else:
-        low, high = checked_region(region, flow.family.dim)
+        low, high = checked_region(how.region, flow.family.dim)
         y = to_inner(coordinates, rng.uniform(low, high, (num_pairs, len(low))))
     y = y[np.isfinite(y).all(axis=1)]
     problem = Problem(y, y, dt, scale)
@@ -81,22 +90,23 @@ def checked_region(region, dim: int) -> tuple[np.ndarray, np.ndarray]:
     return box[0], box[1]
 
 
-def _near(y: np.ndarray, coordinates: Coordinates) -> Callable[[np.ndarray], np.ndarray]:
+def _near(
+    y: np.ndarray, coordinates: Coordinates, how: Drawing
+) -> Callable[[np.ndarray], np.ndarray]:
     """Mark the states (N, 2d) that are in the box of the data, or not far beyond it: orbits that
     escape would be most of what is drawn."""
     low, high = np.nanmin(y, axis=0), np.nanmax(y, axis=0)
-    beyond = _BEYOND * (high - low)
+    beyond = how.beyond * (high - low)
     free = [*coordinates.angles, *coordinates.cyclic]
     beyond[free] = np.inf
     return lambda y: ((y >= low - beyond) & (y <= high + beyond)).all(axis=1)
 
 
-def _visited(flow: Flow, y: np.ndarray, inside, rng) -> np.ndarray:
-    """Each state taken along by a random number of the law's own steps, or to where it leaves."""
+def _visited(flow: Flow, y: np.ndarray, inside, left: np.ndarray) -> np.ndarray:
+    """Each state taken along by so many of the law's own steps, or to where it leaves."""
     family, params, dt = flow.family, np.asarray(flow.params), float(np.asarray(flow.dt))
     problem = Problem(y, y, dt, np.asarray(flow.scale))
     (steps,) = problem.fine_steps(family, params, np.arange(len(y)), (1e-6,))
-    left = rng.integers(0, _LONGEST + 1, len(y))
     going = np.flatnonzero(left)
     while going.size:
         moved = images(family, params, y[going], dt, steps).states

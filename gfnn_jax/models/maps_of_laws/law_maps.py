@@ -3,31 +3,38 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.budget import FLOW, Budget
+from gfnn_jax.budget import FLOW
+from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.charts import Charts
-from gfnn_jax.diagnosis.diagnosis import diagnosed
+from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre
-from gfnn_jax.models.generating_functions.sweeps import sweeps_for
-from gfnn_jax.models.hamiltonians.cost_of_flow import flow_operations
+from gfnn_jax.flows.rates import rates
+from gfnn_jax.models.generating_functions.sweeps import sweeps_for, trial_residual
+from gfnn_jax.models.hamiltonians.cost_of_flow import (
+    CONTRACTING,
+    FREQUENCY_STATES,
+    contraction_of,
+    flow_operations,
+)
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
-from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS, drawn
-from gfnn_jax.models.maps_of_laws.factor_out import TRIAL_PAIRS, factored_out, flow_of
-from gfnn_jax.scenes.scene import Scene
+from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS, Drawing, drawn
 from gfnn_jax.search.search import Entry, Found, Search
 
-_FITTED, _MOST_STRONG = 200, 4  # pairs and terms of the simplest laws
+# Pairs and terms of the simplest laws that are factored out, pairs by which it is found out where,
+# and the error, of the spread, above which a law explains too little (benchmarks/auto.py).
+_FITTED, _MOST_STRONG, TRIAL_PAIRS, _EXPLAINED = 200, 4, 1_000, 0.3
 _THERE_AND_BACK = 8.0  # steps of a law's flow, at each of the states
-_EXPLAINED = 0.3  # of the spread: a law that errs by more explains too little to be factored out
 
 
 class LawMaps(NamedTuple):
@@ -36,134 +43,164 @@ class LawMaps(NamedTuple):
     found: Found
     charts: Charts
 
-
-def more_pairs_would_help(sweeps, found: Found, bound: Tolerance, dearest: float) -> bool:
-    """Return whether none of the sizes that the pairs determine meets the tolerance, and larger
-    ones would still be cheap enough."""
-    if found.ranking and found.ranking[0].candidate.validation_bound <= bound.bound:
-        return False
-    return any(s.short_of_pairs and s.sizes and s.sizes[-1].operations < dearest for s in sweeps)
+    @property
+    def bound(self) -> float:
+        """The error of the best; infinite where there is none."""
+        ranking = self.found.ranking
+        return ranking[0].candidate.validation_bound if ranking else np.inf
 
 
-def search_of_law(
-    law: LearnedHamiltonian,
-    data: Dataset,
-    tolerance: Tolerance,
-    scene: Scene | None,
-    dearest: float,
-    budget: Budget,
-    on_progress,
-    on_candidate,
-    seed: int,
-) -> LawMaps | None:
-    """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's validation
-    rows; None where none of them meets the tolerance, or no chart covers the drawn pairs."""
-    try:
-        with budget.unit("pairs drawn from the flow of H", FLOW, _work(law, NUM_PAIRS)):
-            more = drawn(law.flow, data.coordinates, data.pairs.z0, data.dt, seed=seed)
-    except OutOfTime:
-        return None
-    reversor = scene.reversor if scene else None
-    try:
-        diagnosis = diagnosed(data.validating(more), "auto", reversor, seed)
-    except FitError:  # drawn ones go further than the user's; the law itself is left
-        return None
-    sweeps = list(sweeps_for("auto", diagnosis.charts.charts, diagnosis.data, tolerance, scene))
-    climb = Search(sweeps, tolerance.bound, budget, on_progress, on_candidate)
-    found = climb.to_its_end(dearest)
-    if not found.ranking:
-        return None
-    if found.ranking[0].candidate.validation_bound > tolerance.bound:
-        return None
-    found = found._replace(ended="the tolerance is met, by a map of pairs drawn from H's flow")
-    return LawMaps(found, diagnosis.charts)
+@dataclasses.dataclass(frozen=True)
+class LawMapSearch:
+    """The search for S with the help of a law.
 
+    problem: behind whose pairs the law was found. on_candidate, better: as of `search.Search`.
+    """
 
-def law_explains_most(
-    law: LearnedHamiltonian, found: Found, bound: Tolerance, budget: Budget
-) -> bool:
-    """Return whether nothing meets the tolerance, but S might with most of the motion factored out.
-    What stalls in noise would stall without it too."""
-    if budget.over or not found.ranking or found.stalled:
-        return False
-    best = found.ranking[0].candidate
-    error = law.candidate.validation_relative
-    return best.validation_bound > bound.bound and error < _EXPLAINED
+    law: LearnedHamiltonian
+    problem: LawProblem
+    on_candidate: Callable[[Candidate], Any]
+    better: Callable[[Entry], Any] | None
+    seed: int
 
+    def improved(self, maps: LawMaps, sweeps, dearest: float) -> LawMaps:
+        """The maps that the law helps to, where these are better, else those at hand. sweeps: that
+        were searched. dearest: operations of a step of a map that is chosen beside the law."""
+        problem, law, bound = self.problem, self.law, self.problem.tolerance.bound
+        if problem.tolerance.met_by(law.candidate):
+            larger = (s for s in sweeps if s.short_of_pairs and s.sizes)
+            if maps.bound > bound and any(s.sizes[-1].operations < dearest for s in larger):
+                problem.on_progress("drawing pairs from the flow of H")
+                return self.of_law(dearest) or maps
+            return maps
+        # What stalls in noise would stall without most of the motion too.
+        ended = problem.budget.over or not maps.found.ranking or maps.found.stalled
+        explains = law.candidate.validation_relative < _EXPLAINED
+        if problem.data.args is None and not ended and maps.bound > bound and explains:
+            problem.on_progress(f"learning the residual of the flow of {law.candidate.label}")
+            around = self.around()
+            least = min(maps.bound, law.candidate.validation_bound)
+            return around if around is not None and around.bound < least else maps
+        return maps
 
-def search_around(
-    law: LearnedHamiltonian,
-    data: Dataset,
-    tolerance: Tolerance,
-    scene: Scene | None,
-    budget: Budget,
-    on_progress,
-    on_candidate,
-    better,
-    seed: int,
-) -> LawMaps | None:
-    """Maps of a law's flow Φ and of S, which learns what Φ leaves over: of the whole law, then of
-    its strongest terms, which leave more over but smoother. None where Φ has no image of some of
-    the states, or no chart covers what is left."""
-    best: LawMaps | None = None
-    for laws in ([(law.flow.family, np.asarray(law.flow.params))], strongest(law, data)):
-        if not laws:
-            break
+    def of_law(self, dearest: float) -> LawMaps | None:
+        """Maps fitted to pairs that are drawn from the law's flow, and judged by the user's
+        validation rows; None where none of them meets the tolerance, or no chart covers the drawn
+        pairs."""
+        data, law = self.problem.data, self.law
         try:
-            with budget.unit("what the flow of H leaves over", FLOW, _work(law, len(data))):
-                flows = [flow_of(family, c, data) for family, c in laws]
-                flow, rest = factored_out(flows, data, seed)
-                diagnosis = diagnosed(rest, "auto", scene.reversor if scene else None, seed)
+            name = "pairs drawn from the flow of H"
+            with self.problem.budget.unit(name, FLOW, self._work(NUM_PAIRS)):
+                z = data.pairs.z0
+                more = drawn(law.flow, data.coordinates, z, data.dt, Drawing(seed=self.seed))
         except OutOfTime:
-            break
-        except FitError:
-            continue
-        found = _around(
-            flow, diagnosis, data, tolerance, scene, budget, on_progress, on_candidate, better
+            return None
+        try:
+            diagnosis = self._diagnosed(data.validating(more))
+        except FitError:  # drawn ones go further than the user's; the law itself is left
+            return None
+        found = self._searched(diagnosis, None).to_its_end(dearest)
+        maps = LawMaps(
+            found._replace(ended="the tolerance is met, by a map of pairs drawn from H's flow"),
+            diagnosis.charts,
         )
-        if found.found.ranking and (
-            best is None
-            or found.found.ranking[0].candidate.validation_bound
-            < best.found.ranking[0].candidate.validation_bound
-        ):
-            best = found
-        if best and best.found.ranking[0].candidate.validation_bound <= tolerance.bound:
-            break
-    return best
+        return maps if maps.bound <= self.problem.tolerance.bound else None
+
+    def around(self) -> LawMaps | None:
+        """Maps of a law's flow Φ and of S, which learns what Φ leaves over: of the whole law, then
+        of its strongest terms, which leave more over but smoother. None where Φ has no image of
+        some of the states, or no chart covers what is left."""
+        data, law = self.problem.data, self.law
+        best: LawMaps | None = None
+        for laws in ([(law.flow.family, np.asarray(law.flow.params))], strongest(law, data)):
+            if not laws:
+                break
+            try:
+                name = "what the flow of H leaves over"
+                with self.problem.budget.unit(name, FLOW, self._work(len(data))):
+                    flows = [flow_of(family, c, data) for family, c in laws]
+                    flow, rest = factored_out(flows, data, self.seed)
+                    diagnosis = self._diagnosed(rest)
+            except OutOfTime:
+                break
+            except FitError:
+                continue
+            found = self._around(flow, diagnosis)
+            if best is None or found.bound < best.bound:
+                best = found if found.found.ranking else best
+            if best and best.bound <= self.problem.tolerance.bound:
+                break
+        return best
+
+    def _around(self, flow: Flow, diagnosis: Diagnosis) -> LawMaps:
+        """The search for S around one flow, whose operations are added to every candidate's."""
+        more = flow_operations(flow, self.problem.data)
+        found = self._searched(diagnosis, self.better).to_its_end()
+
+        def dearer(entry: Entry) -> Entry:
+            candidate = dataclasses.replace(
+                entry.candidate,
+                operations=entry.candidate.operations + more,
+                label=f"{entry.candidate.label} around H",
+            )
+            return entry._replace(candidate=candidate)
+
+        entries, ranking = ([dearer(e) for e in part] for part in (found.entries, found.ranking))
+        return LawMaps(found._replace(entries=entries, ranking=ranking), diagnosis.charts)
+
+    def _diagnosed(self, data: Dataset) -> Diagnosis:
+        scene = self.problem.scene
+        return diagnosed(data, "auto", scene.reversor if scene else None, self.seed)
+
+    def _searched(self, diagnosis: Diagnosis, better) -> Search:
+        problem, charts = self.problem, diagnosis.charts.charts
+        sweeps = sweeps_for("auto", charts, diagnosis.data, problem.tolerance, problem.scene)
+        given = problem.tolerance.bound, problem.budget, problem.on_progress
+        return Search(list(sweeps), *given, self.on_candidate, better)
+
+    def _work(self, states: int) -> float:
+        """Operations of the law's flow, there and back, at so many states."""
+        return _THERE_AND_BACK * states * self.law.candidate.operations
 
 
-def _work(law: LearnedHamiltonian, states: int) -> float:
-    """Operations of the law's flow, there and back, at so many states."""
-    return _THERE_AND_BACK * states * law.candidate.operations
+def factored_out(flows: Sequence[Flow], data: Dataset, seed: int) -> tuple[Flow, Dataset]:
+    """The pairs without one of these flows: before, after, or half on either side of what is
+    learned, whichever leaves the map that a small S comes closest to."""
+
+    def misfit(rest: Dataset) -> float:
+        rows = np.random.default_rng(seed).permutation(len(rest))[:TRIAL_PAIRS]
+        return trial_residual(rest.take(rows))
+
+    tried = [(flow, data.without(*pieces)) for flow in flows for pieces in around(flow)]
+    errors = [misfit(rest) for _, rest in tried]
+    return tried[0] if errors[0] <= 2 * min(errors) else tried[int(np.argmin(errors))]
 
 
-def _around(
-    flow: Flow,
-    diagnosis,
-    data: Dataset,
-    tolerance: Tolerance,
-    scene: Scene | None,
-    budget: Budget,
-    on_progress,
-    on_candidate,
-    better,
-) -> LawMaps:
-    """The search for S around one flow, whose operations are added to every candidate's."""
-    more = flow_operations(flow, data)
-    sweeps = list(sweeps_for("auto", diagnosis.charts.charts, diagnosis.data, tolerance, scene))
-    climb = Search(sweeps, tolerance.bound, budget, on_progress, on_candidate, better)
-    found = climb.to_its_end()
+def flow_of(family: Terms, params, data: Dataset) -> Flow:
+    """The flow of a law over dt, to roundoff: to be factored out.
 
-    def dearer(entry: Entry) -> Entry:
-        candidate = dataclasses.replace(
-            entry.candidate,
-            operations=entry.candidate.operations + more,
-            label=f"{entry.candidate.label} around H",
+    data: without a base map. Raises FitError where it has no image of some of the states.
+    """
+    y0, y1, dt, scale = data.y0, data.y1, data.dt, data.scale
+    problem = Problem(y0, y1, dt, scale)
+    (steps,) = problem.fine_steps(family, params, np.arange(len(y0)))
+    fastest = rates(family, params, y0[:FREQUENCY_STATES])
+    by_newton = not contraction_of(fastest, dt, steps) <= CONTRACTING
+    flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, by_newton)
+    failed = ~np.isfinite(np.concatenate([flow.image(y0), flow.inverse().image(y1)])).all(axis=1)
+    if failed.any():
+        raise FitError(
+            f"base: the flow of the given H fails for {int(failed.sum())} of {len(y0) + len(y1)} "
+            "states within one step. Check its formula and units, or leave these states out"
         )
-        return entry._replace(candidate=candidate)
+    return flow
 
-    entries, ranking = ([dearer(e) for e in part] for part in (found.entries, found.ranking))
-    return LawMaps(found._replace(entries=entries, ranking=ranking), diagnosis.charts)
+
+def around(flow: Flow) -> list[tuple[Flow | None, Flow | None]]:
+    """Pieces (before, after) around what is learned: half of the flow on either side, which
+    keeps the symmetry in time, or all of it on one, which suits a kick."""
+    half = dataclasses.replace(flow, dt=0.5 * flow.dt)
+    return [(half, half), (flow, None), (None, flow)]
 
 
 def strongest(law: LearnedHamiltonian, data: Dataset) -> list[tuple[Terms, np.ndarray]]:
@@ -185,13 +222,3 @@ def strongest(law: LearnedHamiltonian, data: Dataset) -> list[tuple[Terms, np.nd
         if found.rms < _EXPLAINED:
             laws.append((part, found.coefficients))
     return laws
-
-
-def better_than(around: Found, found: Found, law: LearnedHamiltonian) -> bool:
-    """Return whether the maps around the law have a better one than the others and the law
-    itself."""
-    if not around.ranking:
-        return False
-    others = [found.ranking[0].candidate, law.candidate]
-    best = around.ranking[0].candidate
-    return all(best.validation_bound < other.validation_bound for other in others)

@@ -11,10 +11,11 @@ import numpy as np
 
 from gfnn_jax.families.terms import Terms, exponents, given_terms, joined, polynomial_terms
 from gfnn_jax.fitting.significance import null_terms
-from gfnn_jax.models.textbook.arguments import Argument, arguments_of
 from gfnn_jax.models.textbook.atoms import (
+    Argument,
     Atom,
     Factor,
+    arguments_of,
     atom_text,
     gradient_of,
     powers_of,
@@ -128,14 +129,12 @@ class Setting:
         *,
         products: bool = False,
         centres: bool = False,
-        allowed: Callable[[Atom], bool] | None = None,
     ) -> Dictionary:
         """The atoms that are tried: shapes of one argument, and products of coordinates from the
         third degree on; the base is in every law.
 
         products: of a coordinate, a product of two or a sine or cosine with a shape of another
-        argument too. centres: shapes of distances from centres beside the origin too. allowed: says
-        which atoms; None: all.
+        argument too. centres: shapes of distances from centres beside the origin too.
         """
         atoms: list[Atom] = []
         gradients: list[np.ndarray] = []
@@ -144,9 +143,6 @@ class Setting:
             groups += [self._of_products()] if products else []
             groups += [self._of_centres()] if centres else []
             for own, gradient in chain(*groups):
-                if allowed is not None:
-                    chosen = [i for i, atom in enumerate(own) if allowed(atom)]
-                    own, gradient = [own[i] for i in chosen], gradient[chosen]
                 atoms += own
                 gradients.append(self.average(gradient))
             rows = (np.concatenate(gradients) * self.weight).reshape(len(atoms), -1)

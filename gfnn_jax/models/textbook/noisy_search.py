@@ -1,7 +1,18 @@
 """The search for laws of physics behind noisy sequences: which few atoms are worth a fit.
 
-Atoms are matched, as in `models.textbook.search`, to the gradients of H along sequences. These are
-known in weak form (`weak_gradients`), without the error of a midpoint: one round is enough. The
+Gradients of H are known in weak form. The equation of motion times a bump φ, integrated by parts
+over a window of a sequence,
+
+    ∫ φ J∇H(z) dt = −∫ φ̇ z dt,
+
+asks for no derivative of the measured states, so that their noise is averaged and not divided by
+the time step (Messenger & Bortz, SIAM Multiscale Model. Simul. 19 (2021) 1474). The bumps
+φ = (1 − u²)⁶ and their slopes are summed over the states, to 1e-5 of the integrals. The left-hand
+side is evaluated at states that are smoothed where the orbit is smooth: noise e there moves the
+columns by ∫ φ J H'' e dt.
+
+Atoms are matched, as in `models.textbook.search`, to the gradients of H along sequences. These
+have no error of a midpoint: one round is enough. The
 noise of the states is known too: columns are in its units, and an atom has to bring as much
 likelihood as there is to say of it. Noise does not tell the right law from one that is within it,
 so that several are handed on; whole sequences choose.
@@ -16,11 +27,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.models.textbook.arguments import Argument
-from gfnn_jax.models.textbook.atoms import Atom, complexity_of, constants_of, with_constants
+from gfnn_jax.fitting.triangle import Triangle
+from gfnn_jax.models.textbook.atoms import (
+    Argument,
+    Atom,
+    complexity_of,
+    constants_of,
+    with_constants,
+)
 from gfnn_jax.models.textbook.dictionary import Setting, beside
 from gfnn_jax.models.textbook.matching import Match, Matching
-from gfnn_jax.models.textbook.weak_gradients import WeakGradients
+from gfnn_jax.phase_space import apply_j
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +51,13 @@ class NoisyTextbookOptions:
     errors of a coordinate, or a product of two, that a law is handed on with. exchanged:
     matches whose atoms are tried in other shapes; looked_at: that are read as laws. far:
     deviations, beyond which a row has less weight.
+
+    Weak gradients: states: of a window. power: of the bump, with 4 the sums over its slope are off
+    by 2e-4. every: states, at which windows begin. most: windows. smoothed, degree: states and
+    degree of local polynomials that smooth a sequence; biased: times the noise, that one leaves
+    over where it is not the orbit. follows: degree of the polynomials that are to follow the states
+    of a window, and over: what they may leave over, in units of the noise; where an orbit turns
+    faster, as at a pole or in a close passage, the sums over the window are no integrals.
     """
 
     atoms: int = 5
@@ -44,9 +68,111 @@ class NoisyTextbookOptions:
     exchanged: int = 4
     looked_at: int = 30
     far: float = 3.0
+    states: int = 15
+    power: int = 6
+    every: int = 6
+    most: int = 320
+    smoothed: tuple[int, ...] = (9, 7)
+    degree: int = 4
+    biased: float = 1.3
+    follows: int = 8
+    over: float = 2.0
 
 
 OPTIONS = NoisyTextbookOptions()
+
+
+class WeakGradients(NamedTuple):
+    """The windows of some sequences.
+
+    states: (N, 2d), smoothed; noise: (N, 2d) what is left on them. target: (R, 2d), the mean of ∇H
+    over each window, as the motion tells it. deviation: (2d,) of its noise. places: (R, w) of each
+    window's states. bump: (w,), whose sum is 1.
+    """
+
+    states: np.ndarray
+    noise: np.ndarray
+    target: np.ndarray
+    deviation: np.ndarray
+    places: np.ndarray
+    bump: np.ndarray
+
+    def deviations(self, hessian: np.ndarray) -> np.ndarray:
+        """(R, 2d) of the noise of both sides, with H'' (N, 2d, 2d) at the states."""
+        moved = np.einsum("nij,nj->ni", hessian**2, self.noise**2)
+        of_states = np.einsum("w,rwi->ri", self.bump**2, moved[self.places])
+        return np.sqrt(self.deviation**2 + np.where(np.isfinite(of_states), of_states, np.inf))
+
+    def average(self, gradients: np.ndarray) -> np.ndarray:
+        """The means (…, R, 2d) over the windows of gradients (…, N, 2d) at the states."""
+        total = self.bump[0] * gradients[..., self.places[:, 0], :]
+        for weight, own in zip(self.bump[1:], self.places.T[1:], strict=True):
+            total = total + weight * gradients[..., own, :]
+        return total
+
+
+def weak_gradients(
+    sequences: list[np.ndarray], dt: float, noise: np.ndarray
+) -> WeakGradients | None:
+    """The windows of sequences (L, 2d) of states dt apart, with noise (2d,) on each coordinate.
+    None where no sequence is as long as a window, or turns slowly enough for one."""
+    u = np.arange(1, OPTIONS.states + 1) / (OPTIONS.states + 1) * 2 - 1
+    bump = (1 - u**2) ** OPTIONS.power
+    bump /= bump.sum()
+    slope = u * (1 - u**2) ** (OPTIONS.power - 1)
+    time = np.arange(OPTIONS.states) * dt
+    slope /= slope @ time  # of a state that moves at rate 1 the mean rate is 1
+    states, noises, measured, places, count = [], [], [], [], 0
+    for sequence in sequences:
+        if len(sequence) < OPTIONS.states:
+            continue
+        smooth, left = _smoothed(sequence, noise)
+        states.append(smooth)
+        noises.append(np.tile(left, (len(sequence), 1)))
+        measured.append(sequence)
+        first = count + np.arange(0, len(sequence) - OPTIONS.states + 1, OPTIONS.every)
+        places.append(first[:, None] + np.arange(OPTIONS.states))
+        count += len(sequence)
+    if not states:
+        return None
+    own, whole = np.concatenate(places), np.concatenate(measured)
+    own = own[_followed(whole[own], noise)]
+    if not len(own):
+        return None
+    own = own[:: -(-len(own) // OPTIONS.most)]
+    used, place = np.unique(own, return_inverse=True)
+    rate = np.einsum("w,rwi->ri", slope, whole[own])
+    deviation = np.roll(noise, len(noise) // 2) * np.linalg.norm(slope)
+    return WeakGradients(
+        np.concatenate(states)[used],
+        np.concatenate(noises)[used],
+        -apply_j(rate),
+        deviation,
+        place.reshape(own.shape),
+        bump,
+    )
+
+
+def _followed(windows: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """(R,) which windows (R, w, 2d) polynomials follow to their noise (2d,)."""
+    count = windows.shape[1]
+    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, count), OPTIONS.follows + 1))[0]
+    over = windows - np.einsum("wk,vk,rvi->rwi", basis, basis, windows)
+    left = np.sqrt(np.sum(over**2, axis=1) / (count - basis.shape[1]))
+    return (left <= OPTIONS.over * noise).all(axis=1)
+
+
+def _smoothed(sequence: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The sequence (L, 2d) smoothed as far as its orbit allows, and the noise (2d,) left on it."""
+    from scipy.signal import savgol_coeffs, savgol_filter  # takes a second: loaded when first used
+
+    for size in OPTIONS.smoothed:
+        kept = float(savgol_coeffs(size, OPTIONS.degree)[size // 2])  # of a state's own noise
+        smooth = np.asarray(savgol_filter(sequence, size, OPTIONS.degree, axis=0))
+        left = np.sqrt(np.mean((sequence - smooth) ** 2, axis=0))
+        if (left <= OPTIONS.biased * np.sqrt(1 - kept) * noise).all():
+            return smooth, np.sqrt(kept) * noise
+    return sequence, noise
 
 
 class Formula(NamedTuple):
@@ -198,16 +324,14 @@ class NoisyTextbook:
         given = *setting.plain(match.atoms), setting.arguments, nothing, np.inf
         whole = Formula(*given, len(self._target))
         columns = setting.columns(whole.family(whole.constants))
+        triangle = Triangle.of(np.column_stack([columns, self._target]))
         kept = np.arange(columns.shape[1])
         while True:
-            own = columns[:, kept]
-            size = np.linalg.norm(own, axis=0)
-            own = own / size
-            c = np.linalg.lstsq(own, self._target, rcond=1e-13)[0]
-            left = np.linalg.norm(self._target - own @ c) / np.sqrt(len(own) - len(kept))
-            deviation = left * np.linalg.norm(np.linalg.pinv(own), axis=1)
-            significance = np.abs(c) / deviation
+            spectrum = triangle.pruned(kept).spectrum()
+            c = spectrum.solution(spectrum.inverse)
+            left = spectrum.residual_norm / np.sqrt(triangle.rows - len(kept))
+            significance = np.abs(c) / (left * spectrum.deviations())
             worst = int(np.argmin(significance))
             if significance[worst] >= OPTIONS.kept or len(kept) == 1:
-                return whole.take(kept.tolist(), c / size)._replace(left=float(left))
+                return whole.take(kept.tolist(), c)._replace(left=float(left))
             kept = np.delete(kept, worst)

@@ -16,14 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps, of_lanes
 from gfnn_jax.models.textbook.atoms import Atom, complexity_of, constants_of, with_constants
 from gfnn_jax.models.textbook.dictionary import Dictionary, Setting
-from gfnn_jax.models.textbook.invariance import Invariance
 from gfnn_jax.models.textbook.matching import Match, Matching
 from gfnn_jax.phase_space import apply_j
 
@@ -92,8 +90,8 @@ class _State(NamedTuple):
 class Textbook:
     """The search for the law of these rows of a problem's pairs, which have no args.
 
-    angles, cyclic: indices of z. symmetries: of the pairs; only what has them by itself is tried.
-    Raises ValueError for more degrees of freedom than ``OPTIONS.most_dim``.
+    angles, cyclic: indices of z. Raises ValueError for more degrees of freedom than
+    ``OPTIONS.most_dim``.
     """
 
     def __init__(
@@ -104,7 +102,6 @@ class Textbook:
         angles: Sequence[int] = (),
         cyclic: Sequence[int] = (),
         on_progress: Callable[[str], Any] = lambda message: None,
-        symmetries: Sequence[SymmetryOfPairs] = (),
     ):
         dim = problem.z0.shape[1] // 2
         if dim > OPTIONS.most_dim:
@@ -117,20 +114,12 @@ class Textbook:
         dt = of_lanes(problem.dt, self._rows)
         self._h = dt[:, None] if np.ndim(dt) else dt
         self._middle, weight = 0.5 * (z0 + self._z1), 1.0 / np.roll(problem.scale, dim)
-        self._setting = setting = Setting(self._middle, weight, angles, cyclic)
-        self.null = setting.null
-        self._invariance = Invariance(symmetries, setting)
-        if self._invariance:
-            setting.take(setting.base.take(self._invariance.terms(setting.base)), weight)
+        self._setting = Setting(self._middle, weight, angles, cyclic)
+        self.null = self._setting.null
         self._tried = 0  # atoms of the dictionary before
         self._target = -apply_j(self._z1 - z0) / self._h
         self._closest: _State | None = None  # of the laws that were not exact
         self._partial: list[_State] = []
-
-    @property
-    def symmetric(self) -> bool:
-        """Return whether symmetries have left atoms out."""
-        return bool(self._invariance)
 
     def law(self, *, products: bool = False, centres: bool = False) -> Law | None:
         """The plainest law whose flow takes z₀ to z₁, of a dictionary with products of shapes, with
@@ -141,11 +130,11 @@ class Textbook:
         blocks = [] if products or centres else setting.blocks()
         tops = setting.tops() if products else []
         with np.errstate(all="ignore"):
-            dictionary = self._dictionary(products=products, centres=centres)
+            dictionary = setting.dictionary(products=products, centres=centres)
             tried, self._tried = self._tried, len(dictionary.atoms)
             if len(dictionary.atoms) == tried:  # products and centres have brought nothing
                 return None
-            found = self._found(dictionary, self._allowed(blocks), self._allowed(tops))
+            found = self._found(dictionary, blocks, tops)
             return None if found is None else self._simplified(found).law
 
     @property
@@ -156,17 +145,6 @@ class Textbook:
             kind = tuple(sorted(tuple(f.form for f in a) for a in state.match.atoms))
             kinds.setdefault(kind, state)
         return [state.law for state in list(kinds.values())[:3]]
-
-    def _dictionary(self, **contents: bool) -> Dictionary:
-        allowed = self._invariance.of_atom if self._invariance else None
-        return self._setting.dictionary(allowed=allowed, **contents)
-
-    def _allowed(self, blocks: list[tuple[Atom, ...]]) -> list[tuple[Atom, ...]]:
-        """The atoms of these that have the symmetries."""
-        if not self._invariance:
-            return blocks
-        kept = (tuple(filter(self._invariance.of_atom, block)) for block in blocks)
-        return list(dict.fromkeys(block for block in kept if block))
 
     def _matching(self, target: np.ndarray) -> Matching:
         return Matching(self._setting, (target * self._setting.weight).ravel())
@@ -271,7 +249,7 @@ class Textbook:
     def _simplified(self, state: _State) -> _State:
         """The simplest law that is as exact: other atoms that match the corrected gradients, fewer
         of them, constants of fewer digits."""
-        matching, dictionary = self._matching(state.target), self._dictionary()
+        matching, dictionary = self._matching(state.target), self._setting.dictionary()
         bound = 3 * max(state.law.left, OPTIONS.roundoff)
         others = matching.best(dictionary, min(3, len(state.match.atoms)))
         simpler = [m for m in others if self._as_well(m.left, state)]

@@ -11,9 +11,6 @@ import numpy as np
 
 Kind = tuple[str, float]  # name and exponent n
 
-_WHOLE = 8  # the highest power of a coordinate, 12 of a distance
-_WHOLE_OF_DISTANCE = 12
-
 
 def values(kind: Kind, x, theta):
     """(f, f') of the shape at x, with the constant θ, None where the shape has none."""
@@ -67,7 +64,7 @@ def kinds_for(x: np.ndarray, *, distance: bool = False, circular: bool = False) 
     if circular:
         powers = [1.0, 2.0, 3.0] + ([-1.0, -2.0] if one_signed else [])
         return [("power", n) for n in powers]
-    whole = range(1, 1 + (_WHOLE_OF_DISTANCE if distance else _WHOLE))
+    whole = range(1, 1 + (12 if distance else 8))
     found: list[Kind] = [("power", float(n)) for n in whole]
     if one_signed:
         found += [("power", -float(n)) for n in range(1, 13)]
@@ -78,15 +75,6 @@ def kinds_for(x: np.ndarray, *, distance: bool = False, circular: bool = False) 
         found += [("sin", 0.0), ("cos", 0.0)]
     found += [("exp", 0.0), ("exp", 1.0), ("root", 1.0), ("root", -1.0), ("pole", 0.0)]
     return [*found, ("softened", 0.0), ("lorentz", 0.0), ("gauss", 0.0)]
-
-
-def parity(kind: Kind) -> int:
-    """1 of an even shape, f(−x) = f(x), -1 of an odd one, 0 of another."""
-    name, n = kind
-    if name == "power":
-        return (-1) ** int(n) if n % 1 == 0 else 0
-    even = ("cos", "root", "softened", "lorentz", "gauss")
-    return {**dict.fromkeys(even, 1), "sin": -1}.get(name, 0)
 
 
 def constants_for(kind: Kind, x: np.ndarray) -> np.ndarray:
