@@ -73,7 +73,6 @@ SHORTHANDS |= {
     ("data.recording", "data.recording_summary"),
     ("learn.fitted", "learn.accelerate"),
     ("learn.fitted", "learn.saved"),
-    ("learn.fitted", "evaluate.law_report"),
     ("learn.fitted", "evaluate.report"),
 }
 HOMES = {  # the module, and those whose names begin as its own does

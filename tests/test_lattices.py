@@ -13,7 +13,7 @@ from gfnn_jax import cli, scenes
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.structures import Bodies
-from gfnn_jax.evaluate import figures, figures_of_many
+from gfnn_jax.evaluate import figures
 from gfnn_jax.families.sums import ENDS, Part, Sums, Windows, body_terms, matrix_free, site_terms
 from gfnn_jax.families.terms import Terms, given_terms
 from gfnn_jax.flows.collocation import Steps, images
@@ -557,11 +557,11 @@ def test_mode_energies_add_up(kind):
     family, params = springs(8, "ring" if kind == "ring" else "free")
     harmonic, z = family.take([0, 1]), RNG.normal(size=(3, 16))
     z -= np.repeat(z.reshape(3, 2, 8).mean(axis=2), 8, axis=1)
-    energies = figures_of_many.mode_energies(z, kind)
+    energies = figures.mode_energies(z, kind)
     np.testing.assert_allclose(energies.sum(axis=1), harmonic.value(params[:2], z), rtol=1e-13)
     site = np.arange(8) if kind == "ring" else np.arange(8) + 0.5
     wave = np.cos((2 if kind == "ring" else 1) * np.pi * 3 * site / 8)
-    (energy,) = figures_of_many.mode_energies(np.concatenate([wave, wave])[None], kind)
+    (energy,) = figures.mode_energies(np.concatenate([wave, wave])[None], kind)
     assert energy[2] > 1.0
     np.testing.assert_allclose(np.delete(energy, 2), 0, atol=1e-14)
 
@@ -569,18 +569,18 @@ def test_mode_energies_add_up(kind):
 def test_figures_show_each_panel_what_it_is_named(tmp_path):
     times, z = np.arange(5.0), RNG.normal(size=(5, 12))
     off = z + 1e-8
-    drawn = figures_of_many.space_time(times, z, off).axes
+    drawn = figures.space_time(times, z, off).axes
     images_ = [ax.get_images()[0].get_array() for ax in drawn[:3]]
     for shown, wanted in zip(images_, (z[:, 6:], off[:, 6:], np.full((5, 6), 1e-8)), strict=True):
         np.testing.assert_allclose(shown, wanted, rtol=1e-6)
     assert [ax.get_title() for ax in drawn[:3]] == ["reference", "GFNN", "difference"]
-    drawn = figures_of_many.orbits(times, z, off, 3).axes
+    drawn = figures.orbits(times, z, off, 3).axes
     np.testing.assert_array_equal(drawn[1].get_lines()[2].get_xydata(), off[:, 2:4])
     np.testing.assert_allclose(drawn[2].get_lines()[1].get_ydata(), np.sqrt(2) * 1e-8, rtol=1e-6)
-    line = figures_of_many.orbits(times, z, off, 6)
+    line = figures.orbits(times, z, off, 6)
     np.testing.assert_array_equal(line.axes[0].get_lines()[0].get_xdata(), times)
     figures.save(line, tmp_path / "line.png")
-    figures.save(figures_of_many.modes(times, z, off), tmp_path / "modes.png")
+    figures.save(figures.modes(times, z, off), tmp_path / "modes.png")
 
 
 def test_too_few_sites_or_pairs_are_refused():

@@ -1,70 +1,130 @@
 """Figures in print quality: arrays in, Axes out.
 
 Each function draws on ``ax`` where one is given, else on a new figure (`save(ax.figure, path)`).
-Figures are matplotlib `Figure` objects; pyplot and its global state are never touched. The style is
-that of `evaluate.figures_style`. Here are errors and orbits; those of what maps cost
-(`evaluate.figures_of_cost`) have their names here too.
+Figures are matplotlib `Figure` objects; pyplot and its global state are never touched. One style
+serves the colour-blind and grey print: each method has a colour, a marker and a line style, by its
+place in the mapping. The reference is black and comes first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
+import matplotlib
 import numpy as np
+from cycler import cycler
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
+from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.evaluate.chaos import kl_divergence
 from gfnn_jax.evaluate.errors import error_statistics
-from gfnn_jax.evaluate.figures_of_cost import (
-    digits_against_step_size,
-    speed_against_error,
-    training_curve,
-    work_precision,
-    work_precision_panels,
-)
-from gfnn_jax.evaluate.figures_style import (
-    COLOURS,
-    HEIGHT,
-    LINES,
-    MARKERS,
-    REFERENCE,
-    STYLE,
-    WIDTH,
-    axes_or_new,
-    legend_above,
-    look_of,
-    save,
-    style,
-    without_minor_ticks,
-)
+from gfnn_jax.phase_space import split
 
-__all__ = (
-    "COLOURS",
-    "HEIGHT",
-    "LINES",
-    "MARKERS",
-    "REFERENCE",
-    "STYLE",
-    "WIDTH",
-    "coordinates_against_time",
-    "coordinates_in_two_panels",
-    "digits_against_step_size",
-    "element_errors",
-    "energy_error",
-    "error_growth",
-    "marginal_panels",
-    "marginals",
-    "phase_portrait",
-    "proportionality",
-    "save",
-    "sections",
-    "speed_against_error",
-    "style",
-    "training_curve",
-    "work_precision",
-    "work_precision_panels",
-)
+# Okabe & Ito's palette without its yellow, which does not show on white, and with grey.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)))
+REFERENCE = "black"
+WIDTH, HEIGHT = 4.8, 3.2  # inches, of one panel; a column of a paper is about 3.3 wide
+STYLE: dict[Any, Any] = {
+    "figure.constrained_layout.use": True,
+    "figure.dpi": 100,
+    "font.size": 9,
+    "axes.labelsize": 9,
+    "axes.titlesize": 9,
+    "legend.fontsize": 8,
+    "legend.framealpha": 0.85,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#DDDDDD",
+    "grid.linewidth": 0.5,
+    "axes.axisbelow": True,
+    "axes.formatter.use_mathtext": True,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 4,
+    "pdf.fonttype": 42,
+    "axes.prop_cycle": cycler(color=COLOURS),
+}
+_HALO = [withStroke(linewidth=2, foreground="white")]  # keeps text legible on lines
+_LOG_LOG = {"xscale": "log", "yscale": "log"}
+_ALONE = {"linestyle": "none"}  # points without a line
+
+
+def style():
+    """Style of the package as a context and as a decorator; matplotlib's settings are restored."""
+    return matplotlib.rc_context(STYLE)
+
+
+@style()
+def save(figure: Figure, path, dpi: int = 200) -> None:
+    """Write a figure as ``.png`` (``dpi`` dots per inch) or ``.pdf``, by the suffix of ``path``."""
+    engine = figure.get_layout_engine()
+    if engine is None:
+        figure.savefig(Path(path), dpi=dpi, bbox_inches="tight")
+        return
+    # The engine leaves room for all labels. Matplotlib calls it by a drawing of its own before the
+    # one that is saved; a call without that drawing takes a third less. With one canvas for both,
+    # the labels are set once.
+    canvas, before = figure.canvas, figure.dpi
+    try:
+        FigureCanvasAgg(figure).figure.dpi = dpi
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+        figure.savefig(Path(path), dpi=dpi)
+    finally:
+        figure.dpi = before
+        figure.set_canvas(canvas)
+        figure.set_layout_engine(engine)
+
+
+def _axes_or_new(ax, width=WIDTH, height=HEIGHT) -> Axes:
+    return Figure(figsize=(width, height)).add_subplot() if ax is None else ax
+
+
+def _look_of(place: int) -> dict:
+    return {
+        "color": COLOURS[place % len(COLOURS)],
+        "marker": MARKERS[place % len(MARKERS)],
+        "linestyle": LINES[place % len(LINES)],
+    }
+
+
+def _curves(ax, curves: Mapping) -> None:
+    """Draw name -> (x (K,), y (K,)), each with the look of its place."""
+    for place, (name, (x, y)) in enumerate(curves.items()):
+        ax.plot(x, y, label=name, **_look_of(place))
+
+
+def _without_minor_ticks(*axes: Axes) -> None:
+    """Leave out the minor ticks of logarithmic axes of three decades or more: they tell little
+    there, and take half of the time of a figure."""
+    for axis in (axis for ax in axes for axis in (ax.xaxis, ax.yaxis)):
+        low, high = axis.get_view_interval()
+        if axis.get_scale() == "log" and high >= 1e3 * low:
+            axis.set_minor_locator(NullLocator())
+
+
+def _legend_above(ax, ncols=3, **options) -> None:
+    """Draw the legend above the axes, where it covers no data."""
+    options |= {"frameon": False, "borderaxespad": 0.2, "handlelength": 2.4, "columnspacing": 1.2}
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=ncols, **options)
+
+
+def _legend_of_all(figure: Figure, ax: Axes, ncols: int) -> None:
+    """Draw the legend of one of its axes above the figure."""
+    names = ax.get_legend_handles_labels()
+    figure.legend(*names, loc="outside upper center", ncols=ncols, frameon=False)
+
 
 # Errors against step number
 
@@ -80,13 +140,13 @@ def error_growth(errors: Mapping, ylabel="position error", ax=None, band=None) -
     band: (steps (L,), two standard deviations of the posterior (B, L)), whose mean over
     trajectories is shaded from below.
     """
-    ax = axes_or_new(ax)
+    ax = _axes_or_new(ax)
     _error_curves(ax, errors, ylabel)
     _guide(ax, 1.0, r"$\propto n$")
     if band is not None:
         _shaded(ax, np.asarray(band[0]), np.mean(band[1], axis=0))
-    without_minor_ticks(ax)
-    legend_above(ax)
+    _without_minor_ticks(ax)
+    _legend_above(ax)
     return ax
 
 
@@ -96,12 +156,11 @@ def proportionality(points: Mapping, xlabel, ylabel, ax=None) -> Axes:
 
     points: name -> (x (K,), y (K,)).
     """
-    ax = axes_or_new(ax)
-    for place, (name, (x, y)) in enumerate(points.items()):
-        ax.plot(x, y, label=name, **look_of(place))
-    ax.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
+    ax = _axes_or_new(ax)
+    _curves(ax, points)
+    ax.set(xlabel=xlabel, ylabel=ylabel, **_LOG_LOG)
     _guide(ax, 1.0, r"$\propto\varepsilon$")
-    legend_above(ax)
+    _legend_above(ax)
     return ax
 
 
@@ -116,8 +175,8 @@ def element_errors(errors: Mapping, axes=None) -> tuple[Axes, Axes]:
     labels = ("error of semi-major axis $a$", "error of eccentricity $e$")
     for i, (ax, label) in enumerate(zip(axes, labels, strict=True)):
         _error_curves(ax, {name: (v[0], v[1 + i]) for name, v in errors.items()}, label)
-        legend_above(ax)
-    without_minor_ticks(*axes)
+        _legend_above(ax)
+    _without_minor_ticks(*axes)
     return tuple(axes)
 
 
@@ -127,72 +186,66 @@ def energy_error(errors: Mapping, ax=None) -> Axes:
 
     errors: name -> (steps (L,), energy error (B, L)). The dotted line grows as √step, as roundoff.
     """
-    ax = axes_or_new(ax)
+    ax = _axes_or_new(ax)
     for place, (name, (steps, error)) in enumerate(errors.items()):
         size = np.sqrt(np.mean(np.atleast_2d(np.asarray(error)) ** 2, axis=0))
         _log_curve(ax, place, name, np.asarray(steps), size)
-    _log_log(ax, r"energy error $|H-H_0|\,/\,|H_0|$ (RMS)")
+    label = r"energy error $|H-H_0|\,/\,|H_0|$ (RMS)"
+    ax.set(xlabel="step $n$", ylabel=label, **_LOG_LOG)
     _guide(ax, 0.5, r"$\propto \sqrt{n}$")
-    without_minor_ticks(ax)
-    legend_above(ax)
+    _without_minor_ticks(ax)
+    _legend_above(ax)
     return ax
 
 
 def _shaded(ax, steps, upper):
     """Shade the region below ``upper`` (L,), without extending the axis downwards."""
-    shown = (steps > 0) & np.isfinite(upper) & (upper > 0)
+    shown = _drawable(steps, upper)
     if not shown.any():
         return
-    ax.plot(steps[shown], upper[shown], color=REFERENCE, linewidth=0.8, alpha=0.5, label="_band")
-    low = min(ax.get_ylim()[0], float(upper[shown].min()))
-    ax.fill_between(
-        steps[shown],
-        low,
-        upper[shown],
-        color="0.5",
-        alpha=0.15,
-        linewidth=0,
-        zorder=0,
-        label=r"two $\sigma$ of the posterior",
-    )
+    x, y = steps[shown], upper[shown]
+    ax.plot(x, y, color=REFERENCE, linewidth=0.8, alpha=0.5, label="_band")
+    low = min(ax.get_ylim()[0], float(y.min()))
+    look = {"color": "0.5", "alpha": 0.15, "linewidth": 0, "zorder": 0}
+    ax.fill_between(x, low, y, label=r"two $\sigma$ of the posterior", **look)
     ax.set_ylim(bottom=low)
 
 
 def _error_curves(ax, errors, ylabel):
     for place, (name, (steps, error)) in enumerate(errors.items()):
-        error = np.atleast_2d(np.asarray(error))
+        error, steps = np.atleast_2d(np.asarray(error)), np.asarray(steps)
         statistics = error_statistics(error)
-        mean, steps = statistics.mean, np.asarray(steps)
-        if statistics.num_lost:
-            num = len(error) - statistics.num_excluded
-            name = f"{name} ({statistics.num_lost} of {num} lost)"
+        mean, median, lost = statistics.mean, statistics.median, statistics.num_lost
+        if lost:
+            name = f"{name} ({lost} of {len(error) - statistics.num_excluded} lost)"
         shown = _log_curve(ax, place, name, steps, mean)
-        if statistics.num_lost:
-            rest = (steps > 0) & ~shown & np.isfinite(statistics.median) & (statistics.median > 0)
-            look = look_of(place) | {"marker": "", "linewidth": 0.8}
-            ax.plot(steps[rest], statistics.median[rest], label="_the median", **look)
+        if lost:
+            rest = ~shown & _drawable(steps, median)
+            look = _look_of(place) | {"marker": "", "linewidth": 0.8}
+            ax.plot(steps[rest], median[rest], label="_the median", **look)
         if len(error) > 1:
             factor = 1 + statistics.std[shown] / mean[shown]
             low, high = mean[shown] / factor, mean[shown] * factor
-            colour = look_of(place)["color"]
+            colour = _look_of(place)["color"]
             ax.fill_between(steps[shown], low, high, color=colour, alpha=0.18, linewidth=0)
-    _log_log(ax, ylabel)
+    ax.set(xlabel="step $n$", ylabel=ylabel, **_LOG_LOG)
+
+
+def _drawable(steps, values):
+    """Flags of the points that axes of logarithms can show."""
+    return (steps > 0) & np.isfinite(values) & (values > 0)
 
 
 def _log_curve(ax, place, name, steps, values):
     """Draw a curve's positive points, log–log, with about eight markers; return their flags."""
-    shown = (steps > 0) & np.isfinite(values) & (values > 0)
+    shown = _drawable(steps, values)
     x = np.log(steps[shown])
     marks = []
     if len(x):  # offset by method, so that markers of curves that coincide do not hide each other
         ticks = np.linspace(x[0], x[-1], 9)[:-1] + (x[-1] - x[0]) / 8 * (0.3 + 0.37 * place % 0.7)
         marks = np.unique(np.clip(np.searchsorted(x, ticks), 0, len(x) - 1)).tolist()
-    ax.plot(steps[shown], values[shown], label=name, markevery=marks, **look_of(place))
+    ax.plot(steps[shown], values[shown], label=name, markevery=marks, **_look_of(place))
     return shown
-
-
-def _log_log(ax, ylabel):
-    ax.set(xscale="log", yscale="log", xlabel="step $n$", ylabel=ylabel)
 
 
 def _guide(ax, exponent, label):
@@ -200,11 +253,10 @@ def _guide(ax, exponent, label):
     data = (np.array(line.get_data(), float) for line in ax.get_lines())
     known = (xy[:, np.isfinite(xy).all(axis=0)] for xy in data)
     curves = [xy for xy in known if xy.shape[1] > 1]
-    if not curves:
-        return
-    x, y = min(curves, key=lambda xy: xy[1, -1])
-    factor = np.min(y / x**exponent) / 2
-    ax.plot(x, factor * x**exponent, color=REFERENCE, linestyle=":", linewidth=1, label=label)
+    if curves:
+        x, y = min(curves, key=lambda xy: xy[1, -1])
+        factor = np.min(y / x**exponent) / 2
+        ax.plot(x, factor * x**exponent, color=REFERENCE, linestyle=":", linewidth=1, label=label)
 
 
 # Orbits
@@ -212,29 +264,23 @@ def _guide(ax, exponent, label):
 
 @style()
 def coordinates_against_time(
-    times, reference, predictions: Mapping, ylabel, window=None, xlabel="time $t$", ax=None
+    times, reference, predictions: Mapping, ylabel, window=None, ax=None
 ) -> Axes:
     """Draw a coordinate against time: reference (L,) in black and predictions name -> (L,).
 
     window: (first, last) time shown, to show late times (paper, Fig. 2, lower row).
     """
-    ax = axes_or_new(ax, WIDTH * 1.3)
+    ax = _axes_or_new(ax, WIDTH * 1.3)
     times = np.asarray(times)
     low, high = (times[0], times[-1]) if window is None else window
     shown = (times >= low) & (times <= high)
     every = max(1, int(shown.sum()) // 12)
     ax.plot(times[shown], np.asarray(reference)[shown], color=REFERENCE, lw=2.2, label="reference")
     for place, (name, values) in enumerate(predictions.items()):
-        start = place * every // max(1, len(predictions))
-        ax.plot(
-            times[shown],
-            np.asarray(values)[shown],
-            label=name,
-            markevery=(start, every),
-            **look_of(place),
-        )
-    ax.set(xlabel=xlabel, ylabel=ylabel)
-    legend_above(ax)
+        look = _look_of(place) | {"markevery": (place * every // max(1, len(predictions)), every)}
+        ax.plot(times[shown], np.asarray(values)[shown], label=name, **look)
+    ax.set(xlabel="time $t$", ylabel=ylabel)
+    _legend_above(ax)
     return ax
 
 
@@ -263,18 +309,17 @@ def phase_portrait(orbits: Mapping, labels=("$q$", "$p$"), modulo=False, ax=None
 
     modulo: True reduces both coordinates to [0, 2π), for the standard map.
     """
-    ax = axes_or_new(ax, HEIGHT * 1.35, HEIGHT * 1.2)
-    place = 0
+    ax = _axes_or_new(ax, HEIGHT * 1.35, HEIGHT * 1.2)
+    places = iter(range(len(orbits)))
     for name, (x, y) in orbits.items():
         if name == "reference":
             # Larger: it shows as a rim where the others cover it.
             _points(ax, x, y, modulo, 1.7, color=REFERENCE, marker="o", label=name, zorder=1.5)
         else:
-            look = look_of(place)
+            look = _look_of(next(places))
             _points(ax, x, y, modulo, color=look["color"], marker=look["marker"], label=name)
-            place += 1
     _plane(ax, labels, modulo)
-    legend_above(ax, markerscale=3)
+    _legend_above(ax, markerscale=3)
     return ax
 
 
@@ -293,16 +338,13 @@ def sections(points: Mapping, labels=("$q_2$", "$p_2$"), modulo=False, axes=None
         axes = grid[: len(points)]
         for ax in grid[len(points) :]:
             ax.remove()
-    limits = None
     for i, (ax, (name, (x, y))) in enumerate(zip(axes, points.items(), strict=True)):
         x, y = _points(ax, x, y, modulo, color=REFERENCE, marker="o")
         below, left = i + columns >= len(points), i % columns == 0
         _plane(ax, (labels[0] if below else None, labels[1] if left else None), modulo)
         ax.tick_params(labelbottom=below, labelleft=left)
-        if limits is None:
-            limits = ax.get_xlim(), ax.get_ylim()
+        (x0, x1), (y0, y1) = limits = axes[0].get_xlim(), axes[0].get_ylim()
         ax.set(xlim=limits[0], ylim=limits[1])
-        (x0, x1), (y0, y1) = limits
         outside = int(np.sum(~((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))))
         ax.set_title(f"{name} ({outside} of {x.size} outside)" if outside else name)
     return list(axes)
@@ -335,28 +377,22 @@ def marginals(reference, samples: Mapping, bins: int, range, label, ax=None) -> 
     reference: (M,) samples; samples: name -> (N,). The bins are those of `metrics.kl_divergence`.
     Densities are relative to all samples, also those outside the range.
     """
-    ax = axes_or_new(ax)
+    ax = _axes_or_new(ax)
 
     def densities(values):
         values = np.ravel(np.asarray(values, float))
         counts, edges = np.histogram(values[np.isfinite(values)], bins, range)
         return counts / (values.size * np.diff(edges)), edges
 
-    ax.stairs(
-        *densities(reference), fill=True, color=REFERENCE, alpha=0.18, label="reference", lw=0
-    )
+    filled = {"fill": True, "color": REFERENCE, "alpha": 0.18, "lw": 0}
+    ax.stairs(*densities(reference), label="reference", **filled)
     for place, (name, values) in enumerate(samples.items()):
-        look = look_of(place)
+        look = _look_of(place) | {"linewidth": 1.3}
+        del look["marker"]
         divergence = kl_divergence(values, reference, bins, range)
-        ax.stairs(
-            *densities(values),
-            color=look["color"],
-            linestyle=look["linestyle"],
-            linewidth=1.3,
-            label=f"{name}, KL {divergence:.2g}",
-        )
+        ax.stairs(*densities(values), label=f"{name}, KL {divergence:.2g}", **look)
     ax.set(xlabel=label, ylabel=f"density ({bins} bins)", xlim=range)
-    legend_above(ax, ncols=2)
+    _legend_above(ax, ncols=2)
     return ax
 
 
@@ -364,8 +400,307 @@ def marginals(reference, samples: Mapping, bins: int, range, label, ax=None) -> 
 def marginal_panels(panels: Mapping, bins: int) -> Figure:
     """Draw `marginals` side by side: label -> (reference (M,), name -> samples (N,), range)."""
     figure = Figure(figsize=(WIDTH * len(panels), HEIGHT * 1.3))
-    for ax, (label, (reference, samples, limits)) in zip(
-        np.ravel(figure.subplots(1, len(panels))), panels.items(), strict=True
-    ):
+    axes = np.ravel(figure.subplots(1, len(panels)))
+    for ax, (label, (reference, samples, limits)) in zip(axes, panels.items(), strict=True):
         marginals(reference, samples, bins, limits, label, ax=ax)
+    return figure
+
+
+# What maps cost, and how they were trained
+
+
+@style()
+def speed_against_error(
+    kilo_operations, errors, labels: Sequence[str], chosen, tolerance=None, estimated=()
+) -> Axes:
+    """Draw the one-step error of candidates against operations of a predicted step, log–log.
+
+    kilo_operations, errors: (K,). The points are numbered by rising cost and named on the right.
+    The chosen one has a ring. The staircase joins the points that no other beats in both. The
+    dotted line is the tolerance. estimated: indices of errors that no step has measured; their
+    points are hollow.
+    """
+    ax = _axes_or_new(None, WIDTH * 1.6, HEIGHT * 1.15)
+    cost, error = np.asarray(kilo_operations, float), np.asarray(errors, float)
+    order = np.argsort(cost, kind="stable")
+    front = _unbeaten(cost, error)
+    ax.step(*front, where="post", color=COLOURS[0], lw=1, label="best for its cost")
+    about = np.isin(np.arange(len(cost)), estimated)
+    dots = _ALONE | {"marker": "o", "color": COLOURS[0], "ms": 5}
+    ax.plot(cost[~about], error[~about], **dots, label="candidate")
+    if about.any():
+        ax.plot(cost[about], error[about], **dots, mfc="white", label="candidate, estimated")
+    ring = _ALONE | {"marker": "o", "ms": 11, "mfc": "none", "mec": COLOURS[1], "mew": 1.8}
+    ax.plot(cost[chosen], error[chosen], label="chosen", **ring)
+    if tolerance is not None:
+        ax.axhline(tolerance, color=REFERENCE, ls=":", lw=1, label="tolerance")
+    ax.set(xlabel="operations per step and trajectory (thousands)", **_LOG_LOG)
+    ax.set(ylabel="one-step error ÷ spread")
+    ax.margins(0.12)
+    _costs_as_numbers(ax, cost)
+    _without_minor_ticks(ax)
+    _number_points(ax, cost, error, order)
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
+    named = (f"{labels[i]}{'  (chosen)' if i == chosen else ''}" for i in order)
+    names = "\n".join(f"{number}  {name}" for number, name in enumerate(named, 1))
+    look = {"va": "top", "fontsize": 7.5, "linespacing": 1.35, "annotation_clip": False}
+    ax.annotate(names, (1.03, 0.7), xycoords="axes fraction", **look)
+    return ax
+
+
+def _costs_as_numbers(ax, cost):
+    """Label the axis of costs by 1, 2, 5, 10, …; more labels would cover each other."""
+    ax.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+    ax.xaxis.set_major_formatter("{x:g}")
+    few = max(cost) < 1e3 * min(cost)
+    ax.xaxis.set_minor_formatter("{x:g}" if few else NullFormatter())
+
+
+def _number_points(ax, x, y, order):
+    """Write 1, 2, … beside the points, each on the side where it covers least."""
+    ax.autoscale_view()
+    points = ax.transData.transform(np.column_stack([x, y])) * 72 / ax.figure.dpi
+    taken = list(points)
+    sides = np.array([(8, 8), (0, 10), (10, 0), (0, -10), (-10, 0), (-8, -8), (8, -8), (-8, 8)])
+    look = {"ha": "center", "va": "center", "fontsize": 8, "path_effects": _HALO}
+    for number, i in enumerate(order, 1):
+        places = points[i] + sides
+        nearest = np.linalg.norm(places[:, None] - np.array(taken), axis=-1).min(axis=1)
+        side = int(np.argmax(np.minimum(nearest, 10)))
+        taken.append(places[side])
+        ax.annotate(str(number), (x[i], y[i]), sides[side], textcoords="offset points", **look)
+
+
+@style()
+def work_precision(
+    curves: Mapping, ylabel="position error", xlabel="time per step and trajectory (µs)", ax=None
+) -> Axes:
+    """Draw error against time: name -> (microseconds (K,), errors (K,)), compile time apart."""
+    ax = _axes_or_new(ax)
+    _curves(ax, curves)
+    ax.set(xlabel=xlabel, ylabel=ylabel, **_LOG_LOG)
+    _costs_as_numbers(ax, np.concatenate([np.ravel(cost) for cost, _ in curves.values()]))
+    _legend_above(ax)
+    return ax
+
+
+@style()
+def work_precision_panels(panels: Mapping, ylabel) -> Figure:
+    """Draw error against time, log–log, of learned maps and other methods, in panels side by side.
+
+    panels: title -> {"ours", "float32", "known", "others"}, each a mapping of name -> (cost (K,),
+    error (K,), size (K,) as text). Ours have a colour and a filled marker each, with the size
+    beside it; the same names in float32 are hollow. The thick line joins those of ours that no
+    other of ours beats. Methods that know H are grey. Numbered crosses are single results of other
+    methods.
+    """
+    figure = Figure(figsize=(WIDTH * 0.85 * len(panels) + 1.6, HEIGHT * 1.25))
+    axes = np.ravel(figure.subplots(1, len(panels), sharey=True))
+    # A name looks alike in all panels, also where one of them lacks another.
+    named = [n for group in ("ours", "known") for p in panels.values() for n in p[group]]
+    place = {name: i for i, name in enumerate(dict.fromkeys(named))}
+    grey, cross = COLOURS[-1], {"color": REFERENCE, "ms": 4}
+    for ax, (title, groups) in zip(axes, panels.items(), strict=True):
+        _front(ax, [*groups["ours"].values(), *groups["float32"].values()])
+        for name, points in groups["ours"].items():
+            look = _look_of(place[name]) | _ALONE | {"ms": 5.5}
+            ax.plot(*points[:2], label=name, **look)
+            beside = {"fontsize": 6, "color": look["color"], "path_effects": _HALO}
+            for cost, error, size in zip(*points, strict=True):
+                ax.annotate(size, (cost, error), (5, 3), textcoords="offset points", **beside)
+            if name in groups["float32"]:
+                ax.plot(*groups["float32"][name][:2], mfc="white", **look)
+        if groups["float32"]:
+            ax.plot([], [], "o", mfc="white", color=grey, label="hollow: in float32")
+        for name, points in groups["known"].items():
+            look = _look_of(place[name]) | {"color": grey, "linewidth": 0.8, "ms": 3.5}
+            ax.plot(*points[:2], label=f"{name} (given H)", **look)
+        others = groups["others"].values()
+        costs, errors = (np.array([np.ravel(v[i])[0] for v in others]) for i in (0, 1))
+        if len(costs):
+            ax.plot(costs, errors, "x", **cross)
+        ax.set(title=title, xlabel="time per trajectory and unit time (µs)", **_LOG_LOG)
+        ax.xaxis.set_minor_formatter(NullFormatter())  # they would cover each other
+        if len(costs):
+            _number_points(ax, costs, errors, np.arange(len(costs)))
+            for number, name in enumerate(groups["others"], 1):
+                ax.plot([], [], "x", label=f"{number}  {name}", **cross)
+    axes[0].set_ylabel(ylabel)
+    handles = {}
+    for ax in axes:
+        for handle, name in zip(*ax.get_legend_handles_labels(), strict=True):
+            handles.setdefault(name, handle)
+    figure.legend(handles.values(), handles, loc="outside right center", frameon=False)
+    return figure
+
+
+def _unbeaten(cost, error) -> tuple[np.ndarray, np.ndarray]:
+    """Points, by rising cost, that no other beats in both cost and error."""
+    order = np.lexsort((error, cost))
+    best = np.minimum.accumulate(error[order])
+    front = np.flatnonzero(np.append(True, best[1:] < best[:-1]))
+    return cost[order][front], best[front]
+
+
+def _front(ax, curves):
+    """Draw the staircase through the points that no other beats in both cost and error."""
+    cost, error = (np.concatenate([np.ravel(c[i]) for c in curves]) for i in (0, 1))
+    look = {"color": COLOURS[5], "lw": 4, "alpha": 0.45, "zorder": 1.5}
+    ax.step(*_unbeaten(cost, error), where="post", label="best of our maps", **look)
+
+
+@style()
+def training_curve(train_rms, validation_rms, ax=None) -> Axes:
+    """Draw the residual on training and validation pairs after each epoch, (E,) each."""
+    ax = _axes_or_new(ax)
+    epochs = 1 + np.arange(len(train_rms))
+    best = int(np.nanargmin(validation_rms))
+    ax.plot(epochs, train_rms, color=COLOURS[0], label="training pairs")
+    ax.plot(epochs, validation_rms, color=COLOURS[1], ls="--", label="held-out pairs")
+    star = _ALONE | {"marker": "*", "ms": 10, "color": COLOURS[1]}
+    ax.plot(epochs[best], validation_rms[best], label=f"kept: epoch {best + 1}", **star)
+    ax.set(yscale="log", xlabel="epoch", ylabel="residual (RMS)")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.legend()
+    return ax
+
+
+@style()
+def digits_against_step_size(sweeps: Mapping, axes=None) -> list[Axes]:
+    """Draw digits kept against the time step, a panel for each system, a curve for each chart.
+
+    sweeps: system -> {"dt": (K,), chart: digits (K,), ...}. A fit that was refused is None or NaN,
+    and is drawn as a cross on the axis.
+    """
+    if axes is None:
+        figure = Figure(figsize=(WIDTH * 0.62 * len(sweeps), HEIGHT))
+        axes = list(np.atleast_1d(figure.subplots(1, len(sweeps), sharey=True)))
+    cross = _ALONE | {"marker": "x"}
+    for ax, (system, curves) in zip(axes, sweeps.items(), strict=True):
+        dt = np.asarray(curves["dt"], float)
+        digits = {n: np.array(v, float) for n, v in curves.items() if n != "dt"}  # None: NaN
+        for place, (name, values) in enumerate(digits.items()):
+            look, lost = _look_of(place), np.isnan(values)
+            ax.plot(dt, values, label=name, **look)
+            # Crosses of charts that fail alike stand above each other.
+            ax.plot(dt[lost], np.full(lost.sum(), -0.4 * place), color=look["color"], **cross)
+        ax.set(title=system, xlabel="time step $dt$")
+    axes[0].set_ylabel("digits kept in one step")
+    axes[0].plot([], [], color=REFERENCE, label="fit refused", **cross)
+    axes[0].legend(loc="lower left")
+    return axes
+
+
+# Many degrees of freedom, one trajectory: the reference has a panel of its own, so that nothing
+# covers it, and the difference of the prediction has another.
+
+_ROUNDOFF = 1e-16  # lower end of log axes
+
+
+def mode_energies(z, ends: str = "ring") -> np.ndarray:
+    """Energies (..., modes) of the normal modes of sites with unit springs, at states z (..., 2d).
+
+    They are ½(|P_k|² + ω_k²|Q_k|²) (Fermi, Pasta & Ulam 1955). For a ring k goes from 1 to d/2, ω_k
+    is 2 sin(πk/d), and the two modes of a wave number are summed. For a chain with free ends k goes
+    from 1 to d − 1, and ω_k is 2 sin(πk/2d).
+    """
+    dim = z.shape[-1] // 2
+    if ends == "ring":
+        k = np.arange(1, dim // 2 + 1)
+        omega, twice = 2 * np.sin(np.pi * k / dim), np.where(2 * k == dim, 1.0, 2.0)
+        q, p = (np.fft.rfft(x, axis=-1)[..., k] / np.sqrt(dim) for x in split(z))
+        return 0.5 * twice * (np.abs(p) ** 2 + omega**2 * np.abs(q) ** 2)
+    k = np.arange(1, dim)
+    waves = np.sqrt(2 / dim) * np.cos(np.pi * k * (np.arange(dim)[:, None] + 0.5) / dim)
+    q, p = (x @ waves for x in split(z))
+    return 0.5 * (p**2 + (2 * np.sin(np.pi * k / (2 * dim)) * q) ** 2)
+
+
+@style()
+def modes(times, reference, predicted, ends: str = "ring") -> Figure:
+    """Draw the energies of the longest waves against time: reference, prediction, difference.
+
+    reference, predicted: (L, 2d).
+    """
+    figure = Figure(figsize=(WIDTH, 2 * HEIGHT))
+    above, middle, below = panels = figure.subplots(3, 1, sharex=True)
+    first = 4
+    exact, found = (mode_energies(np.asarray(z), ends)[:, :first] for z in (reference, predicted))
+    drawn = exact, found, np.maximum(np.abs(found - exact), _ROUNDOFF)
+    for k, colour in zip(range(exact.shape[1]), COLOURS, strict=False):
+        for ax, energy in zip(panels, drawn, strict=True):
+            ax.plot(times, energy[:, k], color=colour, label=f"k = {k + 1}")
+    above.set(ylabel="mode energy, reference")
+    middle.set(ylabel="mode energy, GFNN", ylim=above.get_ylim())
+    below.set(ylabel="difference", xlabel="t", yscale="log")
+    _legend_of_all(figure, above, first)
+    return figure
+
+
+@style()
+def space_time(times, reference, predicted, angles: str = "") -> Figure:
+    """Draw p of each site against time, of reference and prediction (L, 2d), and their difference.
+
+    angles: the angles of a site, "", "q" or "qp", compared modulo 2π.
+    """
+    figure = Figure(figsize=(1.6 * WIDTH, 1.1 * HEIGHT))
+    panels = figure.subplots(1, 3, sharex=True, sharey=True)
+    reference, predicted = np.asarray(reference), np.asarray(predicted)
+    dim = reference.shape[-1] // 2
+    turned = tuple(i for i in range(2 * dim) if "qp"[i // dim] in angles)
+    off = np.abs(nearest_image(predicted - reference, turned))
+    off = off.reshape(len(off), 2, dim).max(axis=1)
+    shown = [split(z)[1] for z in (reference, predicted)]
+    if "p" in angles:
+        shown = [np.remainder(p, 2 * np.pi) for p in shown]
+        look = {"vmin": 0.0, "vmax": 2 * np.pi, "cmap": "twilight"}
+    else:
+        high = float(np.nanmax(np.abs(shown[0])))
+        look = {"vmin": -high, "vmax": high, "cmap": "RdBu_r"}
+    box = {"extent": (0.5, dim + 0.5, times[0], times[-1]), "origin": "lower"}
+    box |= {"aspect": "auto", "interpolation": "nearest"}
+    worst = max(float(np.nanmax(off)), 10 * _ROUNDOFF)
+    looks = look, look, {"norm": LogNorm(_ROUNDOFF, worst), "cmap": "viridis"}
+    images = *shown, np.maximum(off, _ROUNDOFF)
+    titles = "reference", "GFNN", "difference"
+    for ax, image, look, title in zip(panels, images, looks, titles, strict=True):
+        drawn = ax.imshow(image, **look, **box)
+        ax.set(title=title, xlabel="site")
+        ax.grid(visible=False)
+        if ax is not panels[0]:
+            whose = {"ax": ax} if ax is panels[2] else {"ax": panels[:2], "shrink": 0.6}
+            label = "difference" if ax is panels[2] else "$p_i$"
+            figure.colorbar(drawn, label=label, location="bottom", **whose)
+    panels[0].set(ylabel="t")
+    return figure
+
+
+@style()
+def orbits(times, reference, predicted, bodies: int) -> Figure:
+    """Draw orbits of bodies in their first two coordinates, and the error of each against time.
+
+    reference, predicted: (L, 2d), q body by body. The error is the distance between a body's two
+    positions. Bodies on a line are drawn against time.
+    """
+    figure = Figure(figsize=(1.9 * WIDTH, 1.1 * HEIGHT))
+    panels = figure.subplots(1, 3)
+    both = [split(np.asarray(z))[0] for z in (reference, predicted)]
+    exact, found = (q.reshape(len(q), bodies, -1) for q in both)
+    off = np.linalg.norm(found - exact, axis=-1)
+    on_a_line = exact.shape[-1] == 1
+    for i in range(bodies):
+        colour = COLOURS[i % len(COLOURS)]
+        for ax, q in zip(panels, (exact, found), strict=False):
+            x, y = (times, q[:, i, 0]) if on_a_line else (q[:, i, 0], q[:, i, 1])
+            ax.plot(x, y, color=colour, linewidth=0.8)
+            ax.plot(x[-1:], y[-1:], "o", color=colour, label=f"body {i + 1}")
+        panels[2].plot(times, np.maximum(off[:, i], _ROUNDOFF), color=colour)
+    for ax, title in zip(panels, ("reference", "GFNN"), strict=False):
+        ax.set(title=title, xlabel="t" if on_a_line else "$q_x$")
+        ax.set(xlim=panels[0].get_xlim(), ylim=panels[0].get_ylim())
+        if not on_a_line:
+            ax.set_aspect("equal", adjustable="box")
+    panels[0].set(ylabel="$q$" if on_a_line else "$q_y$")
+    panels[2].set(title="difference", xlabel="t", ylabel="distance", yscale="log")
+    _legend_of_all(figure, panels[0], bodies)
     return figure

@@ -25,6 +25,9 @@ class Ahead(NamedTuple):
     values: dict[str, np.ndarray]
     std: dict[str, np.ndarray]
 
+    def missed(self, name: str) -> np.ndarray:
+        return np.abs(self.values[name] - self.measured[name])
+
 
 class Forecasts(NamedTuple):
     """Forecasts from states along a recording. ahead: times (k,) in s; median: column -> median
@@ -59,28 +62,15 @@ def forecasts_along(map_: SymplecticMap, recording: Recording, ahead: Sequence[f
     begins = (starts[i] for i in chosen)
     each = tuple(_ahead(map_, recording, run, k, ahead[-1]) for run, k in begins)
     names = list(each[0].values)
-    median = {
-        name: tuple(
-            float(
-                np.nanmedian(
-                    [
-                        np.interp(
-                            one.begin + s, one.t, np.abs(one.values[name] - one.measured[name])
-                        )
-                        for one in each
-                    ]
-                )
-            )
-            for s in ahead
-        )
-        for name in names
-    }
-    inside = [
-        np.abs(one.values[n] - one.measured[n]) <= 2 * one.std[n] for one in each for n in names
-    ]
-    known = [np.isfinite(one.measured[n]) for one in each for n in names]
-    within = float(np.mean(np.concatenate(inside)[np.concatenate(known)]))
-    return Forecasts(each, tuple(ahead), median, within)
+
+    def median(name: str, s: float) -> float:
+        found = (np.interp(one.begin + s, one.t, one.missed(name)) for one in each)
+        return float(np.nanmedian(list(found)))
+
+    medians = {name: tuple(median(name, s) for s in ahead) for name in names}
+    inside = np.concatenate([one.missed(n) <= 2 * one.std[n] for one in each for n in names])
+    known = np.concatenate([np.isfinite(one.measured[n]) for one in each for n in names])
+    return Forecasts(each, tuple(ahead), medians, float(np.mean(inside[known])))
 
 
 def _ahead(map_: SymplecticMap, recording: Recording, run: str, k: int, longest: float) -> Ahead:

@@ -20,8 +20,6 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, sizes, split
 
-_DEGREE = 6  # of f
-
 
 class BesideFlow(NamedTuple):
     """Parts of a map of positions that are those of a flow.
@@ -38,7 +36,7 @@ class BesideFlow(NamedTuple):
     images: float
 
 
-def beside_flow(map_: SymplecticMap, pairs: Pairs, degree: int = _DEGREE) -> BesideFlow:
+def beside_flow(map_: SymplecticMap, pairs: Pairs, degree: int = 6) -> BesideFlow:
     """Compare a map that was learned from positions alone with the flow of these pairs, of states
     (q, p) and their images a step later: c and f, of this degree, by least squares.
 

@@ -11,9 +11,6 @@ import numpy as np
 
 from gfnn_jax.coordinates import nearest_image, whole_turns
 
-_UPDATES = 30  # of Newton's method, which converges in five or six
-_ROUNDOFF = 1e-13  # of the orbit's size
-
 
 class RotationNumber(NamedTuple):
     """Turns per step, (...,), and how far that of all steps is from that of their first half: an
@@ -58,14 +55,14 @@ def periodic_orbit(map_: Any, z, period: int, angles: tuple[int, ...] = ()) -> P
     Raises ValueError where Newton's method does not converge from z.
     """
     z, turning = np.array(z, float), list(angles)
-    for _ in range(_UPDATES):
+    for _ in range(30):  # Newton's method converges in five or six updates
         z[turning] -= whole_turns(z[turning])
         states, jacobian = (np.asarray(a) for a in _returned(map_, z, period))
         missed = nearest_image(states[-1] - z, angles)
         size = float(np.abs(missed).max())
         if not np.isfinite(size):
             break
-        if size <= _ROUNDOFF * (1 + np.abs(z).max()):
+        if size <= 1e-13 * (1 + np.abs(z).max()):
             return PeriodicOrbit(states[:-1], np.linalg.eigvals(jacobian), size)
         z = z - np.linalg.lstsq(jacobian - np.eye(len(z)), missed, rcond=None)[0]
     raise ValueError(f"expected an orbit of {period} steps near the state, found none")

@@ -1,10 +1,12 @@
 """Report ``report.json`` of a fit: data, model, accuracy, speed, versions.
 
-All keys are always present. A value that does not apply, or is not finite, is null.
+All keys are always present. A value that does not apply, or is not finite, is null. That of a law
+that was learned from a recording has the law's own keys beside them.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from typing import Any
@@ -17,12 +19,27 @@ from gfnn_jax.maps.saved import versions
 from gfnn_jax.solve.status import STATUS_NAMES
 
 STEPS_REPORTED = (1, 10, 100, 1000)
+_LABELS = ("learns", "family", "label", "chart", "num_parameters")
+_ERRORS = ("validation_rms", "validation_relative", "validation_bound", "outside")
+_COSTS = ("operations", "microseconds_per_step", "fit_seconds", "rank", "condition", "chosen")
 
 
 def device() -> str:
     """Name of the device that JAX computes on by default."""
     first = jax.devices()[0]
     return f"{first.platform}: {first.device_kind}"
+
+
+def _made(fit: Fit, scene: str | None, seed: int | None) -> dict[str, Any]:
+    return {
+        "verdict": fit.verdict,
+        "scene": scene,
+        "dt": float(np.asarray(fit.map.dt)),
+        "seed": seed,
+        "dtype": str(fit.map.scale.dtype),
+        "device": device(),
+        "versions": versions(),
+    }
 
 
 def assemble(
@@ -41,13 +58,7 @@ def assemble(
     chosen = fit.chosen
     lent = fit.scene.name if fit.scene is not None else None
     return {
-        "verdict": fit.verdict,
-        "scene": scene or lent,
-        "dt": float(np.asarray(fit.map.dt)),
-        "seed": fit.seed if seed is None else seed,
-        "dtype": str(fit.map.scale.dtype),
-        "device": device(),
-        "versions": versions(),
+        **_made(fit, scene or lent, fit.seed if seed is None else seed),
         "data": {
             "num_pairs": fit.num_pairs,
             "symplecticity_defect": fit.data_defect,
@@ -56,11 +67,7 @@ def assemble(
             **(data or {}),
         },
         "model": {
-            "learns": chosen.learns,
-            "family": chosen.family,
-            "label": chosen.label,
-            "chart": chosen.chart,
-            "num_parameters": chosen.num_parameters,
+            **{name: getattr(chosen, name) for name in _LABELS},
             "base_map": fit.base_map,
         },
         "fit": {
@@ -94,23 +101,7 @@ def assemble(
         },
         "rollout": rollout,
         "candidates": [
-            {
-                "learns": c.learns,
-                "family": c.family,
-                "label": c.label,
-                "chart": c.chart,
-                "num_parameters": c.num_parameters,
-                "validation_rms": c.validation_rms,
-                "validation_relative": c.validation_relative,
-                "validation_bound": c.validation_bound,
-                "outside": c.outside,
-                "operations": c.operations,
-                "microseconds_per_step": c.microseconds_per_step,
-                "fit_seconds": c.fit_seconds,
-                "rank": c.rank,
-                "condition": c.condition,
-                "chosen": c.chosen,
-            }
+            {name: getattr(c, name) for name in (*_LABELS, *_ERRORS, *_COSTS)}
             for c in fit.candidates
         ],
     }
@@ -146,14 +137,7 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
         "formula": fit.formula,
         "terms": [term._asdict() for term in law.terms],
         "friction": [term._asdict() for term in law.friction],
-        "which_friction": None
-        if which is None
-        else {
-            "kinds": list(which.kinds),
-            "odds": which.odds,
-            "limits": which.limits,
-            "text": str(which),
-        },
+        "which_friction": which and {**_kinds(which), "text": str(which)},
         "constants": [term._asdict() for term in law.constants],
         "symmetries": list(law.symmetries),
         "fractions": [str(p) for p in law.proposals],
@@ -164,21 +148,113 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     }
 
 
-def rollout_part(
-    *,
-    num_trajectories: int,
-    num_steps: int,
-    seconds: float,
-    status,
-    statistics,
-    growth,
-    drift,
-) -> dict[str, Any]:
+def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[str, Any]:
+    """The report of a fit of the recording ``source``."""
+    map_, sensors = fit.map, fit.map.sensors
+    assert sensors is not None
+    assert fit.lagrangian is not None
+    assert fit.friction is not None
+    box = map_.parameters
+    ends = () if box is None else np.array([box.names, box.low, box.high], object).T.tolist()
+    num_parameters = sum(t.std > 0 for t in (*fit.lagrangian.terms, *fit.friction.terms))
+    return {
+        **_made(fit, None, seed),
+        "data": {"num_pairs": None, "num_samples": fit.num_samples, "source": source},
+        "model": {
+            "learns": "lagrangian",
+            "family": "Lagrangian",
+            "label": f"L of {len(fit.lagrangian.terms)} terms",
+            "chart": None,
+            "num_parameters": num_parameters,
+        },
+        "fit": {
+            "seconds": fit.seconds,
+            "compile_seconds": 0.0,
+            "total_seconds": fit.seconds,
+            "train_rms": fit.residual,
+            "validation_rms": None,
+            "validation_relative": None,
+            "tolerance": None,
+            "tolerance_met": None,
+            "ended": fit.ended,
+            "messages": list(fit.messages),
+            "steps": list(fit.steps),
+            "alike": list(fit.alike),
+            "next_motions": [motion._asdict() for motion in fit.next_motions],
+        },
+        "hamiltonian": _law(fit.hamiltonian),
+        "lagrangian": {**_law(fit.lagrangian), "text": str(fit.lagrangian)},
+        "friction": {
+            **_law(fit.friction),
+            "text": str(fit.friction),
+            **_kinds(fit.which_friction),
+        },
+        "inputs": {
+            "hold": sensors.hold,
+            "other_rules": fit.input_rules,
+            "delay": sensors.delay,
+            "delay_std": None if fit.delay is None or np.isnan(fit.delay[1]) else fit.delay[1],
+            "gains": {
+                name: {q: {"gain": g, "std": s} for q, (g, s) in forces.items()}
+                for name, forces in fit.gains.items()
+            },
+        },
+        "parameters": {name: {"low": low, "high": high} for name, low, high in ends},
+        "zeros": {name: {"zero": z, "std": s} for name, (z, s) in fit.zeros.items()},
+        "observe": fit.observe,
+        "sensors": {name: {"value": c, "std": s} for name, (c, s) in fit.sensors.items()},
+        "noise": {n: {"sigma": s, "residual": fit.residual[n]} for n, s in fit.noise.items()},
+        "units": fit.units,
+        "wander": None if sensors.wander is None else dataclasses.asdict(sensors.wander),
+        "velocities": {name: one._asdict() for name, one in fit.velocities.items()},
+        "whiteness": {
+            name: {
+                "white": of.white,
+                "lags": of.lags.tolist(),
+                "autocorrelation": of.autocorrelation.tolist(),
+                "bound": of.bound,
+                "inputs": {u: one._asdict() for u, one in of.inputs.items()},
+                "fit_percent": of.fit_percent,
+            }
+            for name, of in fit.whiteness.items()
+        },
+        "gauge": fit.gauge,
+        "energy": fit.energy,
+        "horizon": [h._asdict() for h in fit.horizon],
+        "map": {
+            "multiplier": map_.multiplier(),
+            "symplecticity_defect": None,
+            "chart_determinant_min": None,
+            "newton_iterations_max": None,
+        },
+        "rollout": None,
+        "candidates": [],
+    }
+
+
+def _law(expression: Any) -> dict[str, Any]:
+    return {
+        "formula": expression.formula,
+        "terms": [term._asdict() for term in expression.terms],
+    }
+
+
+def _kinds(friction: Any) -> dict[str, Any]:
+    """Which kinds of friction were found, the odds of each and the limits of the others."""
+    return {
+        "kinds": list(friction.kinds),
+        "odds": dict(friction.odds),
+        "limits": dict(friction.limits),
+    }
+
+
+def rollout_part(*, seconds: float, status, statistics, growth, drift) -> dict[str, Any]:
     """Assemble the report's ``rollout``.
 
     seconds: without compilation. status: (B,) codes. statistics: ErrorStatistics of the position
     error at every step (num_steps + 1,). growth, drift: Estimates, or None where they do not apply.
     """
+    num_trajectories, num_steps = len(status), len(statistics.mean) - 1
     reported = [n for n in STEPS_REPORTED if n <= num_steps]
     none = {str(n): None for n in STEPS_REPORTED}
     return {

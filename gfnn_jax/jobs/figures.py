@@ -9,7 +9,7 @@ import numpy as np
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import TWO_PI
 from gfnn_jax.dataset.structures import Bodies, structure_of
-from gfnn_jax.evaluate import figures, figures_of_many, metrics
+from gfnn_jax.evaluate import figures, metrics
 from gfnn_jax.jobs.measure import Measured, plane_of
 from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.scenes import Scene
@@ -108,10 +108,10 @@ def _figures_of_many(scene: Scene, steps, reference, predicted) -> dict[str, Any
     lane = _whole_lane(reference + predicted)
     drawn = scene.dt * np.asarray(steps), reference[lane], predicted[lane]
     if isinstance(structure, Bodies):
-        return {"orbits": figures_of_many.orbits(*drawn, structure.count)}
-    found = {"space-time": figures_of_many.space_time(*drawn, structure.angles)}
+        return {"orbits": figures.orbits(*drawn, structure.count)}
+    found = {"space-time": figures.space_time(*drawn, structure.angles)}
     if not structure.angles and structure.fields == 1:
-        found["modes"] = figures_of_many.modes(*drawn, structure.kind)
+        found["modes"] = figures.modes(*drawn, structure.kind)
     return found
 
 

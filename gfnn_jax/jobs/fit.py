@@ -16,7 +16,7 @@ from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.data.summary import summary
 from gfnn_jax.errors import InputError, OutOfTime
-from gfnn_jax.evaluate.figures_of_laws import law_figure
+from gfnn_jax.evaluate.figures_of_recordings import law_figure
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.jobs.output import Output, Ran, publish, units_of, write
 from gfnn_jax.jobs.search import (

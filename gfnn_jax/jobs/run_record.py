@@ -11,7 +11,7 @@ import numpy as np
 
 from gfnn_jax.data.recording import SECONDS, Recording, read
 from gfnn_jax.evaluate import report
-from gfnn_jax.evaluate.figures_of_laws import forecasts_figure
+from gfnn_jax.evaluate.figures_of_recordings import forecasts_figure
 from gfnn_jax.evaluate.forecasts import Forecasts, forecasts_along
 from gfnn_jax.jobs.fit import fit_recording
 from gfnn_jax.jobs.output import REPORT, Output

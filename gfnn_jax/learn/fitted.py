@@ -282,18 +282,18 @@ class Fit:
     def report(self, **about: Any) -> dict[str, Any]:
         """Make the report, which ``report.json`` holds, with numbers that are not finite as None.
 
-        about: further entries, as of ``assemble`` in `evaluate.report` and `evaluate.law_report`.
+        about: further entries, as of ``assemble`` and ``assemble_law`` in `evaluate.report`.
         Of a fit that was loaded it is the report that was saved. Raises ValueError where the folder
         holds none.
         """
-        from gfnn_jax.evaluate import law_report, report  # stand after this module: a shorthand
+        from gfnn_jax.evaluate import report  # stands after this module: a shorthand
 
         if "record" in self.stored:
             return {name: part for name, part in self.stored["record"].items() if name != "job"}
         if self.found is None:
             raise ValueError("expected a fit, or the folder of one: this one holds a map alone")
-        of = report if isinstance(self.found, Choice) else law_report
-        return report.finite(of.assemble(self, **about))
+        assemble = report.assemble if isinstance(self.found, Choice) else report.assemble_law
+        return report.finite(assemble(self, **about))
 
     def accelerate(
         self,

@@ -21,9 +21,6 @@ from gfnn_jax.scenes.trajectories import Reference, reference_trajectories, with
 
 Drawn = Float[np.ndarray, "num phase"]
 
-KEPT_ORBITS = 8  # cached orbits that states are drawn around
-ROWS_DRAWN = 1024  # at the least, of which the first are taken
-
 
 @partial(jax.jit, static_argnames=("draw", "num"))
 def _drawn(key, *, draw, num):
@@ -35,7 +32,7 @@ def _enough(num: int) -> int:
 
     JAX draws each entry from its index alone: the first rows of more are the same bits.
     """
-    return max(ROWS_DRAWN, 1 << (num - 1).bit_length())
+    return max(1024, 1 << (num - 1).bit_length())
 
 
 @partial(jax.jit, static_argnames=("shape",))
@@ -46,7 +43,7 @@ def _perturbations(key, *, length, shape):
     return time, jax.random.normal(key_noise, shape, jnp.float64)
 
 
-@lru_cache(maxsize=KEPT_ORBITS)
+@lru_cache(maxsize=8)
 def _orbit(law: AroundOrbit, reference: Reference):
     """States (num_steps + 1, 2d) of the law's orbit."""
     start = np.array([law.start])

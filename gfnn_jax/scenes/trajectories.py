@@ -21,24 +21,39 @@ from gfnn_jax.scenes.scene import Scene, Section
 
 States = Float[Array | np.ndarray, "batch phase"]
 
-TOLERANCE = 1e-15  # 1e-14 costs 15 % less and drifts ten times more in energy
-MAX_SOLVER_STEPS = 1024  # for one dt; a state that needs more is about to collide
-# States solved together: on a CPU more take hardly less time each, and one alone half that of 8.
-LANES_ON_CPU = 8
-LANES_ON_ACCELERATOR = 4096
-SAVED_AT_ONCE = 64  # states of a trajectory that one call of the program returns
-LONGEST_RETURN = 1e6  # time allowed for a return to a section; lost orbits run out of steps before
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Numbers of a reference.
+
+    tolerance: 1e-14 costs 15 % less and drifts ten times more in energy. max_solver_steps: for one
+    dt; a state that needs more is about to collide. lanes_on_cpu: states solved together: more take
+    hardly less time each, and one alone half that of 8. saved_at_once: states of a trajectory that
+    one call of the program returns. longest_return: time allowed for a return to a section; lost
+    orbits run out of steps before.
+    """
+
+    tolerance: float = 1e-15
+    max_solver_steps: int = 1024
+    lanes_on_cpu: int = 8
+    lanes_on_accelerator: int = 4096
+    saved_at_once: int = 64
+    longest_return: float = 1e6
 
 
-def _solve(field, start, end, z, until=None, *, tolerance=TOLERANCE, predicts=False):
-    """Integrate dz/dt = field(z, t) from z (2d,) at time ``start`` to time ``end``: by Dopri8, or
-    where it ``predicts`` by Dopri5, which is then differentiated forwards.
+OPTIONS = Options()
+
+
+def _solve(field, span, z, until=None, *, tolerance=OPTIONS.tolerance, predicts=False):
+    """Integrate dz/dt = field(z, t) from z (2d,) over the times ``span``, (start, end): by Dopri8,
+    or where it ``predicts`` by Dopri5, which is then differentiated forwards.
 
     With ``until`` the solver stops at the end of the first step after which ``until(z)`` holds. It
     never interpolates. The result is NaN where the solver fails.
     """
     import diffrax  # takes half a second: loaded when first used
 
+    start, end = span
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, z, _: field(z, t)),
         diffrax.Dopri5() if predicts else diffrax.Dopri8(),
@@ -48,7 +63,7 @@ def _solve(field, start, end, z, until=None, *, tolerance=TOLERANCE, predicts=Fa
         None,
         z,
         stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
-        max_steps=MAX_SOLVER_STEPS,
+        max_steps=OPTIONS.max_solver_steps,
         event=None if until is None else diffrax.Event(lambda t, y, args, **_: until(y)),
         adjoint=diffrax.ForwardMode() if predicts else diffrax.RecursiveCheckpointAdjoint(),
         throw=False,
@@ -84,7 +99,7 @@ class _Dynamics:
         """Make ``advance(t, x)`` by one ``dt``, for x (B, ...). A state that fails becomes NaN for
         good. Each dt is one solve, so that a trajectory does not depend on which of its states are
         saved."""
-        return jax.vmap(lambda t, x: _solve(self.field, t, t + dt, x), in_axes=(None, 0))
+        return jax.vmap(lambda t, x: _solve(self.field, (t, t + dt), x), in_axes=(None, 0))
 
     def advance(self, dt, period):
         """Make ``advance(t, x)``, x (B, ...) one dt or one step of the map later.
@@ -113,16 +128,16 @@ class _Dynamics:
             rate = field(x)
             return rate / rate[i]
 
-        x = self.section.lift(z)
-        x = _solve(field, 0.0, LONGEST_RETURN, x, until=lambda x: x[i] < 0)
-        x = _solve(field, 0.0, LONGEST_RETURN, x, until=lambda x: x[i] > 0)
-        return self.section.coordinates(_solve(by_coordinate, x[i], 0.0, x))
+        x, within = self.section.lift(z), (0.0, OPTIONS.longest_return)
+        x = _solve(field, within, x, until=lambda x: x[i] < 0)
+        x = _solve(field, within, x, until=lambda x: x[i] > 0)
+        return self.section.coordinates(_solve(by_coordinate, (x[i], 0.0), x))
 
     @partial(jax.jit, static_argnames=("self",))
     def continued(self, start, x0, first, count, every, times):
         """States after ``every``, 2 every, ..., count every steps, from step ``first`` on.
 
-        Returns (SAVED_AT_ONCE, B, ...), of which the first ``count`` rows count. start: the states
+        Returns (saved_at_once, B, ...), of which the first ``count`` rows count. start: the states
         at step 0, for an exact flow; x0: those at step ``first``. times: dt, and the period.
         """
         dt, period = times
@@ -138,7 +153,7 @@ class _Dynamics:
             x = ahead(x, first + every * k)
             return x, saved.at[k].set(x)
 
-        saved = jnp.zeros((SAVED_AT_ONCE, *x0.shape))
+        saved = jnp.zeros((OPTIONS.saved_at_once, *x0.shape))
         return jax.lax.fori_loop(0, count, save, (x0, saved))[1]
 
     @partial(jax.jit, static_argnames=("self",))
@@ -146,7 +161,7 @@ class _Dynamics:
         """Advance states x (B, ...), each by its own time dt (B,)."""
         if self.flow is not None:
             return jax.vmap(self.flow)(x, dt)
-        return jax.vmap(lambda x, dt: _solve(self.field, 0.0, dt, x))(x, dt)
+        return jax.vmap(lambda x, dt: _solve(self.field, (0.0, dt), x))(x, dt)
 
 
 def _blocks(num):
@@ -155,7 +170,7 @@ def _blocks(num):
     The last state fills up the last block. A state has the same bits beside any others, for the
     solver controls the steps of each lane alone.
     """
-    lanes = LANES_ON_CPU if jax.default_backend() == "cpu" else LANES_ON_ACCELERATOR
+    lanes = OPTIONS.lanes_on_cpu if jax.default_backend() == "cpu" else OPTIONS.lanes_on_accelerator
     for first in range(0, num, lanes):
         yield np.minimum(np.arange(first, first + lanes), num - 1)
 
@@ -191,8 +206,8 @@ class Reference:
         saved, times = np.empty((num_saved, *x0.shape)), (self.dt, self.period)
         for rows in _blocks(len(x0)):
             start = x = x0[rows]
-            for done in range(0, num_saved, SAVED_AT_ONCE):
-                count, first = min(SAVED_AT_ONCE, num_saved - done), done * save_every
+            for done in range(0, num_saved, OPTIONS.saved_at_once):
+                count, first = min(OPTIONS.saved_at_once, num_saved - done), done * save_every
                 part = self.dynamics.continued(start, x, first, count, save_every, times)
                 saved[done : done + count, rows] = np.asarray(part)[:count]
                 x = saved[done + count - 1, rows]
@@ -250,7 +265,7 @@ def flow_step(field: Callable, dt: float, tolerance: float) -> Callable:
     def along(z, t):
         return field(z)
 
-    return lambda z: _solve(along, 0.0, dt, z, tolerance=tolerance, predicts=True)
+    return lambda z: _solve(along, (0.0, dt), z, tolerance=tolerance, predicts=True)
 
 
 def reference_error(scene: Scene, z0: States, num_steps: int) -> float:
