@@ -56,8 +56,8 @@ STYLE: dict[Any, Any] = {
     "axes.prop_cycle": cycler(color=COLOURS),
 }
 _HALO = [withStroke(linewidth=2, foreground="white")]  # keeps text legible on lines
-_LOG_LOG = {"xscale": "log", "yscale": "log"}
-_ALONE = {"linestyle": "none"}  # points without a line
+_LOG_LOG: dict[str, Any] = {"xscale": "log", "yscale": "log"}
+_ALONE: dict[str, Any] = {"linestyle": "none"}  # points without a line
 
 
 def style():
@@ -91,7 +91,7 @@ def _axes_or_new(ax, width=WIDTH, height=HEIGHT) -> Axes:
     return Figure(figsize=(width, height)).add_subplot() if ax is None else ax
 
 
-def _look_of(place: int) -> dict:
+def _look_of(place: int) -> dict[str, Any]:
     return {
         "color": COLOURS[place % len(COLOURS)],
         "marker": MARKERS[place % len(MARKERS)],
@@ -206,7 +206,7 @@ def _shaded(ax, steps, upper):
     x, y = steps[shown], upper[shown]
     ax.plot(x, y, color=REFERENCE, linewidth=0.8, alpha=0.5, label="_band")
     low = min(ax.get_ylim()[0], float(y.min()))
-    look = {"color": "0.5", "alpha": 0.15, "linewidth": 0, "zorder": 0}
+    look: dict[str, Any] = {"color": "0.5", "alpha": 0.15, "linewidth": 0, "zorder": 0}
     ax.fill_between(x, low, y, label=r"two $\sigma$ of the posterior", **look)
     ax.set_ylim(bottom=low)
 
@@ -277,7 +277,9 @@ def coordinates_against_time(
     every = max(1, int(shown.sum()) // 12)
     ax.plot(times[shown], np.asarray(reference)[shown], color=REFERENCE, lw=2.2, label="reference")
     for place, (name, values) in enumerate(predictions.items()):
-        look = _look_of(place) | {"markevery": (place * every // max(1, len(predictions)), every)}
+        look: dict[str, Any] = _look_of(place) | {
+            "markevery": (place * every // max(1, len(predictions)), every)
+        }
         ax.plot(times[shown], np.asarray(values)[shown], label=name, **look)
     ax.set(xlabel="time $t$", ylabel=ylabel)
     _legend_above(ax)
@@ -384,10 +386,11 @@ def marginals(reference, samples: Mapping, bins: int, range, label, ax=None) -> 
         counts, edges = np.histogram(values[np.isfinite(values)], bins, range)
         return counts / (values.size * np.diff(edges)), edges
 
-    filled = {"fill": True, "color": REFERENCE, "alpha": 0.18, "lw": 0}
-    ax.stairs(*densities(reference), label="reference", **filled)
+    filled: dict[str, Any] = {"fill": True, "color": REFERENCE, "alpha": 0.18, "lw": 0}
+    counts, edges = densities(reference)
+    ax.stairs(counts, edges, label="reference", **filled)
     for place, (name, values) in enumerate(samples.items()):
-        look = _look_of(place) | {"linewidth": 1.3}
+        look: dict[str, Any] = _look_of(place) | {"linewidth": 1.3}
         del look["marker"]
         divergence = kl_divergence(values, reference, bins, range)
         ax.stairs(*densities(values), label=f"{name}, KL {divergence:.2g}", **look)
@@ -443,8 +446,8 @@ def speed_against_error(
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
     named = (f"{labels[i]}{'  (chosen)' if i == chosen else ''}" for i in order)
     names = "\n".join(f"{number}  {name}" for number, name in enumerate(named, 1))
-    look = {"va": "top", "fontsize": 7.5, "linespacing": 1.35, "annotation_clip": False}
-    ax.annotate(names, (1.03, 0.7), xycoords="axes fraction", **look)
+    look: dict[str, Any] = {"va": "top", "fontsize": 7.5, "linespacing": 1.35}
+    ax.annotate(names, (1.03, 0.7), xycoords="axes fraction", annotation_clip=False, **look)
     return ax
 
 
@@ -462,7 +465,7 @@ def _number_points(ax, x, y, order):
     points = ax.transData.transform(np.column_stack([x, y])) * 72 / ax.figure.dpi
     taken = list(points)
     sides = np.array([(8, 8), (0, 10), (10, 0), (0, -10), (-10, 0), (-8, -8), (8, -8), (-8, 8)])
-    look = {"ha": "center", "va": "center", "fontsize": 8, "path_effects": _HALO}
+    look: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "path_effects": _HALO}
     for number, i in enumerate(order, 1):
         places = points[i] + sides
         nearest = np.linalg.norm(places[:, None] - np.array(taken), axis=-1).min(axis=1)
@@ -499,13 +502,14 @@ def work_precision_panels(panels: Mapping, ylabel) -> Figure:
     # A name looks alike in all panels, also where one of them lacks another.
     named = [n for group in ("ours", "known") for p in panels.values() for n in p[group]]
     place = {name: i for i, name in enumerate(dict.fromkeys(named))}
-    grey, cross = COLOURS[-1], {"color": REFERENCE, "ms": 4}
+    grey = COLOURS[-1]
+    cross: dict[str, Any] = {"color": REFERENCE, "ms": 4}
     for ax, (title, groups) in zip(axes, panels.items(), strict=True):
         _front(ax, [*groups["ours"].values(), *groups["float32"].values()])
         for name, points in groups["ours"].items():
             look = _look_of(place[name]) | _ALONE | {"ms": 5.5}
             ax.plot(*points[:2], label=name, **look)
-            beside = {"fontsize": 6, "color": look["color"], "path_effects": _HALO}
+            beside: dict[str, Any] = {"fontsize": 6, "color": look["color"], "path_effects": _HALO}
             for cost, error, size in zip(*points, strict=True):
                 ax.annotate(size, (cost, error), (5, 3), textcoords="offset points", **beside)
             if name in groups["float32"]:
@@ -545,7 +549,7 @@ def _unbeaten(cost, error) -> tuple[np.ndarray, np.ndarray]:
 def _front(ax, curves):
     """Draw the staircase through the points that no other beats in both cost and error."""
     cost, error = (np.concatenate([np.ravel(c[i]) for c in curves]) for i in (0, 1))
-    look = {"color": COLOURS[5], "lw": 4, "alpha": 0.45, "zorder": 1.5}
+    look: dict[str, Any] = {"color": COLOURS[5], "lw": 4, "alpha": 0.45, "zorder": 1.5}
     ax.step(*_unbeaten(cost, error), where="post", label="best of our maps", **look)
 
 
@@ -653,11 +657,11 @@ def space_time(times, reference, predicted, angles: str = "") -> Figure:
     shown = [split(z)[1] for z in (reference, predicted)]
     if "p" in angles:
         shown = [np.remainder(p, 2 * np.pi) for p in shown]
-        look = {"vmin": 0.0, "vmax": 2 * np.pi, "cmap": "twilight"}
+        look: dict[str, Any] = {"vmin": 0.0, "vmax": 2 * np.pi, "cmap": "twilight"}
     else:
         high = float(np.nanmax(np.abs(shown[0])))
         look = {"vmin": -high, "vmax": high, "cmap": "RdBu_r"}
-    box = {"extent": (0.5, dim + 0.5, times[0], times[-1]), "origin": "lower"}
+    box: dict[str, Any] = {"extent": (0.5, dim + 0.5, times[0], times[-1]), "origin": "lower"}
     box |= {"aspect": "auto", "interpolation": "nearest"}
     worst = max(float(np.nanmax(off)), 10 * _ROUNDOFF)
     looks = look, look, {"norm": LogNorm(_ROUNDOFF, worst), "cmap": "viridis"}
@@ -667,10 +671,9 @@ def space_time(times, reference, predicted, angles: str = "") -> Figure:
         drawn = ax.imshow(image, **look, **box)
         ax.set(title=title, xlabel="site")
         ax.grid(visible=False)
-        if ax is not panels[0]:
-            whose = {"ax": ax} if ax is panels[2] else {"ax": panels[:2], "shrink": 0.6}
-            label = "difference" if ax is panels[2] else "$p_i$"
-            figure.colorbar(drawn, label=label, location="bottom", **whose)
+        if title == "GFNN":
+            figure.colorbar(drawn, ax=panels[:2], label="$p_i$", location="bottom", shrink=0.6)
+    figure.colorbar(drawn, ax=panels[2], label="difference", location="bottom")
     panels[0].set(ylabel="t")
     return figure
 

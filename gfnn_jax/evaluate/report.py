@@ -240,7 +240,7 @@ def _law(expression: Any) -> dict[str, Any]:
 
 
 def _kinds(friction: Any) -> dict[str, Any]:
-    """Which kinds of friction were found, the odds of each and the limits of the others."""
+    """The kinds of friction that were found, the odds of each, the limits of the others."""
     return {
         "kinds": list(friction.kinds),
         "odds": dict(friction.odds),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -88,10 +89,12 @@ class _Dynamics:
 
     def field(self, x, t=0.0):
         """Vector field of the Hamiltonian; parameters are constant in time."""
+        hamiltonian = self.hamiltonian
+        assert hamiltonian is not None
         z, args = x[: self.width], x[self.width :]
         begin, own = (args[-1], args[:-1]) if self.begins else (0.0, args)
         given = (own,) if own.size else ()
-        along = hamiltonian_vector_field(lambda z, t: self.hamiltonian(z, t, *given))
+        along = hamiltonian_vector_field(lambda z, t: hamiltonian(z, t, *given))
         rate = along(z, begin + t if self.begins else t)
         return jnp.concatenate([rate, jnp.zeros_like(args)]) if args.size else rate
 
@@ -108,7 +111,8 @@ class _Dynamics:
         never grows and loses digits.
         """
         if self.step is not None or self.section is not None:
-            lanes = jax.vmap(self.step or self._returned)
+            step: Callable = self.step or self._returned
+            lanes = jax.vmap(step)
             return lambda t, x: lanes(x)
         if period is None:
             return self.integrated(dt)
@@ -140,12 +144,12 @@ class _Dynamics:
         Returns (saved_at_once, B, ...), of which the first ``count`` rows count. start: the states
         at step 0, for an exact flow; x0: those at step ``first``. times: dt, and the period.
         """
-        dt, period = times
-        advance = None if self.flow is not None else self.advance(dt, period)
+        (dt, period), flow = times, self.flow
+        advance: Any = None if flow is not None else self.advance(dt, period)
 
         def ahead(x, i):
-            if advance is None:
-                return jax.vmap(self.flow, (0, None))(start, dt * (i + every).astype(float))
+            if flow is not None:
+                return jax.vmap(flow, (0, None))(start, dt * (i + every).astype(float))
             return jax.lax.fori_loop(i, i + every, lambda i, x: advance(dt * i.astype(float), x), x)
 
         def save(k, carry):
