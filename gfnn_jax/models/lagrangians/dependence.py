@@ -263,7 +263,7 @@ class _Problem:
         home = np.repeat(np.arange(len(sets)), [len(functions) for functions in sets])
         return found / np.mean(np.abs(found), axis=0), home
 
-    def solved(self, sets: Sets, start: _Solved | None = None) -> _Solved:
+    def solved(self, sets: Sets) -> _Solved:
         """The coefficients of these sets, and their score."""
         table, home = self.tables(sets)
         terms, count = len(self.structure.terms), self.count
@@ -271,7 +271,7 @@ class _Problem:
         scaled = np.concatenate([np.ones(terms, bool), ~rate])
         further = len(self.values[0].p) - (count - 1)  # gains, zeros, sensors
         gains = self.structure.dim * self.structure.num_inputs
-        x = self._begun(home, further) if start is None else self._from(start, sets)
+        x = self._begun(home)
         open_ = np.arange(1, len(x))  # the first function of M₁₁ has a given coefficient
         turn = np.zeros((len(self.values), count + further, len(x)))
         for k, row in enumerate(home):
@@ -300,7 +300,7 @@ class _Problem:
         rare = sum(_size_of(function) for functions in sets for function in functions)
         return _Solved(sets, best, cost + EVIDENCE.significant**2 * len(open_) + rare)
 
-    def _begun(self, home: np.ndarray, further: int) -> np.ndarray:
+    def _begun(self, home: np.ndarray) -> np.ndarray:
         """Coefficients to start from: the mean of the values."""
         mean = np.mean([one.p for one in self.values], axis=0)
         terms = len(self.structure.terms)
@@ -309,31 +309,13 @@ class _Problem:
         x = np.where(np.diff(home, prepend=-1) > 0, whole[home], 0.0)
         return np.concatenate([x, whole[self.count :]])
 
-    def _from(self, start: _Solved, sets: Sets) -> np.ndarray:
-        """The coefficients of other sets: those of the same functions as they are, of a function
-        that another was exchanged for that one's."""
-        x, at, before = [], 0, iter(self._of_rows(start))
-        for functions in sets:
-            known = next(before)
-            lost = sum(value for function, value in known.items() if function not in functions)
-            new = [function for function in functions if function not in known]
-            x += [known.get(f, lost / max(len(new), 1)) for f in functions]
-            at += len(known)
-        return np.concatenate([x, start.x[at:]])
-
-    def _of_rows(self, found: _Solved) -> Iterator[dict[Function, float]]:
-        at = 0
-        for functions in found.sets:
-            yield dict(zip(functions, found.x[at : at + len(functions)].tolist(), strict=True))
-            at += len(functions)
-
     def descended(self, first: tuple[Function, ...]) -> _Solved:
         """The sets of the lowest score that single changes lead to, M₁₁ with these functions."""
         none = self.every[0]
         here = self.solved((first, *((none,),) * (self.count - 1)))
         for _ in range(OPTIONS.most):
             best = min(
-                (self.solved(sets, here) for sets in self._changed(here.sets)),
+                map(self.solved, self._changed(here.sets)),
                 key=lambda one: one.score,
                 default=here,
             )

@@ -68,6 +68,7 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
     lagrangian, friction = _expressions(best, names)
     gains, found = _gains(best, recording), whiteness(traces, channels, recording.inputs)
     zeros, parameters = _zeros_and_sensors(fit, recording)
+    flaws = _flaws(best, found)
     shown = dict(zip(channels, sensors.observation_model.formulas, strict=True))
     return LearnedLaw(
         map=findings.map,
@@ -92,12 +93,17 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         alike=_alike(fit, lagrangian, friction),
         horizon=tuple(best.calibration.horizons),
         energy=_energy(traces, friction, recording.inputs),
-        messages=(*findings.messages, *_not_followed(found), *_warnings(best, recording, gains)),
+        messages=(
+            *findings.messages,
+            *(f"{flaw}: {remedy}" for flaw, remedy in flaws.items()),
+            *about_parameters(recording, law.powers, fit.structure.most_functions),
+            *_not_seen(gains),
+        ),
         steps=findings.steps,
         num_samples=len(recording),
         seconds=findings.seconds,
         ended="every length of arcs was fitted",
-        flaws=_flaws(best, found),
+        flaws=tuple(flaws),
     )
 
 
@@ -166,48 +172,30 @@ def _zeros_and_sensors(
     return zeros, {name: one for (_, name), one in zip(keys, fitted[len(where) :], strict=True)}
 
 
-def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> tuple[str, ...]:
-    """Reasons why the law is not all of the motion, or is not reliable."""
-    converged, driven = best.fit.fitted.converged, best.choice.gains
-    return (
-        *([] if converged else ["the fit of the law did not converge"]),
-        *(["the record gains energy that no input explains"] if driven else []),
-        *(
-            f"{one.fit_percent:.0f} % of the variation of {name} is followed, and the rest is no "
-            "noise"
-            for name, one in found.items()
-            if one.fit_percent < _FOLLOWED and not one.white
-        ),
-    )
-
-
-def _not_followed(found: Mapping[str, Whiteness]) -> list[str]:
-    """Warnings about channels much of whose variation is neither the law's nor noise."""
-    return [
+def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str]:
+    """Reasons why the law is not all of the motion, or is not reliable -> their remedy."""
+    flaws = {
         f"the law follows only {one.fit_percent:.0f} % of the variation of {name}, and the rest is "
-        "no noise: a force, an input or a change of the sensor is missing. law.png (fit.traces) "
+        "no noise": "a force, an input or a change of the sensor is missing. law.png (fit.traces) "
         "shows when"
         for name, one in found.items()
         if one.fit_percent < _FOLLOWED and not one.white
-    ]
-
-
-def _warnings(best: CalibratedLaw, recording: Recording, gains: Gains) -> list[str]:
-    """Reasons not to rely on the law, each with its remedy."""
-    found = []
+    }
     if not best.fit.fitted.converged:
-        found.append(
-            "the fit of the law did not converge: its coefficients and standard errors are not "
-            "reliable. Fit a shorter part of the record (--from, --to) or fewer terms (--terms)"
+        flaws["the fit of the law did not converge"] = (
+            "its coefficients and standard errors are not reliable. Fit a shorter part of the "
+            "record (--from, --to) or fewer terms (--terms)"
         )
     if best.choice.gains:
-        found.append(
-            "the record gains energy that no input explains. If the system is driven, name its "
-            "drive: --inputs NAME (inputs=)"
+        flaws["the record gains energy that no input explains"] = (
+            "if the system is driven, name its drive: --inputs NAME (inputs=)"
         )
-    most = best.fit.structure.most_functions
-    found += about_parameters(recording, best.law.powers, most)
-    return found + [
+    return flaws
+
+
+def _not_seen(gains: Gains) -> list[str]:
+    """Warnings about inputs without a force."""
+    return [
         f"no force of the input {u} is seen: its gain is within {_CLEAR:g} standard errors of 0. "
         f"Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
         for u, forces in gains.items()

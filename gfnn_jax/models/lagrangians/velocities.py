@@ -22,6 +22,7 @@ from gfnn_jax.data.channels import channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.stretches import Arcs, Nodes, Stretch
 from gfnn_jax.fitting.evidence import correlation_time
+from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.signals.derivatives import difference
 
@@ -85,19 +86,16 @@ def velocities(recording: Recording, fit: LawFit) -> dict[str, Velocity]:
         if finite.sum() < 10:
             continue
         v = x[..., d + i]
-        X = np.stack([v, a[..., i], np.ones_like(v)], axis=-1)[finite]
-        r = (measured - v)[finite]
-        sizes = np.linalg.norm(X, axis=0)
-        inverse = np.linalg.pinv(X / sizes) / sizes[:, None]
-        beta = inverse @ r
-        left = np.where(
-            finite, measured - v - np.stack([v, a[..., i], 1 + 0 * v], -1) @ beta, np.nan
-        )
+        rows = np.stack([v, a[..., i], np.ones_like(v), measured - v], axis=-1)
+        problem = Linearised.of_rows(rows[finite])
+        beta = problem.step()
+        made = rows[..., :3] @ beta
+        left = np.where(finite, rows[..., 3] - made, np.nan)
         sigma = float(np.sqrt(np.nanmean(left**2)))
         tau = correlation_time(left[..., None] / sigma)
-        error = sigma * np.sqrt(tau) * np.linalg.norm(inverse, axis=1)
-        share = float(np.sqrt(np.mean((X @ beta) ** 2))) / sigma
-        chance = _CHANCE / np.sqrt(len(r))
+        error = sigma * np.sqrt(tau) * problem.errors
+        share = float(np.sqrt(np.mean(made[finite] ** 2))) / sigma
+        chance = _CHANCE / np.sqrt(finite.sum())
         white = _colour(left) < max(_COLOURED, chance) and not _copied(recording, i, name)
         allowed = max(_WRONG, chance * np.sqrt(3 * tau))
         found[name] = Velocity(
