@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gfnn_jax.learn.fit import fit
     from gfnn_jax.learn.fitted import Fit
     from gfnn_jax.learn.monitors import Monitors, fit_monitors
-    from gfnn_jax.learn.options import FitOptions
+    from gfnn_jax.learn.options import FitOptions, GeneratingFunction, Hamiltonian, Lagrangian
     from gfnn_jax.learn.saved import load
     from gfnn_jax.maps.saved import register
     from gfnn_jax.maps.stroboscopic import stroboscopic
@@ -51,8 +51,11 @@ _HOMES = {
     "FitError": "errors",
     "FitOptions": "learn.options",
     "FitWarning": "errors",
+    "GeneratingFunction": "learn.options",
+    "Hamiltonian": "learn.options",
     "Fitted": "models.model",
     "InputError": "errors",
+    "Lagrangian": "learn.options",
     "Monitors": "learn.monitors",
     "Pairs": "phase_space",
     "Recording": "data.recording",
@@ -83,7 +86,10 @@ __all__ = [
     "FitOptions",
     "FitWarning",
     "Fitted",
+    "GeneratingFunction",
+    "Hamiltonian",
     "InputError",
+    "Lagrangian",
     "Monitors",
     "Pairs",
     "Recording",

@@ -30,9 +30,8 @@ from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.jobs import fit as jobs_fit
 from gfnn_jax.jobs import progress, search
-from gfnn_jax.learn import check
 from gfnn_jax.learn import fit as learn_fit
-from gfnn_jax.learn.options import OPTIONS
+from gfnn_jax.learn.options import MODELS, OPTIONS
 from gfnn_jax.maps import saved as models
 from gfnn_jax.maps.inputs import HOLDS
 
@@ -81,7 +80,7 @@ def fitted():
 def test_choices_are_those_of_the_fit():
     chosen = {name: about.kind.choices for name, about in OPTIONS.items()}
     assert chosen["chart"] == ("auto", *CHARTS)
-    assert set(chosen["learn"]) == {*check.LEARNS, "lagrangian"}  # of a recording
+    assert set(chosen["learn"]) == {"auto", *MODELS}
     assert chosen["input_hold"] == ("auto", *HOLDS)
 
 

@@ -190,7 +190,7 @@ def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypat
     [
         ({"ensemble": 0}, "whole number from 1 to .* as ensemble, got 0"),
         ({"ensemble": 3}, "expected family='mlp'"),
-        ({"ensemble": 3, "family": "mlp", "learn": "hamiltonian"}, "an ensemble is of networks S"),
+        ({"ensemble": 3, "family": "mlp", "learn": "hamiltonian"}, "ensemble"),
     ],
 )
 def test_what_makes_no_ensemble_is_refused(options, words):

@@ -56,9 +56,9 @@ MISTAKES = {
         lambda: fit(np.where(np.arange(200)[:, None] == 5, np.nan, Z0)),
         "the first is row 5",
     ),
-    "the array instead of pairs": (lambda: gfnn.fit(Z0), "gfnn.Pairs(z0, z1, dt), got ndarray"),
-    "a tuple instead of pairs": (lambda: gfnn.fit((Z0, Z1, DT)), "(z0, z1, dt), got tuple"),
-    "the file instead of pairs": (lambda: gfnn.fit("data.npz"), "gfnn.Pairs(z0, z1, dt), got str"),
+    "the array instead of pairs": (lambda: gfnn.fit(Z0), "or arrays (t, x), got ndarray"),
+    "a tuple instead of pairs": (lambda: gfnn.fit((Z0, Z1, DT)), "or arrays (t, x), got tuple"),
+    "a file that is not there": (lambda: gfnn.fit("nowhere.npz"), "nowhere.npz: no such file"),
     # The time step, parameters, the drive.
     "dt as text": (lambda: fit(Z0, Z1, "0.1"), "expected a number as time step, got '0.1'"),
     "no dt": (lambda: fit(Z0, Z1, None), "expected a number as time step, got None"),
@@ -93,7 +93,10 @@ MISTAKES = {
     "a power as ^": (lambda: fit(terms=["p1^2"]), "a power is written **"),
     "an unknown name in a term": (lambda: fit(terms=["x1**2"]), "the name 'x1': expected numbers"),
     "code in a term": (lambda: fit(terms=['__import__("os")']), "a call of '__import__'"),
-    "terms for a map": (lambda: fit(terms=["p1**2"], learn="map"), "terms are those of H"),
+    "terms for a map": (
+        lambda: fit(terms=["p1**2"], learn="map"),
+        "terms: not options of one model",
+    ),
     "three bodies of one coordinate": (lambda: fit(structure="bodies:3"), "3, 6 or 9 degrees"),
     "a seed as text": (lambda: fit(seed="a"), "from 0 to 2**32 - 1 as seed, got 'a'"),
     # Drawing from scenes, loading.

@@ -415,7 +415,7 @@ def test_positions_in_a_file_are_fitted_and_continued(tmp_path, monkeypatch, cap
     written("begun.csv", read[:20, :4])
     said = ["fit", "turns.csv", "--positions", "theta", "--angles", "theta", "--out", "model"]
     assert cli.main([*said, "--learn", "hamiltonian"]) == 2
-    assert "expected auto, lagrangian or map" in capsys.readouterr().err
+    assert "not options of a recording" in capsys.readouterr().err
     assert cli.main([*said, "--learn", "map", "--tolerance", "1e-12"]) == 0
     report = json.loads(Path("model/report.json").read_text())
     assert report["model"]["chart"] == "type1"

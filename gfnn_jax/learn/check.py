@@ -20,8 +20,6 @@ from gfnn_jax.phase_space import Pairs, sizes, split
 from gfnn_jax.scenes.draws import sample_states
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
 
-LEARNS = ("auto", "map", "hamiltonian")  # of pairs
-
 _OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
 _COMPARED = 100
 FEWEST = 8  # pairs of a structure: 4 train, 4 are held out
@@ -38,15 +36,8 @@ def check_request(
     structure: of the options, or the scene's.
     """
     angles = options.angles
-    if not isinstance(pairs, Pairs):
-        raise FitError(f"expected gfnn.Pairs(z0, z1, dt), got {type(pairs).__name__}")
     if scene is not None and not isinstance(scene, Scene):
         raise FitError(f"expected a scene, as gfnn.scenes.make('two-body'), got {scene!r}")
-    if options.learn not in LEARNS:
-        raise FitError(
-            f"learn={options.learn!r}: only for a gfnn.Recording, got pairs; expected one of "
-            + ", ".join(LEARNS)
-        )
     own_dt = bool(np.ndim(pairs.dt))
     if (
         not own_dt

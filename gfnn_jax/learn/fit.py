@@ -10,7 +10,8 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,7 +19,8 @@ import numpy as np
 
 from gfnn_jax.candidates.assemble import block_of
 from gfnn_jax.candidates.candidate import Candidate
-from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.files import are_recordings, read_trajectories
+from gfnn_jax.data.recording import Recording, read
 from gfnn_jax.data.wrong_values import without_wrong_values
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
@@ -47,7 +49,6 @@ from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.phase_space import Pairs, require_x64
-from gfnn_jax.scenes.scene import Scene
 from gfnn_jax.threads import one_thread
 
 _STATES_MEASURED = 200  # states at which the chosen map's defect and determinant are taken
@@ -55,8 +56,8 @@ _STATES_MEASURED = 200  # states at which the chosen map's defect and determinan
 
 @with_options
 def fit(
-    pairs: Pairs | Recording,
-    scene: Scene | None = None,
+    data: Any,
+    scene: Any = None,
     *,
     options: FitOptions | None = None,
     clock: Callable[[], float] = time.perf_counter,
@@ -68,17 +69,18 @@ def fit(
     on_better: Callable[[SymplecticMap, Candidate], Any] | None = None,
     **changes: Any,
 ) -> Fit:
-    """Learn the map of these pairs: the cheapest candidate within the tolerance, else the best.
+    """Learn the law or the map of these data: for pairs the cheapest candidate within the
+    tolerance, else the best; for a recording its law, a Lagrangian with friction and inputs.
 
-    For a `Recording` learn its law, a Lagrangian with friction and inputs, from its positions; of
-    the options ``learn`` ("auto" or "lagrangian"), ``friction``, ``input_hold``, ``mass`` and
-    ``on_progress`` apply (`models.lagrangians.recordings`). With learn="map" learn the map of its
-    positions instead: see `fit_positions`.
-
-    pairs:     states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their order.
-               Of different dt, S is a function of dt too, in the midpoint chart. With parameters
-               (args) H is learned, or an S of state and parameters, which family="polynomial" or
-               learn="map" ask for.
+    data:      `Pairs`, states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their
+               order. Of different dt, S is a function of dt too, in the midpoint chart. With
+               parameters (args) H is learned, or an S of state and parameters, which
+               family="polynomial" or learn="map" ask for. Or a `Recording`, of which ``learn``
+               ("auto" or "lagrangian"), ``terms``, ``friction``, ``input_hold``, ``mass`` and
+               ``loss`` apply (`models.lagrangians.recordings`); with learn="map" the map of its
+               positions is learned (`fit_positions`). Or a table, a DataFrame or arrays by name,
+               or a file, of either kind. Or times (n,), with positions x1 … xd, (n,) or (n, d),
+               behind them: ``fit(t, x)``.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     options:   a `FitOptions`, which the keywords below change; None: its defaults.
     clock:     gives the seconds that max_seconds is held against. spent: seconds of them that are
@@ -89,17 +91,25 @@ def fit(
     on_better: called with a map and its candidate whenever steps have shown one that is more
                accurate than those before, so that it can be kept should the fit be interrupted.
 
-    Raises FitError, in one line, where the data are too few or not finite or a chart that was asked
-    for is singular over them (naming the chart to use instead). Warns (FitWarning) where nothing
+    Raises FitError, in one line, where the data are too few or not finite, a chart that was asked
+    for is singular over them (naming the chart to use instead), or no law follows a recording: then
+    it has a ``verdict``. Warns (FitWarning) where nothing
     meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
     (a few are left out), and where the pairs do not look symplectic; of a recording where its law
     did not converge, misses a drive, or has an input of no effect.
     """
     options = dataclasses.replace(options or FitOptions(), **changes)
+    positions = scene if _is_array(scene) else None
+    scene = None if positions is not None else scene
+    pairs = as_pairs_or_recording(data, positions)
     if isinstance(pairs, Recording):
-        _check_of_recording(scene, options)
+        if scene is not None or options.model is not None:
+            given = "model" if scene is None else "scene"
+            raise InputError(f"{given}: only for pairs of states q, p, got a recording")
+        of_map = options.learn == "map"
+        options.refuse_others(["map" if of_map else "lagrangian"], "a recording, without momenta")
         with one_thread():
-            if options.learn == "map":
+            if of_map:
                 return fit_positions(pairs, options, clock, on_progress, on_candidate)
             law = fit_recording(
                 pairs,
@@ -113,9 +123,8 @@ def fit(
         for message in law.messages:
             warnings.warn(message, FitWarning, stacklevel=2)
         return Fit(law.map, law)
-    if options.loss is not None:
-        raise FitError("loss: only for the law of a recording, got pairs")
-    budget = options.budget(clock, pairs.dim if isinstance(pairs, Pairs) else None, spent)
+    options.refuse_others(("hamiltonian", "map"), "pairs, which are no recording")
+    budget = options.budget(clock, pairs.dim, spent)
     require_x64("a fit")
     messages: list[str] = []
 
@@ -211,19 +220,28 @@ def fit(
     return Fit(chosen.candidate.map, choice)
 
 
-def _check_of_recording(scene: Scene | None, options: FitOptions) -> None:
-    """Raises InputError for options of pairs alone."""
-    if options.learn not in ("auto", "lagrangian", "map"):
-        raise InputError(
-            f"learn={options.learn!r}: a recording has no momenta; expected auto, lagrangian or map"
+def as_pairs_or_recording(data: Any, more: Any = None) -> Pairs | Recording:
+    """Data that `fit` takes, as pairs or a recording. more: of times ``data`` (n,) the positions
+    x1 … xd, (n,) or (n, d)."""
+    if isinstance(data, (Pairs, Recording)):
+        return data
+    if isinstance(data, (str, Path)):
+        return read(data) if are_recordings(data) else read_trajectories(Path(data)).pairs()
+    if hasattr(data, "columns") or isinstance(data, Mapping):  # a table
+        return Recording(data)
+    if more is None:
+        raise FitError(
+            "expected gfnn.Pairs(z0, z1, dt), a gfnn.Recording, a table, a file, or arrays (t, x), "
+            f"got {type(data).__name__}"
         )
-    if scene is not None or options.base is not None:
-        given = "base" if scene is None else "scene"
-        raise InputError(f"{given}: only for pairs of states q, p, got a recording")
-    if options.learn == "map" and options.loss is not None:
-        raise InputError("loss: only for the law of a recording, got learn='map'")
-    if options.learn != "map" and options.structure is not None:
-        raise InputError("structure: not for the law of a recording (learn='map' has it)")
+    positions = np.asarray(more)
+    columns = positions.reshape(len(positions), -1).T
+    named = {f"x{i}": column for i, column in enumerate(columns, start=1)}
+    return Recording({"t": np.asarray(data), **named}, positions=list(named))
+
+
+def _is_array(value: Any) -> bool:
+    return hasattr(value, "__array__") or isinstance(value, (list, tuple))
 
 
 def fit_positions(

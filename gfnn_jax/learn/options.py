@@ -7,17 +7,19 @@ not loaded.
 from __future__ import annotations
 
 import dataclasses
+import difflib
+import functools
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
 from numbers import Integral, Real
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from gfnn_jax.budget import Budget, seconds_allowed
 from gfnn_jax.dataset.structure_names import EXPECTED, STRUCTURES, names_structure
 from gfnn_jax.errors import FitError
 
+T = TypeVar("T")
 RUN, FIT = ("gfnn run", "gfnn fit"), ("gfnn fit",)
 
 
@@ -65,6 +67,11 @@ def _are(test: Callable[[Any], bool], *kinds: type) -> Callable[[Any], bool]:
     return lambda values: isinstance(values, kinds) and all(test(value) for value in values)
 
 
+def _same(value: Any, default: Any) -> bool:
+    """Return whether an option has its default, or nothing where the default is nothing."""
+    return value is default or (not default and not value) or value == default
+
+
 def _texts(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(";") if part.strip())
 
@@ -98,10 +105,6 @@ _TEXT = Kind("text", lambda v: isinstance(v, str))
 _LAW = Kind("a Hamiltonian as text or a function of z", _is_text_or_function)
 _INDICES = Kind("a tuple of indices", _are(lambda i: isinstance(i, int), tuple, list))
 _MASSES = Kind("a mapping of a position's name to its mass", lambda v: isinstance(v, Mapping))
-_MODEL = Kind(
-    "a model with a name, sizes(data) and fit(data, size)",
-    lambda v: all(hasattr(v, name) for name in ("name", "sizes", "fit")),
-)
 _LOSS = Kind(
     "a loss with of(residuals) and weights(residuals)",
     lambda v: all(hasattr(v, name) for name in ("of", "weights")),
@@ -117,268 +120,282 @@ class About(NamedTuple):
 
     kind: Kind
     help: str
-    metavar: str | None
-    commands: tuple[str, ...]
-    decides: bool
+    metavar: str | None = None
+    commands: tuple[str, ...] = RUN
+    decides: bool = True
 
 
-def _about(
-    kind: Kind,
-    help_: str,
-    metavar: str | None = None,
-    commands: tuple[str, ...] = RUN,
-    *,
-    decides: bool = True,
-) -> dict[str, About]:
-    return {"about": About(kind, help_, metavar, commands, decides)}
+def _named(cls: type[T]) -> type[T]:
+    """Make a dataclass tell, of a wrong name, the nearest right one."""
+    init, names = cls.__init__, [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
+
+    @functools.wraps(init)
+    def checked(self: T, **given: Any) -> None:
+        for name in set(given) - set(names):
+            near = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"expected {', '.join(names)}"
+            raise TypeError(f"{cls.__name__}: unexpected keyword argument '{name}', {hint}")
+        init(self, **given)
+
+    cls.__init__ = checked
+    return cls
 
 
+@_named
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Hamiltonian:
+    """H(z), whose flow is the map: of known ``terms``, of those that a library has, or a network
+    (family "mlp"). Options as of `gfnn.fit`."""
+
+    terms: Sequence[str | Callable] = ()
+    structure: str | None = None
+    family: str = "auto"
+    max_iterations: int = 250
+
+
+@_named
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Lagrangian:
+    """L(q, v) of a recording, with ``friction`` and inputs. Options as of `gfnn.fit`."""
+
+    terms: Sequence[str] = ()
+    friction: str = "auto"
+    input_hold: str = "auto"
+    mass: Mapping[str, float] | None = None
+    loss: Any = None
+
+
+@_named
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GeneratingFunction:
+    """S, whose step is an implicit equation: of a ``family`` in a ``chart``, beside the flow of a
+    known ``base``. Options as of `gfnn.fit`."""
+
+    family: Any = "auto"
+    chart: str = "auto"
+    base: str | Callable | None = None
+    structure: str | None = None
+    ensemble: int = 1
+    max_iterations: int = 250
+
+
+MODELS = {"hamiltonian": Hamiltonian, "lagrangian": Lagrangian, "map": GeneratingFunction}
+_OF_MODEL = {
+    learn: tuple(field.name for field in dataclasses.fields(model))
+    for learn, model in MODELS.items()
+}
+_MODEL = Kind(
+    "gfnn.Hamiltonian(), Lagrangian(), GeneratingFunction(), or a model with a name, sizes(data) "
+    "and fit(data, size)",
+    lambda v: (
+        isinstance(v, tuple(MODELS.values()))
+        or all(hasattr(v, name) for name in ("name", "sizes", "fit"))
+    ),
+)
+
+
+OPTIONS: dict[str, About] = {
+    "tolerance": About(
+        POSITIVE,
+        "largest one-step error of a map of states, RMS over coordinates of error divided by "
+        "spread; its upper 95 % bound must not exceed it",
+        "E",
+    ),
+    "absolute_tolerance": About(
+        POSITIVE,
+        "instead of the tolerance: largest RMS error per coordinate, in the data's units",
+        "E",
+        FIT,
+    ),
+    "learn": About(
+        _one_of("auto", "map", "hamiltonian", "lagrangian"),
+        "what is learned: map (S, whose step is an implicit equation), hamiltonian (H, whose flow "
+        "is the map) or auto (both: H where it meets the tolerance at no more than four times the "
+        "cost of a step, for it holds outside the data and at any time step); for a recording its "
+        "law (lagrangian, auto) or the map of its positions (map)",
+    ),
+    "terms": About(
+        _TERMS,
+        'known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"; in Python also functions of z; for a '
+        'recording those of its law: "omega**2; V: cos(theta); R: omega**2"',
+        "TEXT",
+    ),
+    "base": About(
+        _LAW,
+        'known part of H: "p1**2/2 - cos(q1)"; its flow is factored out, and S learns the '
+        "remainder",
+        "TEXT",
+    ),
+    "structure": About(
+        STRUCTURE,
+        "structure of many degrees of freedom: H is a sum over equal sites, with terms in q1, p1 "
+        "of a site and q2, p2, … of the next ones (ring:2 has two q at every site, side by side); "
+        "or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike). For a ring "
+        "or a chain S is learned instead where a map is asked for or no H meets the tolerance. "
+        "Default: that of the scene",
+        "|".join(STRUCTURES),
+    ),
+    "family": About(
+        _one_of("auto", "polynomial", "features", "sines", "mlp", or_holds=_is_family),
+        "family of the generating function: polynomial (Fourier in angles), features (the "
+        "scene's), sines, mlp (also of an H that is a network); in Python also a family of one's "
+        "own that is linear in its parameters, or a function of Inputs that gives such families",
+    ),
+    "model": About(
+        _MODEL,
+        "model that is learned, with options of its own; or one of one's own; None: what the data "
+        "are decides",
+        commands=(),
+    ),
+    "chart": About(
+        _one_of("auto", "type1", "type2", "type3", "midpoint"),
+        "chart that S is evaluated in",
+    ),
+    "ensemble": About(
+        COUNT,
+        "with family mlp: number of networks trained together; their mean is the map, their "
+        "spread its bands",
+        "N",
+    ),
+    "angles": About(
+        _INDICES,
+        "without a scene: indices in z of what has period 2π",
+        commands=(),
+    ),
+    "seed": About(
+        SEED,
+        "seed of what is drawn at random",
+        "N",
+    ),
+    "max_seconds": About(
+        _SECONDS,
+        "time for the fit in seconds, after which the best map so far is kept (default 120, or no "
+        "limit with a maximum of operations); in Python None: no limit, and the same map on a "
+        "busy machine and an idle one",
+        "S",
+        decides=False,
+    ),
+    "max_operations": About(
+        _OPERATIONS,
+        "counted operations for the fit: the value of fit.max_operations in a report gives the "
+        "same model again, also where time had ended that fit",
+        "N",
+        decides=False,
+    ),
+    "max_iterations": About(
+        COUNT,
+        "iterations of a network's training",
+        commands=(),
+    ),
+    "friction": About(
+        _TEXT,
+        "for a recording, friction by its force: auto, none, linear (viscous, ∝ v), quadratic "
+        "(drag, ∝ v |v|), dry (Coulomb), uniform (R = γT); several joined by +",
+        "KIND",
+        FIT,
+    ),
+    "input_hold": About(
+        _one_of("auto", "hold", "linear", "band"),
+        "for a recording, inputs between samples: hold (zero order), linear, band (band-limited), "
+        "or auto, by held-out data",
+        None,
+        FIT,
+    ),
+    "mass": About(
+        _MASSES,
+        "for a recording: the known mass of one position",
+        commands=(),
+    ),
+    "loss": About(
+        _LOSS,
+        "for a recording whose law is learned: the loss of residuals in units of their noise, of "
+        "one's own",
+        commands=(),
+    ),
+    "devices": About(
+        DEVICES,
+        "number of devices that share the rows, and the networks of an ensemble; on a CPU these "
+        "are its cores; the same bits on any number",
+        "all|N",
+        FIT,
+        decides=False,
+    ),
+}
+
+
+@_named
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FitOptions:
     """Options of a fit, checked once, when they are made. Each is a keyword of `gfnn.fit`, and most
     are options of ``gfnn run`` and ``gfnn fit``, written --max-seconds.
 
-    Raises FitError, in one line, for a value that an option cannot have, and for options that
-    exclude one another.
+    Raises FitError, in one line, for a value that an option cannot have, and for options that no
+    one model has.
     """
 
-    tolerance: float = field(
-        default=1e-6,
-        metadata=_about(
-            POSITIVE,
-            "largest one-step error of a map of states, RMS over coordinates of error divided by "
-            "spread; its upper 95 % bound must not exceed it",
-            "E",
-        ),
-    )
-    absolute_tolerance: float | None = field(
-        default=None,
-        metadata=_about(
-            POSITIVE,
-            "instead of the tolerance: largest RMS error per coordinate, in the data's units",
-            "E",
-            FIT,
-        ),
-    )
-    learn: str = field(
-        default="auto",
-        metadata=_about(
-            _one_of("auto", "map", "hamiltonian", "lagrangian"),
-            "what is learned: map (S, whose step is an implicit equation), hamiltonian (H, "
-            "whose flow "
-            "is the map) or auto (both: H where it meets the tolerance at no more than four "
-            "times the "
-            "cost of a step, for it holds outside the data and at any time step); of a "
-            "recording its "
-            "law (lagrangian, auto) or the map of its positions (map)",
-        ),
-    )
-    terms: Sequence[str | Callable] = field(
-        default=(),
-        metadata=_about(
-            _TERMS,
-            'known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"; in Python also functions of z; of a '
-            'recording those of its law: "omega**2; V: cos(theta); R: omega**2"',
-            "TEXT",
-        ),
-    )
-    base: str | Callable | None = field(
-        default=None,
-        metadata=_about(
-            _LAW,
-            'known part of H: "p1**2/2 - cos(q1)"; its flow is factored out, and S learns the '
-            "remainder",
-            "TEXT",
-        ),
-    )
-    structure: str | None = field(
-        default=None,
-        metadata=_about(
-            STRUCTURE,
-            "structure of many degrees of freedom: H is a sum over equal sites, with terms "
-            "in q1, p1 "
-            "of a site and q2, p2, … of the next ones (ring:2 has two q at every site, side "
-            "by side); "
-            "or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike). "
-            "Of a ring "
-            "or a chain S is learned instead where a map is asked for or no H meets the tolerance. "
-            "Default: that of the scene",
-            "|".join(STRUCTURES),
-        ),
-    )
-    family: Any = field(
-        default="auto",
-        metadata=_about(
-            _one_of("auto", "polynomial", "features", "sines", "mlp", or_holds=_is_family),
-            "family of the generating function: polynomial (Fourier in angles), features (the "
-            "scene's), sines, mlp (also of an H that is a network); in Python also a family "
-            "of one's "
-            "own that is linear in its parameters, or a function of Inputs that gives such "
-            "families",
-        ),
-    )
-    model: Any = field(
-        default=None,
-        metadata=_about(
-            _MODEL, "a model of one's own, which is then all that is learned", commands=()
-        ),
-    )
-    chart: str = field(
-        default="auto",
-        metadata=_about(
-            _one_of("auto", "type1", "type2", "type3", "midpoint"),
-            "chart that S is evaluated in",
-        ),
-    )
-    ensemble: int = field(
-        default=1,
-        metadata=_about(
-            COUNT,
-            "with family mlp: number of networks trained together; their mean is the map, their "
-            "spread its bands",
-            "N",
-        ),
-    )
-    angles: Sequence[int] = field(
-        default=(),
-        metadata=_about(
-            _INDICES, "without a scene: indices in z of what has period 2π", commands=()
-        ),
-    )
-    seed: int = field(
-        default=0,
-        metadata=_about(
-            SEED,
-            "seed of what is drawn at random",
-            "N",
-        ),
-    )
-    max_seconds: float | Literal["auto"] | None = field(
-        default="auto",
-        metadata=_about(
-            _SECONDS,
-            "time for the fit in seconds, after which the best map so far is kept (default "
-            "120, or no "
-            "limit with a maximum of operations); in Python None: no limit, and the same map "
-            "on a busy "
-            "machine and an idle one",
-            "S",
-            decides=False,
-        ),
-    )
-    max_operations: int | None = field(
-        default=None,
-        metadata=_about(
-            _OPERATIONS,
-            "counted operations for the fit: the value of fit.max_operations in a report gives the "
-            "same model again, also where time had ended that fit",
-            "N",
-            decides=False,
-        ),
-    )
-    max_iterations: int = field(
-        default=250,
-        metadata=_about(
-            COUNT,
-            "iterations of a network's training",
-            commands=(),
-        ),
-    )
-    friction: str = field(
-        default="auto",
-        metadata=_about(
-            _TEXT,
-            "of a recording, friction by its force: auto, none, linear (viscous, ∝ v), quadratic "
-            "(drag, "
-            "∝ v |v|), dry (Coulomb), uniform (R = γT); several joined by +",
-            "KIND",
-            FIT,
-        ),
-    )
-    input_hold: str = field(
-        default="auto",
-        metadata=_about(
-            _one_of("auto", "hold", "linear", "band"),
-            "of a recording, inputs between samples: hold (zero order), linear, band "
-            "(band-limited), "
-            "or "
-            "auto, by held-out data",
-            None,
-            FIT,
-        ),
-    )
-    mass: Mapping[str, float] | None = field(
-        default=None,
-        metadata=_about(_MASSES, "of a recording: the known mass of one position", commands=()),
-    )
-    loss: Any = field(
-        default=None,
-        metadata=_about(
-            _LOSS,
-            "of a recording whose law is learned: the loss of residuals in units of their "
-            "noise, of "
-            "one's own",
-            commands=(),
-        ),
-    )
-    devices: int | str | None = field(
-        default=None,
-        metadata=_about(
-            DEVICES,
-            "number of devices that share the rows, and the networks of an ensemble; on a "
-            "CPU these "
-            "are its cores; the same bits on any number",
-            "all|N",
-            FIT,
-            decides=False,
-        ),
-    )
+    tolerance: float = 1e-6
+    absolute_tolerance: float | None = None
+    learn: str = "auto"
+    terms: Sequence[str | Callable] = ()
+    base: str | Callable | None = None
+    structure: str | None = None
+    family: Any = "auto"
+    model: Any = None
+    chart: str = "auto"
+    ensemble: int = 1
+    angles: Sequence[int] = ()
+    seed: int = 0
+    max_seconds: float | Literal["auto"] | None = "auto"
+    max_operations: int | None = None
+    max_iterations: int = 250
+    friction: str = "auto"
+    input_hold: str = "auto"
+    mass: Mapping[str, float] | None = None
+    loss: Any = None
+    devices: int | str | None = None
 
     def __post_init__(self):
         for option in dataclasses.fields(self):
-            value, kind = getattr(self, option.name), option.metadata["about"].kind
+            value, kind = getattr(self, option.name), OPTIONS[option.name].kind
             if not (value is None and option.default is None) and not kind.holds(value):
                 raise FitError(f"expected {kind.words} as {option.name}, got {value!r}")
-        self._refuse_contradictions()
+        self._take_from_model()
+        self.refuse_others(tuple(MODELS), "one model")
+        if self.ensemble > 1 and self.family != "mlp":
+            raise FitError("ensemble: of networks S, expected family='mlp'")
+        if self.learn == "hamiltonian" and self.family not in ("auto", "mlp"):
+            raise FitError(f"family={self.family!r}: of S; H has terms, or is a network ('mlp')")
 
-    def _refuse_contradictions(self) -> None:
-        of_h, plain = self.learn == "hamiltonian", (self.family, self.chart) == ("auto", "auto")
-        if self.model is not None and not (
-            plain
-            and (self.learn, self.base) == ("auto", None)
-            and not self.terms
-            and self.structure is None
-        ):
-            raise FitError(
-                "model: nothing else is learned beside it, expected no learn, terms, base, "
-                "structure, family or chart"
-            )
-        if self.ensemble > 1 and (self.family != "mlp" or of_h):
-            raise FitError(
-                "an ensemble is of networks S: expected family='mlp' and no learn='hamiltonian', "
-                f"got {self._given}"
-            )
-        if self.terms and (self.learn == "map" or not plain):
-            raise FitError(
-                "terms are those of H: expected no learn='map', family or chart beside them, got "
-                f"{self._given}"
-            )
-        if self.base is not None and (of_h or self.terms):
-            raise FitError(
-                "base is factored out of a map S: expected no terms or learn='hamiltonian' beside "
-                f"it, got {self._given or 'terms'}"
-            )
-        if of_h and (self.family not in ("auto", "mlp") or self.chart != "auto"):
-            raise FitError(
-                "learn='hamiltonian' has no chart, and no family but 'mlp': these are of S; got "
-                f"{self._given}"
-            )
+    def _take_from_model(self) -> None:
+        """Take the options of a model of the package's own as though they were named here."""
+        if self.model is None:
+            return
+        learn = next((n for n, kind in MODELS.items() if isinstance(self.model, kind)), None)
+        if self._of_models or self.learn != "auto":
+            given = ", ".join([*self._of_models, *(["learn"] if self.learn != "auto" else [])])
+            raise FitError(f"model: nothing else is learned beside it, expected no {given}")
+        if learn is not None:
+            own = {name: getattr(self.model, name) for name in _OF_MODEL[learn]}
+            for name, value in {**own, "learn": learn, "model": None}.items():
+                object.__setattr__(self, name, value)
+            self.__post_init__()
 
     @property
-    def _given(self) -> str:
-        """Names of learn, family and chart that were asked for."""
-        asked = {"learn": self.learn, "family": self.family, "chart": self.chart}
-        return ", ".join(f"{n}={value!r}" for n, value in asked.items() if value != "auto")
+    def _of_models(self) -> list[str]:
+        """Names of the options of models that were given."""
+        names = dict.fromkeys(name for own in _OF_MODEL.values() for name in own)
+        fields = {option.name: option.default for option in dataclasses.fields(self)}
+        return [n for n in names if not _same(getattr(self, n), fields[n])]
+
+    def refuse_others(self, learns: Sequence[str], of_what: str) -> None:
+        """Raise FitError where none of the models ``learns`` has all options that were given."""
+        given = set(self._of_models)
+        asked = learns if self.learn == "auto" else [n for n in learns if n == self.learn]
+        if not any(given <= set(_OF_MODEL[n]) for n in asked):
+            known = {n: ", ".join(_OF_MODEL[n]) for n in asked or learns}
+            listed = "; ".join(f"{MODELS[n].__name__}({own})" for n, own in known.items())
+            shown = [f"learn={self.learn!r}"] * (self.learn != "auto") + sorted(given)
+            raise FitError(f"{', '.join(shown)}: not options of {of_what}, expected {listed}")
 
     @property
     def deciding(self) -> dict[str, Any]:
@@ -393,7 +410,6 @@ class FitOptions:
         return Budget(seconds, self.max_operations, clock, dim, spent)
 
 
-OPTIONS: dict[str, About] = {f.name: f.metadata["about"] for f in dataclasses.fields(FitOptions)}
 _LISTED = "\n".join(f"    {name}: {about.help}." for name, about in OPTIONS.items())
 FitOptions.__doc__ = f"{FitOptions.__doc__}\n{_LISTED}\n    "
 

@@ -1,0 +1,106 @@
+"""Data in any form, and models as objects: each option belongs to one of them."""
+
+import inspect
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import gfnn_jax as gfnn
+from gfnn_jax.learn.fit import as_pairs_or_recording
+
+Z = np.random.default_rng(0).normal(size=(60, 2))
+C, S = np.cos(0.3), np.sin(0.3)
+PAIRS = gfnn.Pairs(Z, Z @ np.array([[C, -S], [S, C]]), 0.3)
+T = 0.05 * np.arange(300)
+X = np.cos(2 * T) + 1e-3 * np.random.default_rng(1).normal(size=T.shape)
+LAW = gfnn.Lagrangian(terms=["v1**2", "V: x1**2"], friction="none")
+
+
+@pytest.mark.parametrize(
+    ("model", "options"),
+    [
+        (gfnn.Hamiltonian(terms=["q1**2", "p1**2"]), {"learn": "hamiltonian"}),
+        (gfnn.GeneratingFunction(chart="type2"), {"learn": "map", "chart": "type2"}),
+    ],
+)
+def test_an_object_is_its_keywords(model, options):
+    terms = {"terms": model.terms} if hasattr(model, "terms") else {}
+    found = gfnn.fit(PAIRS, model=model, tolerance=1e-6)
+    same = gfnn.fit(PAIRS, tolerance=1e-6, **options, **terms)
+    assert type(found) is gfnn.Fit
+    assert (found.chosen.learns, found.chosen.label) == (same.chosen.learns, same.chosen.label)
+    np.testing.assert_array_equal(found.map.step(Z)[0], same.map.step(Z)[0])
+
+
+@pytest.fixture(scope="module")
+def law():
+    return gfnn.fit(T, X, model=LAW)
+
+
+def test_times_and_positions(law):
+    assert law.verdict == "identified"
+    assert [t.term for t in law.lagrangian.terms] == ["v1**2", "x1**2"]
+    assert law.map.sensors.positions == ("x1",)
+
+
+@pytest.mark.parametrize("kind", ["recording", "table", "arrays", "file"])
+def test_any_form_of_the_same_data(kind, law, tmp_path):
+    table = pd.DataFrame({"t": T, "x1": X})
+    path = tmp_path / "swing.csv"
+    table.to_csv(path, index=False)
+    data = {
+        "recording": gfnn.Recording(table, positions=["x1"]),
+        "table": table,
+        "arrays": {"t": T, "x1": X},
+        "file": path,
+    }[kind]
+    assert gfnn.fit(data, model=LAW).lagrangian == law.lagrangian
+
+
+def test_several_positions():
+    both = np.stack([X, X[::-1]], axis=1)
+    recording = as_pairs_or_recording(T, both)
+    assert recording.positions == ("x1", "x2")
+
+
+def test_a_file_of_states(tmp_path):
+    np.savez(tmp_path / "pairs.npz", z0=PAIRS.z0, z1=PAIRS.z1, dt=PAIRS.dt)
+    found = gfnn.fit(str(tmp_path / "pairs.npz"), tolerance=1e-6)
+    assert found.verdict == "identified"
+
+
+@pytest.mark.parametrize(
+    ("make", "near"),
+    [
+        (lambda: gfnn.Hamiltonian(term=["q1"]), "did you mean terms"),
+        (lambda: gfnn.Lagrangian(frictions="none"), "did you mean friction"),
+        (lambda: gfnn.GeneratingFunction(charts="type1"), "did you mean chart"),
+        (lambda: gfnn.fit(PAIRS, tolerence=1e-3), "did you mean tolerance"),
+    ],
+)
+def test_a_wrong_name_tells_the_nearest(make, near):
+    with pytest.raises(TypeError, match=near):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("data", "options"),
+    [
+        (PAIRS, {"model": LAW}),
+        (PAIRS, {"friction": "linear"}),
+        (PAIRS, {"terms": ["q1"], "chart": "type2"}),
+        (PAIRS, {"model": gfnn.Hamiltonian(), "chart": "type2"}),
+        (PAIRS, {"learn": "hamiltonian", "chart": "type2"}),
+        ({"t": T, "x1": X}, {"model": gfnn.Hamiltonian()}),
+        ({"t": T, "x1": X}, {"structure": "ring"}),
+        ({"t": T, "x1": X}, {"learn": "map", "loss": object()}),
+    ],
+)
+def test_an_option_belongs_to_one_model(data, options):
+    with pytest.raises(gfnn.FitError):
+        gfnn.fit(data, **options)
+
+
+def test_the_type_that_is_promised():
+    assert inspect.signature(gfnn.fit).return_annotation == "Fit"
