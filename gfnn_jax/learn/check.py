@@ -66,10 +66,10 @@ def check_request(
             f"expected a time step that is finite and above 0, got {pairs.dt}"
             + (float(pairs.dt) < 0) * ": where z1 come before z0 in time, exchange them"
         )
-    if structure is not None:
-        _check_structured(structure, scene, options, pairs)
     known = () if options.base is None else (options.base,)
     try:
+        if structure is not None:
+            _check_structured(structure, scene, options, pairs)
         given_terms(pairs.dim, () if structure else options.terms, tuple(pairs.args or ()))
         given_terms(pairs.dim, known)
     except (InputError, jax.errors.ConcretizationTypeError) as error:
@@ -103,43 +103,33 @@ def _check_structured(
     structure: str, scene: Scene | None, options: FitOptions, pairs: Pairs
 ) -> None:
     """Raises FitError for what does not go with a structure."""
-    learn, terms, chart, angles = options.learn, options.terms, options.chart, options.angles
-    if (options.family, options.base) != ("auto", None):
-        raise FitError(f"structure {structure} has its own terms: expected no family or base")
-    if chart == "type1":
-        raise FitError(f"structure {structure}: expected another chart than type1")
-    bodies = structure.startswith("bodies")
-    if bodies and (learn == "map" or chart != "auto"):
-        raise FitError(
-            f"structure {structure}: only H is learned, expected no learn='map' or chart"
-        )
+    learn, terms, chart = options.learn, options.terms, options.chart
     coordinates = scene.coordinates if scene is not None else CARTESIAN
-    if bodies and (angles or coordinates.angles):
-        raise FitError(f"structure {structure}: expected no angles")
+    bodies, angles = structure.startswith("bodies"), options.angles or coordinates.angles
     own = coordinates.forward is not CARTESIAN.forward or coordinates.cyclic
-    if own or pairs.args or pairs.period is not None:
-        raise FitError(
-            f"structure {structure}: expected plain q and p, no coordinates of a scene, parameters "
-            "or drive"
-        )
-    if learn == "hamiltonian" and (angles or coordinates.angles):
-        raise FitError(f"structure {structure} with angles: only S is learned (learn='map')")
-    if learn == "map" and np.ndim(pairs.dt):
-        raise FitError(f"structure {structure}: learn='map' expects pairs of one dt, got several")
-    if terms and (angles or coordinates.angles):
-        raise FitError(f"structure {structure} with angles: expected no terms, which are of H")
-    if terms and bodies:
-        raise FitError(f"structure {structure}: expected no terms, it has powers of distances")
+    refused = {
+        "it has its own terms: expected no family or base": (options.family, options.base)
+        != ("auto", None),
+        "expected another chart than type1": chart == "type1",
+        "only H is learned, expected no learn='map' or chart": bodies
+        and (learn == "map" or chart != "auto"),
+        "expected no angles": bodies and angles,
+        "expected plain q and p, no coordinates of a scene, parameters or drive": own
+        or pairs.args
+        or pairs.period is not None,
+        "with angles only S is learned (learn='map'), expected no terms, which are of H": angles
+        and (learn == "hamiltonian" or terms),
+        "learn='map' expects pairs of one dt, got several": learn == "map" and np.ndim(pairs.dt),
+        "expected no terms, it has powers of distances": terms and bodies,
+        "expected terms as text in q1, p1 of a site and q2, p2, … of the next ones": not all(
+            isinstance(term, str) for term in terms
+        ),
+    }
+    for why, given in refused.items():
+        if given:
+            raise FitError(f"structure {structure}: {why}")
     for term in terms:
-        if not isinstance(term, str):
-            raise FitError(
-                "expected terms of a structure as text in q1, p1 of a site and q2, p2, … of the "
-                "next ones"
-            )
-        try:
-            site_terms(pairs.dim, "ring", 0, 0, (term,), max(1, fields_of(structure)))
-        except InputError as error:
-            raise FitError(str(error)) from error
+        site_terms(pairs.dim, "ring", 0, 0, (str(term),), max(1, fields_of(structure)))
 
 
 def unlike_the_scene(pairs: Pairs, scene: Scene) -> list[str]:

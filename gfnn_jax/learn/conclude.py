@@ -31,8 +31,7 @@ from gfnn_jax.models.generating_functions.size import OF_SOLVE, OF_STEPS
 from gfnn_jax.models.hamiltonians.choose_law import long_step
 from gfnn_jax.models.hamiltonians.covariance import leaves_white
 from gfnn_jax.models.hamiltonians.learned_law import TURNS
-from gfnn_jax.search.extrapolate import GAINED
-from gfnn_jax.search.search import MET, Entry
+from gfnn_jax.search.search import GAINED, MET, Entry
 
 _NO_MORE = {
     False: "no larger set of terms promises to meet it",

@@ -21,37 +21,30 @@ from gfnn_jax.candidates.assemble import block_of
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.files import are_recordings, read_trajectories
 from gfnn_jax.data.recording import Recording, read
-from gfnn_jax.data.wrong_values import without_wrong_values
-from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.diagnosis.outliers import clean, looked_for_errors
 from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
 from gfnn_jax.errors import FitError, FitWarning, InputError
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.all_rows import with_test_rows
 from gfnn_jax.learn.check import wrapped
-from gfnn_jax.learn.choose import Chosen, choose
+from gfnn_jax.learn.choose import Chosen, choose, stated, with_posterior, with_test_rows
 from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.diagnose import diagnose_request
-from gfnn_jax.learn.fitted import Choice, Fit
+from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, with_options
 from gfnn_jax.learn.paid_for import paid_for
 from gfnn_jax.learn.positions import learn_positions
-from gfnn_jax.learn.posterior import with_posterior
 from gfnn_jax.learn.propose import structures_to_try
 from gfnn_jax.learn.request import checked
 from gfnn_jax.learn.searches import Searched, searched
-from gfnn_jax.learn.stated import stated
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.phase_space import Pairs, require_x64
 from gfnn_jax.threads import one_thread
-
-_STATES_MEASURED = 200  # states at which the chosen map's defect and determinant are taken
 
 
 @with_options
@@ -78,7 +71,7 @@ def fit(
                family="polynomial" or learn="map" ask for. Or a `Recording`, of which ``learn``
                ("auto" or "lagrangian"), ``terms``, ``friction``, ``input_hold``, ``mass`` and
                ``loss`` apply (`models.lagrangians.recordings`); with learn="map" the map of its
-               positions is learned (`fit_positions`). Or a table, a DataFrame or arrays by name,
+               positions is learned (`learn.positions`). Or a table, a DataFrame or arrays by name,
                or a file, of either kind. Or times (n,), with positions x1 … xd, (n,) or (n, d),
                behind them: ``fit(t, x)``.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
@@ -110,7 +103,7 @@ def fit(
         options.refuse_others(["map" if of_map else "lagrangian"], "a recording, without momenta")
         with one_thread():
             if of_map:
-                return fit_positions(pairs, options, clock, on_progress, on_candidate)
+                return learn_positions(pairs, options, clock, on_progress, on_candidate)
             law = fit_recording(
                 pairs,
                 friction=options.friction,
@@ -172,21 +165,21 @@ def fit(
             found = searched(request, data, diagnosis, on_better)
             if found.met_by_law:
                 break
-        diagnosis, found, about_pairs = without_gross_errors(request, diagnosis, found)
+        found, about_pairs = without_gross_errors(request, found)
         warn(about_pairs)
         found = without_bias(found, request)
         data = found.data
         chosen = with_posterior(choose(found, request), found)
         on_progress("computing the error to state, by pairs that chose nothing")
-        error = stated(chosen, found, budget)
-        chosen, stated_by = with_test_rows(chosen, error, found, budget)
+        chosen = with_test_rows(stated(chosen, found, budget), found, budget)
         conclusion = conclude(chosen, found, request)
-        warn([*conclusion.messages, *filter(None, [error.few])])
+        warn([*conclusion.messages, *filter(None, [chosen.few])])
         symmetries = symmetries_of_pairs(found.data)
+    diagnosis = found.diagnosis
     damping = diagnosis.damping if chosen.candidate.learns == "map" else None
     if damping is not None:  # a fact, not a warning
         messages.append(damping.line(data.dt))
-    num_states = min(_STATES_MEASURED, block_of(2 * data.dim))
+    num_states = min(STATES_MEASURED, block_of(2 * data.dim))
     some = chosen.data.pairs.take(chosen.data.validation[:num_states])
     choice = Choice(
         candidates=_all_candidates(chosen, found),
@@ -210,7 +203,7 @@ def fit(
         damping=damping,
         symmetries=symmetries,
         partial_laws=() if found.met_by_law else tuple(request.partial_laws),
-        stated_by=stated_by,
+        stated_by=chosen.stated_by,
         test_pairs=data.pairs.take(data.test) if len(data.test) else None,
         operations=budget.operations,
         budget=budget,
@@ -244,69 +237,6 @@ def _is_array(value: Any) -> bool:
     return hasattr(value, "__array__") or isinstance(value, (list, tuple))
 
 
-def fit_positions(
-    recording: Recording,
-    options: FitOptions,
-    clock: Callable[[], float],
-    on_progress: Callable[[str], Any],
-    on_candidate: Callable[[Candidate], Any],
-) -> Fit:
-    """Learn the map behind positions alone, at even times or by turns: S(q, Q) of chart type 1.
-
-    recording: its positions, of one run or many; an angle's values that range over more than one
-    turn are a lift and trusted, others known modulo 2π. options: of which the tolerance, a
-    structure of sites, the seed and the budget apply. The rest as of `fit`; errors are those of the
-    next position.
-
-    The map acts on z = (q, p), p = −h ∂S/∂q: ``map.from_positions`` and
-    ``map.rollout(positions=(q, Q), …)`` start it. Positions of one place tell p but for a factor
-    and a gauge, which `models.positions.discrete_lagrangian` fixes: frequencies, positions and
-    stability do not depend on them, the size of p, energies and areas do.
-    Raises FitError where the recording has no positions at even times, or too few.
-    """
-    require_x64("a fit")
-    asked = Tolerance.of(options)
-    recording, left_out = without_wrong_values(recording)
-    budget = options.budget(clock, len(recording.positions) or None)
-    found = learn_positions(
-        recording,
-        tolerance=asked,
-        structure=options.structure,
-        seed=options.seed,
-        budget=budget,
-        on_progress=on_progress,
-        on_candidate=on_candidate,
-    )
-    messages = (*left_out, *found.messages)
-    for message in messages:
-        warnings.warn(message, FitWarning, stacklevel=3)
-    test = found.states.take(found.test[: min(_STATES_MEASURED, block_of(2 * found.map.dim))])
-    determinant = np.asarray(found.map.determinant(test.z0))
-    choice = Choice(
-        candidates=tuple(dataclasses.replace(c, map=None) for c in found.candidates),
-        asked=asked,
-        num_pairs=found.positions.num_triples,
-        determinants={},
-        data_defect=float("nan"),
-        base_map=False,
-        noise=None,
-        messages=messages,
-        ended=found.ended,
-        seconds=budget.seconds,
-        compile_seconds=found.compile_seconds,
-        test_states=np.asarray(test.z0),
-        model_determinant_min=float(determinant[np.argmin(np.abs(determinant))]),
-        pairs=found.states,
-        positions=found.positions,
-        stated_by=found.stated_by,
-        validation_pairs=found.states.take(found.validation),
-        operations=budget.operations,
-        budget=budget,
-        seed=options.seed,
-    )
-    return Fit(found.map, choice)
-
-
 def _devices(devices: int | str | None) -> tuple[Any, ...]:
     """JAX's devices of this process that were asked for; none where nobody asked."""
     try:
@@ -336,7 +266,7 @@ def _smallest_determinant(chosen: Chosen) -> float:
     if piece is None:
         return float("nan")
     piece = jax.tree.map(np.asarray, piece)
-    rows = data.validation[:_STATES_MEASURED]
+    rows = data.validation[:STATES_MEASURED]
     dt, args = data.given(rows)
     piece = dataclasses.replace(piece, dt=dt) if data.own_dt is not None else piece
     determinant = piece.determinant(data.y0[rows], data.y1[rows], args)

@@ -22,8 +22,7 @@ from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
 from gfnn_jax.errors import FitWarning, OutOfTime
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.fitting.evidence import EVIDENCE
-from gfnn_jax.learn.positions import OfPositions
-from gfnn_jax.learn.posterior import work_of_posterior
+from gfnn_jax.learn.choose import work_of_posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
@@ -32,7 +31,37 @@ from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS
 from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.scenes.scene import Scene
 
+STATES_MEASURED = 200  # states at which the chosen map's defect and determinant are taken
 _OF_DERIVATIVE = 3.0  # times a step's: the time that compiling its derivative takes
+
+
+@dataclasses.dataclass(frozen=True)
+class OfPositions:
+    """Traits of an S of positions alone.
+
+    symmetric: whether S(q, Q) = S(Q, q). rank: how many combinations of its terms the data tell;
+    the others, the factor of S among them, are those of free motion. condition: of those told.
+    noise: σ (d,) of the readings, where they have noise and S was fitted with latent positions.
+    """
+
+    symmetric: bool
+    num_parameters: int
+    rank: int
+    condition: float
+    num_triples: int
+    noise: tuple[float, ...] | None = None
+
+    def __str__(self) -> str:
+        """Line about what was learned."""
+        left = self.num_parameters - self.rank
+        kind = "symmetric, as of a reversible map" if self.symmetric else "of no symmetry"
+        listed = "" if self.noise is None else ", ".join(f"{s:.3g}" for s in self.noise)
+        return (
+            f"S(q, Q) of {self.num_triples:,} triples of successive positions, {kind}. Positions "
+            "do not determine its scale: momenta, energies and areas have a unit of their own"
+            + (f". {left} undetermined combinations of terms are 0" if left else "")
+            + (f". The noise of the readings is {listed}" if listed else "")
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

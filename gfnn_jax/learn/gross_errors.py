@@ -24,7 +24,6 @@ from gfnn_jax.candidates.assemble import composed, stepped
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import error_of_each
-from gfnn_jax.diagnosis.diagnosis import Diagnosis
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.diagnose import diagnose_request
 from gfnn_jax.learn.request import Request
@@ -63,18 +62,10 @@ _OF_TREES, _OF_NEIGHBOURS = 500, 1_400
 _WHAT = "the search for pairs that the map misses by far"
 
 
-class Cleaned(NamedTuple):
-    """The diagnosis and the search without gross errors, and what is to be said of those."""
-
-    diagnosis: Diagnosis
-    found: Searched
-    messages: list[str]
-
-
-def without_gross_errors(request: Request, diagnosis: Diagnosis, found: Searched) -> Cleaned:
+def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, list[str]]:
     """Searched again without gross errors, as long as that lowers what is left over of the others,
     or without states that the map cannot follow, where the others then meet the tolerance; as it
-    is, where the tolerance is met, there are none, or too many."""
+    is, where the tolerance is met, there are none, or too many. And what is to be said of them."""
     wrong, rim, count = np.zeros(0, int), np.zeros(0, int), len(found.data)
     request = dataclasses.replace(request, factors=None, checkpoints=None)
     for _ in range(_ROUNDS):
@@ -106,8 +97,7 @@ def without_gross_errors(request: Request, diagnosis: Diagnosis, found: Searched
         at_rim = _at_the_rim(found, rows)
         request.on_progress(f"without {gone} of {count} pairs that the map misses by far")
         data = found.data.take(others)
-        anew = diagnose_request(request, data)
-        again = searched(request, data, anew, None)
+        again = searched(request, data, diagnose_request(request, data), None)
         left = _residuals(again)
         if left is not None:
             with request.budget.free(FLOW, left.work):
@@ -119,7 +109,7 @@ def without_gross_errors(request: Request, diagnosis: Diagnosis, found: Searched
             break
         named = found.data.row[rows]
         wrong, rim = (wrong, np.append(rim, named)) if at_rim else (np.append(wrong, named), rim)
-        diagnosis, found = anew, again
+        found = again
     messages = []
     if len(wrong):
         messages.append(
@@ -132,7 +122,7 @@ def without_gross_errors(request: Request, diagnosis: Diagnosis, found: Searched
             f"{_named(rim, count)} lie at the edge of the data, where S cannot follow them: the "
             "map is fitted, and its error stated, without them"
         )
-    return Cleaned(diagnosis, found, messages)
+    return found, messages
 
 
 def _named(rows: np.ndarray, count: int) -> str:

@@ -38,8 +38,7 @@ from gfnn_jax.models.generating_functions.sweeps import (
     part_of_noise,
 )
 from gfnn_jax.models.hamiltonians.choose_law import preferred
-from gfnn_jax.search.extrapolate import GAINED
-from gfnn_jax.search.search import Entry
+from gfnn_jax.search.search import GAINED, Entry
 
 _MOST_SWEEPS = 3
 _WHAT = "the fit of S to the states that noisy pairs most likely had"

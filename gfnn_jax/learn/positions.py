@@ -9,33 +9,36 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gfnn_jax.budget import ROWS, Budget
-from gfnn_jax.candidates.assemble import stepped
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import block_of, stepped
+from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import Coordinates, nearest_image
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.wrong_values import without_wrong_values
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, one_step_error
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.dataset.split import Split, split_rows
 from gfnn_jax.dataset.structures import Sites, structure_of
-from gfnn_jax.errors import FitError, OutOfTime
+from gfnn_jax.errors import FitError, FitWarning, OutOfTime
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import TYPE1
 from gfnn_jax.generating.generated import Generated
+from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit, OfPositions
+from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps.sensors import Sensors
-from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.positions.discrete_lagrangian import displacement, residuals, solve
 from gfnn_jax.models.positions.latent_positions import starting_noise, without_noise
 from gfnn_jax.models.positions.position_maps import images_of, map_of, states_of
 from gfnn_jax.models.positions.triples import Triples, triples_of
-from gfnn_jax.phase_space import Pairs, sizes
+from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.search.search import MET
 
 _DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)
@@ -49,66 +52,31 @@ _STALLED = 0.5  # of the residual, that a larger S leaves at least where reading
 _WINDOW = 40  # steps, from whose readings a state is estimated
 
 
-@dataclasses.dataclass(frozen=True)
-class OfPositions:
-    """Traits of an S of positions alone.
-
-    symmetric: whether S(q, Q) = S(Q, q). rank: how many combinations of its terms the data tell;
-    the others, the factor of S among them, are those of free motion. condition: of those told.
-    noise: σ (d,) of the readings, where they have noise and S was fitted with latent positions.
-    """
-
-    symmetric: bool
-    num_parameters: int
-    rank: int
-    condition: float
-    num_triples: int
-    noise: tuple[float, ...] | None = None
-
-    def __str__(self) -> str:
-        """Line about what was learned."""
-        left = self.num_parameters - self.rank
-        kind = "symmetric, as of a reversible map" if self.symmetric else "of no symmetry"
-        listed = "" if self.noise is None else ", ".join(f"{s:.3g}" for s in self.noise)
-        return (
-            f"S(q, Q) of {self.num_triples:,} triples of successive positions, {kind}. Positions "
-            "do not determine its scale: momenta, energies and areas have a unit of their own"
-            + (f". {left} undetermined combinations of terms are 0" if left else "")
-            + (f". The noise of the readings is {listed}" if listed else "")
-        )
-
-
-class LearnedPositions(NamedTuple):
-    """The map, every size that was tried, what its S is like, all states as pairs, the rows that
-    chose and those that state the error, and what is to be said."""
-
-    map: SymplecticMap
-    candidates: tuple[Candidate, ...]
-    positions: OfPositions
-    states: Pairs
-    validation: np.ndarray
-    test: np.ndarray
-    stated_by: str
-    messages: list[str]
-    ended: str
-    compile_seconds: float
-
-
 def learn_positions(
     recording: Recording,
-    *,
-    tolerance: Tolerance,
-    budget: Budget,
-    structure: str | None = None,
-    seed: int = 0,
-    on_progress: Callable[[str], Any] = lambda message: None,
-    on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
-) -> LearnedPositions:
-    """The map behind the positions of a recording, at even times or by turns.
+    options: FitOptions,
+    clock: Callable[[], float],
+    on_progress: Callable[[str], Any],
+    on_candidate: Callable[[Candidate], Any],
+) -> Fit:
+    """Learn the map behind positions alone, at even times or by turns: S(q, Q) of chart type 1.
 
-    structure: "ring" or "chain" of equal sites. Raises FitError where the triples are too few for
+    recording: its positions, of one run or many; an angle's values that range over more than one
+    turn are a lift and trusted, others known modulo 2π. options: of which the tolerance, a
+    structure of equal sites ("ring", "chain"), the seed and the budget apply. The rest as of
+    `gfnn.fit`; errors are those of the next position.
+
+    The map acts on z = (q, p), p = −h ∂S/∂q: ``map.from_positions`` and
+    ``map.rollout(positions=(q, Q), …)`` start it. Positions of one place tell p but for a factor
+    and a gauge, which `models.positions.discrete_lagrangian` fixes: frequencies, positions and
+    stability do not depend on them, the size of p, energies and areas do.
+    Raises FitError where the recording has no positions at even times, too few triples of them for
     the smallest S, or no S explains them.
     """
+    require_x64("a fit")
+    tolerance, structure = Tolerance.of(options), options.structure
+    recording, left_out = without_wrong_values(recording)
+    budget = options.budget(clock, len(recording.positions) or None)
     triples = triples_of(recording, sites=structure is not None)
     sites = structure_of(structure, triples.dim, Coordinates("positions", triples.angles))
     if sites is not None and not isinstance(sites, Sites):
@@ -128,7 +96,14 @@ def learn_positions(
         np.zeros((1, triples.dim)),
     )
     sweep = _Sweep(
-        triples, sites, _split(triples, seed), tolerance, budget, on_progress, on_candidate, sensors
+        triples,
+        sites,
+        _split(triples, options.seed),
+        tolerance,
+        budget,
+        on_progress,
+        on_candidate,
+        sensors,
     )
     best = sweep.best(symmetric=True)
     if best is None or best.candidate.validation_bound > tolerance.bound:
@@ -140,7 +115,10 @@ def learn_positions(
             f"{len(triples)} triples of positions gave no S(q, Q) whose step can be solved. Add "
             "positions, or raise --max-seconds (max_seconds=)"
         )
-    return sweep.learned(sweep.without_noise(best), on_progress)
+    fit = sweep.learned(sweep.without_noise(best), left_out, options.seed)
+    for message in fit.messages:
+        warnings.warn(message, FitWarning, stacklevel=3)
+    return fit
 
 
 class _Found(NamedTuple):
@@ -336,29 +314,23 @@ class _Sweep:
         error = nearest_image(positions - self.triples.after[rows], self.triples.angles)
         return one_step_error(error, self.spread, self.tolerance, self.split.stretch[rows])
 
-    def learned(self, best: _Found, on_progress: Callable[[str], Any]) -> LearnedPositions:
+    def learned(self, best: _Found, left_out: Sequence[str], seed: int) -> Fit:
         """The map of the best S, its error that of the steps that users run, on triples that chose
-        nothing where there are enough."""
-        on_progress(f"compiling the step of {best.candidate.label}")
+        nothing where there are enough. left_out: lines about readings that were."""
+        self.on_progress(f"compiling the step of {best.candidate.label}")
         sensors = dataclasses.replace(self.sensors, sigma=best.noise)
         map_, states = map_of(best.piece, best.root, sensors, self.triples, self.sites)
         test = self.split.test if len(self.split.test) else self.split.validation
         steps = stepped(map_, states.z1[test])
         images = np.where(steps.failed[:, None], np.nan, steps.images)[:, : self.triples.dim]
-        error = self.error_of(images, test)
         chosen = dataclasses.replace(
-            best.candidate,
-            validation_rms=error.rms,
-            validation_relative=error.relative,
-            validation_bound=error.bound,
-            deviations=error.deviations,
-            map=map_,
+            with_error(best.candidate, self.error_of(images, test)),
             chosen=True,
             newton_iterations_max=int(steps.iterations.max()),
             microseconds_per_step=steps.microseconds_per_step,
         )
         others = [c for c in self.tried if c is not best.candidate]
-        met, messages = chosen.validation_bound <= self.tolerance.bound, []
+        met, messages = chosen.validation_bound <= self.tolerance.bound, list(left_out)
         ended = MET if met else self.budget.ended or "larger S are no more accurate"
         if not met:
             messages.append(
@@ -366,20 +338,33 @@ class _Sweep:
                 f"accurate has a one-step error of {chosen.validation_relative:.2e} of the spread "
                 f"(95 % bound {chosen.validation_bound:.2e}); the search ended because {ended}"
             )
-        on_progress(str(best.about))
+        self.on_progress(str(best.about))
         part = "took no part in the fit or its choices" if test is self.split.test else "also chose"
-        return LearnedPositions(
-            map_,
-            tuple(sorted([*others, chosen], key=lambda c: c.operations)),
-            best.about,
-            states,
-            self.split.validation,
-            test,
-            f"{len(test):,} triples that {part}",
-            messages,
-            ended,
-            steps.compile_seconds,
+        tested = states.take(test[: min(STATES_MEASURED, block_of(2 * map_.dim))])
+        determinant = np.asarray(map_.determinant(tested.z0))
+        choice = Choice(
+            candidates=tuple(sorted([*others, chosen], key=lambda c: c.operations)),
+            asked=self.tolerance,
+            num_pairs=best.about.num_triples,
+            determinants={},
+            data_defect=float("nan"),
+            base_map=False,
+            noise=None,
+            messages=tuple(messages),
+            ended=ended,
+            seconds=self.budget.seconds,
+            compile_seconds=steps.compile_seconds,
+            test_states=np.asarray(tested.z0),
+            model_determinant_min=float(determinant[np.argmin(np.abs(determinant))]),
+            pairs=states,
+            positions=best.about,
+            stated_by=f"{len(test):,} triples that {part}",
+            validation_pairs=states.take(self.split.validation),
+            operations=self.budget.operations,
+            budget=self.budget,
+            seed=seed,
         )
+        return Fit(map_, choice)
 
 
 def _split(triples: Triples, seed: int) -> Split:

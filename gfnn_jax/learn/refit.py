@@ -20,10 +20,10 @@ from gfnn_jax.budget import FLOW, RATES, ROWS
 from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.errors import FitWarning
 from gfnn_jax.fitting.gauss_newton import FlowFit
+from gfnn_jax.learn.choose import FEWEST_RUNS_TESTED
 from gfnn_jax.learn.conclude import not_met
 from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.learn.refit_rows import RowsOfRefit, fitted_piece
-from gfnn_jax.learn.stated import FEWEST_RUNS_TESTED
 from gfnn_jax.maps.saved import packed, unpacked
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.hamiltonians.fitted_law import Term, formula

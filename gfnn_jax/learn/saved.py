@@ -16,8 +16,7 @@ from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.text import Term
-from gfnn_jax.learn.fitted import Choice, Fit
-from gfnn_jax.learn.positions import OfPositions
+from gfnn_jax.learn.fitted import Choice, Fit, OfPositions
 from gfnn_jax.maps import saved as maps
 from gfnn_jax.models.hamiltonians.fitted_law import Dropped, PartialLaw, Proposal, Rival
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian

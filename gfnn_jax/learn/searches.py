@@ -41,7 +41,7 @@ class Searched(NamedTuple):
     """law: H, or None. of_terms: S with parameters or of a structure, or None. linear: the linear
     map, where the budget has left nothing that is as accurate. found: the generated maps. swept:
     whether any were looked for. charts: theirs. data: the user's, nothing of it factored out.
-    tolerance: that was asked for."""
+    tolerance: that was asked for. diagnosis: of the pairs."""
 
     law: LearnedHamiltonian | None
     of_terms: LearnedMap | None
@@ -50,6 +50,7 @@ class Searched(NamedTuple):
     charts: Charts
     data: Dataset
     tolerance: Tolerance
+    diagnosis: Diagnosis
     linear: Candidate | None = None
 
     @property
@@ -58,9 +59,10 @@ class Searched(NamedTuple):
 
 
 def searched(
-    request: Request, data: Dataset, diagnosis: Diagnosis, on_better: OnBetter | None
+    request: Request, data: Dataset, taken: Diagnosis, on_better: OnBetter | None
 ) -> Searched:
     """Every candidate. Raises FitError where there is none."""
+    diagnosis = taken
     tolerance, budget, on_progress, on_candidate = (
         request.tolerance,
         request.budget,
@@ -133,7 +135,8 @@ def searched(
         best = found.ranking[0].candidate
         if best.validation_bound < of_terms.candidate.validation_bound:
             of_terms = None
-    return Searched(law, of_terms, found, bool(climb.sweeps), charts, data, tolerance, linear)
+    swept = bool(climb.sweeps)
+    return Searched(law, of_terms, found, swept, charts, data, tolerance, taken, linear)
 
 
 def _no_better(of_terms: LearnedMap, law: LearnedHamiltonian, tolerance: Tolerance) -> bool:

@@ -5,20 +5,24 @@ one that is accurate enough. A sweep is left that no longer gains, that another 
 whose errors do not lead to the tolerance where another's do, or whose largest size promises no more
 than another has reached.
 Only sizes that may be accurate enough, and the few best where none is, are validated by steps.
+
+A sweep is a protocol: who searches, chooses, states the error and draws the conclusions asks it for
+these members, and never which model it is of.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from gfnn_jax.budget import ROWS, SOLVE, Budget, OutOfTime
+from gfnn_jax.budget import ROWS, SOLVE, Budget
 from gfnn_jax.candidates.candidate import Candidate
-from gfnn_jax.search.extrapolate import GAINED, Decay, decay_of
-from gfnn_jax.search.sweep import Climbed
+from gfnn_jax.dataset.dataset import Dataset
+from gfnn_jax.errors import OutOfTime
 
 # A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
 # the odd degrees), and larger families only fit noise.
@@ -34,6 +38,85 @@ _NO_WORSE = 1.03  # an error larger by this factor is as good, if the map is che
 MET = "the tolerance is met"
 _KEPT = 0.1  # of the last kept map's error: a map so much better is kept in its stead
 _FAR = 10.0  # times the tolerance: a sweep that leads to no smaller error misses it
+# Sizes of a smaller range foretell nothing: an even S gains nothing from every other degree.
+_RANGE = 2.0
+# A size whose error ÷ the least before it is more than this has gained nothing; a sweep whose least
+# error, times this, is no larger than the best one's has come as far.
+GAINED = 0.8
+# Extrapolated over more than so many times the orders that were seen, a decay means nothing.
+_FARTHEST = 3.0
+OnProgress = Callable[[str], Any]
+
+
+@runtime_checkable
+class Climbed(Protocol):
+    """Sizes of one model as a search climbs them.
+
+    sizes: by rising ``operations`` of a step, each with an ``order`` with which the logarithm of
+    the error falls in proportion. short_of_pairs: whether more pairs would allow larger sizes.
+    """
+
+    sizes: Sequence[Any]
+    short_of_pairs: bool
+
+    def named(self, size: Any) -> str:
+        """Name of the unit of work that estimates the size."""
+        ...
+
+    def at(self, order: float) -> str:
+        """Name of a size of this order, and what it would take."""
+        ...
+
+    def work(self, size: Any) -> float:
+        """Operations that estimating its error takes."""
+        ...
+
+    def work_of_steps(self, size: Any) -> float:
+        """Operations that validating it takes."""
+        ...
+
+    def estimate(self, size: Any, budget: Budget, on_progress: OnProgress) -> Candidate:
+        """The size fitted, with its estimated error."""
+        ...
+
+    def validate(
+        self, size: Any, estimated: Candidate, budget: Budget, on_progress: OnProgress
+    ) -> Candidate:
+        """The estimated candidate with the error of its own steps."""
+        ...
+
+
+@runtime_checkable
+class Sweep(Climbed, Protocol):
+    """Sizes of one model on one data set, with what a fit goes on to ask of one of them.
+
+    data: the pairs that it is fitted to. linear: whether a size is a linear least-squares problem,
+    whose residuals, solutions from other rows and noise of the coefficients are at hand.
+    """
+
+    data: Dataset
+    linear: bool
+
+    def work_of_refit(self, size: Any) -> float:
+        """Operations that fitting it to other rows takes, infinite where it is not fitted anew."""
+        ...
+
+    def piece(self, size: Any) -> Any:
+        """The piece of a map (`maps.piece.Piece`) that the fitted size makes."""
+        ...
+
+    def images(self, size: Any, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Images of these rows (n, 2d), inner ones, and which steps were solved (n,)."""
+        ...
+
+    def predicted(self, size: Any, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Images (n, 2d) of these rows, in the user's coordinates, by a fit to other rows."""
+        ...
+
+    def posterior(self, size: Any) -> Callable[[], np.ndarray] | None:
+        """Function that makes the covariance root (k, m) of the params of the size's piece; None
+        where the model has none."""
+        ...
 
 
 class Entry(NamedTuple):
@@ -55,8 +138,44 @@ class Found(NamedTuple):
     ended: str
 
 
+@dataclasses.dataclass(eq=False)
+class _Climb:
+    """A sweep as far as it was climbed. best: of its estimates. ratio: of a step's error to its
+    estimate; None until a step has been looked at. stalled: sizes in a row without a gain. beaten:
+    how often another sweep was better. left: whether no larger size is tried. errors: (order,
+    bound) of the estimates."""
+
+    sweep: Climbed
+    best: float = np.inf
+    ratio: float | None = None
+    stalled: int = 0
+    beaten: int = 0
+    left: bool = False
+    errors: list[tuple[float, float]] = dataclasses.field(default_factory=list)
+
+    @property
+    def _calibration(self) -> float:
+        return 1.0 if self.ratio is None else self.ratio
+
+    @property
+    def reached(self) -> float:
+        """The smallest error, infinite where none is estimated."""
+        return self._calibration * min((e for _, e in self.errors), default=np.inf)
+
+    @property
+    def decay(self) -> Decay | None:
+        """The errors, extrapolated."""
+        return decay_of([(x, self._calibration * e) for x, e in self.errors])
+
+    @property
+    def end(self) -> float:
+        """The extrapolated error of the largest size; infinite where it is not known."""
+        decay = self.decay
+        return np.inf if decay is None else decay.error_at(self.sweep.sizes[-1].order)
+
+
 class Search:
-    """A climb of sweeps (`search.sweep.Climbed`), which may be made in parts.
+    """A climb of sweeps (`Climbed`), which may be made in parts.
 
     bound: the tolerance on a candidate's ``validation_bound``. on_candidate: called with every
     candidate. on_validated: called with every entry whose steps have been looked at.
@@ -74,17 +193,11 @@ class Search:
         self.sweeps, self._bound, self._budget = sweeps, bound, budget
         self._on_progress, self._on_candidate = on_progress, on_candidate
         self._on_validated = on_validated
+        self._climbs = [_Climb(sweep) for sweep in sweeps]
         self._queue = sorted(
             (size.operations, i, n) for i, s in enumerate(sweeps) for n, size in enumerate(s.sizes)
         )
         self._entries: list[Entry] = []
-        self._best = [np.inf] * len(sweeps)
-        # Of a step's error to its estimate, by sweep; None until a step has been looked at.
-        self._ratio: list[float | None] = [None] * len(sweeps)
-        self._beaten, self._stalled = [0] * len(sweeps), [0] * len(sweeps)
-        self._left: set[int] = set()
-        # (order, bound) of the estimates
-        self._errors: list[list[tuple[float, float]]] = [[] for _ in sweeps]
         self._cheapest, self._kept, self._unfinished = np.inf, np.inf, False
 
     def climb(self, dearest: float = np.inf, most: float = np.inf) -> None:
@@ -95,11 +208,12 @@ class Search:
         try:
             while self._queue:
                 operations, i, n = self._queue[0]
-                if i not in self._left and operations < self._cheapest:
-                    work = self.sweeps[i].work(self.sweeps[i].sizes[n])
+                climb = self._climbs[i]
+                if not climb.left and operations < self._cheapest:
+                    work = climb.sweep.work(climb.sweep.sizes[n])
                     if work > most and self._entries:
                         return
-                    self._look_at(i, n)
+                    self._look_at(climb, n)
                 self._queue.pop(0)
         except OutOfTime:
             self._unfinished = True
@@ -109,9 +223,9 @@ class Search:
         self.climb(dearest)
         return self.found()
 
-    def _look_at(self, i: int, n: int) -> None:
+    def _look_at(self, climb: _Climb, n: int) -> None:
         """One size: estimated, and validated by steps where it may be accurate enough."""
-        sweep, size = self.sweeps[i], self.sweeps[i].sizes[n]
+        sweep, size = climb.sweep, climb.sweep.sizes[n]
         follows = SOLVE, sweep.work_of_steps(size)
         with self._budget.unit(sweep.named(size), ROWS, sweep.work(size), then=follows):
             estimated = sweep.estimate(size, self._budget, self._on_progress)
@@ -122,37 +236,46 @@ class Search:
         # Something to keep should the search be interrupted is worth a few more looks.
         keep = self._on_validated is not None and relative < _KEPT * self._kept
         self._kept = min(self._kept, relative) if keep else self._kept
-        known = self._ratio[i]
-        ratio = 1.0 / _CALIBRATED if known is None else known
+        ratio = 1.0 / _CALIBRATED if climb.ratio is None else climb.ratio
         if keep or ratio * estimated.validation_bound <= _WITHIN_REACH * self._bound:
-            entry = self._validated(entry)
+            entry = self._validated(entry, self._budget)
             error = entry.candidate.validation_relative
             if np.isfinite(error) and relative > 0:
-                self._ratio[i] = error / relative
+                climb.ratio = error / relative
         candidate = entry.candidate
         self._on_candidate(candidate)
         if candidate.validated and self._on_validated is not None:
             self._on_validated(entry)
         if candidate.validated and candidate.validation_bound <= self._bound:
             self._cheapest = min(self._cheapest, size.operations)
-            self._left.add(i)
-        self._stalled[i] = self._stalled[i] + 1 if relative > GAINED * self._best[i] else 0
-        self._best[i] = min(self._best[i], relative)
-        self._beaten[i] += any(_beats(e.candidate, estimated) for e in self._entries)
-        if self._stalled[i] == _STALLED or self._beaten[i] == _BEATEN:
-            self._left.add(i)
-        self._errors[i].append((size.order, estimated.validation_bound))
-        self._left |= _hopeless(self.sweeps, self._errors, self._ratios, self._left, self._bound)
+            climb.left = True
+        climb.stalled = climb.stalled + 1 if relative > GAINED * climb.best else 0
+        climb.best = min(climb.best, relative)
+        climb.beaten += any(_beats(e.candidate, estimated) for e in self._entries)
+        climb.left |= climb.stalled == _STALLED or climb.beaten == _BEATEN
+        climb.errors.append((size.order, estimated.validation_bound))
+        for hopeless in [c for c in self._climbs if self._is_hopeless(c)]:
+            hopeless.left = True
 
-    def _validated(self, entry: Entry) -> Entry:
+    def _is_hopeless(self, climb: _Climb) -> bool:
+        """Return whether the sweep's largest size would miss the bound by far, where another sweep
+        has a smaller error already, or has come as far and leads to the bound."""
+        end = climb.end
+        if not (_FAR * self._bound < end < np.inf):
+            return False
+        return any(
+            other.reached < end
+            or (not other.left and other.end <= self._bound and other.reached <= climb.reached)
+            for other in self._climbs
+            if other is not climb
+        )
+
+    def _validated(self, entry: Entry, budget: Budget) -> Entry:
         """The entry with its error measured by steps, in its place among the others."""
         sweep, size = entry.sweep, entry.size
-        name = f"steps of {sweep.named(size)}"
-        with self._budget.unit(name, SOLVE, sweep.work_of_steps(size)):
-            candidate = sweep.validate(size, entry.candidate, self._budget, self._on_progress)
-        return self._replaced(entry, candidate)
-
-    def _replaced(self, entry: Entry, candidate: Candidate) -> Entry:
+        unit = budget.unit(f"steps of {sweep.named(size)}", SOLVE, sweep.work_of_steps(size))
+        with unit:
+            candidate = sweep.validate(size, entry.candidate, budget, self._on_progress)
         place = next(k for k, e in enumerate(self._entries) if e is entry)
         self._entries[place] = entry._replace(candidate=candidate)
         return self._entries[place]
@@ -163,21 +286,17 @@ class Search:
         does."""
         return self._cheapest
 
-    @property
-    def _ratios(self) -> list[float]:
-        return [1.0 if r is None else r for r in self._ratio]
-
     def found(self) -> Found:
         """Gather what there is; where nothing meets the tolerance, with the few best validated."""
         met = bool(np.isfinite(self._cheapest))
         if not met:
             self._validate_the_best()
-        sweeps, stalled = self.sweeps, self._stalled
-        entries = [_calibrated(e, self._ratio[sweeps.index(e.sweep)]) for e in self._entries]
+        ratios = {id(climb.sweep): climb.ratio for climb in self._climbs}
+        entries = [_calibrated(e, ratios[id(e.sweep)]) for e in self._entries]
         ended = MET
         if not met:
-            ended = self._budget.ended if self._unfinished else _why(sweeps, stalled, self._best)
-            ended += _promised(sweeps, self._errors, self._ratios, stalled, self._bound)
+            ended = self._budget.ended if self._unfinished else _why(self._climbs)
+            ended += _promised(self._climbs, self._bound)
         return Found(entries, _ranking(entries, self._bound), _stalled_sweeps(entries), ended)
 
     def _validate_the_best(self) -> None:
@@ -185,66 +304,26 @@ class Search:
         best = _finalists([e for e in self._entries if not e.candidate.validated])
         for place, entry in enumerate(best):
             if place == 0:
-                work = entry.sweep.work_of_steps(entry.size)
-                with self._budget.free(SOLVE, work):
-                    free = Budget()
-                    estimated = entry.sweep.validate(
-                        entry.size, entry.candidate, free, self._on_progress
-                    )
-                self._replaced(entry, estimated)
+                with self._budget.free(SOLVE, entry.sweep.work_of_steps(entry.size)):
+                    self._validated(entry, Budget())
                 continue
             try:
-                self._validated(entry)
+                self._validated(entry, self._budget)
             except OutOfTime:
                 return
 
 
-def _decays(errors, ratio: list[float]) -> list[Decay | None]:
-    """Extrapolate the errors of each sweep."""
-    return [
-        decay_of([(x, r * e) for x, e in sizes]) for sizes, r in zip(errors, ratio, strict=True)
-    ]
-
-
-def _hopeless(
-    sweeps: Sequence[Any], errors, ratio: list[float], left: set[int], bound: float
-) -> set[int]:
-    """The sweeps whose largest size would miss the bound by far, where another sweep has a smaller
-    error already, or has come as far and leads to the bound."""
-    ends = {
-        i: found.error_at(sweeps[i].sizes[-1].order)
-        for i, found in enumerate(_decays(errors, ratio))
-        if found is not None
-    }
-    reached = _reached(errors, ratio)
-
-    def better(j: int, i: int) -> bool:
-        leads = j not in left and ends.get(j, np.inf) <= bound and reached[j] <= reached[i]
-        return j != i and (leads or reached[j] < ends[i])
-
-    far = [i for i, end in ends.items() if end > _FAR * bound]
-    return {i for i in far if any(better(j, i) for j in range(len(sweeps)))}
-
-
-def _reached(errors, ratio: list[float]) -> list[float]:
-    """The smallest error of each sweep, infinite where none is estimated."""
-    return [r * min((e for _, e in s), default=np.inf) for s, r in zip(errors, ratio, strict=True)]
-
-
-def _promised(
-    sweeps: Sequence[Any], errors, ratio: list[float], stalled: Sequence[int], bound: float
-) -> str:
+def _promised(climbs: Sequence[_Climb], bound: float) -> str:
     """Extrapolation of the most accurate sweep's errors to a size that would meet the bound;
     nothing where they stall, or are too few to say."""
-    reached = _reached(errors, ratio)
-    i = int(np.argmin(reached)) if reached else 0
-    found = _decays(errors, ratio)[i] if reached else None
-    if found is None or stalled[i] == _STALLED:
+    best = min(climbs, key=lambda climb: climb.reached, default=None)
+    decay = None if best is None or best.stalled == _STALLED else best.decay
+    if best is None or decay is None:
         return ""
-    order = found.order_for(bound)
+    order = decay.order_for(bound)
     if order is None:
         return "; its error falls too slowly to predict which size would meet the tolerance"
-    return f"; extrapolated, {sweeps[i].at(order)} would meet the tolerance"
+    return f"; extrapolated, {best.sweep.at(order)} would meet the tolerance"
 
 
 def _calibrated(entry: Entry, ratio: float | None) -> Entry:
@@ -320,14 +399,65 @@ def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
     return found
 
 
-def _why(sweeps: Sequence[Any], stalled: list[int], best: Sequence[float]) -> str:
+def _why(climbs: Sequence[_Climb]) -> str:
     """Reason why a search that met nothing ended before its time. Sweeps far from the best one's
     error tell nothing."""
-    good = [i for i, s in enumerate(sweeps) if s.sizes and GAINED * best[i] <= min(best)]
-    if any(stalled[i] == _STALLED for i in good):
+    least = min((climb.best for climb in climbs), default=np.inf)
+    good = [c for c in climbs if c.sweep.sizes and GAINED * c.best <= least]
+    if any(climb.stalled == _STALLED for climb in good):
         return "larger models are no more accurate"
-    if any(sweeps[i].short_of_pairs for i in good):
+    if any(climb.sweep.short_of_pairs for climb in good):
         return "the pairs determine no larger model: more pairs would help"
     if good:
         return "there is no larger model to try: a smaller dt or region of states would help"
     return "the pairs determine no model at all"
+
+
+class Decay(NamedTuple):
+    """The logarithm of a sweep's error falls by ``rate`` per unit of order, from ``error`` at
+    ``order``, at orders that are ``spacing`` apart. first: the order of the first size."""
+
+    first: float
+    order: float
+    error: float
+    rate: float
+    spacing: float
+
+    def error_at(self, order: float) -> float:
+        """The error of the size of this order."""
+        steps = math.floor(max(order - self.order, 0.0) / self.spacing + 1e-9)
+        return self.error * math.exp(-self.rate * self.spacing * steps)
+
+    def order_for(self, bound: float) -> float | None:
+        """The smallest order whose error is within the bound; None where it is too far to tell."""
+        if self.rate <= 0:
+            return None
+        fall = max(math.log(self.error / bound), 0.0)
+        found = self.order + self.spacing * math.ceil(fall / (self.rate * self.spacing) - 1e-9)
+        far = found - self.first > _FARTHEST * max(self.order - self.first, self.spacing)
+        return None if far else found
+
+
+def decay_of(sizes: Sequence[tuple[float, float]]) -> Decay | None:
+    """The decay of sizes (order, error), by rising order; None where they are too few.
+
+    Only sizes count that gain: an even S gains from every other degree. The rate is the better one
+    of the last two, each over two gains, so that a sweep is rather thought to be good.
+    """
+    finite = [(x, e) for x, e in sizes if 0 < e < math.inf]
+    if not finite or finite[-1][0] - finite[0][0] < _RANGE:
+        return None
+    gains = finite[:1]
+    for order, error in finite[1:]:
+        if error < GAINED * gains[-1][1]:
+            gains.append((order, error))
+    (first, _), (order, error) = gains[0], gains[-1]
+    if len(gains) == 1:
+        return Decay(first, order, error, 0.0, 1.0)
+    ends = [j for j in range(1, len(gains)) if j >= len(gains) - 2 and (j > 1 or len(gains) == 2)]
+    rates = (_rate(gains[max(j - 2, 0)], gains[j]) for j in ends)
+    return Decay(first, order, error, max(rates), order - gains[-2][0])
+
+
+def _rate(one: tuple[float, float], other: tuple[float, float]) -> float:
+    return math.log(one[1] / other[1]) / (other[0] - one[0])
