@@ -93,7 +93,7 @@ class Caught(Exception):
 
 @pytest.fixture(scope="module")
 def spoilt():
-    """(request, diagnosis, search) of an oscillator with noise, three of whose images are then
+    """(request, search) of an oscillator with noise, three of whose images are then
     moved: before the search neighbours would tell them."""
     rng = np.random.default_rng(0)
     z0 = rng.uniform(-1, 1, (300, 2))
@@ -109,18 +109,18 @@ def spoilt():
         patch.setattr(fit, "without_gross_errors", caught)
         with pytest.raises(Caught) as known:
             gfnn.fit(pairs, max_seconds=None, **options)
-    request, seen, found = known.value.args
+    request, found = known.value.args
     z1 = found.data.y1.copy()
     z1[[20, 150, 222]] += 0.03
     data = dataclasses.replace(found.data, y1=z1, pairs=dataclasses.replace(pairs, z1=z1))
-    return request, seen, found._replace(data=data)
+    return request, found._replace(data=data)
 
 
 @pytest.fixture
 def looked_for(spoilt, monkeypatch):
     """Budget -> (number of pairs that are left, the states whose image was asked for)."""
     asked, image = [], Flow.image
-    request, seen, found = spoilt
+    request, found = spoilt
 
     def counted(self, z, *args):
         asked.append(len(z))
@@ -130,7 +130,7 @@ def looked_for(spoilt, monkeypatch):
         asked.clear()
         given = dataclasses.replace(request, budget=budget)
         monkeypatch.setattr(Flow, "image", counted)
-        return len(gross_errors.without_gross_errors(given, seen, found).found.data), sum(asked)
+        return len(gross_errors.without_gross_errors(given, found)[0].data), sum(asked)
 
     return looked
 

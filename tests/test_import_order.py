@@ -71,7 +71,7 @@ SHORTHANDS = {
 }
 SHORTHANDS |= {
     ("data.recording", "data.recording_summary"),
-    ("learn.fitted", "learn.accelerate"),
+    ("learn.fitted", "learn.fit"),
     ("learn.fitted", "learn.saved"),
     ("learn.fitted", "evaluate.report"),
 }

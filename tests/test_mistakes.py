@@ -12,7 +12,7 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.learn.check import unnamed_angles
+from gfnn_jax.learn.request import unnamed_angles
 
 DT = 0.1
 RNG = np.random.default_rng(0)

@@ -183,23 +183,3 @@ def test_a_foreign_description(change, message, tmp_path):
     save_model(tmp_path / "m", arrays, description)
     with pytest.raises(InputError, match=message):
         models.load(tmp_path / "m")
-
-
-def test_a_model_with_the_former_names_loads(tmp_path):
-    """Fields and types that were renamed since it was saved."""
-    map_ = a_map(*polynomial(), predictor=predictor())
-    models.save(map_, tmp_path / "m")
-    arrays, description = load_model(tmp_path / "m")
-    for tree in (description["map"], arrays):
-        if "angle_centre" in tree:
-            tree["cut"] = tree.pop("angle_centre")
-        piece = tree["pieces"]["0"]
-        piece["scalar"] = piece.pop("family")
-        sides = piece.pop("predictor")
-        piece["there"], piece["back"] = sides["forward"], sides["backward"]
-    for side in ("there", "back"):
-        description["map"]["pieces"]["0"][side]["type"] = "Start"
-    save_model(tmp_path / "m", arrays, description)
-    loaded = models.load(tmp_path / "m")
-    assert jax.tree.structure(loaded) == jax.tree.structure(map_)
-    jax.tree.map(np.testing.assert_array_equal, loaded, map_)

@@ -27,7 +27,6 @@ from gfnn_jax.jobs.search import (
     scene_named,
     search,
 )
-from gfnn_jax.learn.check import FEWEST
 from gfnn_jax.learn.fit import fit as learn_fit
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.learn.refit import (
@@ -38,6 +37,7 @@ from gfnn_jax.learn.refit import (
     why_not,
     work_of_refit,
 )
+from gfnn_jax.learn.request import FEWEST
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group, Share

@@ -22,10 +22,9 @@ from gfnn_jax.diagnosis.residuals import (
 )
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting.significance import CERTAIN
-from gfnn_jax.learn.check import not_radians, wrapped
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.propose import proposed
-from gfnn_jax.learn.request import Request
+from gfnn_jax.learn.request import Request, not_radians, wrapped
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.size import OF_SOLVE, OF_STEPS
 from gfnn_jax.models.hamiltonians.choose_law import long_step

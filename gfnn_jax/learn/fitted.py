@@ -344,9 +344,9 @@ class Fit:
         Raises FitError where no Hamiltonian was learned that meets the tolerance or was chosen, or
         its flow fails in the region, InputError for a region that is none.
         """
-        from gfnn_jax.learn import accelerate  # stands after this module: a shorthand
+        from gfnn_jax.learn import fit  # stands after this module: a shorthand
 
-        return accelerate.accelerated(
+        return fit.accelerated(
             self,
             dt=dt,
             region=region,

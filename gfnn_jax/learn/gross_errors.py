@@ -25,8 +25,7 @@ from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import error_of_each
 from gfnn_jax.errors import OutOfTime
-from gfnn_jax.learn.diagnose import diagnose_request
-from gfnn_jax.learn.request import Request
+from gfnn_jax.learn.request import Request, diagnose_request
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.models.generating_functions.size import Size
 from gfnn_jax.models.generating_functions.sweeps import LinearSweep

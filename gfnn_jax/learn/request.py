@@ -1,30 +1,240 @@
-"""Request of a fit, checked before any work."""
+"""Request of a fit: the pairs, checked before any work, those of them that the budget pays for, and
+their diagnosis.
+
+Refusals are one line each: what was expected and what came. What every fit does with each pair, the
+looks at copies, outliers and local Jacobians and the first models, has to fit into the budget
+before anything is begun; otherwise whole runs are left aside. That is decided by operations: the
+clock of a busy machine changes no sample.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 
-from gfnn_jax.budget import Budget
+from gfnn_jax.budget import RATES, ROWS, Budget
 from gfnn_jax.candidates.candidate import Candidate
-from gfnn_jax.coordinates import Coordinates
+from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
-from gfnn_jax.dataset.structures import Structure, structure_of
-from gfnn_jax.dataset.varied import as_varied
-from gfnn_jax.learn.check import (
-    check_moves,
-    check_request,
-    coarse_tolerance,
-    unlike_the_scene,
-    unnamed_angles,
-)
+from gfnn_jax.dataset.runs import Identified, sampled
+from gfnn_jax.dataset.structures import Structure, fields_of, structure_of
+from gfnn_jax.dataset.varied import as_varied, check_varied
+from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed, lossy, undiagnosed
+from gfnn_jax.diagnosis.local_jacobians import check_number
+from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.sums import site_terms
+from gfnn_jax.families.terms import given_terms
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
-from gfnn_jax.phase_space import Pairs
-from gfnn_jax.scenes.scene import Scene
+from gfnn_jax.models.maps_of_laws.law_maps import factored_out, flow_of
+from gfnn_jax.phase_space import Pairs, sizes, split
+from gfnn_jax.scenes.draws import sample_states
+from gfnn_jax.scenes.scene import AroundOrbit, Scene
+
+_OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
+_COMPARED = 100
+FEWEST = 8  # pairs of a structure: 4 train, 4 are held out
+_COARSE = 0.01  # of what a step moves
+_FEWEST_JUMPS = 3  # by 2π, that make an angle
+_STILL = 1e-15  # of the spread: no move
+
+
+def check_request(
+    pairs: Pairs, scene: Scene | None, options: FitOptions, structure: str | None
+) -> None:
+    """Raises FitError where the pairs cannot give what is asked for.
+
+    structure: of the options, or the scene's.
+    """
+    angles = options.angles
+    if scene is not None and not isinstance(scene, Scene):
+        raise FitError(f"expected a scene, as gfnn.scenes.make('two-body'), got {scene!r}")
+    own_dt = bool(np.ndim(pairs.dt))
+    if (
+        not own_dt
+        and not isinstance(pairs.dt, numbers.Real)
+        and (pairs.dt is None or isinstance(pairs.dt, str) or np.shape(pairs.dt) != ())
+    ):
+        raise FitError(f"expected a number as time step, got {pairs.dt!r}")
+    for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
+        if np.dtype(z.dtype).kind not in "fiu":
+            raise FitError(f"expected {name} of real numbers, got {z.dtype}")
+    if scene is not None and scene.dim != pairs.dim:
+        raise FitError(f"scene {scene.name} has dim {scene.dim}, the pairs have {pairs.dim}")
+    if scene is not None and angles:
+        raise FitError("angles come with the scene: give a scene or angles, not both")
+    bad = [a for a in angles if not 0 <= a < 2 * pairs.dim]
+    if bad or len(set(angles)) < len(angles):
+        raise FitError(
+            f"expected different angles among 0..{2 * pairs.dim - 1}, got {tuple(angles)}"
+        )
+    if own_dt or pairs.args or pairs.period is not None:
+        check_varied(pairs)
+    if pairs.period is not None and options.chart == "type1":
+        raise FitError("expected another chart than type1 for a driven map")
+    if not own_dt and not 0 < float(pairs.dt) < np.inf:
+        raise FitError(
+            f"expected a time step that is finite and above 0, got {pairs.dt}"
+            + (float(pairs.dt) < 0) * ": where z1 come before z0 in time, exchange them"
+        )
+    known = () if options.base is None else (options.base,)
+    try:
+        if structure is not None:
+            _check_structured(structure, scene, options, pairs)
+        given_terms(pairs.dim, () if structure else options.terms, tuple(pairs.args or ()))
+        given_terms(pairs.dim, known)
+    except (InputError, jax.errors.ConcretizationTypeError) as error:
+        raise FitError(str(error)) from error
+    if options.family == "features" and (scene is None or scene.features is None):
+        raise FitError("family 'features' needs a scene that declares features")
+    for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
+        finite = np.isfinite(np.asarray(z)).all(axis=1)
+        if not finite.all():
+            raise FitError(
+                f"expected finite states, got {int((~finite).sum())} rows of {name} with NaN or "
+                f"infinity, the first is row {int(np.argmin(finite))}"
+            )
+    if structure is None:
+        check_number(pairs)
+    elif len(pairs) < FEWEST:
+        raise FitError(f"expected at least {FEWEST} pairs, got {len(pairs)}")
+
+
+def check_moves(pairs: Pairs) -> None:
+    """Raises FitError where no state moves."""
+    z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
+    if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= _STILL:
+        raise FitError(
+            "expected states that move, got z1 = z0 in every pair: is H = 0, or are these the same "
+            "columns twice?"
+        )
+
+
+def _check_structured(
+    structure: str, scene: Scene | None, options: FitOptions, pairs: Pairs
+) -> None:
+    """Raises FitError for what does not go with a structure."""
+    learn, terms, chart = options.learn, options.terms, options.chart
+    coordinates = scene.coordinates if scene is not None else CARTESIAN
+    bodies, angles = structure.startswith("bodies"), options.angles or coordinates.angles
+    own = coordinates.forward is not CARTESIAN.forward or coordinates.cyclic
+    refused = {
+        "it has its own terms: expected no family or base": (options.family, options.base)
+        != ("auto", None),
+        "expected another chart than type1": chart == "type1",
+        "only H is learned, expected no learn='map' or chart": bodies
+        and (learn == "map" or chart != "auto"),
+        "expected no angles": bodies and angles,
+        "expected plain q and p, no coordinates of a scene, parameters or drive": own
+        or pairs.args
+        or pairs.period is not None,
+        "with angles only S is learned (learn='map'), expected no terms, which are of H": angles
+        and (learn == "hamiltonian" or terms),
+        "learn='map' expects pairs of one dt, got several": learn == "map" and np.ndim(pairs.dt),
+        "expected no terms, it has powers of distances": terms and bodies,
+        "expected terms as text in q1, p1 of a site and q2, p2, … of the next ones": not all(
+            isinstance(term, str) for term in terms
+        ),
+    }
+    for why, given in refused.items():
+        if given:
+            raise FitError(f"structure {structure}: {why}")
+    for term in terms:
+        site_terms(pairs.dim, "ring", 0, 0, (str(term),), max(1, fields_of(structure)))
+
+
+def unlike_the_scene(pairs: Pairs, scene: Scene) -> list[str]:
+    """Warnings where the pairs are of another size than the scene's states: 1/r₁ and the like know
+    where the scene's bodies are, in its units."""
+    import jax  # loaded when first used
+
+    if isinstance(scene.sampling, AroundOrbit):
+        states = np.asarray(scene.sampling.start)[None, :]
+    else:
+        states = np.asarray(sample_states(scene, _COMPARED, jax.random.key(0)))
+    messages = []
+    for name, ours, theirs in zip(
+        ("positions", "momenta"), split(np.asarray(pairs.z0)), split(states), strict=True
+    ):
+        size, usual = (float(np.median(np.linalg.norm(x, axis=1))) for x in (ours, theirs))
+        if usual > 0 and not 1 / _OTHER_SIZE < size / usual < _OTHER_SIZE:
+            messages.append(
+                f"the {name} are {size / usual:.2g} times the size of those in the scene "
+                f"{scene.name}, whose features assume its own units: are the data in these?"
+            )
+    return messages
+
+
+def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
+    """A warning where the tolerance exceeds a hundredth of what a step moves."""
+    z0, move = np.asarray(pairs.z0), np.asarray(pairs.z1) - np.asarray(pairs.z0)
+    # An angle that turned over moves little, whatever the difference of its numbers: the median.
+    moved = np.median(np.abs(move / sizes(z0)) if tolerance.relative else np.abs(move), axis=0)
+    size = float(np.sqrt(np.mean(moved**2)))
+    if not tolerance.bound > _COARSE * size > 0:
+        return []
+    unit = "of the coordinates' spread" if tolerance.relative else "in the data's units"
+    option = "tolerance" if tolerance.relative else "absolute_tolerance"
+    return [
+        f"a step moves the states by {size:.1e} {unit}: maps close to the identity meet the "
+        f"tolerance {tolerance.bound:g}. Set --{option.replace('_', '-')} ({option}=) to "
+        f"{_COARSE * size:.0e} or less"
+    ]
+
+
+def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
+    """Warnings where what is declared an angle hardly is one: it runs over more than two turns, and
+    moves by more than half a turn in a step. For fits that came out badly."""
+    if coordinates.forward is not CARTESIAN.forward:
+        return []
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    range_, move = np.ptp(z0, axis=0), np.abs(z1 - z0).max(axis=0)
+    return [
+        f"coordinate {a} of z, given as an angle, ranges over {range_[a]:.3g} and moves by up to "
+        f"{move[a]:.3g} in a step. Angles are in radians: are these degrees? Convert them, or take "
+        f"{a} out of --angles (angles=)"
+        for a in coordinates.angles
+        if range_[a] > 2 * TWO_PI and move[a] > np.pi
+    ]
+
+
+def wrapped(pairs: Pairs, coordinates: Coordinates) -> list[int]:
+    """Indices in z of what jumps by 2π, as an angle does that is wrapped and was not named: its
+    values lie within one turn, some moves are beyond half a turn, and those are moves of the size
+    of the others where 2π is taken from them."""
+    if coordinates.forward is not CARTESIAN.forward:
+        return []
+    z0, move = np.asarray(pairs.z0), np.asarray(pairs.z1) - np.asarray(pairs.z0)
+    found = []
+    for i in (i for i in range(2 * pairs.dim) if i not in coordinates.angles):
+        size = np.abs(move[:, i])
+        jumps = size > np.pi
+        if not _FEWEST_JUMPS <= jumps.sum() < len(size) / 2 or np.ptp(z0[:, i]) > TWO_PI:
+            continue
+        most = min(1.5 * size[~jumps].max(), np.pi / 2)
+        if np.abs(size[jumps] - TWO_PI).max() <= most:
+            found.append(i)
+    return found
+
+
+def unnamed_angles(pairs: Pairs, coordinates: Coordinates) -> list[str]:
+    """A warning that names the coordinates which are `wrapped` angles, and the option."""
+    found = wrapped(pairs, coordinates)
+    if not found:
+        return []
+    move = np.abs(np.asarray(pairs.z1) - np.asarray(pairs.z0))
+    count, indices = int((move[:, found] > np.pi).any(axis=1).sum()), ",".join(map(str, found))
+    named = "coordinate " + indices if len(found) == 1 else f"coordinates {indices}"
+    return [
+        f"{named} of z: jumps of 2π in {count} of {len(pairs)} pairs, as of an angle that is "
+        f"wrapped; name it: --angles {indices}, angles=({indices},)"
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,3 +323,50 @@ def checked(pairs: Pairs, scene: Scene | None, options: FitOptions, **others: An
     messages += [*coarse_tolerance(pairs, bound), *unnamed_angles(pairs, coordinates)]
     options = dataclasses.replace(options, learn=learn)
     return Request(pairs, scene, coordinates, options, bound, found, messages=messages, **others)
+
+
+# Operations that a pair takes of the looks and of the search for H, in units of (2d)²: a million
+# pairs of two degrees of freedom take 22 s (benchmarks/budgets.py).
+_OF_PAIR = 12_500
+# A sample takes so many, a second, and has so many pairs at least.
+_OF_SAMPLE, _FEWEST = 1e10, 2_000
+
+
+def paid_for(found: Identified, budget: Budget, seed: int) -> Identified:
+    """The pairs, or a sample of them, drawn by the seed, where the budget does not pay for all:
+    of two degrees of freedom 50,000. That is told with what else was left out."""
+    pairs, row = found
+    count, of_pair = len(pairs), _OF_PAIR * (2 * pairs.dim) ** 2
+    most = max(_FEWEST, int(_OF_SAMPLE / of_pair))
+    work = count * of_pair
+    if count <= most or budget.pays_for(work):
+        return found
+    rows = sampled(pairs, most, seed)
+    enough = f"--max-seconds {work / RATES[ROWS]:.0f}"
+    if budget.max_operations is not None:
+        enough = f"--max-operations {work:,}"
+    budget.leave_out(
+        f"{count - len(rows):,} of {count:,} pairs",
+        f"the budget pays for a sample; {enough} pays for all",
+    )
+    return Identified(pairs.take(rows), row[rows])
+
+
+def diagnose_request(request: Request, plain: Dataset) -> Diagnosis:
+    """The diagnosis of the pairs that a fit takes; a law that the user knows is factored out.
+
+    plain: as taken. Raises FitError where no chart covers the data.
+    """
+    data, options = plain, request.options
+    by_args = plain.args is not None and plain.period is None and plain.own_dt is None
+    if by_args and plain.structure is None and options.learn != "hamiltonian":
+        return lossy(plain, options.chart, request.reversor, options.seed)
+    if plain.varied or plain.structure is not None:
+        return undiagnosed(plain)
+    if options.base is not None:
+        known = given_terms(plain.dim, (options.base,))
+        flow = flow_of(known, np.ones(known.num_parameters), plain)
+        _, data = factored_out([flow], plain, options.seed)
+    # A law of the user's keeps areas, and so does what H of an autonomous system generates.
+    may_lose = options.base is None and options.learn != "hamiltonian" and not plain.after
+    return diagnosed(data, options.chart, request.reversor, options.seed, may_lose=may_lose)

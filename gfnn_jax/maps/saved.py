@@ -124,13 +124,6 @@ def _is_tuple(kind: type) -> bool:
     return issubclass(kind, tuple) and hasattr(kind, "_fields")
 
 
-# Names in models that earlier releases saved.
-_FORMER_TYPES = {"Start": "PolynomialModel"}
-_FORMER_FIELDS = {
-    ("Generated", "scalar"): "family",
-    ("SymplecticMap", "cut"): "angle_centre",
-    ("Ranges", "seen"): "sums",
-}
 # Stands in the description where a function of the scene belongs.
 _OF_SCENE = "of the scene"
 _DESCRIBED = "described"  # name of the text among the arrays of `packed`
@@ -197,7 +190,7 @@ def load_beside(folder, scene: Scene | None = None) -> tuple[SymplecticMap, dict
         raise InputError(f"{folder}: was learned in the scene '{name}', not in '{scene.name}'")
     texts, trees = description.get("beside", {}), arrays.pop("beside", None) or {}
     try:
-        map_ = _decode(*_renamed(description["map"], arrays), scene)
+        map_ = _decode(description["map"], arrays, scene)
         names = [name for name in {**texts, **trees} if name != "type"]
         beside = {name: _decode(texts.get(name), trees.get(name), scene) for name in names}
         return map_, {**beside, "record": description["record"]}
@@ -380,32 +373,6 @@ def _decode(text: Any, arrays: Any, scene: Scene | None) -> Any:
             "(gfnn_jax.register)"
         )
     return _TYPES[kind](**items)
-
-
-def _renamed(text: Any, arrays: Any) -> tuple[Any, Any]:
-    """Rename types and fields of earlier releases in the tree."""
-    if not isinstance(text, dict) or "type" not in text:
-        return text, arrays
-    kind: str = _FORMER_TYPES.get(str(text["type"])) or text["type"]
-    words: dict[str, Any] = {"type": kind}
-    numbers: dict[str, Any] = {}
-    names: list[str] = [n for n in {**text, **(arrays or {})} if n != "type"]
-    for name in names:
-        inside = _renamed(text.get(name), (arrays or {}).get(name))
-        name_now = _FORMER_FIELDS.get((kind, name), name)
-        if name in text:
-            words[name_now] = inside[0]
-        if arrays and name in arrays:
-            numbers[name_now] = inside[1]
-    if kind == "Generated" and "there" in words:
-        sides = {"forward": "there", "backward": "back"}
-        predictor = {now: words.pop(former) for now, former in sides.items()}
-        found = {n: numbers.pop(f) for n, f in sides.items() if f in numbers}
-        given = predictor["forward"] is not None
-        words["predictor"] = {"type": "Predictor", **predictor} if given else None
-        if given:
-            numbers["predictor"] = found
-    return words, numbers or None
 
 
 def _decode_coordinates(text: dict[str, Any], scene: Scene | None) -> Coordinates:
