@@ -23,11 +23,21 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.solve.status import LEFT_DOMAIN
 
 _TIMING = "the time of a step, and the error of compiled ones"
-_PREDICTOR_PAIRS = 2_000
-# States are stepped in blocks of one shape, whatever their number: compiled once for a kind of map.
-# A block of wide states is of so many numbers.
-_BLOCK, _BLOCK_NUMBERS = 512, 2**16
-_REPEATS = 5  # of a timed block; the best counts
+
+
+@dataclasses.dataclass(frozen=True)
+class AssemblyOptions:
+    """Pairs and states of the last looks at a chosen map."""
+
+    predictor_pairs: int = 2_000
+    # States are stepped in blocks of one shape, whatever their number: compiled once for a kind of
+    # map. A block of wide states is of so many numbers.
+    block: int = 512
+    block_numbers: int = 2**16
+    repeats: int = 5  # of a timed block; the best counts
+
+
+OPTIONS = AssemblyOptions()
 
 
 class Assembled(NamedTuple):
@@ -65,7 +75,7 @@ def measured(
 def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:
     """The piece with predictors fitted to its own images of the data's states: where S is coarse,
     the data are no closer to its roots than S is to the data."""
-    rows = rows[:_PREDICTOR_PAIRS]
+    rows = rows[: OPTIONS.predictor_pairs]
     images, solved = refined_images(data, generated.chart, generated.family, generated.params, rows)
     if solved.sum() < 2:  # nothing to learn from: the data's own images
         images, solved = data.y1[rows], np.ones(len(rows), bool)
@@ -117,7 +127,7 @@ def _dt_range(piece: Piece, data: Dataset) -> np.ndarray | None:
 
 def block_of(width: int) -> int:
     """The number of states (2d,) of this width that are stepped together."""
-    return max(1, min(_BLOCK, _BLOCK_NUMBERS // width))
+    return max(1, min(OPTIONS.block, OPTIONS.block_numbers // width))
 
 
 class Stepped(NamedTuple):
@@ -159,7 +169,7 @@ def stepped(
     else:
         found, seconds = [run(rows[0])], 0.0
         if timed:
-            seconds = min(run(rows[0])[1] for _ in range(_REPEATS))
+            seconds = min(run(rows[0])[1] for _ in range(OPTIONS.repeats))
         compiling = found[0][1] - seconds if timed else 0.0
         found += [run(block) for block in rows[1:]]
     blocks = [out for out, _ in found]

@@ -47,22 +47,31 @@ from gfnn_jax.models.hamiltonians.learned_law import assembled as flow_assembled
 from gfnn_jax.models.hamiltonians.problem import work_of_refit
 from gfnn_jax.search.search import Entry
 
-_CONFIRMED = 1.1  # of the error that the search measured
-_SMALLER = 3  # sizes that are looked at below maps all of which have steps that fail
+
+@dataclasses.dataclass(frozen=True)
+class ChoiceOptions:
+    """Limits of the choice and of the error that it states (study: stated_errors)."""
+
+    confirmed: float = 1.1  # of the error that the search measured
+    smaller: int = 3  # sizes that are looked at below maps all of which have steps that fail
+    folds: int = 5
+    matters: float = 0.01  # of the tolerance: an error above it, that few states make, is told
+    # quantile of the rows that bounds the one at 90 %, of some hundred rows
+    nine_of_ten: float = 0.97
+    # Numbers of the states at which a flow's own steps are measured, and times that the worst
+    # counts.
+    numbers: int = 8_192
+    worst: int = 3
+    # Operations of a root of m terms, ÷ m³: nearly all of them make the factor of a size two
+    # further, of twice as many terms and twelve times as many rows, which tells noise from misfit.
+    of_root: float = 200.0
 
 
-_FOLDS = 5
+OPTIONS = ChoiceOptions()
 FEWEST_RUNS_TESTED = 10  # runs that state the error for all others
-_MATTERS = 0.01  # of the tolerance: an error above it, that few states make, is told
-_NINE_OF_TEN = 0.97  # quantile of the rows that bounds the one at 90 %, of some hundred rows
-# Numbers of the states at which a flow's own steps are measured, and times that the worst counts.
-_NUMBERS, _WORST = 8_192, 3
 _WHAT = "the stated error by cross-validation"
 
 
-# Operations of a root of m terms, ÷ m³: nearly all of them make the factor of a size two further,
-# of twice as many terms and twelve times as many rows, which tells noise from misfit.
-_OF_ROOT = 200.0
 _TEST_ROWS = "the fit of the chosen size to the test pairs too"
 
 
@@ -98,7 +107,7 @@ def choose(searched: Searched, request: Request) -> Chosen:
         return _of_ranking(ranking, request)
     request.on_progress(f"compiling the flow of {law.candidate.label}")
     candidate, seconds, *_ = flow_assembled(law, *given)
-    expected = max(bound, _CONFIRMED * law.candidate.validation_bound)
+    expected = max(bound, OPTIONS.confirmed * law.candidate.validation_bound)
     if best is not None and not candidate.validation_bound <= expected:
         return _of_ranking(ranking, request)
     return Chosen(candidate, data, seconds)
@@ -126,7 +135,7 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
         assembled = measured(entry.candidate, map_, sweep.data, request.tolerance, budget)
         compile_seconds += assembled.compile_seconds
         tried.append((assembled.candidate, assembled.failed, entry))
-        expected = max(bound, _CONFIRMED * entry.candidate.validation_bound)
+        expected = max(bound, OPTIONS.confirmed * entry.candidate.validation_bound)
         if not assembled.compiled:
             break
         if np.isfinite(found := assembled.candidate.validation_bound) and found <= expected:
@@ -152,7 +161,9 @@ def _smaller(
         return
     sweep = min(tried, key=lambda t: t[1])[2].sweep
     least = min(sweep.sizes.index(e.size) for _, _, e in tried if e.sweep is sweep)
-    for entry in _validated(sweep, sweep.sizes[:least][: -_SMALLER - 1 : -1], budget, on_progress):
+    for entry in _validated(
+        sweep, sweep.sizes[:least][: -OPTIONS.smaller - 1 : -1], budget, on_progress
+    ):
         yield entry
         if not tried[-1][1]:
             return
@@ -197,7 +208,7 @@ def with_posterior(chosen: Chosen, searched: Searched) -> Chosen:
 
 def work_of_posterior(num_parameters: int) -> float:
     """Operations of computing it."""
-    return _OF_ROOT * float(num_parameters) ** 3
+    return OPTIONS.of_root * float(num_parameters) ** 3
 
 
 def stated(chosen: Chosen, found: Searched, budget: Budget) -> Chosen:
@@ -257,7 +268,7 @@ def _of_steps(chosen: Chosen, found: Searched) -> float:
     law, data = found.law, found.data
     if law is None or chosen.candidate.learns != "hamiltonian" or not law.terms:
         return 0.0
-    rows = np.arange(0, len(data), -(-len(data) * data.y0.shape[1] // _NUMBERS))
+    rows = np.arange(0, len(data), -(-len(data) * data.y0.shape[1] // OPTIONS.numbers))
     (dt, args), flow = data.given(rows), law.flow
     steps = Steps(flow.stages, flow.over(np.max(data.each_dt)).substeps)
     off = truncation(
@@ -265,7 +276,7 @@ def _of_steps(chosen: Chosen, found: Searched) -> float:
     )
     square = np.mean((off / data.scale) ** 2, axis=1)
     square = square[np.isfinite(square)]
-    bound = bound_of_mean(square, np.arange(len(square)), _WORST) if len(square) > 1 else 0.0
+    bound = bound_of_mean(square, np.arange(len(square)), OPTIONS.worst) if len(square) > 1 else 0.0
     unit = 1.0 if found.tolerance.relative else float(np.sqrt(np.mean(data.spread**2)))
     return unit * float(np.sqrt(bound))
 
@@ -274,11 +285,12 @@ def of_few(errors: np.ndarray, tolerance: Tolerance) -> str:
     """Warning where few of these errors (n,) make their RMS: then it has no bound that n of them
     tell (the variance of a heavy tail is infinite), and a quantile is stated beside it."""
     rms = float(np.sqrt(np.mean(errors**2)))
-    if not FEW * np.median(errors) < rms < np.inf or rms < _MATTERS * tolerance.bound:
+    if not FEW * np.median(errors) < rms < np.inf or rms < OPTIONS.matters * tolerance.bound:
         return ""
+    unit = " of the spread" if tolerance.relative else ""
     return (
         f"few states make most of the error: nine of ten err by less than "
-        f"{np.quantile(errors, _NINE_OF_TEN):.1e}{' of the spread' if tolerance.relative else ''}. "
+        f"{np.quantile(errors, OPTIONS.nine_of_ten):.1e}{unit}. "
         "The 95 % bound of the RMS does not hold for other states: quote the error of nine of ten"
     )
 
@@ -291,7 +303,7 @@ def _by_folds(
     model = _refits(chosen, found)
     if model is None:
         return None
-    folds = np.array_split(np.unique(cluster[rows]), _FOLDS)
+    folds = np.array_split(np.unique(cluster[rows]), OPTIONS.folds)
     out = [rows[np.isin(cluster[rows], fold)] for fold in folds if len(fold)]
     try:
         last = budget.last(_WHAT, model.kind, len(out) * model.work)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -38,16 +39,25 @@ _NO_MORE = {
 }
 _LOOK = "the test whether the residuals are noise"
 _WHITE = "the residuals of H are white, as noise is"
-_SHARE = 0.1  # of the residual, that a change of volume must explain
-_KNOWN = 1.5  # times the noise that was given: up to it, what is left over is that noise
-# Times the noise: above it a map's own error is not what noise makes of it, √(2m/N) with N rows,
-# three or more for each of the m terms.
-_OWN_ERROR = 1.5
-_ROUNDOFF = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
-_RESIDUAL_PAIRS = 2_000  # whose residuals are looked at
-_FRICTION_PAIRS = 1_000  # where the tolerance is met
-_NOISE_PAIRS = 1_024  # from which the noise of the states is measured
-_NOISE_NUMBERS = 8_192  # the same of many sites: numbers of so many pairs
+
+
+@dataclasses.dataclass(frozen=True)
+class ConclusionOptions:
+    """Limits by which what a map leaves over is told apart, and how many pairs are looked at."""
+
+    share: float = 0.1  # of the residual, that a change of volume must explain
+    known: float = 1.5  # times the noise that was given: up to it, what is left over is that noise
+    # Times the noise: above it a map's own error is not what noise makes of it, √(2m/N) with N
+    # rows, three or more for each of the m terms.
+    own_error: float = 1.5
+    roundoff: float = 1e-12  # of the data's spread: below it a stall is arithmetic, not noise
+    residual_pairs: int = 2_000  # whose residuals are looked at
+    friction_pairs: int = 1_000  # where the tolerance is met
+    noise_pairs: int = 1_024  # from which the noise of the states is measured
+    noise_numbers: int = 8_192  # the same of many sites: numbers of so many pairs
+
+
+OPTIONS = ConclusionOptions()
 
 
 class Conclusion(NamedTuple):
@@ -95,7 +105,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     if jumps:
         messages = []  # of a law that misses them
         ended = reason = "no map follows the jumps of an angle that is wrapped and was not named"
-    elif candidate.validation_relative > _ROUNDOFF and searched.linear is None:
+    elif candidate.validation_relative > OPTIONS.roundoff and searched.linear is None:
         stalled = _stalled(candidate, chosen.entry, searched)
         left = _left_of_sites if structured else _what_is_left
         work = _work(chosen.entry or next(iter(found.ranking), None))
@@ -129,11 +139,11 @@ def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
     candidate, law, data = chosen.candidate, searched.law, searched.data
     lossy = candidate.learns == "hamiltonian" and law is not None and bool(law.friction)
     compiled = candidate.microseconds_per_step is not None
-    if lossy or not compiled or data.varied or not candidate.validation_relative > _ROUNDOFF:
+    if lossy or not compiled or data.varied or not candidate.validation_relative > OPTIONS.roundoff:
         return []
     if data.coordinates.forward is not CARTESIAN.forward:
         return []
-    sample = _residuals_of_sample(candidate, None, searched, _FRICTION_PAIRS)
+    sample = _residuals_of_sample(candidate, None, searched, OPTIONS.friction_pairs)
     found = hidden_friction(sample.image, sample.residual, data.user_angles)
     if found is None:
         return []
@@ -167,7 +177,7 @@ def _work(entry: Entry | None) -> float:
         return 0.0
     width, count = 2 * entry.sweep.data.dim, entry.candidate.num_parameters
     rows = len(entry.sweep.data.training) * width
-    steps = OF_STEPS * (_RESIDUAL_PAIRS + _NOISE_PAIRS * width / 10)
+    steps = OF_STEPS * (OPTIONS.residual_pairs + OPTIONS.noise_pairs * width / 10)
     return 2 * OF_SOLVE * count**3 + 2 * rows * count**2 + steps * entry.size.operations
 
 
@@ -210,7 +220,10 @@ class _Sample(NamedTuple):
 
 
 def _residuals_of_sample(
-    candidate: Candidate, entry: Entry | None, searched: Searched, most: int = _RESIDUAL_PAIRS
+    candidate: Candidate,
+    entry: Entry | None,
+    searched: Searched,
+    most: int = OPTIONS.residual_pairs,
 ) -> _Sample:
     """The residuals of the entry's map, or of the candidate's where there is none."""
     data = searched.data if entry is None else entry.sweep.data
@@ -239,7 +252,7 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     change, error = volume_change(y0, residual)
     # Friction shrinks every coordinate by a part of what is left over of it.
     size = float(np.sqrt(np.mean((residual / scale) ** 2)))
-    if abs(change) > max(CERTAIN * error, _SHARE * residual.shape[1] * size):
+    if abs(change) > max(CERTAIN * error, OPTIONS.share * residual.shape[1] * size):
         message = (
             f"the residuals are no noise: phase-space volumes change by {change:.2g} ± {error:.1g} "
             "(relative) in a step, as by friction, and a symplectic map keeps them. The law of a "
@@ -293,7 +306,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         )
     rows, sequence = sample.rows, sample.sequence
     taken = candidate.num_parameters / (data.training.size * 2 * data.dim)
-    noise = state_noise(candidate.map, data.pairs.take(rows[:_NOISE_PAIRS]), taken)
+    noise = state_noise(candidate.map, data.pairs.take(rows[: OPTIONS.noise_pairs]), taken)
     if law is not None and law.noise is not None and candidate.learns == "hamiltonian":
         # Along an arc what the law misses adds up, and looks like noise.
         noise = np.minimum(law.noise, noise)
@@ -303,7 +316,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     own, sizes_of_noise = "", _by_name(noise)
     if candidate.learns == "map" and entry is not None and entry.sweep.linear:
         part = entry.sweep.error_by_noise(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))
-        if part > _OWN_ERROR:
+        if part > OPTIONS.own_error:
             message = (
                 "the residuals look like noise, but fits to halves of the pairs differ by "
                 f"{part:.1g} times as much, more than noise makes them. The terms tried cannot "
@@ -341,7 +354,7 @@ def _names(width: int) -> list[str]:
 def _beside_known(found: np.ndarray, known: np.ndarray) -> _LeftOver:
     """Noise (2d,) that was given, beside what the residuals suggest (2d,)."""
     ratio = float(np.max(found / known))
-    if ratio <= _KNOWN:
+    if ratio <= OPTIONS.known:
         reason = "the residuals are the noise that was given"
         return _LeftOver(known, [f"larger models are no more accurate: {reason}"], reason)
     name = _names(len(found))[int(np.argmax(found / known))]
@@ -358,7 +371,7 @@ def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOv
     if not stalled:
         return _LeftOver(None, [])
     data = chosen.data
-    few = max(1, _NOISE_NUMBERS // (2 * data.dim))
+    few = max(1, OPTIONS.noise_numbers // (2 * data.dim))
     rows = np.sort(data.training)[:few]
     noise = noise_of_sites(chosen.candidate.map, data.pairs.take(rows))
     message = (

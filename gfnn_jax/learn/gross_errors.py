@@ -30,34 +30,54 @@ from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.models.generating_functions.size import Size
 from gfnn_jax.models.generating_functions.sweeps import LinearSweep
 
-# A residual beyond so many times what all but two of its neighbours stay below, and the median of
-# all. Of normal noise and d = 1 it is four times the median in one of 60,000 pairs.
-_BEYOND, _NEIGHBOURS, _BUT = 5.0, 10, 2
-# Those neighbours' residuals are ordinary, below so many times the median: a map that cannot follow
-# a close passage errs around it too.
-_ORDINARY = 2.5
-# Where they are not: of a search without them, the RMS residual of the others over that before. A
-# map is spoilt around a gross error; without a close passage it is hardly better elsewhere.
-_MENDED = 0.1
-# Gross errors are apart from the others: residuals between so many times the median and _BEYOND are
-# fewer by this factor than they. What a map cannot represent has a tail without a gap.
-_TAIL, _APART = 3.0, 0.5
-# Where there is none just there: residuals below the smallest of them, down to this part of it, are
-# fewer. One or two of few pairs lie apart by chance: fewer than so many need a wider gap.
-_GAP, _SEVERAL, _WIDE_GAP = 0.6, 5, 0.1
-# A smaller size is the next one whose median residual is so many times larger. A row is at the rim
-# where that size leaves more of it by this factor, and the two differ there by so many times what
-# they do at the median.
-_COARSER, _MORE, _DIFFER = 2.0, 1.3, 3.0
-_ROUNDOFF = 1e-10  # of the spread: below it residuals are arithmetic
-_MOST = 0.12  # of the pairs: gross errors of a twentieth of the states of sequences, two pairs each
-_ROUNDS = 3  # large ones hide smaller ones
-# The RMS residual of all pairs over that of the others, for a search without them to be worth its
-# time; and by how much that of the others may rise then.
-_SPOILT, _RISE = 1.15, 1.02
-# Operations, as of flows in NumPy, of a pair in the trees of its state and image, and of finding
-# the neighbours of both, ÷ (2d)².
-_OF_TREES, _OF_NEIGHBOURS = 500, 1_400
+
+@dataclasses.dataclass(frozen=True)
+class GrossErrorOptions:
+    """Limits by which pairs are told that the map misses by far (study: hard, outliers)."""
+
+    # A residual beyond so many times what all but two of its neighbours stay below, and the median
+    # of all. Of normal noise and d = 1 it is four times the median in one of 60,000 pairs.
+    beyond: float = 5.0
+    neighbours: int = 10
+    but: int = 2
+    # Those neighbours' residuals are ordinary, below so many times the median: a map that cannot
+    # follow a close passage errs around it too.
+    ordinary: float = 2.5
+    # Where they are not: of a search without them, the RMS residual of the others over that
+    # before. A map is spoilt around a gross error; without a close passage it is hardly better
+    # elsewhere.
+    mended: float = 0.1
+    # Gross errors are apart from the others: residuals between so many times the median and beyond
+    # are fewer by this factor than they. What a map cannot represent has a tail without a gap.
+    tail: float = 3.0
+    apart: float = 0.5
+    # Where there is none just there: residuals below the smallest of them, down to this part of
+    # it, are fewer. One or two of few pairs lie apart by chance: fewer than so many need a wider
+    # gap.
+    gap: float = 0.6
+    several: int = 5
+    wide_gap: float = 0.1
+    # A smaller size is the next one whose median residual is so many times larger. A row is at the
+    # rim where that size leaves more of it by this factor, and the two differ there by so many
+    # times what they do at the median.
+    coarser: float = 2.0
+    more: float = 1.3
+    differ: float = 3.0
+    roundoff: float = 1e-10  # of the spread: below it residuals are arithmetic
+    # of the pairs: gross errors of a twentieth of the states of sequences, two pairs each
+    most: float = 0.12
+    rounds: int = 3  # large ones hide smaller ones
+    # The RMS residual of all pairs over that of the others, for a search without them to be worth
+    # its time; and by how much that of the others may rise then.
+    spoilt: float = 1.15
+    rise: float = 1.02
+    # Operations, as of flows in NumPy, of a pair in the trees of its state and image, and of
+    # finding the neighbours of both, ÷ (2d)².
+    of_trees: int = 500
+    of_neighbours: int = 1_400
+
+
+OPTIONS = GrossErrorOptions()
 _WHAT = "the search for pairs that the map misses by far"
 
 
@@ -67,7 +87,7 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
     is, where the tolerance is met, there are none, or too many. And what is to be said of them."""
     wrong, rim, count = np.zeros(0, int), np.zeros(0, int), len(found.data)
     request = dataclasses.replace(request, factors=None, checkpoints=None)
-    for _ in range(_ROUNDS):
+    for _ in range(OPTIONS.rounds):
         left = _residuals(found)
         if left is None:
             break
@@ -84,14 +104,14 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
         except OutOfTime:
             request.budget.leave_out(_WHAT, request.budget.ended)
             break
-        rows, rise = _standing_alone(size, far, around, _ORDINARY), _RISE
+        rows, rise = _standing_alone(size, far, around, OPTIONS.ordinary), OPTIONS.rise
         if not len(rows):
-            rows, rise = _standing_alone(size, far, around, np.inf), _MENDED
+            rows, rise = _standing_alone(size, far, around, np.inf), OPTIONS.mended
         gone = len(wrong) + len(rim) + len(rows)
-        if not len(rows) or gone > _MOST * count:
+        if not len(rows) or gone > OPTIONS.most * count:
             break
         others = np.setdiff1d(np.arange(len(size)), rows)
-        if not _rms(size) > _SPOILT * _rms(size[others]):
+        if not _rms(size) > OPTIONS.spoilt * _rms(size[others]):
             break
         at_rim = _at_the_rim(found, rows)
         request.on_progress(f"without {gone} of {count} pairs that the map misses by far")
@@ -146,7 +166,7 @@ def _residuals(found: Searched) -> _Residuals | None:
     friction: its steps are not smooth where a body turns, and no error of a measurement is."""
     law, data, tolerance = found.law, found.data, found.tolerance
     best = _best(found)
-    if best is None or tolerance.met_by(best) or best.validation_relative <= _ROUNDOFF:
+    if best is None or tolerance.met_by(best) or best.validation_relative <= OPTIONS.roundoff:
         return None
     if data.structure is not None or data.varied:
         return None
@@ -196,10 +216,10 @@ def _at_the_rim(found: Searched, rows: np.ndarray) -> bool:
     place = sweep.sizes.index(chosen)
     for smaller in reversed(sweep.sizes[:place]):
         coarse = sweep.residuals(smaller)
-        if np.median(_sizes(coarse)[others]) > _COARSER * np.median(size[others]):
+        if np.median(_sizes(coarse)[others]) > OPTIONS.coarser * np.median(size[others]):
             differ = _sizes(coarse - left)
-            more = _sizes(coarse)[rows] > _MORE * size[rows]
-            apart = differ[rows] > _DIFFER * np.median(differ[others])
+            more = _sizes(coarse)[rows] > OPTIONS.more * size[rows]
+            apart = differ[rows] > OPTIONS.differ * np.median(differ[others])
             return bool(np.mean(more & apart) > 0.5)
     return False
 
@@ -220,13 +240,13 @@ def _follows(found: Searched, again: Searched, rows: np.ndarray) -> bool:
 def _far(size: np.ndarray) -> np.ndarray:
     """The rows whose residual is far beyond the median."""
     middle = np.median(size)
-    known = len(size) > _NEIGHBOURS and middle > 0
-    return np.flatnonzero(size > _BEYOND * middle) if known else np.zeros(0, int)
+    known = len(size) > OPTIONS.neighbours and middle > 0
+    return np.flatnonzero(size > OPTIONS.beyond * middle) if known else np.zeros(0, int)
 
 
 def _work_of_neighbours(data: Dataset, far: np.ndarray) -> float:
     """Operations of `_around`."""
-    return _OF_TREES * len(data) + _OF_NEIGHBOURS * data.y0.shape[1] ** 2 * len(far)
+    return OPTIONS.of_trees * len(data) + OPTIONS.of_neighbours * data.y0.shape[1] ** 2 * len(far)
 
 
 def _around(data: Dataset, size: np.ndarray, far: np.ndarray) -> np.ndarray:
@@ -234,8 +254,8 @@ def _around(data: Dataset, size: np.ndarray, far: np.ndarray) -> np.ndarray:
     the image: a state that is a gross error has no neighbours but its like."""
     around = np.full(len(far), np.inf)
     for y in (data.y0 / data.scale, data.y1 / data.scale):
-        near = cKDTree(y).query(y[far], k=_NEIGHBOURS + 1)[1][:, 1:]
-        around = np.minimum(around, np.sort(size[near], axis=1)[:, -1 - _BUT])
+        near = cKDTree(y).query(y[far], k=OPTIONS.neighbours + 1)[1][:, 1:]
+        around = np.minimum(around, np.sort(size[near], axis=1)[:, -1 - OPTIONS.but])
     return around
 
 
@@ -247,13 +267,13 @@ def _standing_alone(
     ordinary: times the median of all, that those neighbours' residuals stay below.
     """
     middle = np.median(size)
-    alone = far[(size[far] > _BEYOND * around) & (around < ordinary * middle)]
-    between = np.sum((size > _TAIL * middle) & (size <= _BEYOND * middle))
-    if between < _APART * len(alone):
+    alone = far[(size[far] > OPTIONS.beyond * around) & (around < ordinary * middle)]
+    between = np.sum((size > OPTIONS.tail * middle) & (size <= OPTIONS.beyond * middle))
+    if between < OPTIONS.apart * len(alone):
         return alone
     falling, ordered = alone[np.argsort(-size[alone])], np.sort(size)
     count, least = np.arange(1, len(falling) + 1), size[falling]
-    reach = np.where(count < _SEVERAL, _WIDE_GAP, _GAP) * least
+    reach = np.where(count < OPTIONS.several, OPTIONS.wide_gap, OPTIONS.gap) * least
     below = np.searchsorted(ordered, least) - np.searchsorted(ordered, reach, "right")
-    apart = np.flatnonzero(below < _APART * count)
+    apart = np.flatnonzero(below < OPTIONS.apart * count)
     return np.sort(falling[: apart[-1] + 1]) if len(apart) else falling[:0]

@@ -41,15 +41,28 @@ from gfnn_jax.models.positions.triples import Triples, triples_of
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.search.search import MET
 
-_DEGREES = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)
-_ROWS_PER_TERM, _MOST_OPERATIONS = 3, 2e10  # of one solve: a few seconds on one core
-_FEWEST = 20  # triples
-_BETTER, _WORSE = 0.9, 3  # of the residual: sizes in a row that leave more end a sweep
-_GAIN = 0.5  # of the residual: what an S without symmetry must lower it to
-_ROUNDOFF = 1e-15  # of the spread
-_EXACT = 1e-10  # of the spread: readings whose S leaves less have no noise worth the name
-_STALLED = 0.5  # of the residual, that a larger S leaves at least where readings have noise
-_WINDOW = 40  # steps, from whose readings a state is estimated
+
+@dataclasses.dataclass(frozen=True)
+class PositionOptions:
+    """Sizes of S(q, Q) that are tried, and when a larger one is of no use (study: positions)."""
+
+    degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)
+    # of one solve: a few seconds on one core
+    rows_per_term: int = 3
+    most_operations: float = 2e10
+    fewest: int = 20  # triples
+    # of the residual: sizes in a row that leave more end a sweep
+    better: float = 0.9
+    worse: int = 3
+    gain: float = 0.5  # of the residual: what an S without symmetry must lower it to
+    roundoff: float = 1e-15  # of the spread
+    exact: float = 1e-10  # of the spread: readings whose S leaves less have no noise worth the name
+    # of the residual, that a larger S leaves at least where readings have noise
+    stalled: float = 0.5
+    window: int = 40  # steps, from whose readings a state is estimated
+
+
+OPTIONS = PositionOptions()
 
 
 def learn_positions(
@@ -81,15 +94,17 @@ def learn_positions(
     sites = structure_of(structure, triples.dim, Coordinates("positions", triples.angles))
     if sites is not None and not isinstance(sites, Sites):
         raise FitError(f"expected a ring or a chain of positions, got {structure!r}")
-    if len(triples) < _FEWEST:
-        raise FitError(f"expected at least {_FEWEST} triples of positions, got {len(triples)}")
+    if len(triples) < OPTIONS.fewest:
+        raise FitError(
+            f"expected at least {OPTIONS.fewest} triples of positions, got {len(triples)}"
+        )
     sensors = Sensors(
         recording.positions,
         (),
         recording.angles,
         np.zeros(triples.dim),
         0.0,
-        _WINDOW * triples.dt,
+        OPTIONS.window * triples.dt,
         "hold",
         0.0,
         np.array([triples.dt]),
@@ -133,7 +148,7 @@ class _Found(NamedTuple):
 
 
 def _clearly_better(one: _Found, other: _Found) -> bool:
-    return one.candidate.validation_bound < _GAIN * other.candidate.validation_bound
+    return one.candidate.validation_bound < OPTIONS.gain * other.candidate.validation_bound
 
 
 @dataclasses.dataclass
@@ -170,13 +185,13 @@ class _Sweep:
             except OutOfTime:
                 break
             if found is None or not new.candidate.validation_bound >= (
-                _BETTER * found.candidate.validation_bound
+                OPTIONS.better * found.candidate.validation_bound
             ):
                 found, worse = new, 0
             else:
                 worse += 1
-            met = found.candidate.validation_bound <= max(self.tolerance.bound, _ROUNDOFF)
-            if met or worse == _WORSE:
+            met = found.candidate.validation_bound <= max(self.tolerance.bound, OPTIONS.roundoff)
+            if met or worse == OPTIONS.worse:
                 break
         if found is None or not np.isfinite(found.candidate.validation_bound):
             return None
@@ -191,7 +206,9 @@ class _Sweep:
             both = symmetric and getattr(inner, "signs", None) is None
             family = OfDisplacement(inner, part, both, moves)
             terms = family.num_parameters
-            if _ROWS_PER_TERM * terms > rows or (k and rows * terms**2 > _MOST_OPERATIONS):
+            if OPTIONS.rows_per_term * terms > rows or (
+                k and rows * terms**2 > OPTIONS.most_operations
+            ):
                 return
             yield family
 
@@ -207,12 +224,12 @@ class _Sweep:
             turned = (1,) * dim + (-1,) * dim
             inputs = box_inputs(x, reversor=turned)
             signs = variable_signs(inputs, turned, x) if symmetric else None
-            yield from (Products(inputs, degree, signs) for degree in _DEGREES)
+            yield from (Products(inputs, degree, signs) for degree in OPTIONS.degrees)
             return
         if symmetric:
             x = np.concatenate([x, np.concatenate([other, q - other], axis=1)])
         inputs = box_inputs(x, angles=self.triples.angles)
-        yield from (Products(inputs, degree) for degree in _DEGREES)
+        yield from (Products(inputs, degree) for degree in OPTIONS.degrees)
 
     def without_noise(self, best: _Found) -> _Found:
         """S with latent positions where the readings have noise, by which least squares is biased;
@@ -245,7 +262,7 @@ class _Sweep:
         error, terms = best.candidate.validation_relative, best.candidate.num_parameters
         families = self._families(best.about.symmetric)
         larger = next((f for f in families if f.num_parameters > terms), None)
-        if error <= _EXACT or larger is None:
+        if error <= OPTIONS.exact or larger is None:
             return False
         known = next((c for c in self.tried if c.num_parameters == larger.num_parameters), None)
         if known is None:
@@ -254,7 +271,7 @@ class _Sweep:
                     known = self._fitted(larger, best.about.symmetric).candidate
             except OutOfTime:
                 return False
-        return known.validation_relative > _STALLED * error
+        return known.validation_relative > OPTIONS.stalled * error
 
     def _work(self, family: OfDisplacement) -> float:
         """Operations of a solve."""

@@ -14,18 +14,28 @@ from gfnn_jax.diagnosis.misfit import misfit
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.learn.request import Request
 
-_FEWEST_DIM = 6  # below it a fit needs no structure
+
+@dataclasses.dataclass(frozen=True)
+class ProposalOptions:
+    """Rules of when a structure is proposed, or tried first (study: many)."""
+
+    fewest_dim: int = 6  # below it a fit needs no structure
+    most_terms: int = 150  # of a library that a sample is fitted by
+    # of the forces or of the velocities, that the midpoint's error may leave over
+    explained: float = 0.1
+    # of them: so little that a law of the structure is looked for before anything else
+    tried: float = 0.02
+
+
+OPTIONS = ProposalOptions()
 _CHARTS = ("midpoint", "type2")  # of flows, to O(h²), and of kicked maps
-_MOST_TERMS = 150  # of a library that a sample is fitted by
-_EXPLAINED = 0.1  # of the forces or of the velocities, that the midpoint's error may leave over
-_TRIED = 0.02  # of them: so little that a law of the structure is looked for before anything else
 
 
 def proposed(data: Dataset) -> list[str]:
     """One line that names the structure which explains a sample of the pairs best, to O(h²); none
     where none does. data: without a base map or a structure."""
     best, left = _best(data)
-    if not left < _EXPLAINED:
+    if not left < OPTIONS.explained:
         return []
     return [
         f"the structure {best} explains these pairs: a sample of them leaves relative residuals of "
@@ -40,7 +50,7 @@ def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request
     named = request.options.terms or request.scene is not None or data.structure is not None
     if request.seeks_law and not (named or request.of_network):
         best, left = _best(data)
-        if left < _TRIED:
+        if left < OPTIONS.tried:
             structure = structure_of(best, data.dim, data.coordinates)
             request.on_progress(
                 f"the structure {best} leaves relative residuals of {left:.1g} in forces and "
@@ -56,7 +66,7 @@ def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request
 
 def _best(data: Dataset) -> tuple[str, float]:
     """The structure that leaves least of a sample's forces and velocities over, and that part."""
-    if data.dim < _FEWEST_DIM or data.varied or data.coordinates.angles:
+    if data.dim < OPTIONS.fewest_dim or data.varied or data.coordinates.angles:
         return "", np.inf
     left = {text: _misfit(text, data) for text in _possible(data.dim)}
     best = min(left, key=lambda text: left[text])
@@ -74,6 +84,6 @@ def _misfit(text: str, data: Dataset) -> float:
     structure = structure_of(text, data.dim)
     assert structure is not None
     libraries = list(structure.libraries(data.dim))
-    small = [family for family in libraries if family.num_parameters <= _MOST_TERMS]
+    small = [family for family in libraries if family.num_parameters <= OPTIONS.most_terms]
     charts = [CHARTS[name] for name in _CHARTS]
     return min((misfit(f, data, chart) for f in small for chart in charts), default=np.inf)

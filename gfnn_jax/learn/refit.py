@@ -46,12 +46,26 @@ from gfnn_jax.phase_space import Pairs
 from gfnn_jax.processes import Group
 from gfnn_jax.scenes import Scene
 
-# A pair is an outlier that is missed by so many deviations, which are no smaller than roundoff. A
-# million pairs with one at this limit have no worse a fit for it.
-_OUTLYING, _ROUNDOFF = 100.0, 1e-14
+
+@dataclasses.dataclass(frozen=True)
+class RefitOptions:
+    """Limits of a refit to all pairs (study: scaling)."""
+
+    # A pair is an outlier that is missed by so many deviations, which are no smaller than
+    # roundoff. A million pairs with one at this limit have no worse a fit for it.
+    outlying: float = 100.0
+    roundoff: float = 1e-14
+    passes_of_law: int = 3  # through all pairs: Gauss–Newton steps from coefficients of a sample
+    # a refit whose error is larger by this factor than that of its sample is not kept
+    no_worse: float = 1.1
+    block: int = 20_000  # pairs at a time
+    # of dt: two that are one, and what printed times may differ by
+    same: float = 1e-9
+    printed: float = 1e-5
+
+
+OPTIONS = RefitOptions()
 _OF_TASK = "task "  # before the names of a task, in what processes are told
-_PASSES_OF_LAW = 3  # through all pairs: Gauss–Newton steps from coefficients of a sample
-_NO_WORSE = 1.1  # a refit whose error is larger by this factor than that of its sample is not kept
 
 
 def can_be_refitted(map_: SymplecticMap) -> bool:
@@ -87,7 +101,7 @@ def work_of_refit(fitted: Fit, num_pairs: int, reading: float) -> float:
     if chosen.learns == "map":
         return reading + 2.0 * num_pairs * width * (chosen.num_parameters + 1) ** 2 / RATES[ROWS]
     of_flow = num_pairs * width * chosen.operations / RATES[FLOW]
-    return _PASSES_OF_LAW * (reading + of_flow)
+    return OPTIONS.passes_of_law * (reading + of_flow)
 
 
 def refit(
@@ -122,7 +136,7 @@ def refit(
         warnings.warn(message, FitWarning, stacklevel=3)
 
     old, law, map_ = fitted.chosen, fitted.hamiltonian, fitted.map
-    most = _OUTLYING * np.maximum(old.deviations, _ROUNDOFF * np.asarray(map_.scale))
+    most = OPTIONS.outlying * np.maximum(old.deviations, OPTIONS.roundoff * np.asarray(map_.scale))
     apart = [held] if test is None else [held, test]
     worker = RowsOfRefit(map_, {"most": most, "held": _states_of(apart)})
     apart = [pairs.take(np.flatnonzero(worker.close(pairs))) for pairs in apart]
@@ -141,7 +155,7 @@ def refit(
         if found.outliers:
             warn(
                 f"{found.outliers} of {found.count + found.outliers} pairs are outliers, with "
-                f"residuals above {_OUTLYING:g} standard deviations: they are left out"
+                f"residuals above {OPTIONS.outlying:g} standard deviations: they are left out"
             )
         if found.other_dt:
             warn(
@@ -163,7 +177,7 @@ def refit(
             num_pairs = found.count
     else:
         group.broadcast({})
-    if chosen is None or not after <= _NO_WORSE * before:
+    if chosen is None or not after <= OPTIONS.no_worse * before:
         found_map = "no map" if chosen is None else f"a worse map (RMS error {after:.2e})"
         warn(
             f"the fit to all pairs gives {found_map}: that of the sample (RMS error {before:.2e} "
@@ -225,10 +239,8 @@ def _with_coefficients(
     return dataclasses.replace(law, flow=flow, terms=terms, shown=text, candidate=candidate)
 
 
-_BLOCK = 20_000  # pairs at a time
 # Pairs that are close or not, of the first those that are not resolved, and those of another dt.
 _COUNTED = ("count", "outliers", "unresolved", "other_dt")
-_SAME, _PRINTED = 1e-9, 1e-5  # of dt: two that are one, and what printed times may differ by
 
 
 def fitted_piece(pieces: tuple) -> int | None:
@@ -293,13 +305,13 @@ class RowsOfRefit:
     def _served(self, pairs: Pairs) -> np.ndarray:
         """Mark the pairs (N,) that are apart by a dt that the map has steps of."""
         off = np.abs(np.broadcast_to(np.asarray(pairs.dt), len(pairs)) - self.dt)
-        return np.full(len(pairs), True) if self.any_dt else off <= _PRINTED * self.dt
+        return np.full(len(pairs), True) if self.any_dt else off <= OPTIONS.printed * self.dt
 
     def _own_dt(self, pairs: Pairs) -> np.ndarray | None:
         """Time steps (N,) of the pairs, where a map of any dt must be told."""
         dt = np.broadcast_to(np.asarray(pairs.dt, float), len(pairs))
         same = not isinstance(self.piece.family, OfTimeStep) and np.ndim(pairs.dt) == 0
-        if not self.any_dt or (same and np.all(np.abs(dt - self.dt) <= _SAME * self.dt)):
+        if not self.any_dt or (same and np.all(np.abs(dt - self.dt) <= OPTIONS.same * self.dt)):
             return None
         return np.array(dt)
 
@@ -426,8 +438,8 @@ class RowsOfRefit:
         """Pairs but outliers and those held out, as the fitted piece sees them."""
         held = _keys(self.task["held"])
         for chunk in chunks:
-            for first in range(0, len(chunk), _BLOCK):
-                part = chunk.take(slice(first, first + _BLOCK))
+            for first in range(0, len(chunk), OPTIONS.block):
+                part = chunk.take(slice(first, first + OPTIONS.block))
                 served = self._served(part)
                 counts["other_dt"] += int((~served).sum())
                 if not served.all():

@@ -37,12 +37,27 @@ from gfnn_jax.phase_space import Pairs, sizes, split
 from gfnn_jax.scenes.draws import sample_states
 from gfnn_jax.scenes.scene import AroundOrbit, Scene
 
-_OTHER_SIZE = 3.0  # by such a factor the states of one scene hardly differ; those in other units do
-_COMPARED = 100
+
+@dataclasses.dataclass(frozen=True)
+class RequestOptions:
+    """Limits of the first looks at pairs, and what they cost (study: budgets)."""
+
+    # by such a factor the states of one scene hardly differ; those in other units do
+    other_size: float = 3.0
+    compared: int = 100
+    coarse: float = 0.01  # of what a step moves
+    fewest_jumps: int = 3  # by 2π, that make an angle
+    still: float = 1e-15  # of the spread: no move
+    # Operations that a pair takes of the looks and of the search for H, in units of (2d)²: a
+    # million pairs of two degrees of freedom take 22 s (benchmarks/budgets.py).
+    of_pair: int = 12_500
+    # A sample takes so many, a second, and has so many pairs at least.
+    of_sample: float = 1e10
+    fewest: int = 2_000
+
+
+OPTIONS = RequestOptions()
 FEWEST = 8  # pairs of a structure: 4 train, 4 are held out
-_COARSE = 0.01  # of what a step moves
-_FEWEST_JUMPS = 3  # by 2π, that make an angle
-_STILL = 1e-15  # of the spread: no move
 
 
 def check_request(
@@ -109,7 +124,7 @@ def check_request(
 def check_moves(pairs: Pairs) -> None:
     """Raises FitError where no state moves."""
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
-    if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= _STILL:
+    if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= OPTIONS.still:
         raise FitError(
             "expected states that move, got z1 = z0 in every pair: is H = 0, or are these the same "
             "columns twice?"
@@ -157,13 +172,13 @@ def unlike_the_scene(pairs: Pairs, scene: Scene) -> list[str]:
     if isinstance(scene.sampling, AroundOrbit):
         states = np.asarray(scene.sampling.start)[None, :]
     else:
-        states = np.asarray(sample_states(scene, _COMPARED, jax.random.key(0)))
+        states = np.asarray(sample_states(scene, OPTIONS.compared, jax.random.key(0)))
     messages = []
     for name, ours, theirs in zip(
         ("positions", "momenta"), split(np.asarray(pairs.z0)), split(states), strict=True
     ):
         size, usual = (float(np.median(np.linalg.norm(x, axis=1))) for x in (ours, theirs))
-        if usual > 0 and not 1 / _OTHER_SIZE < size / usual < _OTHER_SIZE:
+        if usual > 0 and not 1 / OPTIONS.other_size < size / usual < OPTIONS.other_size:
             messages.append(
                 f"the {name} are {size / usual:.2g} times the size of those in the scene "
                 f"{scene.name}, whose features assume its own units: are the data in these?"
@@ -177,14 +192,14 @@ def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
     # An angle that turned over moves little, whatever the difference of its numbers: the median.
     moved = np.median(np.abs(move / sizes(z0)) if tolerance.relative else np.abs(move), axis=0)
     size = float(np.sqrt(np.mean(moved**2)))
-    if not tolerance.bound > _COARSE * size > 0:
+    if not tolerance.bound > OPTIONS.coarse * size > 0:
         return []
     unit = "of the coordinates' spread" if tolerance.relative else "in the data's units"
     option = "tolerance" if tolerance.relative else "absolute_tolerance"
     return [
         f"a step moves the states by {size:.1e} {unit}: maps close to the identity meet the "
         f"tolerance {tolerance.bound:g}. Set --{option.replace('_', '-')} ({option}=) to "
-        f"{_COARSE * size:.0e} or less"
+        f"{OPTIONS.coarse * size:.0e} or less"
     ]
 
 
@@ -215,7 +230,7 @@ def wrapped(pairs: Pairs, coordinates: Coordinates) -> list[int]:
     for i in (i for i in range(2 * pairs.dim) if i not in coordinates.angles):
         size = np.abs(move[:, i])
         jumps = size > np.pi
-        if not _FEWEST_JUMPS <= jumps.sum() < len(size) / 2 or np.ptp(z0[:, i]) > TWO_PI:
+        if not OPTIONS.fewest_jumps <= jumps.sum() < len(size) / 2 or np.ptp(z0[:, i]) > TWO_PI:
             continue
         most = min(1.5 * size[~jumps].max(), np.pi / 2)
         if np.abs(size[jumps] - TWO_PI).max() <= most:
@@ -325,19 +340,12 @@ def checked(pairs: Pairs, scene: Scene | None, options: FitOptions, **others: An
     return Request(pairs, scene, coordinates, options, bound, found, messages=messages, **others)
 
 
-# Operations that a pair takes of the looks and of the search for H, in units of (2d)²: a million
-# pairs of two degrees of freedom take 22 s (benchmarks/budgets.py).
-_OF_PAIR = 12_500
-# A sample takes so many, a second, and has so many pairs at least.
-_OF_SAMPLE, _FEWEST = 1e10, 2_000
-
-
 def paid_for(found: Identified, budget: Budget, seed: int) -> Identified:
     """The pairs, or a sample of them, drawn by the seed, where the budget does not pay for all:
     of two degrees of freedom 50,000. That is told with what else was left out."""
     pairs, row = found
-    count, of_pair = len(pairs), _OF_PAIR * (2 * pairs.dim) ** 2
-    most = max(_FEWEST, int(_OF_SAMPLE / of_pair))
+    count, of_pair = len(pairs), OPTIONS.of_pair * (2 * pairs.dim) ** 2
+    most = max(OPTIONS.fewest, int(OPTIONS.of_sample / of_pair))
     work = count * of_pair
     if count <= most or budget.pays_for(work):
         return found

@@ -24,27 +24,36 @@ from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import OutOfTime
 
-# A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing from
-# the odd degrees), and larger families only fit noise.
-_STALLED = 3
-# So often another sweep may be better before this one is left.
-_BEATEN = 3
-_FINALISTS = 3  # that are validated where none meets the tolerance
-# The ratio of a step's error to its estimate hardly changes along a sweep: it is measured once an
-# estimate is within the first factor of the tolerance, and from then on sizes are validated whose
-# estimate times the ratio is within the second.
-_CALIBRATED, _WITHIN_REACH = 1e3, 1.3
-_NO_WORSE = 1.03  # an error larger by this factor is as good, if the map is cheaper
+
+@dataclasses.dataclass(frozen=True)
+class SearchOptions:
+    """Rules of when a sweep is left, and which of its sizes are validated (study: constants)."""
+
+    # A size that gains less than this has stalled; so many in a row (a symmetric map gains nothing
+    # from the odd degrees), and larger families only fit noise.
+    stalled: int = 3
+    # So often another sweep may be better before this one is left.
+    beaten: int = 3
+    finalists: int = 3  # that are validated where none meets the tolerance
+    # The ratio of a step's error to its estimate hardly changes along a sweep: it is measured once
+    # an estimate is within the first factor of the tolerance, and from then on sizes are validated
+    # whose estimate times the ratio is within the second.
+    calibrated: float = 1e3
+    within_reach: float = 1.3
+    no_worse: float = 1.03  # an error larger by this factor is as good, if the map is cheaper
+    kept: float = 0.1  # of the last kept map's error: a map so much better is kept in its stead
+    far: float = 10.0  # times the tolerance: a sweep that leads to no smaller error misses it
+    # Sizes of a smaller range foretell nothing: an even S gains nothing from every other degree.
+    range: float = 2.0
+    # Extrapolated over more than so many times the orders that were seen, a decay means nothing.
+    farthest: float = 3.0
+
+
+OPTIONS = SearchOptions()
 MET = "the tolerance is met"
-_KEPT = 0.1  # of the last kept map's error: a map so much better is kept in its stead
-_FAR = 10.0  # times the tolerance: a sweep that leads to no smaller error misses it
-# Sizes of a smaller range foretell nothing: an even S gains nothing from every other degree.
-_RANGE = 2.0
 # A size whose error ÷ the least before it is more than this has gained nothing; a sweep whose least
 # error, times this, is no larger than the best one's has come as far.
 GAINED = 0.8
-# Extrapolated over more than so many times the orders that were seen, a decay means nothing.
-_FARTHEST = 3.0
 OnProgress = Callable[[str], Any]
 
 
@@ -234,10 +243,10 @@ class Search:
         self._entries.append(entry)
         relative = estimated.validation_relative
         # Something to keep should the search be interrupted is worth a few more looks.
-        keep = self._on_validated is not None and relative < _KEPT * self._kept
+        keep = self._on_validated is not None and relative < OPTIONS.kept * self._kept
         self._kept = min(self._kept, relative) if keep else self._kept
-        ratio = 1.0 / _CALIBRATED if climb.ratio is None else climb.ratio
-        if keep or ratio * estimated.validation_bound <= _WITHIN_REACH * self._bound:
+        ratio = 1.0 / OPTIONS.calibrated if climb.ratio is None else climb.ratio
+        if keep or ratio * estimated.validation_bound <= OPTIONS.within_reach * self._bound:
             entry = self._validated(entry, self._budget)
             error = entry.candidate.validation_relative
             if np.isfinite(error) and relative > 0:
@@ -252,7 +261,7 @@ class Search:
         climb.stalled = climb.stalled + 1 if relative > GAINED * climb.best else 0
         climb.best = min(climb.best, relative)
         climb.beaten += any(_beats(e.candidate, estimated) for e in self._entries)
-        climb.left |= climb.stalled == _STALLED or climb.beaten == _BEATEN
+        climb.left |= climb.stalled == OPTIONS.stalled or climb.beaten == OPTIONS.beaten
         climb.errors.append((size.order, estimated.validation_bound))
         for hopeless in [c for c in self._climbs if self._is_hopeless(c)]:
             hopeless.left = True
@@ -261,7 +270,7 @@ class Search:
         """Return whether the sweep's largest size would miss the bound by far, where another sweep
         has a smaller error already, or has come as far and leads to the bound."""
         end = climb.end
-        if not (_FAR * self._bound < end < np.inf):
+        if not (OPTIONS.far * self._bound < end < np.inf):
             return False
         return any(
             other.reached < end
@@ -317,7 +326,7 @@ def _promised(climbs: Sequence[_Climb], bound: float) -> str:
     """Extrapolation of the most accurate sweep's errors to a size that would meet the bound;
     nothing where they stall, or are too few to say."""
     best = min(climbs, key=lambda climb: climb.reached, default=None)
-    decay = None if best is None or best.stalled == _STALLED else best.decay
+    decay = None if best is None or best.stalled == OPTIONS.stalled else best.decay
     if best is None or decay is None:
         return ""
     order = decay.order_for(bound)
@@ -349,7 +358,7 @@ def _finalists(entries: list[Entry]) -> list[Entry]:
     as_good = [e for e in best[1:] if _as_good(e, best[0])]
     second = sorted(as_good, key=lambda e: e.candidate.operations)[:1]
     best = [*best[:1], *second, *(e for e in best[1:] if e not in second)]
-    return best[:_FINALISTS]
+    return best[: OPTIONS.finalists]
 
 
 def _ranking(entries: list[Entry], bound: float) -> list[Entry]:
@@ -370,7 +379,7 @@ def _ranking(entries: list[Entry], bound: float) -> list[Entry]:
 def _as_good(entry: Entry, best: Entry) -> bool:
     """Return whether an entry's error is no larger than the best one's but for what is not worth
     while."""
-    limit = _NO_WORSE * best.candidate.validation_relative
+    limit = OPTIONS.no_worse * best.candidate.validation_relative
     return entry.candidate.validation_relative <= limit
 
 
@@ -404,7 +413,7 @@ def _why(climbs: Sequence[_Climb]) -> str:
     error tell nothing."""
     least = min((climb.best for climb in climbs), default=np.inf)
     good = [c for c in climbs if c.sweep.sizes and GAINED * c.best <= least]
-    if any(climb.stalled == _STALLED for climb in good):
+    if any(climb.stalled == OPTIONS.stalled for climb in good):
         return "larger models are no more accurate"
     if any(climb.sweep.short_of_pairs for climb in good):
         return "the pairs determine no larger model: more pairs would help"
@@ -434,7 +443,7 @@ class Decay(NamedTuple):
             return None
         fall = max(math.log(self.error / bound), 0.0)
         found = self.order + self.spacing * math.ceil(fall / (self.rate * self.spacing) - 1e-9)
-        far = found - self.first > _FARTHEST * max(self.order - self.first, self.spacing)
+        far = found - self.first > OPTIONS.farthest * max(self.order - self.first, self.spacing)
         return None if far else found
 
 
@@ -445,7 +454,7 @@ def decay_of(sizes: Sequence[tuple[float, float]]) -> Decay | None:
     of the last two, each over two gains, so that a sweep is rather thought to be good.
     """
     finite = [(x, e) for x, e in sizes if 0 < e < math.inf]
-    if not finite or finite[-1][0] - finite[0][0] < _RANGE:
+    if not finite or finite[-1][0] - finite[0][0] < OPTIONS.range:
         return None
     gains = finite[:1]
     for order, error in finite[1:]:
