@@ -105,7 +105,7 @@ def choose(searched: Searched, request: Request) -> Chosen:
     best = ranking[0].candidate if ranking else None
     if law is None or not (best is None or preferred(law.candidate, best, request.tolerance)):
         return _of_ranking(ranking, request)
-    request.on_progress(f"compiling the flow of {law.candidate.label}")
+    request.watch.on_progress(f"compiling the flow of {law.candidate.label}")
     candidate, seconds, *_ = flow_assembled(law, *given)
     expected = max(bound, OPTIONS.confirmed * law.candidate.validation_bound)
     if best is not None and not candidate.validation_bound <= expected:
@@ -121,7 +121,7 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     smaller ones of the best sweep follow, and of maps that all have such steps the one is taken of
     which the fewest do.
     """
-    budget, on_progress, bound = request.budget, request.on_progress, request.tolerance.bound
+    budget, on_progress, bound = request.budget, request.watch.on_progress, request.tolerance.bound
     compile_seconds, tried = 0.0, []
     first = ranking[0]
     larger = (

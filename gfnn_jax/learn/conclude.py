@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.budget import SOLVE, Budget
+from gfnn_jax.budget import SOLVE, Budget, within
 from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
@@ -21,7 +21,6 @@ from gfnn_jax.diagnosis.residuals import (
     state_noise,
     volume_change,
 )
-from gfnn_jax.errors import OutOfTime
 from gfnn_jax.fitting.significance import CERTAIN
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.propose import proposed
@@ -109,11 +108,9 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         stalled = _stalled(candidate, chosen.entry, searched)
         left = _left_of_sites if structured else _what_is_left
         work = _work(chosen.entry or next(iter(found.ranking), None))
-        try:
-            with request.budget.last(_LOOK, SOLVE, work):
-                noise, diagnosis, reason = left(chosen, searched, stalled)
-        except OutOfTime:
-            pass  # told with what else was left out
+        last = request.budget.last(_LOOK, SOLVE, work)
+        known = within(last, lambda: left(chosen, searched, stalled))
+        noise, diagnosis, reason = known or _LeftOver(None, [])  # else told as left out
         if reason and stalled:
             ended = f"larger models are no more accurate: {reason}"
         elif reason:

@@ -8,9 +8,8 @@ same map; the measured time stands beside it.
 from __future__ import annotations
 
 import dataclasses
-import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +31,13 @@ from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.noisy_sweeps import without_bias
-from gfnn_jax.learn.options import FitOptions, with_options
+from gfnn_jax.learn.options import FitOptions, Watch, with_options
 from gfnn_jax.learn.positions import learn_positions
 from gfnn_jax.learn.propose import structures_to_try
 from gfnn_jax.learn.request import checked, diagnose_request, paid_for, wrapped
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
-from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.models.maps_of_laws.draw import Drawing, drawn
 from gfnn_jax.phase_space import Pairs, require_x64
@@ -52,13 +50,6 @@ def fit(
     scene: Any = None,
     *,
     options: FitOptions | None = None,
-    clock: Callable[[], float] = time.perf_counter,
-    spent: float = 0.0,
-    checkpoints: Any = None,
-    factors: Any = None,
-    on_progress: Callable[[str], Any] = lambda message: None,
-    on_candidate: Callable[[Candidate], Any] = lambda candidate: None,
-    on_better: Callable[[SymplecticMap, Candidate], Any] | None = None,
     **changes: Any,
 ) -> Fit:
     """Learn the law or the map of these data: for pairs the cheapest candidate within the
@@ -75,21 +66,17 @@ def fit(
                behind them: ``fit(t, x)``.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     options:   a `FitOptions`, which the keywords below change; None: its defaults.
-    clock:     gives the seconds that max_seconds is held against. spent: seconds of them that are
-               gone already, as on reading files.
-    checkpoints, factors: a ``TrainingCheckpoints`` and a ``KeptFactors``, which an interrupted fit
-               has saved to and the same fit goes on from.
-    on_progress, on_candidate: called with what is being done, and with every candidate.
-    on_better: called with a map and its candidate whenever steps have shown one that is more
-               accurate than those before, so that it can be kept should the fit be interrupted.
+    The other keywords are those of `FitOptions` and `Watch`: ``on_progress`` and ``on_candidate``
+    are called with what is being done, and with every candidate.
 
     Raises FitError, in one line, where the data are too few or not finite, a chart that was asked
     for is singular over them (naming the chart to use instead), or no law follows a recording: then
-    it has a ``verdict``. Warns (FitWarning) where nothing
-    meets the tolerance, where a chart is close to singular, where pairs contradict their neighbours
-    (a few are left out), and where the pairs do not look symplectic; of a recording where its law
-    did not converge, misses a drive, or has an input of no effect.
+    it has a ``verdict``. Warns (FitWarning) where nothing meets the tolerance, where a chart is
+    close to singular, where pairs contradict their neighbours (a few are left out), and where the
+    pairs do not look symplectic; for a recording where its law did not converge, misses a drive, or
+    has an input of no effect.
     """
+    watch = Watch.taken_from(changes)
     options = dataclasses.replace(options or FitOptions(), **changes)
     positions = scene if _is_array(scene) else None
     scene = None if positions is not None else scene
@@ -102,7 +89,7 @@ def fit(
         options.refuse_others(["map" if of_map else "lagrangian"], "a recording, without momenta")
         with one_thread():
             if of_map:
-                return learn_positions(pairs, options, clock, on_progress, on_candidate)
+                return learn_positions(pairs, options, watch)
             law = fit_recording(
                 pairs,
                 friction=options.friction,
@@ -110,13 +97,13 @@ def fit(
                 mass=options.mass,
                 terms=tuple(options.terms),
                 loss=options.loss,
-                on_progress=on_progress,
+                on_progress=watch.on_progress,
             )
         for message in law.messages:
             warnings.warn(message, FitWarning, stacklevel=2)
         return Fit(law.map, law)
     options.refuse_others(("hamiltonian", "map"), "pairs, which are no recording")
-    budget = options.budget(clock, pairs.dim, spent)
+    budget = options.budget(watch, pairs.dim)
     require_x64("a fit")
     messages: list[str] = []
 
@@ -126,20 +113,11 @@ def fit(
             warnings.warn(message, FitWarning, stacklevel=3)
 
     with row_blocks.on_devices(_devices(options.devices)):
-        request = checked(
-            pairs,
-            scene,
-            options,
-            budget=budget,
-            checkpoints=checkpoints,
-            factors=factors,
-            on_progress=on_progress,
-            on_candidate=on_candidate,
-        )
+        request = checked(pairs, scene, options, budget, watch)
         warn(request.messages)
         taken = paid_for(identified(request.pairs), budget, options.seed)
         request = dataclasses.replace(request, pairs=taken.pairs)
-        on_progress(f"estimating local Jacobians from {len(taken.pairs):,} pairs")
+        watch.on_progress(f"estimating local Jacobians from {len(taken.pairs):,} pairs")
         data, about_pairs = clean(
             taken,
             request.coordinates,
@@ -160,8 +138,8 @@ def fit(
             diagnosis = diagnose_request(request, data)
             warn(diagnosis.messages)
             if diagnosis.damping is not None:
-                on_progress(str(diagnosis.damping))
-            found = searched(request, data, diagnosis, on_better)
+                watch.on_progress(str(diagnosis.damping))
+            found = searched(request, data, diagnosis)
             if found.met_by_law:
                 break
         found, about_pairs = without_gross_errors(request, found)
@@ -169,7 +147,7 @@ def fit(
         found = without_bias(found, request)
         data = found.data
         chosen = with_posterior(choose(found, request), found)
-        on_progress("computing the error to state, by pairs that chose nothing")
+        watch.on_progress("computing the error to state, by pairs that chose nothing")
         chosen = with_test_rows(stated(chosen, found, budget), found, budget)
         conclusion = conclude(chosen, found, request)
         warn([*conclusion.messages, *filter(None, [chosen.few])])
@@ -277,11 +255,9 @@ def accelerated(
     *,
     dt: float | None,
     region,
-    tolerance: float | None,
     num_pairs: int,
-    seed: int,
-    max_seconds: float | None,
-    on_progress: Callable[[str], Any],
+    seed: int = 0,
+    **options: Any,
 ) -> Fit:
     """Fit S to pairs of the law's flow, as `Fit.accelerate` says."""
     if fitted.hamiltonian is not None and fitted.hamiltonian.formula is None:
@@ -306,8 +282,6 @@ def accelerated(
         fitted.scene,
         learn="map",
         seed=seed,
-        max_seconds=max_seconds,
         angles=() if fitted.scene is not None else coordinates.angles,
-        on_progress=on_progress,
-        tolerance=fitted.relative_tolerance if tolerance is None else tolerance,
+        **{"tolerance": fitted.relative_tolerance, **options},
     )

@@ -6,20 +6,19 @@ from __future__ import annotations
 import dataclasses
 import io
 import warnings
-from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from gfnn_jax.budget import COMPILE, MAX_SECONDS, ROWS, Budget
+from gfnn_jax.budget import COMPILE, ROWS, Budget, within
 from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.damping import LearnedDamping
 from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
-from gfnn_jax.errors import FitWarning, OutOfTime
+from gfnn_jax.errors import FitWarning
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.learn.choose import work_of_posterior
@@ -325,66 +324,46 @@ class Fit:
         return report.finite(assemble(self, **about))
 
     def accelerate(
-        self,
-        *,
-        dt: float | None = None,
-        region=None,
-        tolerance: float | None = None,
-        num_pairs: int = NUM_PAIRS,
-        seed: int = 0,
-        max_seconds: float | None = MAX_SECONDS,
-        on_progress: Callable[[str], Any] = lambda message: None,
+        self, *, dt: float | None = None, region=None, num_pairs: int = NUM_PAIRS, **options: Any
     ) -> Fit:
         """A generated map of the Hamiltonian that was learned, fitted to pairs drawn from its flow.
 
         dt: the time of its step; None: that of the data. region: (2, 2d), lowest and highest
         values of the states to be predicted; None: where the data were and where the flow takes
-        them. tolerance: relative to the spread of the drawn states; None: as was asked for.
+        them. options: of `gfnn.fit`; the tolerance, where none is given as was asked for, is
+        relative to the spread of the drawn states.
 
         Raises FitError where no Hamiltonian was learned that meets the tolerance or was chosen, or
         its flow fails in the region, InputError for a region that is none.
         """
         from gfnn_jax.learn import fit  # stands after this module: a shorthand
 
-        return fit.accelerated(
-            self,
-            dt=dt,
-            region=region,
-            tolerance=tolerance,
-            num_pairs=num_pairs,
-            seed=seed,
-            max_seconds=max_seconds,
-            on_progress=on_progress,
-        )
+        return fit.accelerated(self, dt=dt, region=region, num_pairs=num_pairs, **options)
 
     def settled(self) -> Fit:
         """Compute what a report and a saved model hold beside the map, as far as the budget goes:
         the posterior, which is left out of the map where it does not fit, and the defect of a step.
         Warns (FitWarning) of what is left out."""
-        known, map_, defect_known = len(self.budget.left_out), self.map, True
-        if map_.posterior is not None and not map_.posterior.known:
+        known, map_ = len(self.budget.left_out), self.map
+        posterior = map_.posterior
+        if posterior is not None and not posterior.known:
             work = work_of_posterior(self.chosen.num_parameters)
-            try:
-                with self.budget.last("the posterior, and with it bands", ROWS, work):
-                    _ = map_.posterior.root
-            except OutOfTime:
+            last = self.budget.last("the posterior, and with it bands", ROWS, work)
+            if within(last, lambda: posterior.root) is None:
                 map_ = dataclasses.replace(map_, posterior=None)
-        try:
-            seconds = _OF_DERIVATIVE * self.budget.compiling
-            with self.budget.last("the symplecticity defect of a step", COMPILE, seconds):
-                defect = self.symplecticity_defect
-        except OutOfTime:
-            defect_known, defect = False, float("nan")
+        seconds = _OF_DERIVATIVE * self.budget.compiling
+        last = self.budget.last("the symplecticity defect of a step", COMPILE, seconds)
+        defect = within(last, lambda: self.symplecticity_defect)
         messages = self.budget.left_out[known:]
         for message in messages:
             warnings.warn(message, FitWarning, stacklevel=2)
         found = self.replaced(
             map=map_,
             messages=(*self.messages, *messages),
-            defect_known=defect_known,
+            defect_known=defect is not None,
             seconds=self.budget.seconds,
         )
-        if defect_known:
+        if defect is not None:
             found.__dict__["symplecticity_defect"] = defect
         return found
 

@@ -86,7 +86,8 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
     or without states that the map cannot follow, where the others then meet the tolerance; as it
     is, where the tolerance is met, there are none, or too many. And what is to be said of them."""
     wrong, rim, count = np.zeros(0, int), np.zeros(0, int), len(found.data)
-    request = dataclasses.replace(request, factors=None, checkpoints=None)
+    watch = dataclasses.replace(request.watch, factors=None, checkpoints=None, on_better=None)
+    request = dataclasses.replace(request, watch=watch)
     for _ in range(OPTIONS.rounds):
         left = _residuals(found)
         if left is None:
@@ -114,9 +115,9 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
         if not _rms(size) > OPTIONS.spoilt * _rms(size[others]):
             break
         at_rim = _at_the_rim(found, rows)
-        request.on_progress(f"without {gone} of {count} pairs that the map misses by far")
+        request.watch.on_progress(f"without {gone} of {count} pairs that the map misses by far")
         data = found.data.take(others)
-        again = searched(request, data, diagnose_request(request, data), None)
+        again = searched(request, data, diagnose_request(request, data))
         left = _residuals(again)
         if left is not None:
             with request.budget.free(FLOW, left.work):

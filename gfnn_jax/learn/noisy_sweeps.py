@@ -67,7 +67,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
         with request.budget.unit(_WHAT, ROWS, work):
             if not only_noise(best, found):
                 return found
-            request.on_progress("fitting S to the states that noisy pairs most likely had")
+            request.watch.on_progress("fitting S to the states that noisy pairs most likely had")
             entry = _corrected(rivals, request)
     except OutOfTime:
         request.budget.leave_out(_WHAT, request.budget.ended)
@@ -77,7 +77,7 @@ def without_bias(found: Searched, request: Request) -> Searched:
         return found
     if not GAINED * entry.candidate.validation_relative <= best.candidate.validation_relative:
         return found
-    request.on_candidate(entry.candidate)
+    request.watch.on_candidate(entry.candidate)
     others = [e for e in found.found.entries if e.size is not entry.size]
     again = found.found._replace(entries=[*others, entry], ranking=[entry, *ranking])
     return found._replace(found=again)
@@ -148,7 +148,7 @@ def _last_of_group(sweep: LinearSweep, size: Size) -> Size:
 
 def _corrected(rivals: list[Entry], request: Request) -> Entry:
     """The entry of smallest expected error, or the cheapest that is as good."""
-    given = request.budget, request.on_progress
+    given = request.budget, request.watch.on_progress
     most = [entry.sweep.largest_known for entry in rivals]
     starts = [best_size(e.sweep, e.size, m, *given).size for e, m in zip(rivals, most, strict=True)]
     # The same for all, so that their distances have one unit.
@@ -170,7 +170,7 @@ def _corrected(rivals: list[Entry], request: Request) -> Entry:
     size = best_size(sweep, size, m, *given).size
     free = Budget()
     candidate = sweep.validate(
-        size, sweep.estimate(size, free, request.on_progress), free, request.on_progress
+        size, sweep.estimate(size, free, request.watch.on_progress), free, request.watch.on_progress
     )
     return Entry(candidate, sweep, size)
 

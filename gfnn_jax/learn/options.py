@@ -11,6 +11,7 @@ import difflib
 import functools
 import inspect
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -403,11 +404,38 @@ class FitOptions:
         values = {name: getattr(self, name) for name, about in OPTIONS.items() if about.decides}
         return {n: list(v) if isinstance(v, (tuple, list)) else v for n, v in values.items()}
 
-    def budget(self, clock: Callable[[], float], dim: int | None, spent: float = 0.0) -> Budget:
-        """Start the budget of a fit whose map has ``dim`` degrees of freedom, ``spent`` seconds
-        ago."""
+    def budget(self, watch: Watch, dim: int | None) -> Budget:
+        """Start the budget of a fit whose map has ``dim`` degrees of freedom."""
         seconds = seconds_allowed(self.max_seconds, self.max_operations)
-        return Budget(seconds, self.max_operations, clock, dim, spent)
+        return Budget(seconds, self.max_operations, watch.clock, dim, watch.spent)
+
+
+@_named
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Watch:
+    """Facts about a fit that decide nothing of its model: who watches it, and what it goes on from.
+
+    clock: gives the seconds that max_seconds is held against. spent: seconds of them that are gone
+    already, as on reading files. checkpoints, factors: a ``TrainingCheckpoints`` and a
+    ``KeptFactors``, which an interrupted fit has saved to and the same fit goes on from.
+    on_progress, on_candidate: called with what is being done, and with every candidate. on_better:
+    called with a map and its candidate whenever steps have shown one that is more accurate than
+    those before, so that it can be kept should the fit be interrupted.
+    """
+
+    clock: Callable[[], float] = time.perf_counter
+    spent: float = 0.0
+    checkpoints: Any = None
+    factors: Any = None
+    on_progress: Callable[[str], Any] = lambda message: None
+    on_candidate: Callable[[Any], Any] = lambda candidate: None
+    on_better: Callable[[Any, Any], Any] | None = None
+
+    @classmethod
+    def taken_from(cls, changes: dict[str, Any]) -> Watch:
+        """Take those of these keywords that are of a watch, out of them."""
+        names = {field.name for field in dataclasses.fields(cls)} & set(changes)
+        return cls(**{name: changes.pop(name) for name in names})
 
 
 _LISTED = "\n".join(f"    {name}: {about.help}." for name, about in OPTIONS.items())
@@ -419,7 +447,8 @@ def with_options(function: Callable[..., Any]) -> Callable[..., Any]:
     ``**options``."""
     shown = inspect.signature(function)
     own = [p for p in shown.parameters.values() if p.kind is not p.VAR_KEYWORD]
-    options = list(inspect.signature(FitOptions).parameters.values())
+    kinds = FitOptions, Watch
+    options = [p for kind in kinds for p in inspect.signature(kind).parameters.values()]
     ordered = sorted([*own, *options], key=lambda p: p.kind is p.KEYWORD_ONLY)
     function.__signature__ = shown.replace(parameters=ordered)  # pyright: ignore[reportFunctionMemberAccess]
     function.__doc__ = f"{function.__doc__}\n    Options:\n\n{_LISTED}\n    "

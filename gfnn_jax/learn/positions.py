@@ -10,12 +10,12 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.budget import ROWS, Budget
+from gfnn_jax.budget import ROWS, Budget, within
 from gfnn_jax.candidates.assemble import block_of, stepped
 from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import Coordinates, nearest_image
@@ -25,14 +25,14 @@ from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, one_step_er
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.dataset.split import Split, split_rows
 from gfnn_jax.dataset.structures import Sites, structure_of
-from gfnn_jax.errors import FitError, FitWarning, OutOfTime
+from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
 from gfnn_jax.generating.charts import TYPE1
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit, OfPositions
-from gfnn_jax.learn.options import FitOptions
+from gfnn_jax.learn.options import FitOptions, Watch
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.models.positions.discrete_lagrangian import displacement, residuals, solve
 from gfnn_jax.models.positions.latent_positions import starting_noise, without_noise
@@ -65,13 +65,7 @@ class PositionOptions:
 OPTIONS = PositionOptions()
 
 
-def learn_positions(
-    recording: Recording,
-    options: FitOptions,
-    clock: Callable[[], float],
-    on_progress: Callable[[str], Any],
-    on_candidate: Callable[[Candidate], Any],
-) -> Fit:
+def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> Fit:
     """Learn the map behind positions alone, at even times or by turns: S(q, Q) of chart type 1.
 
     recording: its positions, of one run or many; an angle's values that range over more than one
@@ -89,7 +83,7 @@ def learn_positions(
     require_x64("a fit")
     tolerance, structure = Tolerance.of(options), options.structure
     recording, left_out = without_wrong_values(recording)
-    budget = options.budget(clock, len(recording.positions) or None)
+    budget = options.budget(watch, len(recording.positions) or None)
     triples = triples_of(recording, sites=structure is not None)
     sites = structure_of(structure, triples.dim, Coordinates("positions", triples.angles))
     if sites is not None and not isinstance(sites, Sites):
@@ -116,8 +110,7 @@ def learn_positions(
         _split(triples, options.seed),
         tolerance,
         budget,
-        on_progress,
-        on_candidate,
+        watch,
         sensors,
     )
     best = sweep.best(symmetric=True)
@@ -160,8 +153,7 @@ class _Sweep:
     split: Split
     tolerance: Tolerance
     budget: Budget
-    on_progress: Callable[[str], Any]
-    on_candidate: Callable[[Candidate], Any]
+    watch: Watch
     sensors: Sensors
     tried: list[Candidate] = dataclasses.field(default_factory=list)
 
@@ -179,10 +171,8 @@ class _Sweep:
         found: _Found | None = None
         worse = 0
         for family in self._families(symmetric):
-            try:
-                with self.budget.unit(f"S of {family.label}", ROWS, self._work(family)):
-                    new = self._fitted(family, symmetric)
-            except OutOfTime:
+            new = self._within_budget(family, symmetric)
+            if new is None:
                 break
             if found is None or not new.candidate.validation_bound >= (
                 OPTIONS.better * found.candidate.validation_bound
@@ -236,13 +226,15 @@ class _Sweep:
         else the best as it is."""
         if not self._stalls(best):
             return best
-        self.on_progress("larger S are no more accurate: fitting the noise of the readings too")
+        self.watch.on_progress(
+            "larger S are no more accurate: fitting the noise of the readings too"
+        )
         symmetric, split = best.about.symmetric, self.split
         training, held_out = (
             self.triples.take(np.sort(rows)) for rows in (split.training, split.validation)
         )
         families = self._families(symmetric)
-        found = without_noise(families, training, held_out, self.budget, self.on_progress)
+        found = without_noise(families, training, held_out, self.budget, self.watch.on_progress)
         if found is None:
             return best
         started = time.perf_counter()
@@ -266,20 +258,21 @@ class _Sweep:
             return False
         known = next((c for c in self.tried if c.num_parameters == larger.num_parameters), None)
         if known is None:
-            try:
-                with self.budget.unit(f"S of {larger.label}", ROWS, self._work(larger)):
-                    known = self._fitted(larger, best.about.symmetric).candidate
-            except OutOfTime:
+            new = self._within_budget(larger, best.about.symmetric)
+            if new is None:
                 return False
+            known = new.candidate
         return known.validation_relative > OPTIONS.stalled * error
 
-    def _work(self, family: OfDisplacement) -> float:
-        """Operations of a solve."""
-        return float(len(self.split.training) * self.triples.dim * family.num_parameters**2)
+    def _within_budget(self, family: OfDisplacement, symmetric: bool) -> _Found | None:
+        """S of this family; None where the budget has no room for it."""
+        work = float(len(self.split.training) * self.triples.dim * family.num_parameters**2)
+        unit = self.budget.unit(f"S of {family.label}", ROWS, work)
+        return within(unit, lambda: self._fitted(family, symmetric))
 
     def _fitted(self, family: OfDisplacement, symmetric: bool) -> _Found:
         """S of this family by least squares."""
-        self.on_progress(f"S of {family.label}, {family.num_parameters} terms")
+        self.watch.on_progress(f"S of {family.label}, {family.num_parameters} terms")
         started, training = time.perf_counter(), self.triples.take(self.split.training)
         solved = solve(family, training)
         about = OfPositions(
@@ -323,7 +316,7 @@ class _Sweep:
             rank=about.rank,
         )
         self.tried.append(candidate)
-        self.on_candidate(candidate)
+        self.watch.on_candidate(candidate)
         return _Found(piece, candidate, about, root, noise)
 
     def error_of(self, positions: np.ndarray, rows: np.ndarray) -> OneStepError:
@@ -334,7 +327,7 @@ class _Sweep:
     def learned(self, best: _Found, left_out: Sequence[str], seed: int) -> Fit:
         """The map of the best S, its error that of the steps that users run, on triples that chose
         nothing where there are enough. left_out: lines about readings that were."""
-        self.on_progress(f"compiling the step of {best.candidate.label}")
+        self.watch.on_progress(f"compiling the step of {best.candidate.label}")
         sensors = dataclasses.replace(self.sensors, sigma=best.noise)
         map_, states = map_of(best.piece, best.root, sensors, self.triples, self.sites)
         test = self.split.test if len(self.split.test) else self.split.validation
@@ -355,7 +348,7 @@ class _Sweep:
                 f"accurate has a one-step error of {chosen.validation_relative:.2e} of the spread "
                 f"(95 % bound {chosen.validation_bound:.2e}); the search ended because {ended}"
             )
-        self.on_progress(str(best.about))
+        self.watch.on_progress(str(best.about))
         part = "took no part in the fit or its choices" if test is self.split.test else "also chose"
         tested = states.take(test[: min(STATES_MEASURED, block_of(2 * map_.dim))])
         determinant = np.asarray(map_.determinant(tested.z0))

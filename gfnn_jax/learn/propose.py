@@ -52,7 +52,7 @@ def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request
         best, left = _best(data)
         if left < OPTIONS.tried:
             structure = structure_of(best, data.dim, data.coordinates)
-            request.on_progress(
+            request.watch.on_progress(
                 f"the structure {best} leaves relative residuals of {left:.1g} in forces and "
                 "velocities: it is tried first"
             )

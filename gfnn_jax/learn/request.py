@@ -11,14 +11,11 @@ from __future__ import annotations
 
 import dataclasses
 import numbers
-from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
 
 from gfnn_jax.budget import RATES, ROWS, Budget
-from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import CARTESIAN, TWO_PI, Coordinates
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
@@ -30,7 +27,7 @@ from gfnn_jax.diagnosis.local_jacobians import check_number
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
-from gfnn_jax.learn.options import FitOptions
+from gfnn_jax.learn.options import FitOptions, Watch
 from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
 from gfnn_jax.models.maps_of_laws.law_maps import factored_out, flow_of
 from gfnn_jax.phase_space import Pairs, sizes, split
@@ -257,7 +254,7 @@ class Request:
     """Pairs in float64 and what is to be learned of them.
 
     options: of the fit, with ``learn`` as the pairs allow it. tolerance, structure: those of the
-    options, and the scene's. on_progress, on_candidate: those of `gfnn.fit`. messages: warnings
+    options, and the scene's. messages: warnings
     about the pairs and the request. partial_laws: those that were found so far.
     """
 
@@ -268,16 +265,13 @@ class Request:
     tolerance: Tolerance
     structure: Structure | None
     budget: Budget
-    checkpoints: Any
-    factors: Any
-    on_progress: Callable[[str], Any]
-    on_candidate: Callable[[Candidate], Any]
+    watch: Watch
     messages: list[str]
     partial_laws: list[PartialLaw] = dataclasses.field(default_factory=list)
 
     def partly(self, law: PartialLaw) -> None:
         """Keep a law that explains a part."""
-        self.on_progress(f"H: {law}")
+        self.watch.on_progress(f"H: {law}")
         self.partial_laws.append(law)
 
     @property
@@ -309,12 +303,11 @@ def lent(scene: Scene | None, options: FitOptions) -> str | None:
     return None if own or (of_bodies and of_map) else scene.structure
 
 
-def checked(pairs: Pairs, scene: Scene | None, options: FitOptions, **others: Any) -> Request:
-    """Make the request, with what is constant in the pairs as a constant.
-
-    others: the remaining fields of `Request`. Raises FitError, in one line, where the pairs cannot
-    give what is asked for.
-    """
+def checked(
+    pairs: Pairs, scene: Scene | None, options: FitOptions, budget: Budget, watch: Watch
+) -> Request:
+    """Make the request, with what is constant in the pairs as a constant. Raises FitError, in one
+    line, where the pairs cannot give what is asked for."""
     structure = lent(scene, options)
     check_request(pairs, scene, options, structure)
     coordinates = (
@@ -337,7 +330,7 @@ def checked(pairs: Pairs, scene: Scene | None, options: FitOptions, **others: An
     bound = Tolerance.of(options)
     messages += [*coarse_tolerance(pairs, bound), *unnamed_angles(pairs, coordinates)]
     options = dataclasses.replace(options, learn=learn)
-    return Request(pairs, scene, coordinates, options, bound, found, messages=messages, **others)
+    return Request(pairs, scene, coordinates, options, bound, found, budget, watch, messages)
 
 
 def paid_for(found: Identified, budget: Budget, seed: int) -> Identified:

@@ -58,18 +58,17 @@ class Searched(NamedTuple):
         return self.law is not None and self.tolerance.met_by(self.law.candidate)
 
 
-def searched(
-    request: Request, data: Dataset, taken: Diagnosis, on_better: OnBetter | None
-) -> Searched:
+def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
     """Every candidate. Raises FitError where there is none."""
     diagnosis = taken
     tolerance, budget, on_progress, on_candidate = (
         request.tolerance,
         request.budget,
-        request.on_progress,
-        request.on_candidate,
+        request.watch.on_progress,
+        request.watch.on_candidate,
     )
     options, scene, charts = request.options, request.scene, diagnosis.charts
+    on_better = request.watch.on_better
     better = _Better(on_better) if on_better is not None else None
     given = tolerance.bound, budget, on_progress, on_candidate, better
     # Small sizes first: a map is then there, however long the search for H.
@@ -170,7 +169,7 @@ def _law(
     if law is not None:
         if better is not None:
             better.offer(law.candidate, lambda: composed(law.flow, problem.data))
-        request.on_candidate(law.candidate)
+        request.watch.on_candidate(law.candidate)
     return law
 
 
@@ -185,7 +184,7 @@ def _sweeps(request: Request, taken: Dataset, diagnosis: Diagnosis) -> list[Any]
         return []
     if data.own_dt is not None:
         alone = data.structure is None and data.args is None
-        return [sweep_of_dt(data, tolerance, request.scene, request.factors)] if alone else []
+        return [sweep_of_dt(data, tolerance, request.scene, request.watch.factors)] if alone else []
     if options.family == "mlp":
         given = (
             data,
@@ -193,11 +192,13 @@ def _sweeps(request: Request, taken: Dataset, diagnosis: Diagnosis) -> list[Any]
             charts[0],
             options.max_iterations,
             options.seed,
-            request.checkpoints,
+            request.watch.checkpoints,
         )
         count = options.ensemble
         return [NetworkSweep(*given) if count == 1 else EnsembleSweep(*given, count=count)]
-    return list(sweeps_for(options.family, charts, data, tolerance, request.scene, request.factors))
+    return list(
+        sweeps_for(options.family, charts, data, tolerance, request.scene, request.watch.factors)
+    )
 
 
 def _nothing_found(num_pairs: int, budget: Budget) -> str:
