@@ -148,7 +148,7 @@ def test_without_a_budget_gross_errors_are_left_out(looked_for):
 def test_where_the_budget_has_no_room_for_all_pairs_none_is_looked_at(part, spoilt, looked_for):
     """At a part of the operations, and of the seconds, that the residuals alone take; with a
     little more there is no room for the neighbours."""
-    work = 300 * spoilt[2].law.candidate.operations
+    work = 300 * spoilt[1].law.candidate.operations
     clock = Budget(max_seconds=part * work / RATES[FLOW], clock=lambda: 0.0)
     for budget in (clock, Budget(max_operations=int(part * work))):
         assert looked_for(budget) == (300, 300 * (part > 1))

@@ -129,7 +129,7 @@ class Sweep(Climbed, Protocol):
 
 
 class Entry(NamedTuple):
-    """A candidate, estimated or validated, of a size of a sweep (`search.sweep.Sweep`)."""
+    """A candidate, estimated or validated, of a size of a sweep (`Sweep`)."""
 
     candidate: Candidate
     sweep: Any
