@@ -17,7 +17,7 @@ from gfnn_jax.fitting import row_blocks
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import affordable, fit_predictors
-from gfnn_jax.maps.parameters import Parameters, sampled
+from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.maps.piece import Piece
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.solve.status import LEFT_DOMAIN
@@ -97,6 +97,12 @@ def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:
 
 def composed(piece: Piece, data: Dataset) -> SymplecticMap:
     """The piece between those that were factored out, in the scene's coordinates: leaves of JAX."""
+    # Where the args that a map depends on were sampled, and the dt of an S of dt
+    parameters = dt_range = None
+    if data.args is not None:
+        parameters = sampled(data.parameters, data.args, data.each_dt, data.period)
+    if data.own_dt is not None and isinstance(piece, Generated):
+        dt_range = np.array([data.own_dt.min(), data.own_dt.max()])
     map_ = SymplecticMap(
         pieces=(*data.before, piece, *data.after),
         coordinates=data.coordinates,
@@ -104,25 +110,11 @@ def composed(piece: Piece, data: Dataset) -> SymplecticMap:
         scale=data.spread,
         angle_centre=data.angle_centre,
         dt=data.dt,
-        parameters=_sampled(data),
-        dt_range=_dt_range(piece, data),
+        parameters=parameters,
+        dt_range=dt_range,
     )
     # Not jnp.asarray, which compiles a copy for every new shape.
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
-
-
-def _sampled(data: Dataset) -> Parameters | None:
-    """Args that the map depends on beside the state, and where they were sampled."""
-    if data.args is None:
-        return None
-    return sampled(data.parameters, data.args, data.each_dt, data.period)
-
-
-def _dt_range(piece: Piece, data: Dataset) -> np.ndarray | None:
-    """Range in which dt was sampled, of an S that was learned with it."""
-    if data.own_dt is None or not isinstance(piece, Generated):
-        return None
-    return np.array([data.own_dt.min(), data.own_dt.max()])
 
 
 def block_of(width: int) -> int:

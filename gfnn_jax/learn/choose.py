@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.budget import FLOW, ROWS, Budget, within
-from gfnn_jax.candidates.assemble import composed, measured, stepped
+from gfnn_jax.candidates.assemble import measured, stepped
 from gfnn_jax.candidates.candidate import Candidate, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
@@ -130,9 +130,8 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     smaller = _smaller(tried, budget, on_progress)
     for entry in itertools.chain([first], larger, ranking[1:], smaller):
         on_progress(f"compiling the step of {entry.candidate.chart} {entry.candidate.label}")
-        sweep = entry.sweep
-        map_ = composed(sweep.piece(entry.size), sweep.data)
-        assembled = measured(entry.candidate, map_, sweep.data, request.tolerance, budget)
+        data = entry.sweep.data
+        assembled = measured(entry.candidate, entry.map, data, request.tolerance, budget)
         compile_seconds += assembled.compile_seconds
         tried.append((assembled.candidate, assembled.failed, entry))
         expected = max(bound, OPTIONS.confirmed * entry.candidate.validation_bound)

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.budget import FLOW
-from gfnn_jax.candidates.assemble import composed, stepped
+from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import error_of_each
@@ -229,9 +229,8 @@ def _follows(found: Searched, again: Searched, rows: np.ndarray) -> bool:
     """Return whether the steps of the map that was found again, without these rows, are solved
     there, and err there by no more than the map before did over all pairs, added up."""
     entry = again.found.ranking[0]
-    map_ = composed(entry.sweep.piece(entry.size), entry.sweep.data)
     pairs = found.data.pairs.take(rows)
-    steps = stepped(map_, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
+    steps = stepped(entry.map, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
     images = np.where(steps.failed[:, None], np.nan, steps.images)
     error = error_of_each(found.data, found.tolerance, images, rows)
     before = found.found.ranking[0].candidate.validation_bound

@@ -92,15 +92,15 @@ def _as_far(found: Searched) -> list[Entry]:
         known = best.get(id(entry.sweep))
         if error <= limit and (known is None or error < known.candidate.validation_relative):
             best[id(entry.sweep)] = entry
-    able = [e for e in best.values() if _can_be_corrected(e)]
+    able = [
+        e
+        for e in best.values()
+        if e.sweep.linear
+        and isinstance(e.size.family, Products)
+        and not e.sweep.data.varied
+        and e.sweep.moved_by_states
+    ]
     return sorted(able, key=lambda e: e.candidate.validation_relative)[:_MOST_SWEEPS]
-
-
-def _can_be_corrected(entry: Entry) -> bool:
-    plain = entry.sweep.linear and isinstance(entry.size.family, Products)
-    if not plain:
-        return False
-    return not entry.sweep.data.varied and entry.sweep.moved_by_states
 
 
 class Expected(NamedTuple):
@@ -138,12 +138,8 @@ def best_size(sweep: LinearSweep, near: Size, most: Size, budget: Budget, on_pro
         best = int(np.argmin(errors))
         if best < place or place + 1 == len(sweep.sizes):
             return Expected(sizes[best], float(errors[best]), float(own[best]), noise)
-        most = _last_of_group(sweep, sweep.sizes[place + 1])
-
-
-def _last_of_group(sweep: LinearSweep, size: Size) -> Size:
-    """The largest size that is estimated from the same factor."""
-    return [other for other in sweep.sizes if other.group is size.group][-1]
+        group = sweep.sizes[place + 1].group  # of sizes that are estimated from one factor
+        most = [size for size in sweep.sizes if size.group is group][-1]
 
 
 def _corrected(rivals: list[Entry], request: Request) -> Entry:

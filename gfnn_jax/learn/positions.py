@@ -116,7 +116,8 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
     best = sweep.best(symmetric=True)
     if best is None or best.candidate.validation_bound > tolerance.bound:
         other = sweep.best(symmetric=False)
-        if other is not None and (best is None or _clearly_better(other, best)):
+        least = np.inf if best is None else OPTIONS.gain * best.candidate.validation_bound
+        if other is not None and (best is None or other.candidate.validation_bound < least):
             best = other
     if best is None:
         raise FitError(
@@ -138,10 +139,6 @@ class _Found(NamedTuple):
     about: OfPositions
     root: np.ndarray
     noise: np.ndarray
-
-
-def _clearly_better(one: _Found, other: _Found) -> bool:
-    return one.candidate.validation_bound < OPTIONS.gain * other.candidate.validation_bound
 
 
 @dataclasses.dataclass

@@ -215,15 +215,10 @@ class _Better:
         self._on_better, self._best = on_better, np.inf
 
     def __call__(self, entry: Entry) -> None:
-        self.offer(entry.candidate, lambda: _map_of(entry))
+        self.offer(entry.candidate, lambda: entry.map)
 
     def offer(self, candidate: Candidate, make: Callable[[], SymplecticMap]) -> None:
         """Hand on the map that ``make`` makes, if its candidate is better than those before."""
         if candidate.validation_bound < self._best:
             self._best = candidate.validation_bound
             self._on_better(make(), candidate)
-
-
-def _map_of(entry: Entry) -> SymplecticMap:
-    sweep = entry.sweep
-    return composed(sweep.piece(entry.size), sweep.data)

@@ -20,9 +20,11 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from gfnn_jax.budget import ROWS, SOLVE, Budget
+from gfnn_jax.candidates.assemble import composed
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import OutOfTime
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,6 +136,11 @@ class Entry(NamedTuple):
     candidate: Candidate
     sweep: Any
     size: Any
+
+    @property
+    def map(self) -> SymplecticMap:
+        """The map of this size."""
+        return composed(self.sweep.piece(self.size), self.sweep.data)
 
 
 class Found(NamedTuple):
