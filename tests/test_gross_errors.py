@@ -55,9 +55,7 @@ def test_states_at_the_rim_are_kept_where_the_map_of_the_others_is_lost_there(
             return 100
 
     candidate = types.SimpleNamespace(validation_bound=1e-3)
-    entry = types.SimpleNamespace(
-        sweep=types.SimpleNamespace(piece=lambda size: None, data=None), size=3, candidate=candidate
-    )
+    entry = types.SimpleNamespace(map=None, candidate=candidate)
     data = Data(pairs=Pairs(z, z, 0.1), user_angles=(), spread=np.ones(2))
     found = types.SimpleNamespace(
         data=data,
@@ -69,7 +67,6 @@ def test_states_at_the_rim_are_kept_where_the_map_of_the_others_is_lost_there(
         failed = np.isin(np.arange(len(z0)), unsolved)
         return types.SimpleNamespace(images=z0 + off, failed=failed)
 
-    monkeypatch.setattr(gross_errors, "composed", lambda piece, data: None)
     monkeypatch.setattr(gross_errors, "stepped", stepped)
     assert gross_errors._follows(found, found, np.array([0, 99])) is follows
 
