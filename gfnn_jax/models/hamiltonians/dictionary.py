@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.noise import of_differences
 from gfnn_jax.dataset.runs import next_of
 from gfnn_jax.errors import InputError, OutOfTime
+from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_with_constants
 from gfnn_jax.flows.collocation import Steps, operations
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw, PartialLaw, Rival, Term, proposals
@@ -62,7 +63,7 @@ class DictionaryOptions:
     brought: that further terms must bring. fitted: laws. evaluations: of the flow at each state,
     that the fits of a law to sequences take together. screened, iterations: part of the cost from
     which one counts, and how many, while laws are compared. as_noise: times the noise, that a law
-    may leave over. sure: logarithm of the largest odds that are told.
+    may leave over.
     """
 
     dictionaries: tuple[tuple[str, tuple[str, ...], tuple[float, ...]], ...] = (
@@ -84,7 +85,6 @@ class DictionaryOptions:
     screened: float = 3e-4
     iterations: int = 12
     as_noise: float = 1.1
-    sure: float = 40.0
 
 
 OPTIONS = DictionaryOptions()
@@ -232,9 +232,9 @@ def _chosen(problem: LawProblem, formulas: list[Formula], noise: np.ndarray) -> 
     if not laws:
         return None
     laws.sort(key=lambda law: law.length)
-    best = laws[0]
-    formula, fitted = best.formula, best.fitted
-    on_held_out = _fitted(sequences, held, formula, fitted.p, fix_coefficients=True)
+    formula, fitted, _ = laws[0]
+    given = formula.family, fitted.p, len(formula.coefficients)
+    on_held_out = sequences.fitted(held, *given, fix_coefficients=True)
     for found in (fitted, on_held_out):
         if found is None or not _rms(noise_of(found) / noise) <= OPTIONS.as_noise:
             for law in laws[:3]:
@@ -252,7 +252,7 @@ def _rivals(laws: list[_LawOfSequences]) -> tuple[Rival, ...]:
         if law.formula.kind != laws[0].formula.kind:
             others.setdefault(law.formula.kind, law)
     return tuple(
-        Rival(_shown(law), float(np.exp(min(law.length - laws[0].length, OPTIONS.sure))))
+        Rival(_shown(law), float(np.exp(min(law.length - laws[0].length, EVIDENCE.log_odds))))
         for law in list(others.values())[:2]
     )
 
@@ -289,23 +289,25 @@ def _significant(
     sequences: Sequences, measured: Measured, formula: Formula
 ) -> _LawOfSequences | None:
     """The terms of a law that whole sequences tell from noise, fitted to them."""
-    p = np.concatenate([formula.coefficients, formula.constants])
     while True:
-        found = _fitted(
-            sequences, measured, formula, p, gained=OPTIONS.screened, iterations=OPTIONS.iterations
+        count = len(formula.coefficients)
+        found = sequences.fitted(
+            measured,
+            formula.family,
+            formula.p,
+            count,
+            gained=OPTIONS.screened,
+            iterations=OPTIONS.iterations,
         )
         if found is None:
             return None
-        triangle = triangle_of(found)
+        formula, triangle = formula.at(found.p), triangle_of(found)
         kept = terms_with_constants(triangle, found.p, ABOVE_NOISE, formula.numbers)
-        if len(kept) == len(formula.coefficients):
+        if len(kept) == count:
             break
         if not kept:
             return None
-        c = found.p[: len(formula.coefficients)]
-        formula = formula.with_constants(found.p[len(c) :]).take(kept, c[kept])
-        p = np.concatenate([formula.coefficients, formula.constants])
-    formula = formula.with_constants(found.p[len(formula.coefficients) :])
+        formula = formula.take(kept)
     count = np.isfinite(found.residuals).sum(axis=(0, 1))
     length = float(
         np.sum(count * np.log(noise_of(found)))
@@ -313,13 +315,6 @@ def _significant(
         + NOISY.penalty * formula.complexity
     )
     return _LawOfSequences(formula, found, length)
-
-
-def _fitted(
-    sequences: Sequences, measured: Measured, formula: Formula, p: np.ndarray, **options: Any
-) -> Fitted | None:
-    terms = len(p) - len(formula.constants)
-    return sequences.fitted(measured, formula.family, p, terms, **options)
 
 
 def _law(problem: LawProblem, formula: Formula, fitted: Fitted) -> FittedLaw:

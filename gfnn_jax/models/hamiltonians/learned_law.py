@@ -25,14 +25,6 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.rates import rates
 from gfnn_jax.flows.uniform import without_forces
-from gfnn_jax.models.hamiltonians.cost_of_flow import (
-    CONTRACTING,
-    FAST,
-    FREQUENCY_STATES,
-    contraction_of,
-    omega_h_of,
-    operations_of,
-)
 from gfnn_jax.models.hamiltonians.covariance import covariance_root
 from gfnn_jax.models.hamiltonians.fitted_law import (
     Dropped,
@@ -49,7 +41,15 @@ from gfnn_jax.models.hamiltonians.friction import (
     kinds_of_friction,
     without_turns,
 )
-from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.hamiltonians.problem import (
+    CONTRACTING,
+    FAST,
+    FREQUENCY_STATES,
+    LawProblem,
+    contraction_of,
+    omega_h_of,
+    operations_of,
+)
 from gfnn_jax.models.hamiltonians.symmetries import symmetries_of
 from gfnn_jax.models.lagrangians.friction_choice import WhichFriction, odds_text
 from gfnn_jax.phase_space import apply_j

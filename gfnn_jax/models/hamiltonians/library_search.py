@@ -25,7 +25,6 @@ from gfnn_jax.fitting.linear_starts import forward_start, log_start, midpoint_st
 from gfnn_jax.fitting.significance import ABOVE_NOISE, null_terms, significant
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.flows.rates import rates
-from gfnn_jax.models.hamiltonians.cost_of_flow import FAST, FREQUENCY_STATES, operations_of
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.friction import Forces, beside_friction, libraries_with
 from gfnn_jax.models.hamiltonians.libraries import (
@@ -33,7 +32,7 @@ from gfnn_jax.models.hamiltonians.libraries import (
     own_terms,
     promising,
 )
-from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.hamiltonians.problem import FAST, FREQUENCY_STATES, LawProblem, operations_of
 from gfnn_jax.models.parameters import states_and_functions, walked
 
 NONE: Mapping[int, FittedLaw] = MappingProxyType({})

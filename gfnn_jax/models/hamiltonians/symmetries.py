@@ -41,11 +41,7 @@ class SymmetryOptions:
 OPTIONS = SymmetryOptions()
 
 
-class Symmetry(NamedTuple):
-    """text: as it is told. rows: (n, terms) the restriction, B c = 0."""
-
-    text: str
-    rows: np.ndarray
+Symmetry = tuple[str, np.ndarray]  # as it is told; (n, terms) the restriction B, B c = 0
 
 
 class LawNumbers(NamedTuple):
@@ -60,14 +56,14 @@ class LawNumbers(NamedTuple):
 
 def symmetries_of(family: Terms, c: np.ndarray, z: np.ndarray, angles: Sequence[int] = ()):
     """Texts of the symmetries that H = Σ c_j φ_j has to roundoff at states z (N, 2d)."""
-    return tuple(s.text for s in _held(family, c, z, angles))
+    return tuple(text for text, _ in _held(family, c, z, angles))
 
 
 def _held(family: Terms, c: np.ndarray, z: np.ndarray, angles: Sequence[int]) -> list[Symmetry]:
     return [
-        s
-        for s in _candidates(family, z[: OPTIONS.states], tuple(angles))
-        if np.abs(s.rows @ c).max() <= OPTIONS.holds * (np.abs(s.rows) @ np.abs(c)).max()
+        (text, rows)
+        for text, rows in _candidates(family, z[: OPTIONS.states], tuple(angles))
+        if np.abs(rows @ c).max() <= OPTIONS.holds * (np.abs(rows) @ np.abs(c)).max()
     ]
 
 
@@ -80,7 +76,7 @@ def imposed(
     if not held:
         return c
     size = np.where(c != 0, np.abs(c), 1.0)
-    rows = np.concatenate([_independent(s.rows, c) for s in held]) * size
+    rows = np.concatenate([_independent(found, c) for _, found in held]) * size
     moved = c - size * (np.linalg.pinv(rows, rcond=OPTIONS.null) @ (rows @ (c / size)))
     most = np.maximum(OPTIONS.allowed * deviations, OPTIONS.digits * np.abs(c))
     return moved if np.all(np.abs(moved - c) <= most) else c
@@ -95,16 +91,16 @@ def restricted(
     linear problem of the least change of p in units of its covariance.
     """
     terms, texts, (p, covariance, rows, _) = family.num_parameters, [], known
-    for symmetry in _candidates(family, z[: OPTIONS.states], tuple(angles)):
+    for text, found in _candidates(family, z[: OPTIONS.states], tuple(angles)):
         a = np.zeros((terms, len(p)))
-        a[:, :terms] = _independent(symmetry.rows, p[:terms])
+        a[:, :terms] = _independent(found, p[:terms])
         deviation = np.sqrt(np.einsum("ij,jk,ik->i", a, covariance, a).clip(0.0))
         parts = np.linalg.norm(a * p, axis=1)
         same = deviation <= OPTIONS.known * parts  # these terms have it, or those before imply it
         if np.any(np.abs(a @ p)[same] > OPTIONS.holds * parts[same]) or (~same).sum() == terms:
             continue
         if same.all():
-            texts.append(symmetry.text)
+            texts.append(text)
             continue
         a = a[~same]
         of_rows = a @ covariance @ a.T
@@ -116,7 +112,7 @@ def restricted(
             continue
         gain = covariance @ a.T @ inverse
         p, covariance = p - gain @ off, covariance - gain @ a @ covariance
-        texts.append(symmetry.text)
+        texts.append(text)
     return LawNumbers(p, covariance, rows, tuple(texts))
 
 
@@ -139,9 +135,9 @@ def _candidates(family: Terms, z: np.ndarray, angles: tuple[int, ...]) -> Iterat
         for text, generator in generators(family.dim, angles):
             # {φ, I} = ∇φᵀ J ∇I, of a quadratic or linear I with ∇I = A z + b.
             moved = (z @ generator[:, :-1].T + generator[:, -1]) @ symplectic_form(family.dim).T
-            yield Symmetry(text, np.einsum("nij,ni->nj", gradients, moved))
+            yield text, np.einsum("nij,ni->nj", gradients, moved)
         for text, matrix in reflections(family.dim, angles):
             there = np.einsum("ki,nkj->nij", matrix, family.term_gradients(z @ matrix.T))
             rows = (gradients - there).reshape(-1, gradients.shape[-1])
             if np.isfinite(rows).all():
-                yield Symmetry(text, rows)
+                yield text, rows

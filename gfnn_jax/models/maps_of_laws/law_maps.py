@@ -20,14 +20,14 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.rates import rates
 from gfnn_jax.models.generating_functions.sweeps import sweeps_for, trial_residual
-from gfnn_jax.models.hamiltonians.cost_of_flow import (
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
+from gfnn_jax.models.hamiltonians.problem import (
     CONTRACTING,
     FREQUENCY_STATES,
+    LawProblem,
     contraction_of,
     flow_operations,
 )
-from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
-from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS, Drawing, drawn
 from gfnn_jax.search.search import Entry, Found, Search
 

@@ -193,11 +193,8 @@ class Setting:
     def _of_one(self) -> _Group:
         """Shapes of one argument."""
         for place, argument in enumerate(self.arguments):
-            single = _singles(place, argument, 1)
-            yield (
-                [(factor,) for factor in single.factors],
-                single.slope[:, :, None] * argument.gradient,
-            )
+            factors, _, slopes = _singles(place, argument, 1)
+            yield [(factor,) for factor in factors], slopes[:, :, None] * argument.gradient
 
     def _of_coordinates(self) -> _Group:
         """Products of coordinates."""
@@ -216,11 +213,10 @@ class Setting:
             for argument, own, single in zip(self.arguments, entering, coarse, strict=True):
                 if used == own:
                     continue
-                along = (single.slope * value)[:, :, None] * argument.gradient
-                yield (
-                    [(*multiplier, factor) for factor in single.factors],
-                    along + single.value[:, :, None] * gradient,
-                )
+                factors, f, slopes = single
+                along = (slopes * value)[:, :, None] * argument.gradient
+                atoms: list[Atom] = [(*multiplier, factor) for factor in factors]
+                yield atoms, along + f[:, :, None] * gradient
 
     def _of_centres(self) -> _Group:
         """Shapes of distances from the points of a grid, along the positions' range and somewhat
@@ -268,17 +264,11 @@ class Setting:
         return [*((one(i),) for i in plain), *squares, *((one(i),) for i in circular)]
 
 
-class _Singles(NamedTuple):
-    """The atoms of one argument: their factors, f and f' (atoms, N)."""
-
-    factors: list[Factor]
-    value: np.ndarray
-    slope: np.ndarray
-
-
-def _singles(place: int, argument: Argument, every: int | None) -> _Singles:
-    """Shapes of the argument, with every so manieth of the constants that are tried; None: those
-    without constants."""
+def _singles(
+    place: int, argument: Argument, every: int | None
+) -> tuple[list[Factor], np.ndarray, np.ndarray]:
+    """Factors of the shapes of the argument, with every so manieth of the constants that are tried,
+    None: those without constants; and f and f' (shapes, N)."""
     x, factors, f, slopes = argument.value, [], [], []
     for kind in argument.kinds:
         if argument.index >= 0 and kind in (("power", 1.0), ("power", 2.0)):
@@ -291,7 +281,7 @@ def _singles(place: int, argument: Argument, every: int | None) -> _Singles:
             factors.append(Factor(place, kind, theta))
             f.append(value)
             slopes.append(slope)
-    return _Singles(factors, np.array(f), np.array(slopes))
+    return factors, np.array(f), np.array(slopes)
 
 
 def beside(plain: Terms, atoms: Iterable[Atom], arguments: Sequence[Argument]) -> Terms:

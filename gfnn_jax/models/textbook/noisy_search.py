@@ -219,9 +219,15 @@ class Formula(NamedTuple):
             place += inside
         return found
 
-    def with_constants(self, constants: np.ndarray) -> Formula:
-        """The same with these constants inside."""
-        return self._replace(atoms=_with(self.atoms, constants))
+    @property
+    def p(self) -> np.ndarray:
+        """(n,): coefficients, then constants."""
+        return np.concatenate([self.coefficients, self.constants])
+
+    def at(self, p: np.ndarray) -> Formula:
+        """The same with these coefficients and constants."""
+        count = len(self.coefficients)
+        return self._replace(coefficients=p[:count], atoms=_with(self.atoms, p[count:]))
 
     def family(self, constants: np.ndarray) -> Terms:
         """The terms, with these constants inside. Raises InputError for one that has run away."""
@@ -233,12 +239,14 @@ class Formula(NamedTuple):
         shapes = [tuple(sorted(f.form for f in atom)) for atom in self.atoms]
         return frozenset([*self.plain.term_names, *((s, shapes.count(s)) for s in shapes)])
 
-    def take(self, kept: Sequence[int], coefficients: np.ndarray) -> Formula:
+    def take(self, kept: Sequence[int]) -> Formula:
         """Take these terms alone."""
         count = self.plain.num_parameters
-        atoms = tuple(self.atoms[j - count] for j in kept if j >= count)
-        plain = self.plain.take([j for j in kept if j < count])
-        return self._replace(plain=plain, atoms=atoms, coefficients=coefficients)
+        return self._replace(
+            plain=self.plain.take([j for j in kept if j < count]),
+            atoms=tuple(self.atoms[j - count] for j in kept if j >= count),
+            coefficients=self.coefficients[list(kept)],
+        )
 
 
 def _with(atoms: Sequence[Atom], constants: np.ndarray) -> tuple[Atom, ...]:
@@ -320,9 +328,10 @@ class NoisyTextbook:
 
     def _formula(self, match: Match) -> Formula:
         """The law of a match, without the coordinates and products that it does not ask for."""
-        setting, nothing = self._setting, np.zeros(0)
-        given = *setting.plain(match.atoms), setting.arguments, nothing, np.inf
-        whole = Formula(*given, len(self._target))
+        setting = self._setting
+        plain, atoms = setting.plain(match.atoms)
+        nothing = np.zeros(plain.num_parameters + len(atoms))
+        whole = Formula(plain, atoms, setting.arguments, nothing, np.inf, len(self._target))
         columns = setting.columns(whole.family(whole.constants))
         triangle = Triangle.of(np.column_stack([columns, self._target]))
         kept = np.arange(columns.shape[1])
@@ -333,5 +342,6 @@ class NoisyTextbook:
             significance = np.abs(c) / (left * spectrum.deviations())
             worst = int(np.argmin(significance))
             if significance[worst] >= OPTIONS.kept or len(kept) == 1:
-                return whole.take(kept.tolist(), c)._replace(left=float(left))
+                found = whole.take(kept.tolist())
+                return found._replace(coefficients=c, left=float(left))
             kept = np.delete(kept, worst)
