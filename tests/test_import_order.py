@@ -80,6 +80,7 @@ HOMES = {  # the module, and those whose names begin as its own does
     "diffrax": "scenes.trajectories",
     "flax": "families.mlp",
     "matplotlib": "evaluate.figures",
+    "numba": "flows.kernel",
     "optax": "fitting.adam",
     "orbax": "storage.checkpoints",
     "pandas": "data.text_files",

@@ -24,7 +24,8 @@ from gfnn_jax.families.lagrangian import (
 )
 from gfnn_jax.fitting.evidence import Comparison
 from gfnn_jax.fitting.linearised import Linearised
-from gfnn_jax.flows.motion import NODES, Form
+from gfnn_jax.flows.dormand_prince import NODES
+from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import HOLDS, at_stages, interpolate
 from gfnn_jax.jobs.forecast import Ahead, forecast_recording
 from gfnn_jax.jobs.output import Output

@@ -245,6 +245,11 @@ class Friction:
         before = {1 / 2: "½ ", 1 / 3: "⅓ ", 1.0: ""}
         return tuple(before[part] + barred(shown(t)) for t, part in sharp.texts(speeds))
 
+    @property
+    def jumps(self) -> np.ndarray:
+        """The dry friction (F,) that has no width: its force jumps where its speed turns."""
+        return (self.kinds == DRY) & (self.widths == 0)
+
     def take(self, keep: Any) -> Friction:
         return Friction(self.directions[keep], self.kinds[keep], self.widths[keep])
 

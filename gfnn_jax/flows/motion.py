@@ -1,19 +1,14 @@
 """Motion of a law between samples, with its derivatives in the state and in the coefficients.
 
-The equation of motion is linear in the coefficients p of a law, r(q, v, a; p) = 0, so that with the
-acceleration known all its derivatives are explicit:
-
-    ∂a/∂x = −M⁻¹ ∂r/∂x,      ∂a/∂p_k = −M⁻¹ r_k,      r_k the residual of term k alone
-
-One step between two samples is a Runge–Kutta step of Dormand and Prince (order 5), with as many
-substeps as the fastest motion asks; all steps of a recording are taken at once, as one batch.
-Where dry friction has no width its force jumps: `flows.coulomb` steps from one jump to the next.
-"""
+A law with free coefficients is followed by steps of Dormand and Prince, with as many substeps as
+the fastest motion asks, from one event of dry friction to the next; `flows.kernel` is what computes
+them."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -25,41 +20,22 @@ from gfnn_jax.families.lagrangian import (
     Terms,
     functions_of,
 )
-from gfnn_jax.flows.dissipation import Dissipation
-from gfnn_jax.flows.quadratic import Parts, Quadratic
-from gfnn_jax.solve.linear import among, inverses
 
-# Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19: the solution of order 5.
-NODES = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
-_A = np.array(
-    [
-        [0, 0, 0, 0, 0, 0],
-        [1 / 5, 0, 0, 0, 0, 0],
-        [3 / 40, 9 / 40, 0, 0, 0, 0],
-        [44 / 45, -56 / 15, 32 / 9, 0, 0, 0],
-        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0, 0],
-        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0],
-    ]
-)
-WEIGHTS = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
+if TYPE_CHECKING:
+    from gfnn_jax.flows.tables import Tables
 
 
 class Step(NamedTuple):
     """States after a step (N, 2d), and their derivatives in the states before (N, 2d, 2d) and in
-    the coefficients (N, 2d, n)."""
+    the coefficients (N, 2d, n); the modes (N, F) in which it ends, of frictions without a width: 1
+    where they slide forward, -1 backward, 0 where they stick; and a status (N,), 0 of lanes that
+    were followed. Of steps one after another, `Form.follow`, each but the status is (N, M, ...)."""
 
     states: np.ndarray
     by_state: np.ndarray
     by_coefficients: np.ndarray
-
-
-class Rates(NamedTuple):
-    """Accelerations a (N, d), their derivatives in q, v and, where asked for, in the coefficients
-    (N, d, 2d + n), and the forces λ (N, F) of dry friction that slides or sticks."""
-
-    a: np.ndarray
-    by: np.ndarray
-    held: np.ndarray
+    modes: np.ndarray
+    status: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -68,9 +44,7 @@ class Form:
     friction, and gains of the inputs. Its coefficients are (c, ρ, G row by row); that of a row of
     friction of the kind UNIFORM is γ, of the force −γ ∂L/∂v. They are p (count,), or (N, count) of
     N states that follow laws of their own; phases of the terms are then (P,) or (N, P). powers: of
-    parameters that systems differ in, by which (θ, ρ, G) are multiplied (`in_systems`).
-    quadratic, dissipation: made of the terms and the friction, and of those of the form that this
-    one was made from where they are the same."""
+    parameters that systems differ in, by which (θ, ρ, G) are multiplied (`in_systems`)."""
 
     terms: Terms
     fixed: np.ndarray
@@ -78,14 +52,6 @@ class Form:
     friction: Friction
     num_inputs: int = 0
     powers: Powers | None = None
-    quadratic: Quadratic = None  # pyright: ignore[reportAssignmentType]
-    dissipation: Dissipation = None  # pyright: ignore[reportAssignmentType]
-
-    def __post_init__(self):
-        if self.quadratic is None or not self.quadratic.is_of(self.terms):
-            object.__setattr__(self, "quadratic", Quadratic.of(self.terms))
-        if self.dissipation is None or self.dissipation.friction is not self.friction:
-            object.__setattr__(self, "dissipation", Dissipation.of(self.friction))
 
     @property
     def dim(self) -> int:
@@ -94,20 +60,6 @@ class Form:
     @property
     def count(self) -> int:
         return self.basis.shape[1] + self.friction.count + self.dim * self.num_inputs
-
-    @property
-    def identity(self) -> np.ndarray:
-        """Derivatives (2d, 2d + count) of a state in itself and in the coefficients."""
-        return np.eye(2 * self.dim, 2 * self.dim + self.count)
-
-    def take(self, lanes: np.ndarray) -> Form:
-        """The form of some lanes, where each has its own phases."""
-        phases = self.terms.phases
-        if phases.ndim == 1:
-            return self
-        return dataclasses.replace(
-            self, terms=dataclasses.replace(self.terms, phases=phases[lanes])
-        )
 
     def split(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """c, ρ and G (..., d, inputs) of p (..., count)."""
@@ -140,176 +92,67 @@ class Form:
         form = dataclasses.replace(self, fixed=0 * self.fixed, basis=np.eye(count), powers=None)
         return form, weights * whole, weights[..., None] * turn
 
-    def accelerate(
-        self,
-        law: Lagrangian,
-        q: np.ndarray,
-        v: np.ndarray,
-        u: np.ndarray,
-        order: int = 2,
-        modes: np.ndarray | None = None,
-    ) -> Rates:
-        """The rates, with derivatives in the states (``order`` 1) and in the coefficients (2).
-        modes: (N, F) of the dry friction without a width, 1 or −1 where it slides, 0 where it
-        sticks."""
-        a, by, held = self._rates(law, q.T, v.T, u.T, order, modes)
-        return Rates(a.T, by.transpose(2, 0, 1), held)
+    @cached_property
+    def _tables(self) -> Tables:
+        from gfnn_jax.flows.tables import Tables  # loads numba: not before a law is followed
 
-    def _rates(
-        self,
-        law: Lagrangian,
-        q: np.ndarray,
-        v: np.ndarray,
-        u: np.ndarray,
-        order: int,
-        modes: np.ndarray | None,
-    ) -> Rates:
-        """`accelerate` of q, v (d, N) and u (inputs, N): a (d, N), by (d, 2d + n, N), held (N, F).
-
-        With the momentum p = M v + w the equation of motion is M a + (∂p/∂q) v − ∂L/∂q = force.
-        """
-        d, num = self.dim, q.shape[1]
-        L = self.quadratic.parts(self.terms, _of_lanes(law.coefficients), q, order)
-        losses, gamma = _of_lanes(law.losses), np.asarray(law.uniform)
-        directions, dry = self.dissipation.directions, self.dissipation.coulomb
-        pull, stiffness = self.dissipation.derivatives(v, order)
-        if modes is not None:
-            pull[dry] = modes.T
-        turning = np.einsum("ikjn,kn->ijn", L.masses_by, v) + L.drift_by  # ∂p/∂q
-        force = 0.5 * np.einsum("ijn,in->jn", turning + L.drift_by, v) + L.force
-        force -= np.einsum("ijn,jn->in", turning, v)
-        force -= directions.T @ (losses * pull)
-        if self.num_inputs:
-            gains = law.gains
-            force += gains @ u if gains.ndim == 2 else np.einsum("nik,kn->in", gains, u)
-        uniform, momentum = self.dissipation.even.any(), np.zeros(0)
-        if uniform:
-            momentum = np.einsum("ikn,kn->in", L.masses, v) + L.drift
-            force -= gamma * momentum
-        inverse = inverses(L.masses)
-        a = np.einsum("ikn,kn->in", inverse, force)
-        held, c = (losses * pull)[dry].T, directions[dry]
-        stuck = np.zeros((num, 0), bool) if modes is None else modes == 0
-        holds = np.flatnonzero(stuck.any(axis=1))
-        if len(holds):
-            moved = inverse[:, :, holds].transpose(2, 0, 1) @ c.T  # (n, d, F)
-            holding = among(stuck[holds], c @ moved, np.broadcast_to(c, (len(holds), *c.shape)))
-            forces = (holding @ a[:, holds].T[:, :, None])[..., 0]
-            a[:, holds] -= (moved @ forces[..., None])[..., 0].T
-            held[holds] += forces
-        if not order:
-            return Rates(a, np.zeros((d, 0, num)), held)
-        width = 2 * d + (self.count if order > 1 else 0)
-        by = np.empty((d, width, num))
-        twisted = np.einsum("ikjln,kn->ijln", L.masses_by_two, v) + L.drift_by_two
-        by_q, by_v = by[:, :d], by[:, d : 2 * d]
-        np.einsum("ikln,kn->iln", L.masses_by, a, out=by_q)
-        by_q += np.einsum("ijln,jn->iln", twisted, v)
-        by_q -= 0.5 * np.einsum("miln,mn->iln", twisted + L.drift_by_two, v)
-        by_q -= L.force_by
-        np.einsum("iljn,jn->iln", L.masses_by, v, out=by_v)
-        by_v += turning
-        by_v -= turning.swapaxes(0, 1)
-        by_v += (self.dissipation.outer @ (losses * stiffness)).reshape(d, d, num)
-        if uniform:
-            by_q += gamma * turning
-            by_v += gamma * L.masses
-        if order > 1:
-            self._by_coefficients(by[:, 2 * d :], L, v, a, u, pull, gamma, momentum)
-        by = np.einsum("ikn,kwn->iwn", -inverse, by)
-        if len(holds):
-            some = by[..., holds].transpose(2, 0, 1)
-            by[..., holds] -= (moved @ (holding @ some)).transpose(1, 2, 0)
-        return Rates(a, by, held)
-
-    def _by_coefficients(
-        self,
-        by: np.ndarray,
-        L: Parts,
-        v: np.ndarray,
-        a: np.ndarray,
-        u: np.ndarray,
-        pull: np.ndarray,
-        gamma: np.ndarray,
-        momentum: np.ndarray,
-    ) -> None:
-        """The residuals (d, n, N) of each coefficient alone, into ``by``."""
-        d, own, num = self.dim, self.basis.shape[1], v.shape[1]
-        rows = self.quadratic.residuals(L, v, a)
-        even = self.dissipation.even
-        if even.any():
-            rows += gamma * self.quadratic.momenta(L, v)
-        columns = self.basis.T @ rows.reshape(len(rows), d * num)
-        by[:, :own] = columns.reshape(own, d, num).swapaxes(0, 1)
-        losses = by[:, own : own + len(even)]
-        losses[:, ~even] = self.dissipation.directions.T[..., None] * pull
-        if even.any():
-            losses[:, even] = momentum[:, None]
-        if self.num_inputs:
-            gains = by[:, own + len(even) :].reshape(d, d, self.num_inputs, num)
-            gains[...] = -np.eye(d)[..., None, None] * u
+        return Tables.of(self.terms, self.basis, self.friction, self.num_inputs)
 
     def step(
-        self, p: np.ndarray, x: np.ndarray, h: np.ndarray, u: np.ndarray, order: int = 2
-    ) -> Step:
-        """One step h (N,) of states x (N, 2d) with its derivatives in the states (``order`` 1) and
-        in the coefficients (2); u (N, substeps, 6, inputs) are the inputs at the nodes of each
-        substep."""
-        law, d, substeps = self.lagrangian(p), self.dim, u.shape[1]
-        D = self.unmoved(len(x), order)
-        for k in range(substeps):
-            x, D, _ = self.substep(law, x, D, h / substeps, u[:, k], order)
-        return Step(x, D[..., : 2 * d], D[..., 2 * d :])
-
-    def unmoved(self, num: int, order: int) -> np.ndarray:
-        """Derivatives of ``num`` states in themselves and in the coefficients, as far as ``order``
-        asks for them."""
-        width = (0, 2 * self.dim, 2 * self.dim + self.count)[order]
-        return np.tile(self.identity[:, :width], (num, 1, 1))
-
-    def substep(
         self,
-        law: Lagrangian,
+        p: np.ndarray,
         x: np.ndarray,
-        D: np.ndarray,
         h: np.ndarray,
         u: np.ndarray,
         order: int = 2,
         modes: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray, Rates]:
-        """States x (N, 2d) and their derivatives D (N, 2d, n) a time h (N,) later, with inputs u
-        (N, 6, inputs) at its nodes, and the rates at its begin; ``order`` and ``modes`` as of
-        `accelerate`."""
-        d, rates, slopes = self.dim, [], []
-        x, D, u = (
-            np.array(of, order="C") for of in (x.T, D.transpose(1, 2, 0), u.transpose(1, 2, 0))
+    ) -> Step:
+        """One step h (N,) of states x (N, 2d) with its derivatives in the states (``order`` 1) and
+        in the coefficients (2); u (N, substeps, 6, inputs) are the inputs at the nodes of each
+        substep. modes: (N, F) in which it begins, by default those of the states. A lane that has
+        no solution, or more events than can be followed, is NaN."""
+        *found, status = self.follow(p, x, h[:, None], u[:, None], order, modes)
+        return Step(*(part[:, 0] for part in found), status)
+
+    def follow(
+        self,
+        p: np.ndarray,
+        x: np.ndarray,
+        h: np.ndarray,
+        u: np.ndarray,
+        order: int = 2,
+        modes: np.ndarray | None = None,
+    ) -> Step:
+        """`step`, M of them one after another, h (N, M) and u (N, M, substeps, 6, inputs): the
+        states after each, with its derivatives in the state before it and in the coefficients."""
+        from gfnn_jax.flows import kernel
+
+        width, frictions = 2 * self.dim, self.friction.count
+        columns = (0, width, width + self.count)[order]
+        c, losses, gains = self.split(p)
+        with np.errstate(all="ignore"):  # of lanes without a law, which become NaN
+            theta = self.fixed + c @ self.basis.T
+            turns = np.atleast_2d(self.terms.phases)
+            turns = np.concatenate([np.cos(turns), np.sin(turns)], axis=1)
+        flat = gains.reshape(*p.shape[:-1], self.dim * self.num_inputs)
+        laws = (
+            _owned(np.atleast_2d(np.concatenate([theta, losses, flat], axis=-1))),
+            _owned(turns),
         )
-        part, every = np.empty_like(D), []
-        for i in range(6):
-            xi, Di = x.copy(), D.copy() if order else D
-            for j in np.flatnonzero(_A[i]):
-                step = _A[i, j] * h
-                xi += step * rates[j]
-                if order:
-                    Di += np.multiply(step, slopes[j], out=part)
-            now = self._rates(law, xi[:d], xi[d:], u[i], order, modes)
-            every.append(now)
-            rates.append(np.concatenate([xi[d:], now.a]))
-            if order:
-                slope = np.empty_like(D)
-                slope[:d] = Di[d:]
-                np.einsum("ikn,kwn->iwn", now.by[:, : 2 * d], Di, out=slope[d:])
-                slope[d:, 2 * d :] += now.by[:, 2 * d :]
-                slopes.append(slope)
-        for i in np.flatnonzero(WEIGHTS):
-            step = WEIGHTS[i] * h
-            x += step * rates[i]
-            if order:
-                D += np.multiply(step, slopes[i], out=part)
-        a, by, held = every[0]
-        return x.T, D.transpose(2, 0, 1), Rates(a.T, by.transpose(2, 0, 1), held)
+        begun = np.full((len(x), frictions), np.nan) if modes is None else modes
+        task = kernel.Task(
+            *map(_owned, (x, begun, h, u)),
+            np.empty((*h.shape, width)),
+            np.empty((*h.shape, width, columns)),
+            np.empty((*h.shape, frictions)),
+            np.empty(len(x), np.int64),
+        )
+        tables = self._tables
+        kernel.follow(tables.whole, tables.room(columns), laws, task, order)
+        by = task.by
+        return Step(task.states, by[..., :width], by[..., width:], task.after, task.status)
 
 
-def _of_lanes(values: np.ndarray) -> np.ndarray:
-    """Coefficients (n,), or (N, n) of each lane, with the lanes last: (n, 1) or (n, N)."""
-    return values[:, None] if values.ndim == 1 else values.T
+def _owned(values: np.ndarray) -> np.ndarray:
+    """Contiguous numbers that may be written: numba takes read-only arrays for another type."""
+    return np.require(values, np.float64, ["C", "W"])

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import i0
 
-from gfnn_jax.flows.motion import NODES
+from gfnn_jax.flows.dormand_prince import NODES
 
 HOLDS = ("hold", "linear", "band")
 TAPS = 32  # samples on either side, of band-limited interpolation

@@ -20,7 +20,6 @@ from gfnn_jax.data.channels import args_of, channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian, functions_of
-from gfnn_jax.flows import coulomb
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import at_stages
 from gfnn_jax.maps.laws import law_of_map
@@ -312,7 +311,7 @@ class _Windows:
         num = arcs * (length - 1)
         u = self.u.reshape(num, *self.u.shape[2:])
         start = x[:, :-1].reshape(num, m)
-        step, _ = coulomb.step(self.law.form, self.law.p, start, self.h.reshape(num), u, order=1)
+        step = self.law.form.step(self.law.p, start, self.h.reshape(num), u, order=1)
         shape = (arcs, length - 1, m)
         closing = step.states.reshape(shape) - x[:, 1:]
         return Defects(closing, step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
@@ -509,36 +508,23 @@ def _followed(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Orbits (B, M + 1, 2d) of the laws from states x (B, 2d), whose covariance is root rootᵀ, by
     steps h (B, M) with inputs u; and the roots (B, n, 2d, ·) of the covariances after the steps
-    that are ``asked`` (n,), with that of the coefficients.
-
-    States are followed one step after another, then all derivatives are taken together.
-    """
+    that are ``asked`` (n,), with that of the coefficients."""
     form, p, roots = _side_by_side(laws, which)
-    orbit, sliding = [x], [coulomb.modes_of(form, p, x, u[:, 0, 0, 0])]
-    for k in range(h.shape[1]):
-        step, after = coulomb.step(form, p, orbit[-1], h[:, k], u[:, k], order=0, modes=sliding[-1])
-        orbit.append(step.states)
-        sliding.append(after)
-    size, count = root.shape[-1], roots.shape[-1]
+    size, count, modes = root.shape[-1], roots.shape[-1], None
     spread = np.concatenate([root, np.zeros((*x.shape, roots.shape[1]))], axis=2)
-    spreads, most = [], max(1, _AT_ONCE // len(x))
+    orbit, spreads, most = [x[:, None]], [], max(1, _AT_ONCE // len(x))
     for first in range(0, h.shape[1], most):
         some = slice(first, first + most)
-        begun, begun_in = (np.stack(of[:-1][some], axis=1) for of in (orbit, sliding))
-        form, p, _ = _side_by_side(laws, np.repeat(which, begun.shape[1]))
-        x, hs, us, modes = (
-            a.reshape(p.shape[0], *a.shape[2:]) for a in (begun, h[:, some], u[:, some], begun_in)
-        )
-        step, _ = coulomb.step(form, p, x, hs, us, modes=modes)
-        by_state = step.by_state.reshape(*begun.shape, begun.shape[-1])
-        further = step.by_coefficients[..., :count].reshape(*begun.shape, count)
-        further = further @ roots[:, None].swapaxes(2, 3)
-        for k in range(begun.shape[1]):
-            spread = by_state[:, k] @ spread
+        step = form.follow(p, x, h[:, some], u[:, some], modes=modes)
+        orbit.append(step.states)
+        x, modes = step.states[:, -1], step.modes[:, -1]
+        further = step.by_coefficients[..., :count] @ roots[:, None].swapaxes(2, 3)
+        for k in range(further.shape[1]):
+            spread = step.by_state[:, k] @ spread
             spread[..., size:] += further[:, k]
             if first + k + 1 == asked[len(spreads)]:
                 spreads.append(spread)
-    return np.stack(orbit, axis=1), np.stack(spreads, axis=1)
+    return np.concatenate(orbit, axis=1), np.stack(spreads, axis=1)
 
 
 def _side_by_side(laws: Sequence[Law], which: np.ndarray) -> tuple[Form, np.ndarray, np.ndarray]:

@@ -15,7 +15,6 @@ import numpy as np
 from gfnn_jax.coordinates import Coordinates, lift
 from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.flows.dissipation import coulomb_rows
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre, family_of, law_of
 from gfnn_jax.flows.uniform import without_forces
@@ -89,7 +88,7 @@ def smoothed(law: Lagrangian, width: float) -> Lagrangian:
     """The law whose dry friction, where it has no width, is smoothed over these speeds: a flow has
     no events."""
     friction = law.friction
-    widths = np.where(coulomb_rows(friction), width, friction.widths)
+    widths = np.where(friction.jumps, width, friction.widths)
     return dataclasses.replace(law, friction=dataclasses.replace(friction, widths=widths))
 
 

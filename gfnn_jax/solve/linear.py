@@ -135,44 +135,6 @@ def covariance_root(covariance: np.ndarray) -> np.ndarray:
     return root * deviations[..., None, :]
 
 
-_ALIKE = 1e-9  # of the largest entry, added for unknowns that depend on each other
-
-
-def among(some, matrix, rhs):
-    """x (B, n, m) with matrix (B, n, n) x = rhs (B, n, m) among ``some`` (B, n) of the unknowns, 0
-    of the others; the least x where they depend on each other (Tikhonov's, iterated once). some:
-    mask; the diagonal of the matrix is not 0 there."""
-    if some.sum(axis=1).max(initial=0) <= 1:
-        own = np.where(some, np.diagonal(matrix, axis1=1, axis2=2), 1.0)
-        return np.where(some[..., None], rhs, 0.0) / own[..., None]
-    both = some[:, :, None] & some[:, None, :]
-    size = np.abs(matrix).max(axis=(1, 2), initial=0.0)[:, None]
-    own = np.where(some, _ALIKE * size, 1.0)[:, :, None] * np.eye(some.shape[1])
-    matrix = np.where(both, matrix, 0.0)
-    rhs = np.where(some[..., None], rhs, 0.0)
-    found = np.linalg.solve(matrix + own, rhs)
-    return found + np.linalg.solve(matrix + own, rhs - matrix @ found)
-
-
-def inverses(matrices: np.ndarray) -> np.ndarray:
-    """The inverses (n, n, N) of matrices; NaN or infinite where one is singular. From three rows
-    on by LAPACK: cofactors would lose the condition number squared."""
-    n = len(matrices)
-    if n == 1:
-        return 1 / matrices
-    if n == 2:
-        (m11, m12), (m21, m22) = matrices
-        return np.array([[m22, -m12], [-m21, m11]]) / (m11 * m22 - m12 * m21)
-    rows = matrices.transpose(2, 0, 1)
-    try:
-        return np.linalg.inv(rows).transpose(1, 2, 0)
-    except np.linalg.LinAlgError:  # one that is singular: NumPy would invert none
-        regular = np.linalg.matrix_rank(rows) == n
-        found = np.full(rows.shape, np.nan)
-        found[regular] = np.linalg.inv(rows[regular])
-        return found.transpose(1, 2, 0)
-
-
 def non_negative(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
     """The x ≥ 0 (n,) of the least ‖A x − b‖, A (N, n)."""
     from scipy.optimize import nnls  # takes a quarter of a second: loaded when first used

@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 
-from gfnn_jax.flows import coulomb
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.solve.latent_arcs import Defects, Observed
@@ -42,8 +41,7 @@ class LawOnArcs:
         if self.args is not None:
             form, coefficients, turn = form.in_systems(coefficients, self.args)
             coefficients = np.repeat(coefficients, length - 1, axis=0)
-        step, _ = coulomb.step(
-            form,
+        step = form.step(
             coefficients,
             x[:, :-1].reshape(num, m),
             self.h.reshape(num),

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs
-from gfnn_jax.flows import coulomb
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import LawFit, places
 from gfnn_jax.models.lagrangians.structure import Key
@@ -100,21 +99,20 @@ def _followed(fit: LawFit, starts: Sequence[np.ndarray]) -> list[Arcs]:
     d, length, problem = fit.form.dim, fit.arcs.t.shape[1], fit.problem
     steps = np.diff(fit.arcs.t, axis=1)
     h = np.full(len(starts), np.median(steps[steps > 0]))
-    still = np.zeros((len(starts), *problem.inputs(fit.arcs).shape[2:]))
+    h = np.repeat(h[:, None], length - 1, axis=1)
+    still = np.zeros((*h.shape, *problem.inputs(fit.arcs).shape[2:]))
     form, coefficients = fit.form, fit.p[: fit.form.count]
     if form.powers is not None and problem.systems.names:  # of the first arc's system
         args = problem.systems.of_nodes[[fit.arcs.home[0][0]]]
         form, each, _ = form.in_systems(coefficients, args)
         coefficients = each[0]
     first = np.array(starts)
-    x = [np.concatenate([first, np.zeros((len(starts), d))], axis=1)]
-    for _ in range(length - 1):
-        with np.errstate(all="ignore"):
-            x.append(coulomb.step(form, coefficients, x[-1], h, still, order=0)[0].states)
-    states = np.stack(x, axis=1)
+    x = np.concatenate([first, np.zeros((len(starts), d))], axis=1)
+    followed = form.follow(coefficients, x, h, still, order=0).states
+    states = np.concatenate([x[:, None], followed], axis=1)
     off = np.abs(states[..., :d] - first[:, None])
     far = 10 * (np.ptp(fit.problem.gauge, axis=0) + np.abs(first))
-    home, t = ((fit.arcs.home[0][0], 0, length),), h[0] * np.arange(length)[None]
+    home, t = ((fit.arcs.home[0][0], 0, length),), h[0, 0] * np.arange(length)[None]
     arcs = []
     for lane in states[np.all(off < far[:, None], axis=(1, 2))]:  # no NaN either
         y = problem.observation(lane[None]).values

@@ -6,7 +6,7 @@ import numpy as np
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.families.lagrangian import Lagrangian
-from gfnn_jax.flows.motion import WEIGHTS
+from gfnn_jax.flows.dormand_prince import WEIGHTS
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.residuals import Trace
 

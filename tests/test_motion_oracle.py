@@ -1,9 +1,11 @@
-"""The parts of a Lagrangian, and its friction, at many states: against the family's own values."""
+"""The oracle of the compiled motion: the parts of a Lagrangian, and its friction, at many states:
+against the family's own values."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+from motion_oracle import Dissipation, Form, Quadratic, inverses
 
 from gfnn_jax.families.lagrangian import (
     DRY,
@@ -14,10 +16,6 @@ from gfnn_jax.families.lagrangian import (
     Lagrangian,
     Terms,
 )
-from gfnn_jax.flows.dissipation import Dissipation
-from gfnn_jax.flows.motion import Form
-from gfnn_jax.flows.quadratic import Quadratic
-from gfnn_jax.solve.linear import inverses
 
 ANGLES = [
     ((2, 0), (0, 0), (0, 0), 0.0),

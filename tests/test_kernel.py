@@ -1,0 +1,209 @@
+"""The compiled motion of laws against the same by NumPy, and what it does with hopeless lanes."""
+
+import concurrent.futures
+import dataclasses
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import motion_oracle
+import numpy as np
+import pytest
+
+import gfnn_jax
+from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction, Terms
+from gfnn_jax.flows import kernel
+from gfnn_jax.flows.motion import Form
+
+
+def law_of(d, powers, dry, seed=0):
+    """A law of d coordinates in a gauge, with powers or without, and friction of each kind."""
+    rng, unit, none = np.random.default_rng(seed), np.eye(d, dtype=int), np.zeros(d, int)
+    last = unit[-1]
+    rows = [(2 * one, none, none, 0.0) for one in unit]
+    rows += [(a + b, none, b - a, 0.3) for a, b in pairwise(unit)]
+    rows += [(last, none, last, 0.2), (none, none, last, 0.0)]
+    if powers:
+        rows += [(none, 2 * last, none, 0.0), (2 * last, 2 * last, none, 0.0)]
+        rows += [(none, unit[0] + 2 * last, last, 0.4), (last, 3 * unit[0], unit[0], 0.1)]
+    friction = [(last, DRY, 0.3), (last, LINEAR, 0.0), (last, QUADRATIC, 0.0)]
+    if dry:
+        friction[1:1] = [(last, DRY, 0.0)]
+        friction += [(unit[0], DRY, 0.0), (last - unit[0], DRY, 0.0)][: 2 * (d > 1)]
+    friction += [(last, UNIFORM, 0.0)]
+    basis, fixed = np.eye(len(rows))[:, 1:], np.zeros(len(rows))
+    basis[0], fixed[0] = 0.1 * rng.normal(size=len(rows) - 1), 3.0
+    form = Form(Terms.of(rows, d), fixed, basis, Friction.of(friction, d), 2)
+    own = np.full(len(rows) - 1, 3.0)
+    own[d - 1 :] = rng.uniform(0.1, 0.3, len(own) - d + 1)
+    p = np.concatenate([own, rng.uniform(0.1, 0.3, len(friction)), rng.normal(size=2 * d)])
+    return form, p
+
+
+def lanes_of(d, num, seed=1):
+    """States of which some are at rest, steps, and inputs that are held for two substeps."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(num, 2 * d))
+    x[::3, d:] *= 1e-2
+    x[::5, d:] = 0
+    return x, np.full(num, 0.1), np.repeat(rng.normal(size=(num, 2, 1, 2)), 6, axis=2)
+
+
+def each_its_own(form, p, num):
+    """A law of each lane: other coefficients and phases."""
+    rng = np.random.default_rng(2)
+    phases = form.terms.phases + 0.1 * rng.normal(size=(num, form.terms.count))
+    terms = dataclasses.replace(form.terms, phases=phases)
+    return dataclasses.replace(form, terms=terms), p * rng.uniform(0.9, 1.1, (num, len(p)))
+
+
+@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("dry", [False, True])
+@pytest.mark.parametrize("powers", [False, True])
+@pytest.mark.parametrize("d", [1, 2, 3, 5])
+def test_steps_are_those_of_numpy(d, powers, dry, own):
+    num = 60
+    (form, p), (x, h, u) = law_of(d, powers, dry), lanes_of(d, num)
+    if own:
+        form, p = each_its_own(form, p, num)
+    for order in (0, 1, 2):
+        found = form.step(p, x, h, u, order)
+        expected, modes = motion_oracle.step(motion_oracle.oracle(form), p, x, h, u, order)
+        np.testing.assert_allclose(found.states, expected.states, atol=2e-14)
+        np.testing.assert_allclose(found.by_state, expected.by_state, atol=1e-13)
+        np.testing.assert_allclose(found.by_coefficients, expected.by_coefficients, atol=1e-13)
+        assert not found.status.any()
+        if dry and d < 5:  # of five bodies some speed may be 0 but for roundoff
+            np.testing.assert_array_equal(found.modes[:, form.friction.jumps], modes)
+    assert found.by_coefficients.shape == (num, 2 * d, form.count)
+    assert len(kernel.follow.signatures) == 1  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_derivatives_are_finite_differences():
+    (form, p), (x, h, u) = law_of(2, True, False), lanes_of(2, 20)
+    found, e = form.step(p, x, h, u), 1e-6
+
+    def slope(vary, count):
+        ends = [
+            [form.step(*vary(s * e * row), h, u, 0).states for s in (1, -1)]
+            for row in np.eye(count)
+        ]
+        return np.stack([(up - down) / (2 * e) for up, down in ends], axis=-1)
+
+    np.testing.assert_allclose(found.by_state, slope(lambda by: (p, x + by), 4), atol=1e-8)
+    by_coefficients = slope(lambda by: (p + by, x), len(p))
+    np.testing.assert_allclose(found.by_coefficients, by_coefficients, atol=1e-8)
+
+
+def test_steps_one_after_another():
+    """As each alone, from the modes in which the one before ended."""
+    (form, p), (x, _, _) = law_of(2, False, True), lanes_of(2, 9)
+    rng = np.random.default_rng(3)
+    h, u = rng.uniform(0, 0.2, (9, 5)), np.repeat(rng.normal(size=(9, 5, 1, 1, 2)), 6, axis=3)
+    found, modes = form.follow(p, x, h, u), None
+    for m in range(5):
+        step = form.step(p, x, h[:, m], u[:, m], modes=modes)
+        np.testing.assert_array_equal(step.states, found.states[:, m])
+        np.testing.assert_array_equal(step.by_coefficients, found.by_coefficients[:, m])
+        x, modes = step.states, step.modes
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_hopeless_lanes_end(seed):
+    """Random tables: no number is refused, no lane is followed without end, none harms another."""
+    rng = np.random.default_rng(seed)
+    d, num = int(rng.integers(1, 4)), 40
+    form, p = law_of(d, bool(rng.integers(2)), bool(rng.integers(2)), seed)
+    form, p = each_its_own(form, p, num)
+    x, h, u = lanes_of(d, num, seed)
+    expected = form.step(p, x, h, u)
+    harmed = rng.permutation(num)[:28]
+    bad = [np.nan, np.inf, -np.inf, 1e300, 1e155, 0.0, -1e30]
+    p, x, h, u = p.copy(), x.copy(), h.copy(), u.copy()
+    for k, lane in enumerate(harmed.tolist()):
+        value, where = bad[k % len(bad)], (p, x, h, u)[k // len(bad)]
+        where[lane] = value if where.ndim < 2 else where[lane]
+        if where.ndim > 1:
+            where[lane, ..., rng.integers(where.shape[-1])] = value
+    p[harmed[0], : form.basis.shape[1]] = 0.0
+    h[harmed[1]] = 0.0
+    found, others = form.step(p, x, h, u), np.setdiff1d(np.arange(num), harmed)
+    np.testing.assert_array_equal(found.states[others], expected.states[others])
+    np.testing.assert_array_equal(found.by_coefficients[others], expected.by_coefficients[others])
+    lost = ~np.isfinite(found.states).all(axis=1)
+    np.testing.assert_array_equal(found.status != 0, lost)
+    assert lost.any()
+
+
+def test_a_law_without_mass_and_states_without_lanes():
+    massless = Form(
+        Terms.of([((0,), (0,), (1,), 0.0)], 1), np.ones(1), np.zeros((1, 0)), Friction.of([], 1)
+    )
+    step = massless.step(np.zeros(0), np.ones((2, 2)), np.ones(2), np.zeros((2, 1, 6, 0)))
+    assert np.isnan(step.states).all()
+    assert step.status.all()
+    none = massless.step(np.zeros(0), np.ones((0, 2)), np.ones(0), np.zeros((0, 1, 6, 0)))
+    assert none.by_coefficients.shape == (0, 2, 0)
+
+
+def test_laws_are_pickled_and_followed_by_threads():
+    laws = [law_of(d, True, True) for d in (2, 3)]
+    tasks = [(*law, *lanes_of(d, 200)) for law, d in zip(laws, (2, 3), strict=True)]
+    expected = [form.step(*rest) for form, *rest in tasks]
+
+    def again(task):
+        form, *rest = task
+        return pickle.loads(pickle.dumps(form)).step(*rest)
+
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        for _ in range(5):
+            for found, step in zip(pool.map(again, tasks), expected, strict=True):
+                for one, other in zip(found, step, strict=True):
+                    np.testing.assert_array_equal(one, other)
+
+
+_ALONE = """
+import os, sys
+import numpy as np
+import test_kernel
+(form, p), (x, h, u) = test_kernel.law_of(3, True, True), test_kernel.lanes_of(3, 30)
+step = form.step(p, x, h, u)
+assert np.isfinite(step.states).all()
+child = os.fork()  # after first use
+same = np.array_equal(form.step(p, x, h, u).states, step.states)
+if not child:
+    os._exit(not same)
+assert same and os.waitpid(child, 0)[1] == 0
+"""
+
+
+def test_an_installation_that_cannot_be_written(tmp_path):
+    """The cache goes to a temporary folder. Numba checks every place in an array meanwhile."""
+    package = tmp_path / "gfnn_jax"
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(Path(gfnn_jax.__file__).parent, package, ignore=ignored)
+    (package / "flows" / "__pycache__").write_text("no folder")
+    (temporary := tmp_path / "temporary").mkdir()
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment |= {
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(__file__).parent)]),
+        "HOME": "/dev/null",
+        "XDG_CACHE_HOME": "/dev/null/none",
+        "TMPDIR": str(temporary),
+        "NUMBA_BOUNDSCHECK": "1",
+        "JAX_PLATFORMS": "cpu",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", _ALONE],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert list(temporary.glob("gfnn_jax-*/*/*.nbi"))
