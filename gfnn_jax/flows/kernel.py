@@ -284,8 +284,8 @@ def _stuck(n, f):
 
 @_function
 def _hold(n, f):
-    """Where directions stick, and M⁻¹ is known: HOLDING (F, d) of a that makes λ, MOVED (d, F) what
-    λ does to a, and FREE = 1 − moved holding. False where none sticks."""
+    """Constrain the directions that stick, of which M⁻¹ is known: HOLDING (F, d) of a that makes λ,
+    MOVED (d, F) what λ does to a, and FREE = 1 − moved holding. False where none sticks."""
     d, count, c = n[SIZES, DIM], n[SIZES, FRICTIONS], n[SIZES, DIRECTIONS]
     moved, holding, alike = n[SIZES, MOVED], n[SIZES, HOLDING], n[SIZES, ALIKE]
     if _stuck(n, f) == 0:
