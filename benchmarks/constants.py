@@ -191,7 +191,7 @@ CONSTANTS = tuple(
         ),
         ("learn.noisy_sweeps", "_NO_WORSE", ("noisy",), "squared error ÷ least, as good below"),
         ("dataset.split", "OPTIONS.fraction", ("few", "noisy"), "part of the pairs that validates"),
-        ("diagnosis.charts", "_FAR", ("long",), "determinant of ∂w/∂z"),
+        ("diagnosis.local_jacobians", "_FAR", ("long",), "determinant of ∂w/∂z"),
         (
             "diagnosis.local_jacobians",
             "NEIGHBOURS_PER_TERM",

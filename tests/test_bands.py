@@ -10,7 +10,7 @@ from gfnn_jax.data.files import read_initial_noise
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import InputError
-from gfnn_jax.fitting import shared_noise, uncertainty
+from gfnn_jax.fitting import uncertainty
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.jobs.output import Output
@@ -71,12 +71,12 @@ def test_covariance_is_that_of_the_textbook_where_all_rows_are_alike():
     rows = rng.normal(size=(20_000, 3)) * [1.0, 10.0, 0.1]
     residual = 0.2 * rng.choice([-1.0, 1.0], size=len(rows))
     train = factored(rows, residual)
-    root = uncertainty.root(train, 3, rows, residual, noise=1.0)
+    root = uncertainty.root(train, 3, (rows, residual), noise=1.0)
     inverse = np.linalg.inv(rows.T @ rows)
     leverage = np.sum((rows @ inverse) * rows, axis=1)
     middle = rows.T @ (rows * (0.04 / (1 - leverage) ** 2)[:, None])
     np.testing.assert_allclose(root.T @ root, inverse @ middle @ inverse, rtol=1e-3)
-    misfit = uncertainty.root(train, 3, rows, residual, noise=0.0)
+    misfit = uncertainty.root(train, 3, (rows, residual), noise=0.0)
     inflated = root.T @ root * 2 * len(rows) / 3
     np.testing.assert_allclose(misfit.T @ misfit, inflated, rtol=1e-9)
 
@@ -90,7 +90,7 @@ def test_noise_of_shared_states_nearly_cancels():
     for e in noise[:20]:
         left = np.diff(e)[:, None] - np.mean(np.diff(e))
         slopes, one = np.ones((count, 1, 1)), np.ones((count, 1, 1))
-        rows = shared_noise.scores(slopes, left, -one, one, np.ones(count - 1, bool))
+        rows = uncertainty.scores(slopes, left, -one, one, np.ones(count - 1, bool))
         found.append(np.sum(rows**2) / count**2)
     assert np.mean(found) == pytest.approx(true, rel=0.2)  # 400 repeats tell it to a tenth
     assert np.mean(found) < 0.1 * np.var(np.diff(noise)) / count
@@ -100,7 +100,7 @@ def test_directions_that_no_row_tells_are_not_sampled():
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(500, 2))[:, [0, 1, 1]]
     residual = rng.normal(size=500)
-    root = uncertainty.root(factored(rows, residual), 3, rows, residual, noise=1.0)
+    root = uncertainty.root(factored(rows, residual), 3, (rows, residual), noise=1.0)
     assert np.abs(root @ [0.0, 1.0, -1.0]).max() < 1e-12
     assert np.linalg.norm(root @ [0.0, 1.0, 1.0]) > 0.01
 

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import zipfile
+from functools import partial
 
 import jax
 import numpy as np
@@ -68,7 +69,9 @@ def map_in(chart, dim, degree, *, angles=(), predicted=True, around=()):
     if predicted:
         Z, info = map_.step(z)
         good = np.asarray(info.status) <= LEFT_DOMAIN
-        found = fit_predictors(chart, z[good], np.asarray(Z)[good], DT, angles=own)
+        found = fit_predictors(
+            chart, z[good], np.asarray(Z)[good], DT, partial(box_inputs, angles=tuple(own))
+        )
         piece = dataclasses.replace(piece, predictor=found[-1].predictor)
     return dataclasses.replace(map_, pieces=(*around, piece, *around)), z
 
@@ -157,7 +160,7 @@ def of_positions(part, both, angles=()):
     z = np.concatenate([q, -DT * gradient[:, :dim]], axis=1)
     piece = Generated(family, params, TYPE1, DT, np.full(2 * dim, SIZE))
     image = np.concatenate([w[:, dim:], DT * gradient[:, dim:]], axis=1)
-    found = fit_predictors(TYPE1, z, image, DT, angles=angles)
+    found = fit_predictors(TYPE1, z, image, DT, partial(box_inputs, angles=tuple(angles)))
     piece = dataclasses.replace(piece, predictor=found[-1].predictor)
     return map_of(piece, z, scale=np.full(2 * dim, SIZE)), z
 

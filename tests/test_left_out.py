@@ -3,8 +3,7 @@
 import numpy as np
 
 from gfnn_jax.families.terms import given_terms
-from gfnn_jax.fitting.gauss_newton import Problem
-from gfnn_jax.fitting.left_out import without_each
+from gfnn_jax.fitting.gauss_newton import Problem, without_each
 from gfnn_jax.flows.collocation import Steps, images
 
 PENDULUM, STEPS = given_terms(1, ["p1**2", "cos(q1)", "q1**2"]), Steps(6, 1)

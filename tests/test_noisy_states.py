@@ -24,8 +24,7 @@ from gfnn_jax.learn import noisy_sweeps
 from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.models.generating_functions.map_arcs import NearestArcs
-from gfnn_jax.models.generating_functions.size import Size
-from gfnn_jax.models.generating_functions.sweeps import Linear, LinearSweep
+from gfnn_jax.models.generating_functions.sweeps import Linear, LinearSweep, Size
 
 SIGMA, DT = 0.03, 0.5
 

@@ -21,9 +21,8 @@ from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
 from gfnn_jax.jobs.forecast import Ahead, forecast_recording
 from gfnn_jax.jobs.output import Output
-from gfnn_jax.models.positions.discrete_lagrangian import residuals, solve
+from gfnn_jax.models.positions.discrete_lagrangian import Triples, residuals, solve, triples_of
 from gfnn_jax.models.positions.latent_positions import arcs_of, fit_latent, starting_noise
-from gfnn_jax.models.positions.triples import Triples, triples_of
 
 K = 0.6
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ from gfnn_jax.budget import COMPILE, Budget, within
 from gfnn_jax.candidates.candidate import Candidate, refined_images, with_error
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, measured_error
+from gfnn_jax.dataset.rows import inputs_of
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.generating.generated import Generated
@@ -79,17 +81,15 @@ def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:
     images, solved = refined_images(data, generated.chart, generated.family, generated.params, rows)
     if solved.sum() < 2:  # nothing to learn from: the data's own images
         images, solved = data.y1[rows], np.ones(len(rows), bool)
-    coordinates, args = data.coordinates, data.given(rows[solved])[1]
+    args = data.given(rows[solved])[1]
     features = getattr(getattr(generated.family, "inputs", None), "features", None)
     fitted = fit_predictors(
         generated.chart,
         data.y0[rows][solved],
         images[solved],
         of_lanes(data.given(rows)[0], solved),
-        angles=coordinates.angles,
-        cyclic=coordinates.cyclic,
-        features=features,
-        args=args,
+        partial(inputs_of, data, features=features),
+        args,
     )
     chosen = affordable(fitted, generated.family)
     return dataclasses.replace(generated, predictor=chosen.predictor)

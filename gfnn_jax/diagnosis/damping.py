@@ -21,7 +21,7 @@ import scipy.linalg
 
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.rows import rows_of
-from gfnn_jax.diagnosis.charts import choose_charts
+from gfnn_jax.diagnosis.local_jacobians import choose_charts
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.inputs import box_inputs

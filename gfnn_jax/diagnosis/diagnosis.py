@@ -9,10 +9,11 @@ import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.varied import given_by
-from gfnn_jax.diagnosis.charts import Charts, choose_charts
 from gfnn_jax.diagnosis.damping import LearnedDamping, learn_damping, where_areas_differ
 from gfnn_jax.diagnosis.local_jacobians import (
+    Charts,
     centres,
+    choose_charts,
     data_defect,
     local_jacobians,
     look_symplectic,

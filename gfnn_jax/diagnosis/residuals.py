@@ -21,11 +21,15 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
+from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.noise import of_halves, of_pairs
 from gfnn_jax.dataset.runs import next_of
+from gfnn_jax.errors import FitError
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
+from gfnn_jax.fitting.linear_starts import fitted_gradients
 from gfnn_jax.fitting.significance import CERTAIN
+from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, apply_j, sizes, split
 
@@ -325,3 +329,35 @@ def differs_between_sequences(z, residual, sequence) -> bool:
         for k in (first, np.argmax(as_far, axis=1))
     )
     return bool(across > 0.5 * np.sum(residual[places] ** 2) and across > OPTIONS.across * along)
+
+
+_PAIRS_OF_MISFIT = 50  # pairs that a library is fitted to; as many judge it
+_QUIET = 0.75  # of the sample, that moves least
+
+
+def misfit(family, data: Dataset, chart: AnyChart) -> float:
+    """Part of the held-out target gradients that a family, linear in its parameters, leaves over:
+    the median over pairs, of the forces or of the velocities, whichever is larger; infinite where
+    its functions overflow. data: without args."""
+    rows = _quiet_pairs(data)
+    y0, y1 = data.y0[rows], data.y1[rows]
+    half = len(rows) // 2
+    w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, data.dt)
+    try:
+        c = fitted_gradients(family, w[:half], target[:half], data.scale)
+    except (FitError, np.linalg.LinAlgError):  # functions that overflow at these states
+        return np.inf
+    off = family.gradient(c, w[half:]) - target[half:]
+    left, whole = (
+        np.median(np.linalg.norm(np.reshape(x, (len(x), 2, -1)), axis=2), axis=0)
+        for x in (off, target[half:])
+    )
+    part = float(np.max(left / np.maximum(whole, np.finfo(float).tiny)))
+    return part if np.isfinite(part) else np.inf
+
+
+def _quiet_pairs(data: Dataset) -> np.ndarray:
+    """A sample of the training pairs without those that move most, as close passages do."""
+    rows = data.training[: 2 * _PAIRS_OF_MISFIT]
+    moved = np.abs((data.y1[rows] - data.y0[rows]) / data.scale).max(axis=1)
+    return rows[moved <= np.quantile(moved, _QUIET)]

@@ -7,6 +7,11 @@ of two linear starts; pairs that the present H already explains come first, the 
 The rows [∂r/∂c, r] of a Gauss–Newton problem are folded, block by block, into one triangle
 (`fitting.triangle`): of its singular values come every damping at once, the condition number and
 the standard errors.
+
+Coefficients without some of the rows (`without_each`): close to the optimum of all rows one
+Gauss–Newton step leads to that of most of them, and its problem is the sum of those of the parts
+that are kept: each part is linearised once, whichever is left out (approximate cross-validation:
+Rad & Maleki, J. R. Stat. Soc. B 82, 2020). Each step is checked by the residuals where it leads.
 """
 
 from __future__ import annotations
@@ -14,6 +19,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +27,7 @@ import numpy as np
 from gfnn_jax.budget import UNBOUNDED, Allowance
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting import row_blocks
-from gfnn_jax.fitting.descent import ROUNDOFF, descended, step
+from gfnn_jax.fitting.descent import DESCENT, ROUNDOFF, descended, step
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps, images, of_lanes, operations, truncation
 from gfnn_jax.flows.rates import MOST_SUBSTEPS, substeps_for
@@ -404,3 +410,54 @@ def summarised(c, triangle: Triangle, used, iterations: int, steps: Steps) -> Fl
     noise = max(triangle.norm / np.sqrt(max(rows - len(c), 1)), ROUNDOFF)
     errors = noise * spectrum.deviations()
     return FlowFit(c, rms, errors, triangle, spectrum.condition, used, iterations, steps)
+
+
+# Of the residual that the linearised problem foretells, by which that of the step may differ.
+_FORETOLD_LEFT_OUT = 0.01
+
+
+def without_each(
+    problem: Problem, family, c: np.ndarray, steps: Steps, parts: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Coefficients (terms,) of the fits to all of these parts but one, for each in turn.
+
+    c: (terms,) of a fit to the rows of the parts, or to most of them. parts: rows, none in two.
+    Where one step from c does not reach the optimum, the fit is made.
+    """
+    if len(parts) > 1 and _is_rounding(problem, family, c, steps, parts):
+        return [c] * len(parts)
+    triangles = [problem.linearised(family, c, steps, part) for part in parts]
+    found = []
+    for i in range(len(parts)):
+        kept = [j for j in range(len(parts)) if j != i]
+        rows = np.sort(np.concatenate([np.zeros(0, int), *(parts[j] for j in kept)]))
+        empty = Triangle.empty(family.num_parameters)
+        here = reduce(Triangle.merge, (triangles[j] for j in kept), empty)
+        there = _one_step(problem, family, c, steps, rows, here)
+        if there is None:
+            there = problem.fit(family, c, rows, rounds=False, steps=steps).coefficients
+        found.append(there)
+    return found
+
+
+def _is_rounding(problem: Problem, family, c, steps: Steps, parts: Sequence[np.ndarray]) -> bool:
+    """Return whether the residual at c is rounding, which no fit to most of the rows lowers."""
+    largest = max(len(part) for part in parts)
+    rows = np.sort(np.concatenate(parts))
+    norm = np.linalg.norm(problem.residuals(family, c, steps, rows))
+    return bool(norm <= ROUNDOFF * np.sqrt((len(rows) - largest) * problem.z0.shape[1]))
+
+
+def _one_step(
+    problem: Problem, family, c: np.ndarray, steps: Steps, rows: np.ndarray, here: Triangle
+) -> np.ndarray | None:
+    """c after a Gauss–Newton step over these rows, of which ``here`` is the triangle at c; c itself
+    where rounding leaves nothing to gain; None where the step is not what was foretold."""
+    if not np.isfinite(here.norm) or here.rows < family.num_parameters:
+        return None
+    spectrum = here.spectrum()
+    tried, foretold = c - step(spectrum, 0.0), spectrum.residual_norm
+    norm = float(np.linalg.norm(problem.residuals(family, tried, steps, rows)))
+    if here.norm <= norm < 2 * here.norm and foretold > (1 - DESCENT.promised) * here.norm:
+        return c  # the descent ends here too: the residual is rounding, or truncation
+    return tried if abs(norm - foretold) <= _FORETOLD_LEFT_OUT * foretold else None

@@ -6,8 +6,10 @@ row their covariance is (AᵀA)⁻¹ (Aᵀ diag(r²) A) (AᵀA)⁻¹: each row c
 worse, and no other. A row that the coefficients have bent towards themselves, of leverage h, has a
 residual of r / (1 − h) (MacKinnon & White, J. Econometrics 29 (1985) 305).
 
-Rows of a sequence share the noise of their states: `fitting.shared_noise` says what that does to
-Aᵀ r, in the place of the rows' own residuals.
+Rows of a sequence share the noise of their states. A pair of states with errors e₀, e₁ leaves
+r = P e₀ + Q e₁, and e₁ is the e₀ of the next pair: the score Aᵀ r of all rows holds each state's
+error once, by Aᵀ Q of one pair and Aᵀ P of the next, which nearly cancel where A is smooth
+(`scores`). The size of the noise is that of `dataset.noise.of_pairs`.
 
 What the terms cannot represent is not independent: it stays, however many pairs there are. Of
 ``rows`` such residuals only as many count as there are terms, each in its own part of phase space.
@@ -18,6 +20,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammainc
 
+from gfnn_jax.dataset.noise import of_pairs
 from gfnn_jax.fitting.triangle import Triangle
 
 # A row is never taken for one that the coefficients reproduce whatever it says.
@@ -33,7 +36,7 @@ _FEWEST_TERMS, _TINY = 3, 1e-280
 def variance(triangle: Triangle, size: int, taken: float | None = None) -> float:
     """Mean square per degree of freedom that the leading ``size`` terms leave of these rows.
 
-    taken: degrees of freedom that noise takes of them (`shared_noise.degrees_of_freedom`); None:
+    taken: degrees of freedom that noise takes of them (`uncertainty.degrees_of_freedom`); None:
     noise is independent from row to row, and takes ``size``.
     """
     left = triangle.residual_norm(size) ** 2
@@ -63,8 +66,7 @@ def misfit(explained: float, terms: int, variance: float) -> float:
 def root(
     train: Triangle,
     size: int,
-    sample: np.ndarray,
-    residual: np.ndarray,
+    left: tuple[np.ndarray, np.ndarray],
     *,
     noise: float | None,
     ridge: float = 0.0,
@@ -72,13 +74,13 @@ def root(
 ) -> np.ndarray:
     """(size, size): rootᵀ root is the covariance of the coefficients of the leading terms.
 
-    sample, residual: rows of A (n, size) among those of ``train``, and of what is left over (n,).
+    left: rows of A (n, size) among those of ``train``, and their residuals (n,).
     noise: the part of its mean square that is noise; None: not known, and then none of it is.
     ridge: of `least_squares.solve`. scores: (k, size) of these rows' noise, from
-    `shared_noise.scores`; None: it is independent from row to row. Directions that are not told, of
+    `uncertainty.scores`; None: it is independent from row to row. Directions that are not told, of
     columns scaled to one, are 0, as in the solution.
     """
-    spectrum = train.spectrum(size)
+    (sample, residual), spectrum = left, train.spectrum(size)
     along, degrees = spectrum.root(ridge), max(spectrum.degrees_of_freedom(ridge), 1.0)
     leverage = np.minimum(np.sum((sample @ along) ** 2, axis=1), _MOST_LEVERAGE)
     rows = np.linalg.qr((residual / (1 - leverage))[:, None] * sample, mode="r")
@@ -90,3 +92,33 @@ def root(
     found = np.zeros((size, size))
     found[: len(weighted)] = (weighted @ along) @ along.T
     return found
+
+
+def scores(
+    slopes: np.ndarray,
+    residual: np.ndarray,
+    first: np.ndarray,
+    second: np.ndarray,
+    goes_on: np.ndarray,
+) -> np.ndarray:
+    """(k, m): what one deviation of each state's each coordinate adds to Aᵀ r; the sum of the rows'
+    squares is the covariance of Aᵀ r.
+
+    slopes: A (n, 2d, m) of pairs in their order. residual: r (n, 2d). first, second: P and Q
+    (n, 2d, 2d). goes_on: (n − 1,) whether the image of a pair is the state of the next.
+    """
+    step = np.linalg.solve(second, np.concatenate([residual[..., None], -first], axis=-1))
+    deviation = of_pairs(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
+    of_first, of_second = (part.swapaxes(1, 2) @ slopes for part in (first, second))
+    of_first[1:][goes_on] += of_second[:-1][goes_on]
+    alone = of_second[np.append(~goes_on, True)]
+    each = np.concatenate([of_first, alone]) * deviation[:, None]
+    return each.reshape(-1, slopes.shape[-1])
+
+
+def degrees_of_freedom(slopes: np.ndarray, residual: np.ndarray, scores: np.ndarray) -> float:
+    """Degrees of freedom that the noise of these scores (k, m) takes of the residual (n, 2d) in a
+    fit of A = slopes (n, 2d, m): as many as there are terms, were the rows independent."""
+    rows = np.concatenate([slopes, residual[..., None]], axis=-1)
+    root = Triangle.of(rows.reshape(-1, rows.shape[-1])).spectrum().root()
+    return float(np.sum((scores @ root) ** 2) / np.mean(residual**2))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -115,35 +115,25 @@ def fit_predictors(
     y0,
     y1,
     dt: Any,
-    *,
-    angles: Sequence[int] = (),
-    cyclic: Sequence[int] = (),
-    features=None,
+    inputs_of: Callable[..., Inputs] = box_inputs,
     args=None,
 ) -> list[Fitted]:
     """Fit predictors of a chart's map and of its inverse, by rising degree.
 
     y0, y1: (N, 2d) states and images, NumPy, angles lifted. dt: a number, or one per pair (N,), of
-    either sign, on which the models then depend beside the state. angles, cyclic, features, args:
-    arguments of ``box_inputs``. The degree rises until the model is close enough or no longer
-    improves, because of noise or of the number of pairs.
+    either sign, on which the models then depend beside the state, or args (N, k). inputs_of: makes
+    the variables of states, as ``box_inputs``. The degree rises until the model is close enough or
+    no longer improves, because of noise or of the number of pairs.
     """
     rows = np.linspace(0, len(y0) - 1, min(_ROWS, len(y0))).astype(int)
     y0, y1, args = y0[rows], y1[rows], None if args is None else args[rows]
     args, back = (dt[rows, None], -dt[rows, None]) if np.ndim(dt) else (args, args)
 
     def fitted(chart: AnyChart, given, other, args) -> list[tuple[PolynomialModel, float]]:
-        dim = given.shape[1] // 2
-        free = chart.free(dim)
+        free = chart.free(given.shape[1] // 2)
         unknown = chart.evaluation_point(given, other)[:, free]
         known = chart.first_guess(given)[:, free]
-        inputs = box_inputs(
-            given,
-            angles=tuple(a for a in angles if a < dim),
-            cyclic=tuple(cyclic),
-            features=features,
-            args=args,
-        )
+        inputs = inputs_of(given, args=args)
         return _by_degree(inputs, inputs(given, args), unknown - known, sizes(unknown))
 
     forward, backward = fitted(chart, y0, y1, args), fitted(chart.reverse(dt)[0], y1, y0, back)

@@ -34,8 +34,7 @@ from gfnn_jax.dataset.measured_error import (
     measured_error,
 )
 from gfnn_jax.errors import FitError
-from gfnn_jax.fitting.gauss_newton import Problem
-from gfnn_jax.fitting.left_out import without_each
+from gfnn_jax.fitting.gauss_newton import Problem, without_each
 from gfnn_jax.flows.collocation import Steps, truncation
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.request import Request

@@ -1,6 +1,6 @@
 """Pairs that the map found contradicts by far more than it does the pairs around them.
 
-Neighbours tell an outlier where states are dense (`diagnosis.local_jacobians.outliers`); a map that
+Neighbours tell an outlier where states are dense (`diagnosis.outliers`); a map that
 all pairs agree on tells it anywhere. What a map cannot represent is smooth: its residual is as
 large at the neighbours. A gross error of measurement stands alone. So may a state at the rim of the
 data, as of the closest passages; there a smaller size of the map errs far more still, while it
@@ -27,8 +27,7 @@ from gfnn_jax.dataset.measured_error import error_of_each
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.request import Request, diagnose_request
 from gfnn_jax.learn.searches import Searched, searched
-from gfnn_jax.models.generating_functions.size import Size
-from gfnn_jax.models.generating_functions.sweeps import LinearSweep
+from gfnn_jax.models.generating_functions.sweeps import LinearSweep, Size
 
 
 @dataclasses.dataclass(frozen=True)

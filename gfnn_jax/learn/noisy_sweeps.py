@@ -30,11 +30,11 @@ from gfnn_jax.learn.conclude import only_noise
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.map_arcs import LONGEST, NearestArcs
-from gfnn_jax.models.generating_functions.size import Size
 from gfnn_jax.models.generating_functions.sweeps import (
     SAMPLE_ROWS,
     Factors,
     LinearSweep,
+    Size,
     part_of_noise,
 )
 from gfnn_jax.models.hamiltonians.choose_law import preferred
@@ -272,8 +272,7 @@ class NoisySweep(LinearSweep):
         return uncertainty.root(
             train,
             count,
-            slopes,
-            slopes @ solved.coefficients - rows[:, -1],
+            (slopes, slopes @ solved.coefficients - rows[:, -1]),
             noise=noise,
             ridge=solved.ridge,
         )

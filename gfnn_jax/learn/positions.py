@@ -34,10 +34,15 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit, OfPositions
 from gfnn_jax.learn.options import FitOptions, Watch
 from gfnn_jax.maps.sensors import Sensors
-from gfnn_jax.models.positions.discrete_lagrangian import displacement, residuals, solve
+from gfnn_jax.models.positions.discrete_lagrangian import (
+    Triples,
+    displacement,
+    residuals,
+    solve,
+    triples_of,
+)
 from gfnn_jax.models.positions.latent_positions import starting_noise, without_noise
 from gfnn_jax.models.positions.position_maps import images_of, map_of, states_of
-from gfnn_jax.models.positions.triples import Triples, triples_of
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.search.search import MET
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.structures import structure_of
-from gfnn_jax.diagnosis.misfit import misfit
+from gfnn_jax.diagnosis.residuals import misfit
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.learn.request import Request
 

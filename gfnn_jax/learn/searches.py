@@ -14,8 +14,8 @@ from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.structures import Sites
-from gfnn_jax.diagnosis.charts import Charts
 from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed
+from gfnn_jax.diagnosis.local_jacobians import Charts
 from gfnn_jax.errors import FitError
 from gfnn_jax.learn.request import Request
 from gfnn_jax.maps.symplectic_map import SymplecticMap

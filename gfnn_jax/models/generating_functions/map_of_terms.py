@@ -285,7 +285,7 @@ def _covariance_root(piece: Generated, data: Dataset) -> np.ndarray:
         left = float(np.sum(residual**2)) / max(target.size - count, 1)
         noise = min(part / left, 1.0) if left > 0 else 1.0
     train = Triangle.of(np.column_stack([slopes, aim]))
-    return uncertainty.root(train, count, slopes, residual, noise=noise)
+    return uncertainty.root(train, count, (slopes, residual), noise=noise)
 
 
 def _larger(family: Terms | Sums, data: Dataset) -> Terms | Sums | None:

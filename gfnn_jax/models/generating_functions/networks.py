@@ -33,8 +33,7 @@ from gfnn_jax.fitting.levenberg_marquardt import (
     LMResult,
     LMState,
 )
-from gfnn_jax.models.generating_functions.size import OF_STEPS, Generates, Size
-from gfnn_jax.models.generating_functions.sweeps import trial_residual
+from gfnn_jax.models.generating_functions.sweeps import OF_STEPS, Generates, Size, trial_residual
 
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000

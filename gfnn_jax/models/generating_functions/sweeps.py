@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.budget import Budget
+from gfnn_jax.candidates.assemble import with_predictor
 from gfnn_jax.candidates.candidate import Candidate, refined_images, validated
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
@@ -35,14 +36,59 @@ from gfnn_jax.families.own import own_families
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
-from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
+from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.least_squares import ROWS_PER_TERM
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
+from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping
 from gfnn_jax.models.generating_functions.parity import is_even
-from gfnn_jax.models.generating_functions.size import OF_SOLVE, OF_STEPS, Generates, Size
+
+# Operations of singular values, ÷ terms³; and of a step in NumPy, in units that take as long.
+OF_SOLVE, OF_STEPS = 22.0, 20.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """One size of a sweep: what a search needs to know before its error is estimated."""
+
+    family: Any
+    group: Any  # the largest family whose error is estimated from the same factor
+    order: float  # the logarithm of the error falls in proportion: a degree, or log₂ of a number
+
+    @property
+    def operations(self) -> float:
+        """Floating-point operations per predicted step: one update, which takes ∇S with its
+        Hessian, and ∇S where it leads."""
+        gradient, with_hessian = self.family.operations
+        return float(gradient + with_hessian)
+
+
+class Generates:
+    """Base of the sweeps of S: a solved size makes a piece."""
+
+    data: Dataset
+    chart: AnyChart
+    tolerance: Tolerance
+
+    def solve(self, size: Size, budget: Budget, on_progress) -> tuple[Any, Any]:
+        """Solve for the params of the size's family; with them what is known of the solution."""
+        raise NotImplementedError
+
+    def piece(self, size: Size) -> Generated:
+        """The piece that the size's S generates, with its predictor."""
+        data, params = self.data, self._params_of(size)
+        piece = Generated(size.family, params, self.chart, data.dt, data.scale)
+        return with_predictor(piece, data, data.training)
+
+    def images(self, size: Size, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Images of these rows (n, 2d), inner ones, and which steps were solved (n,)."""
+        params = self._params_of(size)
+        return refined_images(self.data, self.chart, size.family, params, rows)
+
+    def _params_of(self, size: Size) -> Any:
+        return self.solve(size, Budget(), lambda message: None)[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +120,6 @@ class Options:
 
 
 OPTIONS = Options()
-
 # Rows per term of a larger size, by which noise is told from misfit.
 SAMPLE_ROWS = 6
 
@@ -448,13 +493,12 @@ class LinearSweep(Generates):
         states = None
         if goes_on.any() and self.moved_by_states:
             states = (residual, *self.by_states(family, params, w, *args), goes_on)
-        scores = shared_noise.scores(slopes, *states) if states else None
+        scores = uncertainty.scores(slopes, *states) if states else None
         noise = self._noise(size, larger, data, states) if larger is not None else None
         return uncertainty.root(
             train,
             family.num_parameters,
-            slopes.reshape(-1, family.num_parameters),
-            residual.ravel(),
+            (slopes.reshape(-1, family.num_parameters), residual.ravel()),
             noise=noise,
             ridge=solved.ridge,
             scores=scores,
@@ -504,9 +548,9 @@ class LinearSweep(Generates):
         residual = slopes[..., : len(solved.coefficients)] @ solved.coefficients
         residual = residual - target * self._weight
         states = residual, *self.by_states(near.family, params, w, *args), goes_on
-        scores = shared_noise.scores(slopes, *states)
+        scores = uncertainty.scores(slopes, *states)
         return [
-            shared_noise.degrees_of_freedom(slopes[..., :count], residual, scores[:, :count])
+            uncertainty.degrees_of_freedom(slopes[..., :count], residual, scores[:, :count])
             for count in counts
         ]
 
@@ -518,7 +562,7 @@ class LinearSweep(Generates):
     def _noise(self, size: Size, larger: Size, data, states) -> float:
         """The part of the residual's mean square that is noise, by what a larger size explains of
         it: of all rows where that one was estimated from all of them, else of these. states:
-        residual, its derivatives and which pairs go on, as `shared_noise.scores` takes them, or
+        residual, its derivatives and which pairs go on, as `uncertainty.scores` takes them, or
         None."""
 
         def left(of: Size) -> tuple[float, float, int]:
@@ -532,8 +576,8 @@ class LinearSweep(Generates):
             degrees = float(count)
             if states is not None:
                 slopes = self._slopes(of.family, data[0], *data[2:])
-                scores = shared_noise.scores(slopes, *states)
-                degrees = shared_noise.degrees_of_freedom(slopes, states[0], scores)
+                scores = uncertainty.scores(slopes, *states)
+                degrees = uncertainty.degrees_of_freedom(slopes, states[0], scores)
             square = reduced.residual_norm(count) ** 2 / max(reduced.rows, 1)
             return square, degrees, reduced.rows
 

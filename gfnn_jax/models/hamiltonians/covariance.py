@@ -18,7 +18,7 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms, multiplied
-from gfnn_jax.fitting import least_squares, shared_noise, uncertainty
+from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.flows.collocation import Steps
@@ -54,7 +54,7 @@ def covariance_root(law: FittedLaw, flows: Problem, data: Dataset, steps: Steps)
         if goes_on.any():
             first = images.by_state * scale
             second = np.broadcast_to(-np.diag(scale), first.shape)
-            scores = shared_noise.scores(
+            scores = uncertainty.scores(
                 slopes, left, first / unit[..., None], second / unit[..., None], goes_on
             )
             states = first, second, goes_on
@@ -66,8 +66,7 @@ def covariance_root(law: FittedLaw, flows: Problem, data: Dataset, steps: Steps)
     return uncertainty.root(
         fit.triangle,
         count,
-        slopes.reshape(-1, count),
-        np.hypot(left, OPTIONS.near_roundoff).ravel(),
+        (slopes.reshape(-1, count), np.hypot(left, OPTIONS.near_roundoff).ravel()),
         noise=noise,
         scores=scores,
     )
@@ -118,7 +117,7 @@ class _Residuals:
     ) -> float | None:
         """Part of the mean square that no generator K explains, residual = J∇K at the images: K the
         largest that the rows tell. generators: by rising size. states: the residual's derivatives
-        and which pairs go on, as `shared_noise.scores` takes them. None where the rows are too few.
+        and which pairs go on, as `uncertainty.scores` takes them. None where the rows are too few.
 
         1 where K explains no more than it would of noise, by ``explained`` standard errors: an F
         test.
@@ -138,10 +137,10 @@ class _Residuals:
         if states is not None:
             to_target = -weight[:, None] * symplectic_form(data.dim)
             slopes, (first, second, goes_on) = family.term_gradients(z) * weight[:, None], states
-            scores = shared_noise.scores(
+            scores = uncertainty.scores(
                 slopes, weight * target, to_target @ first, to_target @ second, goes_on
             )
-            freedom = shared_noise.degrees_of_freedom(slopes, weight * target, scores)
+            freedom = uncertainty.degrees_of_freedom(slopes, weight * target, scores)
         left = reduced.norm**2 / max(reduced.rows - self.taken, 1)
         if left == 0:
             return 1.0

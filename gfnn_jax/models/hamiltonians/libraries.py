@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.diagnosis.misfit import misfit
+from gfnn_jax.diagnosis.residuals import misfit
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.sums import Sums

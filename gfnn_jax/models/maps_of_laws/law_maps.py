@@ -11,8 +11,8 @@ import numpy as np
 from gfnn_jax.budget import FLOW
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.diagnosis.charts import Charts
 from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed
+from gfnn_jax.diagnosis.local_jacobians import Charts
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.gauss_newton import Problem

@@ -17,8 +17,7 @@ import numpy as np
 from gfnn_jax.budget import FLOW, Budget
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.generating.arcs import PositionArcs, nodes_of
-from gfnn_jax.models.positions.discrete_lagrangian import Solved, residuals, solve
-from gfnn_jax.models.positions.triples import Triples
+from gfnn_jax.models.positions.discrete_lagrangian import Solved, Triples, residuals, solve
 from gfnn_jax.solve.latent_arcs import SOFT_L1, Readings
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ import numpy as np
 from gfnn_jax.coordinates import Coordinates, circle_centre, whole_turns
 from gfnn_jax.dataset.structures import Sites
 from gfnn_jax.families.displacements import OfDisplacement
+from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.generating.charts import TYPE1
 from gfnn_jax.generating.generated import Generated
@@ -19,7 +21,7 @@ from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.positions.triples import Triples
+from gfnn_jax.models.positions.discrete_lagrangian import Triples
 from gfnn_jax.phase_space import Pairs, sizes
 
 _SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved
@@ -67,7 +69,8 @@ def map_of(
     if sites is not None and turning:
         domain = dataclasses.replace(sites, angles="qp").domain(before)
     if not matrix_free(piece.family):
-        fitted = fit_predictors(TYPE1, before, middle, triples.dt, angles=tuple(angles))
+        inputs = partial(box_inputs, angles=triples.angles)
+        fitted = fit_predictors(TYPE1, before, middle, triples.dt, inputs)
         piece = dataclasses.replace(piece, predictor=affordable(fitted, piece.family).predictor)
     map_ = SymplecticMap(
         pieces=(piece,),
