@@ -6,9 +6,32 @@ nothing is compiled. Inside a step they are traced by JAX.
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from collections.abc import Callable
+from typing import Any, dataclass_transform
 
 import numpy as np
+
+
+@dataclass_transform(frozen_default=True, eq_default=False)
+def pytree(
+    *static: str, dropped: tuple[str, ...] = (), eq: bool = False, repr: bool = True
+) -> Callable:
+    """Make a class a frozen dataclass and a pytree of JAX.
+
+    Its fields are leaves, or trees of these. Those of the names ``static`` are hashable constants
+    of compiled code; those that are ``dropped`` are lost where a tree is rebuilt. eq: compared by
+    its fields; else by identity.
+    """
+
+    def registered(kind: type) -> type:
+        import jax  # loaded when first used
+
+        kind = dataclasses.dataclass(frozen=True, eq=eq, repr=repr)(kind)
+        names = [f.name for f in dataclasses.fields(kind) if f.name not in (*static, *dropped)]
+        return jax.tree_util.register_dataclass(kind, names, static, dropped)
+
+    return registered
 
 
 def namespace(*arrays: Any) -> Any:

@@ -10,23 +10,18 @@ way back where momenta are turned.
 
 from __future__ import annotations
 
-import dataclasses
-from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import namespace
+from gfnn_jax.arrays import namespace, pytree
 from gfnn_jax.coordinates import whole_turns
+from gfnn_jax.families.family import AroundAnother
 from gfnn_jax.families.sums import matrix_free
 
 
-@partial(
-    jax.tree_util.register_dataclass, data_fields=("family", "moves"), meta_fields=("part", "both")
-)
-@dataclasses.dataclass(frozen=True, eq=False)
-class OfDisplacement:
+@pytree("part", "both")
+class OfDisplacement(AroundAnother):
     """The family of S(q, Q) that a family F of 2d variables makes.
 
     part: c, of the way from q to Q. both: whether S is the mean of F both ways, and symmetric.
@@ -40,17 +35,9 @@ class OfDisplacement:
     moves: Any = None
 
     @property
-    def name(self) -> str:
-        return self.family.name
-
-    @property
     def label(self) -> str:
         """Label in a table of candidates: name and size."""
         return f"{self.family.label} of q and Q − q"
-
-    @property
-    def num_parameters(self) -> int:
-        return self.family.num_parameters
 
     @property
     def operations(self) -> tuple[int, int]:
@@ -67,9 +54,6 @@ class OfDisplacement:
     def unflatten(self, coefficients):
         """Coefficients (num_parameters,), NumPy -> the parameters of F."""
         return self.family.unflatten(coefficients)
-
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
 
     def value(self, params, w, args=None):
         """S, shape (...): w (..., 2d)."""

@@ -8,19 +8,17 @@ within what the members say differently. It generates a symplectic map for any w
 
 from __future__ import annotations
 
-import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from gfnn_jax.arrays import pytree
 from gfnn_jax.families.family import DifferentiatedByJax
 from gfnn_jax.families.mlp import Mlp
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("network", "members"), meta_fields=())
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree()
 class Ensemble(DifferentiatedByJax):
     """Ensemble of E networks of one shape; the params of the family are their weights (E,).
 

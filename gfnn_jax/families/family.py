@@ -8,8 +8,7 @@ static. The same lines compute in NumPy for NumPy arrays (a fit) and are traced 
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
@@ -18,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
-from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace, pytree
+from gfnn_jax.errors import FitError
 from gfnn_jax.phase_space import TIME
 
 
@@ -107,8 +107,33 @@ def parameter_gradients(family: Any, params: Any, w: Any, args: Any = None, alon
     return (along or family).term_gradients(w, args)
 
 
-class AroundAnother:
-    """Base of a family that is made of another one, ``family``; its params are coefficients."""
+class CalledAsValue:
+    """Base of all families of this package: called, a family is its value."""
+
+    def __call__(self, params, w, args=None):
+        return self.value(params, w, args)
+
+    def value(self, params, w, args=None):
+        """Value of f, shape (...): w (..., 2d)."""
+        raise NotImplementedError
+
+
+class OfCoefficients(CalledAsValue):
+    """Base of a family whose params are the coefficients (N,) of its terms."""
+
+    @property
+    def label(self: Any) -> str:
+        """Name and number of terms, as tables show them."""
+        return f"{self.name} {self.num_parameters}"
+
+    def unflatten(self, coefficients):
+        """Return the coefficients: they are the parameters."""
+        return coefficients
+
+
+class AroundAnother(OfCoefficients):
+    """Base of a family that is made of another one, ``family``, and is that one where it has no
+    member of its own."""
 
     family: Any
 
@@ -117,28 +142,25 @@ class AroundAnother:
         """Degrees of freedom d."""
         return self.family.dim
 
-    def unflatten(self, coefficients):
-        """Return the coefficients: they are the parameters."""
-        return coefficients
+    @property
+    def name(self) -> str:
+        return self.family.name
 
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
+    @property
+    def num_parameters(self) -> int:
+        return self.family.num_parameters
 
-    def value(self, params, w, args=None):
-        raise NotImplementedError
+    @property
+    def operations(self) -> tuple[int, int]:
+        """Floating-point operations of a gradient, and of a gradient with its Hessian."""
+        return self.family.operations
 
 
-class DifferentiatedByJax:
+class DifferentiatedByJax(CalledAsValue):
     """Derivatives by JAX for a family that has no closed form of them.
 
     ``value`` must treat the rows of w independently. One compiled function serves NumPy arrays.
     """
-
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
-
-    def value(self, params, w, args=None):
-        raise NotImplementedError
 
     def gradient(self, params, w, args=None):
         """Gradient ∂f/∂w (..., 2d), by one reverse sweep of the batch."""
@@ -167,8 +189,7 @@ def _compiled_hessian(family, params, w, args):
     return family.gradient_and_hessian(params, w, args)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("function",), meta_fields=())
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree()
 class FromFunction(DifferentiatedByJax):
     """Family of a user's own S(params, w) of one state w (2d,)."""
 
@@ -203,6 +224,34 @@ def as_family(function: Any) -> Any:
     if not callable(function) or hasattr(type(function), "gradient_and_hessian"):
         return function
     return from_function(function)
+
+
+def own_families(given: Any, inputs: Any) -> Iterator[Any]:
+    """Iterate over the families of a user's own, by rising number of terms.
+
+    given: a `LinearFamily`, or a function of the fit's `Inputs`, the variables of w scaled to
+    [−1, 1], that gives such families. Raises FitError where a family lacks a member that a fit
+    needs, and where they do not grow.
+    """
+    families, last = [given] if hasattr(given, "term_gradients") else given(inputs), 0
+    for family in families:
+        if not isinstance(family, LinearFamily):
+            lacks = [n for n in dir(LinearFamily) if n[0] != "_" and not hasattr(family, n)]
+            raise FitError(
+                f"expected a linear family; {type(family).__name__} has no {', '.join(lacks)}"
+            )
+        if type(family).__hash__ is None:
+            raise FitError(
+                f"{type(family).__name__} is compared by its fields, a fit needs families compared "
+                "by identity: declare it with dataclass(frozen=True, eq=False)"
+            )
+        if family.num_parameters <= last:
+            raise FitError(
+                f"expected families by rising number of terms, got {family.num_parameters} after "
+                f"{last}"
+            )
+        last = family.num_parameters
+        yield family
 
 
 def symmetric_gradient(family: Family, params: Any, w: Any, args: Any = None) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -11,19 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace, pytree
 
 _MARGIN = 1.0 + 1e-9  # the data's extremes lie just inside the box
 _PARITY_STATES = 64  # number of states on which the parity of a feature is judged
 _CHUNK = 4_096  # states for which features are compiled, whatever the number of data
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("centre", "scale", "args_centre", "args_scale"),
-    meta_fields=("keep", "angles", "width", "features"),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("keep", "angles", "width", "features")
 class Inputs:
     """Variables x of a family: w without its cyclic entries, or the scene's features, scaled.
 

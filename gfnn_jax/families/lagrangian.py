@@ -19,13 +19,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace, pytree
 from gfnn_jax.families.text import added, barred, combination, power, shown
 
 MAX_POWER = 8  # of one coordinate in one term; powers come from a table of this length
@@ -52,12 +51,7 @@ class Derivatives(NamedTuple):
     by_vv: Any  # (..., d, d)
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("speeds", "powers", "modes", "phases"),
-    meta_fields=(),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree()
 class Terms:
     """The terms ℓ_j of a Lagrangian: whole numbers k, n and m, each (P, d), and phases (P,).
 
@@ -185,12 +179,7 @@ class Terms:
         return push * f[..., None] + dg * along[..., None] - g[..., None] * df
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("directions", "kinds", "widths"),
-    meta_fields=(),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree()
 class Friction:
     """Terms r_k of Rayleigh's R: directions c (F, d), whole numbers; kinds (F,), LINEAR, QUADRATIC
     or DRY; widths ε (F,), which dry friction alone uses, in units of v."""
@@ -284,12 +273,7 @@ class Friction:
         return _outer(slope, self.directions.astype(v.dtype))
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("terms", "coefficients", "friction", "losses", "uniform", "gains"),
-    meta_fields=("powers",),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("powers")
 class Lagrangian:
     """L = Σ θ_j ℓ_j with θ ``coefficients`` (P,), friction R = Σ ρ_k r_k with ρ ``losses`` (F,),
     uniform friction −γ ∂L/∂v with γ ``uniform`` in 1/time, and gains G (d, inputs) of inputs u.

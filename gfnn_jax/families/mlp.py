@@ -8,7 +8,6 @@ scaling inside S leaves the map symplectic.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
@@ -18,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gfnn_jax.arrays import pytree
 from gfnn_jax.families.family import DifferentiatedByJax
 from gfnn_jax.families.inputs import Inputs
 
@@ -37,12 +37,7 @@ ACTIVATIONS: dict[str, Callable] = {
 }
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("inputs", "amplitude"),
-    meta_fields=("hidden", "activation"),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("hidden", "activation")
 class Mlp(DifferentiatedByJax):
     """Fully connected network with one output, linear in its last layer.
 

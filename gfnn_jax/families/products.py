@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from functools import cache, cached_property, partial, reduce
+from functools import cache, cached_property, reduce
 from operator import mul
 from typing import Any
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace, pytree
+from gfnn_jax.families.family import CalledAsValue
 from gfnn_jax.families.inputs import Inputs
 
 
@@ -296,9 +296,8 @@ class Basis:
 basis_of = cache(Basis)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("inputs",), meta_fields=("degree", "signs"))
-@dataclasses.dataclass(frozen=True, eq=False)
-class Products:
+@pytree("degree", "signs")
+class Products(CalledAsValue):
     """Family of Chebyshev × Fourier products of total degree at most ``degree``.
 
     The variables are those of the inputs, and include the args where S depends on some.
@@ -347,9 +346,6 @@ class Products:
     def unflatten(self, coefficients):
         """Make the matrix C (m, n), the parameters of S, of coefficients (num_parameters,)."""
         return self.basis.placed(np.asarray(coefficients))
-
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
 
     def value(self, params, w, args=None):
         """Value S(C, w), shape (...): params the matrix C, w (..., 2d)."""

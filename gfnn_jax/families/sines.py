@@ -8,23 +8,17 @@ fit is one least-squares solve; the number of features does not grow with the di
 
 from __future__ import annotations
 
-import dataclasses
-from functools import cached_property, partial
+from functools import cached_property
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace, pytree
+from gfnn_jax.families.family import OfCoefficients
 from gfnn_jax.families.inputs import Inputs
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("inputs",),
-    meta_fields=("num_parameters", "bandwidth", "seed"),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
-class Sines:
+@pytree("num_parameters", "bandwidth", "seed")
+class Sines(OfCoefficients):
     """Family of ``num_parameters`` random sines of the variables; whole wave numbers for angles."""
 
     inputs: Inputs
@@ -33,10 +27,6 @@ class Sines:
     seed: int = 0
 
     name = "sines"
-
-    @property
-    def label(self) -> str:
-        return f"{self.name} {self.num_parameters}"
 
     @property
     def operations(self) -> tuple[int, int]:
@@ -60,13 +50,6 @@ class Sines:
         k, b = (xp.asarray(a, dtype=x.dtype) for a in self._frequencies)
         phase = matmul(x, k.T)
         return k, phase + as_row(b, phase)
-
-    def unflatten(self, coefficients):
-        """Return the coefficients (num_parameters,), which are the parameters of S."""
-        return coefficients
-
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
 
     def value(self, params, w, args=None):
         """Value S(params, w), shape (...): params (num_parameters,), w (..., 2d)."""

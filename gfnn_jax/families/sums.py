@@ -12,15 +12,14 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Sequence
-from functools import partial
 from itertools import combinations, product
 from typing import Any
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace, pytree
 from gfnn_jax.families.expressions import depends_on, parse, window_terms
+from gfnn_jax.families.family import OfCoefficients
 from gfnn_jax.families.site_sums import site_sum
 from gfnn_jax.families.terms import Terms, exponents, given_terms, joined
 from gfnn_jax.families.text import added
@@ -212,9 +211,8 @@ class Part:
     over: Any
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=(), meta_fields=("dim", "parts"))
-@dataclasses.dataclass(frozen=True)
-class Sums:
+@pytree("dim", "parts", eq=True)
+class Sums(OfCoefficients):
     """Family that is the sum of its parts. params: coefficients (N,) of all parts in order."""
 
     dim: int
@@ -222,10 +220,6 @@ class Sums:
 
     name = "sums"
     quadratic = False  # no affine map is tried in its stead: a dense matrix
-
-    @property
-    def label(self) -> str:
-        return f"{self.name} {self.num_parameters}"
 
     @property
     def num_parameters(self) -> int:
@@ -268,13 +262,6 @@ class Sums:
                 parts.append(Part(part.terms.take(own), part.over))
             first = last
         return Sums(self.dim, tuple(parts))
-
-    def unflatten(self, coefficients):
-        """Return the coefficients (N,), which are the parameters."""
-        return coefficients
-
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
 
     def value(self, params, w, args=None):
         """Value of f, shape (...): params (N,), w (..., 2d)."""

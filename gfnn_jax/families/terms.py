@@ -9,16 +9,14 @@ family consists of text and whole numbers, and is saved as such.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from itertools import combinations_with_replacement
 from typing import Any
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import matmul, namespace
+from gfnn_jax.arrays import matmul, namespace, pytree
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.expressions import (
     Expression,
@@ -29,6 +27,7 @@ from gfnn_jax.families.expressions import (
     parse,
     to_text,
 )
+from gfnn_jax.families.family import OfCoefficients
 from gfnn_jax.families.jets import jets
 from gfnn_jax.families.text import superscript
 from gfnn_jax.families.traced import traced
@@ -125,13 +124,8 @@ def _plan_of(powers: tuple[tuple[int, ...], ...], still: tuple[int, ...]) -> _Pl
     return _Plan(np.array(powers, dtype=int), still)
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=(),
-    meta_fields=("dim", "variables", "powers", "parameters"),
-)
-@dataclasses.dataclass(frozen=True)
-class Terms:
+@pytree("dim", "variables", "powers", "parameters", eq=True)
+class Terms(OfCoefficients):
     """Family of products of powers of ``variables``, one for each row of ``powers`` (N, k).
 
     variables: expressions as text. params: the coefficients (N,). parameters: names of the args,
@@ -144,10 +138,6 @@ class Terms:
     parameters: tuple[str, ...] = ()
 
     name = "terms"
-
-    @property
-    def label(self) -> str:
-        return f"{self.name} {self.num_parameters}"
 
     @property
     def num_parameters(self) -> int:
@@ -210,13 +200,6 @@ class Terms:
             tuple(tuple(row) for row in kept[:, used].tolist()),
             self.parameters,
         )
-
-    def unflatten(self, coefficients):
-        """Return the coefficients (N,), which are the parameters."""
-        return coefficients
-
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
 
     def value(self, params, w, args=None):
         """Value of f, shape (...): params (N,), w (..., 2d)."""

@@ -7,20 +7,18 @@ variable beside the coordinates, in which S is not differentiated.
 
 from __future__ import annotations
 
-import dataclasses
-from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
 
+from gfnn_jax.arrays import pytree
+from gfnn_jax.families.family import AroundAnother
 from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.products import Products
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("products",), meta_fields=())
-@dataclasses.dataclass(frozen=True, eq=False)
-class OfTimeStep:
+@pytree()
+class OfTimeStep(AroundAnother):
     """Family S(C, w; dt²): args are the time step, (1,) or (..., 1), of either sign.
 
     products: the products of functions of w and of their only argument, dt².
@@ -29,8 +27,8 @@ class OfTimeStep:
     products: Products
 
     @property
-    def name(self) -> str:
-        return self.products.name
+    def family(self) -> Products:  # type: ignore[override]
+        return self.products
 
     @property
     def label(self) -> str:
@@ -51,25 +49,13 @@ class OfTimeStep:
         """Inputs of w and dt²."""
         return self.products.inputs
 
-    @property
-    def num_parameters(self) -> int:
-        return self.products.num_parameters
-
     def terms_of(self, degree: int) -> int:
         """Number of parameters of the same family of another degree."""
         return self.products.terms_of(degree)
 
-    @property
-    def operations(self) -> tuple[int, int]:
-        """Floating-point operations of ∇S, and of ∇S with its Hessian."""
-        return self.products.operations
-
     def unflatten(self, coefficients) -> np.ndarray:
         """Make the matrix C, the parameters of S, of coefficients (..., num_parameters), NumPy."""
         return self.products.unflatten(coefficients)
-
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
 
     def value(self, params: Any, w: Any, args: Any = None):
         """Value of S, shape (...)."""

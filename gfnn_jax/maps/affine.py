@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
-from gfnn_jax.arrays import as_row, matmul
+from gfnn_jax.arrays import as_row, matmul, pytree
 from gfnn_jax.phase_space import apply_j, area
 from gfnn_jax.solve.status import OK, Info
 
 
-@partial(
-    jax.tree_util.register_dataclass, data_fields=("matrix", "centre", "shift"), meta_fields=()
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree()
 class Affine:
     """Map z -> centre + shift + E (z − centre), E a symplectic matrix: half a base map. A piece.
 

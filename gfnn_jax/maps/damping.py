@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from itertools import product
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace, pytree
 from gfnn_jax.phase_space import split
 from gfnn_jax.solve.status import OK, Info
 
@@ -42,8 +40,7 @@ class _Shrinks:
         return image, jnp.concatenate([q, shrunk], axis=-1), info
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("factor", "shift"), meta_fields=())
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree()
 class Damping(_Shrinks):
     """D_b: (q, p) -> (q, b p + c). A piece.
 
@@ -77,8 +74,7 @@ class Damping(_Shrinks):
         return Damping(1 / self.factor, -self.shift / self.factor)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("centre", "half"), meta_fields=("degrees",))
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("degrees")
 class FunctionsOfArgs:
     """Products of Chebyshev polynomials of args, the constant first.
 
@@ -117,12 +113,7 @@ class FunctionsOfArgs:
         return xp.stack(columns, axis=-1)
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("factor", "shift", "functions"),
-    meta_fields=("inverted",),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("inverted")
 class DampingOfArgs(_Shrinks):
     """D_b of b(args) = Σ β_j f_j(args) and of c(args) alike. A piece: for each value of the args
     the `Damping` of that b, AᵀJA = b(args) J.

@@ -9,14 +9,11 @@ step. Scaling the coordinates does not change it.
 
 from __future__ import annotations
 
-import dataclasses
-from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_row, matmul, namespace
+from gfnn_jax.arrays import as_row, matmul, namespace, pytree
 from gfnn_jax.families.jets import jets
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.phase_space import sizes
@@ -26,12 +23,7 @@ _MARGIN = 2.0
 _RANGE_MARGIN = 0.25  # on either side, relative to a range's width
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("centre", "scale", "factor", "limit"),
-    meta_fields=("keep",),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("keep")
 class Domain:
     """Domain {y : κ(y) <= limit} in the coordinates ``keep`` of y; all states where it is empty.
 
@@ -87,8 +79,7 @@ def covering(y, *, ignore: tuple[int, ...] = ()) -> Domain:
     return Domain(keep, centre, scale, factor, np.asarray(limit))
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("low", "high"), meta_fields=("sums",))
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("sums")
 class Ranges:
     """Domain of a sum over neighbourhoods, by the ranges of each variable of a neighbourhood.
 

@@ -7,15 +7,12 @@ rollout of any length keeps the drive's phase.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_numbers, as_row, namespace
+from gfnn_jax.arrays import as_numbers, as_row, namespace, pytree
 from gfnn_jax.phase_space import TIME
 
 _EDGE = 1e-9  # tolerance at the ends of a range, relative to it, for printed numbers
@@ -25,12 +22,7 @@ _LARGEST_GAP = 1 / 8
 _HALF_DIGITS = 2.0**27 + 1  # splits a float64 in two halves, whose products are exact (Veltkamp)
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("low", "high", "period"),
-    meta_fields=("names",),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("names")
 class Parameters:
     """Names, ranges and period of the arguments of a map.
 

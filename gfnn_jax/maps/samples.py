@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax.arrays import pytree
 from gfnn_jax.compiling import compiled_sooner
 from gfnn_jax.maps.lanes import (
     Lanes,
@@ -30,8 +31,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 _TOGETHER = 256
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("map", "params"), meta_fields=("piece",))
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("piece")
 class Samples:
     """Set of n maps that equal ``map`` but for the params (n, ...) of one piece."""
 

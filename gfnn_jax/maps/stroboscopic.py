@@ -7,25 +7,20 @@ that does not depend on time.
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gfnn_jax.arrays import pytree
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 _WHOLE = 1e-9  # relative tolerance on the whole number of steps in a period
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("piece", "parameters", "t0", "dt"),
-    meta_fields=("steps", "backward"),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("steps", "backward")
 class OverPhases:
     """Row of a driven piece at the times t0 + n dt, n from 0 to ``steps`` − 1, itself without args.
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from functools import partial
 from numbers import Integral
 from typing import Any
 
@@ -23,6 +22,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from gfnn_jax.arrays import pytree
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.maps import programs
@@ -46,13 +46,7 @@ from gfnn_jax.phase_space import require_x64
 from gfnn_jax.threads import one_thread
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("pieces", "domain", "scale", "angle_centre", "dt", "parameters", "dt_range"),
-    meta_fields=("coordinates", "signals"),
-    drop_fields=("posterior", "sensors"),
-)
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+@pytree("coordinates", "signals", dropped=("posterior", "sensors"), repr=False)
 class SymplecticMap:
     """Learned map, with the domain and the ranges of its data.
 

@@ -31,8 +31,8 @@ from gfnn_jax.dataset.noise import of_pairs
 from gfnn_jax.dataset.rows import inputs_of, of_rows, rows_of, weighted_rows_of
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.dataset.split import outermost
+from gfnn_jax.families.family import own_families
 from gfnn_jax.families.inputs import Inputs, variable_signs
-from gfnn_jax.families.own import own_families
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.time_step import OfTimeStep
