@@ -34,7 +34,7 @@ from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE1, TYPE2, TYPE3
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import fit_predictors
 from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping, DampingOfArgs, FunctionsOfArgs
+from gfnn_jax.maps.damping import Damping, FunctionsOfArgs
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import map_of_law
 from gfnn_jax.maps.parameters import sampled
@@ -287,7 +287,7 @@ def with_length(kind):
     if kind == "damped":
         functions = FunctionsOfArgs.within(lengths, 3)
         of_length = np.array([[0.8], [0.05], [0.01], [-0.02]])
-        damping = DampingOfArgs(of_length, 0.1 * of_length, functions)
+        damping = Damping(of_length, 0.1 * of_length, functions)
         map_ = dataclasses.replace(map_, pieces=(piece, damping))
     return map_, z, lengths
 

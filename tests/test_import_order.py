@@ -60,13 +60,8 @@ ORDER = (
 SHORTHANDS = {
     ("maps.symplectic_map", f"maps.{name}")
     for name in (
-        "positions",
         "saved",
-        "samples",
-        "sharded",
-        "energy",
-        "estimates",
-        "position_estimates",
+        "forecasts",
     )
 }
 SHORTHANDS |= {

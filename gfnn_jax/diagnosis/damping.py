@@ -30,7 +30,7 @@ from gfnn_jax.fitting.least_squares import ROWS_PER_TERM
 from gfnn_jax.fitting.significance import CERTAIN
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping, DampingOfArgs, FunctionsOfArgs
+from gfnn_jax.maps.damping import Damping, FunctionsOfArgs
 from gfnn_jax.phase_space import split, symplectic_form
 
 
@@ -84,10 +84,10 @@ class LearnedDamping:
     extremes: tuple[np.ndarray, ...] = ()
 
     @property
-    def piece(self) -> Damping | DampingOfArgs:
+    def piece(self) -> Damping:
         if self.functions is None:
             return Damping(self.factor, self.shift)
-        return DampingOfArgs(self.factor.reshape(len(self.factor), -1), self.shift, self.functions)
+        return Damping(self.factor.reshape(len(self.factor), -1), self.shift, self.functions)
 
     @property
     def uniform(self) -> bool:

@@ -145,7 +145,8 @@ def _forecast(ax, sheet: _Sheet, fit: LearnedLaw, run: str, name: str) -> None:
     ahead = t[t > begin][:: max(1, int(np.sum(t > begin)) // most)]
     factor, angle = recording.factors[name], name in recording.angles
     readings = recording.unwrapped(name, run) if angle else recording.values(name, run)
-    ax.plot(t, readings / factor, ".", ms=2, color="0.6", label="measured")
+    readings = readings / factor
+    ax.plot(t, readings, ".", ms=2, color="0.6", label="measured")
     own = recording.slice(run=run)
     try:
         found = fit.map.forecast(own.slice(stop=begin), ahead, own if recording.inputs else None)
@@ -154,10 +155,11 @@ def _forecast(ax, sheet: _Sheet, fit: LearnedLaw, run: str, name: str) -> None:
     value, std = found.values[name][0], found.std[name][0]
     if angle:  # the turn that the lift of the measured angle has there
         begins = np.interp(begin, t[np.isfinite(readings)], readings[np.isfinite(readings)])
-        value = value + 2 * np.pi * np.round((begins - value[0]) / (2 * np.pi))
-    ax.plot(ahead, value / factor, lw=1, color=_BLUE, label="forecast")
-    ax.fill_between(ahead, (value - 2 * std) / factor, (value + 2 * std) / factor, alpha=0.25)
-    low, high = np.nanmin(readings) / factor, np.nanmax(readings) / factor
+        turn = 2 * np.pi / factor
+        value = value + turn * np.round((begins - value[0]) / turn)
+    ax.plot(ahead, value, lw=1, color=_BLUE, label="forecast")
+    ax.fill_between(ahead, value - 2 * std, value + 2 * std, alpha=0.25)
+    low, high = np.nanmin(readings), np.nanmax(readings)
     ax.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
     ax.set(ylabel=sheet.label(name), xlabel="t [s]")
 

@@ -83,10 +83,10 @@ def _ahead(map_: SymplecticMap, recording: Recording, run: str, k: int, longest:
     found = map_.forecast(start, later.times(run), own)
     measured, values, std = {}, {}, {}
     for name in found.values:
-        factor = recording.factors[name]
-        readings, value = later.values(name, run), found.values[name][0]
+        factor, values[name] = recording.factors[name], found.values[name][0]
+        measured[name] = later.values(name, run) / factor
         if name in recording.angles:
-            readings = readings + 2 * np.pi * np.round((value - readings) / (2 * np.pi))
-        measured[name], values[name] = readings / factor, value / factor
-        std[name] = found.std[name][0] / factor
+            turn = 2 * np.pi / factor
+            measured[name] += turn * np.round((values[name] - measured[name]) / turn)
+        std[name] = found.std[name][0]
     return Ahead(begin, later.times(run), measured, values, std)

@@ -20,7 +20,7 @@ from gfnn_jax.data.text_files import to_text
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.units import read_in_units, refuse_other_units
-from gfnn_jax.maps.estimates import Forecast
+from gfnn_jax.maps.forecasts import Forecast, forecast
 from gfnn_jax.maps.saved import load, record
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
@@ -102,7 +102,7 @@ def forecast_recording(model: Path, initial: Path, output: Output, asked: Ahead)
                     f"{asked.compare}: holds no sample of run {run} after the end of {initial}, "
                     f"{last:g} s. To forecast a part of one file: --to T ends --initial there"
                 )
-        found[run] = known.map.forecast(part, times, ahead)
+        found[run] = forecast(known.map, part, times, ahead)
     compared = None if measured is None else _compared(known, found, measured)
     second = SECONDS[recording.time_unit]
     factors = dict.fromkeys(known.job.get("degrees", ()), np.pi / 180) | recording.factors
@@ -166,7 +166,7 @@ def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> For
         {name: array / factors.get(name, 1.0) for name, array in of.items()}
         for of in (one.values, one.std)
     )
-    return Forecast(one.times / second, values, std, one.outside)
+    return one._replace(times=one.times / second, values=values, std=std)
 
 
 def _compared(known: _Model, found: dict[str, Forecast], measured: Recording) -> Comparison:

@@ -28,7 +28,6 @@ from gfnn_jax.jobs.units import read_in_units, refuse_other_units
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.bands import bands, horizon
 from gfnn_jax.maps.lanes import Lanes
-from gfnn_jax.maps.positions import starts_from_positions
 from gfnn_jax.maps.samples import Samples
 from gfnn_jax.maps.sharded import Sharded
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -130,7 +129,7 @@ def predict(
     if asked.dt is not None:
         with _refused_as("--dt"):
             map_ = map_.over(asked.dt)
-    if starts_from_positions(map_) and are_recordings(initial):
+    if map_.of_positions and are_recordings(initial):
         z0, params = _last_states(map_, model, initial), None
     else:
         names = () if map_.parameters is None else map_.parameters.names

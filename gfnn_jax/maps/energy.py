@@ -16,7 +16,6 @@ from gfnn_jax.compiling import compiled_sooner
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.uniform import Power, power
 from gfnn_jax.maps.inner import after, inner
-from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 
 class Ledger(NamedTuple):
@@ -29,7 +28,7 @@ class Ledger(NamedTuple):
     closure: Any
 
 
-def power_of(map_: SymplecticMap, z, args=None, inputs=None) -> Power:
+def power_of(map_: Any, z, args=None, inputs=None) -> Power:
     """`SymplecticMap.power`."""
     z = map_._states(z)
     _check_flow(map_)
@@ -37,7 +36,7 @@ def power_of(map_: SymplecticMap, z, args=None, inputs=None) -> Power:
     return found if z.ndim == 2 else jax.tree.map(lambda a: a[0], found)
 
 
-def ledger(map_: SymplecticMap, z0, num_steps: int, *, params=None, inputs=None) -> Ledger:
+def ledger(map_: Any, z0, num_steps: int, *, params=None, inputs=None) -> Ledger:
     """The energies of rollouts from z0 (B, 2d), in the mean over ``num_steps`` steps: what is lost
     and supplied is integrated by the quadrature of the steps themselves. params, inputs: as of
     `SymplecticMap.rollout`. Raises ValueError for a map that is no flow."""
@@ -46,7 +45,7 @@ def ledger(map_: SymplecticMap, z0, num_steps: int, *, params=None, inputs=None)
     return _ledger(map_, z0, map_._schedule(params, z0, None, inputs, num_steps), num_steps)
 
 
-def _check_flow(map_: SymplecticMap) -> None:
+def _check_flow(map_: Any) -> None:
     """Raises ValueError where the map is none."""
     if len(map_.pieces) != 1 or not isinstance(map_.pieces[0], Flow):
         raise ValueError("expected the flow of a Hamiltonian, whose energy is known")

@@ -45,6 +45,15 @@ class RolloutInfo(NamedTuple):
     bands: Bands | None = None
 
 
+class Saving(NamedTuple):
+    """What a rollout saves: ``blocks`` states, one every ``every`` steps; and whether lanes stop
+    where they leave the domain. Hashable: a constant of compiled code."""
+
+    blocks: int
+    every: int = 1
+    stop_outside: bool = False
+
+
 def _by_domain(status, inside, stop_outside: bool):
     """Update the status by the domain; only lanes that have not ended can change."""
     outside = STOPPED_AT_EDGE if stop_outside else LEFT_DOMAIN
@@ -78,7 +87,7 @@ def begun(map_, z, args, stop_outside) -> Lanes:
 start_lanes = compiled_sooner(begun, (3,))
 
 
-def advanced(map_, lanes, args, num_saved, save_every, stop_outside) -> tuple[Lanes, Any]:
+def advanced(map_, lanes, args, saving: Saving) -> tuple[Lanes, Any]:
     """Implement `SymplecticMap.advance` inside ``jit``."""
 
     def step(lanes: Lanes) -> Lanes:
@@ -93,7 +102,9 @@ def advanced(map_, lanes, args, num_saved, save_every, stop_outside) -> tuple[La
         y, compensation, turns = reduced(map_, y, compensation)
         inside, finite = contains(map_, y, then), jnp.all(jnp.isfinite(y), axis=-1)
         failed = jnp.where(finite, info.status, NON_FINITE)
-        status = jnp.where(failed == OK, _by_domain(lanes.status, inside, stop_outside), failed)
+        status = jnp.where(
+            failed == OK, _by_domain(lanes.status, inside, saving.stop_outside), failed
+        )
         status = jnp.where(going, status, lanes.status).astype(jnp.int32)
         leaves = going & (failed == OK) & ~inside & (lanes.left_at < 0)
         winding = jnp.where(jnp.isfinite(turns), turns, 0.0).astype(lanes.winding.dtype)
@@ -110,19 +121,19 @@ def advanced(map_, lanes, args, num_saved, save_every, stop_outside) -> tuple[La
     def observe(lanes: Lanes):
         return outer(map_, lanes.y, lanes.winding.astype(lanes.y.dtype))
 
-    lanes, saved = scan_steps(step, lanes, num_saved, save_every=save_every, observe=observe)
+    lanes, saved = scan_steps(step, lanes, saving.blocks, save_every=saving.every, observe=observe)
     return lanes, jnp.moveaxis(saved, 0, 1)
 
 
-advance_lanes = compiled_sooner(advanced, (3, 4, 5))
+advance_lanes = compiled_sooner(advanced, (3,))
 
 
-def predicted(map_, z, args, num_saved, save_every, stop_outside) -> tuple[Any, RolloutInfo]:
+def predicted(map_, z, args, saving: Saving) -> tuple[Any, RolloutInfo]:
     """Implement `SymplecticMap.rollout` for states z (B, 2d), inside ``jit``."""
-    lanes = begun(map_, z, args, stop_outside)
-    lanes, saved = advanced(map_, lanes, args, num_saved, save_every, stop_outside)
+    lanes = begun(map_, z, args, saving.stop_outside)
+    lanes, saved = advanced(map_, lanes, args, saving)
     info = RolloutInfo(lanes.status, lanes.left_at, lanes.iterations)
     return jnp.concatenate([z[:, None], saved], axis=1), info
 
 
-roll_out = compiled_sooner(of_one_or_many(predicted), (3, 4, 5))
+roll_out = compiled_sooner(of_one_or_many(predicted), (3,))

@@ -68,8 +68,9 @@ def map_of_law(
         u = np.zeros((len(z), count)) if inputs is None else np.asarray(inputs, float)
         own = signals.constant(own, u[some], z[some].shape, np.float64)
     one = law.at(args[some]) if parameters else law
-    steps = _steps(one, family, params, z[some], dt, scale, own, tolerance)
-    flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, steps.newton)
+    flow = Flow(family, params, dt, scale)
+    steps = _steps(one, flow, z[some], own, tolerance)
+    flow = dataclasses.replace(flow, **dataclasses.asdict(steps))
     posterior = None if root is None else Posterior(0, np.asarray(root))
     return SymplecticMap(
         (flow,),
@@ -160,22 +161,23 @@ def velocities_of(map_: SymplecticMap, z, args=None):
     return Legendre(law.terms).velocity(law.coefficients, np.asarray(z))
 
 
-def _steps(law: Lagrangian, family, params, z, dt: float, scale, args, tolerance: float):
-    """The cheapest steps whose own error is within the tolerance at nearly all of these states;
-    and whether Newton's method is to solve them: where dry friction is stiff, whose force turns
-    over within ε, and no more than Newton's method bears in a substep."""
+def _steps(law: Lagrangian, flow: Flow, z, args, tolerance: float) -> Steps:
+    """The cheapest steps of a flow whose own error is within the tolerance at nearly all of these
+    states; and whether Newton's method is to solve them: where dry friction is stiff, whose force
+    turns over within ε, and no more than Newton's method bears in a substep."""
+    dt = float(flow.dt)
     turned = dt * stiffness(law, split(z)[0])
     fewest, stiff = turned / STIFFEST, bool(turned > _CONTRACTING)
-    finest = Steps(_STAGES[-1], 2 * _SUBSTEPS[-1])
-    reference = images(family, params, z, dt, finest, args=args).states
-    steps = Steps(_STAGES[-1], _SUBSTEPS[-1], stiff)
+
+    def after(steps: Steps) -> np.ndarray:
+        return images(flow.family, flow.params, z, dt, steps, args=args).states
+
+    reference = after(Steps(_STAGES[-1], 2 * _SUBSTEPS[-1]))
     for _, stages, substeps in sorted((s**2 * n, s, n) for s in _STAGES for n in _SUBSTEPS):
         tried = Steps(stages, substeps, stiff)
         if substeps < min(fewest, _SUBSTEPS[-1]):
             continue
-        found = images(family, params, z, dt, tried, args=args).states
-        off = np.abs((found - reference) / scale).max(axis=1)
+        off = np.abs((after(tried) - reference) / flow.scale).max(axis=1)
         if np.mean(off <= tolerance) >= _NEARLY:
-            steps = tried
-            break
-    return steps
+            return tried
+    return Steps(_STAGES[-1], _SUBSTEPS[-1], stiff)

@@ -18,7 +18,6 @@ from gfnn_jax.coordinates import whole_turns
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.generating.arcs import PositionArcs, nodes_of
-from gfnn_jax.maps.estimates import Forecast
 from gfnn_jax.solve.latent_arcs import Readings
 
 _EVEN = 0.01  # of a time step, by which times may miss an even grid
@@ -40,23 +39,24 @@ class _Ends(NamedTuple):
 
 
 def estimate(map_: Any, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """`SymplecticMap.estimate`, of a map that was learned from positions alone."""
+    """Implement `maps.forecasts.estimate` for a map of positions alone."""
     piece = jax.tree.map(np.asarray, map_.pieces[0])
     ends = _ends(map_, piece, recording)
     return _states(piece, ends)
 
 
-def forecast(map_: Any, recording: Recording, times: Any) -> Forecast:
-    """`SymplecticMap.forecast`, of a map that was learned from positions alone."""
+def forecast(
+    map_: Any, recording: Recording, times: np.ndarray, inputs: Recording | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
+    """Implement `maps.forecasts.forecast` for a map of positions alone: values, std, outside."""
     piece, sensors, dim = jax.tree.map(np.asarray, map_.pieces[0]), map_.sensors, map_.dim
-    times, dt = np.atleast_1d(np.asarray(times, float)), float(piece.dt)
-    last = np.array([np.max(recording.times(run)) for run in recording.runs])
+    dt, last = float(piece.dt), np.array([np.max(recording.times(run)) for run in recording.runs])
     ahead = (times - last[:, None]) / dt
     steps = np.round(ahead).astype(int)
-    if times.ndim != 1 or not (steps > 0).all() or not np.abs(ahead - steps).max() < _EVEN:
+    if not (steps > 0).all() or not np.abs(ahead - steps).max() < _EVEN:
         raise InputError(
             f"expected times that are whole steps of {dt:g} s after the end of each run "
-            f"({last.max():g} s), got {times.ravel()[0]:g} to {times.ravel()[-1]:g} s"
+            f"({last.max():g} s), got {times[0]:g} to {times[-1]:g} s"
         )
     ends = _ends(map_, piece, recording)
     orbits = np.asarray(map_.rollout(_states(piece, ends)[0], int(steps.max()))[0])[..., :dim]
@@ -72,11 +72,8 @@ def forecast(map_: Any, recording: Recording, times: Any) -> Forecast:
             spread[..., 2 * dim :] += moved.by_coefficients[:, k]
     rows = np.arange(len(steps))[:, None]
     values, std = orbits[rows, steps], deviations[rows, steps]
-    return Forecast(
-        times,
-        {name: values[..., i] for i, name in enumerate(sensors.positions)},
-        {name: std[..., i] for i, name in enumerate(sensors.positions)},
-    )
+    named = [{name: of[..., i] for i, name in enumerate(sensors.positions)} for of in (values, std)]
+    return named[0], named[1], ()
 
 
 def _states(piece: Any, ends: _Ends) -> tuple[np.ndarray, np.ndarray]:
@@ -100,11 +97,6 @@ def _arcs(map_: Any, piece: Any) -> PositionArcs:
 def _ends(map_: Any, piece: Any, recording: Recording) -> _Ends:
     """Fit an orbit of S through the last readings of every run."""
     sensors, dim = map_.sensors, map_.dim
-    if sensors is None:
-        raise InputError(
-            "expected a map that knows its sensors, got one of an older release or of "
-            "pairs: fit the recording again"
-        )
     windows = [_window(map_, piece, recording, run) for run in recording.runs]
     arcs, sigma = _arcs(map_, piece), np.tile(sensors.sigma, 2)
     known = dataclasses.replace(arcs, basis=arcs.basis[:, :0])

@@ -18,12 +18,12 @@ from gfnn_jax.compiling import compiled_sooner
 from gfnn_jax.maps.lanes import (
     Lanes,
     RolloutInfo,
+    Saving,
     advanced,
     begun,
     predicted,
     require_no_inputs_backwards,
 )
-from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 # Fewest lanes that are stepped together. More samples at once gain nothing on a CPU: a batched
 # program takes both sides of every branch (100 samples, Hénon–Heiles, µs per step: 1,000 states
@@ -35,7 +35,7 @@ _TOGETHER = 256
 class Samples:
     """Set of n maps that equal ``map`` but for the params (n, ...) of one piece."""
 
-    map: SymplecticMap
+    map: Any
     params: Any
     piece: int
 
@@ -45,10 +45,10 @@ class Samples:
     def __iter__(self):  # an index of JAX that is too large raises nothing and would not end it
         return (self[i] for i in range(len(self)))
 
-    def __getitem__(self, index) -> SymplecticMap:
+    def __getitem__(self, index) -> Any:
         return self.one(self.params[index])
 
-    def one(self, params) -> SymplecticMap:
+    def one(self, params) -> Any:
         """Make the map with these params of its piece."""
         pieces = list(self.map.pieces)
         pieces[self.piece] = dataclasses.replace(pieces[self.piece], params=params)
@@ -69,13 +69,13 @@ class Samples:
         *,
         params=None,
         t0=None,
-        save_every: int = 1,
-        stop_outside: bool = False,
+        save_every=1,
+        stop_outside=False,
     ) -> tuple[Lanes, Any]:
         """Advance lanes as `SymplecticMap.advance` does; the states are (n, B, num_saved, 2d)."""
         args = self.map._args(params, lanes.y[0], t0)
-        together = self._together(lanes.y)
-        return _advance(self, lanes, args, num_saved, save_every, stop_outside, together)
+        saving = Saving(num_saved, save_every, stop_outside)
+        return _advance(self, lanes, args, saving, self._together(lanes.y))
 
     def reversed(self) -> Samples:
         """Make the inverse maps."""
@@ -102,19 +102,12 @@ class Samples:
         """
         if num_steps < 0:
             require_no_inputs_backwards(inputs)
-            return self.reversed().rollout(
-                z0,
-                -num_steps,
-                params=params,
-                t0=t0,
-                save_every=save_every,
-                stop_outside=stop_outside,
-            )
+            options = {"params": params, "t0": t0, "save_every": save_every}
+            return self.reversed().rollout(z0, -num_steps, stop_outside=stop_outside, **options)
         z0, _ = self._given(z0, params, t0)
         args = self.map._schedule(params, self.map._states(z0[0]), t0, inputs, num_steps)
-        return _rollout(
-            self, z0, args, num_steps // save_every, save_every, stop_outside, self._together(z0)
-        )
+        saving = Saving(num_steps // save_every, save_every, stop_outside)
+        return _rollout(self, z0, args, saving, self._together(z0))
 
     def _given(self, z0, params, t0) -> tuple[Any, Any]:
         """Return the states (n, B, 2d) and their args."""
@@ -134,7 +127,7 @@ class Samples:
         return next(k for k in range(most, 0, -1) if len(self) % k == 0)
 
 
-def sampled(map_: SymplecticMap, key, num: int) -> Samples:
+def sampled(map_: Any, key, num: int) -> Samples:
     """Draw ``num`` maps from the posterior of the coefficients of ``map_``.
 
     key: of ``jax.random``; the same key always gives the same maps. Raises ValueError where the map
@@ -181,17 +174,11 @@ def _start(samples, z0, args, stop_outside, together):
     return _mapped(samples, lambda m, z: begun(m, z, args, stop_outside), (z0,), together)
 
 
-@partial(compiled_sooner, static_argnums=(3, 4, 5, 6))
-def _advance(samples, lanes, args, num_saved, save_every, stop_outside, together):
-    def advance(map_, lanes):
-        return advanced(map_, lanes, args, num_saved, save_every, stop_outside)
-
-    return _mapped(samples, advance, (lanes,), together)
+@partial(compiled_sooner, static_argnums=(3, 4))
+def _advance(samples, lanes, args, saving, together):
+    return _mapped(samples, lambda m, own: advanced(m, own, args, saving), (lanes,), together)
 
 
-@partial(compiled_sooner, static_argnums=(3, 4, 5, 6))
-def _rollout(samples, z0, args, num_saved, save_every, stop_outside, together):
-    def predict(map_, z):
-        return predicted(map_, z, args, num_saved, save_every, stop_outside)
-
-    return _mapped(samples, predict, (z0,), together)
+@partial(compiled_sooner, static_argnums=(3, 4))
+def _rollout(samples, z0, args, saving, together):
+    return _mapped(samples, lambda m, z: predicted(m, z, args, saving), (z0,), together)

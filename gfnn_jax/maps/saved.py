@@ -40,7 +40,7 @@ from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import PolynomialModel, Predictor
 from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping, DampingOfArgs, FunctionsOfArgs
+from gfnn_jax.maps.damping import Damping, FunctionsOfArgs
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.observation import Observation
@@ -94,12 +94,12 @@ _TYPES: dict[str, type] = {
         SoftL1,
         Biweight,
         Damping,
-        DampingOfArgs,
         FunctionsOfArgs,
         OfDisplacement,
     )
 } | {"LagrangianTerms": lagrangian.Terms}
 _NAMES = {kind: name for name, kind in _TYPES.items()}
+_TYPES["DampingOfArgs"] = Damping  # in maps that 0.3 saved
 
 
 def register(kind: type) -> type:

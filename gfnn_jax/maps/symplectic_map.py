@@ -24,14 +24,17 @@ from jax.core import Tracer
 
 from gfnn_jax.arrays import pytree
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.flows.flow import Flow
-from gfnn_jax.maps import programs
+from gfnn_jax.generating.charts import TYPE1
+from gfnn_jax.maps import energy, programs
 from gfnn_jax.maps.bands import Bands, bands
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.lanes import (
     Lanes,
     RolloutInfo,
+    Saving,
     advance_lanes,
     require_no_inputs_backwards,
     roll_out,
@@ -41,9 +44,10 @@ from gfnn_jax.maps.modified_hamiltonian import ModifiedHamiltonian
 from gfnn_jax.maps.parameters import Parameters, as_args
 from gfnn_jax.maps.piece import PieceWithAction, serves_any_dt
 from gfnn_jax.maps.posterior import Posterior
+from gfnn_jax.maps.samples import sampled
 from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.maps.sharded import Sharded, local_devices
 from gfnn_jax.phase_space import require_x64
-from gfnn_jax.threads import one_thread
 
 
 @pytree("coordinates", "signals", dropped=("posterior", "sensors"), repr=False)
@@ -109,18 +113,14 @@ class SymplecticMap:
 
     def sample(self, key, num: int):
         """Draw ``num`` maps from the posterior, each symplectic: `maps.samples.Samples`."""
-        from gfnn_jax.maps import samples  # stands after this module: a shorthand for its function
-
-        return samples.sampled(self, key, num)
+        return sampled(self, key, num)
 
     def sharded(self, devices: int | str = "all"):
         """Share rollouts of this map out among devices of this process: `maps.sharded.Sharded`.
 
         devices: "all", or the number of devices, the first ones.
         """
-        from gfnn_jax.maps import sharded  # stands after this module: a shorthand for its class
-
-        return sharded.Sharded(self, sharded.local_devices(devices))
+        return Sharded(self, local_devices(devices))
 
     def step(self, z, args=None, *, dt=None, t0=None, inputs=None):
         """Make one step: (Z, Info); Info's leaves are () or (B,). dt: argument of `over`. inputs:
@@ -178,9 +178,27 @@ class SymplecticMap:
         Where angles were learned from readings modulo their period, the move is taken modulo it;
         else a lift is trusted. Raises ValueError for another map, or another shape.
         """
-        from gfnn_jax.maps import positions  # stands after this module: a shorthand
+        if not self.of_positions:
+            raise ValueError(
+                "expected a map that was learned from positions alone, whose S is one of (q, Q)"
+            )
+        dtype = np.dtype(self.scale.dtype)
+        q, other = np.asarray(q, dtype), np.asarray(other, dtype)
+        if q.shape != other.shape or q.ndim not in (1, 2) or q.shape[-1] != self.dim:
+            raise ValueError(
+                f"expected two positions of shape ({self.dim},) or (B, {self.dim}), got {q.shape} "
+                f"and {other.shape}"
+            )
+        own = jax.tree.map(np.asarray, self.pieces[0])
+        w = np.concatenate([q, own.family.lifted(q, other)], axis=-1)
+        p = -own.dt * own.family.gradient(own.params, w)[..., : self.dim]
+        return jax.device_put(np.concatenate([q, p], axis=-1))
 
-        return positions.state_at(self, q, other)
+    @property
+    def of_positions(self) -> bool:
+        """Whether the map was learned from positions alone: its S is one of q and Q."""
+        ours = isinstance(getattr(self.pieces[0], "family", None), OfDisplacement)
+        return ours and len(self.pieces) == 1 and self.pieces[0].chart == TYPE1
 
     def then(self, other: SymplecticMap) -> SymplecticMap:
         """Compose this map and the other one after it: sectors of a ring, phases of a period.
@@ -267,40 +285,25 @@ class SymplecticMap:
     def power(self, z, args=None, *, inputs=None):
         """Energy per unit of time at z: ``lost`` (..., F) by each friction and ``supplied``
         (..., k) by each input: `maps.energy`. Raises ValueError for a map that is no flow."""
-        from gfnn_jax.maps import energy  # stands after this module: a shorthand for its function
-
         return energy.power_of(self, z, args, inputs)
 
     def estimate(self, recording) -> tuple[np.ndarray, np.ndarray]:
         """States z = (q, p) (runs, 2d) at each run's last time and their covariance (runs, 2d, 2d),
-        from the samples of the recording before it: `maps.estimates`, `maps.position_estimates`.
+        from the samples of the recording before it: `maps.forecasts`.
         Raises InputError for a map that was not learned from a recording, or where columns or
         samples are missing."""
-        from gfnn_jax.maps import (
-            estimates,
-            position_estimates,
-            positions,
-        )  # stand after this module
+        from gfnn_jax.maps import forecasts  # stands after this module: loaded when first used
 
-        alone = positions.starts_from_positions(self)
-        with one_thread():
-            return (position_estimates if alone else estimates).estimate(self, recording)
+        return forecasts.estimate(self, recording)
 
     def forecast(self, recording, times, inputs=None):
-        """`maps.estimates.Forecast` of the positions at ``times`` (n,), the recording's clock, from
+        """`maps.forecasts.Forecast` at ``times`` (n,), the recording's clock, in its units, from
         the state at each run's end; ``inputs`` are a recording of those ahead, matched by run where
         it has several. Raises InputError as `estimate` does, for times before a run's end, and of a
         map of positions alone for times between its steps."""
-        from gfnn_jax.maps import (
-            estimates,
-            position_estimates,
-            positions,
-        )  # stand after this module
+        from gfnn_jax.maps import forecasts  # stands after this module: loaded when first used
 
-        with one_thread():
-            if positions.starts_from_positions(self):
-                return position_estimates.forecast(self, recording, times)
-            return estimates.forecast(self, recording, times, inputs)
+        return forecasts.forecast(self, recording, times, inputs).in_units_of(recording)
 
     def linearise(self, z, inputs=None, args=None, *, t0=None):
         """(A, B) of a step: ∂Z/∂z (..., 2d, 2d) and ∂Z/∂u (..., 2d, k), inputs u, (k,) or (B, k),
@@ -353,7 +356,7 @@ class SymplecticMap:
         that the lanes were started with. inputs: of all steps from their start on.
         """
         args = self._schedule(params, lanes.y, t0, inputs)
-        return advance_lanes(self, lanes, args, num_saved, save_every, stop_outside)
+        return advance_lanes(self, lanes, args, Saving(num_saved, save_every, stop_outside))
 
     def rollout(
         self,
@@ -395,36 +398,28 @@ class SymplecticMap:
         if positions is not None:
             z0 = self.from_positions(*positions)
         z0 = self._states(z0)
+        map_ = self if dt is None else self.over(dt, np.shape(z0)[:-1])
+        options = {"params": params, "t0": t0, "save_every": save_every}
+        options["stop_outside"] = stop_outside
         if num_steps < 0:
             require_no_inputs_backwards(inputs)
-            map_ = self if dt is None else self.over(dt, np.shape(z0)[:-1])
-            return map_.reversed().rollout(
-                z0,
-                -num_steps,
-                params=params,
-                t0=t0,
-                save_every=save_every,
-                stop_outside=stop_outside,
-                samples=samples,
-                key=key,
-            )
+            return map_.reversed().rollout(z0, -num_steps, samples=samples, key=key, **options)
         if save_every > num_steps > 0:
             raise ValueError(
                 f"expected save_every <= num_steps, got {save_every} and {num_steps}: only the "
                 "initial states would be saved"
             )
-        map_ = self if dt is None else self.over(dt, z0.shape[:-1])
         args = map_._schedule(params, z0, t0, inputs, num_steps)
-        states, info = roll_out(map_, z0, args, num_steps // save_every, save_every, stop_outside)
+        saving = Saving(num_steps // save_every, save_every, stop_outside)
+        states, info = roll_out(map_, z0, args, saving)
         if samples is None:
             return states, info
         if key is None:
             raise ValueError("expected a key as well as samples, e.g. key=jax.random.key(0)")
-        options = {"params": params, "t0": t0, "inputs": inputs, "save_every": save_every}
         maps, begun = map_.sample(key, samples), np.atleast_2d(z0)
         if positions is not None:  # each with the momentum of its own S
             begun = np.stack([np.atleast_2d(one.from_positions(*positions)) for one in maps])
-        drawn, _ = maps.rollout(begun, num_steps, stop_outside=stop_outside, **options)
+        drawn, _ = maps.rollout(begun, num_steps, inputs=inputs, **options)
         found = bands(drawn, states if z0.ndim == 2 else states[None], self.angles_of_z)
         if z0.ndim == 1:
             found = Bands(found.std[0], found.quantiles[:, 0])

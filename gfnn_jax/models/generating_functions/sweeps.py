@@ -623,7 +623,9 @@ class LinearSweep(Generates):
     def moved_by_states(self) -> bool:
         """Return whether ``of_states`` is all that states' noise does: not behind the flow of a
         law."""
-        return all(isinstance(p, (Affine, Damping)) for p in (*self.data.before, *self.data.after))
+        around = (*self.data.before, *self.data.after)
+        fixed = (getattr(p, "functions", None) is None for p in around)
+        return all(isinstance(p, (Affine, Damping)) for p in around) and all(fixed)
 
     @property
     def _width(self) -> int:
