@@ -46,7 +46,7 @@ class RolloutInfo(NamedTuple):
 
 
 class Saving(NamedTuple):
-    """What a rollout saves: ``blocks`` states, one every ``every`` steps; and whether lanes stop
+    """States that a rollout saves: ``blocks`` of them, one every ``every`` steps; and whether lanes stop
     where they leave the domain. Hashable: a constant of compiled code."""
 
     blocks: int

@@ -196,7 +196,7 @@ class SymplecticMap:
 
     @property
     def of_positions(self) -> bool:
-        """Whether the map was learned from positions alone: its S is one of q and Q."""
+        """True for a map that was learned from positions alone: its S is one of q and Q."""
         ours = isinstance(getattr(self.pieces[0], "family", None), OfDisplacement)
         return ours and len(self.pieces) == 1 and self.pieces[0].chart == TYPE1
 
