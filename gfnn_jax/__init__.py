@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gfnn_jax.evaluate import figures, metrics
     from gfnn_jax.exports.export import export
     from gfnn_jax.families import from_function
+    from gfnn_jax.families.functions import register_function
     from gfnn_jax.generating.charts import CHARTS, Chart
     from gfnn_jax.learn.fit import fit
     from gfnn_jax.learn.fitted import Fit
@@ -72,6 +73,7 @@ _HOMES = {
     "read": "data.recording",
     "reference_trajectories": "scenes.trajectories",
     "register": "maps.saved",
+    "register_function": "families.functions",
     "sample_pairs": "scenes.draws",
     "sample_states": "scenes.draws",
     "sample_test_states": "scenes.draws",
@@ -109,6 +111,7 @@ __all__ = [
     "records",
     "reference_trajectories",
     "register",
+    "register_function",
     "sample_pairs",
     "sample_states",
     "sample_test_states",

@@ -173,3 +173,32 @@ class Normal:
 
     def weights(self, residuals):
         return np.ones_like(residuals)
+
+
+@gfnn.register
+@dataclasses.dataclass(frozen=True)
+class Tilted:
+    """What a camera below an angle sees: scale * tan(½ (theta − tilt))."""
+
+    @property
+    def parameters(self):
+        return {"scale": 1.0, "tilt": 0.0}
+
+    def __call__(self, q, v, c):
+        half = (q[..., 0] - c[..., 1]) / 2
+        slope = c[..., 0] / (2 * np.cos(half) ** 2)
+        by_c = np.stack([np.tan(half), -slope], axis=-1)
+        return c[..., 0] * np.tan(half), slope[..., None], np.zeros_like(v), by_c
+
+
+class Wall:
+    """A soft wall: the square of what x is beyond 1, where it is."""
+
+    name = "wall"
+
+    def derivatives(self, x):
+        beyond = namespace(x).maximum(x - 1.0, 0.0)
+        return beyond**2, 2 * beyond, namespace(x).where(x > 1.0, 2.0, 0.0)
+
+
+wall = gfnn.register_function(Wall())

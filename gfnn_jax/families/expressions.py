@@ -16,7 +16,7 @@ from functools import cache, cached_property
 from typing import Any
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.functions import CHEBYSHEV, FUNCTIONS
+from gfnn_jax.families.functions import CHEBYSHEV, known_functions
 from gfnn_jax.families.site_sums import balanced, of_a_window, written_out
 from gfnn_jax.families.text import OTHER_NAMES, added, plain
 
@@ -150,7 +150,7 @@ def coordinate_names(dim: int) -> tuple[str, ...]:
 
 def check_names(dim: int, names: Sequence[str]) -> None:
     """Raise InputError where these names of parameters could not be used in an expression."""
-    taken = {*coordinate_names(dim), *FUNCTIONS, *OTHER_NAMES, "q", "p", "t"}
+    taken = {*coordinate_names(dim), *known_functions(), *OTHER_NAMES, "q", "p", "t"}
     for name in names:
         if not name.isidentifier() or keyword.iskeyword(name):
             raise InputError(f"expected letters, digits and _ as a parameter's name, got '{name}'")
@@ -168,7 +168,7 @@ def parse(text: str, dim: int, parameters: tuple[str, ...] = ()) -> Expression:
 
     Sums over sites are written as `site_sums` has them. Raises InputError, in one line, for
     anything else but numbers, + - * / **, the coordinates, the parameters and the functions of
-    `FUNCTIONS`.
+    `known_functions`.
     """
     names = {name: coordinate(i) for i, name in enumerate(coordinate_names(dim))}
     if dim == 1:
@@ -220,7 +220,7 @@ def _parsed(node, names, text, depth) -> Expression:
     def refuse(what: str) -> InputError:
         return InputError(
             f"the term '{text}' has {what}: expected numbers, + - * / **, "
-            f"{', '.join(names)} and {', '.join(FUNCTIONS)}"
+            f"{', '.join(names)} and {', '.join(known_functions())}"
         )
 
     def inner(child) -> Expression:
@@ -245,7 +245,7 @@ def _parsed(node, names, text, depth) -> Expression:
     if isinstance(node, ast.Call):
         name = node.func.id if isinstance(node.func, ast.Name) else "?"
         name = OTHER_NAMES.get(name, name)
-        known = name in FUNCTIONS or CHEBYSHEV.fullmatch(name)
+        known = name in known_functions() or CHEBYSHEV.fullmatch(name)
         if not known or node.keywords or len(node.args) != 1:
             raise refuse(f"a call of '{ast.unparse(node.func)}' with {len(node.args)} arguments")
         return call(name, inner(node.args[0]))

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import keyword
 import re
 from collections.abc import Callable
+from typing import Any, Protocol
+
+from gfnn_jax.errors import InputError
 
 
 def _squared(xp, v):
@@ -39,4 +43,41 @@ DERIVATIVES: dict[str, tuple[Callable, Callable, Callable]] = {
 }
 CHEBYSHEV = re.compile(r"T\d{1,2}")
 CIRCULAR = ("sin", "cos")  # which share their values
-FUNCTIONS = (*CIRCULAR, *DERIVATIVES)
+
+
+class Function(Protocol):
+    """A user's own function of one variable: once registered, terms such as "wall(q1)" hold it."""
+
+    @property
+    def name(self) -> str: ...
+
+    def derivatives(self, x: Any) -> tuple[Any, Any, Any]:
+        """f, f' and f'' at x (...), of the array namespace of x: NumPy in a fit, JAX in a step."""
+        ...
+
+
+def known_functions() -> tuple[str, ...]:
+    """Names of the functions that a formula may contain."""
+    return (*CIRCULAR, *DERIVATIVES)
+
+
+_OWN: dict[str, Function] = {}
+
+
+def register_function(function: Function) -> Function:
+    """Make a function known to formulas by its name, in terms that are given and in saved maps.
+
+    Raises InputError where the name cannot be one, or names something else.
+    """
+    name = function.name
+    if not name.isidentifier() or keyword.iskeyword(name) or CHEBYSHEV.fullmatch(name):
+        raise InputError(f"expected letters, digits and _ as a function's name, got '{name}'")
+    if name in known_functions() and _OWN.get(name) is not function:
+        raise InputError(f"'{name}' names another function already: choose another name")
+    _OWN[name] = function
+    DERIVATIVES[name] = (
+        lambda xp, v: function.derivatives(v)[0],
+        lambda xp, v, y: function.derivatives(v)[1],
+        lambda xp, v, y: function.derivatives(v)[2],
+    )
+    return function

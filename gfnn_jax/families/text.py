@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.functions import FUNCTIONS
+from gfnn_jax.families.functions import known_functions
 
 OTHER_NAMES = {"atan": "arctan", "ln": "log"}
 _RAISED = "⁰¹²³⁴⁵⁶⁷⁸⁹"
@@ -83,7 +83,7 @@ def plain(text: str) -> str:
     text = re.sub(f"[{_RAISED}]+", lambda found: f"**{found[0].translate(lowered)}", text)
 
     def times(found: re.Match) -> str:
-        called = found[1] in {*FUNCTIONS, *OTHER_NAMES} and found[2] == "("
+        called = found[1] in {*known_functions(), *OTHER_NAMES} and found[2] == "("
         code = called or any(keyword.iskeyword(word) for word in found.groups())
         return found[0] if code else f"{found[1]}*"
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.expressions import Expression, as_expression, call, coordinate, power
-from gfnn_jax.families.functions import FUNCTIONS
+from gfnn_jax.families.functions import known_functions
 
 
 def traced(function: Callable, dim: int) -> list[Expression]:
@@ -40,7 +40,7 @@ _ELEMENTWISE: dict[str, Callable] = {
     "copy": lambda a: a,
     "copy_p": lambda a: a,
     "stop_gradient": lambda a: a,
-    **{name: (lambda a, name=name: call(name, a)) for name in FUNCTIONS if name != "sqrt"},
+    **{name: (lambda a, name=name: call(name, a)) for name in known_functions() if name != "sqrt"},
 }
 _REARRANGE = {
     "slice",
@@ -114,7 +114,7 @@ def _applied(primitive, params, values) -> list:
             return [np.tensordot(*values, axes=contract)]
     raise InputError(
         f"a term uses '{name}', which has no formula here: expected sums, products, quotients, "
-        f"constant powers and {', '.join(FUNCTIONS)}"
+        f"constant powers and {', '.join(known_functions())}"
     )
 
 

@@ -5,7 +5,8 @@
     px     =  x0 + R*sin(theta + tilt)  a camera with its pivot and its tilt
 
 A channel is text in the names of the coordinates, their velocities and parameters, or a function
-whose arguments have these names. Both become the same tree, which is saved as text.
+whose arguments have these names: both become the same tree, which is saved as text. Or it is a
+`Sensor` of a user's own module.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import product
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -38,17 +39,33 @@ _TRIED = 12  # places of an angle from which a state is looked for
 _ITERATIONS = 30
 
 
+@runtime_checkable
+class Sensor(Protocol):
+    """A user's own sensor g(q, v; c): a dataclass that ``gfnn.register`` makes known to saved maps.
+
+    parameters: names of c, with where they start.
+    """
+
+    @property
+    def parameters(self) -> Mapping[str, float]: ...
+
+    def __call__(self, q: np.ndarray, v: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, ...]:
+        """g (...), ∂g/∂q (..., d), ∂g/∂v (..., d) and ∂g/∂c (..., m) at q, v (..., d) and c (m,)
+        or (..., m). NumPy."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Observation:
     """Channels of a state, the columns of a recording.
 
     channels: names of columns. formulas: of each, in the `symbols` of ``coordinates`` and
-    ``speeds`` and in ``parameters``. values: (m,) of the parameters, those to start from
-    or those that were fitted. loss: of what is left of a channel in units of its noise.
+    ``speeds`` and in ``parameters``, or a `Sensor`. values: (m,) of the parameters, those to start
+    from or those that were fitted. loss: of what is left of a channel in units of its noise.
     """
 
     channels: tuple[str, ...]
-    formulas: tuple[str, ...]
+    formulas: tuple[Any, ...]
     coordinates: tuple[str, ...]
     speeds: tuple[str, ...]
     parameters: tuple[str, ...]
@@ -73,24 +90,43 @@ class Observation:
         return self.channels == self.formulas == self.coordinates
 
     @cached_property
-    def _trees(self) -> tuple[Expression | None, ...]:
-        """Syntax trees of the channels; None where one is the coordinate of its name."""
+    def _trees(self) -> tuple[Any, ...]:
+        """Syntax trees of the channels, or their sensors; None where one is the coordinate of its
+        name."""
         names = (*symbols((*self.coordinates, *self.speeds)), *self.parameters)
-        same = zip(self.channels, self.formulas, strict=True)
-        return tuple(
-            None if c == f and c in self.coordinates else parse_named(f, names) for c, f in same
-        )
+
+        def tree(channel: str, formula: Any) -> Any:
+            if isinstance(formula, str):
+                same = channel == formula and channel in self.coordinates
+                return None if same else parse_named(formula, names)
+            return formula
+
+        return tuple(map(tree, self.channels, self.formulas))
+
+    @cached_property
+    def _used(self) -> tuple[set[int], ...]:
+        """Indices of the state (q, v) that each channel depends on."""
+        x, d = np.random.default_rng(0).normal(size=(8, 2 * self.dim)), self.dim
+        found = []
+        for name, tree in zip(self.channels, self._trees, strict=True):
+            if tree is None:
+                found.append({self.coordinates.index(name)})
+            elif isinstance(tree, Expression):
+                found.append(depends_on(tree))
+            else:
+                start = np.array([*tree.parameters.values()], float)
+                _, by_q, by_v, _ = tree(x[:, :d], x[:, d:], start)
+                moved = np.any(np.concatenate([by_q, by_v], axis=1) != 0, axis=0)
+                found.append(set(np.flatnonzero(moved).tolist()))
+        return tuple(found)
 
     @property
     def direct(self) -> dict[int, int]:
         """Coordinate -> the channel that shows it as it is, where no other channel shows it."""
-        found = {}
-        for k, tree in enumerate(self._trees):
-            i = self.coordinates.index(self.channels[k]) if tree is None else -1
-            others = (depends_on(t) for t in self._trees if t is not None)
-            if tree is None and not any(i in used for used in others):
-                found[i] = k
-        return found
+        pairs = [*zip(self._trees, self._used, strict=True)]
+        indirect = set().union(*(used for tree, used in pairs if tree is not None))
+        direct = {min(used): k for k, (tree, used) in enumerate(pairs) if tree is None}
+        return {i: k for i, k in direct.items() if i not in indirect}
 
     def __call__(self, x: np.ndarray, values: np.ndarray | None = None) -> Observed:
         """g (..., k) at states x (..., 2d), and its derivatives in x and the parameters."""
@@ -103,6 +139,12 @@ class Observation:
             if tree is None:
                 i = self.coordinates.index(self.channels[k])
                 g[..., k], by[..., k, i] = x[..., i], 1.0
+                continue
+            if not isinstance(tree, Expression):
+                own = [self.parameters.index(name) for name in tree.parameters]
+                found = tree(x[..., :d], x[..., d:], np.asarray(c)[..., own])
+                g[..., k], by[..., k, :d], by[..., k, d : 2 * d] = found[:3]
+                by[..., k, [2 * d + i for i in own]] = found[3]
                 continue
             (jet,) = jets([tree], w, 1)
             g[..., k] = jet.value
@@ -119,11 +161,7 @@ class Observation:
         if len(self.direct) == self.dim:
             return y[:, [self.direct[i] for i in range(self.dim)]]
         d = self.dim
-        still = [
-            k
-            for k, tree in enumerate(self._trees)
-            if tree is None or not depends_on(tree) & set(range(d, 2 * d))
-        ]
+        still = [k for k, name in enumerate(self.channels) if name in self.needed]
         q, best = np.zeros((len(y), d)), np.full(len(y), np.inf)
         scale = np.nanstd(y[:, still], axis=0) + 1e-300
         turns = np.arange(_TRIED) * 2 * np.pi / _TRIED
@@ -178,11 +216,8 @@ class Observation:
     def needed(self) -> tuple[str, ...]:
         """Channels without which the coordinates are not told: those that show no velocity."""
         moving = set(range(self.dim, 2 * self.dim))
-        return tuple(
-            name
-            for name, tree in zip(self.channels, self._trees, strict=True)
-            if tree is None or not depends_on(tree) & moving
-        )
+        pairs = zip(self.channels, self._used, strict=True)
+        return tuple(name for name, used in pairs if not used & moving)
 
     def state_sigma(self, x: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         """σ (d,) of the coordinates, of that of the channels (k,), at states x (n, 2d)."""
@@ -240,16 +275,16 @@ def observed(
 ) -> Observation:
     """The observation of a recording with these columns.
 
-    observe: column -> text, or a function whose arguments are coordinates, speeds and parameters by
-    name, the parameters' defaults where they start. offsets, scales: columns that are shown with an
-    offset, or a scale, of their own. guess: where other parameters start; without it those of a
-    channel that shows a coordinate start where it shows it as it is.
+    observe: column -> text, a `Sensor`, or a function whose arguments are coordinates, speeds and
+    parameters by name, the parameters' defaults where they start. offsets, scales: columns that are
+    shown with an offset, or a scale, of their own. guess: where other parameters start; without it
+    those of a channel that shows a coordinate start where it shows it as it is.
     Raises InputError, one line, for what cannot be read or has no start.
     """
     state = (*coordinates, *speeds)
     code = dict(zip(state, symbols(state), strict=True))
     starts = dict(guess)
-    formulas: dict[str, str] = {name: name for name in coordinates if name in columns}
+    formulas: dict[str, Any] = {name: name for name in coordinates if name in columns}
     for name in dict.fromkeys((*offsets, *scales)):
         if name in observe:
             raise InputError(f"observe: {name} has a formula already: write its offset there")
@@ -263,12 +298,15 @@ def observed(
     for name, given in observe.items():
         if name not in columns:
             raise InputError(f"observe: no column {name} among {', '.join(columns)}")
-        formulas[name] = given if isinstance(given, str) else _text_of(given, starts)
+        known = isinstance(given, (str, Sensor))
+        formulas[name] = given if known else _text_of(given, starts)
+        if isinstance(given, Sensor):
+            starts = {**given.parameters, **starts}
     parameters = [
         n
         for column, f in formulas.items()
         if f != column or column not in coordinates
-        for n in names_in(f)
+        for n in (names_in(f) if isinstance(f, str) else f.parameters)
         if n not in code.values()
     ]
     parameters = list(dict.fromkeys(parameters))

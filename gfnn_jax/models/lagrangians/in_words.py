@@ -88,7 +88,7 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         whiteness=found,
         traces=traces,
         next_motions=_next_motions(findings.motions, recording, names),
-        observe={n: f for n, f in shown.items() if n != f},
+        observe={n: str(f) for n, f in shown.items() if n != f},
         sensors=parameters,
         alike=_alike(fit, lagrangian, friction),
         horizon=tuple(best.calibration.horizons),
