@@ -46,8 +46,8 @@ class RolloutInfo(NamedTuple):
 
 
 class Saving(NamedTuple):
-    """States that a rollout saves: ``blocks`` of them, one every ``every`` steps; and whether lanes stop
-    where they leave the domain. Hashable: a constant of compiled code."""
+    """States that a rollout saves: ``blocks`` of them, one every ``every`` steps; and whether
+    lanes stop where they leave the domain. Hashable: a constant of compiled code."""
 
     blocks: int
     every: int = 1
