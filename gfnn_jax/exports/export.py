@@ -17,42 +17,11 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
 
 SUFFIXES = {"c": ".c", "stablehlo": ".zip"}
-_NO_NAMES = {
-    "auto",
-    "break",
-    "case",
-    "char",
-    "const",
-    "continue",
-    "default",
-    "do",
-    "double",
-    "else",
-    "enum",
-    "extern",
-    "float",
-    "for",
-    "goto",
-    "if",
-    "inline",
-    "int",
-    "long",
-    "register",
-    "restrict",
-    "return",
-    "short",
-    "signed",
-    "sizeof",
-    "static",
-    "struct",
-    "switch",
-    "typedef",
-    "union",
-    "unsigned",
-    "void",
-    "volatile",
-    "while",
-}
+_KEYWORDS_OF_C = re.compile(
+    r"auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for"
+    r"|goto|if|inline|int|long|register|restrict|return|short|signed|sizeof|static|struct"
+    r"|switch|typedef|union|unsigned|void|volatile|while"
+)
 
 
 def export(
@@ -103,7 +72,7 @@ def default_out(folder: Path, to: str) -> Path:
 
 def _identifier(out: Path) -> str:
     name = out.stem
-    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or name in _NO_NAMES:
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or _KEYWORDS_OF_C.fullmatch(name):
         raise InputError(
             f"{out}: expected a name of letters, digits and _: the C functions are named after it"
         )

@@ -42,17 +42,8 @@ _ELEMENTWISE: dict[str, Callable] = {
     "stop_gradient": lambda a: a,
     **{name: (lambda a, name=name: call(name, a)) for name in known_functions() if name != "sqrt"},
 }
-_REARRANGE = {
-    "slice",
-    "squeeze",
-    "reshape",
-    "broadcast_in_dim",
-    "transpose",
-    "rev",
-    "gather",
-    "dynamic_slice",
-    "expand_dims",
-}
+_MOVED = ("slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "rev")
+_REARRANGE = (*_MOVED, "gather", "dynamic_slice", "expand_dims")
 
 
 def _trees(values):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -25,11 +26,21 @@ from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import sizes, split
 
-_STAGES, _SUBSTEPS = (3, 4, 6, 8), (1, 2, 4, 8, 16, 32)  # that are tried, by rising order
-# h × the fastest rate of a substep: of what fixed-point iterations solve, and Newton's method.
-_CONTRACTING, STIFFEST = 1.0, 30.0
-_TEST_STATES = 64  # states whose step tells the error of these
-_NEARLY = 0.95  # of them, whose steps are to be within the tolerance
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the steps of a law's map (benchmarks/speed.py)."""
+
+    stages: tuple[int, ...] = (3, 4, 6, 8)  # that are tried
+    substeps: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
+    # h × the fastest rate of a substep: of what fixed-point iterations solve, and Newton's method.
+    contracting: float = 1.0
+    stiffest: float = 30.0
+    test_states: int = 64  # whose step tells the error of these
+    nearly: float = 0.95  # of them, whose steps are to be within the tolerance
+
+
+OPTIONS = Options()
 
 
 def map_of_law(
@@ -62,7 +73,7 @@ def map_of_law(
     coordinates = Coordinates("cartesian", angles=tuple(angles))
     z, _, centre, covered = lift(np.asarray(z, float), np.asarray(z, float), coordinates)
     whole = tuple(a for a, all_of_it in zip(angles, covered, strict=True) if all_of_it)
-    scale, some = sizes(z), slice(None, None, -(-len(z) // _TEST_STATES))
+    scale, some = sizes(z), slice(None, None, -(-len(z) // OPTIONS.test_states))
     own = args[some] if parameters else None
     if signals is not None:
         u = np.zeros((len(z), count)) if inputs is None else np.asarray(inputs, float)
@@ -167,17 +178,18 @@ def _steps(law: Lagrangian, flow: Flow, z, args, tolerance: float) -> Steps:
     turns over within ε, and no more than Newton's method bears in a substep."""
     dt = float(flow.dt)
     turned = dt * stiffness(law, split(z)[0])
-    fewest, stiff = turned / STIFFEST, bool(turned > _CONTRACTING)
+    fewest, stiff = turned / OPTIONS.stiffest, bool(turned > OPTIONS.contracting)
 
     def after(steps: Steps) -> np.ndarray:
         return images(flow.family, flow.params, z, dt, steps, args=args).states
 
-    reference = after(Steps(_STAGES[-1], 2 * _SUBSTEPS[-1]))
-    for _, stages, substeps in sorted((s**2 * n, s, n) for s in _STAGES for n in _SUBSTEPS):
+    reference = after(Steps(OPTIONS.stages[-1], 2 * OPTIONS.substeps[-1]))
+    every = product(OPTIONS.stages, OPTIONS.substeps)
+    for _, stages, substeps in sorted((s**2 * n, s, n) for s, n in every):
         tried = Steps(stages, substeps, stiff)
-        if substeps < min(fewest, _SUBSTEPS[-1]):
+        if substeps < min(fewest, OPTIONS.substeps[-1]):
             continue
         off = np.abs((after(tried) - reference) / flow.scale).max(axis=1)
-        if np.mean(off <= tolerance) >= _NEARLY:
+        if np.mean(off <= tolerance) >= OPTIONS.nearly:
             return tried
-    return Steps(_STAGES[-1], _SUBSTEPS[-1], stiff)
+    return Steps(OPTIONS.stages[-1], OPTIONS.substeps[-1], stiff)

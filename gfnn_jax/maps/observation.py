@@ -34,9 +34,17 @@ from gfnn_jax.families.traced import traced
 from gfnn_jax.solve.latent_arcs import SOFT_L1, Observed
 from gfnn_jax.solve.noise import Loss
 
-_SAME = 1e-6  # sine of the angle between changes that are the same
-_TRIED = 12  # places of an angle from which a state is looked for
-_ITERATIONS = 30
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of what sensors tell of a state (benchmarks/random_recordings.py)."""
+
+    same: float = 1e-6  # sine of the angle between changes that are the same
+    tried: int = 12  # places of an angle from which a state is looked for
+    iterations: int = 30
+
+
+OPTIONS = Options()
 
 
 @runtime_checkable
@@ -164,7 +172,7 @@ class Observation:
         still = [k for k, name in enumerate(self.channels) if name in self.needed]
         q, best = np.zeros((len(y), d)), np.full(len(y), np.inf)
         scale = np.nanstd(y[:, still], axis=0) + 1e-300
-        turns = np.arange(_TRIED) * 2 * np.pi / _TRIED
+        turns = np.arange(OPTIONS.tried) * 2 * np.pi / OPTIONS.tried
         own = [self.channels.index(n) if n in self.channels else None for n in self.coordinates]
         choices = [turns if i in angles and own[i] is None else np.zeros(1) for i in range(d)]
         for choice in product(*choices):
@@ -190,7 +198,7 @@ class Observation:
         """Gauss–Newton of each sample from x (n, 2d): states, and what they leave of y, squared;
         infinite where a coordinate moves no channel."""
         d, sizes = self.dim, np.full(len(x), np.inf)
-        for _ in range(_ITERATIONS):
+        for _ in range(OPTIONS.iterations):
             shown = self(x)
             r = (y[:, still] - shown.values[:, still]) / scale
             J = shown.by_state[:, still, :d] / scale[:, None]
@@ -243,12 +251,14 @@ class Observation:
         by_state, by_values = self._anywhere(scaled=True)
         stretch = by_state[:, list(lengths)]
         u, v = (np.linalg.svd(a, full_matrices=False) for a in (by_values, stretch))
-        both = u[0][:, u[1] > _SAME].T @ v[0][:, v[1] > _SAME]
+        both = u[0][:, u[1] > OPTIONS.same].T @ v[0][:, v[1] > OPTIONS.same]
         left, overlap, _ = np.linalg.svd(both)
-        if not len(overlap) or overlap[0] < 1 - _SAME:
+        if not len(overlap) or overlap[0] < 1 - OPTIONS.same:
             return ()
-        along = u[2][u[1] > _SAME].T @ (left[:, 0] / u[1][u[1] > _SAME])
-        return tuple(n for n, a in zip(self.parameters, along, strict=True) if abs(a) > _SAME)
+        along = u[2][u[1] > OPTIONS.same].T @ (left[:, 0] / u[1][u[1] > OPTIONS.same])
+        return tuple(
+            n for n, a in zip(self.parameters, along, strict=True) if abs(a) > OPTIONS.same
+        )
 
     def _anywhere(self, scaled: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of all channels at some states, in what shifts each coordinate (or scales it
@@ -359,7 +369,7 @@ def _started(g: Observation) -> np.ndarray:
     x = np.random.default_rng(0).normal(size=(40, 2 * g.dim))
     values[open_] = 1.0
     determined = np.zeros(len(values), bool)
-    for _ in range(_ITERATIONS if len(open_) else 0):
+    for _ in range(OPTIONS.iterations if len(open_) else 0):
         shown = g(x, values)
         rows = [shown.by_coefficients[:, k][:, open_] for k, _ in own]
         left = [x[:, i] - shown.values[:, k] for k, i in own]
@@ -383,4 +393,4 @@ def _spans(table: np.ndarray, column: np.ndarray) -> bool:
     if not table.shape[1] or size == 0:
         return False
     left = column - table @ np.linalg.lstsq(table, column, rcond=None)[0]
-    return bool(np.linalg.norm(left) < _SAME * size)
+    return bool(np.linalg.norm(left) < OPTIONS.same * size)

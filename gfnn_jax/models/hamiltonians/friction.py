@@ -37,7 +37,7 @@ from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.flows.uniform import Uniform, without_forces
-from gfnn_jax.maps.laws import STIFFEST
+from gfnn_jax.maps import laws
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.legendre import lagrangian_of
 from gfnn_jax.models.hamiltonians.libraries import libraries_of, modes_of
@@ -296,8 +296,8 @@ def followed(
     masses = np.einsum("ki,nij,kj->nk", directions, by_p, directions).max(axis=0)
     rates = np.abs(rho) * masses * dt  # of a change of speed over a step
     creeping = noise * np.abs(directions) @ data.scale[: data.dim] / dt
-    widths = np.maximum(creeping, rates / (STIFFEST * MOST_SUBSTEPS))
-    substeps = int(np.ceil(np.max(rates[dry] / widths[dry]) / STIFFEST))
+    widths = np.maximum(creeping, rates / (laws.OPTIONS.stiffest * MOST_SUBSTEPS))
+    substeps = int(np.ceil(np.max(rates[dry] / widths[dry]) / laws.OPTIONS.stiffest))
     wide = dataclasses.replace(friction, widths=np.where(dry, widths, friction.widths))
     return _replaced(family, wide), max(substeps, 1), tuple(map(float, widths[dry]))
 
