@@ -1,6 +1,7 @@
 """Budgets: decisions that count operations, and a clock that only says how many fit."""
 
 import contextlib
+import dataclasses
 import itertools
 import time
 import warnings
@@ -16,7 +17,8 @@ from gfnn_jax.budget import COMPILE, FLOW, ROWS, Budget
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.learn import paid_for, searches
+from gfnn_jax.learn import request as of_pairs
+from gfnn_jax.learn import searches
 
 QUIETLY = pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
 LARGE = 10**10  # operations whose time tells the rate of their kind: a second, by default
@@ -354,8 +356,8 @@ def test_a_faster_clock_ends_at_an_earlier_unit_which_operations_reproduce(learn
 @QUIETLY
 def test_where_the_budget_does_not_pay_for_all_pairs_a_sample_is_fitted(monkeypatch):
     """The seconds and operations of the budget tell, not the clock."""
-    monkeypatch.setattr(paid_for, "_OF_PAIR", 10**9)
-    monkeypatch.setattr(paid_for, "_FEWEST", 200)
+    few = dataclasses.replace(of_pairs.OPTIONS, of_pair=10**9, fewest=200)
+    monkeypatch.setattr(of_pairs, "OPTIONS", few)
     pairs, work = kepler(300), 300 * 16 * 10**9
     seconds = work / 1e10
     for allowed, tick, num_pairs in ((0.9, 4.0, 200), (0.9, 1e-3, 200), (1.1, 4.0, 300)):

@@ -473,7 +473,7 @@ def test_a_law_is_saved_with_its_sensors(swing, tmp_path):
 
 def test_bad_recordings_and_options_are_refused(swing):
     recording, fit = swing
-    with pytest.raises(InputError, match="expected auto, lagrangian or map"):
+    with pytest.raises(InputError, match="not options of a recording"):
         gfnn.fit(recording, learn="hamiltonian")
     with pytest.raises(InputError, match="friction"):
         gfnn.fit(recording, friction="sticky")

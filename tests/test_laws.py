@@ -138,14 +138,14 @@ def test_when_a_law_is_preferred(law, map_, taken):
         ({"terms": ["p1**"]}, "p1"),
         ({"terms": ["p3**2"]}, "p3"),
         ({"terms": ["__import__('os')"]}, "__import__"),
-        ({"terms": ["p1**2"], "learn": "map"}, "beside them, got learn='map'"),
+        ({"terms": ["p1**2"], "learn": "map"}, "not options of one model"),
         ({"terms": [3]}, "texts or functions"),
         ({"terms": ["sqrt(q1)"]}, "finite at all states, got 'sqrt"),
         ({"tolerance": "1e-6"}, "number > 0 as tolerance"),
         ({"angles": 0}, "a tuple of indices"),
-        ({"terms": ["p1**2"], "learn": "auto", "chart": "type2"}, "got chart='type2'"),
-        ({"family": "sines"}, "these are of S"),
-        ({"chart": "type2"}, "these are of S"),
+        ({"terms": ["p1**2"], "learn": "auto", "chart": "type2"}, "not options of one model"),
+        ({"family": "sines"}, "of S"),
+        ({"chart": "type2"}, "not options of one model"),
     ],
 )
 def test_refusals(options, words):

@@ -98,7 +98,7 @@ def test_a_wrong_name_tells_the_nearest(make, near):
     ],
 )
 def test_an_option_belongs_to_one_model(data, options):
-    with pytest.raises(gfnn.FitError):
+    with pytest.raises((gfnn.FitError, gfnn.InputError)):
         gfnn.fit(data, **options)
 
 

@@ -86,7 +86,8 @@ def fit(
             given = "model" if scene is None else "scene"
             raise InputError(f"{given}: only for pairs of states q, p, got a recording")
         of_map = options.learn == "map"
-        options.refuse_others(["map" if of_map else "lagrangian"], "a recording, without momenta")
+        known = ["map" if of_map else "lagrangian"]
+        options.refuse_others(known, "a recording, without momenta", InputError)
         with one_thread():
             if of_map:
                 return learn_positions(pairs, options, watch)

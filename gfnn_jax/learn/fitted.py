@@ -20,6 +20,7 @@ from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
 from gfnn_jax.errors import FitWarning
 from gfnn_jax.exports.symbolic import Formula
+from gfnn_jax.families.sums import Sums
 from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.learn.choose import work_of_posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -142,7 +143,8 @@ class Choice:
             return "map" if self.met else f"map: the tolerance is missed, for {self.ended}"
         if not (self.met or self.white):
             return f"partly: the tolerance is missed, for {self.ended}"
-        if law.null_terms:
+        # Sums over sites have terms that vanish or add up to nothing, whatever the data.
+        if law.null_terms and not isinstance(law.flow.family, Sums):
             return f"one of several: the pairs do not tell {', '.join(law.null_terms)} apart"
         rivals = [rival.formula for rival in law.rivals if rival.odds < EVIDENCE.decided]
         return f"one of several: {'; '.join(rivals)} is as likely" if rivals else "identified"

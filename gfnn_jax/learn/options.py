@@ -388,15 +388,17 @@ class FitOptions:
         fields = {option.name: option.default for option in dataclasses.fields(self)}
         return [n for n in names if not _same(getattr(self, n), fields[n])]
 
-    def refuse_others(self, learns: Sequence[str], of_what: str) -> None:
-        """Raise FitError where none of the models ``learns`` has all options that were given."""
+    def refuse_others(
+        self, learns: Sequence[str], of_what: str, error: type[ValueError] = FitError
+    ) -> None:
+        """Raise an error where none of the models ``learns`` has all options that were given."""
         given = set(self._of_models)
         asked = learns if self.learn == "auto" else [n for n in learns if n == self.learn]
         if not any(given <= set(_OF_MODEL[n]) for n in asked):
             known = {n: ", ".join(_OF_MODEL[n]) for n in asked or learns}
             listed = "; ".join(f"{MODELS[n].__name__}({own})" for n, own in known.items())
             shown = [f"learn={self.learn!r}"] * (self.learn != "auto") + sorted(given)
-            raise FitError(f"{', '.join(shown)}: not options of {of_what}, expected {listed}")
+            raise error(f"{', '.join(shown)}: not options of {of_what}, expected {listed}")
 
     @property
     def deciding(self) -> dict[str, Any]:
