@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from gfnn_jax.data.wrong_values import wrong_values
 from gfnn_jax.signals import energy
 from gfnn_jax.signals.derivatives import derivatives, difference
 from gfnn_jax.signals.local_polynomials import local_fits
 from gfnn_jax.signals.noise import noise, resolution
-from gfnn_jax.signals.spectra import dominant_frequencies
-from gfnn_jax.signals.steps import drift, even_runs, gaps, median_step
+from gfnn_jax.signals.steps import dominant_frequencies, drift, even_runs, gaps, median_step
+from gfnn_jax.signals.wrong_values import wrong_values
 
 RNG = np.random.default_rng(0)
 T = np.arange(0, 20, 0.01)

@@ -19,8 +19,7 @@ from gfnn_jax.data.traits import Traits, of_rows, traits
 from gfnn_jax.data.wrong_values import WrongValues
 from gfnn_jax.errors import InputError
 from gfnn_jax.signals import energy
-from gfnn_jax.signals.spectra import dominant_frequencies
-from gfnn_jax.signals.steps import gaps
+from gfnn_jax.signals.steps import dominant_frequencies, gaps
 
 if TYPE_CHECKING:
     from gfnn_jax.data.recording import Recording

@@ -15,7 +15,7 @@ from gfnn_jax.data.recording_summary import RecordingSummary
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate.figures import COLOURS, save, style
 from gfnn_jax.evaluate.forecasts import Forecasts
-from gfnn_jax.signals.spectra import spectrum
+from gfnn_jax.signals.steps import spectrum
 
 if TYPE_CHECKING:
     from gfnn_jax.models.lagrangians.learned_law import LearnedLaw

@@ -21,11 +21,24 @@ import numpy as np
 from gfnn_jax.signals.local_polynomials import LocalFits
 
 POWERS = {"dry": 1, "linear": 2, "quadratic": 3}
-_STRETCHES = (0.25, 0.6, 1.0, 2.0)  # periods
-_BLOCKS = 12  # of stretches, whose scatter tells errors
-_CLEARLY = 3.0  # standard errors, by which one kind of friction leaves less than the others
-_BALANCED = 0.9  # part of the changes of ½v₁² that the balance must explain
-_RIDGE = 1e-9
+
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """stretches: lengths in periods. blocks: of stretches, whose scatter tells errors. clearly:
+    standard errors, by which one kind of friction leaves less than the others. balanced: part of
+    the changes of ½v₁² that the balance must explain. significant: standard errors of a loss, and
+    its least size. Chosen on motions of test systems with known friction (tests of signals)."""
+
+    stretches: tuple[float, ...] = (0.25, 0.6, 1.0, 2.0)
+    blocks: int = 12
+    clearly: float = 3.0
+    balanced: float = 0.9
+    ridge: float = 1e-9
+    significant: tuple[float, float] = (3.0, 1e-4)
+
+
+_OPTIONS = _Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +55,8 @@ class Loss:
     def significant(self) -> bool:
         """Return whether there is a loss, or a gain: more than three standard errors, and than
         1e-4."""
-        return abs(self.per_period) > max(3 * self.error, 1e-4)
+        errors, least = _OPTIONS.significant
+        return abs(self.per_period) > max(errors * self.error, least)
 
 
 def mean_period(fits: LocalFits, runs: int) -> float:
@@ -75,7 +89,7 @@ def loss(fits: LocalFits, angles: Sequence[bool], inputs: np.ndarray, period: fl
         table = np.concatenate([changes[:, 1:], taken[:, of_kind], taken[:, 3 * dim :]], axis=1)
         found[kind] = _Balance(table, -changes[:, 0])
     linear = found["linear"]
-    if linear.explained < _BALANCED:
+    if linear.explained < _OPTIONS.balanced:
         return None
     power = np.nanmean(speeds**2, axis=1)
     kinetic = np.nanmean(stored[: _kinetic(dim, angles)], axis=1)
@@ -95,7 +109,7 @@ class _Balance:
     def __init__(self, table: np.ndarray, target: np.ndarray):
         scale = np.linalg.norm(table, axis=0)
         self.scale = np.where(scale > 0, scale, 1.0)
-        blocks = np.array_split(np.arange(len(target)), _BLOCKS)
+        blocks = np.array_split(np.arange(len(target)), _OPTIONS.blocks)
         parts = [(table[rows] / self.scale, target[rows]) for rows in blocks]
         self.normals = np.stack([a.T @ a for a, _ in parts])
         self.sides = np.stack([a.T @ b for a, b in parts])
@@ -104,7 +118,7 @@ class _Balance:
         self.explained = 1 - self.squares.sum() / np.sum(target**2)
 
     def _solved(self, normal: np.ndarray, side: np.ndarray) -> np.ndarray:
-        ridge = _RIDGE * np.eye(len(normal))
+        ridge = _OPTIONS.ridge * np.eye(len(normal))
         return np.linalg.lstsq(normal + ridge, side, rcond=None)[0] / self.scale
 
     def with_error(self, quantity) -> tuple[float, float]:
@@ -118,7 +132,7 @@ class _Balance:
         )
         spread = np.sum((without - without.mean()) ** 2)
         return quantity(self._solved(normal, side)), float(
-            np.sqrt((_BLOCKS - 1) / _BLOCKS * spread)
+            np.sqrt((_OPTIONS.blocks - 1) / _OPTIONS.blocks * spread)
         )
 
 
@@ -127,7 +141,7 @@ def _kind(found: dict[str, _Balance]) -> str | None:
     best = min(found, key=lambda kind: found[kind].squares.sum())
     for kind, balance in found.items():
         more = np.log(np.maximum(balance.squares, 1e-300) / np.maximum(found[best].squares, 1e-300))
-        if kind != best and more.mean() < _CLEARLY * more.std() / np.sqrt(len(more)):
+        if kind != best and more.mean() < _OPTIONS.clearly * more.std() / np.sqrt(len(more)):
             return None
     return best
 
@@ -174,7 +188,7 @@ def _over_stretches(
         t = fits.centres[rows]
         middle = 0.5 * (rates[:, rows[1:]] + rates[:, rows[:-1]]) * np.diff(t)
         total = np.concatenate([np.zeros((len(rates), 1)), np.cumsum(middle, axis=1)], axis=1)
-        for part in _STRETCHES:
+        for part in _OPTIONS.stretches:
             end = np.searchsorted(t, t + part * period)
             begin = np.flatnonzero(end < len(t))
             end = end[begin]

@@ -22,18 +22,36 @@ import numpy as np
 from gfnn_jax.signals.local_polynomials import LocalFits, local_fits
 from gfnn_jax.signals.steps import even_runs
 
-DEGREE = 5
 _SIZES = (9, 11, 13, 15, 19, 23, 29, 37, 45, 57, 71, 89, 111, 139, 173, 217, 271, 339)
-_GROWTH = 1.5  # exponent of s²(n) above which it is the motion that grows
-_TRIMMED = 0.02  # of the windows, those with the largest residuals: they may hold outliers
-_FEWEST = 8  # windows
-_NARROW = 15  # samples of the windows in which outliers are looked for
-_RARE = 3e-3  # of the samples, that outliers are at most
-_UNRESOLVED = 0.3  # of a column's spread: what polynomials leave is the motion itself then
-_OUTLIER = 8.0  # standard deviations, of a residual that the sample itself did not pull down
-_LAGS = 16  # of an autoregression
-_MOST_ROWS = 20_000  # that it is fitted to
-_WHITE = 0.15  # autocorrelation beyond that of white noise which is no accident
+
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Thresholds, chosen on noise of known size on motions of test systems (tests of signals).
+
+    degree: of the polynomials. growth: exponent of s²(n) above which it is the motion that grows.
+    trimmed: part of the windows, those with the largest residuals, that may hold outliers. fewest:
+    windows. narrow: samples of the windows in which outliers are looked for. rare: part of the
+    samples that outliers are at most. unresolved: part of a column's spread, above which what
+    polynomials leave is the motion itself. outlier: standard deviations of a residual that the
+    sample itself did not pull down. lags, most_rows: of an autoregression. white: autocorrelation
+    beyond that of white noise which is no accident.
+    """
+
+    degree: int = 5
+    growth: float = 1.5
+    trimmed: float = 0.02
+    fewest: int = 8
+    narrow: int = 15
+    rare: float = 3e-3
+    unresolved: float = 0.3
+    outlier: float = 8.0
+    lags: int = 16
+    most_rows: int = 20_000
+    white: float = 0.15
+
+
+_OPTIONS = _Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +71,7 @@ class Noise:
 
     @property
     def white(self) -> bool:
-        return self.correlation is None or abs(self.correlation) < _WHITE
+        return self.correlation is None or abs(self.correlation) < _OPTIONS.white
 
 
 def noise(
@@ -63,7 +81,7 @@ def noise(
     shortest = max((len(t) for t in times), default=0) // 2
     sizes = [size for size in _SIZES if size <= shortest]
     columns, outliers = _without_outliers(times, columns) if sizes else (columns, [])
-    fits = [local_fits(times, columns, size, DEGREE) for size in sizes]
+    fits = [local_fits(times, columns, size, _OPTIONS.degree) for size in sizes]
     found = []
     for c, column in enumerate(columns):
         variances = np.array([np.nan if f is None else _trimmed(f.variances[c]) for f in fits])
@@ -75,7 +93,7 @@ def noise(
         fit = fits[k]
         assert fit is not None
         sigma, correlation = float(np.sqrt(variances[k])), _correlation(fit, c)
-        if widest == 0 or sigma > _UNRESOLVED * np.nanstd(column):
+        if widest == 0 or sigma > _OPTIONS.unresolved * np.nanstd(column):
             predicted = _unpredicted(times, [column, *(() if inputs is None else inputs)])
             if predicted is not None and predicted < sigma:
                 sigma, correlation = predicted, None
@@ -87,13 +105,15 @@ def _without_outliers(
     times: Sequence[np.ndarray], columns: np.ndarray
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """(columns with outliers replaced, sample numbers of the outliers of each)."""
-    fit = local_fits(times, columns, _NARROW, DEGREE)
+    fit = local_fits(times, columns, _OPTIONS.narrow, _OPTIONS.degree)
     if fit is None:
         return columns, [np.empty(0, int)] * len(columns)
     columns, found = columns.copy(), []
     for c, column in enumerate(columns):
         rows, off = _outliers(fit, c)
-        if len(rows) > _RARE * column.size:  # noise with long tails, as of a sensor's single counts
+        if (
+            len(rows) > _OPTIONS.rare * column.size
+        ):  # noise with long tails, as of a sensor's single counts
             rows, off = rows[:0], off[:0]
         column[rows] -= off
         found.append(rows)
@@ -103,9 +123,9 @@ def _without_outliers(
 def _trimmed(variances: np.ndarray) -> float:
     """The mean variance of windows, the largest left out; NaN where there are few."""
     known = np.sort(variances[np.isfinite(variances)])
-    if len(known) < _FEWEST:
+    if len(known) < _OPTIONS.fewest:
         return np.nan
-    return float(np.mean(known[: int(np.ceil(len(known) * (1 - _TRIMMED)))]))
+    return float(np.mean(known[: int(np.ceil(len(known) * (1 - _OPTIONS.trimmed)))]))
 
 
 def _widest(variances: np.ndarray) -> int | None:
@@ -116,7 +136,7 @@ def _widest(variances: np.ndarray) -> int | None:
     last = known[0]
     for k in known[1:]:
         growth = np.log(max(variances[k], 1e-300) / max(variances[last], 1e-300))
-        if growth > _GROWTH * np.log(_SIZES[k] / _SIZES[last]):
+        if growth > _OPTIONS.growth * np.log(_SIZES[k] / _SIZES[last]):
             break
         last = k
     return int(last)
@@ -148,14 +168,17 @@ def _unpredicted(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> 
     rows, targets = [], []
     for i in even_runs(times):
         series = [np.split(x, ends[:-1])[i] for x in columns]
-        if len(times[i]) <= 4 * _LAGS or not all(np.isfinite(x).all() for x in series):
+        if len(times[i]) <= 4 * _OPTIONS.lags or not all(np.isfinite(x).all() for x in series):
             continue
-        past = [x[_LAGS - k : len(x) - k] for x in series for k in range(_LAGS + 1)]
+        past = [x[_OPTIONS.lags - k : len(x) - k] for x in series for k in range(_OPTIONS.lags + 1)]
         targets.append(past.pop(0))
         rows.append(np.stack([*past, np.ones(len(past[0]))], axis=1))
     if not rows or sum(map(len, targets)) < 4 * rows[0].shape[1]:
         return None
-    table, target = np.concatenate(rows)[:_MOST_ROWS], np.concatenate(targets)[:_MOST_ROWS]
+    table, target = (
+        np.concatenate(rows)[: _OPTIONS.most_rows],
+        np.concatenate(targets)[: _OPTIONS.most_rows],
+    )
     left = target - table @ np.linalg.lstsq(table, target, rcond=None)[0]
     return float(np.sqrt(np.sum(left**2) / (len(left) - table.shape[1])))
 
@@ -176,7 +199,7 @@ def _outliers(fit: LocalFits, column: int) -> tuple[np.ndarray, np.ndarray]:
     rest = np.sum(fit.residuals[column][lines] ** 2, axis=1)
     rest -= (1 - leverage[lines, worst]) * at**2
     scale = np.sqrt(np.maximum(rest, 0) / (size - fit.projection.shape[2] - 1))
-    far = np.abs(at) > _OUTLIER * np.maximum(scale, sigma[lines])
+    far = np.abs(at) > _OPTIONS.outlier * np.maximum(scale, sigma[lines])
     rows, first = np.unique(fit.rows[lines[far], worst[far]], return_index=True)
     return rows, at[far][first]
 

@@ -1,17 +1,32 @@
-"""Steps between samples: their median, gaps, whether they are even, whether a clock drifts."""
+"""Steps between samples: their median, gaps, whether they are even, whether a clock drifts; spectra
+of series."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy import signal
 
-_GAP = 1.5  # of the 95th percentile of the steps; a longer step is a gap
-_FEWEST = 100  # samples of a run whose drift is told
-_NEARBY = 101  # steps whose median counts those in a gap
-_PARABOLA = 0.97  # of the squares of times' deviations from even ones, that a drift explains
-_EVEN = 0.05  # of a step, that times may be off
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """gap: times the 95th percentile of the steps, above which a step is a gap. even: part of a
+    step that times may be off. drifting: samples, at least, of a run whose drift is told. nearby:
+    steps whose median counts those in a gap. parabola: part of the squares of times' deviations
+    from even ones that a drift explains. longest: samples of a segment of a spectrum."""
+
+    gap: float = 1.5
+    even: float = 0.05
+    drifting: int = 100
+    nearby: int = 101
+    parabola: float = 0.97
+    longest: int = 1 << 16
+
+
+_OPTIONS = _Options()
 
 
 def median_step(times: Sequence[np.ndarray]) -> float:
@@ -22,7 +37,7 @@ def median_step(times: Sequence[np.ndarray]) -> float:
 
 def longest_step(steps: np.ndarray) -> float:
     """The longest step that is no gap among these steps (n,)."""
-    return float(_GAP * np.quantile(steps, 0.95)) if len(steps) else np.inf
+    return float(_OPTIONS.gap * np.quantile(steps, 0.95)) if len(steps) else np.inf
 
 
 def gaps(times: Sequence[np.ndarray]) -> list[tuple[int, float, float]]:
@@ -38,7 +53,9 @@ def gaps(times: Sequence[np.ndarray]) -> list[tuple[int, float, float]]:
 def even_runs(times: Sequence[np.ndarray]) -> list[int]:
     """Numbers of the runs whose steps are all the median step, but for a twentieth."""
     step = median_step(times)
-    return [r for r, t in enumerate(times) if np.all(np.abs(np.diff(t) - step) <= _EVEN * step)]
+    return [
+        r for r, t in enumerate(times) if np.all(np.abs(np.diff(t) - step) <= _OPTIONS.even * step)
+    ]
 
 
 def drift(times: np.ndarray) -> float:
@@ -48,17 +65,65 @@ def drift(times: np.ndarray) -> float:
     Times are a parabola in the number of steps then. Gaps count as so many steps; jitter does not
     make a parabola.
     """
-    if len(times) < _FEWEST:
+    if len(times) < _OPTIONS.drifting:
         return 0.0
     from scipy import ndimage  # loaded when first used
 
     steps = np.diff(times)
-    usual = ndimage.median_filter(steps, _NEARBY, mode="nearest")
+    usual = ndimage.median_filter(steps, _OPTIONS.nearby, mode="nearest")
     number = np.concatenate([[0], np.cumsum(np.maximum(np.round(steps / usual), 1))])
     place = 2 * number / number[-1] - 1
     _, slope, bend = coefficients = legendre.legfit(place, times, 2)
     off = times - legendre.legval(place, coefficients[:2])
     parabola = legendre.legval(place, [0, 0, bend])
-    if np.sum(parabola**2) < _PARABOLA * np.sum(off**2):
+    if np.sum(parabola**2) < _OPTIONS.parabola * np.sum(off**2):
         return 0.0
     return float(6 * bend / slope)
+
+
+def spectrum(times: Sequence[np.ndarray], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(frequencies (F,) in Hz, power density (F,) in units²/Hz) by Welch's method with Hann
+    windows; the mean over runs, weighted by their length.
+
+    Values between samples and in gaps are interpolated on a straight line.
+    """
+    step = median_step(times)
+    length = min(max(len(t) for t in times), _OPTIONS.longest)
+    total, weight, frequencies = 0.0, 0, np.fft.rfftfreq(length, step)
+    ends = np.cumsum([len(t) for t in times])[:-1]
+    for t, x in zip(times, np.split(values, ends), strict=True):
+        known = np.isfinite(x)
+        if known.sum() < 8:
+            continue
+        even = np.arange(t[0], t[-1] + 0.5 * step, step)
+        series = np.interp(even, t[known], x[known])
+        size = min(length, len(series))
+        _, power = signal.welch(series, 1 / step, nperseg=size, nfft=length, detrend="linear")
+        total, weight = total + power * len(series), weight + len(series)
+    return frequencies, np.asarray(total) / max(weight, 1) * np.ones_like(frequencies)
+
+
+def dominant_frequencies(
+    times: Sequence[np.ndarray], values: np.ndarray, most: int = 3
+) -> list[float]:
+    """Frequencies in Hz of the highest peaks, the highest first, those above a hundredth of it."""
+    frequencies, power = spectrum(times, values)
+    if len(frequencies) < 4 or not np.any(power > 0):
+        return []
+    peaks, _ = signal.find_peaks(np.concatenate([[0], power[1:], [0]]))
+    peaks = peaks[peaks < len(power)]
+    if len(peaks) == 0:
+        return []
+    order = peaks[np.argsort(power[peaks])[::-1]]
+    order = order[power[order] > 1e-2 * power[order[0]]][:most]
+    return [_refined(frequencies, power, int(k)) for k in order]
+
+
+def _refined(frequencies: np.ndarray, power: np.ndarray, k: int) -> float:
+    """The top of the parabola through the logarithms of the power at k and its neighbours."""
+    if not 0 < k < len(power) - 1 or np.any(power[k - 1 : k + 2] <= 0):
+        return float(frequencies[k])
+    below, at, above = np.log(power[k - 1 : k + 2])
+    bend = below - 2 * at + above
+    shift = 0.5 * (below - above) / bend if bend < 0 else 0.0
+    return float(frequencies[k] + shift * (frequencies[1] - frequencies[0]))

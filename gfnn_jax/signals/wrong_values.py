@@ -1,0 +1,261 @@
+"""Wrong values of a column: outliers, single or in a row, and stretches of a sensor that was stuck.
+
+*Roughness* is how far samples are from cubics through their four neighbours: noise, a sensor's
+single counts, and what of the motion is not smooth.
+
+*Outliers*: samples that these cubics miss by far are suspected. A polynomial through the samples on
+both sides then tells what the suspected ones should be, and how well it can: at a kink, a step or
+with few samples a period the sides themselves do not lie on it, and nothing is said. An outlier
+begins and ends abruptly; a short swing of the motion rises and falls from sample to sample. Nor is
+it one that is off by a whole turn: an angle that was not lifted.
+
+*Stuck*: equal values, then a jump to where the motion is by then. A body that rests starts slowly
+from where it rested, and a coarse sensor shows its turning points by equal values beside which it
+moves by its smallest step. Only a sensor that was stuck while the motion went on catches up in one
+step, with a jump far above the steps around it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+
+_TURN = 2 * np.pi
+
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Thresholds, chosen on recordings of test systems with and without wrong values
+    (`benchmarks/random_recordings.py`).
+
+    Roughness: samples of a block, of which the roughest counts; part of the blocks that are
+    ordinary (what spoils fewer than the others is not the sensor's way).
+
+    Outliers are suspected at ``suspected`` times the median miss of ``nearby`` samples, which is
+    ``of_median`` of white noise of unit size. joined: samples from one suspected one to the next of
+    the same stretch; beside: on either side, whose cubics an outlier spoils; longest: of a stretch;
+    side: on either side of it, as many as it has if these are more, fitted by a polynomial of this
+    degree; widest: of the duration of so many samples without a gap. far: standard deviations of
+    what the sides tell; rough: times the ordinary roughness; of_turn: part of a turn, that one must
+    be away from it; abrupt: times as far off as the sample beside it, that its ends are.
+
+    Stuck are at least ``fewest`` equal values (two or three are what a camera makes of a frame that
+    it dropped) among ``around`` steps before and behind; jump: times the fastest of these, at
+    least; resolutions: that the motion goes in a step (slower, equal values are a sensor's digits).
+    """
+
+    block: int = 16
+    ordinary: float = 0.8
+    suspected: float = 10.0
+    nearby: int = 64
+    of_median: float = 0.94
+    joined: int = 6
+    beside: int = 2
+    longest: int = 40
+    side: int = 8
+    degree: int = 5
+    widest: float = 1.5
+    far: float = 10.0
+    rough: float = 3.0
+    of_turn: float = 0.1
+    abrupt: float = 3.0
+    fewest: int = 5
+    around: int = 8
+    jump: float = 3.0
+    resolutions: float = 2.0
+
+
+_OPTIONS = _Options()
+
+
+@dataclasses.dataclass(frozen=True)
+class WrongValues:
+    """A stretch of wrong values of one column.
+
+    run: its number. rows: (k,) samples, the runs one after another. off: how far they are from
+    where the samples around them lead; None of a sensor that was stuck.
+    """
+
+    run: int
+    rows: np.ndarray
+    off: float | None
+
+
+def wrong_values(
+    times: Sequence[np.ndarray], runs: Sequence[np.ndarray], resolution: float | None
+) -> tuple[WrongValues, ...]:
+    """The wrong values of a column (n_r,) of each run, NaN where missing, in the order of time."""
+    begins = np.cumsum([0, *map(len, times)])
+    known = [np.flatnonzero(np.isfinite(x)) for x in runs]
+    series = [(t[k], x[k], b + k) for t, x, k, b in zip(times, runs, known, begins, strict=False)]
+    rough, step = _roughness([_misses(t, x) for t, x, _ in series]), resolution or 0.0
+    found = []
+    for run, (t, x, rows) in enumerate(series):
+        moving = np.ones(len(x), bool)
+        for begin, end in _stuck(t, x, step, rough):
+            moving[begin:end] = False
+            found.append(WrongValues(run, rows[begin:end], None))
+        t, x, rows = t[moving], x[moving], rows[moving]
+        for begin, end, off in _outliers(t, x, step, rough):
+            found.append(WrongValues(run, rows[begin:end], off))
+    return tuple(sorted(found, key=lambda stretch: stretch.rows[0]))
+
+
+def _misses(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Distances (n,) from the cubics; 0 for the first two and the last two samples."""
+    found = np.zeros(len(x))
+    n, places = len(x) - 4, (0, 1, 3, 4)
+    if n < 1:
+        return found
+    cubic = np.zeros(n)
+    for j in places:
+        weight = np.ones(n)
+        for m in places:
+            if m != j:
+                weight *= (t[2:-2] - t[m : m + n]) / (t[j : j + n] - t[m : m + n])
+        cubic += weight * x[j : j + n]
+    found[2:-2] = np.abs(x[2:-2] - cubic)
+    return found
+
+
+def _roughness(runs: Sequence[np.ndarray]) -> float:
+    """The largest miss that is ordinary in a column, of the `_misses` (n_r,) of its runs: 3.4
+    standard deviations of white noise. Infinite where no run has a block of samples."""
+    whole = [
+        miss[: len(miss) // _OPTIONS.block * _OPTIONS.block].reshape(-1, _OPTIONS.block)
+        for miss in runs
+    ]
+    largest = np.concatenate([blocks.max(axis=1) for blocks in whole] or [np.empty(0)])
+    return float(np.quantile(largest, _OPTIONS.ordinary)) if len(largest) else np.inf
+
+
+def _outliers(
+    t: np.ndarray, x: np.ndarray, resolution: float, rough: float
+) -> list[tuple[int, int, float]]:
+    """(begin, end, how far off at most) of stretches of samples of a run (n,).
+
+    t, x: without missing values. resolution: the smallest step between values, 0 if it is unknown.
+    rough: of the column (`_roughness`).
+    """
+    miss = _misses(t, x)
+    if len(x) < 2 * _OPTIONS.side + 1 or not miss.max() > _OPTIONS.rough * rough:
+        return []
+    usual = np.maximum(_nearby(miss), max(resolution, 1e-12 * np.ptp(x)))
+    suspected = miss > _OPTIONS.suspected * usual
+    at = np.flatnonzero(suspected)
+    if len(at) == 0:
+        return []
+    clean = ~suspected
+    for k in range(1, _OPTIONS.beside + 1):
+        clean[k:] &= ~suspected[:-k]
+        clean[:-k] &= ~suspected[k:]
+    right = np.flatnonzero(clean)
+    parts, found = np.split(at, np.flatnonzero(np.diff(at) > _OPTIONS.joined) + 1), []
+    series = _Series(t, x, right, float(np.median(np.diff(t))), usual, _OPTIONS.rough * rough)
+    while parts:
+        first, *parts = parts
+        outlier = series.outlier(first[0], first[-1])
+        if outlier is None and parts:  # all between a jump and the one that leads back
+            outlier = series.outlier(first[0], parts[0][-1])
+            parts = parts if outlier is None else parts[1:]
+        if outlier is not None:
+            found.append(outlier)
+    return found
+
+
+class _Series(NamedTuple):
+    """Samples (n,), those of them that are right (K,), the median step, how far cubics usually
+    miss them (n,), and how far off one must be."""
+
+    t: np.ndarray
+    x: np.ndarray
+    right: np.ndarray
+    step: float
+    usual: np.ndarray
+    least: float
+
+    def outlier(
+        self, first: int | np.integer, last: int | np.integer
+    ) -> tuple[int, int, float] | None:
+        """(begin, end, how far off) of the stretch with the suspected samples from ``first`` to
+        ``last``; None where it is none, or too few samples around it tell."""
+        begin, end = first - _OPTIONS.beside, last + _OPTIONS.beside + 1
+        count = max(_OPTIONS.side, end - begin)
+        before = self.right[self.right < begin][-count:]
+        behind = self.right[self.right >= end][:count]
+        if end - begin > _OPTIONS.longest or min(len(before), len(behind)) < count:
+            return None
+        widest = _OPTIONS.widest * self.step * (2 * count + end - begin)
+        if self.t[behind[-1]] - self.t[before[0]] > widest:
+            return None
+        sides = np.concatenate([before, behind])
+        noise = float(self.usual[first]) / _OPTIONS.of_median
+        outlier = _apart(self.t, self.x, np.arange(begin, end), sides, noise)
+        return outlier if outlier is not None and outlier[2] > self.least else None
+
+
+def _nearby(miss: np.ndarray) -> np.ndarray:
+    """The median of the block that a sample is in, or of the one before or behind if it is more."""
+    blocks = np.array_split(miss, max(len(miss) // _OPTIONS.nearby, 1))
+    medians = np.pad([np.median(block) for block in blocks], 1, mode="edge")
+    most = np.maximum(np.maximum(medians[:-2], medians[2:]), medians[1:-1])
+    return np.repeat(most, [len(block) for block in blocks])
+
+
+def _apart(
+    t: np.ndarray, x: np.ndarray, rows: np.ndarray, sides: np.ndarray, sigma: float
+) -> tuple[int, int, float] | None:
+    """(begin, end, how far off) of the samples among ``rows`` that the polynomial of the ``sides``
+    misses by far; None where it does not tell."""
+    middle, half = t[rows].mean(), np.ptp(t[sides]) / 2
+    q, r = np.linalg.qr(legvander((t[sides] - middle) / half, _OPTIONS.degree))
+    coefficients = q.T @ x[sides]
+    left = x[sides] - q @ coefficients
+    sigma = max(sigma, float(np.sqrt(left @ left / (len(sides) - _OPTIONS.degree - 1))))
+    reach = np.linalg.solve(r.T, legvander((t[rows] - middle) / half, _OPTIONS.degree).T)
+    off = np.abs(x[rows] - coefficients @ reach)
+    far = np.flatnonzero(off > _OPTIONS.far * sigma * np.sqrt(1 + np.sum(reach**2, axis=0)))
+    if len(far) == 0 or far[0] == 0 or far[-1] == len(rows) - 1:
+        return None
+    first, last = far[0], far[-1]
+    if off[first] < _OPTIONS.abrupt * off[first - 1] or off[last] < _OPTIONS.abrupt * off[last + 1]:
+        return None
+    if abs(np.median(off[far]) - _TURN) < _OPTIONS.of_turn * _TURN:
+        return None
+    return int(rows[first]), int(rows[last]) + 1, float(off[far].max())
+
+
+def _stuck(t: np.ndarray, x: np.ndarray, resolution: float, rough: float) -> list[tuple[int, int]]:
+    """(begin, end) of the samples of a run (n,) that repeat the one before ``begin``.
+
+    t, x: without missing values. resolution: the smallest step between values, 0 if it is unknown.
+    rough: of the column (`_roughness`), which the motion goes in a step at least.
+    """
+    if len(x) < _OPTIONS.fewest:
+        return []
+    times = np.diff(t)
+    ways = np.abs(np.diff(x)) * np.minimum(np.median(times) / times, 1.0)  # a gap makes a long way
+    same = np.concatenate([[False], ways == 0, [False]])
+    begins = np.flatnonzero(same[1:] & ~same[:-1])
+    ends = np.flatnonzero(~same[1:] & same[:-1])
+    slow = max(_OPTIONS.resolutions * resolution, rough)
+    many = (ends - begins + 1 >= _OPTIONS.fewest) & (ends < len(ways))
+    found = []
+    for begin, end in zip(begins[many], ends[many], strict=True):
+        before, behind = (
+            ways[max(begin - _OPTIONS.around, 0) : begin],
+            ways[end + 1 : end + 1 + _OPTIONS.around],
+        )
+        around = [part for part in (before, behind) if len(part) == _OPTIONS.around]
+        moves = any(np.median(part) > slow for part in around)
+        way = max(
+            _OPTIONS.fewest * slow,
+            _OPTIONS.jump * max((part.max() for part in around), default=0.0),
+        )
+        if moves and ways[end] > way:
+            found.append((int(begin) + 1, int(end) + 1))
+    return found
