@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -22,15 +22,23 @@ from gfnn_jax.data.columns import (
     Names,
     angles_of,
     check_known,
+    check_sigmas,
     factors_of,
     listed,
     roles_of,
     time_unit_of,
+    typical,
+    with_sigmas,
 )
 from gfnn_jax.data.roles import ROLES, is_run, is_time, unit_in
-from gfnn_jax.data.runs import restarts, runs_of, second_times
-from gfnn_jax.data.sigmas import check_sigmas, typical, with_sigmas
-from gfnn_jax.data.tables import Table, from_arrays, from_memory
+from gfnn_jax.data.tables import (
+    Table,
+    from_arrays,
+    from_memory,
+    restarts,
+    runs_of,
+    second_times,
+)
 from gfnn_jax.data.text_files import from_text
 from gfnn_jax.errors import InputError
 
@@ -38,6 +46,46 @@ if TYPE_CHECKING:
     from gfnn_jax.data.recording_summary import RecordingSummary
 
 _TURN = 2 * np.pi
+
+
+class ReadOptions(TypedDict, total=False):
+    """Keywords of `Recording`, and of `read` beside the rows to keep.
+
+    positions … sensors: names of columns. Where any is given, columns without a role are ignored;
+             where none is, the names of the columns decide.
+    angles:  positions of period 2π; without it those whose name or unit says so.
+    degrees: columns in degrees, or degrees per second; a position among them is an angle.
+    time_unit: s, ms, us, ns, min or h; by default the header's own, else s.
+    std:     σ of columns, in their own unit: a number, one for each value (T,) of a table, or the
+             name of a column that holds them; of column x also a column x_std.
+    columns: those to take beside times and runs; all others are as if they were not there. Of a
+             file that names none, all in order.
+    dt:      seconds between rows, in place of a column of times.
+    offset, scale: columns that a sensor shows shifted, or scaled, by an unknown amount.
+    coordinates: what moves, where it is not the positions: ``observe`` then says how columns show
+             it.
+    observe: column -> text such as "x0 + R*sin(theta + tilt)", or a function of arguments with
+             these names: coordinates, velocities, and parameters to be fitted.
+    guess:   where parameters of ``observe`` start.
+    """
+
+    positions: Names
+    velocities: Names
+    momenta: Names
+    inputs: Names
+    parameters: Names
+    sensors: Names
+    angles: Names
+    degrees: Names
+    columns: Names
+    time_unit: str | None
+    std: Mapping[str, Any] | None
+    dt: float | None
+    offset: Names
+    scale: Names
+    coordinates: Names
+    observe: Mapping[str, Any] | None
+    guess: Mapping[str, float] | None
 
 
 @dataclasses.dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -93,81 +141,46 @@ class Recording:
     _values: dict[str, dict[str, np.ndarray]]  # run -> name -> (n,)
     _sigmas: dict[str, str]  # name -> the column of σ of its values
 
-    def __init__(
-        self,
-        table: Any,
-        *,
-        positions: Names = None,
-        velocities: Names = None,
-        momenta: Names = None,
-        inputs: Names = None,
-        parameters: Names = None,
-        angles: Names = None,
-        degrees: Names = None,
-        time_unit: str | None = None,
-        std: Mapping[str, Any] | None = None,
-        columns: Names = None,
-        dt: float | None = None,
-        offset: Names = None,
-        scale: Names = None,
-        sensors: Names = None,
-        coordinates: Names = None,
-        observe: Mapping[str, Any] | None = None,
-        guess: Mapping[str, float] | None = None,
-    ):
+    def __init__(self, table: Any, **options: Unpack[ReadOptions]):
         """The recording of a table in memory; of files: `read`.
 
-        table:   a DataFrame, a dict of arrays (T,), or a list of these, one run each (or several,
-                 told apart by a column run, trial or sequence). A column t or time holds the times,
-                 which rise in a run; without a column of runs a new run begins where they fall.
-        positions … parameters: names of columns. Where any is given, columns without a role are
-                 ignored; where none is, the names of the columns decide.
-        angles:  positions of period 2π; without it those whose name or unit says so.
-        degrees: columns in degrees, or degrees per second; a position among them is an angle.
-        time_unit: s, ms, us, ns, min or h; by default the header's own, else s.
-        std:     σ of columns, in their own unit: a number, one for each value (T,) of a table, or
-                 the name of a column that holds them; of column x also a column x_std.
-        columns: those to take beside times and runs; all others are as if they were not there.
-        dt:      seconds between rows, in place of a column of times.
-        offset, scale: columns that a sensor shows shifted, or scaled, by an unknown amount.
-        coordinates: what moves, where it is not the positions: ``observe`` then says how columns
-                 show it.
-        observe: column -> text such as "x0 + R*sin(theta + tilt)", or a function of arguments with
-                 these names: coordinates, velocities, and parameters to be fitted.
-        guess:   where parameters of ``observe`` start.
-        Raises InputError where names, times or values do not fit.
+        table: a DataFrame, a dict of arrays (T,), or a list of these, one run each (or several,
+        told apart by a column run, trial or sequence). A column t or time holds the times, which
+        rise in a run; without a column of runs a new run begins where they fall. options:
+        `ReadOptions`. Raises InputError where names, times or values do not fit.
         """
-        given = {
-            "positions": listed(positions),
-            "velocities": listed(velocities),
-            "momenta": listed(momenta),
-            "inputs": listed(inputs),
-            "parameters": listed(parameters),
-            "sensors": listed(sensors),
-        }
+        unknown = set(options) - set(ReadOptions.__annotations__)
+        if unknown:
+            raise TypeError(f"Recording has no keyword {', '.join(sorted(unknown))}")
+        by_name: dict[str, Any] = dict(options)
+        given = {role: listed(by_name.get(role)) for role in ROLES}
+        angles, degrees = options.get("angles"), options.get("degrees")
+        columns, dt = listed(options.get("columns")), options.get("dt")
+        offset, scale = listed(options.get("offset")), listed(options.get("scale"))
+        std, observe = options.get("std") or {}, options.get("observe") or {}
         tables = [from_memory(t) for t in (table if isinstance(table, (list, tuple)) else [table])]
         if not tables:
             raise InputError("expected at least one table, got none")
-        tables = [_selected(t, listed(columns)) for t in tables]
-        tables, sigmas = with_sigmas(tables, std or {})
+        tables = [_selected(t, columns) for t in tables]
+        tables, sigmas = with_sigmas(tables, std)
         source = ", ".join(dict.fromkeys(t.source for t in tables))
         names = list(dict.fromkeys(name for t in tables for name in t.columns))
         units = {name: unit_in(name) for name in names if unit_in(name)}
         units |= {name: unit for t in reversed(tables) for name, unit in t.units.items()}
         columned = [name for name in names if not is_run(name) and not is_time(name)]
         numbers = [name for name in columned if name not in sigmas.values()]
-        told = time_unit_of(source, names, units, time_unit)
+        told = time_unit_of(source, names, units, options.get("time_unit"))
         unit = told or "s"
         runs = runs_of(tables, columned, SECONDS[unit], dt)
-        coordinate_names = listed(coordinates)
-        check_known(source, "observe", observe or {}, numbers)
+        coordinate_names = listed(options.get("coordinates"))
+        check_known(source, "observe", observe, numbers)
         if coordinate_names and not given["positions"]:
             given["positions"] = tuple(name for name in coordinate_names if name in numbers)
         if coordinate_names and not any(given.values()):
-            given["sensors"] = tuple(observe or {})
+            given["sensors"] = tuple(observe)
         roles, decided = roles_of(source, numbers, given, runs)
         others = [name for of_role in roles.values() for name in of_role]
-        more = (name for name in observe or {} if name not in others)
+        more = (name for name in observe if name not in others)
         roles = {**roles, "sensors": (*roles["sensors"], *more)}
         coordinate_names = coordinate_names or roles["positions"]
         with_role = [name for role in ROLES for name in roles[role]]
@@ -188,11 +201,7 @@ class Recording:
             run: {name: column * factors[name] for name, column in of_run.items()}
             for run, (_, of_run) in runs.items()
         }
-        for what, wanted in (
-            ("std", std or {}),
-            ("offset", listed(offset)),
-            ("scale", listed(scale)),
-        ):
+        for what, wanted in (("std", std), ("offset", offset), ("scale", scale)):
             check_known(source, what, wanted, with_role)
         sigmas = {name: of for name, of in sigmas.items() if name in with_role}
         check_sigmas(source, sigmas, values)
@@ -201,16 +210,16 @@ class Recording:
             **roles,
             "runs": tuple(runs),
             "angles": angular,
-            "std": typical(std or {}, sigmas, with_role, factors, values),
+            "std": typical(std, sigmas, with_role, factors, values),
             "coordinates": coordinate_names,
-            "observe": dict(observe or {}),
-            "guess": {name: float(value) for name, value in (guess or {}).items()},
+            "observe": dict(observe),
+            "guess": {name: float(value) for name, value in (options.get("guess") or {}).items()},
             "units": {n: u for n, u in units.items() if n in numbers},
             "factors": factors,
             "time_unit": unit,
             "time_unit_given": told is not None,
-            "offsets": listed(offset),
-            "scales": listed(scale),
+            "offsets": offset,
+            "scales": scale,
             "ignored": tuple(n for n in numbers if n not in with_role)
             + tuple(dict.fromkeys(n for t in tables for n in t.text)),
             "angles_given": angles is not None or degrees is not None,
@@ -369,23 +378,19 @@ def read(
     start: float = -np.inf,
     stop: float = np.inf,
     every: int = 1,
-    columns: Names = None,
-    **options: Any,
+    **options: Unpack[ReadOptions],
 ) -> Recording:
     """The recording that a file holds, or several files, one run each or more.
 
     paths:    ``.csv`` and other text (separated by commas, semicolons, tabs or blanks; decimal
               points or commas; lines of comments; a line of units below the names), ``.npz`` of
               named arrays, ``.npy``.
-    columns:  names of those to read beside times and runs; of all, in order, where a file names
-              none.
     start, stop, every: rows to keep: between these times (in the file's unit), every so many.
-    options:  positions, velocities, momenta, inputs, parameters, angles, degrees, time_unit, std,
-              dt, offset, scale, sensors, coordinates, observe, guess: as of `Recording`.
+    options:  `ReadOptions`.
     Raises InputError, one line with the file and the line, where a file cannot be used.
     """
     several = [paths] if isinstance(paths, (str, Path)) else list(paths)
-    chosen = listed(columns)
+    chosen = listed(options.get("columns"))
     tables = []
     for path in map(Path, several):
         if not path.is_file():
@@ -394,7 +399,7 @@ def read(
             tables.append(_rows_of(from_arrays(path, chosen), start, stop, every))
         else:
             tables.append(from_text(path, chosen, start=start, stop=stop, every=every))
-    return Recording(tables, columns=columns, **options)
+    return Recording(tables, **options)
 
 
 def _rows_of(table: Table, start: float, stop: float, every: int) -> Table:

@@ -1,4 +1,5 @@
-"""Tables of named columns: those in memory, and those of files of arrays."""
+"""Tables of named columns, of memory and of files of arrays; their rows cut into runs whose times
+rise."""
 
 from __future__ import annotations
 
@@ -10,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.data.blocks import damage
-from gfnn_jax.data.roles import is_run
+from gfnn_jax.data.roles import is_run, is_time
 from gfnn_jax.errors import InputError
+
+_MOST_MOVED = 3  # rows in a row that are taken to be out of place; more are a run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,3 +96,132 @@ def from_arrays(path: Path, columns: Sequence[str]) -> Table:
             )
         loaded = dict(zip(columns, loaded.T, strict=True))
     return dataclasses.replace(from_memory(loaded), source=str(path))
+
+
+def runs_of(
+    tables: list[Table], names: list[str], second: float, dt: float | None
+) -> dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """Run -> times (n,) in seconds and columns (n,) by name, in order of appearance."""
+    found: dict[str, tuple[np.ndarray, dict[str, np.ndarray]]] = {}
+    stems = [Path(table.source).stem for table in tables]
+    for table, stem in zip(tables, stems, strict=True):
+        length = len(next(iter(table.columns.values()), ()))
+        if length == 0:
+            raise InputError(f"{table.source}: holds no rows")
+        parts = _parts(table, length, dt, second)
+        for inner, (rows, times) in parts.items():
+            name = inner
+            if len(tables) > 1 and len(set(stems)) == len(stems):
+                name = stem if len(parts) == 1 and not _run_column(table) else f"{stem}/{inner}"
+            elif name in found:
+                name = str(len(found))
+            nothing = np.full(len(rows), np.nan)
+            values = {n: table.columns[n][rows] if n in table.columns else nothing for n in names}
+            _check_finite(table, rows, values)
+            found[name] = (times, values)
+    return found
+
+
+def _run_column(table: Table) -> str | None:
+    return next((name for name in table.columns if is_run(name)), None)
+
+
+def _parts(
+    table: Table, length: int, dt: float | None, second: float
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Run -> its rows (n,) and their times (n,) in seconds."""
+    column = _run_column(table)
+    time = next(iter(_time_columns(table)), None)
+    if time is None and dt is None:
+        raise InputError(
+            f"{table.source}: expected a column t or time, found {', '.join(table.columns)}; give "
+            "the time between rows: --dt (dt=)"
+        )
+    if column is not None:
+        labels, first, inverse = np.unique(
+            table.columns[column], return_index=True, return_inverse=True
+        )
+        groups = {str(labels[i]): np.flatnonzero(inverse == i) for i in np.argsort(first)}
+    elif dt is None:
+        assert time is not None
+        falls = _falls(table.columns[time])
+        _check_places(table, time, falls)
+        groups = {str(i): rows for i, rows in enumerate(np.split(np.arange(length), falls))}
+    else:
+        groups = {"0": np.arange(length)}
+    if dt is not None:
+        return {run: (rows, dt * np.arange(len(rows))) for run, rows in groups.items()}
+    assert time is not None
+    parts = {}
+    for run, rows in groups.items():
+        times = table.columns[time][rows]
+        _check_times(table, time, rows, times)
+        parts[run] = (rows, times * second)
+    return parts
+
+
+def restarts(tables: list[Table], runs: Mapping[str, Any]) -> list[str]:
+    """A note where times that fall have made runs."""
+    if len(runs) == len(tables) or any(_run_column(table) for table in tables):
+        return []
+    table = next(t for t in tables if len(_falls(t.columns[_time_columns(t)[0]])))
+    place = table.locate(int(_falls(table.columns[_time_columns(table)[0]])[0]))
+    if len(runs) == len(tables) + 1:
+        return [f"the times run back once, at {place}, and a run begins there"]
+    count = len(runs) - len(tables)
+    return [f"the times run back {count} times, first at {place}, and a run begins there"]
+
+
+def second_times(tables: list[Table]) -> list[str]:
+    """A note where a table has more columns of times than the one that is taken."""
+    found = dict.fromkeys((_time_columns(t)[0], n) for t in tables for n in _time_columns(t)[1:])
+    return [f"{other} is not used, for the times are those of {taken}" for taken, other in found]
+
+
+def _time_columns(table: Table) -> list[str]:
+    return [name for name in table.columns if is_time(name)]
+
+
+def _falls(times: np.ndarray) -> np.ndarray:
+    """The rows whose time is before that of the row above."""
+    return np.flatnonzero(np.diff(times) < 0) + 1
+
+
+def _check_places(table: Table, name: str, falls: np.ndarray) -> None:
+    """Raises InputError at a row out of place: without up to `_MOST_MOVED` rows the times go on
+    rising, and do not begin again from where they began."""
+    times, begin = table.columns[name], 0
+    for row in falls:
+        before, behind = times[begin:row], times[row : row + _MOST_MOVED + 1]
+        goes_on = before[-_MOST_MOVED - 1 :].min() < times[row] or behind.max() > before[-1]
+        if before[0] < times[row] and goes_on:
+            raise InputError(
+                f"{table.source}: {table.locate(int(row))}: {name} = {times[row]:.9g} runs back "
+                f"from {times[row - 1]:.9g} and goes on from there: sort the rows, or number the "
+                "runs in a column run"
+            )
+        begin = int(row)
+
+
+def _check_times(table: Table, name: str, rows: np.ndarray, times: np.ndarray) -> None:
+    """Raises InputError where the times of a run are missing or do not rise."""
+    if not np.isfinite(times).all():
+        row = int(rows[np.argmin(np.isfinite(times))])
+        raise InputError(f"{table.source}: {table.locate(row)}: {name} is missing")
+    falls = np.flatnonzero(np.diff(times) <= 0)
+    if len(falls):
+        row, at = int(rows[falls[0] + 1]), int(falls[0])
+        same = times[at + 1] == times[at]
+        what = "is the same as" if same else "runs back from"
+        remedy = "keep one row of each time" if same else "number the runs in a column run"
+        raise InputError(
+            f"{table.source}: {table.locate(row)}: {name} = {times[at + 1]:.9g} {what} "
+            f"{times[at]:.9g} before it ({len(falls)} such rows): {remedy}"
+        )
+
+
+def _check_finite(table: Table, rows: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
+    for name, column in values.items():
+        if np.isinf(column).any():
+            row = int(rows[np.argmax(np.isinf(column))])
+            raise InputError(f"{table.source}: {table.locate(row)}, {name}: infinite")
