@@ -1,6 +1,7 @@
 """The command line: exit statuses, one line per refusal, nothing harmed, reports."""
 
 import json
+import shlex
 import subprocess
 import sys
 import time
@@ -23,7 +24,6 @@ from command_line import (
 )
 
 from gfnn_jax import cli, cli_process, cli_summary, scenes
-from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, FitWarning
@@ -114,114 +114,78 @@ def test_help(command, capsys):
     assert ("95 % bound" in out) == (command in (("run",), ("fit",)))
 
 
-def test_a_line_of_progress_says_where_its_error_comes_from():
-    known = {
-        "label": "polynomial 4",
-        "family": "polynomial",
-        "chart": "midpoint",
-        "num_parameters": 69,
-        "operations": 1e3,
-        "validation_rms": 1e-5,
-        "validation_relative": 2e-5,
-        "validation_bound": 3e-5,
-        "deviations": np.zeros(2),
-        "train_rms": 1e-5,
-        "fit_seconds": 0.1,
-    }
-    for steps, error in ((False, "first estimated at 2.00e-05"), (True, "error 2.00e-05")):
-        assert error in search.line(Candidate(**known, validated=steps))
-
-
-WHOLE = "expected a whole number from 1 to 2**53 - 1, got "
-STEPS = WHOLE.replace(", got", ", or its negative, got")
+# What is typed, and what the refusal names.
 BAD_USAGE = [
-    ((), "expected a command, got none"),
-    (("rum",), "invalid choice: 'rum'"),
-    (("run",), "required: SCENE"),
-    (("run", "two-bdy"), "unknown scene 'two-bdy', did you mean 'two-body'?"),
-    (("run", "two-body", "--dt", "0"), "expected a finite number > 0, got 0"),
-    (("run", "two-body", "--dt", "nan"), "expected a finite number > 0, got nan"),
-    (("run", "two-body", "--dt", "one"), "expected a finite number > 0, got one"),
-    (("run", "standard-map-regular", "--dt", "0.5"), "is a map without time"),
-    (("run", "two-body", "--tolerance", "-1"), "expected a finite number > 0, got -1"),
-    (("run", "two-body", "--chart", "type5"), "invalid choice: 'type5'"),
-    (("run", "two-body", "--family", "spline"), "invalid choice: 'spline'"),
-    (("run", "two-body", "--scalar", "spline"), "invalid choice: 'spline'"),
-    (("run", "two-body", "--family", "features"), "the scene two-body declares none"),
-    (("run", "standard-map-regular", "--learn", "hamiltonian"), "a map without time"),
-    (("run", "two-body", "--seed", "-1"), "expected a whole number from 0 to 2**32 - 1, got -1"),
-    (("run", "two-body", "--seed", "1.5"), "expected a whole number from 0 to 2**32 - 1, got 1.5"),
-    (("run", "two-body", "--quik"), "unrecognized arguments: --quik"),
-    (("run", "two-body", "--out", "{file}"), "is a file, expected a folder"),
-    (("run", "two-body", "--out", "{file}/x"), "is not a folder"),
-    (("run", "two-body", "--out", "{folder}"), "exists already (--overwrite, in Python"),
-    (("run", "two-body", "--out", "{folder}", "--overwrite"), "not overwritten"),
-    (("fit", "{data}"), "required: --out"),
-    (("fit", "{tmp}/none.npz", "--out", "{new}"), "no such file"),
-    (("fit", "n" * 300, "--out", "{new}"), "File name too long"),
-    (("fit", "{file}", "--out", "{new}"), "expected at least two columns"),
-    (("fit", "{empty}", "--out", "{new}"), "cannot be read: damaged?"),
-    (("fit", "{folder}", "--out", "{new}"), "expected a .npz"),
-    (("fit", "{data}", "--out", "{folder}"), "exists already"),
-    (("fit", "{data}", "--out", "{new}", "--dt", "0.2"), "disagrees with the file's dt"),
-    (("fit", "{nodt}", "--out", "{new}"), "holds no time step"),
-    (("fit", "{nan}", "--out", "{new}"), "1 value not finite (NaN or infinity), first z1"),
-    (("fit", "{few}", "--out", "{new}"), "at least 3 are needed"),
-    (("fit", "{sixteen}", "--out", "{new}"), "at least 8 different pairs for d = 1, got 7"),
-    (("fit", "{odd}", "--out", "{new}"), "must have an even last dimension"),
-    (("fit", "{data}", "--out", "{new}", "--scene", "two-body"), "has dim 2, the pairs have 1"),
-    (("fit", "{data}", "--out", "{new}", "--scene", "pluto"), "unknown scene 'pluto'"),
-    (("fit", "{data}", "--out", "{new}", "--angles", "5"), "different angles among 0..1, got (5,)"),
-    (("fit", "{data}", "--out", "{new}", "--angles", "q"), "different whole numbers"),
-    (("fit", "{data}", "--out", "{new}", "--angles", "0,0"), "expected different names"),
-    (("fit", "{data}", "--out", "{new}", "--angles", "0, 00"), "different whole numbers"),
-    (("fit", "{data}", "--out", "{new}", "--angles", "0,"), "different names or indices"),
-    (("fit", "{data}", "--out", "{new}", "--tolerance", "0"), "expected a finite number > 0"),
-    (("fit", "{data}", "--out", "{new}", "--family", "features"), "needs a scene that declares"),
-    (("fit", "{data}", "--out", "{new}", "--terms", "p1**"), "p1"),
-    (("fit", "{data}", "--out", "{new}", "--max-seconds", "0"), "expected a finite number > 0"),
-    (
-        ("fit", "{data}", "--out", "{new}", "--tolerance", "1", "--absolute-tolerance", "1"),
-        "expected --tolerance or --absolute-tolerance, not both",
-    ),
-    (("predict", "{model}"), "required: --initial, --out"),
-    (("predict", "{tmp}/none", "{to}"), "no such file or folder"),
-    (("predict", "{folder}", "{to}"), "holds no model.json"),
-    (("predict", "{model}", "{to}", "--initial", "{tmp}/none.npy"), "no such file"),
-    (("predict", "{model}", "{to}", "--initial", "{wide}"), "expected states of 2 columns"),
-    (("predict", "{model}", "{to}", "--num-steps", "0"), STEPS + "0"),
-    (("predict", "{model}", "{to}", "--num-steps", "1e3"), STEPS + "1e3"),
-    (("predict", "{model}", "{to}", "--num-steps", "1" + 20 * "0"), STEPS + "1000"),
-    (("predict", "{model}", "{to}", "--save-every", "-1"), WHOLE + "-1"),
-    (("predict", "{model}", "{to}", "--save-every", "99"), "--save-every of at most --num-steps"),
-    (("predict", "{model}", "{to}", "--outside", "maybe"), "invalid choice: 'maybe'"),
-    (("predict", "{model}", "{to}", "--out", "{data}"), "exists already"),
-    (("predict", "{model}", "{to}", "--out", "{new}.csv"), "is written as .npz"),
-    (
-        ("fit", "{data}", "--out", "{new}", "--max-seconds", "None"),
-        "expected a finite number > 0, in seconds, got None",
-    ),
-    (
-        ("fit", "{data}", "--out", "{new}", "--max-operations", "None"),
-        "expected a whole number of operations, got None",
-    ),
-    (
-        ("predict", "{model}", "{to}", "--inputs", "{data}", "--estimate-from", "3"),
-        "--estimate-from, --inputs: only for the forecast of a recording by its law",
-    ),
-    (
-        ("fit", "{swing}", "--out", "{new}", "--tolerance", "1e-3", "--strict"),
-        "--tolerance, --strict: not for the law of a recording",
-    ),
-    (("fit", "{swing}", "--out", "{new}", "--despite", "sgin"), "different systems, got 'sgin'"),
+    ("", "gfnn run two-body --quick"),
+    ("rum", "'rum'"),
+    ("run", "SCENE"),
+    ("run two-bdy", "'two-body'"),
+    ("run two-body --dt 0", "--dt"),
+    ("run two-body --dt nan", "--dt"),
+    ("run two-body --dt one", "--dt"),
+    ("run standard-map-regular --dt 0.5", "standard-map-regular"),
+    ("run two-body --tolerance -1", "--tolerance"),
+    ("run two-body --chart type5", "--chart"),
+    ("run two-body --family spline", "--family"),
+    ("run two-body --scalar spline", "--scalar"),
+    ("run two-body --family features", "two-body"),
+    ("run standard-map-regular --learn hamiltonian", "map"),
+    ("run two-body --seed -1", "--seed"),
+    ("run two-body --seed 1.5", "--seed"),
+    ("run two-body --quik", "--quik"),
+    ("run two-body --out {file}", "{file}"),
+    ("run two-body --out {file}/x", "{file}"),
+    ("run two-body --out {folder}", "--overwrite"),
+    ("run two-body --out {folder} --overwrite", "{folder}"),
+    ("fit {data}", "--out"),
+    ("fit {tmp}/none.npz --out {new}", "none.npz"),
+    (f"fit {'n' * 300} --out {{new}}", "nnn"),
+    ("fit {file} --out {new}", "{file}"),
+    ("fit {empty} --out {new}", "{empty}"),
+    ("fit {folder} --out {new}", "{folder}"),
+    ("fit {data} --out {folder}", "{folder}"),
+    ("fit {data} --out {new} --dt 0.2", "--dt"),
+    ("fit {nodt} --out {new}", "--dt"),
+    ("fit {nan} --out {new}", "z1[3, 0]"),
+    ("fit {few} --out {new}", "{few}"),
+    ("fit {sixteen} --out {new}", "got 7"),
+    ("fit {odd} --out {new}", "{odd}"),
+    ("fit {data} --out {new} --scene two-body", "dim 2"),
+    ("fit {data} --out {new} --scene pluto", "'pluto'"),
+    ("fit {data} --out {new} --angles 5", "(5,)"),
+    ("fit {data} --out {new} --angles q", "--angles"),
+    ("fit {data} --out {new} --angles 0,0", "--angles"),
+    ("fit {data} --out {new} --angles '0, 00'", "--angles"),
+    ("fit {data} --out {new} --angles 0,", "--angles"),
+    ("fit {data} --out {new} --tolerance 0", "--tolerance"),
+    ("fit {data} --out {new} --family features", "features"),
+    ("fit {data} --out {new} --terms p1**", "p1"),
+    ("fit {data} --out {new} --max-seconds 0", "--max-seconds"),
+    ("fit {data} --out {new} --max-seconds None", "--max-seconds"),
+    ("fit {data} --out {new} --max-operations None", "--max-operations"),
+    ("fit {data} --out {new} --tolerance 1 --absolute-tolerance 1", "--absolute-tolerance"),
+    ("fit {swing} --out {new} --tolerance 1e-3 --strict", "--tolerance, --strict"),
+    ("fit {swing} --out {new} --despite sgin", "'sgin'"),
+    ("predict {model}", "--initial, --out"),
+    ("predict {tmp}/none {to}", "none"),
+    ("predict {folder} {to}", "{folder}"),
+    ("predict {model} {to} --initial {tmp}/none.npy", "none.npy"),
+    ("predict {model} {to} --initial {wide}", "{wide}"),
+    ("predict {model} {to} --num-steps 0", "--num-steps"),
+    ("predict {model} {to} --num-steps 1e3", "--num-steps"),
+    (f"predict {{model}} {{to}} --num-steps 1{20 * '0'}", "--num-steps"),
+    ("predict {model} {to} --save-every -1", "--save-every"),
+    ("predict {model} {to} --save-every 99", "--save-every"),
+    ("predict {model} {to} --outside maybe", "--outside"),
+    ("predict {model} {to} --out {data}", "{data}"),
+    ("predict {model} {to} --out {new}.csv", "{new}.csv"),
+    ("predict {model} {to} --inputs {data} --estimate-from 3", "--estimate-from, --inputs"),
 ]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"), BAD_USAGE, ids=lambda x: " ".join(x) if type(x) is tuple else ""
-)
-def test_refusals(arguments, message, tmp_path, model, capsys, monkeypatch):
-    """Exit status 2, one line, nothing written."""
+@pytest.mark.parametrize(("typed", "named"), BAD_USAGE)
+def test_refusals(typed, named, tmp_path, model, capsys, monkeypatch):
+    """Exit status 2, one line that names what is wrong, nothing written."""
     monkeypatch.chdir(tmp_path)
     z = oscillator(200, [0, DT])
     broken = z.copy()
@@ -233,8 +197,8 @@ def test_refusals(arguments, message, tmp_path, model, capsys, monkeypatch):
     np.save(tmp_path / "wide.npy", np.zeros((3, 4)))
     np.savez(tmp_path / "nodt.npz", z0=z[:, 0], z1=z[:, 1])
     np.save(tmp_path / "z0.npy", np.zeros((3, 2)))
-    to = f"--initial {tmp_path / 'z0.npy'} --num-steps 10 --out {tmp_path / 'new.npz'}".split()
     places = {
+        "to": f"--initial {tmp_path / 'z0.npy'} --num-steps 10 --out {tmp_path / 'new.npz'}",
         "tmp": tmp_path,
         "new": tmp_path / "new",
         "folder": tmp_path / "folder",
@@ -251,20 +215,13 @@ def test_refusals(arguments, message, tmp_path, model, capsys, monkeypatch):
         "swing": recording_file(tmp_path / "swing.csv"),
     }
     before = files(tmp_path)
-    expanded = [b for a in arguments for b in (to if a == "{to}" else [a.format(**places)])]
-    assert gfnn(*expanded) == 2
+    assert gfnn(*shlex.split(typed.format(**places))) == 2
     err = capsys.readouterr().err
     lines = [line for line in err.splitlines() if not line.startswith("[")]
     assert len(lines) == 1
     assert lines[0].startswith("gfnn: ")
-    assert message in lines[0]
+    assert named.format(**places) in lines[0]
     assert files(tmp_path) == before
-
-
-def test_no_command_says_what_to_try(capsys):
-    assert gfnn() == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "gfnn run two-body --quick" in line
 
 
 def test_usage_is_refused_in_a_moment():
@@ -538,25 +495,6 @@ def test_a_forecast_takes_no_options_of_steps(model, tmp_path, capsys, monkeypat
     assert "--samples, --outside: not for the forecast" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("relative", "met", "end"),
-    [
-        (True, False, "1e-06 of the spread: not met"),
-        (False, True, "1e-06 in the data's units: met"),
-    ],
-)
-def test_an_error_is_told_beside_what_it_is_held_to(relative, met, end):
-    fit = {
-        "validation_rms": 2e-6,
-        "validation_relative": 1e-6,
-        "validation_bound": 3e-6,
-        "tolerance": 1e-6,
-        "tolerance_is_relative": relative,
-        "tolerance_met": met,
-    }
-    assert cli_summary.error_line(fit).endswith(f"; 95 % bound 3.00e-06, tolerance {end}")
-
-
 def test_warnings_are_one_line(fitted, tmp_path, capsys, monkeypatch):
     def warn(*args, **kwargs):
         warnings.warn("nothing meets the tolerance", FitWarning, stacklevel=2)
@@ -664,29 +602,14 @@ def test_compiled_programs_are_kept_in_the_users_cache(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("met", "noise", "terms", "line"),
-    [
-        (True, None, 30, "H = q1²"),
-        (False, [1e-3, 1e-3], 2, "H = q1²"),
-        (
-            False,
-            [1e-3, 1e-3],
-            30,
-            "best partial law: H of 30 terms, one-step error 2.0e-02 of the spread (report.json)",
-        ),
-        (
-            False,
-            None,
-            2,
-            "best partial law: H of 2 terms, one-step error 2.0e-02 of the spread (report.json)",
-        ),
-    ],
+    ("met", "noise", "terms", "is_law"),
+    [(True, None, 30, True), (False, [1e-3], 2, True), (False, [1e-3], 30, False)],
 )
-def test_a_law_that_has_met_nothing_is_not_printed_as_h(met, noise, terms, line):
+def test_a_law_that_has_met_nothing_is_not_printed_as_h(met, noise, terms, is_law):
     report = {
         "fit": {"tolerance_met": met, "validation_relative": 0.02},
         "hamiltonian": {"formula": "q1²", "terms": [{}] * terms},
         "model": {"learns": "hamiltonian"},
         "data": {"noise": noise},
     }
-    assert cli_summary.law_line(report) == line
+    assert ("H = q1²" in cli_summary.law_line(report)) == is_law

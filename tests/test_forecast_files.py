@@ -55,24 +55,17 @@ def folder(motion, tmp_path_factory):
     return folder
 
 
+def typed(line):
+    """The exit status of a command; no name in it has a blank."""
+    return main(line.split())
+
+
 def predicted(folder, initial, inputs, capsys, steps=AHEAD):
     """(exit status, rows of the forecast or None, what stood on standard error)."""
     out = folder / "f.csv"
     out.unlink(missing_ok=True)
-    status = main(
-        [
-            "predict",
-            str(folder / "model"),
-            "--initial",
-            str(folder / initial),
-            "--inputs",
-            str(folder / inputs),
-            "--num-steps",
-            str(steps),
-            "--out",
-            str(out),
-        ]
-    )
+    to = f"--inputs {folder / inputs} --num-steps {steps} --out {out}"
+    status = typed(f"predict {folder / 'model'} --initial {folder / initial} {to}")
     rows = np.genfromtxt(out, delimiter=",", names=True) if out.exists() else None
     return status, rows, capsys.readouterr().err
 
@@ -99,15 +92,11 @@ def test_times_are_in_the_unit_of_each_files_header(motion, folder, initial, inp
 @pytest.mark.parametrize(
     ("initial", "inputs", "told"),
     [
-        ("metres.csv", "u_s.csv", "expected x in mm, in which the model was learned, got m"),
-        ("ms.csv", "u_mV.csv", "expected u in V, in which the model was learned, got mV"),
-        (
-            "ms.csv",
-            "u_short.csv",
-            "needs inputs from 19.95 to 22.95 s, and there are none from 21.45 to 22.95 s",
-        ),
-        ("ms.csv", "u_later.csv", "there are none from 19.95 to 21 s"),
-        ("ms.csv", "u_before.csv", "there are none from 19.95 to 22.95 s"),
+        ("metres.csv", "u_s.csv", "x in mm"),
+        ("ms.csv", "u_mV.csv", "u in V"),
+        ("ms.csv", "u_short.csv", "from 21.45 to 22.95 s"),
+        ("ms.csv", "u_later.csv", "from 19.95 to 21 s"),
+        ("ms.csv", "u_before.csv", "from 19.95 to 22.95 s"),
     ],
 )
 def test_other_units_and_inputs_that_end_early_are_refused(folder, initial, inputs, told, capsys):
@@ -135,19 +124,8 @@ def test_inputs_ahead_may_be_coarse_or_lack_values(motion, folder, plan, capsys)
 
 def test_a_comparison_may_be_in_another_unit_of_time(folder, capsys):
     out = folder / "c.csv"
-    arguments = [
-        "predict",
-        str(folder / "model"),
-        "--initial",
-        str(folder / "s.csv"),
-        "--to",
-        "18",
-        "--compare",
-        str(folder / "ms.csv"),
-        "--out",
-        str(out),
-    ]
-    assert main(arguments) == 0
+    to = f"--to 18 --compare {folder / 'ms.csv'} --out {out}"
+    assert typed(f"predict {folder / 'model'} --initial {folder / 's.csv'} {to}") == 0
     told = capsys.readouterr().out
     assert "up to t = 19.95 s" in told
     rms = float(told.split("x: RMS error ")[1].split(" mm")[0])
@@ -185,19 +163,7 @@ def swings(tmp_path_factory):
         )
     for unit in ("deg", "rad"):
         with contextlib.redirect_stderr(io.StringIO()):
-            assert (
-                main(
-                    [
-                        "fit",
-                        str(folder / f"{unit}.csv"),
-                        "--to",
-                        "15",
-                        "--out",
-                        str(folder / f"model-{unit}"),
-                    ]
-                )
-                == 0
-            )
+            assert typed(f"fit {folder}/{unit}.csv --to 15 --out {folder}/model-{unit}") == 0
     return folder
 
 
@@ -205,22 +171,8 @@ def swings(tmp_path_factory):
 @pytest.mark.parametrize(("initial", "compare"), [("deg", "rad"), ("rad", "deg")])
 def test_degrees_and_radians_go_together(swings, model, initial, compare, capsys):
     """What is compared is in the unit of the file that is compared with."""
-    status = main(
-        [
-            "predict",
-            str(swings / f"model-{model}"),
-            "--initial",
-            str(swings / f"{initial}.csv"),
-            "--to",
-            "15",
-            "--compare",
-            str(swings / f"{compare}.csv"),
-            "--out",
-            str(swings / "f.csv"),
-            "--overwrite",
-        ]
-    )
-    assert status == 0
+    to = f"--to 15 --compare {swings}/{compare}.csv --out {swings}/f.csv --overwrite"
+    assert typed(f"predict {swings}/model-{model} --initial {swings}/{initial}.csv {to}") == 0
     told = capsys.readouterr().out
     rms, unit = told.split("theta: RMS error ")[1].split(",")[0].split(" ")
     assert unit == compare
@@ -229,22 +181,10 @@ def test_degrees_and_radians_go_together(swings, model, initial, compare, capsys
 
 @pytest.mark.parametrize("model", ["deg", "rad"])
 def test_parts_of_a_radian_are_refused(swings, model, capsys):
-    status = main(
-        [
-            "predict",
-            str(swings / f"model-{model}"),
-            "--initial",
-            str(swings / "mrad.csv"),
-            "--num-steps",
-            "5",
-            "--out",
-            str(swings / "m.csv"),
-        ]
-    )
-    assert status == 2
-    assert f"expected theta in {model}, in which the model was learned, got mrad" in (
-        capsys.readouterr().err
-    )
+    to = f"--num-steps 5 --out {swings}/m.csv"
+    assert typed(f"predict {swings}/model-{model} --initial {swings}/mrad.csv {to}") == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert all(word in line for word in ("theta", model, "mrad"))
 
 
 def test_a_velocity_in_another_unit_is_not_left_out_in_silence(tmp_path, capsys):
@@ -262,20 +202,10 @@ def test_a_velocity_in_another_unit_is_not_left_out_in_silence(tmp_path, capsys)
     columns = ["--positions", "x", "--velocities", "v"]
     model = str(tmp_path / "model")
     assert main(["fit", str(tmp_path / "both.csv"), *columns, "--out", model]) == 0
-    status = main(
-        [
-            "predict",
-            model,
-            "--initial",
-            str(tmp_path / "other.csv"),
-            "--num-steps",
-            "5",
-            "--out",
-            str(tmp_path / "f.csv"),
-        ]
-    )
-    assert status == 2
-    assert "expected v in m/s, in which the model was learned, got mm/s" in capsys.readouterr().err
+    to = f"--num-steps 5 --out {tmp_path}/f.csv"
+    assert typed(f"predict {model} --initial {tmp_path}/other.csv {to}") == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert all(word in line for word in ("other.csv", "v", "mm/s"))
 
 
 def test_a_header_that_is_silent_is_read_in_the_units_of_the_model(tmp_path):
