@@ -170,7 +170,7 @@ def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypat
             pass
 
     def run(folder, at):
-        return search(pairs_of(150, 0), None, options, progress=Stopping(at), kept_in=folder)
+        return search(pairs_of(150, 0), None, options, progress=Stopping(at), kept=(folder, {}))
 
     monkeypatch.setattr(networks, "_CHECKPOINT_SECONDS", 0.0)
     whole = run(tmp_path / "whole", 99)

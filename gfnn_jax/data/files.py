@@ -95,11 +95,6 @@ class TrajectoryData:
     def num_pairs(self) -> int:
         return len(self.states) - len(self.lengths)
 
-    @property
-    def sequences(self) -> list[np.ndarray]:
-        """The M sequences, each of shape (L_i, 2d)."""
-        return np.split(self.states, np.cumsum(self.lengths)[:-1])
-
     def pairs(self):
         """All pairs of consecutive states, as `Pairs` of shape (num_pairs, 2d)."""
         from gfnn_jax.phase_space import Pairs  # brings JAX
@@ -116,10 +111,6 @@ class TrajectoryData:
             run=self.run,
             place=self.place,
         )
-
-    def last_states(self) -> np.ndarray:
-        """The last state of each sequence, (M, 2d)."""
-        return self.states[np.cumsum(self.lengths) - 1]
 
 
 def read_trajectories(

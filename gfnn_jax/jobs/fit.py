@@ -115,8 +115,7 @@ def fit(
                 asked,
                 progress=progress,
                 spent=reading,
-                kept_in=kept_in,
-                job=job,
+                kept=(kept_in, job),
             )
             if large and can_be_refitted(fitted.map):
                 assert trajectories.sampled is not None

@@ -15,7 +15,7 @@ from gfnn_jax.errors import FitWarning
 from gfnn_jax.evaluate.metrics import one_step_rms
 from gfnn_jax.jobs.measure import Rollouts, angles_of_z, map_rollouts, step_rollouts
 from gfnn_jax.jobs.progress import Progress
-from gfnn_jax.jobs.run import QUICK_PAIRS, QUICK_TOLERANCE
+from gfnn_jax.jobs.run import QUICK, WHOLE
 from gfnn_jax.jobs.search import search
 from gfnn_jax.jobs.shared_data import SharedData
 from gfnn_jax.learn.options import FitOptions
@@ -61,13 +61,7 @@ def _baseline(method: str, data: SharedData, budget: Budget) -> tuple[dict[str, 
         sizes(fresh.z0),
     )
     part = {
-        "model": {
-            "learns": "map",
-            "family": method,
-            "label": learned.label,
-            "chart": None,
-            "num_parameters": learned.num_parameters,
-        },
+        "model": _model("map", method, learned.label, None, learned.num_parameters),
         "data": {"num_pairs": sequences.num_pairs, "sequence_length": chosen.length},
         "fit": {
             **_training(learned.training, budget.cap),
@@ -94,6 +88,19 @@ def _steps(step, z):
     return jax.vmap(step)(z)
 
 
+def _model(
+    learns: str, family: str, label: str, chart: str | None, num_parameters: int
+) -> dict[str, Any]:
+    """Report's part on a model."""
+    return {
+        "learns": learns,
+        "family": family,
+        "label": label,
+        "chart": chart,
+        "num_parameters": num_parameters,
+    }
+
+
 def _training(training: Any, cap: float | None) -> dict[str, Any]:
     """Report's part on an Adam training. Its errors are those of the method's own loss."""
     return {
@@ -111,14 +118,9 @@ def _training(training: Any, cap: float | None) -> dict[str, Any]:
 def _papers(data: SharedData, budget: Budget) -> tuple[dict[str, Any], Rollouts]:
     pairs = data.sequences(2)
     learned = paper_gfnn(pairs, budget)
+    family = learned.family
     part = {
-        "model": {
-            "learns": "map",
-            "family": "mlp",
-            "label": learned.family.label,
-            "chart": "type2",
-            "num_parameters": learned.family.num_parameters,
-        },
+        "model": _model("map", "mlp", family.label, "type2", family.num_parameters),
         "data": {"num_pairs": pairs.num_pairs, "sequence_length": 2},
         "fit": {
             **_training(learned.training, budget.cap),
@@ -132,9 +134,7 @@ def _papers(data: SharedData, budget: Budget) -> tuple[dict[str, Any], Rollouts]
 def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollouts]:
     """Fit the first few of the same pairs by `gfnn.fit`."""
     scene = data.scene
-    num_pairs, tolerance = scene.num_pairs, scene.tolerance
-    if data.quick:
-        num_pairs, tolerance = min(num_pairs, QUICK_PAIRS), max(tolerance, QUICK_TOLERANCE)
+    num_pairs, tolerance = (QUICK if data.quick else WHOLE).of(scene)
     z = data.sequences(2).z[:num_pairs]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)  # kept in fit.messages
@@ -146,13 +146,9 @@ def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollout
         )
     chosen = fit.chosen
     part = {
-        "model": {
-            "learns": chosen.learns,
-            "family": chosen.family,
-            "label": chosen.label,
-            "chart": chosen.chart,
-            "num_parameters": chosen.num_parameters,
-        },
+        "model": _model(
+            chosen.learns, chosen.family, chosen.label, chosen.chart, chosen.num_parameters
+        ),
         "data": {"num_pairs": fit.num_pairs, "sequence_length": 2},
         "fit": {
             "seconds": chosen.fit_seconds,

@@ -18,16 +18,37 @@ from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps.bands import bands
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
+from gfnn_jax.scenes import Scene
 from gfnn_jax.scenes.draws import sample_pairs, sample_params, sample_t0, sample_test_states
 from gfnn_jax.scenes.trajectories import reference_trajectories
 from gfnn_jax.storage.outputs import atomic_folder
 
-# Pairs and options of a network, and those with --quick.
-_NETWORK = 6_000, {"tolerance": 1e-6, "max_iterations": 250}
-_NETWORK_QUICK = 3_000, {"tolerance": 1e-5, "max_iterations": 60}
-# Trajectories and samples of the band in the figure of errors: twice the work of all rollouts.
-_BAND_TRAJECTORIES, _BAND_SAMPLES = 10, 20
-QUICK_PAIRS, QUICK_TRAJECTORIES, QUICK_TOLERANCE = 4_000, 25, 1e-7
+
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """Sizes of a run: pairs, options of a network, trajectories of the rollouts; None: the scene's.
+
+    tolerance: the least one. band_trajectories, band_samples: of the band in the figure of errors,
+    twice the work of all rollouts; 0 for no band.
+    """
+
+    pairs: int | None = None
+    tolerance: float = 0.0
+    trajectories: int = NUM_TRAJECTORIES
+    network_pairs: int = 6_000
+    network_tolerance: float = 1e-6
+    network_iterations: int = 250
+    band_trajectories: int = 10
+    band_samples: int = 20
+
+    def of(self, scene: Scene) -> tuple[int, float]:
+        """(pairs, tolerance) of a scene."""
+        few = scene.num_pairs if self.pairs is None else min(scene.num_pairs, self.pairs)
+        return few, max(scene.tolerance, self.tolerance)
+
+
+WHOLE = Sizes()
+QUICK = Sizes(4_000, 1e-7, 25, 3_000, 1e-5, 60, 0, 0)
 
 
 def run(
@@ -46,12 +67,11 @@ def run(
     """
     progress = output.progress
     scene = scene_named(name, dt)
-    num_pairs, usual = scene.num_pairs, {"tolerance": scene.tolerance}
+    sizes, usual = QUICK if quick else WHOLE, {}
+    num_pairs, usual["tolerance"] = sizes.of(scene)
     if options.get("family") == "mlp":
-        num_pairs, usual = _NETWORK_QUICK if quick else _NETWORK
-    elif quick:
-        num_pairs = min(num_pairs, QUICK_PAIRS)
-        usual = {"tolerance": max(scene.tolerance, QUICK_TOLERANCE)}
+        num_pairs, usual["tolerance"] = sizes.network_pairs, sizes.network_tolerance
+        usual["max_iterations"] = sizes.network_iterations
     with refusals():
         asked = FitOptions(**{**usual, **options})
     if asked.family == "features" and scene.features is None:
@@ -59,7 +79,7 @@ def run(
             f"family 'features' needs features, and the scene {name} declares none: choose another "
             "family"
         )
-    num_trajectories = QUICK_TRAJECTORIES if quick else NUM_TRAJECTORIES
+    num_trajectories = sizes.trajectories
     job = {
         "command": "run",
         "scene": name,
@@ -79,7 +99,7 @@ def run(
             "params": sample_params(scene, num_trajectories, key_test, test=True),
             "t0": sample_t0(scene, num_trajectories, key_test),
         }
-        fitted = search(pairs, scene, asked, progress=progress, kept_in=kept_in, job=job).settled()
+        fitted = search(pairs, scene, asked, progress=progress, kept=(kept_in, job)).settled()
         progress.status(f"reference trajectories of {NUM_STEPS} steps")
         reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS, **given))
         progress.status(f"rollouts of {NUM_STEPS} steps")
@@ -122,11 +142,11 @@ def _band(map_: SymplecticMap, z0, predicted, given: dict[str, Any]) -> np.ndarr
     """
     if map_.posterior is None:
         return None
-    few = slice(_BAND_TRAJECTORIES)
+    few = slice(WHOLE.band_trajectories)
     own: dict[str, Any] = {
         name: None if values is None else values[few] for name, values in given.items()
     }
-    samples = map_.sample(jax.random.key(0), _BAND_SAMPLES)
+    samples = map_.sample(jax.random.key(0), WHOLE.band_samples)
     drawn, _ = samples.rollout(z0[few], predicted.shape[1] - 1, **own)
     std = bands(drawn, predicted[few], map_.angles_of_z).std
     return 2 * np.linalg.norm(std[..., : map_.dim], axis=-1)

@@ -35,18 +35,18 @@ def search(
     *,
     progress: Progress,
     spent: float = 0.0,
-    kept_in: Path | None = None,
-    job: dict[str, Any] | None = None,
+    kept: tuple[Path, dict[str, Any]] | None = None,
 ) -> Fit:
     """Fit these pairs.
 
-    spent: seconds of the budget that are gone already. kept_in: folder for checkpoints of a
-    training, factors, and the best map so far. job: the job that they belong to. Raises InputError
-    for data or a request that cannot give a map, WorkError where the arithmetic fails.
+    spent: seconds of the budget that are gone already. kept: folder for checkpoints of a training,
+    factors, and the best map so far, and the job that they belong to. Raises InputError for data or
+    a request that cannot give a map, WorkError where the arithmetic fails.
     """
     checkpoints = factors = on_better = None
-    if kept_in is not None:
-        checkpoints, factors = TrainingCheckpoints(kept_in, job or {}), KeptFactors(kept_in)
+    if kept is not None:
+        kept_in, job = kept
+        checkpoints, factors = TrainingCheckpoints(kept_in, job), KeptFactors(kept_in)
         on_better = partial(_keep, kept_in / BEST, scene, job)
     with refusals(), failures_of_arithmetic():
         return fit(

@@ -9,13 +9,23 @@ more noise.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
-_HALVES = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 64, 80)  # samples on either side
-_SAMPLES = 2_000  # where the errors of a window are measured
-_TOLERANCE = 1.05  # of the leave-one-out error, against the best window's
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """halves: windows, samples on either side. samples: where the errors of a window are measured.
+    tolerance: of the leave-one-out error, against the best window's."""
+
+    halves: tuple[int, ...] = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 64, 80)
+    samples: int = 2_000
+    tolerance: float = 1.05
+
+
+_OPTIONS = _Options()
 
 
 class Smooth(NamedTuple):
@@ -52,8 +62,8 @@ def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np
     and the noise σ (d,) of the channels: the smallest leave-one-out error, less the cubic's own
     part."""
     total = sum(len(t) for t, _ in stretches)
-    every = max(1, total // _SAMPLES)
-    halves = [h for h in _HALVES if any(len(t) >= 2 * h + 1 for t, _ in stretches)]
+    every = max(1, total // _OPTIONS.samples)
+    halves = [h for h in _OPTIONS.halves if any(len(t) >= 2 * h + 1 for t, _ in stretches)]
     errors, sigmas = [], []
     for half in halves:
         left_out = [
@@ -67,5 +77,5 @@ def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np
         sigmas.append(np.sqrt(variance / (1 + 9 / (4 * (2 * half + 1)))))
     relative = np.array(errors) / np.maximum(np.min(errors, axis=0), 1e-300)
     score = relative.max(axis=1)
-    good = np.flatnonzero(score <= _TOLERANCE * score.min())
+    good = np.flatnonzero(score <= _OPTIONS.tolerance * score.min())
     return halves[good[-1]], np.min(sigmas, axis=0)
