@@ -260,16 +260,10 @@ def two_carts(wrong=True):
 def test_wrong_values_are_told_with_run_and_time_and_left_out_of_the_figures():
     found, clean = two_carts().summary(), two_carts(wrong=False).summary()
     assert clean.faults == ()
-    lines = [(fault.kind, str(fault).split(". ")[0]) for fault in found.faults]
-    assert [kind for kind, _ in lines] == ["stuck", "outliers", "outliers"]
-    assert (
-        lines[0][1]
-        == "right is stuck from 4.04 s to 4.39 s of run 1 (36 samples repeat the one before)"
-    )
-    assert lines[1][1] == "left has 5 outliers, up to 0.05 off, the first at 0.4 s of run 0"
-    assert (
-        lines[2][1] == "left has 15 outliers in a row from 5 s to 5.14 s of run 2, up to 0.14 off"
-    )
+    stuck, outliers = found.faults
+    assert (stuck.kind, outliers.kind) == ("stuck", "outliers")
+    assert all(word in stuck.message for word in ("right", "36 samples", "4.04 s of run 1"))
+    assert all(word in outliers.message for word in ("left", "20 outliers", "0.4 s of run 0"))
     assert [(c.outliers, c.stuck) for c in found.columns] == [(20, 0), (0, 36)]
     assert found.period == pytest.approx(clean.period, rel=0.02)
     assert found.loss.per_period == pytest.approx(clean.loss.per_period, rel=0.05)
@@ -279,7 +273,7 @@ def test_wrong_values_are_told_with_run_and_time_and_left_out_of_the_figures():
 def test_wrong_values_are_missing_where_they_are_left_out():
     wrong, clean = two_carts(), two_carts(wrong=False)
     kept, lines = without_wrong_values(wrong)
-    assert [line.endswith(": left out") for line in lines] == [True] * 3
+    assert [line.endswith(": left out") for line in lines] == [True] * 2
     for run, name in ((run, name) for run in wrong.runs for name in ("left", "right")):
         expected = wrong.values(name, run).copy()
         expected[expected != clean.values(name, run)] = np.nan

@@ -21,8 +21,8 @@ from gfnn_jax.data.wrong_values import in_words
 from gfnn_jax.signals.derivatives import Relation, difference
 from gfnn_jax.signals.local_polynomials import local_fits
 from gfnn_jax.signals.steps import drift
+from gfnn_jax.signals.wrong_values import TURN
 
-TURN = 2 * np.pi
 WRONG = (
     "constant",
     "repeated",
@@ -184,12 +184,10 @@ def _missing(traits: Traits) -> Iterator[Fault]:
 def _wrong_values(traits: Traits) -> Iterator[Fault]:
     """Sensors that repeat one value while the motion goes on, and samples far from where those
     around them lead."""
-    each = (in_words(traits.recording, name, of) for name, of in traits.wrong.items())
-    told = [one for of_column in each for one in of_column]
+    told = [in_words(traits.recording, name, of) for name, of in traits.wrong.items()]
     for kind in ("stuck", "outliers"):
-        for one in told:
-            if one.kind == kind:
-                yield _note(kind, one.text, "Left out of a fit")
+        for of_column in (one for one in told if kind in one):
+            yield _note(kind, of_column[kind], "Left out of a fit")
 
 
 # Velocities that are not the derivatives of their positions.

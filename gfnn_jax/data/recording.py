@@ -41,11 +41,10 @@ from gfnn_jax.data.tables import (
 )
 from gfnn_jax.data.text_files import from_text
 from gfnn_jax.errors import InputError
+from gfnn_jax.signals.wrong_values import TURN
 
 if TYPE_CHECKING:
     from gfnn_jax.data.recording_summary import RecordingSummary
-
-_TURN = 2 * np.pi
 
 
 class ReadOptions(TypedDict, total=False):
@@ -293,7 +292,7 @@ class Recording:
         if name not in self.angles:
             return values
         known = np.isfinite(values)
-        if not known.any() or np.ptp(values[known]) > _TURN * (1 + 1e-3):
+        if not known.any() or np.ptp(values[known]) > TURN * (1 + 1e-3):
             return values
         lifted = values.copy()
         lifted[known] = np.unwrap(values[known])

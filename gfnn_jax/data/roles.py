@@ -29,18 +29,8 @@ TIMES = (
 )
 RUNS = ("run", "trial", "sequence", "seq", "episode", "experiment", "trajectory")
 
-_GREEK = {
-    "α": "alpha",
-    "β": "beta",
-    "γ": "gamma",
-    "θ": "theta",
-    "φ": "phi",
-    "ϕ": "phi",
-    "ψ": "psi",
-    "ϑ": "theta",
-    "ω": "omega",
-    "τ": "tau",
-}
+_GREEK = {letter: unicodedata.name(letter).split()[3].lower() for letter in "αβγθφψωτ"}
+_GREEK |= {"ϕ": "phi", "ϑ": "theta"}
 _ANGLES = (
     "theta",
     "phi",

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -49,54 +49,27 @@ def without_wrong_values(recording: Recording) -> tuple[Recording, tuple[str, ..
     """The recording without its wrong values, and a message for each kind of them in a column."""
     wrong = wrong_values_of(recording)
     rows = {n: np.concatenate([w.rows for w in of]) for n, of in wrong.items() if of}
-    lines = (told.text for name, of in wrong.items() for told in in_words(recording, name, of))
+    lines = (line for name, of in wrong.items() for line in in_words(recording, name, of).values())
     return recording.without(rows), tuple(f"{line}: left out" for line in lines)
 
 
-class Told(NamedTuple):
-    """Wrong values of one kind, "stuck" or "outliers", in words."""
-
-    kind: str
-    text: str
-
-
-def in_words(recording: Recording, name: str, wrong: Sequence[WrongValues]) -> tuple[Told, ...]:
-    """The wrong values of a column by kinds: of a stuck sensor, single outliers, several in a
-    row."""
-    found = []
-    held = [stretch for stretch in wrong if stretch.off is None]
-    if held:
-        stuck_at = f"{name} is stuck{_when(recording, held[0])}"
-        repeated = f"{len(held[0].rows)} samples repeat the one before"
-        found.append(Told("stuck", f"{stuck_at} ({repeated}){_more(len(held))}"))
-    off = [stretch for stretch in wrong if stretch.off is not None]
-    for single in (True, False):
-        of_kind = [stretch for stretch in off if (len(stretch.rows) == 1) == single]
-        if of_kind:
-            found.append(Told("outliers", _outliers(recording, name, of_kind, single)))
-    return tuple(found)
-
-
-def _outliers(recording: Recording, name: str, off: list[WrongValues], single: bool) -> str:
-    most = max(stretch.off or 0.0 for stretch in off) / recording.factors[name]
-    size = f"{'up to ' * (len(off) > 1 or not single)}{most:.2g} {recording.unit(name)}".rstrip()
-    when = _when(recording, off[0])
-    if single:
-        count = "1 outlier" if len(off) == 1 else f"{len(off)} outliers"
-        return f"{name} has {count}, {size} off{'' if len(off) == 1 else ', the first'}{when}"
-    return f"{name} has {len(off[0].rows)} outliers in a row{when}, {size} off{_more(len(off))}"
-
-
-def _more(count: int) -> str:
-    """Clause on the others of a kind, where there are several."""
-    if count == 1:
-        return ""
-    return ", and once more" if count == 2 else f", and {count - 1} times more"
-
-
-def _when(recording: Recording, stretch: WrongValues) -> str:
-    """The time, and the run where there are several."""
-    times = np.concatenate([recording.times(run) for run in recording.runs])
-    begin, end = times[stretch.rows[[0, -1]]]
-    of = f" of run {recording.runs[stretch.run]}" if len(recording.runs) > 1 else ""
-    return f" at {begin:.6g} s{of}" if begin == end else f" from {begin:.6g} s to {end:.6g} s{of}"
+def in_words(recording: Recording, name: str, wrong: Sequence[WrongValues]) -> dict[str, str]:
+    """The wrong values of a column in a line for each kind, "stuck" or "outliers": how many, where
+    the first ones are."""
+    times, found = np.concatenate([recording.times(run) for run in recording.runs]), {}
+    for kind in ("stuck", "outliers"):
+        of_kind = [stretch for stretch in wrong if (stretch.off is None) == (kind == "stuck")]
+        if not of_kind:
+            continue
+        count, first = sum(len(stretch.rows) for stretch in of_kind), of_kind[0]
+        apart = f" in {len(of_kind)} stretches" if 1 < len(of_kind) < count else ""
+        run = f" of run {recording.runs[first.run]}" if len(recording.runs) > 1 else ""
+        when = f"the first at {times[first.rows[0]]:.6g} s{run}"
+        if kind == "stuck":
+            found[kind] = f"{name} is stuck: {count} samples{apart} repeat the one before, {when}"
+        else:
+            most = max(stretch.off or 0.0 for stretch in of_kind) / recording.factors[name]
+            size = f"up to {most:.2g} {recording.unit(name)}".rstrip()
+            many = f"{count} outlier{'s' * (count > 1)}{apart}"
+            found[kind] = f"{name} has {many}, {size} off, {when}"
+    return found

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
-_TURN = 2 * np.pi
+TURN = 2 * np.pi
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,7 +224,7 @@ def _apart(
     first, last = far[0], far[-1]
     if off[first] < _OPTIONS.abrupt * off[first - 1] or off[last] < _OPTIONS.abrupt * off[last + 1]:
         return None
-    if abs(np.median(off[far]) - _TURN) < _OPTIONS.of_turn * _TURN:
+    if abs(np.median(off[far]) - TURN) < _OPTIONS.of_turn * TURN:
         return None
     return int(rows[first]), int(rows[last]) + 1, float(off[far].max())
 
