@@ -14,7 +14,7 @@ import numpy as np
 from gfnn_jax.data.roles import ROLES, by_name, is_angle, is_time, plain
 from gfnn_jax.data.tables import Table
 from gfnn_jax.errors import InputError
-from gfnn_jax.signals.derivatives import NARROWEST, derivatives
+from gfnn_jax.signals.derivatives import derivatives, window
 from gfnn_jax.signals.noise import noise
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
@@ -115,8 +115,7 @@ def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tupl
     """(position, velocity), the most alike first taken, in the order of the columns."""
     names, table = list(columns), np.stack(list(columns.values()))
     noises = noise(times, table)
-    size = max(min(n.size for n in noises) // 2, NARROWEST)
-    local = derivatives(times, table, size, [n.sigma for n in noises])
+    local = derivatives(times, table, window(noises), [n.sigma for n in noises])
     if local is None:
         return []
     related = {

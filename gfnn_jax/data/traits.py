@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gfnn_jax.data.wrong_values import WrongValues, wrong_values_of
-from gfnn_jax.signals.derivatives import NARROWEST, Derivatives, Relation, derivatives
+from gfnn_jax.signals.derivatives import Derivatives, Relation, derivatives, window
 from gfnn_jax.signals.noise import Noise, noise, resolution
 from gfnn_jax.signals.steps import median_step
 
@@ -96,13 +96,11 @@ def traits(recording: Recording) -> Traits:
         if group:
             found = noise(sound_times, np.stack([columns[n][sound] for n in group]), by)
             noises |= dict(zip(group, found, strict=True))
-    positions = [noises[n].size for n in recording.positions]
-    size = max(min(positions, default=0) // 2, NARROWEST)
-    moving = tuple(driven)
-    local = None
+    moving, local = tuple(driven), None
     if moving:
         sigmas = [noises[n].sigma for n in moving]
         table = np.stack([columns[n][sound] for n in moving])
+        size = window([noises[n] for n in recording.positions])
         local = derivatives(sound_times, table, size, sigmas)
     step = median_step(times)
     return Traits(recording, times, columns, wrong, seen, sound, noises, steps, moving, local, step)

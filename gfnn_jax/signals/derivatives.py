@@ -17,10 +17,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from gfnn_jax.signals.local_polynomials import LocalFits, local_fits
+from gfnn_jax.signals.noise import Noise
 
-NARROWEST = 7  # samples of a window for derivatives
-_DEGREE = 3
-_FEWEST = 12  # windows
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """degree: of the polynomials of values. fewest: windows. narrowest: samples of a window."""
+
+    degree: int = 3
+    fewest: int = 12
+    narrowest: int = 7
+
+
+_OPTIONS = _Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +68,7 @@ class Derivatives:
         v = self.values.values[column]
         rate, bend = self.slopes.slopes[of], self.slopes.curvatures[of]
         known = np.isfinite(v) & np.isfinite(rate)
-        if known.sum() < _FEWEST or np.ptp(v[known]) == 0 or np.ptp(rate[known]) == 0:
+        if known.sum() < _OPTIONS.fewest or np.ptp(v[known]) == 0 or np.ptp(rate[known]) == 0:
             return None
         v, rate, bend = (x[known] - np.mean(x[known]) for x in (v, rate, bend))
         noise = (self.sigmas[of] or 0.0) * self.slopes.slope_gain[known]
@@ -86,6 +95,11 @@ class Derivatives:
         )
 
 
+def window(noises: Sequence[Noise]) -> int:
+    """Samples of a window for derivatives of columns with this noise."""
+    return max(min((n.size for n in noises), default=0) // 2, _OPTIONS.narrowest)
+
+
 def derivatives(
     times: Sequence[np.ndarray], columns: np.ndarray, size: int, sigmas: Sequence[float | None]
 ) -> Derivatives | None:
@@ -93,8 +107,8 @@ def derivatives(
 
     sigmas: of the columns' noise.
     """
-    values = local_fits(times, columns, size, _DEGREE)
-    slopes = local_fits(times, columns, size, _DEGREE + 1)
+    values = local_fits(times, columns, size, _OPTIONS.degree)
+    slopes = local_fits(times, columns, size, _OPTIONS.degree + 1)
     if values is None or slopes is None:
         return None
     return Derivatives(values, slopes, sigmas)
