@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from gfnn_jax.cli import main
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
-from gfnn_jax.jobs.units import read_in_units
+from gfnn_jax.jobs.output import read_in_units
 
 DT, SEEN, AHEAD = 0.05, 400, 60
 

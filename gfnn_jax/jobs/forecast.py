@@ -18,8 +18,7 @@ import numpy as np
 from gfnn_jax.data.recording import SECONDS, Recording
 from gfnn_jax.data.text_files import to_text
 from gfnn_jax.errors import InputError
-from gfnn_jax.jobs.output import Output
-from gfnn_jax.jobs.units import read_in_units, refuse_other_units
+from gfnn_jax.jobs.output import Output, read_in_units, refuse_other_units
 from gfnn_jax.maps.forecasts import Forecast, forecast
 from gfnn_jax.maps.saved import load, record
 from gfnn_jax.maps.symplectic_map import SymplecticMap

@@ -1,4 +1,5 @@
-"""Output of a job: where it goes, what may stand there, its progress; a model with its record."""
+"""Output of a job: where it goes, what may stand there, its progress; a model with its record, and
+recordings in the units of the one that it was learned from."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.recording import Recording, read
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import report
 from gfnn_jax.jobs.progress import SILENT, Progress
@@ -23,6 +24,7 @@ from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 
 REPORT, MODEL = "report.json", "model"
+_ANGLES = ("deg", "°", "rad")  # begins of the units that `gfnn_jax.read` turns into radians
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,9 +97,42 @@ def pairs_digest(pairs: Pairs) -> str:
 
 
 def units_of(recording: Recording) -> dict[str, Any]:
-    """Entries of a model's job by which another recording is read in its units (`units`)."""
+    """Entries of a model's job by which `read_in_units` reads another recording in its units."""
     return {
         "degrees": [name for name, factor in recording.factors.items() if factor != 1],
         "time_unit": recording.time_unit,
         "units": {name: recording.unit(name) for name in recording.columns},
     }
+
+
+def read_in_units(path: Any, job: dict[str, Any], roles: dict[str, Any]) -> Recording:
+    """Read a recording in the units of its header and, where that is silent about times or about
+    degrees, in those of the recording that the model was learned from.
+
+    roles: keywords of `gfnn_jax.read`; a unit among them goes before the model's.
+    """
+    recording = read(path, **roles)
+    known = (*recording.positions, *recording.velocities)
+    silent = [n for n in job.get("degrees", ()) if n in known and n not in recording.units]
+    told: dict[str, Any] = {"degrees": silent} if silent else {}
+    if not recording.time_unit_given and job.get("time_unit", "s") != "s":
+        told["time_unit"] = job["time_unit"]
+    return read(path, **{**told, **roles}) if told else recording
+
+
+def refuse_other_units(recording: Recording, job: dict[str, Any]) -> None:
+    """Raises InputError where a column has another unit than in the recording that the model was
+    learned from; degrees and radians are one, as both are read in radians."""
+    for name, known in job.get("units", {}).items():
+        own = recording.unit(name) if name in recording.columns else ""
+        if own and known and own != known and not _are_angles(own, known):
+            raise InputError(
+                f"{recording.source}: expected {name} in {known}, in which the model was learned, "
+                f"got {own}"
+            )
+
+
+def _are_angles(*units: str) -> bool:
+    """Return whether these are units of angles, or of their rates over the same time."""
+    angles = all(unit.strip().lower().startswith(_ANGLES) for unit in units)
+    return angles and len({unit.partition("/")[2] for unit in units}) == 1

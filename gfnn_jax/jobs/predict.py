@@ -23,8 +23,7 @@ from gfnn_jax.data.predictions import (
     put_together,
 )
 from gfnn_jax.errors import InputError
-from gfnn_jax.jobs.output import Output
-from gfnn_jax.jobs.units import read_in_units, refuse_other_units
+from gfnn_jax.jobs.output import Output, read_in_units, refuse_other_units
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.bands import bands, horizon
 from gfnn_jax.maps.lanes import Lanes
