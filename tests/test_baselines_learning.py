@@ -50,12 +50,20 @@ def test_a_flow_that_fails_is_nan():
     assert np.isnan(np.asarray(step(jnp.array([1.0, 1.0])))).any()
 
 
+def smaller(monkeypatch, name, recipe, **sizes):
+    """The method of this name, with another recipe and other sizes where it has these."""
+    module = sys.modules[METHODS[name].learn.__module__]
+    own = {size: value for size, value in sizes.items() if hasattr(module._OPTIONS, size)}
+    monkeypatch.setattr(module, "Recipe", lambda *args, **options: recipe)
+    monkeypatch.setattr(module, "_OPTIONS", dataclasses.replace(module._OPTIONS, **own))
+    return METHODS[name]
+
+
 def test_ridges_of_large_states_start_finite(monkeypatch):
     """States in [0, 2π), as the standard map's, through all 24 layers."""
-    p_module = sys.modules[METHODS["p-sympnet"].learn.__module__]
-    monkeypatch.setattr(p_module, "RECIPE", dataclasses.replace(RECIPE, epochs=1))
+    method = smaller(monkeypatch, "p-sympnet", dataclasses.replace(RECIPE, epochs=1))
     z = np.random.default_rng(0).uniform(0, 2 * np.pi, (100, 2, 2))
-    learned = METHODS["p-sympnet"].learn(Sequences(z, 1.0, (0, 1)), Budget(jax.random.key(0)))
+    learned = method.learn(Sequences(z, 1.0, (0, 1)), Budget(jax.random.key(0)))
     assert np.isfinite(learned.training.validation_rms)
 
 
@@ -93,10 +101,8 @@ def test_the_loss_of_a_sequence():
 )
 def test_every_method_ends_in_a_step(name, monkeypatch):
     """Two short epochs: finite, counted, the same for the same key, in float64."""
-    method = METHODS[name]
-    small = {"RECIPE": RECIPE, "HIDDEN": (16,), "LAYERS": 3, "SUBLAYERS": 2, "G_LAYERS": 3}
-    for constant, value in small.items():
-        monkeypatch.setattr(sys.modules[method.learn.__module__], constant, value, raising=False)
+    sizes = {"hidden": (16,), "layers": 3, "sublayers": 2, "g_layers": 3, "p_layers": 3}
+    method = smaller(monkeypatch, name, RECIPE, **sizes)
     sequences = oscillator(200, method.length)
     learned = method.learn(sequences, Budget(jax.random.key(1)))
     z = jnp.asarray(sequences.z[:3, 0])
@@ -114,11 +120,8 @@ def test_every_method_ends_in_a_step(name, monkeypatch):
 def test_learns_an_oscillator(name, share, monkeypatch):
     """RMS error in four steps, as a share of how far the states move. HNN's is that of finite
     differences: (φ − 1)/dt is the field up to dt/2."""
-    method = METHODS[name]
-    module = sys.modules[method.learn.__module__]
     recipe = dataclasses.replace(RECIPE, epochs=10, epoch_length=100)
-    monkeypatch.setattr(module, "HIDDEN", (32,))
-    monkeypatch.setattr(module, "RECIPE", recipe)
+    method = smaller(monkeypatch, name, recipe, hidden=(32,))
     learned = method.learn(oscillator(500, method.length), Budget(jax.random.key(1)))
     states = oscillator(50, 5, seed=9).z
     predicted = np.asarray(rollout(learned.step, jnp.asarray(states[:, 0]), 4))

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from gfnn_jax.baselines.p_sympnet import p_init, p_step
 from gfnn_jax.baselines.srnn import leapfrog, tao
-from gfnn_jax.baselines.sympnets import g_init, g_step, la_init, la_step
+from gfnn_jax.baselines.sympnets import g_init, g_step, la_init, la_step, p_init, p_step
 from gfnn_jax.phase_space import apply_j, split, symplecticity_defect
 from gfnn_jax.scenes import henon_heiles, pcr3bp
 from gfnn_jax.scenes.trajectories import reference_trajectories

@@ -10,9 +10,8 @@ from collections.abc import Callable
 
 from gfnn_jax.baselines.fields import hnn, vfnn
 from gfnn_jax.baselines.learned import Budget, Learned, Sequences
-from gfnn_jax.baselines.p_sympnet import p_sympnet
 from gfnn_jax.baselines.srnn import o_net, srnn
-from gfnn_jax.baselines.sympnets import g_sympnet, la_sympnet
+from gfnn_jax.baselines.sympnets import g_sympnet, la_sympnet, p_sympnet
 
 
 @dataclasses.dataclass(frozen=True)

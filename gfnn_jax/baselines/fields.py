@@ -11,6 +11,7 @@ and outputs of unit size, and a decay of the rate.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -24,14 +25,23 @@ from gfnn_jax.fitting.adam import Recipe
 from gfnn_jax.phase_space import apply_j, sizes
 from gfnn_jax.scenes.trajectories import flow_step
 
-HIDDEN, ACTIVATION = (200, 200), "tanh"
-RECIPE = Recipe(batch_size=200, epochs=40, epoch_length=250, rate=1e-3, schedule="cosine")
-TOLERANCE = 1e-9  # local error of a predicted step, as in their experiments on two bodies
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """hidden: layers, theirs. tolerance: local error of a predicted step, as in their experiments
+    on two bodies."""
+
+    hidden: tuple[int, ...] = (200, 200)
+    tolerance: float = 1e-9
+
+
+_OPTIONS = _Options()
+_ACTIVATION = "tanh"
 
 
 def vfnn(sequences: Sequences, budget: Budget) -> Learned:
     """Learn ż = N(z), N a network with 2d outputs."""
-    field, params = network_field(sequences, HIDDEN, budget.key)
+    field, params = network_field(sequences, _OPTIONS.hidden, budget.key)
     return _learn_field(field, params, sequences, budget, "vector field 200-200")
 
 
@@ -40,7 +50,7 @@ def hnn(sequences: Sequences, budget: Budget) -> Learned:
     z, velocity = sequences.derivatives()
     target_gradient = -apply_j(velocity)  # ∇H
     inputs = box_inputs(z, angles=q_angles(sequences))
-    family = Mlp(inputs, HIDDEN, ACTIVATION, amplitude_of(z, target_gradient))
+    family = Mlp(inputs, _OPTIONS.hidden, _ACTIVATION, amplitude_of(z, target_gradient))
 
     def field(params, z):
         return apply_j(jax.grad(family, argnums=1)(params, z))
@@ -55,14 +65,14 @@ def network_field(sequences: Sequences, hidden: tuple[int, ...], key) -> tuple[C
     inputs, unit = Mlp(box_inputs(z, angles=q_angles(sequences)), hidden), sizes(velocity)
 
     def net(dtype):
-        return network(inputs.num_inputs, hidden, z.shape[1], ACTIVATION, dtype)
+        return network(inputs.num_inputs, hidden, z.shape[1], _ACTIVATION, dtype)
 
     def field(params, z):
         dtype = jax.tree.leaves(params)[0].dtype
         entries = inputs.network_inputs(z).astype(dtype)
         return jnp.asarray(unit, dtype) * net(dtype).apply({"params": params}, entries)
 
-    params = initial(inputs.num_inputs, hidden, z.shape[1], ACTIVATION, jnp.float32, key)
+    params = initial(inputs.num_inputs, hidden, z.shape[1], _ACTIVATION, jnp.float32, key)
     return field, params
 
 
@@ -77,11 +87,13 @@ def _learn_field(field, params, sequences: Sequences, budget: Budget, label: str
     def loss(params, z, velocity):
         return jnp.mean(jnp.sum((lanes(params, z) - velocity) ** 2, axis=-1))
 
+    recipe = Recipe(batch_size=200, epochs=40, epoch_length=250, rate=1e-3, schedule="cosine")
     rows = sequences.derivatives()
-    params, trained = train(loss, params, rows, rows[0].shape[1], RECIPE, budget)
+    params, trained = train(loss, params, rows, rows[0].shape[1], recipe, budget)
+
     # Along a solution the angles need not be reduced again: the field is that of the reduced state.
-    step = periodic(
-        lambda params, z: flow_step(lambda y: field(params, y), sequences.dt, TOLERANCE)(z),
-        sequences.angles,
-    )
+    def step(params, z):
+        return flow_step(lambda y: field(params, y), sequences.dt, _OPTIONS.tolerance)(z)
+
+    step = periodic(step, sequences.angles)
     return Learned(lambda z: step(params, z), params, label, trained)

@@ -17,7 +17,10 @@ import numpy as np
 from gfnn_jax.coordinates import TWO_PI
 from gfnn_jax.fitting.adam import AdamFit, Recipe, Training
 
-HELD = 2_000  # rows that validate, at most a tenth of all
+
+def held(num: int) -> int:
+    """Number of rows that validate, of so many: at most a tenth of all."""
+    return min(2_000, num // 10)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,14 +102,14 @@ def train(
 
     Returns the params in float64 and the record of the training.
     """
-    held = min(HELD, len(rows[0]) // 10)
+    first = held(len(rows[0]))
     training = Training(
         recipe,
         budget.key,
         cap=budget.cap,
         on_epoch=lambda epoch, _, rms: budget.on_progress(f"epoch {epoch}: error {rms:.1e}"),
     )
-    apart = tuple(r[held:] for r in rows), tuple(r[:held] for r in rows)
+    apart = tuple(r[first:] for r in rows), tuple(r[:first] for r in rows)
     trained = training.of_loss(loss, params, *apart, components)
     return in_float64(trained.params), trained
 

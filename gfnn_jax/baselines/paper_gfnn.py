@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.baselines.fields import q_angles
-from gfnn_jax.baselines.learned import HELD, Budget, Sequences, in_float64
+from gfnn_jax.baselines.learned import Budget, Sequences, held, in_float64
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import PAPER_HIDDEN, PAPER_HIDDEN_STANDARD_MAP, Mlp, amplitude_of
@@ -24,9 +24,6 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import sizes
-
-_PART = 50  # iterations between two readings of the clock
-_MOST_STATES = 20_000  # number of states from which the domain is made
 
 
 class PaperGfnn(NamedTuple):
@@ -46,27 +43,28 @@ def paper_gfnn(pairs: Sequences, budget: Budget) -> PaperGfnn:
     w, target = TYPE2.evaluation_point(z0, z1), TYPE2.target_gradient(z0, z1, pairs.dt)
     inputs = box_inputs(w, angles=q_angles(pairs))
     family = Mlp(inputs, hidden, "tanh", amplitude_of(w, target))
-    held = min(HELD, len(w) // 10)
+    first = held(len(w))
+    part = 50  # iterations between two readings of the clock
     iterations = recipe.epochs * (len(w) // recipe.batch_size)
-    recipe = dataclasses.replace(recipe, epochs=max(1, iterations // _PART), epoch_length=_PART)
+    recipe = dataclasses.replace(recipe, epochs=max(1, iterations // part), epoch_length=part)
     training = Training(
         recipe,
         budget.key,
         cap=budget.cap,
         on_epoch=lambda epoch, _, rms: budget.on_progress(
-            f"{epoch * _PART} iterations: error {rms:.1e}"
+            f"{epoch * part} iterations: error {rms:.1e}"
         ),
     ).of_gradients(
         family,
         family.init(budget.key, jnp.float32),
-        (w[held:], target[held:]),
-        (w[:held], target[:held]),
+        (w[first:], target[first:]),
+        (w[:first], target[:first]),
         pairs.dt * np.ones(2 * pairs.dim),
     )
     scale = sizes(z0)
     generated = Generated(family, in_float64(training.params), TYPE2, pairs.dt, scale)
     coordinates = Coordinates("cartesian", angles=pairs.angles)
     centre = np.full(len(pairs.angles), np.pi)  # z0 is in [0, 2π)
-    domain = covering(z0[:_MOST_STATES], ignore=pairs.angles)
+    domain = covering(z0[:20_000], ignore=pairs.angles)
     map_ = SymplecticMap((generated,), coordinates, domain, scale, centre, pairs.dt)
     return PaperGfnn(map_, family, training)

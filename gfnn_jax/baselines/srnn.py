@@ -16,6 +16,7 @@ which serves noisy data. There are two variants for systems that are not separab
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -29,9 +30,20 @@ from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.fitting.adam import Recipe
 from gfnn_jax.phase_space import apply_j, split
 
-HIDDEN, ACTIVATION = (256, 256), "tanh"
-RECIPE = Recipe(batch_size=32, epochs=1_500, epoch_length=200, rate=5e-3, schedule="cosine")
-BINDING = 10.0  # Tao's ω, the strength with which the two copies of the state are bound
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Hidden layers, theirs."""
+
+    hidden: tuple[int, ...] = (256, 256)
+
+
+_OPTIONS = _Options()
+
+
+def _learned(step: Callable, params, sequences: Sequences, budget: Budget, label: str) -> Learned:
+    recipe = Recipe(batch_size=32, epochs=1_500, epoch_length=200, rate=5e-3, schedule="cosine")
+    return learn_map(step, params, sequences, recipe, budget, label)
 
 
 def srnn(sequences: Sequences, budget: Budget) -> Learned:
@@ -47,8 +59,8 @@ def srnn(sequences: Sequences, budget: Budget) -> Learned:
         chosen = list(columns)
         return Mlp(
             box_inputs(z, angles=q_angles(sequences), cyclic=others),
-            HIDDEN,
-            ACTIVATION,
+            _OPTIONS.hidden,
+            "tanh",
             amplitude_of(z[:, chosen], gradient[:, chosen]),
         )
 
@@ -72,18 +84,18 @@ def srnn(sequences: Sequences, budget: Budget) -> Learned:
         params = hamiltonian.init(budget.key, jnp.float32)
         step = tao(hamiltonian, dt)
         label = "Tao's step of H, 256-256"
-    return learn_map(step, params, sequences, RECIPE, budget, label)
+    return _learned(step, params, sequences, budget, label)
 
 
 def o_net(sequences: Sequences, budget: Budget) -> Learned:
     """Learn a leapfrog of a network with 2d outputs."""
-    field, params = network_field(sequences, HIDDEN, budget.key)
+    field, params = network_field(sequences, _OPTIONS.hidden, budget.key)
     step = leapfrog(
         lambda params, z: split(field(params, z))[0],
         lambda params, z: split(field(params, z))[1],
         sequences.dt,
     )
-    return learn_map(step, params, sequences, RECIPE, budget, "leapfrog of a field 256-256")
+    return _learned(step, params, sequences, budget, "leapfrog of a field 256-256")
 
 
 def leapfrog(velocity: Callable, force: Callable, dt: float) -> Callable:
@@ -103,10 +115,12 @@ def leapfrog(velocity: Callable, force: Callable, dt: float) -> Callable:
     return step
 
 
-def tao(hamiltonian: Callable, dt: float, binding: float = BINDING) -> Callable:
+def tao(hamiltonian: Callable, dt: float, binding: float = 10.0) -> Callable:
     """Make ``step(params, z)`` of any ``hamiltonian(params, z)``: Tao's second-order splitting of
 
     H(q, y) + H(x, p) + ω/2 (‖q − x‖² + ‖p − y‖²),        x = q and y = p at the start.
+
+    binding: ω, the strength with which the two copies of the state are bound.
     """
     gradient = jax.grad(hamiltonian, argnums=1)
     angle = 2 * binding * dt

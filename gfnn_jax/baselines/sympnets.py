@@ -5,32 +5,61 @@ for identifying Hamiltonian systems", Neural Networks 132 (2020), and their publ
 jpzxshi/sympnets: sigmoid, Adam at 1e-3, weights drawn with a deviation of 0.01. LA: linear modules
 and activations in turn, at the paper's 30 layers × 10 sublayers; G: gradient modules. We add:
 batches instead of all pairs at once, and a decay of the rate.
+
+P-SympNet, a row of exact flows of ridge polynomials, each layer's H = f(w·z): Tapley, "Symplectic
+Neural Networks Based on Dynamical Systems" (arXiv:2408.09821, 2024), and the public code
+bentaps/strupnet, method P. A layer conserves its own w·z, so that
+
+    z + dt f'(w·z) J w
+
+is the exact flow. Any linear symplectic map is such a row with quadratic f.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gfnn_jax.baselines.learned import Budget, Learned, Sequences, learn_map
 from gfnn_jax.fitting.adam import Recipe
-from gfnn_jax.phase_space import split
+from gfnn_jax.phase_space import apply_j, split
 
-LAYERS, SUBLAYERS = 30, 10  # sizes of LA, as in the paper
-G_LAYERS, G_WIDTH = 20, 50
-RECIPE = Recipe(batch_size=200, epochs=1_200, epoch_length=250, rate=1e-3, schedule="cosine")
-_DEVIATION = 0.01
-UNROLL = 5  # layers compiled in a row; all layers would take four times as long to compile
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Sizes, of LA as in the paper. deviation: of the first weights. unroll: layers
+    compiled in a row; all layers would take four times as long to compile."""
+
+    layers: int = 30
+    sublayers: int = 10
+    g_layers: int = 20
+    g_width: int = 50
+    p_layers: int = 24
+    p_degree: int = 6
+    deviation: float = 0.01
+    unroll: int = 5
+    p_unroll: int = 6
+
+
+_OPTIONS = _Options()
+
+
+def _recipe(epoch_length: int = 250, rate: float = 1e-3) -> Recipe:
+    return Recipe(
+        batch_size=200, epochs=1_200, epoch_length=epoch_length, rate=rate, schedule="cosine"
+    )
 
 
 def la_sympnet(sequences: Sequences, budget: Budget) -> Learned:
     """Learn linear and activation modules in turn, a linear one last."""
-    params = la_init(budget.key, sequences.dim, LAYERS, SUBLAYERS)
-    label = f"{LAYERS} layers of {SUBLAYERS} sublayers"
-    return learn_map(la_step, params, sequences, RECIPE, budget, label)
+    params = la_init(budget.key, sequences.dim, _OPTIONS.layers, _OPTIONS.sublayers)
+    label = f"{_OPTIONS.layers} layers of {_OPTIONS.sublayers} sublayers"
+    return learn_map(la_step, params, sequences, _recipe(), budget, label)
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3))
@@ -39,9 +68,9 @@ def la_init(key, dim: int, layers: int, sublayers: int):
     linear, active = jax.random.split(key)
     shape = (layers, sublayers, dim, dim)
     return {
-        "half": _DEVIATION * jax.random.normal(linear, shape, jnp.float32),
+        "half": _OPTIONS.deviation * jax.random.normal(linear, shape, jnp.float32),
         "shift": jnp.zeros((layers, 2 * dim), jnp.float32),
-        "active": _DEVIATION * jax.random.normal(active, (layers - 1, dim), jnp.float32),
+        "active": _OPTIONS.deviation * jax.random.normal(active, (layers - 1, dim), jnp.float32),
     }
 
 
@@ -55,7 +84,7 @@ def la_step(params, z):
 
     active = params["active"]
     modules = (matrices[:-1], params["shift"][:-1], active, _even(len(active)))
-    z, _ = jax.lax.scan(layer, z, modules, unroll=UNROLL)
+    z, _ = jax.lax.scan(layer, z, modules, unroll=_OPTIONS.unroll)
     return matrices[-1] @ z + params["shift"][-1]
 
 
@@ -86,9 +115,9 @@ def _linear(halves, dim: int):
 
 def g_sympnet(sequences: Sequences, budget: Budget) -> Learned:
     """Learn gradient modules: shears by the gradient of Σᵢ aᵢ F(kᵢ·q + bᵢ), F' the sigmoid."""
-    params = g_init(budget.key, sequences.dim, G_LAYERS, G_WIDTH)
-    label = f"{G_LAYERS} layers of width {G_WIDTH}"
-    return learn_map(g_step, params, sequences, RECIPE, budget, label)
+    params = g_init(budget.key, sequences.dim, _OPTIONS.g_layers, _OPTIONS.g_width)
+    label = f"{_OPTIONS.g_layers} layers of width {_OPTIONS.g_width}"
+    return learn_map(g_step, params, sequences, _recipe(), budget, label)
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3))
@@ -96,9 +125,9 @@ def g_init(key, dim: int, layers: int, width: int):
     """Draw parameters, float32: inner weights, biases, outer weights of each module."""
     inner, outer = jax.random.split(key)
     return {
-        "inner": _DEVIATION * jax.random.normal(inner, (layers, width, dim), jnp.float32),
+        "inner": _OPTIONS.deviation * jax.random.normal(inner, (layers, width, dim), jnp.float32),
         "bias": jnp.zeros((layers, width), jnp.float32),
-        "outer": _DEVIATION * jax.random.normal(outer, (layers, width), jnp.float32),
+        "outer": _OPTIONS.deviation * jax.random.normal(outer, (layers, width), jnp.float32),
     }
 
 
@@ -115,4 +144,45 @@ def g_step(params, z):
 
     inner = params["inner"]
     modules = (inner, params["bias"], params["outer"], _even(len(inner)))
-    return jax.lax.scan(layer, z, modules, unroll=UNROLL)[0]
+    return jax.lax.scan(layer, z, modules, unroll=_OPTIONS.unroll)[0]
+
+
+def p_sympnet(sequences: Sequences, budget: Budget) -> Learned:
+    """Learn ridge polynomials of the degrees 2 to 6."""
+    largest = float(np.max(np.sqrt(np.mean(sequences.z**2, axis=(0, 1)))))
+    params = p_init(budget.key, sequences.dim, _OPTIONS.p_layers, _OPTIONS.p_degree)
+    # High powers of states much larger than 1 would overflow before the training begins.
+    direction = np.asarray(params["direction"])
+    params["direction"] = direction / np.float32(max(1.0, largest))
+    label = f"{_OPTIONS.p_layers} ridge polynomials of degree {_OPTIONS.p_degree}"
+
+    def step(params, z):
+        return p_step(params, z, sequences.dt)
+
+    return learn_map(step, params, sequences, _recipe(500, 1e-2), budget, label)
+
+
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def p_init(key, dim: int, layers: int, degree: int):
+    """Draw parameters, float32: unit-sized directions, small coefficients of degrees 2, 3, ..."""
+    directions, coefficients = jax.random.split(key)
+    size = (2 * dim) ** -0.5
+    return {
+        "direction": size * jax.random.normal(directions, (layers, 2 * dim), jnp.float32),
+        "coefficient": 0.01 * jax.random.normal(coefficients, (layers, degree - 1), jnp.float32),
+    }
+
+
+def p_step(params, z, dt: float):
+    """Apply all layers in a row to z (2d,)."""
+
+    def layer(z, ridge):
+        direction, coefficients = ridge
+        at = direction @ z
+        slope = jnp.zeros_like(at)
+        for power in range(coefficients.shape[0], 0, -1):  # Horner: of degree power + 1
+            slope = (slope + (power + 1) * coefficients[power - 1]) * at
+        return z + dt * slope * apply_j(direction), None
+
+    layers = (params["direction"], params["coefficient"])
+    return jax.lax.scan(layer, z, layers, unroll=_OPTIONS.p_unroll)[0]
