@@ -23,11 +23,13 @@ class Evidence:
 
     In standard errors: significant: below it a coefficient may go; nothing: below it the
     coefficient goes without a look at held-out parts; scored: above it one that is omitted is
-    tried. gain: share of the held-out cost by which a change has to lower it. chance: standard
-    errors of a difference of held-out costs that chance makes. decided: odds below which two models
-    are as good; needed: odds below which a direction of friction is left out. log_odds: the largest
-    logarithm of odds that is stated. logarithm: of the ratio of likelihoods, that a model of
-    correlated residuals has to gain.
+    tried. gain: share of the held-out cost by which a change has to lower it; with two standard
+    errors of the paired differences in its place a term that is not there spoils the law of a
+    spring (random_recordings, draw 0), for small shares are what a wrong law gains. chance:
+    standard errors of a difference of held-out costs that chance makes. decided: odds below which
+    two models are as good; needed: odds below which a direction of friction is left out. log_odds:
+    the largest logarithm of odds that is stated. logarithm: of the ratio of likelihoods, that a
+    model of correlated residuals has to gain.
     """
 
     significant: float = 4.0

@@ -18,9 +18,9 @@ import numpy as np
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import DRY, LINEAR, MAX_POWER, QUADRATIC
 from gfnn_jax.families.text import plain
+from gfnn_jax.models.lagrangians.libraries import SINE
 from gfnn_jax.models.lagrangians.structure import Loss, Row, with_powers
 
-_SINE = -np.pi / 2
 Node = ast.expr
 
 
@@ -128,7 +128,7 @@ class _Reader(NamedTuple):
                 m = [multiples.get(name, 0) for name in self.positions]
                 if set(multiples) - set(self.positions) or not any(m):
                     raise self.refused(text)
-                wave = tuple(m), phase + (_SINE if _called(factor) == "sin" else 0.0)
+                wave = tuple(m), phase + (SINE if _called(factor) == "sin" else 0.0)
             else:
                 raise self.refused(text)
         if sum(k) > 2 or max(n, default=0) > MAX_POWER or min([*k, *n]) < 0:

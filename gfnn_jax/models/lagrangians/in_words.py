@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -34,11 +35,24 @@ from gfnn_jax.models.lagrangians.text import (
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
-_CLEAR = 3.0  # standard errors of a gain, below which its input has no visible effect
-_MANY = 3  # functions of parameters in a term, of which laws of physics have fewer
-_FOLLOWED = 90.0  # % of a channel's variation, of which a law that explains it follows more
-_ALIKE = 0.99  # correlation of two coefficients that the record cannot tell apart
 
+@dataclasses.dataclass(frozen=True)
+class WarningOptions:
+    """Limits at which a law is not to be relied on (`benchmarks/as_a_user.py`).
+
+    clear: standard errors of a gain, below which its input has no visible effect. many: functions
+    of parameters in a term, of which laws of physics have fewer. followed: % of a channel's
+    variation, of which a law that explains it follows more. alike: correlation of two coefficients
+    that the record cannot tell apart.
+    """
+
+    clear: float = 3.0
+    many: int = 3
+    followed: float = 90.0
+    alike: float = 0.99
+
+
+OPTIONS = WarningOptions()
 Gains = dict[str, dict[str, tuple[float, float]]]
 
 
@@ -179,7 +193,7 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
         "no noise": "a force, an input or a change of the sensor is missing. law.png (fit.traces) "
         "shows when"
         for name, one in found.items()
-        if one.fit_percent < _FOLLOWED and not one.white
+        if one.fit_percent < OPTIONS.followed and not one.white
     }
     if not best.fit.fitted.converged:
         flaws["the fit of the law did not converge"] = (
@@ -196,10 +210,10 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
 def _not_seen(gains: Gains) -> list[str]:
     """Warnings about inputs without a force."""
     return [
-        f"no force of the input {u} is seen: its gain is within {_CLEAR:g} standard errors of 0. "
-        f"Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
+        f"no force of the input {u} is seen: its gain is within {OPTIONS.clear:g} standard errors "
+        f"of 0. Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
         for u, forces in gains.items()
-        if all(abs(gain) < _CLEAR * error for gain, error in forces.values())
+        if all(abs(gain) < OPTIONS.clear * error for gain, error in forces.values())
     ]
 
 
@@ -219,7 +233,7 @@ def about_parameters(
                 "law depends on it, as far as this recording shows"
             )
     count = len({tuple(args_of(recording, run, names).tolist()) for run in recording.runs})
-    if powers is not None and most_functions >= min(count, _MANY):
+    if powers is not None and most_functions >= min(count, OPTIONS.many):
         found.append(
             f"a term has {most_functions} functions of {', '.join(names)}, and the runs are of "
             f"{count} values: other functions agree there, and forecasts between and beyond may "
@@ -253,7 +267,7 @@ def _alike(fit: LawFit, lagrangian: Formula, friction: Formula) -> tuple[str, ..
     only = (f"{', '.join(together)}: {ONLY_TOGETHER}",) if together else ()
     return only + tuple(
         f"{listed[i]} and {listed[j]} (correlation {rho:+.3f})"
-        for i, j, rho in fit.linearised.collinear(_ALIKE)
+        for i, j, rho in fit.linearised.collinear(OPTIONS.alike)
     )
 
 

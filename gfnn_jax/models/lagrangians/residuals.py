@@ -14,8 +14,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-_LAGS = 20  # nodes, up to which residuals are correlated
-_BEYOND = 3.0  # standard deviations of a correlation that is no accident, of the largest of many
+
+@dataclasses.dataclass(frozen=True)
+class WhitenessOptions:
+    """Limits of the test (`benchmarks/as_a_user.py`).
+
+    lags: nodes, up to which residuals are correlated. beyond: standard deviations of a correlation
+    that is no accident, of the largest of many.
+    """
+
+    lags: int = 20
+    beyond: float = 3.0
+
+
+OPTIONS = WhitenessOptions()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,14 +95,17 @@ def whiteness(
     for k, name in enumerate(channels):
         r = [np.clip(trace.residuals[:, k], -5, 5) for trace in traces]  # outliers count as five σ
         count = sum(int(np.isfinite(one).sum()) for one in r)
-        rho = np.array([_correlation(r, r, lag) for lag in range(_LAGS + 1)])
-        bound = _BEYOND / np.sqrt(max(count, 1))
+        rho = np.array([_correlation(r, r, lag) for lag in range(OPTIONS.lags + 1)])
+        bound = OPTIONS.beyond / np.sqrt(max(count, 1))
         colour = 1 + 2 * float(np.sum(rho[1:].clip(min=0)))
         of_inputs = {}
         for j, u in enumerate(inputs):
             mean = np.mean(np.concatenate([trace.inputs[:, j] for trace in traces]))
             series = [trace.inputs[:, j] - mean for trace in traces]
-            both = {lag: _correlation(series, r, lag) for lag in range(-_LAGS // 4, _LAGS + 1)}
+            both = {
+                lag: _correlation(series, r, lag)
+                for lag in range(-OPTIONS.lags // 4, OPTIONS.lags + 1)
+            }
             best = max(both, key=lambda lag: abs(both[lag]))
             significant = bool(abs(both[best]) > bound * np.sqrt(colour))
             of_inputs[u] = OfInput(both[best], best * step, significant)
@@ -99,7 +114,7 @@ def whiteness(
         percent = 100 * (1 - np.sqrt(np.nanmean(left**2)) / max(np.nanstd(measured), 1e-300))
         white = bool(np.all(np.abs(rho[1:]) < bound))
         found[name] = Whiteness(
-            step * np.arange(_LAGS + 1), rho, bound, white, of_inputs, float(percent)
+            step * np.arange(OPTIONS.lags + 1), rho, bound, white, of_inputs, float(percent)
         )
     return found
 

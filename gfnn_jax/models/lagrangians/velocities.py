@@ -26,9 +26,23 @@ from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.signals.derivatives import difference
 
-_WRONG = 0.2  # of the noise, that scale, lag and bias may make up
-_CHANCE = 3.0  # standard deviations of what they make up by accident
-_COLOURED, _NEAR = 0.2, 8  # correlation of noise, of so many neighbours, that is no accident
+
+@dataclasses.dataclass(frozen=True)
+class VelocityOptions:
+    """Limits at which measured velocities are used (`benchmarks/measured.py`).
+
+    wrong: of the noise, that scale, lag and bias may make up. chance: standard deviations of what
+    they make up by accident. coloured: correlation of noise, of ``near`` neighbours, that is no
+    accident.
+    """
+
+    wrong: float = 0.2
+    chance: float = 3.0
+    coloured: float = 0.2
+    near: int = 8
+
+
+OPTIONS = VelocityOptions()
 
 
 class Velocity(NamedTuple):
@@ -95,9 +109,9 @@ def velocities(recording: Recording, fit: LawFit) -> dict[str, Velocity]:
         tau = correlation_time(left[..., None] / sigma)
         error = sigma * np.sqrt(tau) * problem.errors
         share = float(np.sqrt(np.mean(made[finite] ** 2))) / sigma
-        chance = _CHANCE / np.sqrt(finite.sum())
-        white = _colour(left) < max(_COLOURED, chance) and not _copied(recording, i, name)
-        allowed = max(_WRONG, chance * np.sqrt(3 * tau))
+        chance = OPTIONS.chance / np.sqrt(finite.sum())
+        white = _colour(left) < max(OPTIONS.coloured, chance) and not _copied(recording, i, name)
+        allowed = max(OPTIONS.wrong, chance * np.sqrt(3 * tau))
         found[name] = Velocity(
             (1 + float(beta[0]), float(error[0])),
             (-float(beta[1]), float(error[1])),
@@ -112,7 +126,7 @@ def velocities(recording: Recording, fit: LawFit) -> dict[str, Velocity]:
 def _colour(left: np.ndarray) -> float:
     """The largest correlation of noise (A, L) with that of near nodes, of either sign."""
     power = np.nanmean(left**2)
-    near = range(1, min(_NEAR, left.shape[1] - 1) + 1)
+    near = range(1, min(OPTIONS.near, left.shape[1] - 1) + 1)
     return max(abs(float(np.nanmean(left[:, k:] * left[:, :-k]) / power)) for k in near)
 
 
