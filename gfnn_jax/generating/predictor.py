@@ -26,15 +26,29 @@ from gfnn_jax.phase_space import sizes
 
 # A guess this close, in units of the data's spread, is the root of roundoff: one update is left.
 CLOSE = 5e-8
-# That update leaves the square of the guess's error, the same at every step: below the floor, but
-# more than the roundoff of a million steps. Guesses closer than this leave less (Hénon–Heiles, S of
-# degree 8: the energy error grows with the 0.55th power of the steps instead of the 0.86th).
-_STEADY = 1e-8
-# The model extends a little outside the box, as rollouts of states at its edge do, but not to where
-# T_n of its own degree is larger than 250.
-_REACH, _LARGEST = 1.2, 250.0
-_MOST_DEGREE, _MOST_TERMS, _ROWS = 20, 250, 4_000
-_RIDGE = 1e-13  # relative to a column's size: data on a surface leave some products undetermined
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of predictors (benchmarks/speed.py)."""
+
+    # That update leaves the square of the guess's error, the same at every step: below the floor,
+    # but more than the roundoff of a million steps. Guesses closer than this leave less
+    # (Hénon–Heiles, S of degree 8: the energy error grows with the 0.55th power of the steps
+    # instead of the 0.86th).
+    steady: float = 1e-8
+    # The model extends a little outside the box, as rollouts of states at its edge do, but not to
+    # where T_n of its own degree is larger than 250.
+    reach: float = 1.2
+    largest: float = 250.0
+    most_degree: int = 20
+    most_terms: int = 250
+    rows: int = 4_000
+    # relative to a column's size: data on a surface leave some products undetermined
+    ridge: float = 1e-13
+
+
+OPTIONS = Options()
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("family", "matrices"), meta_fields=())
@@ -72,7 +86,7 @@ class PolynomialModel:
     @property
     def reach(self) -> np.ndarray:
         """Largest magnitude of each variable at which the polynomials are evaluated."""
-        reach = min(_REACH, math.cosh(math.acosh(_LARGEST) / self.family.degree))
+        reach = min(OPTIONS.reach, math.cosh(math.acosh(OPTIONS.largest) / self.family.degree))
         return np.where(self.family.inputs.is_angle, np.inf, reach)
 
     def of_variables(self, x):
@@ -125,7 +139,7 @@ def fit_predictors(
     the variables of states, as ``box_inputs``. The degree rises until the model is close enough or
     no longer improves, because of noise or of the number of pairs.
     """
-    rows = np.linspace(0, len(y0) - 1, min(_ROWS, len(y0))).astype(int)
+    rows = np.linspace(0, len(y0) - 1, min(OPTIONS.rows, len(y0))).astype(int)
     y0, y1, args = y0[rows], y1[rows], None if args is None else args[rows]
     args, back = (dt[rows, None], -dt[rows, None]) if np.ndim(dt) else (args, args)
 
@@ -172,14 +186,14 @@ def _by_degree(inputs: Inputs, x, target, unit) -> list[tuple[PolynomialModel, f
     One factorisation serves all degrees. Returns the models with their held-out errors.
     """
     held = np.arange(len(x)) % 5 == 0
-    most = min(_MOST_TERMS, len(x) // 3)
+    most = min(OPTIONS.most_terms, len(x) // 3)
     top = 1
-    while top < _MOST_DEGREE and Products(inputs, top + 1).num_parameters <= most:
+    while top < OPTIONS.most_degree and Products(inputs, top + 1).num_parameters <= most:
         top += 1
     largest = _basis(Products(inputs, top))
     design = _design(largest, x)
     width = design.shape[1]
-    ridge = _RIDGE * np.linalg.norm(design[~held], axis=0)
+    ridge = OPTIONS.ridge * np.linalg.norm(design[~held], axis=0)
     ridge = np.where(ridge > 0, ridge, 1.0)  # a product that vanishes on all states gets 0
     rows = np.vstack([design[~held], np.diag(ridge)])
     q, r = np.linalg.qr(rows)
@@ -198,7 +212,7 @@ def _by_degree(inputs: Inputs, x, target, unit) -> list[tuple[PolynomialModel, f
         matrices = _basis(family).placed(solution[1:].T)
         matrices[:, 0, 0] = solution[0]
         found.append((PolynomialModel(family, matrices), float(error)))
-        if error < _STEADY:
+        if error < OPTIONS.steady:
             break
     return found
 

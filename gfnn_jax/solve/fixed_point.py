@@ -9,6 +9,7 @@ data. A lane that has converged is frozen.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -23,18 +24,28 @@ from gfnn_jax.solve.newton import Evaluation, floors, largest, relative, settled
 from gfnn_jax.solve.status import NON_FINITE, NOT_CONVERGED, OK, Info
 
 MOST = 100  # updates, and those of a derivative: a contraction of 0.7 reaches roundoff
-# Near roundoff a lane continues while two updates (q moves p and p moves q) leave no more than this
-# part of its residual.
-_SHRINKS = 0.7
-# A lane whose error after _FIRST or more updates n is not below _SLOW^n has Newton updates instead,
-# each of which costs as much as some fifty.
-_SLOW, _FIRST = 0.8, 10
-_MOST_NEWTON = 40  # updates of Newton's method
-_LINEAR = 1e-4  # relative residual of their linear systems
-_SHORTEST = 2.0**-20  # smallest part of a Newton step
-_CLOSE = 1e-15  # residual relative to its terms, in NumPy: roundoff
-_SOLVED = 1e-14  # relative residual above which a lane has Newton updates in NumPy
-_STALE = 4  # updates in NumPy without a better lane, after which the iteration ends
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the fixed-point iteration (benchmarks/many.py)."""
+
+    # Near roundoff a lane continues while two updates (q moves p and p moves q) leave no more
+    # than this part of its residual.
+    shrinks: float = 0.7
+    # A lane whose error after ``first`` or more updates n is not below slow^n has Newton updates
+    # instead, each of which costs as much as some fifty.
+    slow: float = 0.8
+    first: int = 10
+    most_newton: int = 40  # updates of Newton's method
+    linear: float = 1e-4  # relative residual of their linear systems
+    shortest: float = 2.0**-20  # smallest part of a Newton step
+    close: float = 1e-15  # residual relative to its terms, in NumPy: roundoff
+    solved: float = 1e-14  # relative residual above which a lane has Newton updates in NumPy
+    stale: int = 4  # updates in NumPy without a better lane, after which the iteration ends
+
+
+OPTIONS = Options()
 
 
 @runtime_checkable
@@ -96,11 +107,11 @@ def iterate(
         x = state.x - unit * state.residual
         evaluation = equation.evaluate(shared, lanes, x)
         error, iterations = floors(evaluation), state.iterations + 1
-        further = (error > settled) | ((error > 1.0) & (error < _SHRINKS * state.earlier))
+        further = (error > settled) | ((error > 1.0) & (error < OPTIONS.shrinks * state.earlier))
         fast = (
-            (iterations < _FIRST)
+            (iterations < OPTIONS.first)
             | (error <= settled)
-            | (error < _SLOW ** iterations.astype(error.dtype) * start)
+            | (error < OPTIONS.slow ** iterations.astype(error.dtype) * start)
         )
         new = _Iterate(
             x,
@@ -129,7 +140,7 @@ def newton_krylov(
     """
     unit, settled = equation.unit(shared, lanes), settled_floors(guess.dtype)
     _, aux, info = done
-    most, infinite = info.iterations + _MOST_NEWTON, jnp.full_like(guess, jnp.inf)
+    most, infinite = info.iterations + OPTIONS.most_newton, jnp.full_like(guess, jnp.inf)
     begun = _Damped(  # the first step is zero and leads to the guess
         guess,
         infinite,
@@ -149,7 +160,7 @@ def newton_krylov(
         further = (error > settled) | ((error > 1.0) & (error < 0.5 * state.error))
         further = better & further & (iterations < most)
         rhs = jnp.where(further[:, None], evaluation.residual, 0.0)
-        step = krylov.differentiable(equation.product(shared, lanes, x), rhs, _LINEAR)
+        step = krylov.differentiable(equation.product(shared, lanes, x), rhs, OPTIONS.linear)
         new = _Damped(
             x,
             evaluation.residual,
@@ -161,7 +172,7 @@ def newton_krylov(
             further,
         )
         # Close to the floor only the full step makes sense: what is left is roundoff.
-        shortest = jnp.where(state.error <= settled, 1.0, _SHORTEST)
+        shortest = jnp.where(state.error <= settled, 1.0, OPTIONS.shortest)
         halved = state._replace(part=0.5 * state.part, open=state.part[:, 0] > shortest)
         return where(better, new, where(state.open, halved, state))
 
@@ -217,17 +228,19 @@ def refine(equation: Contraction, shared: Any, lanes: Any, guess: Any):
         unit, stale = equation.unit(shared, lanes), 0
         new = best = evaluated(guess)
         for _ in range(MOST):
-            if stale == _STALE or (best[2] <= _CLOSE).all():
+            if stale == OPTIONS.stale or (best[2] <= OPTIONS.close).all():
                 break
             new = evaluated(new[0] - unit * new[1].residual)
             better = new[2] < best[2]
             best, stale = where(better, new, best), 0 if better.any() else stale + 1
-        best = where(best[2] <= _SOLVED, best, evaluated(guess))
-        while (left := ~(best[2] <= _SOLVED)).any():
+        best = where(best[2] <= OPTIONS.solved, best, evaluated(guess))
+        while (left := ~(best[2] <= OPTIONS.solved)).any():
             product = equation.product(shared, lanes, best[0])
-            step = krylov.solve(product, np.where(left[:, None], best[1].residual, 0.0), _LINEAR)
+            step = krylov.solve(
+                product, np.where(left[:, None], best[1].residual, 0.0), OPTIONS.linear
+            )
             new = evaluated(best[0] - unit * step)
-            better = left & (new[2] < _SHRINKS * best[2])
+            better = left & (new[2] < OPTIONS.shrinks * best[2])
             best = where(better, new, best)
             if not better.any():
                 break

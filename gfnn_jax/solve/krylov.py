@@ -10,6 +10,7 @@ Memory: 2 `SPACE` vectors for each lane.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,11 +20,21 @@ import numpy as np
 from gfnn_jax.arrays import namespace
 
 SPACE = 20  # directions before a restart
-_NOTHING = 1e-12  # an image that shrinks to this part is roundoff: the space is exhausted
-_SHRUNK = 0.8  # a residual that shrinks to this part begins the next direction
-_RESTART = 1e-8  # relative residual at which a solve to roundoff restarts
-_MOST = 12  # restarts of a system that is solved to roundoff
-_STALLED = 0.5  # a restart that leaves more than this part of the residual has met roundoff
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of GMRES and Newton–Krylov (benchmarks/many.py)."""
+
+    nothing: float = 1e-12  # an image that shrinks to this part is roundoff: the space is exhausted
+    shrunk: float = 0.8  # a residual that shrinks to this part begins the next direction
+    restart: float = 1e-8  # relative residual at which a solve to roundoff restarts
+    most: int = 12  # restarts of a system that is solved to roundoff
+    # a restart that leaves more than this part of the residual has met roundoff
+    stalled: float = 0.5
+
+
+OPTIONS = Options()
 
 
 class _Search(NamedTuple):
@@ -56,13 +67,13 @@ def solve(product: Callable, rhs: Any, tolerance: float):
             along = xp.sum(s.pairs[:, 1] * pair[None, 1], axis=-1)
             pair = pair - xp.sum(along[:, None, :, None] * s.pairs, axis=0)
         size = norm_of(pair[1])
-        pair = _unit(pair, xp.where(size > _NOTHING * norm_of(image), size, 0.0)[None])
+        pair = _unit(pair, xp.where(size > OPTIONS.nothing * norm_of(image), size, 0.0)[None])
         along = xp.sum(s.residual * pair[1], axis=-1)
         moved = xp.where(s.norm > goal, along, 0.0)[None, :, None] * pair
         residual = s.residual - moved[1]
         norm = norm_of(residual)
         here = (xp.arange(SPACE) == s.count).reshape(-1, 1, 1, 1)
-        shrunk = (norm < _SHRUNK * s.norm)[:, None]
+        shrunk = (norm < OPTIONS.shrunk * s.norm)[:, None]
         return _Search(
             s.x + moved[0],
             residual,
@@ -93,14 +104,14 @@ def solve_to_roundoff(product: Callable, rhs: Any):
     def solved(product, rhs):
         def goes_on(state):
             _, _, norm, earlier, count = state
-            return (count < _MOST) & jax.numpy.any(norm < _STALLED * earlier)
+            return (count < OPTIONS.most) & jax.numpy.any(norm < OPTIONS.stalled * earlier)
 
         def again(state):
             x, residual, norm, earlier, count = state
-            tried = x + solve(product, residual, _RESTART)
+            tried = x + solve(product, residual, OPTIONS.restart)
             left = rhs - product(tried)
             new = norm_of(left)
-            better = (norm < _STALLED * earlier) & (new < norm)
+            better = (norm < OPTIONS.stalled * earlier) & (new < norm)
             return (
                 jax.numpy.where(better[:, None], tried, x),
                 jax.numpy.where(better[:, None], left, residual),

@@ -25,7 +25,22 @@ from gfnn_jax.coordinates import Coordinates, lift, lift_sites, nearest_image
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError
 
-_EVEN = 0.01  # of a time step, by which times may miss an even grid
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the linear problem of S(q, Q), and of its data (benchmarks/positions.py)."""
+
+    even: float = 0.01  # of a time step, by which times may miss an even grid
+    sampled: int = 2_000  # positions by which the mixed term is taken
+    # of the largest singular value: a smaller one is a combination that nothing tells
+    null: float = 1e-13
+    rows: int = 4_096  # of a part that is folded, and four for each term
+    # of a displacement, by which mixed derivatives of terms are differences
+    difference: float = 1e-4
+
+
+OPTIONS = Options()
+
 _HALF_TURN = np.pi  # moves of two lifts differ by whole turns
 _ONE_TURN = 2 * np.pi * (1 + 1e-3)  # a column that ranges over more is a lift
 
@@ -114,7 +129,7 @@ def triples_of(recording: Recording, *, sites: bool = False) -> Triples:
         )
     dt = float(np.median(np.concatenate(steps)))
     off = np.abs(np.concatenate(steps) - dt).max()
-    if off > _EVEN * dt:
+    if off > OPTIONS.even * dt:
         raise FitError(
             f"{recording.source}: a map needs positions at even times; the step is {dt:g} s, and "
             f"some are off by {off:.2g} s. A law takes uneven times: --learn lagrangian (learn=)"
@@ -138,12 +153,6 @@ def _lifted(triples: Triples, sites: bool) -> Triples:
     z0, z1, _, _ = (lift_sites if sites else lift)(*states, Coordinates("positions", angles))
     middle, coming, going = z0[:, :dim], z0[:, dim:], z1[:, dim:]
     return dataclasses.replace(triples, before=middle - coming, middle=middle, after=middle + going)
-
-
-_SAMPLED = 2_000  # positions by which the mixed term is taken
-_NULL = 1e-13  # of the largest singular value: a smaller one is a combination that nothing tells
-_ROWS = 4_096  # of a part that is folded, and four for each term
-_DIFFERENCE = 1e-4  # of a displacement, by which mixed derivatives of terms are differences
 
 
 class Solved(NamedTuple):
@@ -187,7 +196,7 @@ def solve(family: Any, triples: Triples) -> Solved:
     # The changes of S that leave the mixed term as it is: all but the first column of Q.
     others = np.linalg.qr(np.column_stack([mixed, np.eye(len(mixed))]))[0][:, 1 : len(mixed)]
     u, values, v = np.linalg.svd(triangle @ others, full_matrices=False)
-    determined = values > _NULL * values[0]
+    determined = values > OPTIONS.null * values[0]
     along = u[:, determined].T @ (triangle @ free)
     coefficients = free - others @ (v[determined].T @ (along / values[determined]))
     condition = float(values[0] / values[determined][-1])
@@ -208,7 +217,7 @@ def _mixed_terms(family: Any, triples: Triples) -> np.ndarray:
     """Mean of −h² ∂²/∂q_i∂Q_i of every term of S, weighed as above: (m,)."""
     dim, w, size = triples.dim, _sample(triples), displacement(triples)
     total = np.zeros(family.num_parameters)
-    for i, step in enumerate(_DIFFERENCE * size):
+    for i, step in enumerate(OPTIONS.difference * size):
         off = np.zeros(2 * dim)
         off[i] = step
         ahead, behind = (family.term_gradients(v)[:, dim + i] for v in (w + off, w - off))
@@ -222,18 +231,19 @@ def _free_motion(family: Any, triples: Triples) -> np.ndarray:
     moves = (w[:, triples.dim :] - w[:, : triples.dim]) / triples.dt**2
     gradients = family.term_gradients(w)
     target = np.concatenate([-moves, moves], axis=1)
-    return np.linalg.lstsq(gradients.reshape(target.size, -1), target.ravel(), rcond=_NULL)[0]
+    rows = gradients.reshape(target.size, -1)
+    return np.linalg.lstsq(rows, target.ravel(), rcond=OPTIONS.null)[0]
 
 
 def _sample(triples: Triples) -> np.ndarray:
     """Sample of the points w = (q, Q)."""
-    return triples.ends[:: max(1, 2 * len(triples) * triples.dim // _SAMPLED)]
+    return triples.ends[:: max(1, 2 * len(triples) * triples.dim // OPTIONS.sampled)]
 
 
 def _folded(family: Any, triples: Triples) -> np.ndarray:
     """The triangular factor (m, m) of all equations, part by part: memory stays that of a part."""
     m, size = family.num_parameters, displacement(triples)
-    part = max(1, (4 * m + _ROWS) // triples.dim)
+    part = max(1, (4 * m + OPTIONS.rows) // triples.dim)
     rows = np.empty((0, m))
     for first in range(0, len(triples), part):
         new = equations(family, triples.take(slice(first, first + part)), size)
