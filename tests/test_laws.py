@@ -332,7 +332,7 @@ def test_a_map_that_is_far_cheaper_than_the_law_is_fitted_to_pairs_of_the_law(pa
     found = gfnn.fit(few, tolerance=1e-5)
     assert found.chosen.learns == "map"
     assert found.chosen.num_parameters * 3 > 60 * 4  # more than the pairs alone determine
-    assert str(found) == FORMULA
+    assert str(found.hamiltonian) == FORMULA
     assert "drawn from H" in found.ended
     fresh = henon_heiles_pairs(100, seed=5)
     error = np.asarray(found.map.step(fresh.z0)[0]) - fresh.z1
