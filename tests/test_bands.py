@@ -175,7 +175,7 @@ def test_samples_roll_back_to_where_they_began(noisy):
     shared, _ = fit.map.sharded(1).rollout(ends[0], -20)
     alone, _ = fit.map.rollout(ends[0], -20)
     np.testing.assert_allclose(shared, alone, rtol=0, atol=1e-14)
-    with pytest.raises(ValueError, match="no inputs of a rollout backwards"):
+    with pytest.raises(ValueError, match="inputs"):
         samples.rollout(z, -2, inputs=np.ones((2, 1)))
 
 

@@ -1,12 +1,12 @@
 """Results that are older than their code are found, told and measured again."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from other_python import run_python
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
@@ -120,14 +120,6 @@ def test_every_result_of_the_repository_has_a_study():
 
 def test_a_study_tells_its_commit_and_files():
     text = "import harness, json; print(json.dumps(harness.circumstances()['code']))"
-    here = commits.HERE
-    done = subprocess.run(
-        [sys.executable, "-c", text],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(here), str(here.parent)])},
-        check=True,
-    )
-    code = json.loads(done.stdout)
+    code = json.loads(run_python(text))
     assert {"gfnn_jax/phase_space.py", "benchmarks/harness.py"} <= set(code["files"].split())
     assert "gfnn_jax/cli.py" not in code["files"]

@@ -51,7 +51,7 @@ def test_an_interrupted_comparison_keeps_what_is_finished_and_reports_all(small,
     kept = json.loads((out.with_name("out.partial") / "hnn.json").read_text())
     with pytest.raises(InputError, match="an unfinished comparison"):
         compare(out)
-    with pytest.raises(InputError, match="belongs to another comparison: seed differ"):
+    with pytest.raises(InputError, match="seed"):
         compare(out, resume=True, seed=1)
     told = []
     compared = compare(out, resume=True, progress=Progress(told.append))
@@ -99,7 +99,7 @@ def test_which_scenes_are_separable():
 
 
 def test_a_scene_with_parameters_is_not_compared(tmp_path):
-    with pytest.raises(InputError, match="has parameters, which the other methods do not take"):
+    with pytest.raises(InputError, match="parameters"):
         comparison.compare("pendulum-length", Output(tmp_path / "c"))
 
 

@@ -1,13 +1,11 @@
 """Figures show the arrays they were given, are labelled, and leave matplotlib's globals alone."""
 
-import subprocess
-import sys
-
 import matplotlib
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.patches import StepPatch
+from other_python import run_python
 
 from gfnn_jax.evaluate import figures, metrics
 
@@ -90,7 +88,7 @@ def test_pyplot_is_never_imported(tmp_path):
         "figures.save(ax.figure, sys.argv[1])\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
-    subprocess.run([sys.executable, "-c", code, str(tmp_path / "figure.png")], check=True)
+    run_python(code, tmp_path / "figure.png")
 
 
 def test_error_growth_shows_the_mean_and_a_band_that_stays_positive():

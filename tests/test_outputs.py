@@ -50,7 +50,7 @@ def test_the_current_folder_cannot_be_exchanged(tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     for name in (".", "..", tmp_path, "../here"):
-        with pytest.raises(InputError, match="is the current folder or one above it"):
+        with pytest.raises(InputError, match="current folder"):
             outputs.ensure_new(name, True, folder=True)
 
 
@@ -142,7 +142,7 @@ def test_an_interrupted_job_says_what_it_keeps(tmp_path):
     assert stop(tmp_path) == [f"{tmp_path}/out.partial keeps part: --resume goes on with it"]
     with pytest.raises(InputError, match="an unfinished job"), job(tmp_path):
         pass
-    with pytest.raises(InputError, match="belongs to another job: seed, more differ"):
+    with pytest.raises(InputError, match="seed, more"):
         stop(tmp_path, resume=True, seed=1, more=2)
     with job(tmp_path, resume=True) as folder:
         assert kept(folder) == ["part"]

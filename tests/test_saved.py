@@ -144,15 +144,15 @@ def test_a_scene_of_ones_own(tmp_path):
 
     saved = a_map(*polynomial(features=features))
     mine = Scene("mine", "a test", 2, 0.1, DrawnFrom(lambda key, num: STATES), features=features)
-    with pytest.raises(InputError, match="features of a scene that is not known"):
+    with pytest.raises(InputError, match="features"):
         models.save(saved, tmp_path / "m")
     assert not (tmp_path / "m").exists()
     models.save(saved, tmp_path / "m", scene=mine)
-    with pytest.raises(InputError, match="learned in the scene 'mine', which the package has not"):
+    with pytest.raises(InputError, match="'mine'"):
         models.load(tmp_path / "m")
-    with pytest.raises(InputError, match="learned in the scene 'mine', not in 'two-body'"):
+    with pytest.raises(InputError, match=r"'mine'.*'two-body'"):
         models.load(tmp_path / "m", scene=two_body())
-    with pytest.raises(InputError, match="needs the features of its scene"):
+    with pytest.raises(InputError, match="features"):
         models.load(tmp_path / "m", scene=dataclasses.replace(mine, features=None))
     assert jax.tree.structure(models.load(tmp_path / "m", mine)) == jax.tree.structure(saved)
 
@@ -161,7 +161,7 @@ def test_a_function_of_ones_own_is_refused(tmp_path):
     def scalar(params, w):
         return params * (w @ w)
 
-    with pytest.raises(InputError, match="a function of your own cannot be saved"):
+    with pytest.raises(InputError, match="function"):
         models.save(a_map(scalar, jnp.asarray(0.1)), tmp_path / "m")
     assert not (tmp_path / "m").exists()
 

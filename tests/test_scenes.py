@@ -299,9 +299,9 @@ def test_names_and_mistakes():
         assert "\n" not in scenes.make(name).purpose
     assert scenes.make("two-body", dt=0.25).dt == 0.25
     assert scenes.make("standard-map-regular", dt=1.0).dt == 1.0
-    with pytest.raises(ValueError, match=r"unknown scene 'twobody', did you mean 'two-body'\?"):
+    with pytest.raises(ValueError, match=r"'two-body'"):
         scenes.make("twobody")
-    with pytest.raises(ValueError, match="unknown scene 'xyz'; scenes: driven-pendulum, "):
+    with pytest.raises(ValueError, match=r"'xyz'.*driven-pendulum"):
         scenes.make("xyz")
     with pytest.raises(ValueError, match=r"its dt is 1, got 0\.5"):
         scenes.make("standard-map-chaotic", dt=0.5)
@@ -309,12 +309,12 @@ def test_names_and_mistakes():
         scenes.make("henon-heiles-section", dt=2.0)
     assert scenes.make("driven-pendulum", dt=4 * math.pi).dt == scenes.driven_pendulum(2).dt
     for dt in (3.0, 0.1, 6.2832):
-        with pytest.raises(ValueError, match=r"whole number of periods of 6\.2831853\d*, got"):
+        with pytest.raises(ValueError, match=r"6\.2831853"):
             scenes.make("driven-pendulum", dt=dt)
     for dt in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="finite and > 0"):
             scenes.make("pcr3bp", dt=dt)
-    with pytest.raises(ValueError, match="tolerance must be finite and > 0, got 0"):
+    with pytest.raises(ValueError, match="tolerance"):
         dataclasses.replace(scenes.two_body(), tolerance=0.0)
     for energy in (0.0, 0.2, math.nan):
         with pytest.raises(ValueError, match="energy must be"):

@@ -242,10 +242,10 @@ def test_a_scene_with_a_parameter():
         dataclasses.replace(scene, dt=pairs.dt[0]), pairs.z0[:1], 1, params=length[:1]
     )
     np.testing.assert_allclose(later[0, 1], pairs.z1[0], rtol=1e-12)
-    with pytest.raises(ValueError, match="expected params l for the scene pendulum-length"):
+    with pytest.raises(ValueError, match="params l"):
         tr.reference_trajectories(scene, pairs.z0, 1)
     for unfit in (scenes.standard_map(), scenes.driven_pendulum()):
-        with pytest.raises(ValueError, match=r"a scene with a flow; got dt from 0\.1 to 0\.2"):
+        with pytest.raises(ValueError, match=r"dt from 0\.1 to 0\.2"):
             draws.sample_pairs(unfit, 5, key, dt_range=(0.1, 0.2))
 
 
@@ -346,7 +346,7 @@ def test_a_hundred_thousand_pairs_are_finite():
 def test_float32_is_refused():
     jax.config.update("jax_enable_x64", False)
     try:
-        with pytest.raises(RuntimeError, match=r"needs float64: call jax\.config\.update"):
+        with pytest.raises(RuntimeError, match=r"float64"):
             draws.sample_pairs(scenes.two_body(), 2, KEY)
     finally:
         jax.config.update("jax_enable_x64", True)
