@@ -335,7 +335,7 @@ def test_a_map_without_all_images_is_still_given(monkeypatch):
 
 
 def test_no_time_at_all_leaves_the_linear_map_and_says_so():
-    with pytest.warns(gfnn.FitWarning, match="time"):
+    with pytest.warns(gfnn.FitWarning, match="no time"):
         fit = gfnn.fit(pendulum_pairs(), max_seconds=1e-9)
     assert fit.chosen.label == "linear"
 
