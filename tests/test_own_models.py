@@ -163,7 +163,7 @@ def test_a_term(tmp_path):
 
 @pytest.mark.parametrize("learn", ["map", "hamiltonian"])
 def test_a_noise_model_is_of_recordings(pairs, learn):
-    with pytest.raises(gfnn.FitError, match="of a recording"):
+    with pytest.raises(gfnn.FitError, match="loss: not options of"):
         gfnn.fit(pairs, SCENE, learn=learn, loss=own_module.Normal())
 
 
