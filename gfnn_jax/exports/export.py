@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import io
+import json
 import re
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from jax import export as exporting
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports.c_source import c_source
-from gfnn_jax.exports.stablehlo import stablehlo
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.phase_space import require_x64
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
 
 SUFFIXES = {"c": ".c", "stablehlo": ".zip"}
@@ -100,3 +105,36 @@ def _about(folder: Path | None) -> dict[str, Any]:
         if isinstance(inside, Mapping) and inside.get(key) not in (None, {}):
             about[title] = inside[key]
     return about
+
+
+PLATFORMS = ("cpu", "cuda")
+
+
+def stablehlo(map_: SymplecticMap, about: dict[str, Any]) -> bytes:
+    """Make the zip archive of a map as StableHLO, by ``jax.export``, which needs nothing of this
+    package.
+
+    ``jax.export.deserialize`` reads ``step.jax`` and ``inverse.jax``: functions of states (B, 2d),
+    for any B, and of the parameters' values (B, k) where the map has some, which return images
+    (B, 2d) and statuses (B,). ``about.json`` holds ``about``, JSON-able, the map's description.
+    """
+    dtype = np.dtype(map_.scale.dtype)
+    if dtype == np.float64:
+        require_x64("a float64 map")
+    (batch,) = exporting.symbolic_shape("b")
+    shapes = [(batch, 2 * map_.dim)]
+    if map_.parameters is not None:
+        shapes.append((batch, len(map_.parameters.names)))
+    given = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, function in (("step", map_.step), ("inverse", map_.inverse)):
+
+            def applied(z, *args, function=function):
+                image, info = function(z, *args)
+                return image, info.status
+
+            exported = exporting.export(jax.jit(applied), platforms=PLATFORMS)(*given)
+            archive.writestr(f"{name}.jax", bytes(exported.serialize()))
+        archive.writestr("about.json", json.dumps(about, indent=1))
+    return packed.getvalue()
