@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from gfnn_jax.arrays import as_row, matmul
+from gfnn_jax.arrays import as_row, matmul, pytree
 from gfnn_jax.families import as_family
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import matrix_free
@@ -104,12 +104,7 @@ class StageEquation:
         return Evaluation(*flat, jnp.zeros((len(z), 0), z.dtype))
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("family", "params", "dt", "scale"),
-    meta_fields=("stages", "substeps", "newton"),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("stages", "substeps", "newton")
 class Flow:
     """The flow of H(params, ·) over dt. A piece: see `maps.piece`. Where H depends on the
     time, the last of the args is that of the state at which a step begins.

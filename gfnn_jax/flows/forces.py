@@ -12,14 +12,12 @@ of τ, τ², … stand among the args, and `families.family.at_time` moves them 
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from math import comb
 from typing import Any
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_row, beside, matmul, namespace
+from gfnn_jax.arrays import as_row, beside, matmul, namespace, pytree
 from gfnn_jax.families.family import AroundAnother, at_time, parameter_gradients
 from gfnn_jax.families.lagrangian import LINEAR, Friction, pushed
 from gfnn_jax.phase_space import split
@@ -45,12 +43,7 @@ class WithForces(AroundAnother):
         return args
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("family", "friction"),
-    meta_fields=("num_inputs", "degree"),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("num_inputs", "degree")
 class Forced(WithForces):
     """H of ``family`` with friction and inputs; params are those of H, then ρ (F,), then G (d, k)
     row by row.

@@ -9,14 +9,12 @@ Mechanics", section 8.1). A double pendulum's L has five terms where its H is ra
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import namespace
+from gfnn_jax.arrays import namespace, pytree
 from gfnn_jax.families.lagrangian import Derivatives, Friction, Lagrangian, Terms
 from gfnn_jax.families.text import shown
 from gfnn_jax.flows.forces import Forced
@@ -26,8 +24,7 @@ from gfnn_jax.phase_space import split
 from gfnn_jax.solve.linear import small_solve
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("terms",), meta_fields=())
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree()
 class Legendre:
     """H of L = Σ θ_j ℓ_j; params are θ (P,), ``terms`` the ℓ_j. H is not linear in θ."""
 

@@ -6,19 +6,14 @@ c_j ∏ μ_i^n_ji: the law of a pendulum of any length, of a cart with any mass 
 
 from __future__ import annotations
 
-import dataclasses
-from functools import partial
 from typing import Any
 
-import jax
-
-from gfnn_jax.arrays import as_row, beside
+from gfnn_jax.arrays import as_row, beside, pytree
 from gfnn_jax.families.family import AroundAnother, at_time, parameter_gradients
 from gfnn_jax.families.lagrangian import Powers, functions_of
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("family",), meta_fields=("powers",))
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("powers")
 class OfSystems(AroundAnother):
     """``family`` whose params (m,) are multiplied by these powers (m, k) of the first k args; the
     other args are the family's own."""

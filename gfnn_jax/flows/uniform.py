@@ -11,14 +11,11 @@ lost at the rate 2γT, whatever M(q) is: Rayleigh's R = γT.
 
 from __future__ import annotations
 
-import dataclasses
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-from gfnn_jax.arrays import as_row, beside, namespace
+from gfnn_jax.arrays import as_row, beside, namespace, pytree
 from gfnn_jax.families.family import at_time, parameter_gradients
 from gfnn_jax.flows.forces import Forced, WithForces
 from gfnn_jax.flows.systems import OfSystems
@@ -27,8 +24,7 @@ from gfnn_jax.phase_space import split
 FRICTION = "friction"  # the name of γ among the terms
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("family",), meta_fields=())
-@dataclasses.dataclass(frozen=True)
+@pytree(eq=True)
 class Uniform(WithForces):
     """H of ``family`` with uniform friction; params (m + 1,) are those of H and γ behind them.
 
@@ -158,8 +154,7 @@ def power(family, params, w, args=None) -> Power:
     return Power(w[..., :0], w[..., :0])
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("family",), meta_fields=())
-@dataclasses.dataclass(frozen=True)
+@pytree(eq=True)
 class CaldirolaKanai:
     """H̃(q, p̃, τ) of ``family``, with the params of `Uniform`; τ is the last of the args."""
 

@@ -8,14 +8,13 @@ parameters and dt come from the implicit function theorem.
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.arrays import namespace
+from gfnn_jax.arrays import namespace, pytree
 from gfnn_jax.families import as_family
 from gfnn_jax.families.family import (
     at_time,
@@ -90,12 +89,7 @@ class ImplicitStep:
         return Evaluation(residual / unit, size / unit, gradient), unit
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("family", "params", "dt", "scale", "predictor"),
-    meta_fields=("chart",),
-)
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree("chart")
 class Generated:
     """Map that S(params, ·) generates in a chart. A piece: see `maps.piece`.
 

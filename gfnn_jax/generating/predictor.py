@@ -8,17 +8,14 @@ single Newton update. Next to a fold of S the guess decides which branch is foun
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 import scipy.linalg
 
-from gfnn_jax.arrays import matmul, namespace
+from gfnn_jax.arrays import matmul, namespace, pytree
 from gfnn_jax.families.inputs import Inputs, box_inputs
 from gfnn_jax.families.products import Basis, Products, basis_of
 from gfnn_jax.generating.charts import AnyChart
@@ -51,8 +48,7 @@ class Options:
 OPTIONS = Options()
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("family", "matrices"), meta_fields=())
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree()
 class PolynomialModel:
     """Polynomials of the state for the unknowns minus the chart's own first guess.
 
@@ -104,8 +100,7 @@ class PolynomialModel:
         return namespace(u).sum(by_row * u[..., None, :], axis=-1)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=("forward", "backward"), meta_fields=())
-@dataclasses.dataclass(frozen=True, eq=False)
+@pytree()
 class Predictor:
     """First guesses for the solves of a map (forward) and of its inverse (backward)."""
 
