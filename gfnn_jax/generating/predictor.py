@@ -8,6 +8,7 @@ single Newton update. Next to a fold of S the guess decides which branch is foun
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
