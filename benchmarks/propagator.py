@@ -111,7 +111,7 @@ def of_checkout(checkout: Path, fits: bool) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--against", type=Path, help="a checkout of another commit")
     parser.add_argument("--out", default=str(OUT), help="JSON; - for the screen")
     parser.add_argument("--steps", action="store_true", help="no fits")

@@ -42,6 +42,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from numba.core import config
 
 from gfnn_jax.flows.dormand_prince import NODES, STAGES, WEIGHTS
 
@@ -106,7 +107,7 @@ class Task(NamedTuple):
 
 # Compilation optimises a function with all that it calls, again in each that calls it: the large
 # large ones call no large ones, but for `follow`.
-_function = numba.njit(
+_function = numba.njit(  # pyright: ignore[reportCallIssue]: two options lack in its types
     error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
 )
 
@@ -125,7 +126,7 @@ def _cached(function):
         made = folder.stat()
         if made.st_uid != user or made.st_mode & 0o022:  # of others, who might change what runs
             raise RuntimeError
-        numba.config.CACHE_DIR = str(folder)
+        config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
         return numba.njit(cache=True, **options)(function)
     except (OSError, RuntimeError):
         print("no folder can be written: the motion of laws is compiled anew", file=sys.stderr)

@@ -111,8 +111,9 @@ class Form:
         in the coefficients (2); u (N, substeps, 6, inputs) are the inputs at the nodes of each
         substep. modes: (N, F) in which it begins, by default those of the states. A lane that has
         no solution, or more events than can be followed, is NaN."""
-        *found, status = self.follow(p, x, h[:, None], u[:, None], order, modes)
-        return Step(*(part[:, 0] for part in found), status)
+        found = self.follow(p, x, h[:, None], u[:, None], order, modes)
+        states, by_state, by_coefficients = (part[:, 0] for part in found[:3])
+        return Step(states, by_state, by_coefficients, found.modes[:, 0], found.status)
 
     def follow(
         self,
@@ -141,7 +142,10 @@ class Form:
         )
         begun = np.full((len(x), frictions), np.nan) if modes is None else modes
         task = kernel.Task(
-            *map(_owned, (x, begun, h, u)),
+            _owned(x),
+            _owned(begun),
+            _owned(h),
+            _owned(u),
             np.empty((*h.shape, width)),
             np.empty((*h.shape, width, columns)),
             np.empty((*h.shape, frictions)),
