@@ -32,6 +32,7 @@ from gfnn_jax.cli_summary import (
     print_record,
     print_summary,
     print_table,
+    print_verdict,
 )
 from gfnn_jax.data.files import are_recordings
 from gfnn_jax.errors import InputError, WorkError
@@ -264,11 +265,13 @@ def _fit_recording(
     with _output(arguments) as output:
         from gfnn_jax.jobs.fit import fit_recording
 
-        given = {"columns": columns, "despite": arguments.despite}
+        kept = {"despite": arguments.despite, "keep": arguments.keep}
+        given = {"columns": columns, **kept}
         ran: Any = fit_recording(arguments.data, output, **given, **options)
     if not is_law:
         return _print_fitted(arguments, ran)
     gains = ran.fit.gains
+    print_verdict(ran.fit)
     print(ran.fit.table)
     print(f"written to {arguments.out}")
     if "stop" in columns:  # what no fit has seen is in the file

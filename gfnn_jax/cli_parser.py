@@ -23,7 +23,8 @@ EXPORTS = ("c", "stablehlo")  # those of `exports.export`, whose import would lo
 EXIT_STATUS = """\
 exit status:
   0    success
-  1    a failure during the work (a full disk); with --strict also a missed tolerance
+  1    a failure during the work (a full disk), no law of a recording; with --strict also a missed
+       tolerance
   2    bad usage or bad input, before any long work
   130  stopped by Ctrl-C
   143  stopped by SIGTERM"""
@@ -211,6 +212,11 @@ def _fit(command: _Command) -> None:
         "KIND",
         type=_split,
         default=(),
+    )
+    command.flag(
+        "--keep",
+        "of a recording: write the law into MODEL although it misses most of the motion; the exit "
+        "status is 1 all the same",
     )
     command.flag(
         "--distributed",

@@ -40,12 +40,18 @@ def error_line(fit: dict[str, Any]) -> str:
     )
 
 
+def print_verdict(fit: Any) -> None:
+    """Print the verdict, the first line of a result."""
+    print(f"verdict: {fit.verdict}")
+
+
 def print_summary(ran: Any, out: Path) -> None:
     if ran is None:
         print(f"{out}: already holds the result of this job")
         return
     from gfnn_jax.learn.fitted import candidates_table
 
+    print_verdict(ran.fit)
     print_table(candidates_table(ran.fit))
     report = ran.report
     fit, defect = report["fit"], report["map"]["symplecticity_defect"]
@@ -101,6 +107,7 @@ def print_table(table: Any) -> None:
 
 def print_record(ran: Any, out: Path) -> None:
     """Print a law, and its forecasts of the last third of the recording."""
+    print_verdict(ran.learned.fit)
     print(ran.learned.fit.table)
     ahead = ", ".join(f"{seconds:.3g}" for seconds in ran.forecasts.ahead)
     for name, errors in ran.forecasts.median.items():

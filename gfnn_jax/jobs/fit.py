@@ -15,7 +15,7 @@ from gfnn_jax.data.recording import read
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.data.summary import summary
-from gfnn_jax.errors import InputError, OutOfTime
+from gfnn_jax.errors import FitError, InputError, OutOfTime, WorkError
 from gfnn_jax.evaluate.figures_of_recordings import law_figure
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.jobs.output import Output, Ran, publish, units_of, write
@@ -28,6 +28,7 @@ from gfnn_jax.jobs.search import (
     search,
 )
 from gfnn_jax.learn.fit import fit as learn_fit
+from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.learn.refit import (
     can_be_refitted,
@@ -182,12 +183,14 @@ def fit_recording(
     *,
     columns: dict[str, Any],
     despite: Sequence[str] = (),
+    keep: bool = False,
     **options: Any,
 ) -> Ran:
     """Learn the law of recordings (files), or with ``learn="map"`` the map of their positions, and
     write it with its report into the model folder.
 
     columns: keywords of `gfnn_jax.read`. despite: kinds of mistakes that the files may show.
+    keep: whether a law that misses most of the motion is written before the error is raised.
     options: `FitOptions`. Raises InputError where `gfnn look` finds a mistake; WorkError where no
     law follows the recording, or the arithmetic fails.
     """
@@ -198,13 +201,19 @@ def fit_recording(
     refuse_mistakes(recording, despite)
     job = {"command": "fit", "data": recording.source, **asked.deciding, **units_of(recording)}
     is_law = asked.learn != "map"
+    refused: FitError | None = None
     with refusals(), failures_of_arithmetic():
-        fitted = learn_fit(
-            recording,
-            options=asked,
-            on_progress=progress.line if is_law else progress.status,
-            on_candidate=lambda candidate: progress.line(line(candidate)),
-        )
+        try:
+            fitted = learn_fit(
+                recording,
+                options=asked,
+                on_progress=progress.line if is_law else progress.status,
+                on_candidate=lambda candidate: progress.line(line(candidate)),
+            )
+        except FitError as error:
+            if not (keep and isinstance(error.fit, Fit)):
+                raise
+            fitted, refused = error.fit, error
     if is_law:
         result = fitted.report(source=recording.source, seed=asked.seed)
     else:
@@ -217,4 +226,6 @@ def fit_recording(
         write(folder, folder, fitted, result, job)
         if is_law:
             law_figure(fitted, recording, folder / LAW_FIGURE)
+    if refused is not None:
+        raise WorkError(f"{refused}; this law is kept in {output.out}")
     return Ran(fitted, output.out, result)

@@ -38,6 +38,7 @@ from gfnn_jax.learn.request import checked, diagnose_request, paid_for, wrapped
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
+from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.models.maps_of_laws.draw import Drawing, drawn
 from gfnn_jax.phase_space import Pairs, require_x64
@@ -71,10 +72,11 @@ def fit(
 
     Raises FitError, in one line, where the data are too few or not finite, a chart that was asked
     for is singular over them (naming the chart to use instead), or no law follows a recording: then
-    it has a ``verdict``. Warns (FitWarning) where nothing meets the tolerance, where a chart is
-    close to singular, where pairs contradict their neighbours (a few are left out), and where the
-    pairs do not look symplectic; for a recording where its law did not converge, misses a drive, or
-    has an input of no effect.
+    it has a ``verdict``, and a ``fit`` where a law misses most of the motion. InputError where
+    arrays (t, x) are no numbers or of other shapes, or positions do not move. Warns (FitWarning)
+    where nothing meets the tolerance, where a chart is close to singular, where pairs contradict
+    their neighbours (a few are left out), and where the pairs do not look symplectic; for a
+    recording where its law did not converge, misses a drive, or has an input of no effect.
     """
     watch = Watch.taken_from(changes)
     options = dataclasses.replace(options or FitOptions(), **changes)
@@ -91,15 +93,21 @@ def fit(
         with one_thread():
             if of_map:
                 return learn_positions(pairs, options, watch)
-            law = fit_recording(
-                pairs,
-                friction=options.friction,
-                input_hold=options.input_hold,
-                mass=options.mass,
-                terms=tuple(options.terms),
-                loss=options.loss,
-                on_progress=watch.on_progress,
-            )
+            try:
+                law = fit_recording(
+                    pairs,
+                    friction=options.friction,
+                    input_hold=options.input_hold,
+                    mass=options.mass,
+                    terms=tuple(options.terms),
+                    loss=options.loss,
+                    on_progress=watch.on_progress,
+                )
+            except FitError as error:
+                if isinstance(error.fit, LearnedLaw):
+                    stored = {"verdict": error.verdict}
+                    error.fit = Fit(error.fit.map, error.fit, stored)
+                raise
         for message in law.messages:
             warnings.warn(message, FitWarning, stacklevel=2)
         return Fit(law.map, law)
@@ -200,15 +208,39 @@ def as_pairs_or_recording(data: Any, more: Any = None) -> Pairs | Recording:
         return read(data) if are_recordings(data) else read_trajectories(Path(data)).pairs()
     if hasattr(data, "columns") or isinstance(data, Mapping):  # a table
         return Recording(data)
+    if more is None and isinstance(data, tuple) and len(data) == 2:
+        data, more = data
     if more is None:
         raise FitError(
             "expected gfnn.Pairs(z0, z1, dt), a gfnn.Recording, a table, a file, or arrays (t, x), "
             f"got {type(data).__name__}"
         )
-    positions = np.asarray(more)
+    return _of_arrays(data, more)
+
+
+def _of_arrays(t: Any, x: Any) -> Recording:
+    """Recording of times (n,) and positions x1 … xd, (n,) or (n, d). Raises InputError where these
+    are no real numbers or of other shapes."""
+    try:
+        times, positions = np.asarray(t), np.asarray(x)
+    except ValueError as error:  # rows of different lengths
+        raise InputError(f"expected arrays (t, x) of numbers: {error}") from error
+    shapes = f"t {times.shape} and x {positions.shape}"
+    if not (times.ndim == 1 and positions.ndim in (1, 2) and len(times) == len(positions)):
+        raise InputError(f"expected times t (n,) and positions x (n,) or (n, d), got {shapes}")
+    if not positions.size:
+        raise InputError(f"expected samples, got none: {shapes}")
+    if not {times.dtype.kind, positions.dtype.kind} <= set("fiu"):
+        kinds = f"{times.dtype} and {positions.dtype}"
+        raise InputError(f"expected t and x of real numbers, got {kinds}")
+    if not np.isfinite(times).all():
+        raise InputError(
+            f"expected finite times, got {times[~np.isfinite(times)][0]} in row "
+            f"{int(np.argmin(np.isfinite(times)))}"
+        )
     columns = positions.reshape(len(positions), -1).T
     named = {f"x{i}": column for i, column in enumerate(columns, start=1)}
-    return Recording({"t": np.asarray(data), **named}, positions=list(named))
+    return Recording({"t": times, **named}, positions=list(named))
 
 
 def _is_array(value: Any) -> bool:

@@ -140,14 +140,23 @@ class Choice:
         """Verdict of the pairs, as of `Fit.verdict`."""
         law = self.law
         if law is None:
-            return "map" if self.met else f"map: the tolerance is missed, for {self.ended}"
+            if self.met:
+                return "map"
+            return f"map: {self._error} misses the tolerance, for {self.ended}"
         if not (self.met or self.white):
-            return f"partly: the tolerance is missed, for {self.ended}"
+            return f"partly: {self._error} misses the tolerance, for {self.ended}"
         # Sums over sites have terms that vanish or add up to nothing, whatever the data.
         if law.null_terms and not isinstance(law.flow.family, Sums):
             return f"one of several: the pairs do not tell {', '.join(law.null_terms)} apart"
         rivals = [rival.formula for rival in law.rivals if rival.odds < EVIDENCE.decided]
         return f"one of several: {'; '.join(rivals)} is as likely" if rivals else "identified"
+
+    @property
+    def _error(self) -> str:
+        """The one-step error of the chosen candidate, in the unit of the tolerance."""
+        best, relative = self.chosen, self.asked.relative
+        error = best.validation_relative if relative else best.validation_rms
+        return f"a one-step error of {error:.1e}{relative * ' of the spread'}"
 
     @property
     def line(self) -> str:
@@ -290,6 +299,12 @@ class Fit:
                 )
                 return getattr(own["map"], name)
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles hold what folders hold: neither the data nor what only the search needed."""
+        from gfnn_jax.learn import saved  # stands after this module: a shorthand for its function
+
+        return saved.state_of(self)
 
     def replaced(self, **changes: Any) -> Fit:
         """The fit with another map (``map``), and other values of what was found."""

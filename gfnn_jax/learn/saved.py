@@ -64,13 +64,27 @@ def save(
 ) -> None:
     """Save a fit as a model folder. record: its report with whatever is worth keeping beside;
     None: the report, without what takes long to compute. The rest as of `maps.saved.save`."""
-    known = "symplecticity_defect" in fit.__dict__
-    if record is None and isinstance(fit.found, Choice) and not known:
-        fit = fit.replaced(defect_known=False)
-    if record is None:
-        record = {} if fit.found is None and "record" not in fit.stored else fit.report()
+    record = _record(fit) if record is None else record
     beside = {"verdict": fit.verdict, "found": _portable(fit.found)}
     maps.save(fit.map, folder, scene=scene, record=record, overwrite=overwrite, beside=beside)
+
+
+def _record(fit: Fit) -> dict[str, Any]:
+    """The report, without what takes long to compute and is not known; {} of a map alone."""
+    known = "symplecticity_defect" in fit.__dict__
+    if isinstance(fit.found, Choice) and not known:
+        fit = fit.replaced(defect_known=False)
+    return {} if fit.found is None and "record" not in fit.stored else fit.report()
+
+
+def state_of(fit: Fit) -> dict[str, Any]:
+    """Fields of the fit as a folder would give it back, for pickles."""
+    stored = {"verdict": fit.verdict, "record": fit.stored.get("record") or _record(fit)}
+    stored = {name: value for name, value in stored.items() if value}
+    found = _portable(fit.found)
+    if found is not None and not isinstance(found, Choice):
+        found = dataclasses.replace(found, map=fit.map)
+    return {"map": fit.map, "found": found, "stored": stored}
 
 
 def load(folder, scene: Scene | None = None) -> Fit:

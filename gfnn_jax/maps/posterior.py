@@ -35,6 +35,10 @@ class Posterior:
         object.__setattr__(self, "root", np.asarray(make()))
         return self.root
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickles hold the root, which is computed for them."""
+        return Posterior, (self.piece, self.root)
+
     @property
     def known(self) -> bool:
         """True where root has been computed."""

@@ -125,6 +125,9 @@ class LearnedHamiltonian:
         """H as people read it: "0.5 p1² - cos(q1)"."""
         return self.shown or "a network"
 
+    def __repr__(self) -> str:
+        return f"LearnedHamiltonian({self})"
+
     def sympy(self) -> Any:
         """H as a sympy expression. Raises ValueError of a network and a Lagrangian."""
         return as_sympy(self._expression)

@@ -42,13 +42,17 @@ class WarningOptions:
 
     clear: standard errors of a gain, below which its input has no visible effect. many: functions
     of parameters in a term, of which laws of physics have fewer. followed: % of a channel's
-    variation, of which a law that explains it follows more. alike: correlation of two coefficients
-    that the record cannot tell apart.
+    variation, of which a law that explains it follows more. beyond: times the noise, above which
+    correlated residuals are motion that the law lacks, unless it follows ``nearly`` all, in %:
+    there they may be a series that a library ends. alike: correlation of two coefficients that the
+    record cannot tell apart.
     """
 
     clear: float = 3.0
     many: int = 3
     followed: float = 90.0
+    beyond: float = 3.0
+    nearly: float = 99.9
     alike: float = 0.99
 
 
@@ -194,6 +198,16 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
         "shows when"
         for name, one in found.items()
         if one.fit_percent < OPTIONS.followed and not one.white
+    }
+    times = best.fit.rms() / best.fit.problem.scales.sigma
+    flaws |= {
+        f"the residuals of {name} are {loud:.2g} times its noise and correlated, "
+        f"{one.fit_percent:.1f} % of its variation is followed": "a force, an input or a term is "
+        "missing. law.png (fit.traces) shows when"
+        for (name, one), loud in zip(found.items(), times, strict=True)
+        if not one.white
+        and OPTIONS.followed <= one.fit_percent < OPTIONS.nearly
+        and loud > OPTIONS.beyond
     }
     if not best.fit.fitted.converged:
         flaws["the fit of the law did not converge"] = (

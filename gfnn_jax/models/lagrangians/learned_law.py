@@ -213,6 +213,9 @@ class LearnedLaw:
         chosen = f"; cost of held-out arcs, this rule 1: {', '.join(others)}" if others else ""
         return f"inputs: {RULES[self.map.sensors.hold]}{when}{chosen}"
 
+    def __str__(self) -> str:
+        return self.line
+
     def __repr__(self) -> str:
         return f"LearnedLaw({self.line})"
 

@@ -58,13 +58,15 @@ class RecordingOptions:
     missed: of a channel's variation: no law that leaves as much follows the recording.
     above_noise: times: such a rest is no noise. clearly: share by which errors of forecasts are
     smaller, which chance does not make. imitated: share of what a sensor's parameter changes that
-    no coefficient of the law does, below which it is not identifiable.
+    no coefficient of the law does, below which it is not identifiable. still: range of a position
+    over its size, at which it does not move: roundoff.
     """
 
     missed: float = 0.8
     above_noise: float = 3.0
     clearly: float = 0.2
     imitated: float = 1e-4
+    still: float = 1e-14
 
 
 OPTIONS = RecordingOptions()
@@ -89,11 +91,12 @@ def fit_recording(
     which are then all that is fitted. loss: of residuals in units of their noise; None: the soft L1
     of `solve.noise`.
     Raises InputError for bad options or a recording without positions, FitError where no law is
-    found.
+    found; its ``fit`` is then the `LearnedLaw` that misses most of the motion, where there is one.
     """
     started = time.process_time()
     options = _options(friction)
     _check(recording, input_hold, mass)
+    _check_moves(recording)
     steps: list[str] = []
 
     def note(line: str) -> None:
@@ -107,6 +110,30 @@ def fit_recording(
     data = dataclasses.replace(data, mass=mass or {})
     rules = _rules(recording, input_hold)
     data, found = _found(data, terms, rules)
+    missed = no_law(data.problem.scales) if _misses(found.fit) else None
+    try:
+        best, findings = _findings(recording, data, found, left_out, steps)
+        findings = findings._replace(seconds=time.process_time() - started)
+        law = in_words(recording, best, findings)
+    except (FitError, np.linalg.LinAlgError):
+        if missed is not None:
+            raise missed from None
+        raise
+    if missed is not None:
+        missed.fit = law
+        raise missed
+    return law
+
+
+def _findings(
+    recording: Recording,
+    data: RecordingData,
+    found: SearchResult,
+    left_out: Sequence[str],
+    steps: list[str],
+) -> tuple[CalibratedLaw, Findings]:
+    """The law that was found, made ready for forecasts, and what its fit shows."""
+    note, options = data.problem.on_progress, data.problem.options
     model, choice, _ = _forecasting_best(found, data)
     fit = with_fine_steps(model.fit)
     measured = velocities(recording, fit)
@@ -131,9 +158,9 @@ def fit_recording(
         model,
         messages,
         tuple(steps),
-        time.process_time() - started,
+        0.0,
     )
-    return in_words(recording, best, findings)
+    return best, findings
 
 
 def _options(friction: str) -> SearchOptions:
@@ -185,6 +212,21 @@ def _check(recording: Recording, input_hold: str, mass: Mapping[str, float] | No
             raise InputError(f"mass: expected {name} above 0, got {value}")
     if len(mass or {}) > 1:
         raise InputError("mass: one known mass fixes the scale of L; got several")
+
+
+def _check_moves(recording: Recording) -> None:
+    """Raises InputError where no position moves."""
+    columns = [name for name in recording.positions if name in recording.columns]
+    for name in columns:
+        values = np.concatenate([recording.values(name, run) for run in recording.runs])
+        seen = values[np.isfinite(values)]
+        if len(seen) and np.ptp(seen) > OPTIONS.still * np.abs(seen).max():
+            return
+    if columns:
+        raise InputError(
+            f"{recording.source}: expected positions that move, got the same value of "
+            f"{', '.join(columns)} in every sample"
+        )
 
 
 def _rules(recording: Recording, input_hold: str) -> tuple[str, ...]:
@@ -324,7 +366,7 @@ def _found(
             found = other
     if again.hold == found.model.hold:
         found = found._replace(model=found.model._replace(others=again.others))
-    if not found.follows or _misses(found.fit):
+    if not found.follows:
         raise no_law(problem.scales)
     return data, found
 

@@ -1,0 +1,75 @@
+"""Verdicts of data that no law follows, and what `gfnn.fit` refuses, in one line each."""
+
+import pickle
+
+import jax
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+
+TIMES = np.arange(400) * 0.05
+
+
+def test_a_self_sustained_oscillator_is_not_identified():
+    """R of an oscillator of Van der Pol's is none that friction has; what a law with little energy
+    lost leaves over is correlated, and far above the noise."""
+    t = np.arange(800) * 0.05
+    found = solve_ivp(
+        lambda t, y: [y[1], 0.1 * (1 - y[0] ** 2) * y[1] - y[0]], (0, 40), [2.0, 0], t_eval=t
+    )
+    noise = 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    with pytest.warns(gfnn.FitWarning, match="residuals of x1"):
+        fit = gfnn.fit(t, found.y[0] + noise)
+    assert fit.verdict.startswith("partly: ")
+    assert fit.found.whiteness["x1"].fit_percent > 95
+
+
+def test_noise_has_no_law(tmp_path):
+    x = np.random.default_rng(0).normal(size=400)
+    with pytest.raises(gfnn.FitError) as refused:
+        gfnn.fit(TIMES, x)
+    assert refused.value.verdict.startswith("no law")
+    fit = refused.value.fit
+    assert isinstance(fit, gfnn.Fit)
+    assert fit.verdict == fit.report()["verdict"] == refused.value.verdict
+    fit.save(tmp_path / "kept")
+    assert gfnn.load(tmp_path / "kept").verdict == fit.verdict
+
+
+@pytest.mark.parametrize(
+    ("t", "x", "named"),
+    [
+        (TIMES, np.ones(400), "x1"),
+        (TIMES, TIMES + 1j, "complex128"),
+        (TIMES, TIMES[:-1], r"\(399,\)"),
+        (TIMES, TIMES.reshape(100, 2, 2), r"\(100, 2, 2\)"),
+        (TIMES[:0], TIMES[:0], "none"),
+        (np.where(TIMES == 1, np.nan, TIMES), TIMES, "row 20"),
+        (TIMES.astype(str), TIMES, "<U"),
+        (TIMES, [[1], [1, 2]], "numbers"),
+    ],
+)
+def test_arrays_that_are_no_recording_are_refused(t, x, named):
+    with pytest.raises(gfnn.InputError, match=named):
+        gfnn.fit(t, x)
+    with pytest.raises(gfnn.InputError, match=named):
+        gfnn.fit((t, x))
+
+
+def test_a_fit_of_pairs_can_be_pickled():
+    scene = gfnn.scenes.henon_heiles(energy=1 / 12)
+    pairs = gfnn.sample_pairs(scene, num_pairs=400, key=jax.random.key(0))
+    fit = gfnn.fit(pairs, scene, tolerance=1e-8)
+    again = pickle.loads(pickle.dumps(fit))
+    assert again.verdict == fit.verdict == "identified"
+    assert str(again.law) == str(fit.law)
+    assert again.table == fit.table
+    z = pairs.z0[:3]
+    np.testing.assert_array_equal(again.map.step(z), fit.map.step(z))
+    assert len(repr(fit.law)) < 200
+
+
+def test_the_package_lists_public_names():
+    assert set(dir(gfnn)) == {*gfnn.__all__, "__version__"}
