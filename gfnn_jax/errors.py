@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class InputError(ValueError):
     """Error of usage or input. The message names what was expected and what came."""
@@ -25,7 +27,7 @@ class FitError(ValueError):
     where there is one.
     """
 
-    def __init__(self, message: str, verdict: str = "", fit: object = None):
+    def __init__(self, message: str, verdict: str = "", fit: Any = None):
         super().__init__(" ".join(message.split()))
         self.verdict, self.fit = verdict, fit
 

@@ -38,7 +38,6 @@ from gfnn_jax.learn.request import checked, diagnose_request, paid_for, wrapped
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
-from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.models.maps_of_laws.draw import Drawing, drawn
 from gfnn_jax.phase_space import Pairs, require_x64
@@ -104,9 +103,8 @@ def fit(
                     on_progress=watch.on_progress,
                 )
             except FitError as error:
-                if isinstance(error.fit, LearnedLaw):
-                    stored = {"verdict": error.verdict}
-                    error.fit = Fit(error.fit.map, error.fit, stored)
+                if error.fit is not None:
+                    error.fit = Fit(error.fit.map, error.fit, {"verdict": error.verdict})
                 raise
         for message in law.messages:
             warnings.warn(message, FitWarning, stacklevel=2)
