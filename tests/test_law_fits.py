@@ -312,8 +312,9 @@ def test_wrong_values_are_left_out_of_a_fit_and_told(wrong):
     with pytest.warns(gfnn.FitWarning, match="left out"):
         found = gfnn.fit(gfnn.Recording({"t": t, "theta": spoilt}, **of))
     assert str(found) == str(expected)
-    kind = "is stuck" if wrong == "stuck" else "has 11 outliers in a row"
-    assert found.messages[0].startswith(f"theta {kind} from 15.55 s to 16.05 s")
+    kind = "stuck" if wrong == "stuck" else "outliers"
+    for named in ("theta", kind, "11", "15.55 s"):
+        assert named in found.messages[0]
 
 
 def test_a_driven_mass_has_a_law_of_one_term():

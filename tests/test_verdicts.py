@@ -58,6 +58,20 @@ def test_arrays_that_are_no_recording_are_refused(t, x, named):
         gfnn.fit((t, x))
 
 
+@pytest.mark.parametrize("x", [np.cos(TIMES) + 1j, [[1], [1, 2]]])
+def test_columns_of_no_real_numbers_are_refused(x):
+    with pytest.raises(gfnn.InputError, match="numbers"):
+        gfnn.fit({"t": TIMES, "x": x})
+
+
+@pytest.mark.parametrize("x", [0.3 * TIMES, 0.3 * TIMES**2])
+def test_motion_that_does_not_come_back_has_no_law(x):
+    noise = 1e-3 * np.random.default_rng(0).normal(size=len(x))
+    with pytest.raises(gfnn.FitError) as refused:
+        gfnn.fit(TIMES, x + noise)
+    assert refused.value.verdict.startswith("no law")
+
+
 def test_a_fit_of_pairs_can_be_pickled():
     scene = gfnn.scenes.henon_heiles(energy=1 / 12)
     pairs = gfnn.sample_pairs(scene, num_pairs=400, key=jax.random.key(0))

@@ -42,7 +42,10 @@ def from_memory(table: Any) -> Table:
     if isinstance(table, Table):
         return table
     if isinstance(table, Mapping):
-        named = {str(name): np.asarray(values) for name, values in table.items()}
+        try:
+            named = {str(name): np.asarray(values) for name, values in table.items()}
+        except ValueError as error:  # rows of different lengths
+            raise InputError(f"expected columns of numbers: {error}") from error
     elif isinstance(table, np.ndarray) and table.dtype.names:
         named = {name: table[name] for name in table.dtype.names}
     elif hasattr(table, "columns") and hasattr(table, "to_numpy"):  # a DataFrame
@@ -60,6 +63,8 @@ def from_memory(table: Any) -> Table:
         if is_run(name):
             found[name] = values.astype(str)
             continue
+        if values.dtype.kind == "c":
+            raise InputError(f"{name}: expected real numbers, got {values.dtype}")
         try:
             numbers = values.astype(np.float64)
         except (TypeError, ValueError):

@@ -28,7 +28,6 @@ from gfnn_jax.jobs.search import (
     search,
 )
 from gfnn_jax.learn.fit import fit as learn_fit
-from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.learn.refit import (
     can_be_refitted,
@@ -211,7 +210,7 @@ def fit_recording(
                 on_candidate=lambda candidate: progress.line(line(candidate)),
             )
         except FitError as error:
-            if not (keep and isinstance(error.fit, Fit)):
+            if not keep or error.fit is None:
                 raise
             fitted, refused = error.fit, error
     if is_law:

@@ -119,6 +119,8 @@ def fit_recording(
         if missed is not None:
             raise missed from None
         raise
+    if all(one.fit_percent < 100 * (1 - OPTIONS.missed) for one in law.whiteness.values()):
+        missed = missed or no_law(data.problem.scales)
     if missed is not None:
         missed.fit = law
         raise missed
@@ -294,8 +296,15 @@ def samples_of(
             found, scales = moving.stretches, measure(moving.stretches)
     given = np.array([recording.std[name] or np.nan for name in observation.channels])
     scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
+    nodes = nodes_of(found, scales)
+    if not nodes:
+        raise FitError(
+            f"{recording.source}: no part of the recording is long enough beside the time in which "
+            f"its motion changes, about {scales.period:.3g} s",
+            verdict="no law: the motion hardly changes in the recording",
+        )
     problem = ArcProblem(
-        nodes_of(found, scales),
+        nodes,
         scales,
         observation,
         angles,
