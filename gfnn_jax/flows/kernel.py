@@ -42,9 +42,8 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numba.core import config
-
-from gfnn_jax.flows.dormand_prince import NODES, STAGES, WEIGHTS
+from numba.core import config, event
+from numba.core.llvm_bindings import llvm
 
 FINE, UNFINISHED, LOST = range(3)  # status of a lane: followed; too many events; not finite
 VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN = range(5)  # kinds of friction; COULOMB: dry, no width
@@ -72,14 +71,18 @@ D0, D1, D, SLOPES, HOLDING, ALIKE, MATRIX, RHS, PAIRS, SLOPE, CURVATURE, NUM_SIZ
 # wave; ∂θ/∂c without zeros; of friction ρ, ε, dr/ds, λ, λ at the begin, modes (1 or −1 where it
 # slides, 0 where it sticks), directions that turned, that are carried, and speeds along the modes
 # at the end; a row of derivatives; powers of coordinates with derivatives; rates and inputs at the
-# stages.
+# stages; the tableau of Dormand and Prince. Numbers of other modules would stay as they were in the
+# cache of numba, which looks at this file alone.
 X0, X1, X, A, A_FIRST, FORCE, MOMENTUM, THETA, COS_PHASE, SIN_PHASE, FACTOR, ALONG = range(12)
 COSINE, SINE, PARTS, LOSSES, WIDTHS, PULL, HELD, HELD_FIRST, MODES, TURNED = range(12, 22)
 CARRIED, AFTER, ROW, POWER, POWER_BY, POWER_BY_TWO, RATES = range(22, 29)
-_STAGES = len(NODES)
+_STAGES = 6
 U = RATES + _STAGES
 INSIDE = U + _STAGES
-BLOCKS = INSIDE + _STAGES
+STAGES = INSIDE + _STAGES
+NODES = STAGES + _STAGES
+WEIGHTS = NODES + 1
+BLOCKS = WEIGHTS + 1
 
 _EVENTS = 64  # of a lane in one substep, after which it has no solution
 _APART_FROM = 1e-6  # of a direction, left of others that it depends on
@@ -110,6 +113,31 @@ class Task(NamedTuple):
 _function = numba.njit(  # pyright: ignore[reportCallIssue]: two options lack in its types
     error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
 )
+
+
+class _Compilation(event.Listener):
+    """Says that `follow` is compiled, where no cache holds it, and keeps LLVM from unrolling loops
+    meanwhile: of loops as short as these that is a third of the time, and makes them slower. Numba
+    has no option of a function for it; who compiles holds its lock."""
+
+    def on_start(self, event: event.Event) -> None:
+        if (event.data or {}).get("dispatcher") is follow:
+            print("the motion of laws is compiled: some seconds, kept on disk", file=sys.stderr)
+            llvm.create_pipeline_tuning_options = _rolled
+
+    def on_end(self, event: event.Event) -> None:
+        if (event.data or {}).get("dispatcher") is follow:
+            llvm.create_pipeline_tuning_options = _options
+
+
+_options = llvm.create_pipeline_tuning_options
+
+
+def _rolled(*arguments, **options):
+    """The options of LLVM's passes, without the unrolling of loops."""
+    made = _options(*arguments, **options)
+    made.loop_unrolling = False
+    return made
 
 
 def _cached(function):
@@ -476,17 +504,18 @@ def _smooth(n, f, span, order, u):
     for i in range(_STAGES + 1):
         last = i == _STAGES
         x, target = (X1, end) if last else (X, stage)
+        shares = WEIGHTS if last else STAGES + i
         if order >= 0:
             for k in range(2 * d):
                 f[x, k] = f[X0, k]
                 for j in range(i):
-                    share = WEIGHTS[j] if last else STAGES[i, j]
+                    share = f[shares, j]
                     f[x, k] += share * span * f[RATES + j, k]
             for k in range(rows):
                 for m in range(width):
                     f[target + k, m] = f[begin + k, m]
                 for j in range(i):
-                    share = span * (WEIGHTS[j] if last else STAGES[i, j])
+                    share = span * f[shares, j]
                     if share != 0.0:
                         for m in range(width):
                             f[target + k, m] += share * f[slopes + 2 * d * j + k, m]
@@ -532,12 +561,12 @@ def _within(n, f, begin, end):
             if begin == 0.0 and end == 1.0:
                 f[INSIDE + i, k] = f[U + i, k]
                 continue
-            at, value = begin + (end - begin) * NODES[i], 0.0
+            at, value = begin + (end - begin) * f[NODES, i], 0.0
             for j in range(_STAGES):
                 weight = 1.0
                 for m in range(_STAGES):
                     if m != j:
-                        weight *= (at - NODES[m]) / (NODES[j] - NODES[m])
+                        weight *= (at - f[NODES, m]) / (f[NODES, j] - f[NODES, m])
                 value += weight * f[U + j, k]
             f[INSIDE + i, k] = value
 
@@ -838,3 +867,6 @@ def follow(n, f, laws, task, order):
                     break
             _store(n, f, task, (lane, m), status == FINE)
         task.status[lane] = status
+
+
+event.register("numba:compile", _Compilation())

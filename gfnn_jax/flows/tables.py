@@ -8,6 +8,7 @@ import numpy as np
 
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction, Terms
 from gfnn_jax.flows import kernel as row
+from gfnn_jax.flows.dormand_prince import NODES, STAGES, WEIGHTS
 
 _KINDS = {
     LINEAR: row.VISCOUS,
@@ -83,7 +84,9 @@ class Tables(NamedTuple):
         directions = places[row.DIRECTIONS - row.MASSES] + np.arange(d)
         parts = ((row.PARTS, basis[at, columns]), (row.WIDTHS, friction.widths))
         columns_of = zip(directions.tolist(), friction.directions.T.astype(float), strict=True)
-        return cls(whole, int(places[-1]), (*parts, *columns_of))
+        stages = zip(range(row.STAGES, row.NODES), STAGES, strict=True)
+        tableau = (*stages, (row.NODES, NODES), (row.WEIGHTS, WEIGHTS))
+        return cls(whole, int(places[-1]), (*parts, *columns_of, *tableau))
 
     def room(self, width: int) -> np.ndarray:
         """Room for the numbers of one lane, with ``width`` derivatives of each part of its
