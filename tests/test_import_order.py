@@ -62,6 +62,7 @@ SHORTHANDS = {
     for name in (
         "saved",
         "forecasts",
+        "events",
     )
 }
 SHORTHANDS |= {

@@ -1,5 +1,7 @@
 """The map of a law: forecasts with inputs and their gradient, bands, files, the energy's ledger."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -234,6 +236,136 @@ def test_a_forecast_and_its_band_across_a_stop():
     spread = np.linalg.norm(np.stack(slopes) / (2 * e) * errors[:, None], axis=0)
     np.testing.assert_allclose(found.std[0, :, 0], np.hypot(spread[1:], sigma), rtol=1e-3)
     assert found.covariances[0, -1, 1, 1] < 1e-20  # it stands still
+
+
+CREEP = 1e-4
+
+
+def learned_block(friction=0.05):
+    """The map of the block, as a recording's: dry friction that is smoothed over what no sensor
+    sees."""
+    law = Lagrangian(
+        SPRING,
+        np.array([0.5, -0.5]),
+        Friction.of([((1,), DRY, CREEP)], 1),
+        np.array([friction]),
+        0.0,
+        np.zeros((1, 0)),
+    )
+    z = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
+    map_ = map_of_law(law, z, 0.1, root=np.diag([0.0, 0.0, 1e-3]))
+    return dataclasses.replace(map_, sensors=sensors_of(("x",), 1.0))
+
+
+def sensors_of(positions, omega, inputs=(), angles=(), hold="hold"):
+    d = len(positions)
+    return Sensors(
+        positions,
+        inputs,
+        angles,
+        np.full(d, 1e-5),
+        omega,
+        1.0,
+        hold,
+        0.0,
+        np.array([20.0]),
+        np.zeros((1, d)),
+        creep=CREEP,
+    )
+
+
+def test_a_rollout_across_a_stop():
+    """Against the exact motion: it loses energy, stops for ever, and its parts are the same."""
+    map_, starts = learned_block(), np.array([0.52, 0.42, 0.03])
+    z = np.stack([starts, 0 * starts], axis=1)
+    states, info = map_.rollout(z, 300)
+    for lane, start in zip(np.asarray(states), starts, strict=True):
+        expected, stop = block(start, 0.05, 0.1 * np.arange(301))
+        assert abs(stop) < 0.05
+        np.testing.assert_allclose(lane[:, 0], expected, atol=1e-8)
+        assert np.diff((lane**2).sum(axis=1)).max() < 1e-8  # of the step, at roundoff of none
+    np.testing.assert_array_equal(info.status, 0)
+    np.testing.assert_array_equal(states[:, -1], states[:, -20])
+    np.testing.assert_array_equal(states[2], np.broadcast_to(z[2], (301, 2)))
+    np.testing.assert_array_equal(map_.step(z)[0], states[:, 1])
+    np.testing.assert_array_equal(map_.step(z[0])[0], states[0, 1])
+    np.testing.assert_array_equal(map_.rollout(z, 300, save_every=7)[0], states[:, :300:7])
+    lanes, begun = map_.start(z), []
+    for _ in range(2):
+        lanes, some = map_.advance(lanes, 150)
+        begun.append(some)
+    np.testing.assert_allclose(np.concatenate(begun, axis=1), states[:, 1:], atol=1e-15)
+    held, _ = map_.rollout(z[0], 1_000_000, save_every=100_000)
+    np.testing.assert_array_equal(held[1:], np.broadcast_to(states[0, -1], (10, 2)))
+
+
+def test_a_rollout_under_jit_smooths_dry_friction():
+    map_, z = learned_block(), np.array([0.42, 0.0])
+    exact = map_.rollout(z, 20)[0]
+    for smooth in (
+        jax.jit(lambda z: map_.rollout(z, 20)[0])(z),
+        jax.vmap(lambda z: map_.rollout(z, 20)[0])(z[None])[0],
+        dataclasses.replace(map_, sensors=None).rollout(z, 20)[0],
+    ):
+        error = np.abs(smooth - exact).max()
+        assert 1e-9 < error < CREEP
+    assert np.isfinite(jax.grad(lambda z: map_.rollout(z, 20)[0][-1, 0])(z)).all()
+
+
+def test_rollouts_with_events_that_end():
+    """Lanes of which nothing is known, that leave the domain, or stop there."""
+    z = np.array([[0.42, 0.0], [np.nan, 0.0], [5.0, 0.0], [np.inf, 0.0]])
+    map_ = learned_block()
+    states, info = map_.rollout(z, 40)
+    np.testing.assert_array_equal(info.status, [0, 4, 1, 4])
+    np.testing.assert_array_equal(info.left_at, [-1, -1, 0, -1])
+    np.testing.assert_array_equal(map_.step(z)[1].status, info.status)
+    assert np.isfinite(states[2]).all()
+    stopped, info = map_.rollout(z, 40, stop_outside=True)
+    np.testing.assert_array_equal(info.status, [0, 4, 2, 4])
+    assert np.isnan(stopped[2, 1:]).all()
+    none, info = map_.rollout(z[:1], 0)
+    np.testing.assert_array_equal(none[:, 0], z[:1])
+
+
+def test_samples_of_a_law_that_sticks():
+    map_, z = learned_block(), np.array([[0.42, 0.0], [0.03, 0.0]])
+    drawn = map_.sample(jax.random.key(0), 3)
+    states, _ = drawn.rollout(z, 200)
+    for one, lanes in zip(drawn, states, strict=True):
+        np.testing.assert_array_equal(one.rollout(z, 200)[0], lanes)
+    lanes, some = drawn.advance(drawn.start(z), 200)
+    np.testing.assert_allclose(some, states[:, :, 1:], atol=1e-15)
+    bands = map_.rollout(z, 200, samples=3, key=jax.random.key(0))[1].bands
+    assert bands.std[0, -1, 0] > 1e-4
+    np.testing.assert_array_equal(bands.std[1], 0.0)
+
+
+@pytest.mark.parametrize("hold", ["hold", "linear", "band"])
+def test_a_rollout_with_inputs_and_turns(hold):
+    """A pendulum with dry friction that a motor turns over: what JAX's steps of a narrower width
+    tend to, angles counted, inputs by their rule, with parameters of the system."""
+    friction = Friction.of([((1,), DRY, CREEP)], 1)
+    powers = ((0,), (0,), (0,), (1,))  # the gain of the motor is in proportion to a parameter
+    law = Lagrangian(TERMS, np.array([0.5, 9.0]), friction, np.array([0.1]), 0.0, np.eye(1), powers)
+    args = np.random.default_rng(1).uniform(1.0, 2.0, (200, 1))
+    signals = Signals(("torque",), hold)
+    map_ = map_of_law(
+        law, Z, DT, angles=(0,), signals=signals, parameters=("gain",), args=args, inputs=args
+    )
+    own = sensors_of(("x",), 1.0, ("torque",), ("x",), hold)
+    exact = dataclasses.replace(map_, sensors=own)
+    z, torque = np.array([[0.3, 0.5], [2.0, 5.9]]), 4 * np.sin(3 * DT * np.arange(101))[:, None]
+    options = {"params": {"gain": np.array([1.2, 1.9])}, "inputs": torque}
+    smooth, _ = map_.rollout(z, 100, **options)
+    found, _ = exact.rollout(z, 100, **options)
+    np.testing.assert_allclose(found, smooth, atol=2e-3)
+    assert np.abs(found[1, -1, 0]) > 2 * np.pi
+    lanes, some = exact.advance(exact.start(z, params=options["params"]), 100, **options)
+    np.testing.assert_allclose(some, found[:, 1:], atol=1e-13)
+    assert abs(int(lanes.winding[1, 0])) > 0
+    one = exact.step(z, options["params"], inputs=[1.0])[0]
+    np.testing.assert_allclose(one, map_.step(z, options["params"], inputs=[1.0])[0], atol=1e-4)
 
 
 @pytest.mark.slow

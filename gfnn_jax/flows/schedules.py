@@ -3,6 +3,8 @@ steps; and inputs that act later than they were measured."""
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from scipy.special import i0
 
@@ -56,6 +58,19 @@ def at_stages(
     moments = np.einsum("...pg,...pgn,...pgk->...nk", parts / size * _SHARES, moved, values)
     found = (_legendre(NODES) * np.array([1.0, 3.0, 5.0])) @ moments
     return np.where(passed, found, values[..., 0, :1, :])  # no time: the value there
+
+
+@cache
+def of_polynomials(degree: int, substeps: int) -> np.ndarray:
+    """Weights (substeps, 6, degree + 1) of the coefficients of a polynomial in time, in units of a
+    step, in the inputs at the nodes of its substeps. Each substep sees the parabola of the same
+    moments, as `at_stages` has it."""
+    x, shares = np.polynomial.legendre.leggauss(degree // 2 + 2)
+    s = 0.5 + 0.5 * x
+    times = (np.arange(substeps)[:, None] + s) / substeps
+    values = times[..., None] ** np.arange(degree + 1)
+    moments = np.einsum("g,gn,pgj->pnj", 0.5 * shares, _legendre(s), values)
+    return (_legendre(NODES) * np.array([1.0, 3.0, 5.0])) @ moments
 
 
 def _legendre(s: np.ndarray) -> np.ndarray:

@@ -150,12 +150,18 @@ def stiffness(law: Lagrangian, q: np.ndarray) -> float:
     return float(np.abs(np.linalg.eigvals(rates)).max())
 
 
-def law_of_map(map_: SymplecticMap) -> Lagrangian:
-    """The law whose flow the map is. Raises ValueError for any other map."""
+def is_of_law(map_: SymplecticMap) -> bool:
+    """True for the flow of a Lagrangian."""
     piece = map_.pieces[0]
     flow = len(map_.pieces) == 1 and isinstance(piece, Flow)
-    if not flow or not isinstance(without_forces(piece.family), Legendre):
+    return flow and isinstance(without_forces(piece.family), Legendre)
+
+
+def law_of_map(map_: SymplecticMap) -> Lagrangian:
+    """The law whose flow the map is. Raises ValueError for any other map."""
+    if not is_of_law(map_):
         raise ValueError("expected the map of a Lagrangian")
+    piece = map_.pieces[0]
     return law_of(piece.family, np.asarray(piece.params))
 
 

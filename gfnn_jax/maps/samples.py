@@ -75,6 +75,10 @@ class Samples:
         """Advance lanes as `SymplecticMap.advance` does; the states are (n, B, num_saved, 2d)."""
         args = self.map._args(params, lanes.y[0], t0)
         saving = Saving(num_saved, save_every, stop_outside)
+        if followed := self._followed(lanes, args):
+            own = [jax.tree.map(lambda a, i=i: a[i], lanes) for i in range(len(self))]
+            found = [one.advance(a, args, saving) for one, a in zip(followed, own, strict=True)]
+            return _stacked(found)
         return _advance(self, lanes, args, saving, self._together(lanes.y))
 
     def reversed(self) -> Samples:
@@ -107,7 +111,17 @@ class Samples:
         z0, _ = self._given(z0, params, t0)
         args = self.map._schedule(params, self.map._states(z0[0]), t0, inputs, num_steps)
         saving = Saving(num_steps // save_every, save_every, stop_outside)
+        if followed := self._followed(z0, args):
+            found = [one.roll_out(z, args, saving) for one, z in zip(followed, z0, strict=True)]
+            return _stacked(found)
         return _rollout(self, z0, args, saving, self._together(z0))
+
+    def _followed(self, *given) -> list[Any]:
+        """Each map as it is followed with the events of its dry friction, on numbers: see
+        `SymplecticMap.rollout`; [] where they are stepped by JAX."""
+        if self.map._followed(self.params, *given) is None:
+            return []
+        return [one._followed(*given) for one in self]
 
     def _given(self, z0, params, t0) -> tuple[Any, Any]:
         """Return the states (n, B, 2d) and their args."""
@@ -153,6 +167,11 @@ def sampled(map_: Any, key, num: int) -> Samples:
 def _generator(key) -> np.random.Generator:
     """Make NumPy's generator of a key of ``jax.random``, which draws without compiling."""
     return np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
+
+
+def _stacked(found: list[Any]) -> Any:
+    """Results of the maps side by side, their leaves (n, ...)."""
+    return jax.tree.map(lambda *parts: np.stack(parts), *found)
 
 
 def _mapped(samples: Samples, function, each: tuple, together: int):

@@ -127,7 +127,9 @@ class SymplecticMap:
         that act during the step."""
         z = self._states(z)
         map_ = self if dt is None else self.over(dt, z.shape[:-1])
-        return programs.step(map_, z, self._args(args, z, t0, inputs))
+        args = self._args(args, z, t0, inputs)
+        followed = map_._followed(z, args)
+        return programs.step(map_, z, args) if followed is None else followed.step(z, args)
 
     def inverse(self, z=None, args=None, *, t0=None):
         """Make one step back, from Z to (z, Info). t0: the time at z, not at Z. Raises ValueError
@@ -356,7 +358,11 @@ class SymplecticMap:
         that the lanes were started with. inputs: of all steps from their start on.
         """
         args = self._schedule(params, lanes.y, t0, inputs)
-        return advance_lanes(self, lanes, args, Saving(num_saved, save_every, stop_outside))
+        saving = Saving(num_saved, save_every, stop_outside)
+        followed = self._followed(lanes, args)
+        if followed is not None:
+            return followed.advance(lanes, args, saving)
+        return advance_lanes(self, lanes, args, saving)
 
     def rollout(
         self,
@@ -382,10 +388,13 @@ class SymplecticMap:
         row more, at the last one's end. dt: argument of `over`. samples: number of maps drawn from
         the posterior with key, of ``jax.random``; the states of all of them are in memory at once.
         Returns the states (B, 1 + |num_steps| // save_every, 2d), the initial ones first, and a
-        RolloutInfo. With samples its ``bands`` have their std about the states, and quantiles. A
-        lane is NaN from where its step fails, or from where it leaves the domain with
-        ``stop_outside``. Raises ValueError where a number of steps or a shape is wrong, inputs are
-        given backwards, and where samples are asked for without a key or from a map without a
+        RolloutInfo. Dry friction of a law of a recording holds bodies that stop, as in forecasts,
+        where all that is given are numbers and the time goes forward; under ``jit``, ``grad`` and
+        ``vmap``, backwards and over several devices it is smoothed, and they creep by less than the
+        noise of a position in a period. With samples its ``bands`` have their std about the states,
+        and quantiles. A lane is NaN from where its step fails, or from where it leaves the domain
+        with ``stop_outside``. Raises ValueError where a number of steps or a shape is wrong, inputs
+        are given backwards, and where samples are asked for without a key or from a map without a
         posterior.
         """
         for name, number in (("num_steps", num_steps), ("save_every", save_every)):
@@ -411,7 +420,11 @@ class SymplecticMap:
             )
         args = map_._schedule(params, z0, t0, inputs, num_steps)
         saving = Saving(num_steps // save_every, save_every, stop_outside)
-        states, info = roll_out(map_, z0, args, saving)
+        followed = map_._followed(z0, args)
+        if followed is None:
+            states, info = roll_out(map_, z0, args, saving)
+        else:
+            states, info = followed.roll_out(z0, args, saving)
         if samples is None:
             return states, info
         if key is None:
@@ -429,6 +442,15 @@ class SymplecticMap:
     def angles_of_z(self) -> tuple[int, ...]:
         """Indices of the user's coordinates that are angles."""
         return self.coordinates.angles if self.coordinates.forward is CARTESIAN.forward else ()
+
+    def _followed(self, *given):
+        """The law of a recording as it is followed with its dry friction on the numbers ``given``,
+        `maps.events.Followed`, or None: then steps are JAX's."""
+        if self.sensors is None:
+            return None
+        from gfnn_jax.maps import events  # stands after this module: loaded when first used
+
+        return events.followed(self, *given)
 
     def _args(self, given, z, t0=None, inputs=None):
         """Args of a step of the states z."""

@@ -142,8 +142,8 @@ class LearnedLaw:
         sensors = self.map.sensors
         if sensors is not None and np.any(law_of_map(self.map).friction.kinds == DRY):
             lines.append(
-                f"dry friction: bodies slide or stick in fits and forecasts; rollouts of the map "
-                f"smooth it over speeds of {sensors.creep:.2g}"
+                "dry friction: bodies slide or stick in fits, forecasts and rollouts; under jit, "
+                f"grad and vmap the map smooths it over speeds of {sensors.creep:.2g}"
             )
         lines += [f"nearly collinear: {pair}" for pair in self.alike[:_SHOWN]]
         lines += [
