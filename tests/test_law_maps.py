@@ -328,6 +328,32 @@ def test_rollouts_with_events_that_end():
     np.testing.assert_array_equal(none[:, 0], z[:1])
 
 
+def test_bodies_that_stick_to_each_other():
+    """Two bodies on springs with friction between them: lanes go on from their states as from their
+    modes, and lose energy."""
+    rows = [((2, 0), (0, 0), (0, 0), 0.0), ((0, 2), (0, 0), (0, 0), 0.0)]
+    rows += [((0, 0), (2, 0), (0, 0), 0.0), ((0, 0), (0, 2), (0, 0), 0.0)]
+    rows += [((1, 1), (0, 0), (0, 0), 0.0)]
+    friction = Friction.of([((1, 0), DRY, CREEP), ((-1, 1), DRY, CREEP)], 2)
+    coefficients = np.array([0.5, 0.3, -0.5, -0.9, 0.1])
+    law = Lagrangian(
+        Terms.of(rows, 2), coefficients, friction, np.array([0.02, 0.2]), 0.0, np.zeros((2, 0))
+    )
+    z = np.random.default_rng(0).normal(size=(40, 4))
+    map_ = dataclasses.replace(map_of_law(law, z, 0.05), sensors=sensors_of(("x", "y"), 2.0))
+    states, _ = map_.rollout(z, 200)
+    lanes, parts = map_.start(z), []
+    for _ in range(200):
+        lanes, some = map_.advance(lanes, 1)
+        parts.append(some)
+    np.testing.assert_allclose(np.concatenate(parts, axis=1), states[:, 1:], atol=1e-10)
+    v = velocities_of(map_, np.asarray(states[:, 1:]))
+    together = np.abs(v[..., 1] - v[..., 0]) < 1e-14
+    assert 0.05 < np.mean(together & (np.abs(v[..., 0]) > 1e-3)) < 0.95
+    energy = jax.vmap(map_.hamiltonian)(states)
+    assert np.diff(energy, axis=1).max() < 1e-7
+
+
 def test_samples_of_a_law_that_sticks():
     map_, z = learned_block(), np.array([[0.42, 0.0], [0.03, 0.0]])
     drawn = map_.sample(jax.random.key(0), 3)

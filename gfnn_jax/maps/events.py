@@ -35,6 +35,7 @@ from gfnn_jax.solve.status import (
 )
 
 _AT_ONCE = 65_536  # states that are followed together
+_REST = 1e-12  # of the speeds, that rounding leaves of one that is 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -74,12 +75,12 @@ class Followed:
             law, p = law.at(args), functions_of(form.powers, args) * p
             form = dataclasses.replace(form, powers=None)
         lanes = jax.tree.map(np.array, lanes)
-        angles, modes = list(self.map.coordinates.angles), None
+        angles = list(self.map.coordinates.angles)
         near, beyond = parts_of_two_pi(lanes.y.dtype)
         y = lanes.y + lanes.compensation
         y[lanes.status > LEFT_DOMAIN] = np.nan
         v = Legendre(law.terms).velocity(law.coefficients, y)
-        x = np.concatenate([split(y)[0], v], axis=-1)
+        x, modes = np.concatenate([split(y)[0], v], axis=-1), _modes(v, form.friction.directions)
         (num, width), left = y.shape, saving.blocks * saving.every
         saved = [np.zeros((0, num, width))]
         while left > 0:
@@ -165,8 +166,18 @@ def followed(map_: Any, *given: Any) -> Followed | None:
     return Followed(bare, law_of(map_), substeps_of(map_.sensors, float(np.max(bare.dt))))
 
 
+def _modes(v: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Modes (B, F) in which velocities v (B, d) begin that were made of momenta: bodies that stick
+    to each other have nearly the same one then. NaN of lanes where the state itself tells."""
+    speeds = v @ directions.T
+    size = np.linalg.norm(v, axis=1)[:, None] * np.linalg.norm(directions, axis=1)
+    rests = np.abs(speeds) <= _REST * size
+    rounded = np.any(rests & (speeds != 0), axis=1)[:, None]
+    return np.where(rounded, np.where(rests, 0.0, np.sign(speeds)), np.nan)
+
+
 def _of_one_or_many(z, found):
-    """What was found of states (B, ...), on the device; of its one lane where z is one state."""
+    """Put what was found of states (B, ...) on the device: of one lane where z is one state."""
     if z.ndim == 1:
         found = jax.tree.map(lambda a: a[0], found)
     return jax.device_put(found)
