@@ -26,7 +26,9 @@ from gfnn_jax.phase_space import split
 class WithForces(AroundAnother):
     """Family of H of which forces change the field; ``family`` is that of H alone."""
 
-    name = "terms with friction"
+    @property
+    def name(self) -> str:
+        return "terms with friction"
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -20,7 +20,10 @@ class OfSystems(AroundAnother):
 
     family: Any
     powers: Powers
-    name = "terms with parameters"
+
+    @property
+    def name(self) -> str:
+        return "terms with parameters"
 
     @property
     def label(self) -> str:
