@@ -5,7 +5,7 @@ from __future__ import annotations
 import keyword
 import re
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from gfnn_jax.errors import InputError
 
@@ -45,6 +45,7 @@ CHEBYSHEV = re.compile(r"T\d{1,2}")
 CIRCULAR = ("sin", "cos")  # which share their values
 
 
+@runtime_checkable
 class Function(Protocol):
     """A user's own function of one variable: once registered, terms such as "wall(q1)" hold it."""
 
