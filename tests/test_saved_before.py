@@ -4,6 +4,7 @@ import json
 import zipfile
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -43,6 +44,10 @@ def test_a_folder_of_0_3_0(name, tmp_path):
     assert fit.law is None
     assert fit.verdict is None
     found, known = numbers_of(fit.map, NUMBERS[name])
+    if name == "recording-dry":  # rollouts of numbers follow its events since 0.4, traced ones not
+        np.testing.assert_allclose(found, known, rtol=0.03)
+        z = np.array(NUMBERS[name]["z0"])
+        found = jax.jit(lambda z: fit.map.rollout(z, 5)[0])(z)
     assert np.mean(np.isfinite(known)) > 0.5  # one lane of the sines is lost on its way
     np.testing.assert_allclose(found, known, rtol=1e-12, atol=1e-13)
 

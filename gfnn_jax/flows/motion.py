@@ -125,7 +125,10 @@ class Form:
         modes: np.ndarray | None = None,
     ) -> Step:
         """`step`, M of them one after another, h (N, M) and u (N, M, substeps, 6, inputs): the
-        states after each, with its derivatives in the state before it and in the coefficients."""
+        states after each, with its derivatives in the state before it and in the coefficients.
+
+        Raises ValueError where the arrays are not of as many lanes: compiled code checks no index.
+        """
         from gfnn_jax.flows import kernel
 
         width, frictions = 2 * self.dim, self.friction.count
@@ -141,6 +144,10 @@ class Form:
             _owned(turns),
         )
         begun = np.full((len(x), frictions), np.nan) if modes is None else modes
+        lanes = (x.shape, begun.shape, u.shape[:2], u.shape[4:])
+        asked = ((len(h), width), (len(h), frictions), h.shape, (self.num_inputs,))
+        if lanes != asked or not all(len(rows) in (1, len(h)) for rows in laws):
+            raise ValueError(f"expected states, modes, steps and inputs {asked}, got {lanes}")
         task = kernel.Task(
             _owned(x),
             _owned(begun),
