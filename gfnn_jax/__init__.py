@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gfnn_jax import records, scenes
+    from gfnn_jax.brackets import Bracket
     from gfnn_jax.compiling import enable_compile_cache
     from gfnn_jax.data.recording import Recording, read
     from gfnn_jax.errors import FitError, FitWarning, InputError, WorkError
@@ -46,6 +47,7 @@ _MODULES = {
     "scenes": "scenes",
 }
 _HOMES = {
+    "Bracket": "brackets",
     "CHARTS": "generating.charts",
     "Chart": "generating.charts",
     "Fit": "learn.fitted",
@@ -82,6 +84,7 @@ _HOMES = {
 
 __all__ = [
     "CHARTS",
+    "Bracket",
     "Chart",
     "Fit",
     "FitError",

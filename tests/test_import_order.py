@@ -17,6 +17,7 @@ ORDER = (
     "arrays",
     "errors",
     "phase_space",
+    "brackets",
     "coordinates",
     "compiling",
     "threads",

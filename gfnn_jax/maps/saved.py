@@ -18,6 +18,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gfnn_jax import brackets
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import lagrangian
@@ -96,6 +97,10 @@ _TYPES: dict[str, type] = {
         Damping,
         FunctionsOfArgs,
         OfDisplacement,
+        brackets.Constant,
+        brackets.Log,
+        brackets.LieAlgebra,
+        brackets.Magnetic,
     )
 } | {"LagrangianTerms": lagrangian.Terms}
 _NAMES = {kind: name for name, kind in _TYPES.items()}
