@@ -19,7 +19,12 @@ from gfnn_jax.data.roles import ROLES
 from gfnn_jax.errors import InputError
 from gfnn_jax.learn.options import COUNT, DEVICES, OPTIONS, POSITIVE, SEED, FitOptions, Kind
 
-EXPORTS = ("c", "stablehlo")  # those of `exports.export`, whose import would load JAX
+EXPORTS = (
+    "c",
+    "c-taylor",
+    "js",
+    "stablehlo",
+)  # those of `exports.export`, whose import would load JAX
 EXIT_STATUS = """\
 exit status:
   0    success
@@ -313,7 +318,8 @@ def _export(command: _Command) -> None:
     command.add("model", "folder that `gfnn fit` wrote", "MODEL", type=Path)
     command.add(
         "--to",
-        "c: C99 for one state at a time, of polynomials, Fourier harmonics and formulas; "
+        "c: C99 for one state at a time, of polynomials, Fourier harmonics and formulas; c-taylor: "
+        "a law's flow to roundoff, friction that sticks; js: a law as JavaScript; "
         "stablehlo: batches by jax.export, of any map",
         choices=EXPORTS,
         required=True,

@@ -294,6 +294,19 @@ static int {name}_{way}(double *z)
     return parts
 
 
+def flow_piece(name: str, piece: Flow, flow: str, width: int, inputs: int) -> list[str]:
+    """Write a piece in C whose ``flow`` over any time is there; ``inputs`` of the args are those of
+    inputs, which an inverse needs at the step's end."""
+    dt = float(np.asarray(piece.dt))
+    later = _later(f"{name}_later", on_symbols(piece.family), inputs)
+    ways = (("step", dt), ("back", -dt))
+    return [flow, *([later] if later else [])] + [
+        f"static int {name}_{way}(double *z)\n{{\n"
+        f"    return flow(z, {literal(h)}, z + {width}, NULL);\n}}\n"
+        for way, h in ways
+    ]
+
+
 _NARROWEST = 1e-150  # width of dry friction that no speed is below, and whose square is a number
 
 

@@ -6,6 +6,7 @@ The code allocates nothing and keeps no state, so that several threads may call 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,9 +16,17 @@ import numpy as np
 from gfnn_jax.coordinates import CARTESIAN, polar
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports import c_parts
-from gfnn_jax.exports.c_pieces import moves_args, piece_functions, unknowns, why_not_piece
+from gfnn_jax.exports.c_pieces import (
+    flow_piece,
+    moves_args,
+    piece_functions,
+    unknowns,
+    why_not_piece,
+)
+from gfnn_jax.exports.graph import graph_of
 from gfnn_jax.exports.polynomials import christoffel
 from gfnn_jax.exports.symbols import Tape, literal, table
+from gfnn_jax.exports.taylor import c_of_flow
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated
@@ -40,14 +49,20 @@ def why_not(map_: SymplecticMap) -> str | None:
     return next((why for piece in map_.pieces if (why := why_not_piece(piece))), None)
 
 
-def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
+def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any], taylor: bool = False) -> str:
     """Write a map as C: ``int NAME_step(const double z[2d], double Z[2d])`` and ``NAME_inverse``.
 
     For a map with parameters, a drive or inputs both take ``const double args[k]`` after z; where
     inputs change during a step, ``NAME_inputs`` makes their part of the args of samples. about:
-    entries of the comment at the top, name -> text. Raises InputError, in one line, for a map that
-    cannot be written in C.
+    entries of the comment at the top, name -> text. taylor: whether a law's flow is made by Taylor
+    series to roundoff, instead of by the map's own collocation. Raises InputError, in one line, for
+    a map that cannot be written in C.
     """
+    graph = graph_of(map_) if taylor else None
+    if graph is not None:  # stiff friction needs no Newton's method: bodies slide or stick
+        map_ = dataclasses.replace(
+            map_, pieces=(dataclasses.replace(map_.pieces[0], newton=False),)
+        )
     if (reason := why_not(map_)) is not None:
         raise InputError(
             f"this map cannot be written in C: {reason}. C takes polynomials, Fourier harmonics "
@@ -57,7 +72,8 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     pieces, width, domain = map_.pieces, 2 * map_.dim, map_.domain
     more = num_args(map_)
     assert isinstance(domain, Domain)
-    parts = [_comment(map_, name, about), c_parts.INCLUDES, c_parts.COMMON]
+    sticks = graph is not None and graph.sticks
+    parts = [_comment(map_, name, about, sticks), c_parts.INCLUDES, c_parts.COMMON]
     if map_.coordinates.angles:
         parts.append(c_parts.ANGLES)
     if map_.coordinates.forward is _POLAR:
@@ -67,15 +83,21 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
         parts.append(c_parts.newton_solver(most, width))
     if most > COFACTORS_UP_TO:
         parts.append(c_parts.ELIMINATION)
-    if stages := max((p.stages for p in pieces if isinstance(p, Flow)), default=0):
+    stages = max((p.stages for p in pieces if isinstance(p, Flow)), default=0)
+    if stages and graph is None:
         parts.append(c_parts.fixed_point_solver(width, stages, more + 1))  # 1: a piece's own
     if domain.keep:
         tape = Tape()
         y = tape.inputs("y", width)
         parts.append(tape.function("christoffel", {"kappa": christoffel(domain, y[0])}))
-    for i, (piece, back) in enumerate(zip(pieces, map_.reversed().pieces[::-1], strict=True)):
+    if graph is not None:
+        parts += flow_piece(
+            "piece0", pieces[0], c_of_flow(graph), width, 0 if map_.signals is None else more
+        )
+        pieces = ()
+    for i, (piece, back) in enumerate(zip(pieces, map_.reversed().pieces[::-1], strict=not taylor)):
         parts += piece_functions(f"piece{i}", piece, back, width, more)
-    order = range(len(pieces))
+    order = range(len(map_.pieces))
     ahead = args_after(map_)
     parts.append(_whole(map_, f"{name}_step", [f"piece{i}_step" for i in order], []))
     parts.append(
@@ -134,8 +156,14 @@ def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str], ahead: Sequenc
     return f"{_signature(map_, name)}\n{{\n{body}\n}}\n"
 
 
-def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
+def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any], sticks: bool) -> str:
     """Write the comment at the top of the file, which describes the map and its functions."""
+    backwards = (
+        ""
+        if not sticks
+        else """
+   Bodies stick and slide. What sticks does not tell where it came from: the inverse answers 3."""
+    )
     names = coordinate_names(map_.dim)
     sizes = ", ".join(f"{n} {s:.3g}" for n, s in zip(names, map_.scale, strict=True))
     angles = [names[i] for i in map_.coordinates.angles if map_.coordinates.forward is not _POLAR]
@@ -154,7 +182,7 @@ def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
 
    z = ({", ".join(names)}), in the units of the data; z and Z may be the same array.{turned}{given}
    Sizes of the coordinates in the data: {sizes}.
-   A step is dt = {literal(np.asarray(map_.dt))} in the data's unit of time.
+   A step is dt = {literal(np.asarray(map_.dt))} in the data's unit of time.{backwards}
 
    Answer: {c_parts.STATUSES}.
    1: {outside} outside the data's domain; the image is in Z all the same. 3, 4: Z is of no use.

@@ -16,12 +16,13 @@ from jax import export as exporting
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports.c_source import c_source
+from gfnn_jax.exports.javascript import javascript
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import require_x64
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
 
-SUFFIXES = {"c": ".c", "stablehlo": ".zip"}
+SUFFIXES = {"c": ".c", "c-taylor": ".c", "js": ".js", "stablehlo": ".zip"}
 _KEYWORDS_OF_C = re.compile(
     r"auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for"
     r"|goto|if|inline|int|long|register|restrict|return|short|signed|sizeof|static|struct"
@@ -39,11 +40,15 @@ def export(
     """Write a map as one file, and return its path.
 
     map_: a map, or the folder of a saved one, whose record then goes into the file.
-    to:   "c": a C99 file with ``int NAME_step(const double z[2d], double Z[2d])`` and
+    to:   a format, of docs/export.md:
+          "c": a C99 file with ``int NAME_step(const double z[2d], double Z[2d])`` and
           ``NAME_inverse``, NAME that of the file; for float64 maps whose functions are polynomials,
-          Fourier harmonics or formulas. "stablehlo": step and inverse of batches of any size, for
-          ``jax.export.deserialize``; for any map.
-    out:  the file; with None a file beside the folder, of its name, with .c or .zip.
+          Fourier harmonics or formulas.
+          "c-taylor": the same of a law, by Taylor series to roundoff, with events of dry friction.
+          "js": a law as JavaScript, whose inputs and coefficients are arguments.
+          "stablehlo": step and inverse of batches of any size, for ``jax.export.deserialize``; for
+          any map.
+    out:  the file; with None a file beside the folder, of its name.
 
     Raises InputError, in one line, where the file exists (unless ``overwrite``) or the map cannot
     be exported in this form, WorkError where writing fails.
@@ -60,8 +65,10 @@ def export(
     ensure_new(out, overwrite)
     map_ = map_ if isinstance(map_, SymplecticMap) else saved.load(map_)
     about = _about(folder)
-    if to == "c":
-        atomic_write(out, c_source(map_, _identifier(out), about))
+    if to in ("c", "c-taylor"):
+        atomic_write(out, c_source(map_, _identifier(out), about, to == "c-taylor"))
+    elif to == "js":
+        atomic_write(out, javascript(map_, _identifier(out), about))
     else:
         known = {"dim": map_.dim, "dt": float(np.asarray(map_.dt))}
         names = map_.parameters.names if map_.parameters is not None else ()
@@ -79,7 +86,7 @@ def _identifier(out: Path) -> str:
     name = out.stem
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or _KEYWORDS_OF_C.fullmatch(name):
         raise InputError(
-            f"{out}: expected a name of letters, digits and _: the C functions are named after it"
+            f"{out}: expected a name of letters, digits and _: functions are named after it"
         )
     return name
 

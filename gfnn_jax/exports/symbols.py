@@ -10,7 +10,8 @@ order, so that the C code rounds nearly as NumPy does.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,13 @@ import numpy as np
 _LONGEST = 90  # characters of an expression that is written where it is used
 _SUM, _PRODUCT, _ATOM = range(3)  # how tightly an operation binds
 _BINDS = {"+": _SUM, "-": _SUM, "*": _PRODUCT, "/": _PRODUCT}
+_ARITHMETIC: dict[str, Callable] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "negative": operator.neg,
+}
 # NumPy's names of functions, which it calls as methods of objects, and those of C.
 _FUNCTIONS = {
     "cos": "cos",
@@ -145,6 +153,11 @@ class Tape:
         values = [self.made("input", f"{name}[{i}]") for i in range(size)]
         return np.array(values, dtype=object).reshape(1, *shape)
 
+    @property
+    def made_so_far(self) -> tuple[Symbol, ...]:
+        """List its operations, in their order."""
+        return tuple(self._made)
+
     def made(self, operation: str, *operands: Any) -> Symbol:
         """Return the symbol of this operation, a known one or a new one."""
         operands = tuple(o if isinstance(o, (Symbol, str)) else float(o) for o in operands)
@@ -191,6 +204,28 @@ class Tape:
                 lines.append(f"const double t{symbol.number} = {text};")
                 texts[symbol.number] = f"t{symbol.number}", _ATOM
         return lines + [f"{n} = {_operand(value, texts, _SUM)};" for n, value in results.items()]
+
+    def evaluated(
+        self, results: Sequence[Any], inputs: Mapping[str, Any], functions: Mapping[str, Any]
+    ) -> list[Any]:
+        """Compute the results with numbers of another kind: those of a library, or symbols.
+
+        inputs: name -> numbers, of each input. functions: name in C -> function of these numbers,
+        "pow" and "clip" with theirs.
+        """
+        uses, found = self._uses(results), dict[int, Any]()
+        for symbol in self._made:
+            if symbol.number not in uses:
+                continue
+            own, operation = symbol.operands, symbol.operation
+            if operation == "input":
+                name, _, place = own[0].partition("[")
+                found[symbol.number] = inputs[name][int(place[:-1])]
+                continue
+            values = [found[o.number] if isinstance(o, Symbol) else o for o in own]
+            made = _ARITHMETIC.get(operation) or functions[operation]
+            found[symbol.number] = made(*values)
+        return [found[r.number] if isinstance(r, Symbol) else r for r in results]
 
     def _uses(self, results) -> dict[int, int]:
         """Number of uses of each symbol that the results depend on."""

@@ -1,0 +1,207 @@
+"""The rates of a law as one expression graph, which every printer of a law reads.
+
+    ż = f(z, u, p, σ)
+
+z = (q, p); u: the args of `map.step` (parameters, the time of a drive, inputs); p: the coefficients
+of the law. Friction whose force has a kink or a jump where its speed turns depends on σ, the sign
+of that speed: with σ as a number, f is analytic. The package's own lines run on symbols
+(`exports.symbols`); no formula is written a second time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.errors import InputError
+from gfnn_jax.exports.c_pieces import on_symbols, why_not_piece
+from gfnn_jax.exports.symbols import Symbol, Tape
+from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.families.family import at_time
+from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Friction
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.forces import Forced
+from gfnn_jax.flows.legendre import Legendre, law_of
+from gfnn_jax.flows.uniform import without_forces
+from gfnn_jax.maps.laws import is_of_law
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+
+
+@dataclasses.dataclass(frozen=True)
+class LawGraph:
+    """The graph of a law, with what its printers say about it.
+
+    tape: its operations, on inputs ``z``, ``u``, ``p`` and ``sigma``. rates: (2d,) of them ż.
+    speeds: (F,) the speeds of the friction that σ belongs to; limits: (F,) the forces at which
+    these hold, 0 of friction that has a kink alone; directions: (F, d) of the speeds. names,
+    arguments, terms: of z, u and p; values: of p. polynomials: (n, k) for each of u, which of u are
+    its coefficients of 1, τ, …, τ the time since a step began; advances: which of u is the time.
+    dt, scale: of a step, and of z.
+    """
+
+    tape: Tape
+    rates: list[Any]
+    speeds: list[Any]
+    limits: list[Any]
+    directions: np.ndarray
+    names: tuple[str, ...]
+    arguments: tuple[str, ...]
+    terms: tuple[str, ...]
+    values: np.ndarray
+    series: tuple[tuple[int, ...], ...]
+    time: int | None
+    dt: float
+    scale: np.ndarray
+
+    @property
+    def dim(self) -> int:
+        return len(self.rates) // 2
+
+    @property
+    def sticks(self) -> bool:
+        """Return whether bodies stick: dry friction acts that has no width."""
+        return any(not _is_zero(limit) for limit in self.limits)
+
+    @property
+    def num_given(self) -> int:
+        """The numbers of u that a step takes: those that the graph reads, and the coefficients of
+        τ, τ², … of inputs."""
+        return sum(map(len, self.series))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Signed:
+    """Friction on symbols: the signs of speeds are given, 0 of friction that needs none."""
+
+    friction: Friction
+    signs: np.ndarray
+
+    def slopes(self, v):
+        """dr_k/ds (F,) at v (d,)."""
+        own, slopes = self.friction, []
+        for s, kind, width, sign in zip(
+            own.directions @ v, own.kinds, own.widths, self.signs, strict=True
+        ):
+            smooth = s if kind == LINEAR else s / (s * s + width**2).sqrt()
+            signed = sign if kind == DRY else sign * s * s
+            slopes.append(smooth if _is_zero(sign) else signed)
+        return np.array(slopes, dtype=object)
+
+
+def graph_of(map_: SymplecticMap) -> LawGraph:
+    """The graph of the law whose flow a map is.
+
+    Raises InputError for a map that is no flow of a law in Cartesian coordinates, or whose law is
+    no formula.
+    """
+    piece = map_.pieces[0]
+    if len(map_.pieces) != 1 or not isinstance(piece, Flow):
+        raise InputError(
+            "this map has no law, whose rates would be exported: use --to c or --to stablehlo"
+        )
+    if map_.coordinates.forward is not CARTESIAN.forward:
+        raise InputError(
+            f"this law is one in {map_.coordinates.name} coordinates: use --to c or --to stablehlo"
+        )
+    sensors = map_.sensors
+    map_ = jax.tree.map(np.asarray, map_)  # drops the sensors
+    piece = map_.pieces[0]
+    reason = why_not_piece(dataclasses.replace(piece, newton=False))
+    if reason is not None:
+        raise InputError(f"this law cannot be written as formulas: {reason}")
+    dim, params = map_.dim, np.asarray(piece.params)
+    base, inputs, degree = _arguments(map_)
+    tape = Tape()
+    z, u = tape.inputs("z", 2 * dim), tape.inputs("u", len(base) + len(inputs))
+    plain = params.ndim == 1
+    p = tape.inputs("p", params.size)[0] if plain else params
+    args = u if u.size else None
+    family = on_symbols(_held(piece.family))
+    speeds, limits, directions = [], [], np.zeros((0, dim), int)
+    if is_of_law(map_):
+        rates, speeds, limits, directions = _of_lagrangian(
+            tape, family, p, z, args, getattr(sensors, "creep", 0.0)
+        )
+    else:
+        gradient = family.gradient(p, z, args)[0]
+        rates = [*gradient[dim:], *(-gradient[:dim])]
+    count = len(inputs)
+    series = [(i,) for i in range(len(base))]
+    series += [
+        tuple(len(base) + order * count + j for order in range(degree + 1)) for j in range(count)
+    ]
+    time = len(base) - 1 if _advances(piece.family, len(base) + count) else None
+    return LawGraph(
+        tape,
+        list(rates),
+        speeds,
+        limits,
+        directions,
+        coordinate_names(dim),
+        (*base, *inputs),
+        tuple(piece.family.term_names) if plain else (),
+        params if plain else np.zeros(0),
+        tuple(series),
+        time,
+        float(map_.dt),
+        np.asarray(map_.scale, float),
+    )
+
+
+def _arguments(map_: SymplecticMap) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+    """Names of parameters (the time of a drive the last) and of inputs, whose polynomials in time
+    have this degree."""
+    base = map_.parameters.names if map_.parameters is not None else ()
+    signals = map_.signals
+    return (base, (), 0) if signals is None else (base, signals.names, signals.degree)
+
+
+def _held(family: Any) -> Any:
+    """The family whose inputs are their values alone: a printer has its own series of them."""
+    if isinstance(family, Forced):
+        return dataclasses.replace(family, degree=0)
+    inner = getattr(family, "family", None)
+    if inner is None or without_forces(family) is family:
+        return family
+    return dataclasses.replace(family, family=_held(inner))
+
+
+def _advances(family: Any, count: int) -> bool:
+    """Return whether the family depends on time, the last of its args but for the inputs."""
+    if not count:
+        return False
+    none = np.zeros(count)
+    return bool(np.any(at_time(_held(family), none, 1.0) != none))
+
+
+def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
+    """Rates of a Lagrangian with its forces, and the speeds, limits and directions of the friction
+    whose sign is given; dry friction of no width beyond ``creep`` is sharp."""
+    law = law_of(family, p)
+    own, dim = law.friction, law.dim
+    sharp = (own.kinds == DRY) & (own.widths <= creep)
+    signed = np.flatnonzero(sharp | (own.kinds == QUADRATIC))
+    signs = np.zeros(own.count, dtype=object)
+    signs[signed] = tape.inputs("sigma", len(signed))[0] if len(signed) else []
+    if law.powers is not None:
+        law = law.at(args[..., : len(law.powers[0])])
+    gains = np.asarray(law.gains, dtype=object).reshape(dim, law.num_inputs)
+    losses = np.asarray(law.losses, dtype=object).ravel()
+    gradient = Legendre(law.terms).gradient(law.coefficients, z)[0]
+    v = gradient[dim:]
+    forces = -gradient[:dim] - z[0, dim:] * law.uniform
+    if own.count:
+        forces = forces - own.directions.T @ (losses * _Signed(own, signs).slopes(v))
+    if law.num_inputs:
+        forces = forces + gains @ args[0, -law.num_inputs :]
+    speeds = [own.directions[k] @ v for k in signed]
+    limits = [losses[k] if sharp[k] else 0.0 for k in signed]
+    return [*v, *forces], speeds, limits, own.directions[signed]
+
+
+def _is_zero(value: Any) -> bool:
+    return not isinstance(value, Symbol) and value == 0

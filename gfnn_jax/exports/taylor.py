@@ -1,0 +1,417 @@
+"""The flow of a law by Taylor series in time, to roundoff, over any time, as C.
+
+    z(t + τ) = Σ_k z_k τ^k,      (k + 1) z_{k+1} = f_k
+
+The coefficients f_k of the rates follow from those of z by recurrences, one for each operation of
+the graph (Å. Jorba & M. Zou, Exp. Math. 14 (2005) 99; A. Griewank & A. Walther, "Evaluating
+Derivatives", ch. 13). A series ends where two terms in a row are rounding; where the most terms are
+too few for the time that is left, it is followed as far as they reach. A flow computed to roundoff
+is symplectic to roundoff.
+
+Friction has events: f is analytic between two of them only. The series of a speed tells when it
+turns, that of the force which holds a body when it exceeds what friction holds; a body that is held
+has the series of this force as one unknown more of each order, from d^k(c·v)/dt^k = 0.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.errors import InputError
+from gfnn_jax.exports import taylor_parts
+from gfnn_jax.exports.graph import LawGraph
+from gfnn_jax.exports.symbols import Symbol, Tape, literal
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the series (`benchmarks/machines.py`).
+
+    order: the most terms; 28 let one series reach dt in most scenes, where 20, the cheapest for
+    each unit of time (Jorba & Zou), take two. rounding: of a term ÷ (size of its coordinate), that
+    ends a series. most: series of a step, from event to event. scan: places in a series where an
+    event is looked for. rest: speed ÷ all speeds, that rounding leaves of one that is 0. unrolled:
+    sums over products in a law whose loops are written out: a compiler then keeps the coefficients
+    in registers.
+    """
+
+    order: int = 28
+    rounding: float = 2.0**-52
+    most: int = 2_000
+    scan: int = 16
+    rest: float = 1e-12
+    unrolled: int = 6
+
+
+OPTIONS = Options()
+_FIRST = 4  # terms of a series before it is asked whether it ends
+
+
+def _refused(name: str) -> Any:
+    def refuse(*_: Any) -> Any:
+        raise InputError(f"this law has no Taylor series: {name} is not analytic; use --to c")
+
+    return refuse
+
+
+def _whole_power(u: Any, exponent: float) -> Any:
+    """u to a whole power by products, which a u of 0 does not stop."""
+    if exponent != int(exponent):
+        return u.tape.made("pow", u, exponent)
+    made: Any = 1.0
+    for _ in range(int(abs(exponent))):
+        made = made * u
+    return made if exponent > 0 else 1.0 / made
+
+
+def _beside(own: str, other: str) -> Any:
+    """A function whose series is made together with another's."""
+
+    def both(u: Any) -> Any:
+        made = u.tape.made(own, u)
+        u.tape.made(other, u)
+        return made
+
+    return both
+
+
+def _arctan(u: Any) -> Any:
+    u.tape.made("+", 1.0, u * u)  # divides its derivative
+    return u.tape.made("atan", u)
+
+
+_PARTNERS = {"sin": "cos", "cos": "sin", "sinh": "cosh", "cosh": "sinh"}
+_FUNCTIONS = {
+    **{own: _beside(own, other) for own, other in _PARTNERS.items()},
+    **{name: (lambda u, name=name: u.tape.made(name, u)) for name in ("exp", "log", "sqrt")},
+    "tan": lambda u: _FUNCTIONS["sin"](u) / _FUNCTIONS["cos"](u),
+    "tanh": lambda u: _FUNCTIONS["sinh"](u) / _FUNCTIONS["cosh"](u),
+    "atan": _arctan,
+    "pow": _whole_power,
+    "fabs": _refused("abs"),
+    "clip": _refused("a clipped number"),
+}
+
+
+class _Rows:
+    """The rows of a table T, a series each: z, the forces that hold bodies, then all operations.
+
+    unrolled: whether coefficients are variables of their own instead of entries of T.
+    """
+
+    def __init__(self, graph: LawGraph, values: Any, unrolled: bool | None):
+        self.graph, tape = graph, Tape()
+        self.width, self.count = len(graph.rates), len(graph.speeds)
+        z, u = tape.inputs("z", self.width)[0], tape.inputs("u", len(graph.arguments))
+        inputs = {"z": z, "u": u[0] if u.size else (), "p": values}
+        inputs["sigma"] = tape.inputs("sigma", self.count)[0] if self.count else ()
+        if values is None:
+            inputs["p"] = tape.inputs("p", len(graph.values))[0] if len(graph.values) else ()
+        wanted = [*graph.rates, *graph.speeds, *graph.limits]
+        found = graph.tape.evaluated(wanted, inputs, _FUNCTIONS)
+        rates, speeds, limits = np.split(
+            np.array([*found, None], dtype=object)[:-1], [self.width, self.width + self.count]
+        )
+        self.rates, self.speeds, self.limits = rates.tolist(), speeds.tolist(), limits.tolist()
+        self.tape, self.size = tape, OPTIONS.order + 1
+        self.made = self._used()
+        self.varies: set[int] = set()
+        self.rows: dict[int, int] = {s.number: i for i, s in enumerate(z)}
+        self.holds = [self.width + j for j in range(self.count)]
+        moving = {f"u[{i}]" for i, own in enumerate(graph.series) if len(own) > 1}
+        moving |= {f"u[{graph.time}]"} | {f"z[{i}]" for i in range(self.width)}
+        for s in self.made:
+            if s.operation == "input":
+                if s.operands[0] in moving:
+                    self.varies.add(s.number)
+            elif any(isinstance(o, Symbol) and o.number in self.varies for o in s.operands):
+                self.varies.add(s.number)
+            if s.operation != "input" or s.operands[0][0] == "u":
+                self.rows.setdefault(s.number, self.width + self.count + len(self.rows) - len(z))
+        sums = sum(s.number in self.varies and not self._is_sum_free(s) for s in self.made)
+        few = sums <= OPTIONS.unrolled and not self.count
+        self.unrolled = few if unrolled is None else unrolled
+
+    @property
+    def num(self) -> int:
+        return self.width + self.count + len(self.rows) - self.width
+
+    def _used(self) -> list[Symbol]:
+        """The operations that are needed, and the arguments of the law, in their order."""
+        ahead = [r for r in (*self.rates, *self.speeds, *self.limits) if isinstance(r, Symbol)]
+        used = {s.number for s in self.tape.made_so_far if s.operation == "input"}
+        while ahead:
+            s = ahead.pop()
+            if s.number not in used or s.operation == "input":
+                used.add(s.number)
+                ahead += [o for o in s.operands if isinstance(o, Symbol)]
+                if s.operation in _PARTNERS:
+                    ahead.append(self.tape.made(_PARTNERS[s.operation], s.operands[0]))
+                if s.operation == "atan":
+                    ahead.append(1.0 + s.operands[0] * s.operands[0])
+        return [s for s in self.tape.made_so_far if s.number in used]
+
+    def _is_sum_free(self, s: Symbol) -> bool:
+        """Return whether a coefficient takes no sum over products of others."""
+        moving = sum(self.varying(o) for o in s.operands)
+        return s.operation in ("+", "-", "negative", "input") or (
+            s.operation == "*" and moving == 1
+        )
+
+    def varying(self, value: Any) -> bool:
+        return isinstance(value, Symbol) and value.number in self.varies
+
+    def begin(self, value: Any) -> str:
+        """Text of where the series of an operand begins in T."""
+        return str(self.rows[value.number] * self.size)
+
+    def at(self, value: Any, k: int | str) -> str:
+        """Text of the k-th coefficient of an operand: a number, or the index ``k`` itself."""
+        if not isinstance(value, Symbol):
+            text = literal(value)
+            return f"({text})" if text.startswith("-") else text
+        if value.operation == "input" and value.operands[0][0] in "ps":
+            return value.operands[0]
+        if self.unrolled:
+            return f"t{self.rows[value.number]}_{k}"
+        begin = self.rows[value.number] * self.size
+        return f"T[{begin}{'' if k == 0 else f' + {k}'}]"
+
+    def written(self, k: int | str) -> list[str]:
+        """The lines that compute the k-th coefficients of all operations."""
+        lines, declared = [], "const double " if self.unrolled else ""
+        for s in self.made:
+            if s.operation == "input" or (k != 0 and s.number not in self.varies):
+                continue
+            made = self._zeroth(s) if k == 0 else self._later(s, k)
+            lines.append(f"{declared}{self.at(s, k)} = {made};")
+        return lines
+
+    def _zeroth(self, s: Symbol) -> str:
+        texts = [self.at(o, 0) for o in s.operands]
+        if s.operation == "negative":
+            return f"-{texts[0]}"
+        if s.operation in ("+", "-", "*", "/"):
+            return f" {s.operation} ".join(texts)
+        return f"{s.operation}({', '.join(texts)})"
+
+    def _later(self, s: Symbol, k: int | str) -> str:
+        operation, own = s.operation, s.operands
+        moving = [o for o in own if self.varying(o)]
+        if operation == "negative" or (operation == "-" and not self.varying(own[0])):
+            return f"-{self.at(moving[0], k)}"
+        if operation in ("+", "-"):
+            return f" {operation} ".join(self.at(o, k) for o in moving)
+        if operation == "*" and len(moving) == 2:
+            same = own[0] is own[1]
+            return self._sum("square", own[:1], k) if same else self._sum("product", own, k)
+        if operation == "*":
+            still = own[0] if moving[0] is own[1] else own[1]
+            return f"{self.at(still, 0)}*{self.at(moving[0], k)}"
+        if operation == "/":
+            by = self._sum("rest", (own[1], s), k)
+            factor = "" if not isinstance(own[0], Symbol) and own[0] == 1 else self.at(own[0], 0)
+            first = f"{self.at(s, 0)}/{factor}" if factor else self.at(s, 0)
+            return f"-{first}*{by}"
+        if operation in _PARTNERS:
+            other = self.tape.made(_PARTNERS[operation], own[0])
+            return f"{'-' if operation == 'cos' else ''}{self._sum('derived', (own[0], other), k)}"
+        if operation == "exp":
+            return self._sum("derived", (own[0], s), k)
+        if operation in ("log", "atan"):
+            by = own[0] if operation == "log" else 1.0 + own[0] * own[0]
+            left = f"{self.at(own[0], k)} - {self._sum('inner', (s, by), k)}"
+            return f"({left})/{self.at(by, 0)}"
+        exponent = 0.5 if operation == "sqrt" else own[1]
+        return self._sum("powered", (own[0], s), k, literal(exponent))
+
+    def _sum(self, name: str, operands: Sequence[Symbol], k: int | str, *more: str) -> str:
+        """A sum over products of coefficients: a call, or its terms where k is a number."""
+        if isinstance(k, str):
+            given = ", ".join([*map(self.begin, operands), *more])
+            return f"{name}(T, {given}, {k})"
+        a, b = operands[0], operands[-1]
+
+        def pair(i: int, j: int) -> str:
+            return f"{self.at(a, i)}*{self.at(b, j)}"
+
+        def weighted(by: Any, terms: Sequence[int]) -> list[str]:
+            return [f"{literal(by(j))}*({pair(j, k - j)})" for j in terms]
+
+        if name == "square":
+            halves = [pair(j, k - j) for j in range((k + 1) // 2)]
+            twice = [f"2.0*({_added(halves)})"] if halves else []
+            return f"({_added(twice + ([pair(k // 2, k // 2)] if k % 2 == 0 else []))})"
+        if name == "product":
+            return f"({_added([pair(j, k - j) for j in range(k + 1)])})"
+        if name == "rest":
+            return f"({_added([pair(j, k - j) for j in range(1, k + 1)])})"
+        if name == "derived":
+            return f"({_added(weighted(lambda j: j / k, range(1, k + 1)))})"
+        if name == "inner":
+            return f"({_added(weighted(lambda j: j / k, range(1, k))) or '0.0'})"
+        exponent = float(more[0])
+        terms = weighted(lambda j: (exponent * j - (k - j)) / k, range(1, k + 1))
+        return f"({_added(terms)})/{self.at(a, 0)}"
+
+
+def _added(terms: Sequence[str]) -> str:
+    """A sum in pairs, which a processor adds side by side."""
+    if len(terms) <= 2:
+        return " + ".join(terms)
+    half = len(terms) // 2
+    return f"({_added(terms[:half])}) + ({_added(terms[half:])})"
+
+
+def c_of_flow(graph: LawGraph, coefficients: bool = False, unrolled: bool | None = None) -> str:
+    """Write ``static int flow(double *z, double h, const double *u, const double *p)`` in C: z is
+    moved by h, a time of either sign, and the answer is a status of ``exports.c_parts``.
+
+    coefficients: whether those of the law are ``p``; else they are constants, and p is not read.
+    unrolled: whether the sums are written out, by default those of small laws.
+    """
+    rows = _Rows(graph, None if coefficients else graph.values.tolist(), unrolled)
+    sizes = {
+        "DIM": graph.dim,
+        "WIDTH": rows.width,
+        "ORDER": OPTIONS.order,
+        "SIZE": rows.size,
+        "ROWS": rows.num,
+        "MOST_SERIES": OPTIONS.most,
+    }
+    tables = {"double scale[WIDTH]": map(literal, graph.scale)}
+    numbers = {"ROUNDING": OPTIONS.rounding}
+    if not rows.unrolled:
+        tables["int rates[WIDTH]"] = map(rows.begin, rows.rates)
+    if rows.count:
+        sizes |= {"FRICTIONS": rows.count, "STICKS": int(graph.sticks), "SCAN": OPTIONS.scan}
+        numbers["REST"] = OPTIONS.rest
+        tables["int speeds[FRICTIONS]"] = map(rows.begin, rows.speeds)
+        tables["double directions[FRICTIONS*DIM]"] = map(literal, np.ravel(graph.directions))
+    parts = [
+        "enum { " + ", ".join(f"{name} = {value}" for name, value in sizes.items()) + " };",
+        *(f"static const double {name} = {literal(value)};" for name, value in numbers.items()),
+        *(f"static const {name} = {{{', '.join(values)}}};" for name, values in tables.items()),
+        "",
+    ]
+    if rows.unrolled:
+        return "\n".join(
+            [*parts, taylor_parts.MOVED, _given(rows), _written_out(rows), taylor_parts.SMOOTH]
+        )
+    signed = ", const double *sigma" if rows.count else ""
+    zeroth, later = rows.written(0), rows.written("k")
+    operations = _function(
+        f"operations(double *T, int k, const double *p{signed})",
+        ["if (k == 0) {", *_indented(zeroth), "    return;", "}", *later],
+        [name for name in ("p", "sigma")[: 1 + bool(signed)] if f"{name}[" not in "".join(zeroth)],
+    )
+    parts += [
+        text for name, text in taylor_parts.SUMS.items() if re.search(rf"\b{name}\(T,", operations)
+    ]
+    parts += [taylor_parts.MOVED, _given(rows), operations]
+    parts += (
+        [_limits(rows), taylor_parts.WITH_FRICTION]
+        if rows.count
+        else [taylor_parts.SERIES, taylor_parts.SMOOTH]
+    )
+    return "\n".join(parts)
+
+
+def _indented(lines: Sequence[str]) -> list[str]:
+    return [f"    {line}" for line in lines]
+
+
+def _function(head: str, lines: Sequence[str], unused: Sequence[str]) -> str:
+    body = "\n".join(_indented([f"(void)({name});" for name in unused] + list(lines)))
+    return f"static void {head}\n{{\n{body}\n}}\n"
+
+
+def _given(rows: _Rows) -> str:
+    """Write the function that puts the args, a time t after the step began, into T."""
+    lines = []
+    graph = rows.graph
+    own = {s.operands[0]: s for s in rows.made if s.operation == "input"}
+    for i, places in enumerate(graph.series):
+        symbol = own[f"u[{i}]"]
+        begin, degree = rows.rows[symbol.number] * rows.size, len(places) - 1
+        lines += [f"T[{begin + m}] = u[{place}];" for m, place in enumerate(places)]
+        if graph.time == i:
+            lines += [f"T[{begin}] += t;", f"T[{begin + 1}] = 1.0;"]
+            degree = 1
+        elif degree:
+            lines += [
+                f"for (int n = 0; n < {degree}; n++)",
+                f"    for (int m = {degree - 1}; m >= n; m--)",
+                f"        T[{begin} + m] += t*T[{begin} + m + 1];",
+            ]
+        if symbol.number in rows.varies:
+            lines += [
+                f"for (int k = {degree + 1}; k < SIZE; k++)",
+                f"    T[{begin} + k] = 0.0;",
+            ]
+    moving = any(len(places) > 1 for places in graph.series) or graph.time is not None
+    unused = ([] if moving else ["t"]) + ([] if lines else ["T", "u"])
+    return _function("given(double *T, const double *u, double t)", lines, unused)
+
+
+def _limits(rows: _Rows) -> str:
+    """Write the function of the forces that friction holds."""
+    texts = [rows.at(limit, 0) for limit in rows.limits]
+    chosen = "".join(f"j == {j} ? {text} : " for j, text in enumerate(texts))
+    return (
+        "static double limit(const double *T, const double *p, int j)\n{\n"
+        f"    (void)(T), (void)(p);\n    return {chosen}0.0;\n}}\n\n"
+    )
+
+
+def _written_out(rows: _Rows) -> str:
+    """Write ``series`` without loops: each coefficient a variable."""
+    graph, lines = rows.graph, []
+    inputs = [s for s in rows.made if s.operation == "input" and s.number in rows.rows]
+    z = inputs[: rows.width]
+    for s in inputs:
+        last = OPTIONS.order - 1 if s.number in rows.varies and s not in z else 0
+        lines += [
+            f"const double {rows.at(s, k)} = T[{rows.rows[s.number] * rows.size + k}];"
+            for k in range(last + 1)
+        ]
+    lines += [
+        f"const double size{i} = ROUNDING*(fabs({rows.at(s, 0)}) + {literal(graph.scale[i])});"
+        for i, s in enumerate(z)
+    ]
+    lines.append(f"const double square = h*h;\ndouble power = {'*'.join('h' * _FIRST)};")
+    for k in range(OPTIONS.order):
+        lines += rows.written(k)
+        for i, (s, rate) in enumerate(zip(z, rows.rates, strict=True)):
+            still = k > 0 and not rows.varying(rate)
+            later = "0.0" if still else f"{literal(1 / (k + 1))}*{rows.at(rate, k)}"
+            place = i * rows.size + k + 1
+            lines.append(f"const double {rows.at(s, k + 1)} = {later};")
+            lines.append(f"T[{place}] = {rows.at(s, k + 1)};")
+        if k > _FIRST and (k - _FIRST) % 2 == 0:
+            lines.append("power *= square;")
+            small = [
+                f"fabs({rows.at(s, n)}*{power}) <= size{i}"
+                for i, s in enumerate(z)
+                for n, power in ((k, "power"), (k + 1, "power*h"))
+            ]
+            lines += [f"if ({' && '.join(small)})", f"    return {k + 1};"]
+    lines.append("return ORDER;")
+    body = "\n".join(_indented(["(void)(p);", *_needed(lines)]))
+    return f"static int series(double *T, double h, const double *p)\n{{\n{body}\n}}\n"
+
+
+def _needed(lines: Sequence[str]) -> list[str]:
+    """The lines without variables that nothing reads."""
+    kept, read = [], set[str]()
+    for line in reversed(lines):
+        name = re.match(r"const double (t\d+_\d+) = ", line)
+        if name is None or name[1] in read:
+            kept.append(line)
+            read |= {*re.findall(r"t\d+_\d+", line[name.end() if name else 0 :])}
+    return kept[::-1]

@@ -1,0 +1,186 @@
+"""Laws for other programs: each format does what the flow of the law does."""
+
+import dataclasses
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from test_exports import (
+    by_c,
+    by_c_pointer,
+    by_c_with,
+    compiled,
+    driven,
+    law,
+    needs_cc,
+    pushed,
+    with_length,
+)
+
+import gfnn_jax as gfnn
+from gfnn_jax import cli, cli_parser
+from gfnn_jax.exports.export import SUFFIXES
+from gfnn_jax.families import lagrangian
+from gfnn_jax.maps.inputs import Signals
+from gfnn_jax.maps.laws import map_of_law
+from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.solve.status import LEFT_DOMAIN, NOT_CONVERGED
+
+needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="no node to run JavaScript")
+
+
+def two_rods(friction, losses, gain=False):
+    """A double pendulum with friction, pushed on its first angle where there is a ``gain``; its
+    dry friction sticks. And its states."""
+    none = (0, 0)
+    rows = [
+        ((2, 0), none, none, 0.0),
+        ((0, 2), none, none, 0.0),
+        ((1, 1), none, (1, -1), 0.0),
+        (none, none, (1, 0), 0.0),
+        (none, none, (0, 1), 0.0),
+    ]
+    own = lagrangian.Lagrangian(
+        lagrangian.Terms.of(rows, 2),
+        np.array([1.0, 0.5, 1.0, 9.0, 4.0]),
+        lagrangian.Friction.of(friction, 2),
+        np.array(losses),
+        0.0,
+        np.array([[1.0], [0.0]]) if gain else np.zeros((2, 0)),
+    )
+    z = np.random.default_rng(0).uniform(-1, 1, (400, 4)) * [1, 1, 2, 2]
+    signals = Signals(("F",)) if gain else None
+    map_ = map_of_law(own, z, 0.02, tolerance=1e-9, signals=signals)
+    none = np.zeros((1, 2))
+    sensors = Sensors(
+        ("a", "b"), (), (), np.full(2, 1e-3), 10.0, 0.6, "hold", 0.0, np.ones(1), none, creep=1e-4
+    )
+    return dataclasses.replace(map_, sensors=sensors), z
+
+
+def viscous():
+    linear = lagrangian.LINEAR
+    return two_rods([((1, 0), linear, 0.0), ((-1, 1), linear, 0.0)], [0.1, 0.05])
+
+
+def sticking():
+    """Dry friction of each joint and of the second rod, and a quadratic one: held bodies, some
+    twice."""
+    rows = [
+        ((1, 0), lagrangian.DRY, 1e-4),
+        ((0, 1), lagrangian.DRY, 1e-4),
+        ((-1, 1), lagrangian.DRY, 1e-4),
+        ((0, 1), lagrangian.QUADRATIC, 0.0),
+    ]
+    return two_rods(rows, [0.6, 0.4, 0.4, 0.1], gain=True)
+
+
+def exactly(map_):
+    """The map by steps so short that its flow is exact."""
+    finer = dataclasses.replace(map_.pieces[0], stages=8, substeps=8)
+    return dataclasses.replace(map_, pieces=(finer,))
+
+
+SMOOTH = {  # the map, states, and args of each
+    "polynomial and formulas": lambda: (*law(), None),
+    "double pendulum with friction": lambda: (*viscous(), None),
+    "parameters, Lagrangian": lambda: with_length("Lagrangian"),
+    "parameters": lambda: with_length("law"),
+    "driven": lambda: driven("law"),
+    "inputs that change": lambda: with_inputs(),
+}
+
+
+def with_inputs():
+    """Inputs that are linear in time during a step, and friction that is uniform."""
+    map_, z = pushed("linear", 0.013, uniform=0.2)
+    return map_, z, np.random.default_rng(1).normal(size=(len(z), 2))
+
+
+def expected(map_, z, args):
+    """Images of the exact flow, by the piece itself: args as C has them."""
+    piece = exactly(map_).pieces[0]
+    return np.asarray(piece.step(z, args)[0])
+
+
+def by_javascript(path, calls):
+    """What the law's ``step`` answers to each call (z, h, u)."""
+    file = path.with_suffix(".json")
+    file.write_text(json.dumps(calls))
+    script = (
+        f"const law = require({str(path)!r});"
+        f"const calls = JSON.parse(require('fs').readFileSync({str(file)!r}));"
+        "console.log(JSON.stringify(calls.map((call) => law.step(...call))));"
+    )
+    done = subprocess.run(["node", "-e", script], capture_output=True, text=True, check=True)
+    return np.array(json.loads(done.stdout), float)
+
+
+@needs_cc
+@pytest.mark.parametrize("kind", SMOOTH)
+def test_a_taylor_series_in_c_is_the_flow(kind, tmp_path):
+    map_, z, args = SMOOTH[kind]()
+    library = compiled(gfnn.export(map_, "c-taylor", tmp_path / "own.c"))
+    for function, own in (
+        (library.own_step, map_),
+        (library.own_inverse, map_.reversed() if args is None else None),
+    ):
+        if own is not None:
+            images, status = by_c(function, z) if args is None else by_c_with(function, z, args)
+            assert set(status.tolist()) <= {0, LEFT_DOMAIN}
+            # A third power of a speed has a kink where it turns, which collocation smooths.
+            atol = 1e-9 if kind == "inputs that change" else 3e-15
+            np.testing.assert_allclose(images, expected(own, z, args), rtol=1e-14, atol=atol)
+
+
+@needs_node
+@pytest.mark.parametrize("kind", SMOOTH)
+def test_javascript_is_the_flow(kind, tmp_path):
+    map_, z, args = SMOOTH[kind]()
+    path = gfnn.export(map_, "js", tmp_path / "own.js")
+    dt = float(map_.dt)
+    given = [[]] * len(z) if args is None else args.tolist()
+    calls = [[state, dt, u] for state, u in zip(z.tolist(), given, strict=True)]
+    atol = 1e-9 if kind == "inputs that change" else 3e-15
+    found = by_javascript(path, calls)
+    np.testing.assert_allclose(found, expected(map_, z, args), rtol=1e-14, atol=atol)
+    if kind == "double pendulum with friction":  # any time, and other coefficients
+        family, params = map_.pieces[0].family, 1.1 * np.asarray(map_.pieces[0].params)
+        other = dataclasses.replace(exactly(map_).pieces[0], params=params, dt=-0.013)
+        calls = [[state, -0.013, [], params.tolist()] for state in z[:50].tolist()]
+        wanted = np.asarray(other.step(z[:50], None)[0])
+        np.testing.assert_allclose(by_javascript(path, calls), wanted, rtol=1e-14, atol=1e-14)
+        assert family.num_parameters == len(params)
+
+
+@needs_cc
+def test_bodies_stick_in_c_as_in_a_rollout(tmp_path):
+    map_, z = sticking()
+    u = 2 * np.sin(0.06 * np.arange(300))[:, None]
+    states = np.asarray(map_.rollout(z[:3], 300, inputs=u)[0])
+    speeds = np.asarray(map_.pieces[0].family.family.velocity(map_.pieces[0].params[:5], states))
+    rests = np.any(np.abs(speeds @ [[1, 0, -1], [0, 1, 1]]) < 1e-10, axis=-1)
+    assert 0.02 < np.mean(rests) < 0.9  # bodies stick, and slide
+    library = compiled(gfnn.export(map_, "c-taylor", tmp_path / "own.c"))
+    begun = np.ascontiguousarray(states[:, :-1].reshape(-1, 4))
+    images, status = by_c_with(library.own_step, begun, np.tile(u, (3, 1)))
+    assert set(status.tolist()) <= {0, LEFT_DOMAIN}
+    # As forecasts are: their steps err by 1e-9.
+    np.testing.assert_allclose(images, states[:, 1:].reshape(-1, 4), atol=2e-8)
+    state = begun[0].copy()
+    assert library.own_inverse(by_c_pointer(state), by_c_pointer(u), by_c_pointer(state)) == (
+        NOT_CONVERGED
+    )
+
+
+def test_formats_of_laws_are_refused_for_what_has_none(tmp_path):
+    from test_exports import MAPS
+
+    map_, _ = MAPS["type 2"]()
+    for to in ("c-taylor", "js"):
+        with pytest.raises(gfnn.InputError, match=r"no law.*--to c"):
+            gfnn.export(map_, to, tmp_path / f"own{SUFFIXES[to]}")
+    assert set(SUFFIXES) == set(cli_parser.EXPORTS)
+    assert cli.main(["export", str(tmp_path), "--to", "js"]) == 2
