@@ -51,15 +51,18 @@ def as_latex(text: str) -> str:
     return sympy.latex(as_sympy(text))
 
 
-def hamiltonian(mass: Mapping[tuple[int, int], Sequence[str]], potential: str, dim: int) -> Any:
-    """½ pᵀ M⁻¹ p + V in p1, …, pd: of the summands of the entries (i, j), i <= j, of M, and V."""
+def hamiltonian(entries: Mapping[tuple[int, ...], Sequence[str]], potential: str, dim: int) -> Any:
+    """½ (p − a)ᵀ M⁻¹ (p − a) + V in p1, …, pd: of V, and of the summands of the entries (i, j),
+    i <= j, of M and (i,) of a."""
     import sympy
 
-    entries = sympy.zeros(dim, dim)
-    for (i, j), summands in mass.items():
-        for summand in summands:
-            entries[i, j] += as_sympy(summand)
-        entries[j, i] = entries[i, j]
+    mass = sympy.zeros(dim, dim)
     p = sympy.Matrix(sympy.symbols(f"p1:{dim + 1}"))
-    kinetic = (p.T * entries.inv() * p)[0, 0] / 2
+    for axes, summands in entries.items():
+        entry = sum(map(as_sympy, summands))
+        if len(axes) == 1:
+            p[axes[0]] -= entry
+        else:
+            mass[axes], mass[axes[::-1]] = entry, entry
+    kinetic = (p.T * mass.inv() * p)[0, 0] / 2
     return kinetic + as_sympy(potential)

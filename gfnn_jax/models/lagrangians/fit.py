@@ -162,6 +162,12 @@ class ArcProblem:
         shown = set(self.observation.direct) - set(self.observation.shifts())
         return tuple(i for i in self.angles if i in shown)
 
+    @property
+    def within_a_turn(self) -> tuple[int, ...]:
+        """Angles that stay within a turn in each run, of which a law may have powers."""
+        ranges = [np.ptp(n.x[:, : self.dim], axis=0) for n in self.nodes]
+        return tuple(i for i in self.angles if max(r[i] for r in ranges) < 2 * np.pi)
+
     def by_rule(self, rule: str) -> ArcProblem:
         """The problem with the inputs of one rule between samples, without a delay; as it is where
         that is its only rule."""
@@ -270,6 +276,15 @@ class LawFit:
     def follows(self) -> bool:
         """Return whether orbits of the law follow all arcs."""
         return bool(np.isfinite(self.fitted.cost))
+
+    @functools.cached_property
+    def is_definite(self) -> bool:
+        """Return whether M is positive definite at all states: else there is no least energy."""
+        law, d = self.form.lagrangian(self.p[: self.form.count]), self.form.dim
+        if not np.all(np.isfinite(self.p)):
+            return False
+        masses = law.at(self.problem.args).masses(self.problem.states[:, :d])
+        return bool(np.linalg.eigvalsh(masses).min() > 0)
 
     @property
     def followed(self) -> Arcs:

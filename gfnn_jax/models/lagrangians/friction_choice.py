@@ -133,6 +133,11 @@ def kinds_of(rows: Sequence[Loss]) -> tuple[int, ...]:
     return tuple(sorted({row[1] for row in rows}))
 
 
+def _is_coupled(row: Loss) -> bool:
+    """Return whether a friction is of the speeds of several coordinates."""
+    return sum(map(bool, row[0])) > 1
+
+
 class _Judged(NamedTuple):
     """A set of frictions and its held-out residuals (A, L, k); rounding: of each of these;
     sizes: each ρ from all arcs, divided by the least that counts as seen, √log n of its standard
@@ -305,17 +310,29 @@ class Table:
         of the kinds. Of directions alike one may stand for another, so that the order decides which
         are left. Those that held-out arcs do not miss go first. The other order is taken where all
         that it leaves are seen and of the first order not all, or where Schwarz's criterion gives
-        it odds of 20."""
-        subset = [k for k, row in enumerate(self.candidates) if row[1] in kinds]
-        found = self.solve(self.triangles[-1], subset)
-        subset = [k for k in subset if found[k] > 0]
+        it odds of 20. Friction of single coordinates is taken where that gives no odds of 20
+        against it: with masses that are free it may be the same as that of relative speeds."""
+        of_kinds = [k for k, row in enumerate(self.candidates) if row[1] in kinds]
+        subset = self._not_below_zero(of_kinds)
         if kinds_of([self.candidates[k] for k in subset]) != kinds:
             return None
         here, other = self._lean(subset, False), self._lean(subset, True)
         if here.is_seen != other.is_seen:
-            return here if here.is_seen else other
-        likelier = here.criterion - other.criterion > 2 * np.log(EVIDENCE.decided)
-        return other if likelier else here
+            here = here if here.is_seen else other
+        elif here.criterion - other.criterion > 2 * np.log(EVIDENCE.decided):
+            here = other
+        if not any(_is_coupled(row) for row in here.rows):
+            return here
+        single = [k for k in of_kinds if not _is_coupled(self.candidates[k])]
+        alone = self._lean(self._not_below_zero(single), False)
+        worse = alone.criterion - here.criterion > 2 * np.log(EVIDENCE.decided)
+        as_good = alone.kinds == kinds and alone.is_seen >= here.is_seen and not worse
+        return alone if as_good else here
+
+    def _not_below_zero(self, subset: Sequence[int]) -> list[int]:
+        """Those of these candidates whose ρ from all arcs is above zero."""
+        found = self.solve(self.triangles[-1], subset)
+        return [k for k in subset if found[k] > 0]
 
     def _lean(self, subset: list[int], seen_first: bool) -> _Judged:
         """The set without its spare directions: first those that are not seen, or first those that

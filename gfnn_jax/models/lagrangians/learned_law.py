@@ -222,40 +222,48 @@ class LearnedLaw:
 
 @dataclasses.dataclass(frozen=True)
 class Hamiltonian:
-    """H = ½ pᵀ M(q)⁻¹ p + V(q) of a law: the entries of M and the terms of V, as fitted."""
+    """H = ½ (p − a)ᵀ M(q)⁻¹ (p − a) + V(q) of a law: the entries of M, "M12: factor", and of a,
+    "a2: factor", and the terms of V, as fitted."""
 
     terms: tuple[Term, ...]
 
     @property
     def formula(self) -> str:
-        """V as code, and the entries of M."""
-        mass = ", ".join(f"{t} {c:.6g}" for t, c, _ in self.terms if t.startswith("M"))
-        return f"p·M⁻¹p/2 + {self._potential.formula}, {mass}"
+        """V as code, and the entries of M and a."""
+        entries = ", ".join(f"{t} {c:.6g}" for t, c, _ in self.terms if ": " in t)
+        p = "(p - a)" if self._has_field else "p"
+        return f"{p}·M⁻¹{p}/2 + {self._potential.formula}, {entries}"
 
     def sympy(self) -> Any:
         """H in the positions' names and p1, …, pd, as a sympy expression."""
-        entries: dict[tuple[int, int], list[str]] = {}
+        entries: dict[tuple[int, ...], list[str]] = {}
         for name, coefficient, _ in self.terms:
-            if name.startswith("M"):
-                place, _, factor = name.partition(": ")
-                i, j = (int(digit) - 1 for digit in place[1:])
-                entries.setdefault((i, j), []).append(f"{coefficient!r}*({factor})")
-        dim = 1 + max(j for _, j in entries)
+            place, colon, factor = name.partition(": ")
+            if colon:
+                axes = tuple(int(digit) - 1 for digit in place[1:])
+                entries.setdefault(axes, []).append(f"{coefficient!r}*({factor})")
+        dim = 1 + max(j for *_, j in entries)
         return symbolic.hamiltonian(entries, self._potential.formula, dim)
 
     def latex(self) -> str:
-        """H in LaTeX's notation, M as a matrix of its own."""
-        return rf"\tfrac12 p^\top M(q)^{{-1}} p + {self._potential.latex()}"
+        """H in LaTeX's notation, M and a as matrices of their own."""
+        p = "(p - a)" if self._has_field else "p"
+        return rf"\tfrac12 {p}^\top M(q)^{{-1}} {p} + {self._potential.latex()}"
+
+    @property
+    def _has_field(self) -> bool:
+        return any(t.term.startswith("a") and ": " in t.term for t in self.terms)
 
     @property
     def _potential(self) -> Formula:
-        return Formula(tuple(t for t in self.terms if not t.term.startswith("M")))
+        return Formula(tuple(t for t in self.terms if ": " not in t.term))
 
 
 def hamiltonian_of(
     law: Lagrangian, lagrangian: Formula, names: tuple[str, ...], parameters: tuple[str, ...]
 ) -> Hamiltonian:
-    """The entries of M as "M12: factor", and V = −(the terms of L without v)."""
+    """The entries of M and a, those of L with two factors v and with one, and V = −(the terms of L
+    without v)."""
     terms = law.terms
     coefficients = np.array([t.coefficient for t in lagrangian.terms])
     std = np.array([t.std for t in lagrangian.terms])
@@ -266,11 +274,11 @@ def hamiltonian_of(
     factors, listed = found.terms, []
     for row, (factor, c, error) in zip(terms.rows(), factors, strict=True):
         axes = [i for i, k in enumerate(row[0]) for _ in range(k)]
-        if len(axes) == 2:
-            double = 2.0 if axes[0] == axes[1] else 1.0
-            name = f"M{axes[0] + 1}{axes[1] + 1}: {factor}"
+        if axes:
+            double = 2.0 if axes[1:] == axes[:1] else 1.0
+            name = f"{'aM'[len(axes) - 1]}{''.join(str(i + 1) for i in axes)}: {factor}"
             listed.append(Term(name, double * c, double * error))
-        elif not axes:
+        else:
             listed.append(Term(factor, -c, error))
     return Hamiltonian(tuple(listed))
 

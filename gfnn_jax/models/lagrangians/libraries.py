@@ -101,13 +101,31 @@ def first(dim: int, angles: tuple[int, ...]) -> list[Row]:
     return rows
 
 
+def gyroscopic(dim: int, angles: tuple[int, ...], degree: int) -> list[Row]:
+    """v_j f(q), of forces at right angles to the motion: powers of lengths and modes up to
+    ``degree``, of which some coordinate comes before the j-th. a(q) and a + ∇χ move alike, and so
+    each field has one representative among them."""
+    none, lengths = (0,) * dim, [i for i in range(dim) if i not in angles]
+    powers = [
+        unit(dim, *axes)
+        for n in range(1, degree + 1)
+        for axes in combinations_with_replacement(lengths, n)
+    ]
+    rows: list[Row] = []
+    for j in range(1, dim):
+        rows += [(unit(dim, j), n, none, 0.0) for n in powers if any(n[:j])]
+        waves = [m for m in modes(dim, angles, degree) if any(m[:j])]
+        rows += [(unit(dim, j), none, m, phase) for m in waves for phase in (0.0, SINE)]
+    return rows
+
+
 def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """Modes up to |m| = 3 and their sines in V, up to 2 in T; powers of lengths up to 6 in V, 2 in
     T."""
     none = (0,) * dim
     lengths = [i for i in range(dim) if i not in angles]
     rows: list[Row] = []
-    for pair in combinations_with_replacement(range(dim), 2) if dim > 1 else ():
+    for pair in combinations_with_replacement(range(dim), 2):
         speeds = unit(dim, *pair)
         for m in modes(dim, angles, 2):
             rows += [(speeds, none, m, 0.0), (speeds, none, m, SINE)]
@@ -122,6 +140,19 @@ def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
         for m in modes(dim, angles, 1):
             rows += [(none, unit(dim, i), m, 0.0), (none, unit(dim, i), m, SINE)]
     return rows
+
+
+def springs(dim: int, angles: Sequence[int]) -> list[Row]:
+    """Potentials of degree 2 of angles that stay within a turn: torsion."""
+    none = (0,) * dim
+    pairs = combinations_with_replacement(angles, 2)
+    return [(none, unit(dim, *axes), none, 0.0) for axes in pairs]
+
+
+def every(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """All terms that a search may come to."""
+    rows = (*first(dim, angles), *gyroscopic(dim, angles, 2), *more(dim, angles))
+    return list(dict.fromkeys(rows))
 
 
 def without_forces(rows: Sequence[Row], axes: Sequence[int]) -> tuple[Row, ...]:

@@ -446,7 +446,7 @@ def _map(data: RecordingData, best: CalibratedLaw) -> SymplecticMap:
         smoothed(best.moving, sensors.creep),
         np.concatenate([q, law.at(problem.args).momentum(q, v)], axis=1),
         problem.scales.dt,
-        angles=problem.angles,
+        angles=tuple(i for i in problem.angles if not fit.structure.has_powers(i)),
         signals=Signals(names, inputs.hold, inputs.delay) if names else None,
         inputs=np.concatenate([n.stretch.u[n.at] for n in problem.nodes]) if names else None,
         parameters=() if law.powers is None else problem.parameters,

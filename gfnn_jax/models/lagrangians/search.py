@@ -45,7 +45,7 @@ class SearchResult(NamedTuple):
     @property
     def follows(self) -> bool:
         """Return whether orbits of the law follow all arcs."""
-        return bool(np.all(np.isfinite(self.fit.p))) and self.fit.follows
+        return self.fit.is_definite and self.fit.follows
 
 
 def search(problem: ArcProblem) -> SearchResult:
@@ -122,7 +122,7 @@ class TermSearch:
     def of(cls, problem: ArcProblem) -> TermSearch:
         """The search among all that the coordinates of a problem may have."""
         d, shifted = problem.dim, problem.observation.shifts()
-        rows = (*libraries.first(d, problem.angles), *libraries.more(d, problem.angles))
+        rows = libraries.every(d, problem.angles)
         terms, frictions = (
             libraries.without_forces(rows, shifted),
             frictions_tried(d, problem.options),

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.input_rules import choose_rule
-from gfnn_jax.models.lagrangians.structure import Row, Structure
+from gfnn_jax.models.lagrangians.structure import Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import weak_start, zeros_of_angles
 
 
@@ -31,7 +32,7 @@ class StartOptions:
     followed, share: residual of a start, times the noise or of the variation, above which others
     are tried. far: zero of an angle, in radians, that a fit from 0 may not reach. few: samples a
     period, below which more of them are the remedy. plain: times the residual of the larger
-    library, that the textbook's may have.
+    library, that a plainer one's may have. noise: residual, times the noise, that is no more.
     """
 
     followed: float = 10.0
@@ -39,6 +40,7 @@ class StartOptions:
     far: float = 0.3
     few: float = 8.0
     plain: float = 1.5
+    noise: float = 2.0
 
 
 OPTIONS = StartOptions()
@@ -59,75 +61,109 @@ def no_law(scales: Scales) -> FitError:
     )
 
 
+class _Library(NamedTuple):
+    """Terms of a start. rank: among libraries, the plainest first. apart: without friction between
+    coordinates, which with masses below zero imitates a force at right angles to the motion. equal:
+    with equal masses of all coordinates, for the weak form makes the equation of one as small as it
+    likes."""
+
+    rows: Sequence[Row]
+    rank: int = 0
+    apart: bool = False
+    equal: bool = False
+
+
 def best_start(problem: ArcProblem) -> LawFit:
-    """The start that leaves least of short arcs, or of those that leave about as much the plainest,
-    by the best of the rules by which inputs act.
+    """The start that leaves least of short arcs, or of those that leave about as much one of the
+    plainest library, by the best of the rules by which inputs act. Richer libraries are tried as
+    long as what is left is more than noise.
 
     Raises FitError where there is none.
     """
     d, angles, some = problem.dim, problem.angles, _Starts(problem)
-    plain = [some.add(libraries.textbook(d, angles))]
+    textbook, first = _Library(libraries.textbook(d, angles)), libraries.first(d, angles)
+    springs, every = libraries.springs(d, problem.within_a_turn), libraries.every(d, angles)
+    some.add(textbook)
     if d > 1 and len(angles) == d:
-        plain.append(some.add(libraries.relative(d, angles)))
-    some.add(libraries.first(d, angles))
+        some.add(_Library(libraries.relative(d, angles)))
+    some.add_richer([*textbook.rows, *springs], 1)
+    some.add(_Library(first, 2))
+    some.add_richer([*first, *libraries.gyroscopic(d, angles, 1)], 3)
     if not some.followed and (zero := some.far_zeros()).any():
-        plain.append(some.add(libraries.textbook(d, angles), zero=zero))
-        some.add(libraries.first(d, angles), zero=zero)
+        some.add(textbook, zero)
+        some.add(_Library(first, 2), zero)
     if d > 1 and not some.followed:
-        plain.append(some.add(libraries.uncoupled(d, angles), apart=True))
-        some.add(libraries.bodies(d, angles), apart=True)
+        some.add(_Library(libraries.uncoupled(d, angles), apart=True))
+        some.add(_Library(libraries.bodies(d, angles), 2, apart=True))
+    some.add_richer([row for row in every if sum(row[0]) < 2 or row in first], 4)
+    some.add_richer(every, 5)
     if not some.fits:
         raise no_law(problem.scales)
     most = OPTIONS.plain * min(map(some.misfit, some.fits))
-    simple = [f for f in some.fits if f.structure.terms in plain and some.misfit(f) <= most]
-    return min(simple or some.fits, key=some.misfit)
+    ranked = zip(some.ranks, some.fits, strict=True)
+    near = [(rank, some.misfit(fit), fit) for rank, fit in ranked if some.misfit(fit) <= most]
+    return min(near, key=lambda one: one[:2])[2]
 
 
 class _Starts:
     """The starts so far, and the problem: after the first of the rule by which inputs act."""
 
     def __init__(self, problem: ArcProblem):
-        self.problem, self.fits = problem, []
+        self.problem, self.fits, self.ranks = problem, [], []
         self.linear = libraries.losses(problem.dim, (LINEAR,), 0.0)
 
-    def add(
-        self, rows: Sequence[Row], zero: np.ndarray | None = None, apart: bool = False
-    ) -> tuple[Row, ...] | None:
-        """Start from the terms of this library that the weak form shows, and return them; None
-        where it does not determine them. zero: (d,) of angles, from which the fit begins. apart:
-        without friction between coordinates."""
+    def add(self, library: _Library, zero: np.ndarray | None = None) -> None:
+        """Start from the terms of a library that the weak form shows, if it determines them.
+        zero: (d,) of angles, from which the fit begins."""
         problem, d = self.problem, self.problem.dim
-        friction = tuple(self.linear[:d] if apart else self.linear)
-        terms, seen = libraries.without_forces(rows, problem.observation.shifts()), problem
+        friction = tuple(self.linear[:d] if library.apart else self.linear)
+        terms = libraries.without_forces(library.rows, problem.observation.shifts())
+        seen = problem
         if zero is not None:
             about = np.concatenate([zero, np.zeros(d)])
             moved = [dataclasses.replace(n, x=n.x - about) for n in problem.nodes]
             seen = dataclasses.replace(problem, nodes=moved)
-        library = Structure(d, terms, friction, (), problem.num_inputs, problem.sensors)
+        whole = Structure(d, terms, friction, (), problem.num_inputs, problem.sensors)
         try:
-            structure, known = weak_start(library, seen)
+            structure, known = weak_start(whole, seen, equal=library.equal)
         except FitError:
-            return None
-        zeros = tuple(i for i in problem.turned if any(row[2][i] for row in structure.terms))
+            return
+        zeros = structure.with_a_zero(problem.turned)
         structure = structure.plus(
             [("loss", row) for row in self.linear[:d]] + [("zero", i) for i in zeros]
         )
         if zero is not None:
             known = known | {("zero", i): float(zero[i]) for i in zeros}
         elif any(structure.terms == other.structure.terms for other in self.fits):
-            return structure.terms
+            return
         periods = problem.options.periods[0]
         rule = choose_rule(problem, structure, known, problem.arcs(periods), problem.scales.sigma)
         # Inputs act so in the other libraries too.
         inputs = rule.fit.problem.inputs
         self.problem = dataclasses.replace(problem, inputs=inputs, rules=(rule.hold,))
         self.fits.append(rule.fit)
+        self.ranks.append(library.rank)
         problem.on_progress(f"{periods:g} periods: {rule.fit}")
-        return structure.terms
+
+    def add_richer(self, rows: Sequence[Row], rank: int) -> None:
+        """Start from a richer library where the residuals of all starts are more than noise: of
+        lengths with equal masses first."""
+        plain = [row for row in rows if sum(row[0]) < 2 or (max(row[0]) == 2 and is_constant(row))]
+        if not self.are_noise and not self.problem.angles:
+            self.add(_Library(plain, rank, apart=True, equal=True))
+        if not self.are_noise:
+            self.add(_Library(rows, rank, apart=True))
 
     def misfit(self, fit: LawFit) -> float:
         """The largest residual of a channel, in units of its noise."""
-        return float(np.max(fit.rms() / self.problem.scales.sigma)) if fit.follows else np.inf
+        if not (fit.follows and fit.is_definite):
+            return np.inf
+        return float(np.max(fit.rms() / self.problem.scales.sigma))
+
+    @property
+    def are_noise(self) -> bool:
+        """Return whether the residuals of some start are."""
+        return min(map(self.misfit, self.fits), default=np.inf) < OPTIONS.noise
 
     @property
     def followed(self) -> bool:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,11 @@ def with_powers(row: Row | Loss, powers: tuple[int, ...]) -> Row | Loss:
 def powers_of(row: Row | Loss, count: int) -> tuple[int, ...]:
     """The powers of ``count`` parameters that a row's coefficient is multiplied by."""
     return row[-1] if isinstance(row[-1], tuple) else (0,) * count
+
+
+def is_constant(row: Row) -> bool:
+    """Return whether a term depends on no coordinate, but on velocities at most."""
+    return not any(row[1]) and not any(row[2])
 
 
 def _moves(key: Key, part: tuple[int, ...]) -> bool:
@@ -79,6 +84,15 @@ class Structure:
         """The coefficients that are known, for sensors those they start from, 0 for the others."""
         known = {**{("sensor", name): value for name, value in self.sensors}, **known}
         return np.array([known.get(key, 0.0) for key in self.keys()])
+
+    def with_a_zero(self, angles: Sequence[int]) -> tuple[int, ...]:
+        """Those of the angles that have modes in it, and no powers, whose zero is a term."""
+        moved = [i for i in angles if any(row[2][i] for row in self.terms)]
+        return tuple(i for i in moved if not self.has_powers(i))
+
+    def has_powers(self, i: int) -> bool:
+        """Return whether a term is a power of coordinate i."""
+        return any(row[1][i] for row in self.terms)
 
     @functools.cached_property
     def uncoupled(self) -> tuple[tuple[int, ...], ...]:

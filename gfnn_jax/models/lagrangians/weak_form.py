@@ -21,7 +21,13 @@ from gfnn_jax.families.lagrangian import functions_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.lagrangians.fit import ArcProblem
 from gfnn_jax.models.lagrangians.libraries import SINE
-from gfnn_jax.models.lagrangians.structure import Key, Loss, Row, Structure
+from gfnn_jax.models.lagrangians.structure import (
+    Key,
+    Loss,
+    Row,
+    Structure,
+    is_constant,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,18 +54,16 @@ OPTIONS = WeakOptions()
 def protected(structure: Structure) -> set[Key]:
     """Constant masses of each coordinate, without which there would be no motion; of several that
     depend on parameters of the system none alone."""
-    masses = [
-        row for row in structure.terms if max(row[0]) == 2 and not any(row[1]) and not any(row[2])
-    ]
+    masses = [row for row in structure.terms if max(row[0]) == 2 and is_constant(row)]
     alone = [row for row in masses if sum(other[0] == row[0] for other in masses) == 1]
     return {("term", row) for row in alone}
 
 
 def weak_start(
-    structure: Structure, problem: ArcProblem, prune: bool = True
+    structure: Structure, problem: ArcProblem, prune: bool = True, equal: bool = False
 ) -> tuple[Structure, dict[Key, float]]:
     """The structure less what is not seen at four standard errors (if ``prune``), and its
-    coefficients.
+    coefficients; with ``equal`` masses of all coordinates, where these are constant.
 
     Raises FitError where a coordinate without mass and force solves the equations.
     """
@@ -73,6 +77,9 @@ def weak_start(
     keys = structure.keys()[: form.count]
     keep = [k for k in range(form.count) if np.any(X[..., k])]
     fixed, significant = protected(structure), problem.options.evidence.significant
+    masses = [k for k in keep if equal and keys[k] in fixed]
+    keep = [k for k in keep if k not in masses]
+    Y = Y - 0.5 * X[..., masses].sum(axis=-1)
     weight = np.ones(d)
     while True:
         for _ in range(2):  # each coordinate's rows in units of their own residual
@@ -93,6 +100,7 @@ def weak_start(
             break
         del keep[int(np.argmin(z))]
     kept = {keys[k]: float(value) for k, value in zip(keep, c, strict=True)}
+    kept |= {keys[k]: 0.5 for k in masses}
     return structure.without({k for k in keys if k not in kept}), kept
 
 

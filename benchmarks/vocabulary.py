@@ -1,0 +1,391 @@
+"""Mechanics that no other study has: is the law found that made each recording?
+
+    python benchmarks/vocabulary.py                    every kind, three draws of each
+    python benchmarks/vocabulary.py --only foucault    one kind
+    python benchmarks/vocabulary.py --quick            one draw of each kind, into runs/
+
+A kind is a Lagrangian L and Rayleigh's R as text, with numbers, a start and a sampling that are
+drawn; SciPy integrates the equations that SymPy makes of them, and positions are seen with noise of
+1e-3 of their spread, 20 to 60 samples a period, 8 to 20 periods. Nothing but the recording and
+which coordinates are angles is given. A law is *right* whose forecasts of a period, from true
+states along the recording, err by less than 2 % of the spread in the median; its terms are *exact*
+where they are those of the truth, and z is the largest distance of one of their coefficients from
+the truth in its standard errors. A wrong law is *silent* whose verdict is `identified` and that
+comes without a message.
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy as sp
+from harness import TABLES, Numbers, between_markers, main, markdown, number, once, provenance
+from harness import results as results_of
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.errors import FitError
+
+DRAWS, NOISE, RIGHT = 3, 1e-3, 0.02
+SAMPLES, PERIODS = (20.0, 60.0), (8.0, 20.0)
+_STARTS, _AHEAD = 11, 10
+_TOLERANCES = {"rtol": 1e-10, "atol": 1e-12, "method": "DOP853"}
+_WIDTH = 1e-3  # of speeds, over which dry friction turns
+
+Terms = Mapping[str, float]
+Rates = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+class System(NamedTuple):
+    """L and R, term -> coefficient, in x1, … and v1, …; where the motion begins (q, v); which
+    coordinates are angles; the period of its motion."""
+
+    lagrangian: Terms
+    start: tuple[tuple[float, ...], tuple[float, ...]]
+    angles: tuple[int, ...] = ()
+    friction: Terms = MappingProxyType({})
+    period: float = 2 * np.pi
+
+
+def _plane(rng: np.random.Generator) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """A start in the plane, some way off, with a speed across."""
+    turn = rng.uniform(0, 2 * np.pi)
+    out, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+    return tuple(rng.uniform(0.7, 1.2) * out), tuple(rng.uniform(0.3, 0.8) * across)
+
+
+FREE = {"v1**2": 0.5, "v2**2": 0.5}
+
+
+def foucault(rng: np.random.Generator) -> System:
+    return System(
+        {**FREE, "x1**2": -0.5, "x2**2": -0.5, "v2*x1": 2 * rng.uniform(0.03, 0.2)}, _plane(rng)
+    )
+
+
+def uniform_field(rng: np.random.Generator) -> System:
+    trap = rng.uniform(0.02, 0.1)
+    return System({**FREE, "v2*x1": rng.uniform(0.7, 1.3), "x1**2": -trap}, _plane(rng))
+
+
+def gradient_field(rng: np.random.Generator) -> System:
+    return System({**FREE, "v2*x1": 1.0, "v2*x1**2": rng.uniform(0.1, 0.25)}, _plane(rng))
+
+
+def dipole_field(rng: np.random.Generator) -> System:
+    (x, y), (vx, vy) = _plane(rng)
+    size = rng.uniform(2, 4)
+    term = {"v2*x1/sqrt(x1**2+x2**2)**3": -size, "v1*x2/sqrt(x1**2+x2**2)**3": size}
+    return System({**FREE, **term}, ((1.2 * x, 1.2 * y), (0.5 * vx, 0.5 * vy)))
+
+
+def penning(rng: np.random.Generator) -> System:
+    axial = rng.uniform(0.4, 0.8) ** 2
+    terms = {**FREE, "v3**2": 0.5, "v2*x1": rng.uniform(1.6, 2.2), "x3**2": -axial / 2}
+    q, v = _plane(rng)
+    return System(
+        {**terms, "x1**2": axial / 4, "x2**2": axial / 4},
+        ((*q, rng.uniform(0.5, 1)), (*v, 0.0)),
+    )
+
+
+def coriolis_pair(rng: np.random.Generator) -> System:
+    stiff = rng.uniform(1.2, 1.8)
+    return System(
+        {**FREE, "x1**2": -0.5, "x2**2": -0.5 * stiff, "v2*x1": rng.uniform(0.1, 0.4)},
+        _plane(rng),
+        friction={"v1**2": rng.uniform(0.003, 0.015), "v2**2": rng.uniform(0.003, 0.015)},
+    )
+
+
+def rotating_saddle(rng: np.random.Generator) -> System:
+    saddle, turn = rng.uniform(0.2, 0.6), 1.0
+    return System(
+        {
+            **FREE,
+            "v2*x1": 2 * turn,
+            "x1**2": (turn**2 - saddle) / 2,
+            "x2**2": (turn**2 + saddle) / 2,
+        },
+        ((0.3, 0.1), (rng.uniform(0.0, 0.1), rng.uniform(-0.2, -0.05))),
+        period=4 * np.pi,
+    )
+
+
+def two_wells(rng: np.random.Generator) -> System:
+    return System(
+        {"v1**2": 0.5, "x1**2": 0.5, "x1**4": -0.25},
+        ((rng.uniform(1.6, 2.0),), (0.0,)),
+        friction={"v1**2": rng.uniform(0.01, 0.04)},
+    )
+
+
+def hoop(rng: np.random.Generator) -> System:
+    spin = rng.uniform(1.6, 3)
+    return System(
+        {"v1**2": 0.5, "cos(x1)": 1.0, "cos(2*x1)": -spin / 4},
+        ((rng.uniform(1.8, 2.6),), (0.0,)),
+        (0,),
+        {"v1**2": rng.uniform(0.01, 0.04)},
+    )
+
+
+def ball_and_beam(rng: np.random.Generator) -> System:
+    terms = {"v1**2": 0.5, "v2**2": rng.uniform(0.5, 1.5), "v2**2*x1**2": 0.5 / 1.4}
+    return System(
+        {**terms, "x1*sin(x2)": -1 / 1.4, "x2**2": -rng.uniform(2, 4), "x1**2": -0.3},
+        ((rng.uniform(0.5, 1), rng.uniform(0.3, 0.6)), (0.0, 0.0)),
+        (1,),
+    )
+
+
+def rocking_disc(rng: np.random.Generator) -> System:
+    arm = rng.uniform(0.15, 0.35)
+    return System(
+        {"v1**2": 0.5, "v1**2*cos(x1)": -arm, "cos(x1)": arm},
+        ((rng.uniform(1.2, 2.2),), (0.0,)),
+        (0,),
+        {"v1**2": rng.uniform(0.005, 0.02)},
+        period=2 * np.pi / np.sqrt(arm),
+    )
+
+
+def wire(rng: np.random.Generator) -> System:
+    bend = rng.uniform(0.4, 0.8)
+    return System(
+        {"v1**2": 0.5, "v1**2*x1**2": 2 * bend**2, "x1**2": -bend},
+        ((rng.uniform(0.8, 1.4),), (0.0,)),
+        friction={"v1**2": rng.uniform(0.005, 0.02)},
+    )
+
+
+def central(rng: np.random.Generator) -> System:
+    a = float(rng.choice([-1, 1, 3]))
+    return System({**FREE, f"sqrt(x1**2+x2**2)**({a:g})": -1 / a}, _plane(rng))
+
+
+def springs_between_angles(rng: np.random.Generator) -> System:
+    between = rng.uniform(0.3, 1)
+    q = rng.uniform(0.8, 1.8), rng.uniform(-1.5, -0.5)
+    return System(
+        {**FREE, "cos(x1)": 1.0, "x1**2": -between, "x1*x2": 2 * between, "x2**2": -between},
+        (q, (0.0, 0.0)),
+        (0, 1),
+        {"v1**2": rng.uniform(0.005, 0.02), "v2**2": rng.uniform(0.005, 0.02)},
+    )
+
+
+def elastic_pendulum(rng: np.random.Generator) -> System:
+    stiff = rng.uniform(4, 8)
+    return System(
+        {
+            **FREE,
+            "x1**2": -stiff / 2,
+            "x2**2": -stiff / 2,
+            "sqrt(x1**2+x2**2)": stiff,
+            "x2": -1.0,
+        },
+        ((rng.uniform(0.5, 1), rng.uniform(-1, -0.7)), (0.0, 0.0)),
+    )
+
+
+def relativistic(rng: np.random.Generator) -> System:
+    return System(
+        {"sqrt(1-v1**2)": -1.0, "x1**2": -0.5},
+        ((rng.uniform(0.9, 1.5),), (0.0,)),
+    )
+
+
+SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
+    f.__name__.replace("_", "-"): f
+    for f in (
+        *(foucault, uniform_field, gradient_field, dipole_field),
+        *(penning, coriolis_pair, rotating_saddle),
+        *(two_wells, hoop, ball_and_beam, rocking_disc, wire, central),
+        *(springs_between_angles, elastic_pendulum, relativistic),
+    )
+}
+
+
+# The truth, and the judgement.
+
+
+def rates(dim: int, L: str, R: str = "0") -> Rates:
+    """q̈ of the text of L and R, by SymPy; dry friction turns over a small speed."""
+    q, v = (sp.symbols([f"{s}{i + 1}" for i in range(dim)], real=True) for s in "xv")
+    names = {str(s): s for s in (*q, *v)} | {"abs": sp.Abs}
+    law, loss = (sp.parse_expr(text, local_dict=names) for text in (L, R))
+    left = [
+        sp.diff(law, x)
+        - sum(sp.diff(law, s, y) * w for y, w in zip(q, v, strict=True))
+        - sp.diff(loss, s)
+        for x, s in zip(q, v, strict=True)
+    ]
+    sign = {"sign": lambda s: np.tanh(s / _WIDTH)}
+    of_mass, of_force = (
+        sp.lambdify((*q, *v), f, [sign, "numpy"]) for f in (sp.hessian(law, v), left)
+    )
+    return lambda x, w: np.linalg.solve(
+        np.array(of_mass(*x, *w), float), np.array(of_force(*x, *w), float)
+    )
+
+
+def text_of(terms: Terms) -> str:
+    return " + ".join(f"({c!r})*({term})" for term, c in terms.items()) or "0"
+
+
+def integrated(law: Rates, q: np.ndarray, v: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """States (n, 2d) at times t from positions and velocities."""
+    d = len(q)
+    done = solve_ivp(
+        lambda _, z: np.concatenate([z[d:], law(z[:d], z[d:])]),
+        (0, t[-1]),
+        [*q, *v],
+        t_eval=t,
+        **_TOLERANCES,
+    )
+    if not done.success:
+        raise ArithmeticError(done.message)
+    return done.y.T
+
+
+def _without_zeros(term: sp.Expr) -> sp.Expr:
+    """A term without the zeros of its angles, which a fit finds near 0."""
+    for f in (sp.cos, sp.sin):
+        term = term.replace(f, lambda a, f=f: f(a - a.as_coeff_Add()[0]))
+    return term
+
+
+def compared(found: list[Any], truth: Terms) -> tuple[bool, float | None]:
+    """Whether the terms of a formula are those of the truth, and the largest distance of one of
+    their coefficients in its standard errors, up to the scale of L."""
+    one, other = (
+        {_without_zeros(sp.sympify(t)): c for t, c in pairs}
+        for pairs in (((t.term, (t.coefficient, t.std)) for t in found), truth.items())
+    )
+    if set(one) != set(other):
+        return False, None
+    scale = next(one[t][0] / other[t] for t in one if t == sp.sympify("v1**2"))
+    apart = [abs(c - scale * other[t]) / std for t, (c, std) in one.items() if std > 0]
+    return True, float(max(apart, default=0.0))
+
+
+def case(name: str, draw: int) -> Numbers:
+    rng = np.random.default_rng([list(SYSTEMS).index(name), draw])
+    system = SYSTEMS[name](rng)
+    q0, v0 = map(np.array, system.start)
+    d = len(q0)
+    samples, periods = np.exp([rng.uniform(*np.log(ends)) for ends in (SAMPLES, PERIODS)])
+    t = system.period / samples * np.arange(int(samples * periods))
+    truth = rates(d, text_of(system.lagrangian), text_of(system.friction))
+    states = integrated(truth, q0, v0, t)
+    q = states[:, :d]
+    spread = q.std(axis=0)
+    seen = q + NOISE * spread * rng.normal(size=q.shape)
+    names = [f"x{i + 1}" for i in range(d)]
+    recording = gfnn.Recording(
+        {"t": t, **dict(zip(names, seen.T, strict=True))},
+        positions=names,
+        angles=[names[i] for i in system.angles],
+    )
+    found: Numbers = {"draw": draw, "samples": float(samples), "count": len(t)}
+    refused = None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)  # kept in fit.messages
+
+        def fitted():
+            nonlocal refused
+            try:
+                return gfnn.fit(recording)
+            except (FitError, np.linalg.LinAlgError) as error:
+                refused = str(error)
+
+        done = once(fitted)
+    found |= {"processor_seconds": done.processor_seconds}
+    if refused is not None:
+        return found | {"refused": refused}
+    fit: Any = done.out
+    law = rates(d, fit.lagrangian.formula, fit.friction.formula or "0")
+    ahead, errors = system.period * np.arange(_AHEAD + 1) / _AHEAD, []
+    for k in np.linspace(0, len(t) - 1, _STARTS).astype(int):
+        start = states[k, :d], states[k, d:]
+        try:
+            miss = integrated(law, *start, ahead) - integrated(truth, *start, ahead)
+            errors.append(np.sqrt(np.mean((miss[1:, :d] / spread) ** 2)))
+        except (ArithmeticError, np.linalg.LinAlgError):
+            errors.append(np.inf)
+    error = float(np.median(errors))
+    exact, z = compared(fit.lagrangian.terms, system.lagrangian)
+    return found | {
+        "formula": fit.formula,
+        "friction": fit.friction.formula,
+        "error": error if np.isfinite(error) else None,
+        "right": error < RIGHT,
+        "exact": exact,
+        "z": z,
+        "verdict": fit.verdict,
+        "messages": list(fit.messages),
+        "silent": fit.verdict == "identified" and not fit.messages and error >= RIGHT,
+    }
+
+
+def measured(name: str, quick: bool) -> Numbers:
+    cases = []
+    for draw in range(1 if quick else DRAWS):
+        with np.errstate(all="ignore"):
+            c = case(name, draw)
+        cases.append(c)
+        said = c.get("refused") or (
+            f"{c['error']}, {'right' if c['right'] else 'wrong'}, {c['verdict']}; {c['formula']}"
+            f"; R = {c['friction']}; z = {c['z']}"
+        )
+        print(f"  {draw}: {c['processor_seconds']:.1f} s, {said[:240]}", flush=True)
+    return {"cases": cases}
+
+
+PIECES = {name: functools.partial(measured, name) for name in SYSTEMS}
+
+
+def tables() -> None:
+    """The table of RESULTS.md."""
+    found = results_of(PIECES, "vocabulary")
+    if not found:
+        return
+    rows = []
+    for name, result in found.items():
+        cases = result["measured"]["cases"]
+        laws = [c for c in cases if "formula" in c]
+        right = [c for c in laws if c["right"]]
+        z = [c["z"] for c in laws if c["z"] is not None]
+        rows.append(
+            [
+                name.replace("-", " "),
+                f"{len(right)} of {len(cases)}",
+                str(sum(c["exact"] for c in laws)),
+                number(max(z)) if z else "–",
+                str(len(cases) - len(laws)),
+                str(sum(c["silent"] for c in laws)),
+                number(np.median([c["error"] for c in right])) if right else "–",
+                number(np.mean([c["processor_seconds"] for c in cases])),
+            ]
+        )
+    heads = (
+        "system",
+        "right",
+        "terms of L exact",
+        "largest z of these",
+        "refused",
+        "wrong and silent",
+        "median error of the right, a period ahead",
+        "CPU s",
+    )
+    between_markers(TABLES, "vocabulary", f"{markdown(heads, rows)}\n\n{provenance(found)}")
+
+
+if __name__ == "__main__":
+    main(__doc__ or "", PIECES, "vocabulary", tables, None)

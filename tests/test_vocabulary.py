@@ -1,0 +1,109 @@
+"""Mechanics beyond the textbook's library: fields, masses M(q) of one coordinate, springs of angles.
+
+The oracle is the system that made the recording; `benchmarks/vocabulary.py` draws many."""
+
+import numpy as np
+import pytest
+import sympy as sp
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.errors import FitError
+from gfnn_jax.models.lagrangians import libraries
+
+NOISE = 1e-3
+
+
+def recorded(acceleration, start, end, samples=800, angles=()):
+    """Positions x1, … of q̈ = acceleration(q, v) from ``start`` (2d,), with noise."""
+    d, t = len(start) // 2, np.linspace(0, end, samples)
+    q = solve_ivp(
+        lambda _, z: np.concatenate([z[d:], acceleration(z[:d], z[d:])]),
+        (0, end),
+        start,
+        t_eval=t,
+        rtol=1e-10,
+        atol=1e-12,
+        method="DOP853",
+    ).y[:d]
+    q = q + NOISE * q.std(axis=1, keepdims=True) * np.random.default_rng(0).normal(size=q.shape)
+    names = [f"x{i + 1}" for i in range(d)]
+    columns = dict(zip(names, q, strict=True))
+    return gfnn.Recording({"t": t, **columns}, positions=names, angles=angles)
+
+
+def within_errors(formula, exact, scale=1.0):
+    """Assert that a formula has these terms, coefficients within four standard errors."""
+    found = {term.term: term for term in formula.terms}
+    assert set(found) == set(exact)
+    for name, value in exact.items():
+        term = found[name]
+        assert abs(term.coefficient - scale * value) <= 4 * term.std + 1e-12, term
+
+
+def test_a_foucault_pendulum_has_its_field_and_its_hamiltonian():
+    turn = 0.1
+
+    def acceleration(q, v):
+        return -q + 2 * turn * np.array([v[1], -v[0]])
+
+    fit = gfnn.fit(recorded(acceleration, [1.0, 0.2, 0.0, 0.3], 60))
+    exact = {"v1**2": 0.5, "v2**2": 0.5, "x1**2": -0.5, "x2**2": -0.5, "v2*x1": 2 * turn}
+    within_errors(fit.lagrangian, exact)
+    assert fit.verdict == "identified"
+    x, p = sp.symbols("x1 x2"), sp.symbols("p1 p2")
+    H = (p[0] ** 2 + (p[1] - 2 * turn * x[0]) ** 2 + x[0] ** 2 + x[1] ** 2) / 2
+    assert "a2: x1" in fit.hamiltonian.formula
+    at = dict(zip((*x, *p), (0.3, -0.7, 0.5, 1.1), strict=True))
+    assert float(fit.hamiltonian.sympy().subs(at)) == pytest.approx(float(H.subs(at)), rel=2e-3)
+
+
+def test_a_field_with_a_gradient_from_motion_that_drifts():
+    def acceleration(q, v):
+        return (1 + 0.4 * q[0]) * np.array([v[1], -v[0]])
+
+    fit = gfnn.fit(recorded(acceleration, [0.5, 1.0, -0.4, 0.2], 80))
+    within_errors(fit.lagrangian, {"v1**2": 0.5, "v2**2": 0.5, "v2*x1": 1.0, "v2*x1**2": 0.2})
+
+
+def test_two_wells_from_one_to_the_other():
+    fit = gfnn.fit(recorded(lambda q, v: q - q**3 - 0.05 * v, [1.8, 0.0], 60))
+    within_errors(fit.lagrangian, {"v1**2": 0.5, "x1**2": 0.5, "x1**4": -0.25})
+
+
+def test_a_bead_on_a_wire_has_a_mass_that_depends_on_its_place():
+    """y = ½ x²: L = ½ (1 + x²) v² − ½ x²."""
+
+    def acceleration(q, v):
+        return (-q * v**2 - q - 0.03 * v) / (1 + q**2)
+
+    fit = gfnn.fit(recorded(acceleration, [1.3, 0.0], 100))
+    scale = 2 * fit.lagrangian.terms[0].coefficient
+    within_errors(fit.lagrangian, {"v1**2": 0.5, "v1**2*x1**2": 0.5, "x1**2": -0.5}, scale)
+
+
+def test_a_torsion_spring_between_pendulums_that_stay_within_a_turn():
+    def acceleration(q, v):
+        twist = 1.2 * (q[1] - q[0])
+        return np.array([-np.sin(q[0]) + twist, -np.sin(q[1]) - twist]) - 0.02 * v
+
+    fit = gfnn.fit(recorded(acceleration, [1.6, -0.7, 0, 0], 80, angles=["x1", "x2"]))
+    exact = {"v1**2": 0.5, "v2**2": 0.5, "cos(x1)": 1.0, "cos(x2)": 1.0}
+    within_errors(fit.lagrangian, {**exact, "x1**2": -0.6, "x1*x2": 1.2, "x2**2": -0.6})
+    assert fit.map.coordinates.angles == ()
+
+
+def test_a_field_has_one_representative():
+    """v_j f(q) and the gradients v·∇χ are independent, and with these any field is one."""
+    rows = libraries.gyroscopic(3, (), 2)
+    assert len(rows) == len(set(rows)) == 3 + 8
+    assert all(any(row[1][: row[0].index(1)]) for row in rows)
+
+
+def test_masses_of_either_sign_are_no_law():
+    """ẍ = −x + ẏ, ÿ = −y − ẋ without terms v_j f(q): only L = ½ẋ² − ½ẏ² with friction that drives."""
+    rows = [f"{c}**2" for c in ("v1", "v2", "x1", "x2")]
+    losses = ["R: v1**2", "R: v2**2", "R: (v2 - v1)**2"]
+    recording = recorded(lambda q, v: -q + np.array([v[1], -v[0]]), [1.0, 0.2, 0.0, 0.3], 40)
+    with pytest.raises(FitError, match="no law"):
+        gfnn.fit(recording, terms=[*rows, *losses])
