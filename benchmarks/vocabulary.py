@@ -254,7 +254,7 @@ def integrated(law: Rates, q: np.ndarray, v: np.ndarray, t: np.ndarray) -> np.nd
     return done.y.T
 
 
-def _without_zeros(term: sp.Expr) -> sp.Expr:
+def _without_zeros(term: Any) -> Any:
     """A term without the zeros of its angles, which a fit finds near 0."""
     for f in (sp.cos, sp.sin):
         term = term.replace(f, lambda a, f=f: f(a - a.as_coeff_Add()[0]))
@@ -264,14 +264,13 @@ def _without_zeros(term: sp.Expr) -> sp.Expr:
 def compared(found: list[Any], truth: Terms) -> tuple[bool, float | None]:
     """Whether the terms of a formula are those of the truth, and the largest distance of one of
     their coefficients in its standard errors, up to the scale of L."""
-    one, other = (
-        {_without_zeros(sp.sympify(t)): c for t, c in pairs}
-        for pairs in (((t.term, (t.coefficient, t.std)) for t in found), truth.items())
-    )
+    one: dict[Any, Any] = {_without_zeros(sp.sympify(t.term)): t for t in found}
+    other: dict[Any, float] = {_without_zeros(sp.sympify(t)): c for t, c in truth.items()}
     if set(one) != set(other):
         return False, None
-    scale = next(one[t][0] / other[t] for t in one if t == sp.sympify("v1**2"))
-    apart = [abs(c - scale * other[t]) / std for t, (c, std) in one.items() if std > 0]
+    first = sp.sympify("v1**2")
+    scale = one[first].coefficient / other[first]
+    apart = [abs(t.coefficient - scale * other[k]) / t.std for k, t in one.items() if t.std > 0]
     return True, float(max(apart, default=0.0))
 
 

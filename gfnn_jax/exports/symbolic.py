@@ -56,13 +56,13 @@ def hamiltonian(entries: Mapping[tuple[int, ...], Sequence[str]], potential: str
     i <= j, of M and (i,) of a."""
     import sympy
 
-    mass = sympy.zeros(dim, dim)
-    p = sympy.Matrix(sympy.symbols(f"p1:{dim + 1}"))
+    mass, field = sympy.zeros(dim, dim), sympy.zeros(dim, 1)
     for axes, summands in entries.items():
-        entry = sum(map(as_sympy, summands))
+        entry = sum(map(as_sympy, summands), sympy.Integer(0))
         if len(axes) == 1:
-            p[axes[0]] -= entry
+            field[axes[0]] = entry
         else:
             mass[axes], mass[axes[::-1]] = entry, entry
+    p = sympy.Matrix(sympy.symbols(f"p1:{dim + 1}")) - field
     kinetic = (p.T * mass.inv() * p)[0, 0] / 2
     return kinetic + as_sympy(potential)

@@ -155,16 +155,27 @@ class Linearised:
         pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > least, 1)), strict=True)
         return [(int(i), int(j), float(correlation[i, j])) for i, j in pairs]
 
-    def null_direction(self, options: LinearisedOptions = OPTIONS) -> np.ndarray:
-        """A change (n,) of the coefficients that moves no residual, 0 of those that are no part of
-        it, and 0 where there is none."""
+    def null_space(self, options: LinearisedOptions = OPTIONS) -> np.ndarray:
+        """Independent changes (m, n) of the coefficients that move no residual, the least last, 0
+        of those that are no part of one."""
         if not len(self.p):
-            return np.zeros(0)
-        spectrum, none = self.spectrum, np.zeros(len(self.p))
-        if spectrum.s[-1] > options.null * spectrum.s[0]:
-            return none
-        part = np.abs(spectrum.vt[-1])
-        return np.where(part > options.part * part.max(), spectrum.vt[-1] / spectrum.column, none)
+            return np.zeros((0, 0))
+        spectrum = self.spectrum
+        along = spectrum.vt[spectrum.s <= options.null * spectrum.s[0]]
+        part = np.abs(along) > options.part * np.abs(along).max(axis=1, keepdims=True, initial=0)
+        return np.where(part, along / spectrum.column, 0.0)
+
+    def null_direction(self, options: LinearisedOptions = OPTIONS) -> np.ndarray:
+        """The last of them (n,); 0 where there is none."""
+        found = self.null_space(options)
+        return found[-1] if len(found) else np.zeros(len(self.p))
+
+    def shortest(self) -> np.ndarray:
+        """Coefficients (n,) that move the residuals as p does, and as little as can be: without
+        their part along the null space, in units of what each moves."""
+        size = self.spectrum.column
+        along = np.linalg.qr((self.null_space() * size).T)[0]
+        return self.p - along @ (along.T @ (self.p * size)) / size
 
     # Other rows.
 

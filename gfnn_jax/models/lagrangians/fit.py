@@ -334,6 +334,14 @@ class LawFit:
         keys, step = self.structure.keys(), self.linearised.null_direction()
         return {keys[k]: float(step[k]) for k in np.flatnonzero(step)}
 
+    @functools.cached_property
+    def undetermined(self) -> set[Key]:
+        """Coefficients that some combination which moves nothing is of."""
+        if not self.follows:
+            return set()
+        parts, keys = self.linearised.null_space().any(axis=0), self.structure.keys()
+        return {key for key, part in zip(keys, parts, strict=True) if part}
+
     def rms(self) -> np.ndarray:
         """Root mean square residual (k,), in units of the channels."""
         left = self.fitted.residuals * self.arcs.noise

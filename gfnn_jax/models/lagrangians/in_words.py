@@ -142,10 +142,11 @@ def _names(recording: Recording) -> _Names:
 
 def _standard_errors(best: CalibratedLaw) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Standard errors of the terms of L, of R, of the gains (d, m), and of the last coefficient,
-    the rate γ of uniform friction where there is one."""
+    the rate γ of uniform friction where there is one; NaN of terms that are not determined."""
     std = np.sqrt(np.maximum(np.diag(best.covariance), 0.0))
-    law = best.law
+    law, open_ = best.law, best.fit.undetermined
     of_terms, of_losses, rest = np.split(std, np.cumsum([law.terms.count, law.friction.count]))
+    of_terms[[("term", row) in open_ for row in best.fit.structure.terms]] = np.nan
     return of_terms, of_losses, rest[: law.gains.size].reshape(law.gains.shape), float(std[-1])
 
 
@@ -277,7 +278,7 @@ def _alike(fit: LawFit, lagrangian: Formula, friction: Formula) -> tuple[str, ..
     texts = dict(zip(fit.structure.terms, (t.term for t in lagrangian.terms), strict=True))
     texts |= dict(zip(fit.structure.friction, (t.term for t in friction.terms), strict=True))
     names = {key: texts.get(key[1], " ".join(map(str, key))) for key in fit.values}
-    listed, together = list(names.values()), [names[key] for key in fit.degenerate()]
+    listed, together = list(names.values()), [names[key] for key in names if key in fit.undetermined]
     only = (f"{', '.join(together)}: {ONLY_TOGETHER}",) if together else ()
     return only + tuple(
         f"{listed[i]} and {listed[j]} (correlation {rho:+.3f})"

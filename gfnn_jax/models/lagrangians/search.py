@@ -79,6 +79,10 @@ def fit_given(given: Given, problem: ArcProblem) -> SearchResult:
     first, *longer = options.periods
     model = choose_rule(problem, structure, known, problem.arcs(first), problem.scales.sigma)
     problem.on_progress(f"{first:g} periods: {model.fit}")
+    if model.fit.undetermined:
+        p = model.fit.linearised.shortest()
+        known = dict(zip(model.fit.structure.keys(), p.tolist(), strict=True))
+        model = model._replace(fit=model.fit.again(known=known, rescale=False))
     tried = frictions_tried(d, options) if given.friction is None else None
     return TermSearch(None, tried).along(model.fit, longer)
 
