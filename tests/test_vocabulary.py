@@ -1,4 +1,4 @@
-"""Mechanics beyond the textbook's library: fields, masses M(q) of one coordinate, torsion springs.
+"""Mechanics beyond the textbook's library: fields, masses M(q) of one coordinate, torsion.
 
 The oracle is the system that made the recording; `benchmarks/vocabulary.py` draws many."""
 
@@ -101,7 +101,7 @@ def test_a_field_has_one_representative():
 
 
 def test_masses_of_either_sign_are_no_law():
-    """ẍ = −x + ẏ, ÿ = −y − ẋ without terms v_j f(q): only L = ½ẋ² − ½ẏ² and friction that drives."""
+    """ẍ = −x + ẏ, ÿ = −y − ẋ without v_j f(q): only L = ½ẋ² − ½ẏ² and friction that drives."""
     rows = [f"{c}**2" for c in ("v1", "v2", "x1", "x2")]
     losses = ["R: v1**2", "R: v2**2", "R: (v2 - v1)**2"]
     recording = recorded(lambda q, v: -q + np.array([v[1], -v[0]]), [1.0, 0.2, 0.0, 0.3], 40)

@@ -278,7 +278,8 @@ def _alike(fit: LawFit, lagrangian: Formula, friction: Formula) -> tuple[str, ..
     texts = dict(zip(fit.structure.terms, (t.term for t in lagrangian.terms), strict=True))
     texts |= dict(zip(fit.structure.friction, (t.term for t in friction.terms), strict=True))
     names = {key: texts.get(key[1], " ".join(map(str, key))) for key in fit.values}
-    listed, together = list(names.values()), [names[key] for key in names if key in fit.undetermined]
+    listed, open_ = list(names.values()), fit.undetermined
+    together = [name for key, name in names.items() if key in open_]
     only = (f"{', '.join(together)}: {ONLY_TOGETHER}",) if together else ()
     return only + tuple(
         f"{listed[i]} and {listed[j]} (correlation {rho:+.3f})"
