@@ -330,7 +330,7 @@ class Table:
         return alone if as_good else here
 
     def _not_below_zero(self, subset: Sequence[int]) -> list[int]:
-        """Those of these candidates whose ρ from all arcs is above zero."""
+        """The candidates among these whose ρ from all arcs is above zero."""
         found = self.solve(self.triangles[-1], subset)
         return [k for k in subset if found[k] > 0]
 
