@@ -86,7 +86,7 @@ class Structure:
         return np.array([known.get(key, 0.0) for key in self.keys()])
 
     def with_a_zero(self, angles: Sequence[int]) -> tuple[int, ...]:
-        """The angles that have modes in its terms and no powers, so that their zero can be fitted."""
+        """The angles that have modes in its terms and no powers: their zero can be fitted."""
         moved = [i for i in angles if any(row[2][i] for row in self.terms)]
         return tuple(i for i in moved if not self.has_powers(i))
 
