@@ -30,7 +30,7 @@ from gfnn_jax.data.columns import (
     typical,
     with_sigmas,
 )
-from gfnn_jax.data.roles import ROLES, is_run, is_time, unit_in
+from gfnn_jax.data.roles import ROLES, coordinates_in, is_run, is_time, unit_in
 from gfnn_jax.data.tables import (
     Table,
     from_arrays,
@@ -62,7 +62,7 @@ class ReadOptions(TypedDict, total=False):
     dt:      seconds between rows, in place of a column of times.
     offset, scale: columns that a sensor shows shifted, or scaled, by an unknown amount.
     coordinates: what moves, where it is not the positions: ``observe`` then says how columns show
-             it.
+             it; by default those that its formulas name (theta, or omega, which is its velocity).
     observe: column -> text such as "x0 + R*sin(theta + tilt)", or a function of arguments with
              these names: coordinates, velocities, and parameters to be fitted.
     guess:   where parameters of ``observe`` start.
@@ -173,6 +173,9 @@ class Recording:
         runs = runs_of(tables, columned, SECONDS[unit], dt)
         coordinate_names = listed(options.get("coordinates"))
         check_known(source, "observe", observe, numbers)
+        if not coordinate_names and not given["positions"]:
+            implied = coordinates_in(observe.values())
+            coordinate_names = () if {*implied} & {*numbers} else implied
         if coordinate_names and not given["positions"]:
             given["positions"] = tuple(name for name in coordinate_names if name in numbers)
         if coordinate_names and not any(given.values()):

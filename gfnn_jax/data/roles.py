@@ -144,6 +144,21 @@ def role_of(name: str) -> str | None:
     return role
 
 
+def coordinates_in(formulas: Iterable[object]) -> tuple[str, ...]:
+    """The coordinates that formulas of sensors speak of, by the usual names: theta and x, also as
+    omega, v, theta_dot or x_ddot; of formulas that are no text none."""
+    text = " ".join(one for one in formulas if isinstance(one, str))
+    found = []
+    for name in re.findall(r"[^\W\d]\w*", text):
+        of = re.sub(r"(_d*dot)$", "", name)
+        speed = re.fullmatch(r"(omega|v)(\w*)", of)
+        if speed:
+            of = {"omega": "theta", "v": "x"}[speed[1]] + speed[2]
+        if of != name or role_of(of) == "positions":
+            found.append(of)
+    return tuple(dict.fromkeys(found))
+
+
 def by_name(names: Iterable[str]) -> dict[str, tuple[str, ...]]:
     """The columns of each role, those whose names do not tell left out.
 

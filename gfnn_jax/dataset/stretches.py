@@ -1,16 +1,22 @@
-"""A recording as a fit of its law sees it: stretches without gaps, thinned to nodes, cut into arcs.
+"""A recording as a fit of its law sees it: stretches of samples, thinned to nodes, cut into arcs.
 
 A *stretch* is a part of one run without a gap, angles lifted. Its *nodes* are samples of it, some
-forty to a period of the fastest motion, each with the state (q, v) that local cubics give. An
-*arc* is a row of nodes. All is NumPy, made once.
+forty to a period of the fastest motion, each with a state (q, v). An *arc* is a row of nodes. All
+is NumPy, made once.
+
+Where the sampling is even, a longer step is a gap, samples are complete, and local cubics give the
+states. Where that would lose readings (times of a Poisson process, cells that are missing, runs of
+a few samples) a sample is whatever was read at one time, *splines* that all runs share give the
+states, nodes stand between samples that are far apart, and a gap is a quarter of a period without
+a reading, in which the state is no longer predictable before there is a law.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,8 +24,9 @@ from gfnn_jax.data.channels import args_of, channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.signals.local_cubics import Smooth, choose_half, smooth
+from gfnn_jax.signals.splines import FEWEST, Splines, splines
 
-GAP = 3.5  # median steps: a longer one ends a stretch
+GAP = 3.5  # median steps: a longer one ends a stretch, where sampling is even or inputs act
 PER_PERIOD = 40  # nodes
 MOST_STEPS = 6_000  # of a fit: more tell little more
 
@@ -36,6 +43,10 @@ class Options:
     slow: float = 0.1  # of the rms speed: less of it, in one of several systems, tells no frequency
     still: float = 1.5  # of the noise: the standard deviation up to which a coordinate stands still
     kept: float = 0.25  # periods of a rest that stay, in which the body comes to a stop or starts
+    even: float = 0.95  # of the readings, that even stretches have to hold
+    gap: float = 0.25  # periods without a reading, over which a state is not predictable yet
+    apart: float = 0.7  # of the time between nodes, after which a channel is looked at again
+    empty: float = 100.0  # median steps: no spline leads over a longer one
 
 
 OPTIONS = Options()
@@ -44,8 +55,9 @@ OPTIONS = Options()
 @dataclasses.dataclass(frozen=True, eq=False)
 class Stretch:
     """Samples without a gap of ``run``: times t (n,), channels y (n, k), NaN where one was not
-    seen, inputs u (n, inputs), the coordinates q (n, d) that the channels show, the ``noise``
-    (n, k) of each value in units of its channel's, and the parameters args (k,) of the system."""
+    seen, inputs u (n, inputs), the coordinates q (n, d) that the channels show, NaN where they do
+    not, the ``noise`` (n, k) of each value in units of its channel's, and the parameters args (k,)
+    of the system; whether all samples are complete and none is far from the next."""
 
     run: str
     t: np.ndarray
@@ -54,19 +66,57 @@ class Stretch:
     q: np.ndarray
     noise: np.ndarray
     args: np.ndarray
+    even: bool = True
 
     def part(self, a: int, b: int) -> Stretch:
         """Samples a to b."""
-        names = ("t", "y", "u", "q", "noise")
-        return dataclasses.replace(self, **{name: getattr(self, name)[a:b] for name in names})
+        return self.rows(np.s_[a:b])
 
-    def cut(self) -> list[Stretch]:
-        """The parts between gaps."""
-        steps = np.diff(self.t)
-        cuts = (
-            np.flatnonzero(steps > GAP * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
+    def cut(self, steps: float = GAP) -> list[Stretch]:
+        """The parts between gaps of more than so many median steps."""
+        apart = np.diff(self.t)
+        cuts = np.flatnonzero(apart > steps * np.median(apart)) + 1 if len(apart) else []
+        return [self.part(a, b) for a, b in pairwise([0, *map(int, cuts), len(self.t)])]
+
+    def complete(self) -> Stretch:
+        """The samples that tell all coordinates."""
+        return self.rows(np.isfinite(self.q).all(1))
+
+    def rows(self, keep: Any) -> Stretch:
+        """Take these samples."""
+        names = ("t", "y", "u", "q", "noise")
+        return dataclasses.replace(self, **{name: getattr(self, name)[keep] for name in names})
+
+    def thinned(self, spacing: float) -> np.ndarray:
+        """Samples (m,) at which a channel is read that was not for about ``spacing``."""
+        seen, last, kept = np.isfinite(self.y), np.full(self.y.shape[1], -np.inf), []
+        for k, (t, own) in enumerate(zip(self.t.tolist(), seen, strict=True)):
+            if np.any(own & (t - last >= OPTIONS.apart * spacing)):
+                last[own] = t
+                kept.append(k)
+        return np.array(kept, int)
+
+    def filled(self, spacing: float) -> Stretch:
+        """The samples with places between those that are farther apart than ``spacing``, where
+        nothing was read."""
+        parts = np.maximum(np.ceil(np.diff(self.t) / spacing - 0.5), 1).astype(int)
+        at = np.concatenate([[0], np.cumsum(parts)])
+        every = np.arange(at[-1] + 1)
+
+        def spread(rows: np.ndarray, empty: float) -> np.ndarray:
+            found = np.full((len(every), rows.shape[1]), empty)
+            found[at] = rows
+            return found
+
+        u = [np.interp(every, at, column) for column in self.u.T]
+        return dataclasses.replace(
+            self,
+            t=np.interp(every, at, self.t),
+            y=spread(self.y, np.nan),
+            u=np.stack(u, axis=1) if u else np.zeros((len(every), 0)),
+            q=spread(self.q, np.nan),
+            noise=spread(self.noise, 1.0),
         )
-        return [self.part(a, b) for a, b in pairwise([0, *cuts.tolist(), len(self.t)])]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,18 +131,34 @@ class Nodes:
     x: np.ndarray
     zero: np.ndarray
 
+    def evenly(self, fewest: int) -> Nodes:
+        """Nodes at even times, as many or ``fewest``, between which cubics lead from state to
+        state: for integrals along them. They are no samples."""
+        from scipy.interpolate import CubicHermiteSpline, CubicSpline  # loaded when first used
+
+        t, d = self.t, self.x.shape[1] // 2
+        times = np.linspace(t[0], t[-1], max(len(t), fewest))
+        q = CubicHermiteSpline(t, self.x[:, :d], self.x[:, d:])(times)
+        x = np.concatenate([q, CubicSpline(t, self.x[:, d:])(times)], axis=1)
+        own, places = self.stretch, np.arange(len(times))
+        u = [np.interp(times, own.t, column) for column in own.u.T]
+        u = np.stack(u, axis=1) if u else np.zeros((len(times), 0))
+        y = np.full((len(times), self.y.shape[1]), np.nan)
+        return Nodes(dataclasses.replace(own, t=times, u=u), places, times, y, x, self.zero)
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scales:
     """Scales of the samples, from the samples: noise σ (k,) of the channels, rms speeds (d,), the
-    fastest frequency ω (1/s), the median step dt, the window of the local cubics (samples to either
-    side), and the largest rms step of a channel ÷ its standard deviation."""
+    fastest frequency ω (1/s), the usual step dt, the window of the local cubics (samples to either
+    side) or, where sampling is uneven, the splines, and the largest rms step of a channel ÷ its
+    standard deviation."""
 
     sigma: np.ndarray
     speed: np.ndarray
     omega: float
     dt: float
-    half: int
+    half: int | Splines
     stride: float
 
     @property
@@ -101,13 +167,35 @@ class Scales:
 
     @property
     def every(self) -> int:
-        """Samples from one node to the next."""
+        """Samples from one node to the next, where sampling is even."""
         return max(1, round(self.period / self.dt / PER_PERIOD))
+
+    @property
+    def uneven(self) -> bool:
+        """Return whether sampling is uneven."""
+        return isinstance(self.half, Splines)
+
+    def nodes_of(self, seconds: float) -> int:
+        """Nodes of an even recording that lasts so long."""
+        return 1 + int(np.ceil(PER_PERIOD * seconds / self.period))
+
+    def cubics(self, s: Stretch, at: np.ndarray) -> np.ndarray:
+        """States (m, 2d) at samples of an even stretch, by local cubics."""
+        assert not isinstance(self.half, Splines)
+        q, v, _ = smooth(s.t, s.q, self.half, at)[0]
+        return np.concatenate([q, v], axis=1)
+
+    @property
+    def spacing(self) -> float:
+        """Time between nodes."""
+        if self.uneven:
+            return max(self.dt, self.period / PER_PERIOD)
+        return self.dt * self.every
 
     @property
     def per_period(self) -> float:
         """Nodes to a period: some forty, fewer of a recording with fewer samples."""
-        return self.period / (self.dt * self.every)
+        return self.period / self.spacing
 
     @property
     def samples(self) -> float:
@@ -141,56 +229,78 @@ class Arcs:
 def stretches(
     recording: Recording,
     channels: Sequence[str] | None = None,
-    coordinates_of: Callable[[np.ndarray], np.ndarray] | None = None,
+    coordinates_of: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
     parameters: Sequence[str] = (),
 ) -> list[Stretch]:
     """The stretches of all runs.
 
-    channels: columns that are seen, the positions unless given. coordinates_of: (n, k) channels ->
-    (n, d) coordinates, NaN where they are not told; None: the channels are the coordinates.
+    channels: columns that are seen, the positions unless given. coordinates_of: (n, k) channels at
+    times (n,) -> (n, d) coordinates, NaN where they are not told; None: the channels are the
+    coordinates.
     parameters: in which the systems of the runs differ.
     Raises FitError where no stretch is long enough.
     """
     names = recording.positions if channels is None else channels
-    found = []
+    whole = []
     for run in recording.runs:
         t, u = recording.times(run), recording.array("inputs", run)
         y, noise = channels_of(recording, names, run)
-        q = y if coordinates_of is None else coordinates_of(y)
+        q = y if coordinates_of is None else coordinates_of(y, t)
         lifted = {*recording.angles} - {*names}  # angles that no column shows: columns are lifted
         turns = [i for i, n in enumerate(recording.coordinates) if n in lifted]
-        complete = np.isfinite(q).all(1) & np.isfinite(u).all(1)
-        t, y, u, q, noise = t[complete], y[complete], u[complete], q[complete], noise[complete]
+        read = np.isfinite(y).any(1) & np.isfinite(u).all(1)
+        t, y, u, q, noise = t[read], y[read], u[read], q[read], noise[read]
         if coordinates_of is not None and len(q):
             q = q.copy()
-            q[:, turns] = np.unwrap(q[:, turns], axis=0)
-        found += Stretch(run, t, y, u, q, noise, args_of(recording, run, parameters)).cut()
-    found = [s for s in found if len(s.t) >= OPTIONS.shortest]
+            for i in turns:
+                told = np.isfinite(q[:, i])
+                q[told, i] = np.unwrap(q[told, i])
+        whole.append(Stretch(run, t, y, u, q, noise, args_of(recording, run, parameters)))
+    even = [part for s in whole for part in s.complete().cut() if len(part.t) >= OPTIONS.shortest]
+    if even and _readings(even) >= OPTIONS.even * _readings(whole):
+        return even
+    gap = GAP if recording.inputs else OPTIONS.empty
+    found = [dataclasses.replace(part, even=False) for s in whole for part in s.cut(gap)]
+    found = [s for s in found if np.all(np.isfinite(s.q).sum(0) >= FEWEST)]
     if not found:
         raise FitError(
-            f"{recording.source}: no run has {OPTIONS.shortest} samples in a row (a step above "
-            f"{GAP:g} times the median, or a missing position or input, is a gap)"
+            f"{recording.source}: no run has {FEWEST} readings of each position in a row (a step "
+            f"above {gap:g} times the median is a gap)"
         )
     return found
 
 
+def _readings(found: Sequence[Stretch]) -> int:
+    return sum(int(np.isfinite(s.y).sum()) for s in found)
+
+
 def measure(found: Sequence[Stretch]) -> Scales:
-    """Noise, speeds and the fastest frequency, from local cubics at some two thousand samples."""
-    half, sigma = choose_half([(s.t, s.q) for s in found])
+    """Noise, speeds and the fastest frequency, from local cubics at some two thousand samples, or
+    from splines."""
     every = max(1, sum(len(s.t) for s in found) // 2_000)
-    smooths = [smooth(s.t, s.q, half, np.arange(0, len(s.t), every))[0] for s in found]
+    dt = float(np.median(np.concatenate([np.diff(s.t) for s in found])))
+    if all(s.even for s in found):
+        half, sigma = choose_half([(s.t, s.q) for s in found])
+        smooths = [smooth(s.t, s.q, half, np.arange(0, len(s.t), every))[0] for s in found]
+    else:
+        half = splines([(s.t, s.q, np.ones(s.q.shape)) for s in found])
+        sigma = half.sigma
+        smooths = [half.smooth(s.t, s.q, _inside(s.t)[::every]) for s in found]
+        dt = _usual_step(found)
     speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
     if not np.all(speed > 0):
         still = ", ".join(str(i + 1) for i in np.flatnonzero(~(speed > 0)))
         raise InputError(
             f"position {still} does not move: leave it out of --positions (positions=)"
         )
-    dt = float(np.median(np.concatenate([np.diff(s.t) for s in found])))
-    if not all(np.array_equal(s.y, s.q) for s in found):
+    if not all(np.array_equal(s.y, s.q, equal_nan=True) for s in found):
         sigma = _noise_of_channels(found)
-    steps = np.concatenate([np.diff(s.y, axis=0) for s in found])
-    resolution = np.nanmedian(np.abs(steps), axis=0)
-    size = np.sqrt(np.nanmean(steps**2, axis=0))
+    steps = [
+        np.concatenate([np.diff(s.y[have, k]) for s in found for have in [~np.isnan(s.y[:, k])]])
+        for k in range(found[0].y.shape[1])
+    ]
+    resolution = np.array([np.median(np.abs(one)) for one in steps])
+    size = np.array([np.sqrt(np.mean(one**2)) for one in steps])
     sigma = np.maximum(sigma, 1e-9 * np.maximum(resolution, size))  # clean data have none
     systems: dict[tuple[float, ...], list[Smooth]] = {}
     for stretch, own in zip(found, smooths, strict=True):
@@ -199,6 +309,18 @@ def measure(found: Sequence[Stretch]) -> Scales:
     with np.errstate(invalid="ignore"):
         stride = size / np.nanstd(np.concatenate([s.y for s in found]), axis=0)
     return Scales(sigma, speed, omega, dt, half, float(np.nanmax(stride)))
+
+
+def _inside(t: np.ndarray) -> np.ndarray:
+    """Times but for the ends of a run, where a curve's derivatives are those of its noise."""
+    edge = max(1, len(t) // 20)
+    return t[edge:-edge]
+
+
+def _usual_step(found: Sequence[Stretch]) -> float:
+    """The mean time between samples, of steps that are no gap."""
+    steps = np.concatenate([np.diff(s.t) for s in found])
+    return float(np.mean(steps[steps <= 10 * np.median(steps)]))
 
 
 def _frequency(smooths: Sequence[Smooth], slow: np.ndarray) -> float:
@@ -216,30 +338,50 @@ def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
         known = [
             (s.t[have], s.y[have, k : k + 1]) for s in found for have in [~np.isnan(s.y[:, k])]
         ]
-        known = [pair for pair in known if len(pair[0]) >= OPTIONS.shortest]
-        if not known:
-            raise FitError(f"a column has no {OPTIONS.shortest} samples in a row: leave it out")
-        sigma.append(float(choose_half(known)[1][0]))
+        if all(s.even for s in found):
+            known = [pair for pair in known if len(pair[0]) >= OPTIONS.shortest]
+            if not known:
+                raise FitError(f"a column has no {OPTIONS.shortest} samples in a row: leave it out")
+            sigma.append(float(choose_half(known)[1][0]))
+        else:
+            known = [(t, y, np.ones(y.shape)) for t, y in known]
+            sigma.append(float(splines(known).sigma[0]))
     return np.array(sigma)
 
 
 def nodes_of(found: Sequence[Stretch], scales: Scales) -> list[Nodes]:
     """The nodes of all stretches; of a long recording those of blocks, spread evenly over it."""
-    rows = [np.arange(0, len(s.t), scales.every) for s in found]
-    total = sum(map(len, rows))
-    length = round(OPTIONS.block * scales.period / scales.dt / scales.every)
+    if isinstance(scales.half, Splines):
+        parts = [part for s in found for part in _between_gaps(s, scales, scales.half)]
+    else:
+        parts = [(s, np.arange(0, len(s.t), scales.every), None) for s in found]
+    total = sum(len(at) for _, at, _ in parts)
+    length = round(OPTIONS.block * scales.per_period)
     keep = -(-total * scales.substeps // MOST_STEPS)  # every so many blocks
     nodes, count = [], 0
-    for s, at in zip(found, rows, strict=True):
+    for s, at, states in parts:
         blocks = [at] if keep == 1 else [at[k : k + length] for k in range(0, len(at), length)]
         for block in blocks:
             count += 1
             if len(block) < OPTIONS.shortest_arc or (count - 1) % keep:
                 continue
-            q, v, _ = smooth(s.t, s.q, scales.half, block)[0]
-            x = np.concatenate([q, v], axis=1)
+            x = scales.cubics(s, block) if states is None else states[block]
             nodes.append(Nodes(s, block, s.t[block], s.y[block], x, np.zeros(s.y.shape[1])))
     return nodes
+
+
+def _between_gaps(
+    s: Stretch, scales: Scales, curves: Splines
+) -> Iterator[tuple[Stretch, np.ndarray, np.ndarray]]:
+    """A stretch with places where nothing was read, its nodes (m,) between two gaps, and the states
+    (n, 2d) of all places."""
+    filled = s.rows(s.thinned(scales.spacing)).filled(1.5 * scales.spacing)
+    q, v, _ = curves.smooth(s.t, s.q, filled.t)
+    seen = np.flatnonzero(np.isfinite(filled.y).any(1))
+    longest = max(OPTIONS.gap * scales.period, 2 * scales.spacing)
+    ends = np.flatnonzero(np.diff(filled.t[seen]) > longest) + 1
+    for a, b in pairwise([0, *map(int, ends), len(seen)]):
+        yield filled, np.arange(seen[a], seen[b - 1] + 1), np.concatenate([q, v], axis=1)
 
 
 def arcs_of(nodes: Sequence[Nodes], length: int) -> Arcs:
@@ -289,7 +431,10 @@ class Moving(NamedTuple):
 
 
 def without_rests(found: Sequence[Stretch], scales: Scales) -> Moving:
-    """Take the rests out of stretches of plain positions; where no motion would be left, none."""
+    """Take the rests out of stretches of plain positions; where no motion would be left, or where
+    sampling is uneven, none."""
+    if scales.uneven:
+        return Moving(list(found), 0.0, 0.0)
     window = max(9, round(scales.period / scales.dt))
     kept, resting, short = [], 0.0, 0.0
     for stretch in found:

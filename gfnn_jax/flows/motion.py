@@ -38,6 +38,15 @@ class Step(NamedTuple):
     status: np.ndarray
 
 
+class Rates(NamedTuple):
+    """Accelerations (N, d), and their derivatives in the states (N, d, 2d) and in the coefficients
+    (N, d, n)."""
+
+    values: np.ndarray
+    by_state: np.ndarray
+    by_coefficients: np.ndarray
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Form:
     """A law whose coefficients are free: terms with θ = ``fixed`` + ``basis`` c (the gauge),
@@ -114,6 +123,22 @@ class Form:
         found = self.follow(p, x, h[:, None], u[:, None], order, modes)
         states, by_state, by_coefficients = (part[:, 0] for part in found[:3])
         return Step(states, by_state, by_coefficients, found.modes[:, 0], found.status)
+
+    def rates(self, p: np.ndarray, x: np.ndarray, u: np.ndarray, h: float, order: int = 2) -> Rates:
+        """Accelerations at states x (N, 2d) under inputs u (N, inputs), with their derivatives, by
+        differences over two steps h from there that err by h²/3 of their second derivative."""
+        d, count = self.dim, len(x)
+        p = np.tile(p, (2, 1)) if p.ndim > 1 else p
+        steps = h * np.repeat([1.0, 2.0], count)
+        inputs = np.tile(u[:, None, None], (2, 1, 6, 1))
+        found = self.step(p, np.tile(x, (2, 1)), steps, inputs, order)
+        parts = (part.reshape(2, count, *part.shape[1:])[:, :, d:] for part in found[:3])
+        one = np.broadcast_to(np.eye(2 * d)[d:], (count, d, 2 * d))
+        values, by_state, by_coefficients = (
+            (4 * near - far - 3 * here) / (2 * h)
+            for (near, far), here in zip(parts, (x[:, d:], one, 0.0), strict=True)
+        )
+        return Rates(values, by_state, by_coefficients)
 
     def follow(
         self,

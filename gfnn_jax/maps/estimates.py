@@ -26,12 +26,14 @@ from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.signals.local_cubics import smooth
+from gfnn_jax.signals.splines import splines
 from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
 from gfnn_jax.solve.linear import covariance_root
 
 FEWEST = 5  # samples from which a state is estimated
 _MOST = 160  # samples of a window that are used
 _FINE = 0.16  # radians of the fastest motion in a step
+_SMALL = 2e-3  # radians of the fastest motion, over which velocities are differenced
 _FEW = 4  # steps between inputs, of which those in between are filled in
 _AT_ONCE = 4_096  # steps whose derivatives are taken together
 
@@ -230,14 +232,16 @@ def windows_of(
         u = [recording.values(n, run) for n in sensors.inputs]
         u = np.stack(u, axis=1) if u else np.zeros((len(t), 0))
         known = np.isfinite(u).all(axis=1)
-        finite = np.isfinite(sensors.coordinates_of(y)).all(axis=1)
-        if np.sum(finite) < FEWEST:
+        q = sensors.coordinates_of(y, t)
+        finite = np.isfinite(q).any(axis=1)
+        if np.min(np.isfinite(q).sum(axis=0)) < FEWEST:
             raise InputError(
                 f"{recording.source}: run {run}: expected at least {FEWEST} samples to estimate "
-                f"the state from, got {np.sum(finite)}"
+                f"the state from, got {np.min(np.isfinite(q).sum(axis=0))}"
             )
         times, places, noise = t[finite], y[finite], noise[finite]
-        recent = times >= times[-FEWEST:].min()
+        latest = [t[np.isfinite(column)][-FEWEST] for column in q.T]
+        recent = times >= min(latest)
         recent |= times >= times.max() - sensors.window
         args = None if parameters is None else args_of(recording, run, varied)
         window = Window(times[recent], places[recent], t[known], u[known], noise[recent], args)
@@ -300,7 +304,8 @@ class _Windows:
         return Defects(closing, step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
-        shown = self.law.sensors.observation_model(x)
+        u = np.concatenate([self.u[:, :, 0, 0], self.u[:, -1:, -1, -1]], axis=1)
+        shown = _channels([self.law], np.zeros(len(x), int), x, u)
         return shown._replace(by_coefficients=shown.by_coefficients[..., :0])
 
     def take(self, arcs: np.ndarray) -> _Windows:
@@ -325,7 +330,7 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
     t, y, x = np.array(t), np.array(y), np.array(x)
     u = _inputs(law, windows, t, substeps_of(sensors, np.max(np.diff(t, axis=1), initial=0.0)))
     arcs = _Windows(law, np.diff(t, axis=1), u)
-    sigma = sensors.observation_model.state_sigma(x[:, -1], sensors.sigma)
+    sigma = sensors.observation_model.state_sigma(x[:, -1], sensors.sigma, sensors.omega)
     scale = np.concatenate([sigma, sigma * sensors.omega])
     sigma, loss, wander = (
         sensors.sigma * np.array(noise),
@@ -396,8 +401,11 @@ def estimates_of(
 def _started(sensors: Sensors, window: Window) -> tuple[Window, np.ndarray]:
     """The window with places between samples that are farther apart than most, where nothing was
     seen, and the states (n, 2d) of local cubics: one long step would make all of them shorter."""
-    t, own = window.t, sensors.coordinates_of(window.y)
-    start = smooth(t, own, min(len(t), _near(sensors, t)))[0]
+    t, own = window.t, sensors.coordinates_of(window.y, window.t)
+    if np.isfinite(own).all():
+        start = smooth(t, own, min(len(t), _near(sensors, t)))[0]
+    else:
+        start = splines([(t, own, np.ones(own.shape))]).smooth(t, own, t)
     x = np.concatenate([start.q, start.v], axis=1)
     steps = np.diff(t)
     parts = np.ceil(steps / max(np.median(steps), _FINE / sensors.omega) - 1e-3).astype(int)
@@ -467,8 +475,8 @@ def propagate_each(
     orbit, spread = _followed(laws, which, x, root[:, : 2 * d], np.diff(ends, axis=1), u, asked)
     of_zeros = np.pad(root[:, 2 * d :], ((0, 0), (0, 0), (0, spread.shape[-1] - root.shape[-1])))
     orbit = orbit[:, asked]
-    scales = np.stack([law.sensors.observation_model.values for law in laws])[which, None]
-    channels, ahead = sensors.observation_model(orbit, scales), times - last[:, None]
+    at = np.concatenate([u[:, :, 0, 0], u[:, -1:, -1, -1]], axis=1)[:, asked]
+    channels, ahead = _channels(laws, which, orbit, at), times - last[:, None]
     values, shown, further = channels.values, channels.by_state @ spread, 0.0
     if sensors.wander is not None:
         left = sensors.wander.fading(ahead)[..., None]
@@ -530,6 +538,24 @@ def _in_steps(sensors: Sensors, times: np.ndarray) -> tuple[np.ndarray, np.ndarr
         times[:, k, None] + steps[:, k, None] * np.arange(n) / n for k, n in enumerate(parts)
     ]
     return np.concatenate([*between, times[:, -1:]], axis=1), np.cumsum(parts)
+
+
+def _channels(laws: Sequence[Law], which: np.ndarray, x: np.ndarray, u: np.ndarray) -> Observed:
+    """Channels of states x (B, n, 2d) that move by ``laws[which]`` under inputs u (B, n, k), each
+    law with parameters of its own."""
+    seen = laws[0].sensors.observation_model
+    if not seen.accelerated:
+        return seen(
+            x, np.stack([law.sensors.observation_model.values for law in laws])[which, None]
+        )
+    found: list[Any] = [None] * len(x)
+    for k in np.unique(which).tolist():
+        own, law = np.flatnonzero(which == k), laws[k]
+        values, h = law.sensors.observation_model.values, _SMALL / law.sensors.omega
+        shown, _ = seen.along(law.form, law.p, x[own], u[own], h, values)
+        for n, *parts in zip(own.tolist(), *shown, strict=True):
+            found[n] = parts
+    return Observed(*map(np.stack, zip(*found, strict=True)))
 
 
 def substeps_of(sensors: Sensors, h: float) -> int:

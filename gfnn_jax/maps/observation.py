@@ -3,8 +3,15 @@
     theta  =  theta + zero              an angle whose zero is unknown
     omega  =  k*omega                   a gyroscope of unknown scale
     px     =  x0 + R*sin(theta + tilt)  a camera with its pivot and its tilt
+    gyro   =  omega + b                 a gyroscope alone: theta is seen by no sensor
+    acc    =  l*theta_ddot + g*sin(theta)
 
-A channel is text in the names of the coordinates, their velocities and parameters, or a function
+A coordinate that no channel shows by positions alone is *unseen*: it starts as the integral of its
+velocity, zero on a line through the extremes of that, where no force acts. The slope of the line is
+what the sensor shows of a body at rest.
+
+A channel is text in the names of the coordinates, their velocities (omega of theta, v of x, or with
+_dot), their accelerations (with _ddot) and parameters, or a function
 whose arguments have these names: both become the same tree, which is saved as text. Or it is a
 `Sensor` of a user's own module.
 """
@@ -13,6 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import product
@@ -31,6 +39,8 @@ from gfnn_jax.families.expressions import (
 )
 from gfnn_jax.families.jets import jets
 from gfnn_jax.families.traced import traced
+from gfnn_jax.flows.motion import Form, Rates
+from gfnn_jax.signals.splines import FEWEST, splines
 from gfnn_jax.solve.latent_arcs import SOFT_L1, Observed
 from gfnn_jax.solve.noise import Loss
 
@@ -41,6 +51,7 @@ class Options:
 
     same: float = 1e-6  # sine of the angle between changes that are the same
     tried: int = 12  # places of an angle from which a state is looked for
+    extreme: float = 0.25  # of the largest speed, that an extreme of the velocity has at least
     iterations: int = 30
 
 
@@ -101,7 +112,9 @@ class Observation:
     def _trees(self) -> tuple[Any, ...]:
         """Syntax trees of the channels, or their sensors; None where one is the coordinate of its
         name."""
-        names = (*symbols((*self.coordinates, *self.speeds)), *self.parameters)
+        own = symbols((*self.coordinates, *self.speeds))
+        twice = (f"{name}_ddot" for name in own[: self.dim])
+        names = (*own, *twice, *self.parameters)
 
         def tree(channel: str, formula: Any) -> Any:
             if isinstance(formula, str):
@@ -113,14 +126,15 @@ class Observation:
 
     @cached_property
     def _used(self) -> tuple[set[int], ...]:
-        """Indices of the state (q, v) that each channel depends on."""
+        """Indices of (q, v, a), positions, velocities, accelerations, that each channel depends
+        on."""
         x, d = np.random.default_rng(0).normal(size=(8, 2 * self.dim)), self.dim
         found = []
         for name, tree in zip(self.channels, self._trees, strict=True):
             if tree is None:
                 found.append({self.coordinates.index(name)})
             elif isinstance(tree, Expression):
-                found.append(depends_on(tree))
+                found.append({*depends_on(tree)} & {*range(3 * self.dim)})
             else:
                 start = np.array([*tree.parameters.values()], float)
                 _, by_q, by_v, _ = tree(x[:, :d], x[:, d:], start)
@@ -136,13 +150,42 @@ class Observation:
         direct = {min(used): k for k, (tree, used) in enumerate(pairs) if tree is None}
         return {i: k for i, k in direct.items() if i not in indirect}
 
-    def __call__(self, x: np.ndarray, values: np.ndarray | None = None) -> Observed:
-        """g (..., k) at states x (..., 2d), and its derivatives in x and the parameters."""
-        c = self.values if values is None else values
+    @cached_property
+    def accelerated(self) -> bool:
+        """Return whether a channel depends on accelerations."""
+        return any(max(used, default=0) >= 2 * self.dim for used in self._used)
+
+    def along(
+        self, form: Form, p: np.ndarray, x: np.ndarray, u: np.ndarray, h: float, values: np.ndarray
+    ) -> tuple[Observed, np.ndarray]:
+        """`__call__` at states x (N, L, 2d) of a law of coefficients p (n,) or (N, n), under inputs
+        u (N, L, inputs), and the derivative (N, L, k, n) in p; h: a small time."""
+        N, L, width = x.shape
+        each = np.repeat(p, L, axis=0) if p.ndim > 1 else p
+        rates = form.rates(each, x.reshape(N * L, width), u.reshape(N * L, -1), h)
+        rates = Rates(*(part.reshape(N, L, *part.shape[1:]) for part in rates))
+        g, by = self._shown(x, values, rates.values)
+        by_state, by_rates, by_values = np.split(by, [2 * self.dim, 3 * self.dim], axis=-1)
+        shown = Observed(g, by_state + by_rates @ rates.by_state, by_values)
+        return shown, by_rates @ rates.by_coefficients
+
+    def __call__(
+        self, x: np.ndarray, values: np.ndarray | None = None, a: np.ndarray | None = None
+    ) -> Observed:
+        """g (..., k) at states x (..., 2d) and accelerations a (..., d), 0 unless given, and its
+        derivatives in x and the parameters."""
+        g, by = self._shown(x, self.values if values is None else values, a)
+        return Observed(g, by[..., : 2 * self.dim], by[..., 3 * self.dim :])
+
+    def _shown(
+        self, x: np.ndarray, c: np.ndarray, a: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """g (..., k) and its derivatives (..., k, 3d + m) in (q, v, a) and the parameters."""
         d, m, count = self.dim, len(self.parameters), len(self.channels)
         shape = x.shape[:-1]
-        g, by = np.zeros((*shape, count)), np.zeros((*shape, count, 2 * d + m))
-        w = x if not m else np.concatenate([x, np.broadcast_to(c, (*shape, m))], axis=-1)
+        g, by = np.zeros((*shape, count)), np.zeros((*shape, count, 3 * d + m))
+        a = np.zeros((*shape, d)) if a is None else a
+        w = np.concatenate([x, a, np.broadcast_to(c, (*shape, m))], axis=-1)
         for k, tree in enumerate(self._trees):
             if tree is None:
                 i = self.coordinates.index(self.channels[k])
@@ -152,22 +195,34 @@ class Observation:
                 own = [self.parameters.index(name) for name in tree.parameters]
                 found = tree(x[..., :d], x[..., d:], np.asarray(c)[..., own])
                 g[..., k], by[..., k, :d], by[..., k, d : 2 * d] = found[:3]
-                by[..., k, [2 * d + i for i in own]] = found[3]
+                by[..., k, [3 * d + i for i in own]] = found[3]
                 continue
             (jet,) = jets([tree], w, 1)
             g[..., k] = jet.value
             for i, slope in jet.slope.items():
                 by[..., k, i] = slope
-        return Observed(g, by[..., : 2 * d], by[..., 2 * d :])
+        return g, by
 
-    def coordinates_of(self, y: np.ndarray, angles: Sequence[int]) -> np.ndarray:
-        """The coordinates (n, d) that channels y (n, k) show at ``values``, each sample for itself;
-        ``angles`` that no column shows directly in (−π, π].
+    @cached_property
+    def unseen(self) -> tuple[int, ...]:
+        """Coordinates that no channel shows by positions alone."""
+        still = {*range(self.dim)}
+        seen = set().union(*(used for used in self._used if used <= still))
+        return tuple(i for i in range(self.dim) if i not in seen)
+
+    def coordinates_of(
+        self, y: np.ndarray, angles: Sequence[int], t: np.ndarray | None = None
+    ) -> np.ndarray:
+        """The coordinates (n, d) that channels y (n, k) show at ``values``, each sample for itself,
+        NaN where they do not; ``angles`` that no column shows directly in (−π, π]. Unseen ones are
+        integrals over times t (n,).
 
         Raises InputError where the channels leave a coordinate open.
         """
         if len(self.direct) == self.dim:
             return y[:, [self.direct[i] for i in range(self.dim)]]
+        if self.unseen:
+            return self._integrated(t, y)
         d = self.dim
         still = [k for k, name in enumerate(self.channels) if name in self.needed]
         q, best = np.zeros((len(y), d)), np.full(len(y), np.inf)
@@ -182,15 +237,84 @@ class Observation:
             x, left = self._followed(x, y, still, scale)
             better = left < best
             q[better], best[better] = x[better, :d], left[better]
-        if not np.isfinite(best).all():
+        told = np.isfinite(best)
+        if not told.any():
             raise InputError(
                 f"observe: {', '.join(self.channels)} do not determine "
                 f"{', '.join(self.coordinates)}: each needs a channel that shows it"
             )
+        q[~told] = np.nan
         for i in angles:
             if own[i] is None:
                 q[:, i] = np.pi - (np.pi - q[:, i]) % (2 * np.pi)
         return q
+
+    def _integrated(self, t: np.ndarray | None, y: np.ndarray) -> np.ndarray:
+        """Coordinates of which the unseen ones are integrals of their velocities."""
+        seen = [i for i in range(self.dim) if i not in self.unseen]
+        if t is None or any(i not in self.direct for i in seen):
+            names = ", ".join(self.coordinates[i] for i in self.unseen)
+            raise InputError(
+                f"observe: {names}: no column shows it. Where only velocities are shown of one "
+                "coordinate, columns have to show the others as they are"
+            )
+        q = np.full((len(y), self.dim), np.nan)
+        q[:, seen] = y[:, [self.direct[i] for i in seen]]
+        for i in self.unseen:
+            q[:, i] = _between_extremes(t, self._velocity(i, y))[0]
+        return q
+
+    def _velocity(self, i: int, y: np.ndarray) -> np.ndarray:
+        """The velocity (n,) of a coordinate by the channel that shows it alone, at ``values``."""
+        place = self.dim + i
+        own = [k for k, used in enumerate(self._used) if used == {place}]
+        states = np.eye(2 * self.dim)[[place, place]] * [[0.0], [1.0]]
+        zero, one = self(states).values[:, own[0]] if own else (0.0, 0.0)
+        if not zero != one:
+            raise InputError(
+                f"observe: no column shows {self.coordinates[i]}, nor its velocity alone, as "
+                f"{self.speeds[i]} + b"
+            )
+        return (y[:, own[0]] - zero) / (one - zero)
+
+    def _states(self, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States (n, 2d) and accelerations (n, d) at times t (n,), of the unseen coordinates as
+        integrals."""
+        q = self._integrated(t, y)
+        found = splines([(t, q, np.ones(q.shape))]).smooth(t, q, t)
+        return np.concatenate(found[:2], axis=1), found.a
+
+    def balanced(self, runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Observation:
+        """The observation whose parameters let unseen coordinates come back, as far as they can, in
+        runs of times t (n,) and channels y (n, k), and suit all channels best."""
+        found = self
+        for i in self.unseen:
+            slopes = [(np.ptp(t), _between_extremes(t, found._velocity(i, y))[1]) for t, y in runs]
+            weights, by = np.array(slopes).T
+            back = np.zeros(2 * self.dim)
+            back[self.dim + i] = -np.average(by, weights=weights**3)
+            x = np.random.default_rng(0).normal(size=(40, 2 * self.dim))
+            shown = found(x)
+            moved = -(shown.by_state @ back).ravel()
+            by_values = shown.by_coefficients.reshape(len(moved), -1)
+            change = np.linalg.lstsq(by_values, moved, rcond=None)[0]
+            found = dataclasses.replace(found, values=found.values + change)
+        if len(self.channels) == self.dim:
+            return found
+        states = [found._states(t, y) for t, y in runs]
+        x, a = (np.concatenate(of) for of in zip(*states, strict=True))
+        y = np.concatenate([y for _, y in runs])
+        values, scale = found.values, np.nanstd(y, axis=0)
+        for _ in range(OPTIONS.iterations):
+            shown = found(x, values, a)
+            left = ((y - shown.values) / scale).ravel()
+            rows = (shown.by_coefficients / scale[:, None]).reshape(len(left), -1)
+            told = np.isfinite(left) & np.isfinite(rows).all(1)
+            change = np.linalg.lstsq(rows[told], left[told], rcond=1e-9)[0]
+            values = values + change
+            if np.max(np.abs(change)) < 1e-9 * np.max(np.abs(values)):
+                break
+        return dataclasses.replace(found, values=values)
 
     def _followed(
         self, x: np.ndarray, y: np.ndarray, still: list[int], scale: np.ndarray
@@ -223,17 +347,24 @@ class Observation:
     @property
     def needed(self) -> tuple[str, ...]:
         """Channels without which the coordinates are not told: those that show no velocity."""
-        moving = set(range(self.dim, 2 * self.dim))
+        if self.unseen:
+            return self.channels
+        moving = set(range(self.dim, 3 * self.dim))
         pairs = zip(self.channels, self._used, strict=True)
         return tuple(name for name, used in pairs if not used & moving)
 
-    def state_sigma(self, x: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-        """σ (d,) of the coordinates, of that of the channels (k,), at states x (n, 2d)."""
-        J = self(x).by_state[..., : self.dim] / sigma[:, None]
+    def state_sigma(self, x: np.ndarray, sigma: np.ndarray, omega: float) -> np.ndarray:
+        """σ (d,) of the coordinates, of that of the channels (k,), at states x (n, 2d); of unseen
+        ones that of their velocities over the frequency ω."""
+        by_state, unseen = self(x).by_state, list(self.unseen)
+        J = by_state[..., : self.dim].copy()
+        J[..., unseen] = np.hypot(J, omega * by_state[..., self.dim :])[..., unseen]
+        J /= sigma[:, None]
         return 1 / np.sqrt(np.mean(np.sum(J**2, axis=1), axis=0))
 
     def shifts(self) -> tuple[int, ...]:
-        """Coordinates that the parameters can shift: their zero is then where the law has it."""
+        """Coordinates that the parameters can shift, or that are unseen: their zero is then where
+        the law has it."""
         by_state, by_values = self._anywhere()
         return tuple(i for i in range(self.dim) if _spans(by_values, by_state[:, [i]]))
 
@@ -292,6 +423,8 @@ def observed(
     Raises InputError, one line, for what cannot be read or has no start.
     """
     state = (*coordinates, *speeds)
+    same = {f"{q}_dot": v for q, v in zip(coordinates, speeds, strict=True) if q.isidentifier()}
+    same |= {f"{v}_dot": f"{q}_ddot" for q, v in zip(coordinates, speeds, strict=True)}
     code = dict(zip(state, symbols(state), strict=True))
     starts = dict(guess)
     formulas: dict[str, Any] = {name: name for name in coordinates if name in columns}
@@ -310,6 +443,8 @@ def observed(
             raise InputError(f"observe: no column {name} among {', '.join(columns)}")
         known = isinstance(given, (str, Sensor))
         formulas[name] = given if known else _text_of(given, starts)
+        if isinstance(given, str):
+            formulas[name] = re.sub(r"\b\w+_dot\b", lambda m: same.get(m[0], m[0]), given)
         if isinstance(given, Sensor):
             starts = {**given.parameters, **starts}
     parameters = [
@@ -317,7 +452,7 @@ def observed(
         for column, f in formulas.items()
         if f != column or column not in coordinates
         for n in (names_in(f) if isinstance(f, str) else f.parameters)
-        if n not in code.values()
+        if n not in (*code.values(), *(f"{code[q]}_ddot" for q in coordinates))
     ]
     parameters = list(dict.fromkeys(parameters))
     unknown = [name for name in guess if name not in parameters]
@@ -362,10 +497,12 @@ def _text_of(function: Callable, starts: dict[str, float]) -> str:
 
 def _started(g: Observation) -> np.ndarray:
     """The values of the parameters; where none were given, those with which a channel shows the
-    coordinate or velocity of its name as nearly as it can."""
+    coordinate or velocity of its name, or of one that is unseen, as nearly as it can."""
     values, state = g.values.copy(), (*g.coordinates, *g.speeds)
     open_ = np.flatnonzero(np.isnan(values))
     own = [(k, state.index(name)) for k, name in enumerate(g.channels) if name in state]
+    unseen = {g.dim + i for i in g.unseen}  # whose velocity starts as it is shown
+    own += [(k, *used) for k, used in enumerate(g._used) if len(used) == 1 and used <= unseen]
     x = np.random.default_rng(0).normal(size=(40, 2 * g.dim))
     values[open_] = 1.0
     determined = np.zeros(len(values), bool)
@@ -379,7 +516,7 @@ def _started(g: Observation) -> np.ndarray:
         determined[open_] = np.any(J, axis=0)
         values[open_] += np.linalg.pinv(J, rcond=1e-8) @ np.concatenate(left)
     missing = [g.parameters[i] for i in open_ if not determined[i] or not np.isfinite(values[i])]
-    if missing:
+    if missing and not g.unseen:  # else what is integrated tells them
         raise InputError(
             f"observe: {', '.join(missing)}: expected a first guess, guess={{{missing[0]!r}: …}} "
             f"(--guess {missing[0]}=…)"
@@ -387,10 +524,27 @@ def _started(g: Observation) -> np.ndarray:
     return np.where(np.abs(values) < 1e-12, 0.0, values)
 
 
+def _between_extremes(t: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
+    """The integral (n,) of a velocity v (n,), NaN where it was not read, less a straight line
+    through its values at the extremes of v, and the slope of that line."""
+    known = np.isfinite(v)
+    if known.sum() < FEWEST:
+        return np.full(len(t), np.nan), 0.0
+    column, ones = v[:, None], np.ones((len(v), 1))
+    curve = splines([(t, column, ones)]).curve(t, v)
+    q = curve.antiderivative()(t)
+    speed, rate = np.abs(curve(t)), curve(t, nu=1)
+    at = np.flatnonzero((rate[1:] * rate[:-1] < 0) & (speed[1:] > OPTIONS.extreme * speed.max()))
+    if len(at) < 3:
+        return np.where(known, q - np.mean(q), np.nan), 0.0
+    line = np.polyfit(t[at], q[at], 1)
+    return np.where(known, q - np.polyval(line, t), np.nan), float(line[0])
+
+
 def _spans(table: np.ndarray, column: np.ndarray) -> bool:
     """Return whether a column is a combination of those of a table."""
     size = np.linalg.norm(column)
-    if not table.shape[1] or size == 0:
-        return False
+    if size == 0 or not table.shape[1]:
+        return bool(size == 0)
     left = column - table @ np.linalg.lstsq(table, column, rcond=None)[0]
     return bool(np.linalg.norm(left) < OPTIONS.same * size)

@@ -56,11 +56,12 @@ class Sensors:
         """Indices of the coordinates that are angles."""
         return tuple(i for i, name in enumerate(self.positions) if name in self.angles)
 
-    def coordinates_of(self, y: np.ndarray) -> np.ndarray:
-        """The coordinates (n, d) that channels y (n, k) of samples in a row show, angles lifted."""
+    def coordinates_of(self, y: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """The coordinates (n, d) that channels y (n, k) of samples in a row, at times t (n,), show,
+        angles lifted."""
         if self.observation is None:
             return y
-        q = self.observation_model.coordinates_of(y, self.turning)
+        q = self.observation_model.coordinates_of(y, self.turning, t)
         known = np.isfinite(q).all(axis=1)
         for i in self.turning:
             if self.positions[i] not in self.observation_model.channels:

@@ -212,7 +212,7 @@ class ArcProblem:
     def state_scale(self, sigma: np.ndarray) -> np.ndarray:
         """The defect (2d,) that counts as one standard deviation of the channels."""
         states = np.concatenate([self.gauge, 0 * self.gauge], axis=1)
-        own = self.observation.state_sigma(states, sigma)
+        own = self.observation.state_sigma(states, sigma, self.scales.omega)
         return np.concatenate([own, own * self.scales.omega])
 
     def fit(

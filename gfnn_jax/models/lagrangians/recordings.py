@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.data.channels import parameters_of
+from gfnn_jax.data.channels import channels_of, parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import by_name, symbols
 from gfnn_jax.data.wrong_values import without_wrong_values
@@ -278,10 +278,14 @@ def samples_of(
     observation, angles = _observation(recording)
     observation = observation if loss is None else dataclasses.replace(observation, loss=loss)
     parameters = parameters_of(recording) if differ else ()
+    if observation.unseen:
+        names = observation.channels
+        own = [(recording.times(r), channels_of(recording, names, r)[0]) for r in recording.runs]
+        observation = observation.balanced(own)
     found = _segments(recording, observation, angles, parameters)
     offset = [i for i in observation.shifts() if i not in angles]
     if offset and not recording.guess:  # an offset starts at the middle of its coordinate
-        middle = np.mean(np.concatenate([s.q for s in found]), axis=0)
+        middle = np.nanmean(np.concatenate([s.q for s in found]), axis=0)
         observation = observation.shifted(
             np.where(np.isin(range(observation.dim), offset), middle, 0.0)
         )
@@ -337,7 +341,10 @@ def _segments(
     """The segments of a recording, as the parameters of ``observation`` show its coordinates."""
     if observation.is_plain:
         return stretches(recording, parameters=parameters)
-    coordinates = partial(observation.coordinates_of, angles=angles)
+
+    def coordinates(y: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return observation.coordinates_of(y, angles, t)
+
     return stretches(recording, observation.channels, coordinates, parameters)
 
 

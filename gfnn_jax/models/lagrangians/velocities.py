@@ -164,9 +164,12 @@ def with_channels(
 
 
 def _column(recording: Recording, s: Stretch, name: str, which: int = 0) -> np.ndarray:
-    """(n, 1) of a column, or of its relative noise, at the samples of a stretch."""
-    at = np.searchsorted(recording.times(s.run), s.t)
-    return channels_of(recording, [name], s.run)[which][at]
+    """(n, 1) of a column, or of its relative noise, at the samples of a stretch; where nothing was
+    read NaN."""
+    t = recording.times(s.run)
+    at = np.minimum(np.searchsorted(t, s.t), len(t) - 1)
+    found = channels_of(recording, [name], s.run)[which][at]
+    return np.where((t[at] == s.t)[:, None], found, (np.nan, 1.0)[which])
 
 
 def _at_nodes(arcs: Arcs, nodes: Sequence[Nodes], columns: Sequence[np.ndarray]) -> np.ndarray:

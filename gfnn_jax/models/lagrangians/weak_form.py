@@ -67,11 +67,18 @@ def weak_start(
 
     Raises FitError where a coordinate without mass and force solves the equations.
     """
-    d, nodes = structure.dim, problem.nodes
+    d, nodes, uneven = structure.dim, problem.nodes, problem.scales.uneven
+    if uneven:
+        nodes = [n.evenly(problem.scales.nodes_of(np.ptp(n.t))) for n in nodes]
     args = np.repeat([n.stretch.args for n in nodes], [len(n.t) for n in nodes], axis=0)
     form = structure.form(np.concatenate([n.x[:, :d] for n in nodes]), args)
     lengths = [length * problem.scales.period for length in OPTIONS.lengths]
-    parts = [weak_rows(form, node, length) for node in nodes for length in lengths]
+    parts = [
+        # of a run that is shorter than a window, all of it
+        weak_rows(form, node, min(length, 0.999 * np.ptp(node.t)) if uneven else length)
+        for node in nodes
+        for length in lengths
+    ]
     rows, targets = zip(*parts, strict=True)
     X, Y = np.concatenate(rows), -np.concatenate(targets)
     keys = structure.keys()[: form.count]

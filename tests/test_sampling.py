@@ -1,0 +1,151 @@
+"""Uneven, incomplete and short recordings, and sensors that show no position."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.cli import main
+from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
+from gfnn_jax.errors import InputError
+from gfnn_jax.signals.splines import splines
+
+NOISE = 1e-3
+
+
+def swing(times, start=(1.2, 0.0), friction=0.05):
+    """States (n, 2) of θ̈ = −9 sin θ − friction θ̇ at these times, by SciPy."""
+    found = solve_ivp(
+        lambda _, z: [z[1], -9 * np.sin(z[0]) - friction * z[1]],
+        (0, times[-1]),
+        start,
+        t_eval=times,
+        rtol=1e-10,
+        atol=1e-12,
+    )
+    return found.y.T
+
+
+def law_is_right(fit):
+    values = {term.term: (term.coefficient, term.std) for term in fit.lagrangian.terms}
+    assert {*values} == {"omega**2", "cos(theta)"}
+    assert values["cos(theta)"][0] == pytest.approx(9, abs=max(5 * values["cos(theta)"][1], 0.01))
+    (lost,) = fit.friction.terms
+    assert lost.term == "omega**2"
+    assert lost.coefficient == pytest.approx(0.025, abs=4 * lost.std)
+
+
+@pytest.mark.parametrize(("count", "noise"), [(400, 1e-3), (400, 0.03), (150, 1e-3)])
+def test_splines_tell_the_noise_and_the_derivatives(count, noise):
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.uniform(0, 16, count))
+    y = np.stack([np.cos(3 * t), np.sin(2 * t)], axis=1)
+    read = np.where(rng.uniform(size=y.shape) < 0.2, np.nan, y + noise * rng.normal(size=y.shape))
+    found = splines([(t, read, np.ones(y.shape))])
+    np.testing.assert_allclose(found.sigma, noise, rtol=0.5 if count < 200 else 0.15)
+    at = np.linspace(1, 15, 50)
+    curves = found.smooth(t, read, at)
+    error = max(3 * noise, 0.02)
+    np.testing.assert_allclose(curves.q[:, 0], np.cos(3 * at), atol=error)
+    np.testing.assert_allclose(curves.v[:, 0] / 3, -np.sin(3 * at), atol=2 * error)
+    np.testing.assert_allclose(curves.a[:, 1] / 4, -np.sin(2 * at), atol=5 * error)
+
+
+def test_runs_share_the_noise():
+    rng = np.random.default_rng(1)
+    runs = []
+    for _ in range(60):
+        t = 0.2 * np.arange(rng.integers(6, 11))
+        y = np.cos(3 * t + rng.uniform(0, 6))[:, None]
+        runs.append((t, y + NOISE * rng.normal(size=y.shape), np.ones(y.shape)))
+    assert splines(runs).sigma[0] == pytest.approx(NOISE, rel=0.3)
+
+
+def test_every_reading_is_used_and_nodes_stand_between():
+    """A stretch of a pendulum at random times, with a gap of a fifth of a period and cells that are
+    missing: one row of nodes, each near the truth."""
+    rng = np.random.default_rng(2)
+    t = np.sort(rng.uniform(0, 20, 500))
+    t = t[(t < 8) | (t > 8.4)]
+    theta, omega = swing(t).T
+    seen = np.where(rng.uniform(size=len(t)) < 0.3, np.nan, theta + NOISE * rng.normal(size=len(t)))
+    recording = gfnn.Recording({"t": t, "theta": seen}, positions=["theta"])
+    (one,) = stretches(recording)
+    assert np.isfinite(one.y).sum() == np.isfinite(seen).sum()
+    scales = measure([one])
+    assert scales.uneven
+    assert scales.period == pytest.approx(2.1, rel=0.2)
+    assert scales.sigma[0] == pytest.approx(NOISE, rel=0.2)
+    (nodes,) = nodes_of([one], scales)
+    assert np.max(np.diff(nodes.t)) < 2.3 * scales.spacing
+    assert np.isnan(nodes.y[(nodes.t > 8) & (nodes.t < 8.4)]).all()
+    near = [np.argmin(np.abs(t - at)) for at in nodes.t[np.isfinite(nodes.y[:, 0])]]
+    found = nodes.x[np.isfinite(nodes.y[:, 0])]
+    np.testing.assert_allclose(found[:, 0], theta[near], atol=4 * NOISE)
+    np.testing.assert_allclose(found[3:-3, 1], omega[near][3:-3], atol=0.1)
+
+
+def test_a_law_of_random_times_and_missing_cells():
+    rng = np.random.default_rng(3)
+    t = np.sort(rng.uniform(0, 30, 500))
+    seen = swing(t)[:, 0] + NOISE * rng.normal(size=len(t))
+    seen = np.where(rng.uniform(size=len(t)) < 0.3, np.nan, seen)
+    recording = gfnn.Recording({"t": t, "theta": seen}, positions=["theta"])
+    fit = gfnn.fit(recording)
+    law_is_right(fit)
+    assert fit.verdict == "identified"
+    ahead = fit.map.forecast(recording, t[-1] + np.array([0.5, 1.0]))
+    true = swing(np.append(t, t[-1] + np.array([0.5, 1.0])))[-2:, 0]
+    np.testing.assert_allclose(ahead.values["theta"][0], true, atol=5e-3)
+
+
+def test_a_law_of_many_short_runs():
+    rng, runs = np.random.default_rng(4), []
+    for _ in range(80):
+        t = 0.15 * np.arange(rng.integers(6, 11))
+        start = rng.uniform(-1.2, 1.2), rng.uniform(-2, 2)
+        seen = swing(np.append(t, 2.0), start)[:-1, 0] + NOISE * rng.normal(size=len(t))
+        runs.append({"t": t, "theta": seen})
+    law_is_right(gfnn.fit(gfnn.Recording(runs, positions=["theta"])))
+
+
+@pytest.fixture(scope="module")
+def gyroscope():
+    rng, t = np.random.default_rng(5), np.arange(0, 20, 0.02)
+    omega = swing(t, (0.8, 0.0))[:, 1]
+    return {"t": t, "gyro": omega + 0.05 + 5e-3 * rng.normal(size=len(t))}
+
+
+def test_a_gyroscope_alone(gyroscope):
+    """θ is seen by no sensor; the bias is fitted."""
+    recording = gfnn.Recording(gyroscope, observe={"gyro": "omega + b"})
+    assert recording.coordinates == ("theta",)
+    fit = gfnn.fit(recording)
+    law_is_right(fit)
+    bias, std = fit.sensors["b"]
+    assert abs(bias - 0.05) < 4 * std < 4e-3
+    assert "no sensor shows theta" in fit.gauge
+    ahead = fit.map.forecast(recording, [21.0, 22.0])
+    np.testing.assert_allclose(
+        ahead.values["gyro"][0],
+        swing(np.array([0, 21.0, 22.0]), (0.8, 0.0))[1:, 1] + 0.05,
+        atol=0.02,
+    )
+
+
+def test_a_gyroscope_from_the_command_line(gyroscope, tmp_path, capsys):
+    path, model = tmp_path / "phone.csv", tmp_path / "model"
+    rows = np.stack([*gyroscope.values()], axis=1)
+    np.savetxt(path, rows, delimiter=",", header="t,Gyroscope x (rad/s)", comments="")
+    assert (
+        main(["fit", str(path), "--observe", "Gyroscope x = omega + b", "--out", str(model)]) == 0
+    )
+    assert "no sensor shows theta" in capsys.readouterr().out
+    more = ["--num-steps", "50", "--out", str(tmp_path / "ahead.csv")]
+    assert main(["predict", str(model), "--initial", str(path), *more]) == 0
+
+
+def test_a_coordinate_that_nothing_shows_is_refused(gyroscope):
+    recording = gfnn.Recording(gyroscope, observe={"gyro": "theta + 0*x"}, coordinates="theta,phi")
+    with pytest.raises(InputError, match="phi"):
+        gfnn.fit(recording)
