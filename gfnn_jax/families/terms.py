@@ -25,6 +25,7 @@ from gfnn_jax.families.expressions import (
     count_operations,
     depends_on,
     parse,
+    parse_named,
     to_text,
 )
 from gfnn_jax.families.family import OfCoefficients
@@ -124,18 +125,19 @@ def _plan_of(powers: tuple[tuple[int, ...], ...], still: tuple[int, ...]) -> _Pl
     return _Plan(np.array(powers, dtype=int), still)
 
 
-@pytree("dim", "variables", "powers", "parameters", eq=True)
+@pytree("dim", "variables", "powers", "parameters", "names", eq=True)
 class Terms(OfCoefficients):
     """Family of products of powers of ``variables``, one for each row of ``powers`` (N, k).
 
     variables: expressions as text. params: the coefficients (N,). parameters: names of the args,
-    which variables may contain.
+    which variables may contain. names: of the coordinates, where these are no (q, p): any number.
     """
 
     dim: int
     variables: tuple[str, ...]
     powers: tuple[tuple[int, ...], ...]
     parameters: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
 
     name = "terms"
 
@@ -146,6 +148,8 @@ class Terms(OfCoefficients):
     @cached_property
     def trees(self) -> list[Expression]:
         """Expressions of the variables."""
+        if self.names:
+            return [parse_named(text, self.names) for text in self.variables]
         return [parse(text, self.dim, self.parameters) for text in self.variables]
 
     @property
@@ -199,6 +203,7 @@ class Terms(OfCoefficients):
             tuple(self.variables[k] for k in used),
             tuple(tuple(row) for row in kept[:, used].tolist()),
             self.parameters,
+            self.names,
         )
 
     def value(self, params, w, args=None):
@@ -250,6 +255,11 @@ class Terms(OfCoefficients):
         ]
         hessian = xp.stack(full, axis=-1).reshape(*w.shape, width)
         return self._stacked(_pulled_back(variables, slopes), w), hessian
+
+    def term_values(self, w, args=None):
+        """Values of all terms at w (..., 2d): (..., N). NumPy."""
+        products = self._products(self._variables(w, 0, args), w)
+        return np.stack([products[i] for i in self._plan.places], axis=-1)
 
     def term_gradients(self, w, args=None):
         """Gradients of all terms at w (..., 2d): (..., 2d, N). NumPy."""

@@ -1,0 +1,260 @@
+"""The brackets that a field allows, each with its H, and the rule that chooses among several.
+
+Where several brackets make the same motion, the one is taken whose algebra has a name and an exact
+step, compact before other; then that of fewest constants; in three dimensions, where a pencil of
+brackets shares the motion, the one whose Casimir is nearest to a sphere in units of the
+coordinates. NumPy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares, minimize
+
+from gfnn_jax.brackets import Bracket, _echelon, jacobi_failure
+from gfnn_jax.families.terms import Terms, exponents
+from gfnn_jax.models.brackets.algebra import analysed, changed
+from gfnn_jax.models.brackets.null_space import CONSTANT, LINEAR, LOG, NullSpace
+from gfnn_jax.models.brackets.poisson_field import OfField, hamiltonian_of
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the choice among brackets (benchmarks/brackets.py)."""
+
+    # ÷ the largest constant: a constant, or a failure of Jacobi's identity, that is none
+    zero: float = 1e-8
+    misfit: float = 1e-8  # of f that a bracket with H may leave, relative
+    starts: int = 24  # random combinations of several null vectors, brought to Jacobi's identity
+    seed: int = 0
+
+
+OPTIONS = Options()
+
+
+class Found(NamedTuple):
+    """A bracket that a field allows. hamiltonian: H over ``library``. several: number m of
+    independent bivectors that the flow conserves. name: of its kind. rule: why it was taken."""
+
+    bracket: Bracket
+    name: str
+    library: Terms
+    hamiltonian: OfField
+    several: int
+    rule: str
+
+    @property
+    def rank(self) -> tuple:
+        """Order of preference, least first."""
+        blocks = getattr(self.bracket, "blocks", None)
+        return (
+            self.hamiltonian.misfit > OPTIONS.misfit,
+            blocks == (),
+            self.several_terms,
+        )
+
+    @property
+    def several_terms(self) -> int:
+        """Number of constants of the bracket."""
+        probe = np.random.default_rng(OPTIONS.seed).uniform(0.5, 1.5, self.bracket.size)
+        return len(self.bracket.relations()) + int(np.count_nonzero(self.bracket.matrix(probe)))
+
+
+def polynomials(names: tuple[str, ...], degree: int, *, constant: bool = False) -> Terms:
+    """All monomials of degree 1 to ``degree`` in the coordinates of these names; with 1 first."""
+    rows = exponents(len(names), degree)
+    return Terms(0, names, ((0,) * len(names), *rows) if constant else tuple(rows), (), names)
+
+
+def library_of(kind: str, names: tuple[str, ...], degree: int, given: Terms | None) -> Terms:
+    """Terms of H for a field of this degree."""
+    if given is not None:
+        return given
+    if kind == CONSTANT:
+        return polynomials(names, degree + 1)
+    if kind == LINEAR:
+        return polynomials(names, degree)
+    n, own = len(names), exponents(len(names), max(degree - 1, 1))
+    logs = [tuple(int(k == n + i) for k in range(2 * n)) for i in range(n)]
+    rows = (*logs, *((*row, *(0,) * n) for row in own))
+    return Terms(0, (*names, *(f"log({name})" for name in names)), rows, (), names)
+
+
+def brackets_of(
+    null: NullSpace, z: np.ndarray, f: np.ndarray, library: Terms, noise: float = 0.0
+) -> list[Found]:
+    """Brackets among the null vectors with an H whose B∇H is the field, best first.
+
+    z, f: (N, n) states and the field there. noise: of f, relative.
+    """
+    found = []
+    for vector, rule in _combinations(null, z, noise):
+        for bracket, name in _made(null, vector, library.names, noise):
+            own = _with_energy(bracket, library, z, f, noise)
+            if own[1].misfit <= max(OPTIONS.misfit, 3 * noise):
+                found.append(Found(own[0], name, library, own[1], len(null.vectors), rule))
+    return sorted(found, key=lambda one: one.rank)
+
+
+def _combinations(null: NullSpace, z: np.ndarray, noise: float) -> Iterator[tuple[np.ndarray, str]]:
+    """Null vectors, or combinations of several that may have Jacobi's identity, each with the rule
+    that takes it; its largest coefficient is 1 in units of the coordinates."""
+    if len(null.vectors) == 1:
+        yield null.vectors[0], ""
+        return
+    if not len(null.vectors):
+        return
+    rows = _echelon(null.vectors)
+    few = "that of fewest constants"
+    if null.tensors.kind != LINEAR:
+        yield from ((row, few) for row in (*rows, rows.sum(axis=0)))
+        return
+    if null.tensors.width == 3:
+        yield _nearest_sphere(null, rows, z), "the one whose Casimir is nearest to a sphere"
+    yield from ((row, few) for row in rows if _jacobi(null, row) <= max(OPTIONS.zero, noise))
+    rng = np.random.default_rng(OPTIONS.seed)
+    for _ in range(OPTIONS.starts):
+        start = rng.normal(size=len(rows))
+        start /= np.linalg.norm(start)
+        solved = least_squares(
+            lambda t: np.append(_identity(_constants(null, t @ rows)[1]).ravel(), t @ t - 1), start
+        )
+        vector = solved.x @ rows
+        if _jacobi(null, vector) <= max(OPTIONS.zero, noise):
+            yield vector, few
+
+
+def _constants(null: NullSpace, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """B_0 (n, n) and c (n, n, n) of an affine bivector."""
+    n = null.tensors.width
+    table = vector.reshape(-1, n + 1)
+    form, c = np.zeros((n, n)), np.zeros((n, n, n))
+    for row, (a, b) in zip(table, null.tensors.places, strict=True):
+        form[a, b], form[b, a] = row[0], -row[0]
+        c[a, b], c[b, a] = row[1:], -row[1:]
+    return form, c
+
+
+def _identity(c: np.ndarray) -> np.ndarray:
+    once = np.einsum("ijl,lkm->ijkm", c, c)
+    return once + once.transpose(1, 2, 0, 3) + once.transpose(2, 0, 1, 3)
+
+
+def _jacobi(null: NullSpace, vector: np.ndarray) -> float:
+    """Failure of Jacobi's identity, ÷ the square of the constants."""
+    c = _constants(null, vector)[1]
+    return jacobi_failure(c) / max(np.abs(c).max() ** 2, 1e-300)
+
+
+def _nearest_sphere(null: NullSpace, rows: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """The combination (J,) whose Casimir ½ zᵀQz has the least condition number, in units of the
+    coordinates: B = [Qz]ₓ in three dimensions."""
+    scale = np.sqrt(np.mean(z**2, axis=0))
+    forms = []
+    for row in rows:
+        c = _constants(null, row)[1]
+        q = np.array([c[1, 2], c[2, 0], c[0, 1]])
+        forms.append(0.5 * (q + q.T) * scale * scale[:, None])
+    forms = np.array([q / np.linalg.norm(q) for q in forms])
+    norms = [np.linalg.norm(q) for q in forms]
+
+    def condition(t: np.ndarray) -> float:
+        values = np.linalg.eigvalsh(np.tensordot(t / np.linalg.norm(t), forms, 1))
+        return float(np.abs(values).max() / max(np.abs(values.sum()) / 3, 1e-9) + np.ptp(values))
+
+    rng = np.random.default_rng(OPTIONS.seed)
+    starts = rng.normal(size=(OPTIONS.starts, len(rows)))
+    best = min((minimize(condition, t, method="Nelder-Mead") for t in starts), key=lambda s: s.fun)
+    units = [np.linalg.norm(_units(_constants(null, row)[1], scale)) for row in rows]
+    return (best.x / np.array(units) / norms) @ rows
+
+
+def _units(c: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    q = np.array([c[1, 2], c[2, 0], c[0, 1]])
+    return 0.5 * (q + q.T) * scale * scale[:, None]
+
+
+def _made(
+    null: NullSpace, vector: np.ndarray, names: tuple[str, ...], noise: float
+) -> Iterator[tuple[Bracket, str]]:
+    """The bracket of a null vector, in standard constants where there are such."""
+    n, zero = null.tensors.width, max(OPTIONS.zero, noise)
+    if null.tensors.kind != LINEAR:
+        form = np.zeros((n, n))
+        for value, (a, b) in zip(vector, null.tensors.places, strict=True):
+            form[a, b], form[b, a] = value, -value
+        form = _rounded(form / np.abs(form).max(), zero)
+        if null.tensors.kind == LOG:
+            yield Bracket.log(form, names), "log-canonical"
+        else:
+            yield Bracket.constant(form, names), "constant"
+        return
+    form, c = _constants(null, vector)
+    c = np.where(np.abs(c) > zero * np.abs(c).max(), c, 0.0)
+    if np.abs(form).max() > zero * np.abs(vector).max():
+        magnetic = _magnetic(form, c, names, zero)
+        if magnetic is not None:
+            yield magnetic, "canonical after p = v + A(x)"
+        return
+    algebra = analysed(c, max(zero, 1e-7))
+    if algebra.lifted is not None:
+        basis = algebra.lifted
+        yield Bracket.lie(algebra.blocks, _rounded(basis, zero), names), algebra.name
+    else:
+        c = _rounded(c / np.abs(c).max(), zero)
+        if jacobi_failure(c) <= 1e-10:
+            yield Bracket.from_constants(c, names), algebra.name
+
+
+def _rounded(values: np.ndarray, zero: float) -> np.ndarray:
+    """Entries that are 0 but for what is zero, and whole numbers but for it."""
+    near = np.round(values)
+    return np.where(np.abs(values - near) <= zero * np.abs(values).max(), near + 0.0, values)
+
+
+def _magnetic(form, c, names, zero: float) -> Bracket | None:
+    """{x_i, v_j} constant, {v_i, v_j} affine in x; None of any other affine bracket."""
+    n = len(form)
+    size = np.abs(form).max()
+    still = [i for i in range(n) if np.abs(c[i]).max() == 0]
+    d = n // 2
+    x, v = list(range(d)), list(range(d, n))
+    if n % 2 or not set(x) <= set(still) or np.abs(form[np.ix_(x, x)]).max() > zero * size:
+        return None
+    if np.abs(c[np.ix_(v, v, v)]).max(initial=0.0) > 0:
+        return None
+    form, c = form / form[0, d], c / form[0, d]
+    inverse = form[np.ix_(x, v)]
+    mass = np.linalg.inv(inverse)
+    field = np.concatenate([form[np.ix_(v, v)][None], np.moveaxis(c[np.ix_(v, v, x)], -1, 0)])
+    field = _rounded(mass @ field @ mass, zero)
+    powers = np.concatenate([np.zeros((1, d), int), np.eye(d, dtype=int)])
+    kept = [k for k, f in enumerate(field) if np.abs(f).max() > 0]
+    return Bracket.magnetic(field[kept], powers[kept], _rounded(mass, zero), names)
+
+
+def _with_energy(bracket, library, z, f, noise) -> tuple[Bracket, OfField]:
+    """The bracket with H, both turned where H would be convex downwards: (−B, −H) is the same
+    motion."""
+    own = hamiltonian_of(bracket, library, z, f, noise)
+    some = z[:: max(1, len(z) // 50)]
+    hessian = library.gradient_and_hessian(own.c, some)[1]
+    scale = np.mean(z**2, axis=0)
+    if np.mean(np.trace(hessian * scale, axis1=1, axis2=2)) >= 0:
+        return bracket, own
+    return _reversed(bracket), own._replace(c=-own.c)
+
+
+def _reversed(bracket: Bracket) -> Bracket:
+    """−B."""
+    if hasattr(bracket, "constants"):
+        if bracket.blocks:
+            return Bracket.lie(bracket.blocks, -bracket.basis, bracket.names)
+        return Bracket.from_constants(-bracket.constants, bracket.names)
+    if hasattr(bracket, "form"):
+        return dataclasses.replace(bracket, form=-bracket.form)
+    return dataclasses.replace(bracket, field=-bracket.field, mass=-bracket.mass)

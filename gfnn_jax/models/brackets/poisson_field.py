@@ -1,0 +1,108 @@
+"""ż = B(z) ∇H(z) as a family of fields that is linear in the coefficients of H, and H of a field
+whose bracket is known. NumPy."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linprog
+
+from gfnn_jax.brackets import Bracket
+from gfnn_jax.families.terms import Terms
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of H from a field (benchmarks/brackets.py)."""
+
+    # singular value ÷ the largest, columns in units of the terms' sizes: of a Casimir
+    casimir: float = 1e-9
+    zero: float = 1e-7  # ÷ the largest, in these units: a coefficient that is none
+
+
+OPTIONS = Options()
+
+
+@dataclasses.dataclass(frozen=True)
+class PoissonField:
+    """f = Σ_j c_j B ∇φ_j, φ the terms of H."""
+
+    bracket: Bracket
+    library: Terms
+
+    @property
+    def num(self) -> int:
+        """Number of terms."""
+        return self.library.num_parameters
+
+    def rate(self, c, z):
+        """f (N, n)."""
+        return np.einsum("nij,nj->ni", self.bracket.matrix(z), self.library.gradient(c, z))
+
+    def jacobian(self, c, z):
+        """∂f/∂z (N, n, n); that of B by complex steps, which are exact of polynomials."""
+        gradient, hessian = self.library.gradient_and_hessian(c, z)
+        found = self.bracket.matrix(z) @ hessian
+        for k, h in enumerate(np.maximum(np.abs(z).max(axis=0), 1e-300) * 1e-20):
+            moved = z.astype(complex)
+            moved[:, k] += 1j * h
+            found[:, :, k] += np.einsum("nij,nj->ni", self.bracket.matrix(moved).imag / h, gradient)
+        return found
+
+    def columns(self, z):
+        """B ∇φ_j (N, n, J)."""
+        return self.bracket.matrix(z) @ self.library.term_gradients(z)
+
+
+class OfField(NamedTuple):
+    """H of a field. c: (J,) coefficients, sparse modulo Casimirs. misfit: of B∇H against the field,
+    RMS ÷ its RMS. free: number of combinations of terms that are Casimirs."""
+
+    c: np.ndarray
+    misfit: float
+    free: int
+
+
+def hamiltonian_of(
+    bracket: Bracket, library: Terms, z: np.ndarray, f: np.ndarray, noise: float = 0.0
+) -> OfField:
+    """H with B∇H = f at states z (N, n), f (N, n), by linear least squares; of all that differ by
+    Casimirs the one with the smallest sum of its coefficients' sizes, in units of the terms.
+
+    noise: of f, relative: what of singular values is none.
+    """
+    units, scale = term_sizes(library, z), np.sqrt(np.mean(f**2, axis=0)) + 1e-300
+    columns = PoissonField(bracket, library).columns(z) / units / scale[:, None]
+    matrix, right = columns.reshape(-1, library.num_parameters), (f / scale).ravel()
+    u, s, vt = np.linalg.svd(matrix, full_matrices=False)
+    known = s > max(OPTIONS.casimir, noise) * s[0]
+    c = vt[known].T @ ((u.T @ right)[known] / s[known])
+    kernel = np.linalg.svd(vt[known], full_matrices=True)[2][known.sum() :]
+    sparse = _sparse(c, kernel)
+    kept = np.abs(sparse) > max(OPTIONS.zero, noise) * np.abs(sparse).max(initial=0.0)
+    solved = np.zeros(len(c))
+    solved[kept] = np.linalg.lstsq(matrix[:, kept], right, rcond=1e-13)[0]
+    misfit = float(np.sqrt(np.mean((matrix @ solved - right) ** 2) / np.mean(right**2)))
+    return OfField(solved / units, misfit, len(kernel))
+
+
+def term_sizes(library: Terms, z: np.ndarray) -> np.ndarray:
+    """(J,) the RMS of each term's variation over the states."""
+    values = library.term_values(z)
+    size = np.sqrt(np.mean(values**2, axis=0))
+    return np.where(size > 0, size, 1.0)
+
+
+def _sparse(c: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    """c + t · kernel (m, J) of the smallest Σ|c_j|, whose vertex has at least m zeros."""
+    if not len(kernel):
+        return c
+    count, own = len(c), len(kernel)
+    # c + kernelᵀ t = a − b with a, b ≥ 0: least Σ(a + b)
+    equal = np.hstack([kernel.T, -np.eye(count), np.eye(count)])
+    cost = np.concatenate([np.zeros(own), np.ones(2 * count)])
+    bounds = [(None, None)] * own + [(0, None)] * (2 * count)
+    found = linprog(cost, A_eq=equal, b_eq=-c, bounds=bounds, method="highs-ds")
+    return c if found.x is None else c + found.x[:own] @ kernel
