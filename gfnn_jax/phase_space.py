@@ -21,6 +21,7 @@ from gfnn_jax.errors import FitError
 Scalar = Float[Array, ""]
 State = Float[Array, "phase"]
 States = Float[Array, "batch phase"]
+POISSON = "poisson"  # structure of pairs whose states are no (q, p)
 TIME = "t"  # the name, among args, of the time of a drive; it is the last of them
 
 
@@ -134,6 +135,8 @@ class Pairs:
     std: standard deviation of the noise on each measured coordinate, (2d,), or on each value of
     both states of a pair, (N, 2d), in the user's units: the fits of S and H weight pairs by those
     of each value. With None it is estimated.
+    structure: "poisson" of states z (N, n), n ≥ 2, that are no (q, p), as angular velocities or
+    populations: the bracket is then learned too. names: of their coordinates; () for z1 … zn.
 
     Raises FitError where the arrays do not have these shapes.
     """
@@ -147,18 +150,19 @@ class Pairs:
     run: Any = None
     place: Any = None
     std: Any = None
+    structure: str | None = None
+    names: tuple[str, ...] = ()
 
     def __post_init__(self):
+        if self.structure not in (None, POISSON):
+            raise FitError(f"expected structure 'poisson' or None, got {self.structure!r}")
         # JAX makes pairs of whatever it maps arrays to; a user's are lists or arrays.
         kinds = {type(z).__name__ for z in (self.z0, self.z1) if isinstance(z, (list, tuple))}
         if kinds:
             raise FitError(f"expected arrays z0 and z1 of shape (N, 2d), got a {kinds.pop()}")
         if not all(isinstance(z, (np.ndarray, jax.Array)) for z in (self.z0, self.z1)):
             return
-        if self.z0.shape != self.z1.shape or self.z0.ndim != 2 or self.z0.shape[1] % 2:
-            raise FitError(
-                f"expected z0 and z1 of one shape (N, 2d), got {self.z0.shape} and {self.z1.shape}"
-            )
+        self._check_shapes()
         if isinstance(self.dt, (list, tuple, np.ndarray, jax.Array)):
             self._set("dt", np.asarray(self.dt) if np.ndim(self.dt) else self.dt)
             if np.ndim(self.dt) and np.shape(self.dt) != (len(self),):
@@ -181,6 +185,22 @@ class Pairs:
                 )
             if not (np.isfinite(self.std) & (self.std > 0)).all():
                 raise FitError("expected every std finite and above 0; leave std out if unknown")
+
+    def _check_shapes(self) -> None:
+        """Raise FitError where states and images are no (N, 2d), or (N, n) of a bracket."""
+        width, any_width = self.z0.shape[-1], self.structure == POISSON
+        if self.z0.shape != self.z1.shape or self.z0.ndim != 2 or width < 2:
+            shape = "(N, n), n ≥ 2" if any_width else "(N, 2d)"
+            raise FitError(
+                f"expected z0 and z1 of one shape {shape}, got {self.z0.shape} and {self.z1.shape}"
+            )
+        if width % 2 and not any_width:
+            raise FitError(
+                f"{width} columns are no positions and momenta (q, p). Of states with another "
+                'bracket, as angular velocities: gfnn.Pairs(z0, z1, dt, structure="poisson")'
+            )
+        if self.names and len(self.names) != width:
+            raise FitError(f"expected {width} names of coordinates, got {len(self.names)}")
 
     def _set_identities(self) -> None:
         """Make ``run`` and ``place`` arrays (N,). Raises FitError on other shapes or types."""
@@ -224,16 +244,18 @@ class Pairs:
             None if own else self.dt,
             self.period,
             run[1],
+            (self.structure, self.names),
         )
 
     @classmethod
     def tree_unflatten(cls, fixed, leaves) -> Pairs:
         """Invert ``tree_flatten``."""
-        (dt, period, names), (z0, z1, args, run, place, std, *own) = fixed, leaves
-        run = run if names is None else np.array(names)
-        return cls(
-            z0, z1, own[0] if own else dt, args, period=period, run=run, place=place, std=std
-        )
+        (dt, period, runs, own_kind), (z0, z1, args, run, place, std, *own) = fixed, leaves
+        run = run if runs is None else np.array(runs)
+        known = {"period": period, "run": run, "place": place, "std": std}
+        structure, names = own_kind
+        dt = own[0] if own else dt
+        return cls(z0, z1, dt, args, **known, structure=structure, names=names)
 
     def __len__(self) -> int:
         return self.z0.shape[0]
@@ -249,16 +271,9 @@ class Pairs:
         args = self.args and {name: values[rows] for name, values in self.args.items()}
         run, place = (None if of is None else of[rows] for of in (self.run, self.place))
         std = self.std[rows] if np.ndim(self.std) == 2 else self.std
-        return Pairs(
-            self.z0[rows],
-            self.z1[rows],
-            dt,
-            args,
-            period=self.period,
-            run=run,
-            place=place,
-            std=std,
-        )
+        changes = {"args": args, "run": run, "place": place, "std": std}
+        z0, z1 = self.z0[rows], self.z1[rows]
+        return dataclasses.replace(self, z0=z0, z1=z1, dt=dt, t0=None, **changes)
 
 
 def _named(args: Any, count: int) -> dict[str, Any]:

@@ -43,6 +43,7 @@ ORDER = (
     "models.positions",
     "models.lagrangians",
     "models.textbook",
+    "models.brackets",
     "models.generating_functions",
     "models.hamiltonians",
     "search",

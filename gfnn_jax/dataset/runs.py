@@ -6,6 +6,7 @@ run. Two pairs of a run whose places differ by one share a state, and its noise.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -54,16 +55,7 @@ def identified(pairs: Pairs) -> Identified:
 
 def _numbered(pairs: Pairs, run: np.ndarray, place: np.ndarray) -> Pairs:
     """The pairs with these runs and places."""
-    return Pairs(
-        pairs.z0,
-        pairs.z1,
-        pairs.dt,
-        pairs.args,
-        period=pairs.period,
-        run=run,
-        place=place,
-        std=pairs.std,
-    )
+    return dataclasses.replace(pairs, t0=None, run=run, place=place)
 
 
 def _chains(run: np.ndarray, z0: np.ndarray, z1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -357,7 +357,8 @@ def polynomial_terms(
 def joined(first: Terms, second: Terms) -> Terms:
     """Make the union of the terms of both, without duplicates."""
     variables, *rows = _over_both(first, second)
-    return Terms(first.dim, variables, tuple(dict.fromkeys(rows[0] + rows[1])), first.parameters)
+    both = tuple(dict.fromkeys(rows[0] + rows[1]))
+    return Terms(first.dim, variables, both, first.parameters, first.names)
 
 
 def multiplied(first: Terms, second: Terms) -> Terms:
@@ -366,7 +367,7 @@ def multiplied(first: Terms, second: Terms) -> Terms:
     rows = dict.fromkeys(
         tuple(a + b for a, b in zip(one, other, strict=True)) for one in left for other in right
     )
-    return Terms(first.dim, variables, tuple(rows), first.parameters)
+    return Terms(first.dim, variables, tuple(rows), first.parameters, first.names)
 
 
 def _over_both(first: Terms, second: Terms):

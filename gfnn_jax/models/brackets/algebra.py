@@ -35,8 +35,8 @@ _EPSILON = standard_constants(("so3",))
 
 
 class Algebra(NamedTuple):
-    """An algebra: its name, its blocks as `Bracket.lie` has them, and L (n, n) with which y = Lz has
-    standard constants; () and None of one that has no standard here."""
+    """An algebra: its name, its blocks as `Bracket.lie` has them, and L (n, n) with which y = Lz
+    has standard constants; () and None of one that has no standard here."""
 
     name: str
     blocks: tuple[str, ...] = ()
@@ -117,7 +117,7 @@ def _rotations(c: np.ndarray, form: np.ndarray) -> np.ndarray | None:
     ad = own.transpose(0, 2, 1)  # (ad_i)_kj = c_ijk
     eye = np.eye(n)
     commute = np.concatenate([np.kron(a, eye) - np.kron(eye, a.T) for a in ad])
-    _, s, vt = np.linalg.svd(commute, full_matrices=True)
+    vt = np.linalg.svd(commute, full_matrices=True)[2]
     count = n // 3
     kernel = vt[-count:].reshape(count, n, n)
     # a symmetric combination, whose eigenspaces the factors are: that of the widest gaps
@@ -186,4 +186,6 @@ def _euclidean(c: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.nda
     gamma *= np.sqrt(3) / np.linalg.norm(gamma)
     gamma *= np.sign(gamma[0, np.abs(gamma[0]).argmax()])
     lifted = np.concatenate([levi, gamma])
-    return lifted if np.abs(changed(c, lifted) - standard_constants(("se3",))).max() < 0.05 else None
+    return (
+        lifted if np.abs(changed(c, lifted) - standard_constants(("se3",))).max() < 0.05 else None
+    )

@@ -42,7 +42,15 @@ class Options:
 OPTIONS = Options()
 
 
-class Field(Protocol):
+class Columns(Protocol):
+    """Vector fields v_j."""
+
+    def columns(self, z: np.ndarray) -> np.ndarray:
+        """v_j (N, n, J)."""
+        ...
+
+
+class Field(Columns, Protocol):
     """Family of vector fields, linear in its coefficients c (J,). All in NumPy, z (N, n)."""
 
     @property
@@ -56,10 +64,6 @@ class Field(Protocol):
 
     def jacobian(self, c: np.ndarray, z: np.ndarray) -> np.ndarray:
         """∂f/∂z (N, n, n)."""
-        ...
-
-    def columns(self, z: np.ndarray) -> np.ndarray:
-        """v_j (N, n, J)."""
         ...
 
 
@@ -115,7 +119,7 @@ def flow(field: Field, c: np.ndarray, z0: np.ndarray, dt: Any, substeps: int = 1
                 new = field.rate(c, inside.reshape(-1, z.shape[1])).reshape(inside.shape)
                 moved = np.nanmax(np.abs(h * (new - slopes)) / scale, initial=0.0)
                 slopes = new
-                if not moved < 0.99 * change and moved < 1e-9 or moved <= OPTIONS.solved:
+                if (not moved < 0.99 * change and moved < 1e-9) or moved <= OPTIONS.solved:
                     break
                 change = moved
             nodes.append(inside)
@@ -128,7 +132,8 @@ def flow(field: Field, c: np.ndarray, z0: np.ndarray, dt: Any, substeps: int = 1
 def substeps_of(field: Field, c: np.ndarray, z: np.ndarray, dt: Any) -> int:
     """Substeps in which the stages are solved to roundoff at these states."""
     rates = np.abs(field.jacobian(c, z)).sum(axis=2).max(axis=1) * np.reshape(dt, -1)
-    fastest = float(np.nanquantile(rates, 0.99))
+    rates = rates[np.isfinite(rates)]
+    fastest = float(np.quantile(rates, 0.99)) if len(rates) else 0.0
     return int(np.clip(np.ceil(fastest / OPTIONS.rate), 1, OPTIONS.most_substeps))
 
 
@@ -167,7 +172,7 @@ def fit_field(
         residual = z1 - moved.images
         relative = float(np.sqrt(np.mean((residual / spread) ** 2)))
         if not np.isfinite(relative) or (best is not None and relative > 3 * best.relative):
-            if best is None and iterations > 8 or share < 0.01:
+            if (best is None and iterations > 8) or share < 0.01:
                 break
             share *= 0.3
             c = (c if best is None else best.c) * (0.5 if best is None else 1.0)
@@ -178,7 +183,7 @@ def fit_field(
             best = FieldFit(c, residual, relative, np.zeros((0, 0)), iterations)
         if relative <= OPTIONS.roundoff or not gained:
             break
-        half = _half(field, c, 0.5 * (moved.images + z0), h)
+        half = half_step(field, c, 0.5 * (moved.images + z0), h)
         target = np.linalg.solve(half, residual[..., None])[..., 0]
         pinned = moved.nodes + moved.times[:, None, None] * residual
         step = _solved(field, pinned, moved.weights, h, target, spread)[0]
@@ -193,14 +198,14 @@ def fit_field(
     return best._replace(root=max(sigma, 1e-16) * root, iterations=iterations)
 
 
-def _half(field: Field, c, z, h) -> np.ndarray:
+def half_step(field: Field, c, z, h) -> np.ndarray:
     """M(h, h/2) (N, n, n), from f' at one state of each path (N, n)."""
     a = 0.5 * h[..., None] * field.jacobian(c, z)
     eye = np.eye(z.shape[1])
     return eye + a @ (eye + 0.5 * a @ (eye + a / 3))
 
 
-def mean_columns(field: Field, nodes, weights, h) -> np.ndarray:
+def mean_columns(field: Columns, nodes, weights, h) -> np.ndarray:
     """∫ v_j dt (N, n, J), or of a free field ∫ ψ_k dt (N, 1, K)."""
     total = 0.0
     for inside, weight in zip(nodes, weights, strict=True):

@@ -8,18 +8,20 @@ coordinates. NumPy.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
-from gfnn_jax.brackets import Bracket, _echelon, jacobi_failure
+from gfnn_jax.brackets import Bracket, jacobi_failure
+from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms, exponents
-from gfnn_jax.models.brackets.algebra import analysed, changed
+from gfnn_jax.models.brackets.algebra import analysed
 from gfnn_jax.models.brackets.null_space import CONSTANT, LINEAR, LOG, NullSpace
-from gfnn_jax.models.brackets.poisson_field import OfField, hamiltonian_of
+from gfnn_jax.models.brackets.poisson_field import OfField, hamiltonian_of, sparse, term_sizes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +31,11 @@ class Options:
     # ÷ the largest constant: a constant, or a failure of Jacobi's identity, that is none
     zero: float = 1e-8
     misfit: float = 1e-8  # of f that a bracket with H may leave, relative
-    starts: int = 24  # random combinations of several null vectors, brought to Jacobi's identity
+    # times these: entries of y = Lz that are whole numbers, and a constant part that is none
+    snapped: float = 10.0
+    rounded: float = 1.5  # times the least misfit: that of constants made whole numbers
+    starts: int = 6  # random combinations of several null vectors, brought to Jacobi's identity
+    places: int = 12  # of largest constants, at which null vectors of few constants are looked for
     seed: int = 0
 
 
@@ -93,10 +99,15 @@ def brackets_of(
     """
     found = []
     for vector, rule in _combinations(null, z, noise):
-        for bracket, name in _made(null, vector, library.names, noise):
-            own = _with_energy(bracket, library, z, f, noise)
-            if own[1].misfit <= max(OPTIONS.misfit, 3 * noise):
-                found.append(Found(own[0], name, library, own[1], len(null.vectors), rule))
+        made = [
+            (name, *_with_energy(bracket, library, z, f, noise))
+            for bracket, name in _made(null, vector, library.names, noise)
+        ]
+        least = min((own.misfit for *_, own in made), default=0.0)
+        limit = min(max(OPTIONS.misfit, 3 * noise), OPTIONS.rounded * least + OPTIONS.misfit)
+        for name, bracket, own in made:
+            if own.misfit <= limit:
+                found.append(Found(bracket, name, library, own, len(null.vectors), rule))
     return sorted(found, key=lambda one: one.rank)
 
 
@@ -108,16 +119,15 @@ def _combinations(null: NullSpace, z: np.ndarray, noise: float) -> Iterator[tupl
         return
     if not len(null.vectors):
         return
-    rows = _echelon(null.vectors)
-    few = "that of fewest constants"
+    rows, few = _sparse_rows(null.vectors), "that of fewest constants"
     if null.tensors.kind != LINEAR:
         yield from ((row, few) for row in (*rows, rows.sum(axis=0)))
         return
     if null.tensors.width == 3:
         yield _nearest_sphere(null, rows, z), "the one whose Casimir is nearest to a sphere"
     yield from ((row, few) for row in rows if _jacobi(null, row) <= max(OPTIONS.zero, noise))
-    rng = np.random.default_rng(OPTIONS.seed)
-    for _ in range(OPTIONS.starts):
+    rng, many = np.random.default_rng(OPTIONS.seed), null.tensors.width > 6
+    for _ in range(0 if many else OPTIONS.starts):
         start = rng.normal(size=len(rows))
         start /= np.linalg.norm(start)
         solved = least_squares(
@@ -126,6 +136,23 @@ def _combinations(null: NullSpace, z: np.ndarray, noise: float) -> Iterator[tupl
         vector = solved.x @ rows
         if _jacobi(null, vector) <= max(OPTIONS.zero, noise):
             yield vector, few
+
+
+def _sparse_rows(vectors: np.ndarray) -> np.ndarray:
+    """Vectors of few entries that span the same space as vectors (m, J), the fewest first: each the
+    one of least Σ|x_j| whose entry at one place is 1 (Spielman, Wang & Wright, COLT 2012)."""
+    found = list(vectors)
+    places = np.argsort(-np.linalg.norm(vectors, axis=0))[: OPTIONS.places]
+    for place in places:
+        first = vectors[:, place] / (vectors[:, place] @ vectors[:, place])
+        others = np.linalg.svd(vectors[:, place][None], full_matrices=True)[2][1:]
+        found.append(sparse(first @ vectors, others @ vectors))
+    found = [x / np.abs(x).max() for x in found]
+    rows: list[np.ndarray] = []
+    for x in sorted(found, key=lambda x: int((np.abs(x) > OPTIONS.zero).sum())):
+        if np.linalg.matrix_rank(np.array([*rows, x]), tol=1e-6) > len(rows):
+            rows.append(x)
+    return np.array(rows)
 
 
 def _constants(null: NullSpace, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -195,15 +222,20 @@ def _made(
         return
     form, c = _constants(null, vector)
     c = np.where(np.abs(c) > zero * np.abs(c).max(), c, 0.0)
-    if np.abs(form).max() > zero * np.abs(vector).max():
+    if np.abs(form).max() > OPTIONS.snapped * zero * np.abs(vector).max():
         magnetic = _magnetic(form, c, names, zero)
         if magnetic is not None:
             yield magnetic, "canonical after p = v + A(x)"
         return
-    algebra = analysed(c, max(zero, 1e-7))
+    # what is zero of a Killing form is less certain than constants are
+    tried = [analysed(c, min(factor * zero, 0.1)) for factor in (10.0, 100.0)]
+    algebra = next((a for a in tried if a.lifted is not None), tried[0])
     if algebra.lifted is not None:
-        basis = algebra.lifted
-        yield Bracket.lie(algebra.blocks, _rounded(basis, zero), names), algebra.name
+        # B is known but for a factor, which H has the inverse of: y is as large as z
+        basis = algebra.lifted * np.sqrt(3) / np.linalg.norm(algebra.lifted[:3])
+        for by in (OPTIONS.snapped * zero, zero):
+            with contextlib.suppress(FitError):  # rounded to a singular one
+                yield Bracket.lie(algebra.blocks, _rounded(basis, by), names), algebra.name
     else:
         c = _rounded(c / np.abs(c).max(), zero)
         if jacobi_failure(c) <= 1e-10:
@@ -238,18 +270,25 @@ def _magnetic(form, c, names, zero: float) -> Bracket | None:
 
 
 def _with_energy(bracket, library, z, f, noise) -> tuple[Bracket, OfField]:
-    """The bracket with H, both turned where H would be convex downwards: (−B, −H) is the same
-    motion."""
+    """The bracket with H, convex where it can be."""
     own = hamiltonian_of(bracket, library, z, f, noise)
+    bracket, c = upright(bracket, library, own.c, z)
+    return bracket, own._replace(c=c)
+
+
+def upright(bracket: Any, library: Terms, c: np.ndarray, z: np.ndarray) -> tuple[Any, np.ndarray]:
+    """The bracket and H, both reversed where H would be concave: (−B, −H) is the same motion."""
     some = z[:: max(1, len(z) // 50)]
-    hessian = library.gradient_and_hessian(own.c, some)[1]
-    scale = np.mean(z**2, axis=0)
-    if np.mean(np.trace(hessian * scale, axis1=1, axis2=2)) >= 0:
-        return bracket, own
-    return _reversed(bracket), own._replace(c=-own.c)
+    hessian = library.gradient_and_hessian(c, some)[1]
+    bends = np.diagonal(hessian, axis1=1, axis2=2) * np.mean(z**2, axis=0)
+    if np.abs(bends.sum()) <= 1e-6 * np.abs(bends).sum():
+        bends = c * term_sizes(library, z)
+    if bends.sum() >= 0:
+        return bracket, c
+    return _reversed(bracket), -c
 
 
-def _reversed(bracket: Bracket) -> Bracket:
+def _reversed(bracket: Any) -> Any:
     """−B."""
     if hasattr(bracket, "constants"):
         if bracket.blocks:

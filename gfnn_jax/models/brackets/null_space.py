@@ -1,8 +1,8 @@
-"""The bracket of a field: antisymmetric B with L_f B = λB, linear in the coefficients of B.
+"""The bracket of a field: antisymmetric B with L_f B = 0, linear in the coefficients of B.
 
     (L_f B)_ij = f·∇B_ij − Σ_k (∂_k f_i B_kj + B_ik ∂_k f_j)
 
-is zero where the flow of f is Poisson, and λB of uniform friction. It is evaluated at states, each
+is zero where the flow of f is Poisson. It is evaluated at states, each
 coordinate in units of its size: constant B, then B affine in z, then log-canonical ones,
 b_ij z_i z_j. NumPy.
 """
@@ -22,13 +22,11 @@ class Options:
     """Options of the null space (benchmarks/brackets.py)."""
 
     rows_per_column: float = 3.0  # of numbers that L_f B is taken at
-    # singular value ÷ the largest: of a null vector of a field without noise
+    # singular value in units of f': of a null vector of a field without noise
     null: float = 1e-10
     # standard errors of L_f B by the field's own covariance, that a null vector may have
     errors: float = 3.0
     draws: int = 12  # of the field's coefficients, that tell this error
-    gap: float = 10.0  # times the null space's largest singular value: the least of the others'
-    seed: int = 0
 
 
 OPTIONS = Options()
@@ -69,14 +67,6 @@ class Tensors:
         slopes = np.concatenate([np.zeros((1, self.width)), eye])
         return values, np.broadcast_to(slopes, (*count, *slopes.shape))
 
-    def matrices(self, z: np.ndarray) -> np.ndarray:
-        """All of the basis (N, J, n, n) at z."""
-        values = self.monomials(z)[0]
-        out = np.zeros((len(z), *values.shape[1:], self.width, self.width))
-        for p, (a, b) in enumerate(self.places):
-            out[:, p, :, a, b], out[:, p, :, b, a] = values[:, p], -values[:, p]
-        return out.reshape(len(z), self.num, self.width, self.width)
-
     def lie(self, z: np.ndarray, f: np.ndarray, slope: np.ndarray) -> np.ndarray:
         """L_f of all of the basis, its entries above the diagonal (N, P, J), from f (N, n) and
         f' (N, n, n)."""
@@ -95,26 +85,20 @@ class Tensors:
 
 
 class NullSpace(NamedTuple):
-    """Bivectors with L_f B = λB of one kind, in the units of the coordinates.
+    """Bivectors with L_f B = 0 of one kind, in the units of the coordinates.
 
-    tensors: the basis. vectors: (m, J) coefficients in it. rate: λ. values: all singular values,
-    rising, ÷ the largest. expected: that a null vector may have by the field's errors.
+    tensors: the basis. vectors: (m, J) coefficients in it. values: all singular values, rising, ÷
+    the size of f' over the states: 1 where nothing cancels.
     """
 
     tensors: Tensors
     vectors: np.ndarray
-    rate: float
     values: np.ndarray
-    expected: float
 
     @property
     def nearest(self) -> float:
         """The smallest singular value."""
         return float(self.values[0])
-
-    def matrix(self, vector: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """B (N, n, n) of one vector (J,) at z (N, n)."""
-        return np.einsum("j,njab->nab", vector, self.tensors.matrices(z), optimize=True)
 
 
 def null_spaces(
@@ -138,19 +122,19 @@ def null_spaces(
         stride = max(1, int(len(z) // max(needed, 30)))
         own = slice(None, None, stride)
         lie = tensors.lie(y[own], f[own], slope[own]).reshape(-1, tensors.num)
+        size = np.sqrt(len(lie) / len(tensors.places) * np.mean(np.sum(slope[own] ** 2, (1, 2))))
         _, values, vt = np.linalg.svd(lie, full_matrices=False)
-        values, vt = values[::-1] / values[0], vt[::-1]
+        values, vt = values[::-1] / size, vt[::-1]
         errors = [
             tensors.lie(y[own], *(a[own] for a in one)).reshape(-1, tensors.num) for one in draws
         ]
-        size = np.linalg.norm(lie, 2)
         limit = np.array(
             [np.sqrt(np.mean([np.sum((e @ v) ** 2) for e in errors])) / size for v in vt[:8]]
         )
         allowed = np.maximum(OPTIONS.errors * limit, OPTIONS.null)
         count = int(np.cumprod(values[: len(allowed)] <= allowed).sum())
         vectors = vt[:count] * _back(tensors, scale)
-        yield NullSpace(tensors, vectors, 0.0, values, float(allowed[max(count - 1, 0)]))
+        yield NullSpace(tensors, vectors, values)
 
 
 def _in_units(f, slope, scale):

@@ -80,8 +80,8 @@ def hamiltonian_of(
     known = s > max(OPTIONS.casimir, noise) * s[0]
     c = vt[known].T @ ((u.T @ right)[known] / s[known])
     kernel = np.linalg.svd(vt[known], full_matrices=True)[2][known.sum() :]
-    sparse = _sparse(c, kernel)
-    kept = np.abs(sparse) > max(OPTIONS.zero, noise) * np.abs(sparse).max(initial=0.0)
+    least = sparse(c, kernel)
+    kept = np.abs(least) > max(OPTIONS.zero, noise) * np.abs(least).max(initial=0.0)
     solved = np.zeros(len(c))
     solved[kept] = np.linalg.lstsq(matrix[:, kept], right, rcond=1e-13)[0]
     misfit = float(np.sqrt(np.mean((matrix @ solved - right) ** 2) / np.mean(right**2)))
@@ -95,7 +95,7 @@ def term_sizes(library: Terms, z: np.ndarray) -> np.ndarray:
     return np.where(size > 0, size, 1.0)
 
 
-def _sparse(c: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+def sparse(c: np.ndarray, kernel: np.ndarray) -> np.ndarray:
     """c + t · kernel (m, J) of the smallest Σ|c_j|, whose vertex has at least m zeros."""
     if not len(kernel):
         return c

@@ -1,0 +1,220 @@
+"""ż = B(z)∇H(z) fitted to sequences with noise: arcs whose states are latent, the coefficients of H
+and the constants of the bracket together (`solve.latent_arcs`). NumPy."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.brackets import Bracket, standard_constants
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.models.brackets.algebra import changed
+from gfnn_jax.models.brackets.poisson_field import PoissonField
+from gfnn_jax.solve.latent_arcs import Defects, Fitted, Observed, Readings, observed_whole
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of fits to arcs (benchmarks/brackets.py)."""
+
+    rate: float = 0.2  # largest h‖f'‖ of a Runge–Kutta step
+    most_substeps: int = 16
+    nodes: int = 64  # of an arc, at most
+    fewest_nodes: int = 4
+    # standard errors of a coefficient that stays
+    significant: float = 4.0
+    whole: float = 3.0  # of a constant of the bracket, from a whole number that it is then
+    near: float = 0.05  # largest distance from that number
+    rounds: int = 5  # of dropping terms
+    states: int = 400  # at which the field's rates are taken
+    # of the noise: residuals that are none
+    least: float = 1e-3
+
+
+OPTIONS = Options()
+
+
+@dataclasses.dataclass(frozen=True)
+class FreeBracket:
+    """A bracket whose constants are fitted too: entries of ``form``, or of the ``basis``, that are
+    no whole numbers. places: (K, 2) of these entries."""
+
+    bracket: Any
+    places: np.ndarray
+
+    @classmethod
+    def of(cls, bracket: Bracket) -> FreeBracket:
+        """The bracket with every entry that is no whole number."""
+        if getattr(bracket, "blocks", None):
+            entries = bracket.basis  # pyright: ignore[reportAttributeAccessIssue]
+        elif hasattr(bracket, "form"):
+            entries = np.triu(bracket.form)  # pyright: ignore[reportAttributeAccessIssue]
+        else:
+            entries = np.zeros((0, 0))
+        return cls(bracket, np.argwhere(entries != np.round(entries)))
+
+    @property
+    def values(self) -> np.ndarray:
+        """(K,) of these entries."""
+        lie = hasattr(self.bracket, "basis")
+        entries = self.bracket.basis if lie else getattr(self.bracket, "form", np.zeros((0, 0)))
+        return entries[tuple(self.places.T)] if len(self.places) else np.zeros(0)
+
+    def moved(self, values: np.ndarray) -> Any:
+        """The bracket with other values (K,)."""
+        if not len(self.places):
+            return self.bracket
+        i, j = self.places.T
+        if hasattr(self.bracket, "basis"):
+            basis = self.bracket.basis.copy()
+            basis[i, j] = values
+            return Bracket.lie(self.bracket.blocks, basis, self.bracket.names)
+        form = self.bracket.form.copy()
+        form[i, j], form[j, i] = values, -values
+        return dataclasses.replace(self.bracket, form=form)
+
+    def columns(self, z: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """∂(B∇H)/∂values (N, n, K)."""
+        out = np.zeros((*z.shape, len(self.places)))
+        for k, (i, j) in enumerate(self.places):
+            if hasattr(self.bracket, "basis"):
+                basis = self.bracket.basis.astype(complex)
+                basis[i, j] += 1e-30j
+                standard = standard_constants(self.bracket.blocks)
+                slope = np.imag(changed(standard, np.linalg.inv(basis))) / 1e-30
+                out[..., k] = np.einsum("abc,nc,nb->na", slope, z, gradient, optimize=True)
+            else:
+                log = self.bracket.name == "log-canonical"
+                unit = z[:, i] * z[:, j] if log else 1.0
+                out[:, i, k], out[:, j, k] = unit * gradient[:, j], -unit * gradient[:, i]
+        return out
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PoissonArcs:
+    """The law as `Readings.fit` wants it: p is (c, values of the bracket). dt: between nodes, a
+    number or (A, L − 1). substeps: Runge–Kutta steps of order 4 between nodes."""
+
+    library: Terms
+    free: FreeBracket
+    dt: Any
+    substeps: int
+
+    def take(self, arcs: np.ndarray) -> PoissonArcs:
+        """The same of some of the arcs."""
+        return self if np.ndim(self.dt) == 0 else dataclasses.replace(self, dt=self.dt[arcs])
+
+    def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
+        """The states themselves."""
+        return observed_whole(x, len(p))
+
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
+        """Ends of the steps from all nodes but the last, less the next nodes."""
+        arcs, length, m = x.shape
+        z = x[:, :-1].reshape(-1, m)
+        h = np.reshape(np.broadcast_to(self.dt, (arcs, length - 1)), (-1, 1)) / self.substeps
+        count = self.library.num_parameters
+        bracket = self.free.moved(p[count:])
+        field, free = PoissonField(bracket, self.library), FreeBracket(bracket, self.free.places)
+        c = p[:count]
+        slope = np.zeros((len(z), m, m + len(p)))
+        slope[:, range(m), range(m)] = 1.0
+
+        def rates(z, slope):
+            gradient = self.library.gradient(c, z)
+            moving = field.jacobian(c, z) @ slope
+            moving[..., m : m + count] += field.columns(z)
+            moving[..., m + count :] += free.columns(z, gradient)
+            return np.einsum("nij,nj->ni", bracket.matrix(z), gradient), moving
+
+        for _ in range(self.substeps):
+            total, change, at = np.zeros_like(z), np.zeros_like(slope), (z, slope)
+            for part, weight in zip((0.5, 0.5, 1.0, 0.0), (1, 2, 2, 1), strict=True):
+                rate, moving = rates(*at)
+                total, change = total + weight * rate / 6, change + weight * moving / 6
+                at = z + part * h * rate, slope + part * h[..., None] * moving
+            z, slope = z + h * total, slope + h[..., None] * change
+        ends = z.reshape(arcs, length - 1, m)
+        slope = slope.reshape(arcs, length - 1, m, -1)
+        return Defects(ends - x[:, 1:], slope[..., :m], slope[..., m:])
+
+
+class ArcsFit(NamedTuple):
+    """A law fitted to arcs: the field, c, a root of the covariance of c, the noise σ (n,), and the
+    residuals' RMS in units of it."""
+
+    field: PoissonField
+    c: np.ndarray
+    root: np.ndarray
+    sigma: np.ndarray
+
+
+def fit_arcs(
+    field: PoissonField, c: np.ndarray, y: np.ndarray, dt: float, sigma: np.ndarray
+) -> ArcsFit:
+    """Fit H and the bracket's constants to arcs y (A, L, n), dt between nodes. Terms below four
+    standard errors are dropped, and constants that may be whole numbers are. sigma: (n,) noise to
+    start from."""
+    some = y.reshape(-1, y.shape[2])[:: max(1, y[..., 0].size // OPTIONS.states)]
+    rate = np.quantile(np.abs(field.jacobian(c, some)).sum(axis=2).max(axis=1), 0.99)
+    substeps = int(np.clip(np.ceil(rate * dt / OPTIONS.rate), 1, OPTIONS.most_substeps))
+    library, free, x = field.library, FreeBracket.of(field.bracket), y
+    p = np.concatenate([c, free.values])
+    for last in range(OPTIONS.rounds):
+        model = PoissonArcs(library, free, dt, substeps)
+        fitted = Readings(model, y, sigma).fit(p, x, sigma, least=OPTIONS.least * sigma)
+        p, x, sigma = fitted.p, fitted.x, fitted.sigma
+        count, root = library.num_parameters, _root(fitted)
+        errors = np.sqrt(np.sum(root**2, axis=0))
+        kept = np.flatnonzero(np.abs(p[:count]) > OPTIONS.significant * errors[:count])
+        near = np.round(p[count:])
+        whole = np.abs(p[count:] - near) <= np.minimum(OPTIONS.whole * errors[count:], OPTIONS.near)
+        same = len(kept) == count and not whole.any()
+        if same or not len(kept) or last == OPTIONS.rounds - 1:
+            break
+        library = library.take(kept.tolist())
+        bracket = free.moved(np.where(whole, near, p[count:]))
+        free = FreeBracket(bracket, free.places[~whole])
+        p = np.concatenate([p[:count][kept], p[count:][~whole]])
+    found = PoissonField(free.moved(p[count:]), library)
+    return ArcsFit(found, p[:count], root[:, :count], sigma)
+
+
+def _root(fitted: Fitted) -> np.ndarray:
+    """Root of the covariance of p where directions that nothing tells, as of a change of z that
+    keeps the motion, are held."""
+    factor = fitted.triangle
+    units = np.linalg.norm(factor, axis=0)
+    units = np.where(units > 0, units, 1.0)
+    _, s, vt = np.linalg.svd(factor / units)
+    told = s > 1e-6 * s[0]
+    return np.where(told, 1 / np.where(told, s, 1.0), 0.0)[:, None] * vt / units
+
+
+def arcs_of(z0: np.ndarray, z1: np.ndarray, run: np.ndarray, place: np.ndarray) -> list[np.ndarray]:
+    """Sequences of states (L, n) that pairs of one run after another make, in equal steps."""
+    goes_on = (run[1:] == run[:-1]) & (np.diff(place) == 1) & (z1[:-1] == z0[1:]).all(axis=1)
+    starts = np.flatnonzero(np.append(True, ~goes_on))
+    ends = np.append(starts[1:], len(z0))
+    return [np.concatenate([z0[a:b], z1[b - 1 : b]]) for a, b in zip(starts, ends, strict=True)]
+
+
+def equal_arcs(sequences: list[np.ndarray]) -> np.ndarray:
+    """The sequences cut into arcs of one length (A, L, n): an arc begins with the state that the
+    one before ends with; what is shorter is left out."""
+    longest = max(map(len, sequences))
+    length = min(OPTIONS.nodes, longest)
+    parts = [
+        states[first : first + length]
+        for states in sequences
+        for first in range(0, len(states) - length + 1, length - 1)
+    ]
+    return np.array(parts)
+
+
+def lagged(sequences: list[np.ndarray], steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of states (N, n) that are so many steps apart."""
+    long = [s for s in sequences if len(s) > steps]
+    return np.concatenate([s[:-steps] for s in long]), np.concatenate([s[steps:] for s in long])

@@ -1,0 +1,356 @@
+"""The law ż = B(z)∇H(z) of pairs, the bracket B found too or given.
+
+field of rising degree through its flow → is it determined by these runs? → brackets by kinds →
+H modulo Casimirs → H once more through the flow. NumPy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.brackets import Bracket, canonical
+from gfnn_jax.errors import FitError
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.models.brackets.arcs import arcs_of, equal_arcs, fit_arcs, lagged
+from gfnn_jax.models.brackets.atoms import with_shapes
+from gfnn_jax.models.brackets.fields import (
+    Field,
+    FieldFit,
+    FreeField,
+    fit_field,
+    flow,
+    substeps_of,
+    undetermined,
+)
+from gfnn_jax.models.brackets.find import Found, brackets_of, library_of, polynomials, upright
+from gfnn_jax.models.brackets.null_space import CONSTANT, LINEAR, LOG, null_spaces
+from gfnn_jax.models.brackets.poisson_field import PoissonField, hamiltonian_of
+from gfnn_jax.phase_space import sizes
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of the search for a bracket (benchmarks/brackets.py)."""
+
+    degrees: tuple[int, ...] = (1, 2, 3, 4)  # of the field
+    given_degrees: tuple[int, ...] = (1, 2, 3, 4, 6)  # of H, where the bracket is given
+    rows_per_term: float = 1.5  # pairs for each function of the library, at least
+    exact: float = 1e-10  # of the spread: what a field without noise or misfit leaves at most
+    better: float = 0.9  # of the error on held-out pairs: what a higher degree must lower it to
+    partly: float = 1e-2  # of the spread: an error of a field that is a start at all
+    states: int = 400  # at which the field is analysed
+    draws: int = 12  # of the field's coefficients, by their covariance
+    # standard errors of the field, that what is no bracket or no term may have
+    errors: float = 3.0
+    # of sequences with noise: h‖f'‖ of the steps that the field is fitted over, the fewest states,
+    # and times the residual of one step, that those steps may leave
+    long: float = 0.6
+    fewest: int = 8
+    grown: float = 1.6
+    standard: int = 1  # brackets of which H is looked for among shapes
+    # times the error of the free field, that a Poisson field may leave
+    worse: float = 3.0
+    seed: int = 0
+
+
+OPTIONS = Options()
+
+
+class Data(NamedTuple):
+    """Pairs: states z0, z1 (N, n), dt a number or (N,), their run and place along it (N,). spread:
+    (n,) of all pairs, of which these are some."""
+
+    z0: np.ndarray
+    z1: np.ndarray
+    dt: Any
+    run: np.ndarray
+    place: np.ndarray
+    spread: np.ndarray
+
+    def take(self, rows) -> Data:
+        """The pairs of these rows."""
+        dt = self.dt[rows] if np.ndim(self.dt) else self.dt
+        z0, z1, run, place = (a[rows] for a in (self.z0, self.z1, self.run, self.place))
+        return Data(z0, z1, dt, run, place, self.spread)
+
+
+class PoissonLaw(NamedTuple):
+    """ż = B∇H. field: with the terms of H that count. fit: of their coefficients. error: RMS on
+    held-out pairs ÷ spread. name: of the bracket's kind. notes: lines about what was found. sigma:
+    (n,) noise of the states, where sequences were fitted."""
+
+    field: PoissonField
+    fit: FieldFit
+    error: float
+    name: str
+    notes: tuple[str, ...]
+    sigma: np.ndarray | None = None
+
+    @property
+    def bracket(self) -> Bracket:
+        return self.field.bracket
+
+
+def error_on(field: Field, c: np.ndarray, held: Data) -> float:
+    """RMS of the images' errors on held-out pairs ÷ their spread."""
+    images = flow(field, c, held.z0, held.dt, substeps_of(field, c, held.z0, held.dt)).images
+    error = np.sqrt(np.mean(((images - held.z1) / held.spread) ** 2))
+    return float(error) if np.isfinite(error) else np.inf
+
+
+def law_of(
+    train: Data,
+    held: Data,
+    names: tuple[str, ...],
+    *,
+    bracket: Bracket | None = None,
+    terms: Terms | None = None,
+    on_progress: Callable[[str], Any] = lambda message: None,
+) -> PoissonLaw:
+    """The law of these pairs. held: pairs that choose the degree of the field.
+
+    bracket: a known one; None: it is found. terms: of H, where they are known; None: polynomials,
+    and logarithms for log-canonical brackets.
+
+    Raises FitError where the runs do not determine a field, no field has the pairs' flow, or it has
+    no bracket: with a verdict, and the nearest singular value.
+    """
+    if bracket is not None:
+        return _of_bracket(bracket, train, held, terms, on_progress)
+    field, fit, error, notes = _free_field(train, held, names, terms, on_progress)
+    noisy = _noise(field, fit, error, train)
+    fit = fit if noisy is None else noisy.fit
+    if noisy is None and error > OPTIONS.exact and terms is None:
+        law = _without_polynomials(train, held, names, on_progress)
+        if law is not None:
+            return law._replace(notes=notes)
+    some = train.z0[:: max(1, len(train.z0) // OPTIONS.states)]
+    f, slope = field.rate(fit.c, some), field.jacobian(fit.c, some)
+    rng = np.random.default_rng(OPTIONS.seed)
+    drawn = [rng.normal(size=len(fit.root)) @ fit.root for _ in range(OPTIONS.draws)]
+    draws = [(field.rate(c, some), field.jacobian(c, some)) for c in drawn]
+    off = [np.mean((one[0] / sizes(f)) ** 2) for one in draws]
+    noise = float(np.sqrt(np.mean(off)))
+    nearest: dict[str, float] = {}
+    for null in null_spaces(some, f, slope, draws):
+        kind = null.tensors.kind
+        nearest[kind] = null.nearest
+        on_progress(f"{kind} brackets: {len(null.vectors)}, the nearest at {null.nearest:.1e}")
+        if not len(null.vectors):
+            continue
+        library = library_of(kind, names, _degree(field), terms)
+        for found in brackets_of(null, some, f, library, OPTIONS.errors * noise):
+            law = _through_flow(found, train, held, notes, noisy)
+            if law.error <= max(OPTIONS.worse * error, OPTIONS.exact):
+                return law
+    values = ", ".join(f"{value:.2g} ({kind})" for kind, value in nearest.items())
+    raise FitError(
+        f"no bracket: L_f B = 0 has no solution among these, the nearest singular value being "
+        f"{values}, where 0 is a bracket. The field of degree {_degree(field)} leaves {error:.1e} "
+        "of the spread",
+        f"no law: no bracket, nearest singular value {min(nearest.values()):.2g}",
+    )
+
+
+def _degree(field: FreeField) -> int:
+    """Total degree of a field of polynomials; 1 of others."""
+    return max((sum(row) for row in field.library.powers), default=1)
+
+
+def _free_field(train, held, names, terms, on_progress):
+    """(field, its fit, its error on held-out pairs, notes): of the smallest degree that a higher
+    one does not beat."""
+    best, notes = None, ()
+    for degree in OPTIONS.degrees:
+        library = polynomials(names, degree, constant=True)
+        if library.num_parameters * OPTIONS.rows_per_term > len(train.z0):
+            break
+        field, missing = FreeField(library), ()
+        relations = undetermined(field, train.z0, 0.0)
+        if len(relations):
+            field = FreeField(library.take(range(1, library.num_parameters)))
+            missing = undetermined(field, train.z0, 0.0)
+        if len(missing):
+            if best is not None and best[2] <= OPTIONS.partly:
+                break
+            raise _too_few_runs(len(relations), degree, len(np.unique(train.run)))
+        on_progress(f"a field of degree {degree}, {field.num} coefficients")
+        try:
+            fit = fit_field(field, *train[:3])
+        except FitError:
+            continue
+        error = error_on(field, fit.c, held)
+        if best is None or error <= OPTIONS.better * best[2]:
+            best = field, fit, error
+            notes = (_SHELL.format(count=len(relations)),) if len(relations) else ()
+        if error <= OPTIONS.exact:
+            break
+    if best is None:
+        raise FitError(
+            f"{len(train.z0)} pairs gave no field of degree 1 or 2: add pairs, or take a shorter dt"
+        )
+    return (*best, notes)
+
+
+_SHELL = (
+    "all states lie on one surface ({count} function of the state is the same in every run): off "
+    "it the law is not determined by these data"
+)
+
+
+def _too_few_runs(missing: int, degree: int, runs: int) -> FitError:
+    named = f"{runs} run{'s' * (runs > 1)}"
+    return FitError(
+        f"fewer orbits than determine the law: {missing} functions of degree {degree} are constant "
+        f"on all of {named}, as energies and Casimirs are. Add {missing} or "
+        "more runs that start at other values of these",
+        f"no law: {named} do not determine it",
+    )
+
+
+class _Noisy(NamedTuple):
+    """Sequences with noise: their states, the pairs that lie several steps apart, the free field of
+    these, and the noise (n,)."""
+
+    sequences: list[np.ndarray]
+    long: tuple[np.ndarray, np.ndarray, float]
+    fit: FieldFit
+    sigma: np.ndarray
+
+
+def _noise(field: FreeField, fit: FieldFit, error: float, train: Data) -> _Noisy | None:
+    """What sequences tell of their noise: residuals that do not grow with the time between states.
+    None of pairs without noise, of single pairs, and where the field itself misses."""
+    if error <= OPTIONS.exact or np.ndim(train.dt):
+        return None
+    sequences = arcs_of(train.z0, train.z1, train.run, train.place)
+    some = train.z0[:: max(1, len(train.z0) // OPTIONS.states)]
+    rates = np.abs(field.jacobian(fit.c, some)).sum(axis=2).max(axis=1) * train.dt
+    steps = max(2, int(OPTIONS.long / np.median(rates)))
+    sequences = [s for s in sequences if len(s) >= OPTIONS.fewest]
+    steps = min(steps, max(map(len, sequences), default=4) // 2)
+    if not sequences:
+        return None
+    z0, z1 = lagged(sequences, steps)
+    long = z0, z1, steps * train.dt
+    again = fit_field(field, *long, fit.c)
+    if again.relative > OPTIONS.grown * fit.relative:
+        return None
+    sigma = np.sqrt(np.mean(fit.residual**2, axis=0) / 2)
+    return _Noisy(sequences, long, again, sigma)
+
+
+def _through_flow(
+    found: Found, train: Data, held: Data, notes: tuple[str, ...], noisy: _Noisy | None
+) -> PoissonLaw:
+    """The law with the coefficients of H fitted through the flow of B∇H; with noise along arcs, the
+    constants of the bracket too."""
+    kept = np.flatnonzero(found.hamiltonian.c).tolist()
+    field, sigma = PoissonField(found.bracket, found.library.take(kept)), None
+    pairs = train[:3] if noisy is None else noisy.long
+    fit = fit_field(field, *pairs, found.hamiltonian.c[kept])
+    if noisy is not None:
+        arcs = equal_arcs(noisy.sequences)
+        own = fit_arcs(field, fit.c, arcs, train.dt, noisy.sigma)
+        field, sigma = own.field, own.sigma
+        fit = fit._replace(c=own.c, root=own.root)
+    if found.several > 1:
+        notes = (
+            *notes,
+            f"one of a family of {found.several} brackets, each of which makes the same motion "
+            f"with an H of its own: {found.rule} was taken",
+        )
+    return PoissonLaw(field, fit, error_on(field, fit.c, held), found.name, notes, sigma)
+
+
+def _kind_of(bracket: Bracket) -> str:
+    if hasattr(bracket, "constants"):
+        return LINEAR
+    return LOG if bracket.name == "log-canonical" else CONSTANT
+
+
+def _of_bracket(bracket, train, held, terms, on_progress) -> PoissonLaw:
+    """H of a known bracket: polynomials of the smallest degree that a higher one does not beat, or,
+    where none is exact, shapes of single coordinates beside the quadratic terms."""
+    best = None
+    for degree in OPTIONS.given_degrees if terms is None else (1,):
+        library = library_of(_kind_of(bracket), bracket.labels, degree, terms)
+        if library.num_parameters * OPTIONS.rows_per_term > train.z0.size:
+            break
+        on_progress(f"H of {library.num_parameters} terms")
+        try:
+            law = _of_library(bracket, library, train, held)
+        except FitError:
+            continue
+        if best is None or law.error <= OPTIONS.better * best.error:
+            best = law
+        if law.error <= OPTIONS.exact:
+            return law
+    if best is None:
+        raise FitError(f"no H of the library has a flow near these {len(train.z0)} pairs")
+    if terms is None:
+        shaped = _of_shapes(bracket, train, held, on_progress)
+        best = min((best, shaped), key=lambda law: law.error) if shaped else best
+    return best
+
+
+def _of_library(bracket: Bracket, library: Terms, train: Data, held: Data) -> PoissonLaw:
+    """H of these terms, through the flow, without those that Casimirs make superfluous."""
+    middle, h = 0.5 * (train.z0 + train.z1), np.reshape(train.dt, (-1, 1))
+    start = hamiltonian_of(bracket, library, middle, (train.z1 - train.z0) / h)
+    fit = fit_field(PoissonField(bracket, library), *train[:3], start.c)
+    return _lean(bracket, library, fit.c, train, held)
+
+
+def _lean(bracket, library, c, train: Data, held: Data) -> PoissonLaw:
+    """The law of coefficients c, of all that differ by Casimirs the one of fewest terms."""
+    some = train.z0[:: max(1, len(train.z0) // OPTIONS.states)]
+    f = PoissonField(bracket, library).rate(c, some)
+    own = hamiltonian_of(bracket, library, some, f)
+    kept = np.flatnonzero(own.c).tolist()
+    field = PoissonField(bracket, library.take(kept))
+    fit = fit_field(field, *train[:3], own.c[kept])
+    return PoissonLaw(field, fit, error_on(field, fit.c, held), bracket.name, ())
+
+
+def _of_shapes(bracket, train: Data, held: Data, on_progress) -> PoissonLaw | None:
+    """H of quadratic terms and shapes; None where there is none."""
+    base = library_of(_kind_of(bracket), bracket.labels, 2, None)
+    try:
+        found = with_shapes(bracket, base, train[:3], on_progress)
+        return _lean(bracket, found.library, found.c, train, held)
+    except FitError:
+        return None
+
+
+def _standard(names: tuple[str, ...]) -> list[Bracket]:
+    """Brackets in standard form of so many coordinates: of bodies and spins, and of (q, p)."""
+    n, found = len(names), []
+    if n % 3 == 0:
+        found.append(Bracket.so3(n // 3, names=names))
+    if n == 6:
+        found.append(Bracket.se3(names=names))
+    return found if n % 2 else [*found, canonical(n // 2).named(names)]
+
+
+def _without_polynomials(train, held, names, on_progress) -> PoissonLaw | None:
+    """The law of a standard bracket whose H is no polynomial: of the bracket whose quadratic H
+    misses least. None where no H is exact."""
+    tried = []
+    for bracket in _standard(names):
+        base = library_of(_kind_of(bracket), names, 2, None)
+        with contextlib.suppress(FitError):
+            tried.append((_of_library(bracket, base, train, held).error, bracket))
+    for _, bracket in sorted(tried, key=lambda one: one[0])[: OPTIONS.standard]:
+        on_progress(f"{bracket.name}: an H that is no polynomial")
+        law = _of_shapes(bracket, train, held, on_progress)
+        if law is not None and law.error <= OPTIONS.exact:
+            library = law.field.library
+            turned, c = upright(bracket, library, law.fit.c, train.z0)
+            return law._replace(field=PoissonField(turned, library), fit=law.fit._replace(c=c))
+    return None

@@ -1,0 +1,146 @@
+"""Laws ż = B(z)∇H(z) of pairs, with the bracket found: classes, H, the error of the field, and what
+has no bracket."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from gfnn_jax.brackets import Bracket
+from gfnn_jax.errors import FitError
+from gfnn_jax.models.brackets.algebra import analysed, changed
+from gfnn_jax.models.brackets.search import Data, law_of
+from gfnn_jax.phase_space import sizes
+
+INERTIA = np.array([[2.0, 0.1, 0.05], [0.1, 1.5, 0.15], [0.05, 0.15, 1.0]])
+
+
+def top(w):
+    return np.linalg.solve(INERTIA, np.cross(INERTIA @ w, w))
+
+
+def heavy(z, slope=lambda x: 0.9):
+    m, g = z[:3], z[3:]
+    w = np.array([0.5, 0.6, 1.0]) * m
+    return np.concatenate([np.cross(m, w) + np.cross(g, [0.1, 0.2, slope(g[2])]), np.cross(g, w)])
+
+
+def populations(z):
+    a = np.array([[0, 1, 0, -0.9], [-1, 0, 0.7, 0], [0, -0.7, 0, 1.3], [0.9, 0, -1.3, 0]])
+    return z * (a @ (z - 1.0))
+
+
+def flaschka(z):
+    a, b = z[:2], z[2:]
+    squares = np.concatenate([[0.0], a**2, [0.0]])
+    return np.concatenate([a * np.diff(b), 2 * np.diff(squares)])
+
+
+def charged(z):
+    b = 1 + 0.4 * z[0]
+    return np.array([z[2], z[3], b * z[3] - z[0], -b * z[2] - 0.7 * z[1]])
+
+
+def lorenz(z):
+    x, y, w = z
+    return 0.2 * np.array([10 * (y - x), x * (28 - w) - y, x * y - 8 / 3 * w])
+
+
+def runs_of(field, starts, dt, steps, noise=0.0):
+    rng, parts = np.random.default_rng(1), []
+    times = dt * np.arange(steps + 1)
+    for run, start in enumerate(starts):
+        how = {"method": "DOP853", "rtol": 3e-14, "atol": 1e-15, "t_eval": times}
+        z = solve_ivp(lambda t, z: field(z), (0, times[-1]), start, **how).y.T
+        z = z + noise * rng.normal(size=z.shape)
+        parts.append((z[:-1], z[1:], np.full(steps, run), np.arange(steps)))
+    z0, z1, run, place = map(np.concatenate, zip(*parts, strict=True))
+    return Data(z0, z1, dt, run, place, sizes(z0))
+
+
+def learned(field, starts, dt=0.2, steps=20, noise=0.0):
+    data = runs_of(field, starts, dt, steps, noise)
+    held = data.run >= len(starts) - max(1, len(starts) // 5)
+    names = tuple(f"z{i + 1}" for i in range(data.z0.shape[1]))
+    return law_of(data.take(~held), data.take(held), names), starts
+
+
+def field_error(law, field, states):
+    reference = np.array([field(z) for z in states])
+    off = law.field.rate(law.fit.c, states) - reference
+    return np.abs(off).max() / np.abs(reference).max()
+
+
+CASES = {
+    "so(3)": (top, lambda rng: rng.normal(size=(16, 3))),
+    "se(3)": (heavy, lambda rng: rng.normal(size=(30, 6))),
+    "log-canonical": (populations, lambda rng: rng.uniform(0.5, 1.5, (30, 4))),
+    "solvable, n = 5": (flaschka, lambda rng: rng.uniform(0.3, 1.0, (30, 5))),
+    "canonical after p = v + A(x)": (charged, lambda rng: 0.7 * rng.normal(size=(30, 4))),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_brackets_of_clean_pairs(name):
+    field, draw = CASES[name]
+    rng = np.random.default_rng(0)
+    law, _ = learned(field, draw(rng))
+    assert law.name == name
+    assert field_error(law, field, draw(rng)) < 5e-14
+    assert law.error < 1e-12
+
+
+def test_several_brackets_are_said_to_be():
+    law, _ = learned(top, np.random.default_rng(0).normal(size=(16, 3)))
+    assert "one of a family of 2 brackets" in " ".join(law.notes)
+
+
+def test_h_that_is_no_polynomial():
+    def field(z):
+        return heavy(z, lambda x: -1 / (1.5 + x) ** 2)
+
+    rng = np.random.default_rng(0)
+    starts = rng.normal(size=(24, 6))
+    starts[:, 3:] /= np.linalg.norm(starts[:, 3:], axis=1)[:, None]
+    starts[:, 3:] *= rng.uniform(0.7, 1.2, (24, 1))
+    law, _ = learned(field, starts)
+    assert law.name == "se(3)"
+    assert field_error(law, field, starts) < 1e-11
+    assert "1/(1.5 + z6)" in law.field.library.term_names
+
+
+def test_noisy_sequences():
+    rng = np.random.default_rng(0)
+    law, _ = learned(top, rng.normal(size=(6, 3)), dt=0.05, steps=300, noise=1e-3)
+    assert law.name == "so(3)"
+    assert law.sigma == pytest.approx(np.full(3, 1e-3), rel=0.15)
+    assert field_error(law, top, rng.normal(size=(50, 3))) < 3e-3
+
+
+def test_a_known_bracket():
+    data = runs_of(populations, np.random.default_rng(0).uniform(0.5, 1.5, (20, 4)), 0.2, 20)
+    known = Bracket.log([[0, 1, 0, -0.9], [-1, 0, 0.7, 0], [0, -0.7, 0, 1.3], [0.9, 0, -1.3, 0]])
+    law = law_of(data.take(slice(100, None)), data.take(slice(100)), known.labels, bracket=known)
+    assert law.error < 1e-12
+    assert law.field.library.num_parameters == 8
+
+
+def test_no_bracket_is_claimed_where_there_is_none():
+    starts = 8 * np.random.default_rng(0).normal(size=(30, 3)) + [0, 0, 20]
+    with pytest.raises(FitError, match="nearest singular value") as raised:
+        learned(lorenz, starts, dt=0.1)
+    assert raised.value.verdict.startswith("no law: no bracket, nearest singular value 0.0")
+
+
+def test_too_few_runs_are_refused():
+    data = runs_of(top, np.array([[1.0, 0.5, -0.3]]), 0.2, 80)
+    with pytest.raises(FitError, match="2 functions of degree 2 are constant"):
+        law_of(data.take(slice(60)), data.take(slice(60, None)), ("a", "b", "c"))
+
+
+@pytest.mark.parametrize("blocks", [("so3",), ("so3", "so3"), ("se3",)])
+def test_algebras_are_brought_to_standard_constants(blocks):
+    standard = Bracket.lie(blocks).constants
+    matrix = np.eye(len(standard)) + 0.3 * np.random.default_rng(3).normal(size=standard.shape[:2])
+    found = analysed(changed(standard, matrix))
+    assert found.blocks == blocks
+    assert changed(changed(standard, matrix), found.lifted) == pytest.approx(standard, abs=1e-12)
