@@ -182,7 +182,7 @@ def _next(bracket: Bracket, best: Fitted, pairs) -> list[Atom]:
 
 
 class _At(NamedTuple):
-    """Where the refinement stands, with the paths of its flow and the residual (N, n)."""
+    """State of the refinement, with the paths of its flow and the residual (N, n)."""
 
     fitted: Fitted
     field: PoissonField

@@ -224,7 +224,7 @@ class _Noisy(NamedTuple):
 
 
 def _noise(field: FreeField, fit: FieldFit, error: float, train: Data) -> _Noisy | None:
-    """What sequences tell of their noise: residuals that do not grow with the time between states.
+    """Noise of sequences: residuals that do not grow with the time between states.
     None of pairs without noise, of single pairs, and where the field itself misses."""
     if error <= OPTIONS.exact or np.ndim(train.dt):
         return None
