@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import dataclasses
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -35,7 +36,7 @@ exit status:
   143  stopped by SIGTERM"""
 # Keywords of `gfnn_jax.read` beside roles, with one value each.
 _OF_COLUMNS = (
-    *("angles", "degrees", "columns", "time_unit", "offset", "scale", "coordinates"),
+    *("angles", "degrees", "columns", "time", "time_unit", "offset", "scale", "coordinates"),
     *("start", "stop", "every"),
 )
 DISTRIBUTED_STATUS = "  134  with --distributed: another process of the job was lost"
@@ -144,7 +145,7 @@ def parser() -> argparse.ArgumentParser:
             "look",
             "what a recording holds, before anything is learned",
             "Runs, rates, gaps, noise, friction and mistakes of a recording, found in the file "
-            "itself: .csv and other text, .npz, .npy.",
+            "itself: text of any dialect, .gz, .zip, .npz, .npy, .mat, .xlsx, .xls, .ods.",
         )
     )
     _fit(
@@ -394,10 +395,11 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
 
     for role in ROLES:
         names(f"--{role}", f"columns of {role}")
-    angles = "positions with period 2π; of canonical states indices in z, as 0,2"
+    angles = "positions with period 2π, or none; of canonical states indices in z, as 0,2"
     group.add("--angles", angles, "A,B", type=_names_or_indices)
     names("--degrees", "columns in degrees")
     names("--columns", "columns to read; names of all of them where the file has none")
+    group.add("--time", "the column of times, where its name does not tell", "NAME")
     group.add("--time-unit", "of the times (default s)", choices=tuple(SECONDS))
     noise = "noise of a column, known: a number, or the column that holds it for each value"
     pairs("--std", noise, _sigmas, "NAME=σ")
@@ -431,7 +433,7 @@ def masses(arguments: argparse.Namespace) -> dict[str, float]:
 def names_roles(options: dict[str, Any]) -> bool:
     """Return whether keywords of `column_options` say what columns are, which makes a file a
     recording."""
-    return bool({*ROLES, "columns", "coordinates", "observe"} & set(options))
+    return bool({*ROLES, "columns", "coordinates", "observe", "time"} & set(options))
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -444,6 +446,8 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _names_or_indices(text: str) -> tuple[str, ...] | tuple[int, ...]:
+    if text == "none":
+        return ()
     names = _names(text)
     if len(names) < len(text.split(",")):
         raise argparse.ArgumentTypeError(
@@ -452,9 +456,14 @@ def _names_or_indices(text: str) -> tuple[str, ...] | tuple[int, ...]:
     return tuple(map(int, names)) if all(name.isdecimal() for name in names) else names
 
 
+def _pairs(text: str) -> list[str]:
+    """The parts NAME=X of NAME=X,NAME=X; names may hold commas."""
+    return [part.removeprefix(",") for part in re.findall(r"[^=]*=[^,]*|.+", text)]
+
+
 def _numbers(text: str) -> list[tuple[str, float]]:
     pairs = []
-    for part in text.split(","):
+    for part in _pairs(text):
         name, equals, number = part.partition("=")
         value = _float(number)
         if not (name.strip() and equals and math.isfinite(value) and value > 0):
@@ -465,7 +474,7 @@ def _numbers(text: str) -> list[tuple[str, float]]:
 
 def _sigmas(text: str) -> list[tuple[str, float | str]]:
     """Numbers, or names of columns."""
-    named = [part.partition("=") for part in text.split(",")]
+    named = [part.partition("=") for part in _pairs(text)]
     return [
         (name.strip(), column.strip())
         if name.strip() and math.isnan(_float(column)) and column.strip()
@@ -475,7 +484,7 @@ def _sigmas(text: str) -> list[tuple[str, float | str]]:
 
 
 def _guesses(text: str) -> list[tuple[str, float]]:
-    pairs = [part.partition("=") for part in text.split(",")]
+    pairs = [part.partition("=") for part in _pairs(text)]
     if not all(name.strip() and math.isfinite(_float(number)) for name, _, number in pairs):
         raise argparse.ArgumentTypeError(f"expected NAME=NUMBER, got '{text}'")
     return [(name.strip(), float(number)) for name, _, number in pairs]

@@ -75,13 +75,14 @@ SHORTHANDS |= {
 }
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",
+    "charset_normalizer": "data.texts",
     "diffrax": "scenes.trajectories",
     "flax": "families.mlp",
     "matplotlib": "evaluate.figures",
     "numba": "flows.kernel",
     "optax": "fitting.adam",
     "orbax": "storage.checkpoints",
-    "pandas": "data.text_files",
+    "pandas": "data.text",
     "sympy": "exports.symbolic",
 }
 

@@ -275,7 +275,6 @@ def test_names_as_they_can_stand_in_a_formula():
 
 
 REFUSED = {
-    "Time (s) Run #1,x Run #1,Time (s) Run #2,x Run #2\n0,1,0,1\n1,2,1,2\n": "Run #1, Run #2",
     "a,x\n1,2\n2,3\n": "t or time",
     "t,a,b\n1,2,3\n2,3,4\n": "a, b",
     "t,x\n0,1\n0,2\n": "line 3: t = 0",
@@ -292,7 +291,7 @@ REFUSED = {
     "t [fortnight],x\n0,1\n1,2\n": "--time-unit",
     "t,x,v1,v2\n0,1,2,3\n1,2,3,4\n": "v1, v2 .* x",
     "": "expected rows of numbers",
-    "x\n1\n": "two columns",
+    "x\n1\n": "--dt",
 }
 
 
@@ -367,6 +366,6 @@ def test_options_of_the_command_line_are_keywords_of_read():
 
 def test_names_with_blanks_are_one_word_of_the_command_that_is_told():
     t = np.arange(40) * 0.1
-    table = {"t": t, "frame": np.arange(40.0), "pendulum angle": np.cos(t) + 0.1 * np.sin(9 * t)}
+    table = {"t": t, "frame": np.sin(7.3 * t), "pendulum angle": np.cos(t) + 0.1 * np.sin(9 * t)}
     with pytest.raises(InputError, match="--positions 'frame,pendulum angle', or some"):
         gfnn.Recording(table)

@@ -5,21 +5,27 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from gfnn_jax.data.roles import ROLES, by_name, is_angle, is_time, plain
+from gfnn_jax.data.roles import OF_CALENDAR, ROLES, by_name, is_angle, plain
 from gfnn_jax.data.tables import Table
 from gfnn_jax.errors import InputError
 from gfnn_jax.signals.derivatives import derivatives, window
-from gfnn_jax.signals.noise import noise
+from gfnn_jax.signals.noise import Noise, noise
 
+# Units of time by what one is in the clock of the laws: seconds, or days and years as they are,
+# for an orbit in au and days has velocities in au/d.
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+SECONDS |= {"d": 1.0, "year": 1.0}
 _LIKE = 0.85  # likeness of a column to the derivative of another, that tells
 _MOST_COLUMNS = 12  # whose names do not tell, that are compared
+_ALONE = 1.3  # times the noise, up to which a column's spread is noise alone
+_ONE_AXIS = 0.1  # ratio of strengths of turning, below which one axis is enough
 _STD = "_std"  # end of the name of a column that holds the σ of another
 Names = Sequence[str] | str | None
 Runs = Mapping[str, tuple[np.ndarray, dict[str, np.ndarray]]]
@@ -30,11 +36,35 @@ def listed(given: Names) -> tuple[str, ...]:
     return (given,) if isinstance(given, str) else tuple(given or ())
 
 
+def resolved(given: Names, known: Sequence[str]) -> tuple[str, ...]:
+    """Names of columns, those that hold a comma made whole: "Angle", "Ch 1" of Angle, Ch 1."""
+    names, found = listed(given), []
+    whole = {re.sub(r"\s*,\s*", ",", name): name for name in known if "," in name}
+    while names:
+        joined = {k: ",".join(names[:k]) for k in range(len(names), 1, -1)}
+        length = next((k for k, name in joined.items() if name in whole), 1)
+        found.append(whole[joined[length]] if length > 1 else whole.get(names[0], names[0]))
+        names = names[length:]
+    return tuple(found)
+
+
+class Undecided(InputError):
+    """Columns whose roles nothing tells; ``options`` of `gfnn_jax.read`, or of a fit, may do."""
+
+    def __init__(self, message: str, options: Mapping[str, Any]):
+        super().__init__(message)
+        self.options = dict(options)
+
+
 def roles_of(
-    source: str, names: list[str], given: dict[str, tuple[str, ...]], runs: Runs
+    source: str,
+    names: list[str],
+    given: dict[str, tuple[str, ...]],
+    runs: Runs,
+    units: Mapping[str, str],
 ) -> tuple[dict[str, tuple[str, ...]], list[str]]:
     """(the columns of each role, what had to be decided): those given, else by name, else by what
-    the columns hold.
+    the columns hold and their units.
 
     Raises InputError where a name is unknown or has two roles, or where nothing tells.
     """
@@ -60,11 +90,9 @@ def roles_of(
         differ, taken = verbs[len(varied) > 1]
         notes.append(f"{', '.join(varied)} {differ} from run to run, and {taken}")
     if not any(roles[role] for role in ("positions", "velocities", "momenta")):
-        found, velocities = _positions_and_velocities(source, runs, rest)
-        roles |= {"positions": found, "velocities": velocities}
-        notes.append(
-            f"the data show that {', '.join(velocities)} are derivatives of {', '.join(found)}"
-        )
+        found, told = _by_data(source, runs, rest, units)
+        roles |= {role: (*roles[role], *of_role) for role, of_role in found.items()}
+        notes += told
     for role in ("velocities", "momenta"):
         if len(roles[role]) > len(roles["positions"]) > 0:
             raise InputError(
@@ -86,29 +114,96 @@ def _varied(runs: Runs, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _positions_and_velocities(
-    source: str, runs: Runs, names: Sequence[str]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Columns that make pairs, one the other's derivative.
+# Units of what moves, of its rate, and of what drives it.
+_OF_LENGTHS = re.compile(r"[nµumckd]?m|km|au|px|pixels?|(m?rad|deg|°|degrees?)")
+_OF_TURNING = re.compile(r"(rad|deg|°|degrees?) ?(/|per) ?(s|sec)|dps")
+_OF_DRIVES = re.compile(r"[µumk]?V|[nµum]?A|[mk]?N|N ?·? ?m|Nm", re.IGNORECASE)
 
-    Raises InputError where a column is left over that may be a position or an input.
+
+def _by_data(
+    source: str, runs: Runs, names: Sequence[str], units: Mapping[str, str]
+) -> tuple[dict[str, tuple[str, ...]], list[str]]:
+    """(columns by role, notes) of columns whose names tell nothing: pairs, one the other's
+    derivative; lengths and angles by their units; voltages, currents and forces beside these as
+    inputs; a column that moves alone.
+
+    Raises Undecided where a column is left over that may be a position or an input.
     """
     times = [t for t, _ in runs.values()]
     some = names[:_MOST_COLUMNS]
     columns = {n: np.concatenate([values[n] for _, values in runs.values()]) for n in some}
     moving = [name for name, x in columns.items() if np.isfinite(x).any() and np.nanstd(x) > 0]
-    pairs = _pairs(times, {name: columns[name] for name in moving}) if moving else []
+    if not moving:
+        raise InputError(f"{source}: none of the columns {', '.join(names)} varies")
+    sizes = noise(times, np.stack([columns[name] for name in moving]))
+    still = [n for n, s in zip(moving, sizes, strict=True) if _is_noise(columns[n], s)]
+    still += [n for n in moving if n not in still and np.all(np.diff(columns[n]) == 1)]
+    moving = [name for name in moving if name not in still] or moving
+    notes = [f"{name} holds noise or a count alone, and is put aside" for name in still]
+    pairs = _pairs(times, {name: columns[name] for name in moving})
+    if pairs:
+        paired = ", ".join(v for _, v in pairs), ", ".join(x for x, _ in pairs)
+        notes.append(f"the data show that {paired[0]} are derivatives of {paired[1]}")
     rest = [name for name in moving if not any(name in pair for pair in pairs)]
-    if rest or not pairs:
-        shown, typed = ", ".join(rest or names), shlex.quote(",".join(moving))
-        if not moving:
-            raise InputError(f"{source}: none of the columns {', '.join(names)} varies")
-        raise InputError(
-            f"{source}: the names {', '.join(names)} do not show what was measured, and {shown} "
-            f"may be motion or what drives it. Name them: --positions {typed}, or some "
-            "of them and --inputs"
+    turning = [n for n in rest if _OF_TURNING.fullmatch(units.get(n, ""))]
+    if turning and not pairs:
+        raise _of_rates(source, turning, np.stack([columns[name] for name in turning]))
+    inputs = [n for n in rest if _OF_DRIVES.fullmatch(units.get(n, ""))]
+    lengths = [n for n in rest if _OF_LENGTHS.fullmatch(units.get(n, "").lower())]
+    unclear = [n for n in rest if n not in (*inputs, *lengths)]
+    if not pairs and not lengths and len(rest) == 1:
+        lengths, inputs, unclear = rest, [], []
+        notes.append(f"{rest[0]} alone moves, and is taken as the position")
+    elif lengths and not unclear:
+        driving = f", {', '.join(inputs)} inputs" * bool(inputs)
+        notes.append(f"by their units {', '.join(lengths)} are positions{driving}")
+    if unclear or (inputs and not (pairs or lengths)):
+        raise _unclear(source, columns, moving, unclear or inputs)
+    return {
+        "positions": (*(x for x, _ in pairs), *lengths),
+        "velocities": tuple(v for _, v in pairs),
+        "inputs": tuple(inputs),
+    }, notes
+
+
+def _is_noise(column: np.ndarray, size: Noise) -> bool:
+    """Return whether a column holds a constant and noise alone."""
+    spread = float(np.nanstd(column))
+    return size.white and size.sigma is not None and spread < _ALONE * size.sigma
+
+
+def _of_rates(source: str, names: Sequence[str], columns: np.ndarray) -> Undecided:
+    """Options for rates of turning whose angles no column shows."""
+    known = columns[:, np.isfinite(columns).all(axis=0)]
+    strengths = np.linalg.svd(known, compute_uv=False) if known.size else np.ones(len(names))
+    shown = f"{', '.join(names)} {'is a rate' if len(names) == 1 else 'are rates'} of turning"
+    if len(names) == 3 and strengths[1] > _ONE_AXIS * strengths[0]:
+        states = ",".join(names)
+        return Undecided(
+            f"{source}: {shown} about three axes: --structure poisson --states "
+            f"{shlex.quote(states)} learns the bracket of a body that turns",
+            {"structure": "poisson", "states": tuple(names)},
         )
-    return tuple(x for x, _ in pairs), tuple(v for _, v in pairs)
+    main = names[int(np.argmax(known.std(axis=1)))] if known.size else names[0]
+    observe = {main: "omega + b"}
+    return Undecided(
+        f"{source}: {shown}, and no column shows the angle: --coordinates theta --observe "
+        f"{shlex.quote(f'{main} = omega + b')} has an offset b",
+        {"coordinates": ("theta",), "observe": observe},
+    )
+
+
+def _unclear(
+    source: str, columns: Mapping[str, np.ndarray], moving: Sequence[str], shown: Sequence[str]
+) -> Undecided:
+    """Options for columns that nothing tells apart."""
+    typed = shlex.quote(",".join(moving))
+    return Undecided(
+        f"{source}: the names {', '.join(columns)} do not show what was measured, and "
+        f"{', '.join(shown)} may be motion or what drives it. Name them: --positions {typed}, or "
+        "some of them and --inputs",
+        {"positions": tuple(moving)},
+    )
 
 
 def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tuple[str, str]]:
@@ -178,20 +273,21 @@ def check_known(source: str, what: str, wanted: Any, known: Sequence[str]) -> No
 
 
 def time_unit_of(
-    source: str, names: list[str], units: Mapping[str, str], given: str | None
+    source: str, times: Sequence[str], units: Mapping[str, str], given: str | None
 ) -> str | None:
-    """The unit of the times: the given one, the header's, or that at the end of their name; None
-    where nothing tells. Raises InputError where two of these differ, or one is not known."""
+    """The unit of these columns of times: the given one, the header's, or that which their name
+    says; None where nothing tells. Raises InputError where two of these differ, or one is not
+    known."""
     if given is not None and given not in SECONDS:
         raise InputError(f"expected a time unit among {', '.join(SECONDS)}, got {given!r}")
-    for name in filter(is_time, names):
+    for name in times:
         told = _time_unit(name, units)
         if told is None and given is None and _unit(units, name):
             raise InputError(
                 f"{source}: {name}: unit {units[name]!r} is not known: give --time-unit "
                 f"{'|'.join(SECONDS)}"
             )
-        if told is not None and given is not None and SECONDS[told] != SECONDS[given]:
+        if told is not None and given is not None and clock_of(told) != clock_of(given):
             raise InputError(
                 f"{source}: {name} is in {told} by its header, got the time unit {given} "
                 "(--time-unit, time_unit=)"
@@ -201,16 +297,24 @@ def time_unit_of(
     return given
 
 
+def clock_of(unit: str) -> tuple[str, float]:
+    """(s, d or year, what one of a unit of time is in it)."""
+    return unit if unit in ("d", "year") else "s", SECONDS[unit]
+
+
+_UNITS_OF_TIME = {"seconds": "s", "second": "s", "sec": "s", "msec": "ms", "usec": "us"}
+_UNITS_OF_TIME |= {"millis": "ms", "micros": "us", "day": "d", "days": "d", "hours": "h"}
+_UNITS_OF_TIME |= {"yr": "year", "years": "year", "a": "year", "μs": "us", "utc": "s"}
+
+
 def _time_unit(name: str, units: Mapping[str, str]) -> str | None:
-    """The unit of a column of times, by its header or the end of its name."""
-    end = plain(name).rpartition("_")[2]
-    end = {"millis": "ms", "micros": "us"}.get(end, end)
-    for unit in (_unit(units, name), end):
-        unit = {"seconds": "s", "second": "s"}.get(unit, unit)
-        unit = unit.removesuffix("ec") if unit in ("sec", "msec", "usec") else unit
+    """The unit of a column of times, by its header or by its name."""
+    words = plain(name).split("_")
+    for unit in (_unit(units, name), words[-1], OF_CALENDAR.get(words[0], "")):
+        unit = _UNITS_OF_TIME.get(unit, unit)
         if unit in SECONDS:
             return unit
-    return None
+    return "d" if words == ["julian", "date"] else None
 
 
 def with_sigmas(

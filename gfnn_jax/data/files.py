@@ -373,6 +373,8 @@ def _is_recording(path: Path, with_roles: bool) -> bool:
             return not {"z0.npy", "trajectories.npy"} & set(archive.namelist())
     if with_roles:
         return True
+    if suffix == ".mat":
+        return True
     if suffix == ".npy":
         with damage(path, "the array"):
             return np.load(path, mmap_mode="r", allow_pickle=False).dtype.names is not None

@@ -23,19 +23,23 @@ from gfnn_jax.data.columns import (
     angles_of,
     check_known,
     check_sigmas,
+    clock_of,
     factors_of,
     listed,
+    resolved,
     roles_of,
     time_unit_of,
     typical,
     with_sigmas,
 )
-from gfnn_jax.data.roles import ROLES, coordinates_in, is_run, is_time, unit_in
+from gfnn_jax.data.roles import ROLES, coordinates_in, is_run, unit_in
 from gfnn_jax.data.tables import (
+    ARRAYS,
     Table,
     from_arrays,
     from_memory,
     restarts,
+    rows_of,
     runs_of,
     second_times,
 )
@@ -52,9 +56,10 @@ class ReadOptions(TypedDict, total=False):
 
     positions … sensors: names of columns. Where any is given, columns without a role are ignored;
              where none is, the names of the columns decide.
-    angles:  positions of period 2π; without it those whose name or unit says so.
+    angles:  positions of period 2π; without it those whose name or unit says so; () for none.
     degrees: columns in degrees, or degrees per second; a position among them is an angle.
-    time_unit: s, ms, us, ns, min or h; by default the header's own, else s.
+    time:    the column of times, where its name does not tell.
+    time_unit: s, ms, us, ns, min, h, d or year; by default the header's own, else s.
     std:     σ of columns, in their own unit: a number, one for each value (T,) of a table, or the
              name of a column that holds them; of column x also a column x_std.
     columns: those to take beside times and runs; all others are as if they were not there. Of a
@@ -77,6 +82,7 @@ class ReadOptions(TypedDict, total=False):
     angles: Names
     degrees: Names
     columns: Names
+    time: str | None
     time_unit: str | None
     std: Mapping[str, Any] | None
     dt: float | None
@@ -100,8 +106,8 @@ class Recording:
     units:      name -> unit, as the file gives it, in its header or at the end of the name; of all
                 columns: `unit`.
     factors:    name -> value here ÷ number in the file: π/180 of a column in degrees, else 1.
-    time_unit:  of the file; `times` are in seconds. time_unit_given: whether it was told, here or
-                by the file, not taken to be s.
+    time_unit:  of the file; `times` are in seconds, those of d or year as they are (`clock`).
+                time_unit_given: whether it was told, here or by the file, not taken to be s.
     coordinates: what moves, the positions unless other names were given.
     observe:    column -> what its sensor shows: text in coordinates, velocities and parameters that
                 are fitted, or a function of these (`maps.observation`).
@@ -152,23 +158,26 @@ class Recording:
         if unknown:
             raise TypeError(f"Recording has no keyword {', '.join(sorted(unknown))}")
         by_name: dict[str, Any] = dict(options)
-        given = {role: listed(by_name.get(role)) for role in ROLES}
-        angles, degrees = options.get("angles"), options.get("degrees")
-        columns, dt = listed(options.get("columns")), options.get("dt")
-        offset, scale = listed(options.get("offset")), listed(options.get("scale"))
-        std, observe = options.get("std") or {}, options.get("observe") or {}
         tables = [from_memory(t) for t in (table if isinstance(table, (list, tuple)) else [table])]
         if not tables:
             raise InputError("expected at least one table, got none")
-        tables = [_selected(t, columns) for t in tables]
+        every = list(dict.fromkeys(name for t in tables for name in (*t.columns, *t.text)))
+        of_columns = (*ROLES, "angles", "degrees", "columns", "offset", "scale")
+        names_of = {option: resolved(by_name.get(option), every) for option in of_columns}
+        given = {role: names_of[role] for role in ROLES}
+        angles = None if options.get("angles") is None else names_of["angles"]
+        columns, dt, time = names_of["columns"], options.get("dt"), options.get("time")
+        std, observe = options.get("std") or {}, options.get("observe") or {}
+        tables = [_selected(_timed(t, time), columns) for t in tables]
         tables, sigmas = with_sigmas(tables, std)
         source = ", ".join(dict.fromkeys(t.source for t in tables))
         names = list(dict.fromkeys(name for t in tables for name in t.columns))
         units = {name: unit_in(name) for name in names if unit_in(name)}
         units |= {name: unit for t in reversed(tables) for name, unit in t.units.items()}
-        columned = [name for name in names if not is_run(name) and not is_time(name)]
+        of_times = list(dict.fromkeys(name for t in tables for name in t.times))
+        columned = [name for name in names if not is_run(name) and name not in of_times]
         numbers = [name for name in columned if name not in sigmas.values()]
-        told = time_unit_of(source, names, units, options.get("time_unit"))
+        told = time_unit_of(source, of_times[:1], units, options.get("time_unit"))
         unit = told or "s"
         runs = runs_of(tables, columned, SECONDS[unit], dt)
         coordinate_names = listed(options.get("coordinates"))
@@ -180,7 +189,7 @@ class Recording:
             given["positions"] = tuple(name for name in coordinate_names if name in numbers)
         if coordinate_names and not any(given.values()):
             given["sensors"] = tuple(observe)
-        roles, decided = roles_of(source, numbers, given, runs)
+        roles, decided = roles_of(source, numbers, given, runs, units)
         others = [name for of_role in roles.values() for name in of_role]
         more = (name for name in observe if name not in others)
         roles = {**roles, "sensors": (*roles["sensors"], *more)}
@@ -192,8 +201,8 @@ class Recording:
         angular, in_degrees = angles_of(
             source,
             {**roles, "positions": coordinate_names},
-            listed(angles),
-            listed(degrees),
+            angles or (),
+            names_of["degrees"],
             angles is None,
             units,
         )
@@ -203,11 +212,15 @@ class Recording:
             run: {name: column * factors[name] for name, column in of_run.items()}
             for run, (_, of_run) in runs.items()
         }
-        for what, wanted in (("std", std), ("offset", offset), ("scale", scale)):
+        for what, wanted in (
+            ("std", std),
+            ("offset", names_of["offset"]),
+            ("scale", names_of["scale"]),
+        ):
             check_known(source, what, wanted, with_role)
         sigmas = {name: of for name, of in sigmas.items() if name in with_role}
         check_sigmas(source, sigmas, values)
-        of_times = (*(second_times(tables) if dt is None else ()), *restarts(tables, runs))
+        about_times = (*(second_times(tables) if dt is None else ()), *restarts(tables, runs))
         fields = {
             **roles,
             "runs": tuple(runs),
@@ -220,12 +233,12 @@ class Recording:
             "factors": factors,
             "time_unit": unit,
             "time_unit_given": told is not None,
-            "offsets": offset,
-            "scales": scale,
+            "offsets": names_of["offset"],
+            "scales": names_of["scale"],
             "ignored": tuple(n for n in numbers if n not in with_role)
             + tuple(dict.fromkeys(n for t in tables for n in t.text)),
-            "angles_given": angles is not None or degrees is not None,
-            "notes": (*(n for t in tables for n in t.notes), *of_times, *decided),
+            "angles_given": angles is not None or options.get("degrees") is not None,
+            "notes": (*(n for t in tables for n in t.notes), *about_times, *decided),
             "source": source,
             "_times": {run: times for run, (times, _) in runs.items()},
             "_values": values,
@@ -254,6 +267,11 @@ class Recording:
     def columns(self) -> tuple[str, ...]:
         """Names of the columns that have a role, role by role."""
         return tuple(name for role in ROLES for name in getattr(self, role))
+
+    @property
+    def clock(self) -> str:
+        """The unit of `times`, and of the law: s, or d or year where the file's times are these."""
+        return clock_of(self.time_unit)[0]
 
     @property
     def explained(self) -> frozenset[str]:
@@ -384,33 +402,34 @@ def read(
 ) -> Recording:
     """The recording that a file holds, or several files, one run each or more.
 
-    paths:    ``.csv`` and other text (separated by commas, semicolons, tabs or blanks; decimal
-              points or commas; lines of comments; a line of units below the names), ``.npz`` of
-              named arrays, ``.npy``.
+    paths:    ``.csv`` and other text, of any encoding (separated by commas, semicolons, tabs or
+              blanks; decimal points or commas; lines of comments, preambles, a line of units below
+              the names; ``.gz`` and ``.zip`` too), ``.npz`` and ``.mat`` of named arrays, ``.npy``;
+              with python-calamine ``.xlsx``, ``.xls`` and ``.ods``.
     start, stop, every: rows to keep: between these times (in the file's unit), every so many.
     options:  `ReadOptions`.
     Raises InputError, one line with the file and the line, where a file cannot be used.
     """
     several = [paths] if isinstance(paths, (str, Path)) else list(paths)
-    chosen = listed(options.get("columns"))
+    chosen, time = listed(options.get("columns")), options.get("time")
     tables = []
     for path in map(Path, several):
         if not path.is_file():
             raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
-        if path.suffix.lower() in (".npz", ".npy"):
-            tables.append(_rows_of(from_arrays(path, chosen), start, stop, every))
+        if path.suffix.lower() in ARRAYS:
+            table = _timed(from_arrays(path, chosen), time)
+            tables.append(rows_of(table, start, stop, every))
         else:
-            tables.append(from_text(path, chosen, start=start, stop=stop, every=every))
+            rows = {"start": start, "stop": stop, "every": every}
+            tables.append(from_text(path, chosen, time=time, **rows))
     return Recording(tables, **options)
 
 
-def _rows_of(table: Table, start: float, stop: float, every: int) -> Table:
-    length = len(next(iter(table.columns.values()), ()))
-    keep = np.arange(length) % every == 0
-    for name, values in table.columns.items():
-        if is_time(name):
-            keep &= (values >= start) & (values <= stop)
-    return dataclasses.replace(table, columns={n: v[keep] for n, v in table.columns.items()})
+def _timed(table: Table, time: str | None) -> Table:
+    """The table with this column of times."""
+    if time is not None and time not in table.columns:
+        raise InputError(f"{table.source}: no column {time}, found {', '.join(table.columns)}")
+    return table if time is None else dataclasses.replace(table, time=time)
 
 
 def _number(text: str) -> float | None:
@@ -428,5 +447,5 @@ def _selected(table: Table, columns: tuple[str, ...]) -> Table:
         raise InputError(
             f"{table.source}: no column {', '.join(missing)}, found {', '.join(table.columns)}"
         )
-    kept = {n: x for n, x in table.columns.items() if n in columns or is_time(n) or is_run(n)}
+    kept = {n: x for n, x in table.columns.items() if n in (*columns, *table.times) or is_run(n)}
     return dataclasses.replace(table, columns=kept)

@@ -313,7 +313,7 @@ def as_typed(options: Mapping[str, Any]) -> str:
         if isinstance(value, Mapping):
             value = ",".join(f"{name}={_short(number)}" for name, number in value.items())
         elif isinstance(value, (tuple, list)):
-            value = ",".join(map(str, value))
+            value = ",".join(map(str, value)) or "none"
         parts.append(f" --{words.get(option, option)} {shlex.quote(str(value))}")
     return "".join(parts)
 

@@ -8,25 +8,15 @@ import unicodedata
 from collections.abc import Iterable
 
 ROLES = ("positions", "velocities", "momenta", "inputs", "parameters", "sensors")
+# Words that name a time, first in a name or alone in it; times by the calendar with their unit.
 TIMES = (
-    "t",
-    "time",
-    "times",
-    "timestamp",
-    "timestamps",
-    "date",
-    "datetime",
-    "elapsed",
-    "clock",
-    "sec",
-    "seconds",
-    "millis",
-    "micros",
-    "zeit",
-    "temps",
-    "tiempo",
-    "tempo",
+    *("t", "time", "times", "timestamp", "timestamps", "datetime", "epoch", "elapsed", "clock"),
+    *("sec", "seconds", "millis", "micros", "date", "zeit", "zeitstempel", "uhrzeit", "datum"),
+    *("temps", "heure", "tiempo", "fecha", "tempo", "tijd", "tid", "jd", "jdtdb", "jdut", "mjd"),
+    *("year", "years", "jahr", "annee", "ano"),
 )
+OF_CALENDAR = {"jd": "d", "jdtdb": "d", "jdut": "d", "mjd": "d"}
+OF_CALENDAR |= dict.fromkeys(("year", "years", "jahr", "annee", "ano"), "year")
 RUNS = ("run", "trial", "sequence", "seq", "episode", "experiment", "trajectory")
 
 _GREEK = {letter: unicodedata.name(letter).split()[3].lower() for letter in "αβγθφψωτ"}
@@ -99,8 +89,11 @@ def symbols(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def is_time(name: str) -> bool:
-    """Return whether this is the name of a column of times."""
-    return re.sub(r"_?(s|ms|us|µs|ns)$", "", plain(name)) in TIMES or plain(name) in TIMES
+    """Return whether this is the name of a column of times: Time, time_ms, Zeit t, Date Time."""
+    bare = re.sub(r"_?(s|ms|us|µs|ns)$", "", plain(name))
+    words = re.split(r"[_,]+", plain(name))
+    told = len(words[0]) > 1 and words[0] in TIMES and not set(words[1:]) & {"constant", "step"}
+    return bare in TIMES or plain(name) in TIMES or told or plain(name) == "julian_date"
 
 
 def is_run(name: str) -> bool:

@@ -4,7 +4,8 @@ rise."""
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from gfnn_jax.data.blocks import damage
 from gfnn_jax.data.roles import is_run, is_time
 from gfnn_jax.errors import InputError
 
+ARRAYS = (".npz", ".npy", ".mat")  # ends of the names of files of arrays
 _MOST_MOVED = 3  # rows in a row that are taken to be out of place; more are a run
 
 
@@ -23,6 +25,7 @@ class Table:
 
     units: by column name, as a header or a row of units gave them. text: names of columns that hold
     no numbers. notes: what reading had to decide. locate: says where a row stands, for a message.
+    time: the column of times, where its name does not tell.
     """
 
     columns: dict[str, np.ndarray]
@@ -31,6 +34,21 @@ class Table:
     text: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     locate: Callable[[int], str] = lambda row: f"row {row + 1}"
+    time: str | None = None
+
+    @property
+    def times(self) -> list[str]:
+        """Names of the columns of times, the one that is taken first."""
+        named = [name for name in self.columns if is_time(name) and name != self.time]
+        return named if self.time is None else [self.time, *named]
+
+
+def rows_of(table: Table, start: float, stop: float, every: int) -> Table:
+    """The rows of a table between two times, in its unit, every so many of them."""
+    keep = np.arange(len(next(iter(table.columns.values()), ()))) % every == 0
+    for name in table.times[:1]:
+        keep &= ~((table.columns[name] < start) | (table.columns[name] > stop))
+    return dataclasses.replace(table, columns={n: v[keep] for n, v in table.columns.items()})
 
 
 def from_memory(table: Any) -> Table:
@@ -63,6 +81,8 @@ def from_memory(table: Any) -> Table:
         if is_run(name):
             found[name] = values.astype(str)
             continue
+        if values.dtype.kind == "M":  # moments
+            values = (values - values[:1]) / np.timedelta64(1, "s")
         if values.dtype.kind == "c":
             raise InputError(f"{name}: expected real numbers, got {values.dtype}")
         try:
@@ -86,8 +106,10 @@ def _spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def from_arrays(path: Path, columns: Sequence[str]) -> Table:
-    """The columns of an ``.npz`` of named arrays or of an ``.npy`` array (T, k), whose ``columns``
-    are then named; a structured array names its own."""
+    """The columns of an ``.npz`` or ``.mat`` of named arrays, or of an ``.npy`` array (T, k), whose
+    ``columns`` are then named; a structured array names its own."""
+    if path.suffix.lower() == ".mat":
+        return _of_matlab(path)
     with damage(path, "the array"):
         loaded = np.load(path, allow_pickle=False)
         if not isinstance(loaded, np.ndarray):
@@ -101,6 +123,40 @@ def from_arrays(path: Path, columns: Sequence[str]) -> Table:
             )
         loaded = dict(zip(columns, loaded.T, strict=True))
     return dataclasses.replace(from_memory(loaded), source=str(path))
+
+
+def _of_matlab(path: Path) -> Table:
+    """The arrays of a MATLAB file that have its most frequent length, those in structures too."""
+    from scipy.io import loadmat  # loaded when first needed
+
+    with damage(path, "the file", TypeError):
+        try:
+            loaded = loadmat(path, simplify_cells=True)
+        except NotImplementedError:
+            raise InputError(
+                f"{path}: is of MATLAB 7.3: write it by save('{path.name}', …, '-v7')"
+            ) from None
+    arrays = dict(_numeric(loaded))
+    lengths = [max(x.shape) for x in arrays.values() if x.size > 1]
+    if not lengths:
+        raise InputError(f"{path}: expected arrays of numbers, found {', '.join(loaded)[:80]}")
+    length = max(set(lengths), key=lambda n: (lengths.count(n), n))
+    kept = {n: x if x.shape[0] == length else x.T for n, x in arrays.items() if length in x.shape}
+    others = ", ".join(f"{n} {x.shape}" for n, x in arrays.items() if n not in kept)
+    notes = (f"arrays of another length than {length} are put aside: {others}",) if others else ()
+    columns = {n: x[:, 0] if x.ndim == 2 and x.shape[1] == 1 else x for n, x in kept.items()}
+    return dataclasses.replace(from_memory(columns), source=str(path), notes=notes)
+
+
+def _numeric(value: Mapping[str, Any]) -> Iterator[tuple[str, np.ndarray]]:
+    """Arrays of numbers in a dict of dicts, by their own names."""
+    for name, inner in value.items():
+        if isinstance(inner, dict):
+            yield from _numeric(inner)
+        elif not name.startswith("__") and isinstance(inner, (np.ndarray, float, int)):
+            array = np.atleast_1d(inner)
+            if array.dtype.kind in "fiub" and array.ndim <= 2:
+                yield name, array
 
 
 def runs_of(
@@ -136,11 +192,13 @@ def _parts(
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Run -> its rows (n,) and their times (n,) in seconds."""
     column = _run_column(table)
-    time = next(iter(_time_columns(table)), None)
+    time = next(iter(table.times), None)
     if time is None and dt is None:
+        rising = [n for n, x in table.columns.items() if n != column and np.all(np.diff(x) > 0)]
+        named = f"--time {shlex.quote(rising[0])} if that is it, or " if rising else ""
         raise InputError(
             f"{table.source}: expected a column t or time, found {', '.join(table.columns)}; give "
-            "the time between rows: --dt (dt=)"
+            f"{named}the time between rows: --dt (dt=)"
         )
     if column is not None:
         labels, first, inverse = np.unique(
@@ -169,8 +227,8 @@ def restarts(tables: list[Table], runs: Mapping[str, Any]) -> list[str]:
     """A note where times that fall have made runs."""
     if len(runs) == len(tables) or any(_run_column(table) for table in tables):
         return []
-    table = next(t for t in tables if len(_falls(t.columns[_time_columns(t)[0]])))
-    place = table.locate(int(_falls(table.columns[_time_columns(table)[0]])[0]))
+    table = next(t for t in tables if len(_falls(t.columns[t.times[0]])))
+    place = table.locate(int(_falls(table.columns[table.times[0]])[0]))
     if len(runs) == len(tables) + 1:
         return [f"the times run back once, at {place}, and a run begins there"]
     count = len(runs) - len(tables)
@@ -179,12 +237,8 @@ def restarts(tables: list[Table], runs: Mapping[str, Any]) -> list[str]:
 
 def second_times(tables: list[Table]) -> list[str]:
     """A note where a table has more columns of times than the one that is taken."""
-    found = dict.fromkeys((_time_columns(t)[0], n) for t in tables for n in _time_columns(t)[1:])
+    found = dict.fromkeys((t.times[0], n) for t in tables for n in t.times[1:])
     return [f"{other} is not used, for the times are those of {taken}" for taken, other in found]
-
-
-def _time_columns(table: Table) -> list[str]:
-    return [name for name in table.columns if is_time(name)]
 
 
 def _falls(times: np.ndarray) -> np.ndarray:

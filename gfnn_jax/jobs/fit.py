@@ -199,6 +199,7 @@ def fit_recording(
     recording = read(list(data), **columns)
     refuse_mistakes(recording, despite)
     job = {"command": "fit", "data": recording.source, **asked.deciding, **units_of(recording)}
+    job["reading"] = {n: columns[n] for n in ("columns", "dt", "time") if n in columns}
     is_law = asked.learn != "map"
     refused: FitError | None = None
     with refusals(), failures_of_arithmetic():

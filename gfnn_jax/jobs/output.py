@@ -109,9 +109,18 @@ def read_in_units(path: Any, job: dict[str, Any], roles: dict[str, Any]) -> Reco
     """Read a recording in the units of its header and, where that is silent about times or about
     degrees, in those of the recording that the model was learned from.
 
-    roles: keywords of `gfnn_jax.read`; a unit among them goes before the model's.
+    roles: keywords of `gfnn_jax.read`; a unit among them goes before the model's. A file without
+    names or times is read as that one was.
     """
-    recording = read(path, **roles)
+    reading = job.get("reading", {})
+    try:
+        recording = read(path, **{**reading, **roles})
+    except InputError:
+        if "columns" not in reading:  # a file of inputs alone has not all of them
+            raise
+        reading = {name: value for name, value in reading.items() if name != "columns"}
+        recording = read(path, **{**reading, **roles})
+    roles = {**reading, **roles}
     known = (*recording.positions, *recording.velocities)
     silent = [n for n in job.get("degrees", ()) if n in known and n not in recording.units]
     told: dict[str, Any] = {"degrees": silent} if silent else {}
