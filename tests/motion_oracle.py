@@ -166,7 +166,7 @@ class Quadratic:
             slopes.reshape(-1, count),
             curvatures.reshape(-1, count),
             modes,
-            not np.any(terms.powers),
+            not np.any(terms.powers) and not terms.shapes,
             A.reshape(count * d, d),
             b[..., None],
             c[:, None],
@@ -176,7 +176,7 @@ class Quadratic:
         """Return whether these are the terms, of any phases."""
         own = self.terms
         same = own.speeds is terms.speeds and own.modes is terms.modes
-        return same and own.powers is terms.powers
+        return same and own.powers is terms.powers and own.shapes is terms.shapes
 
     def parts(self, terms: Terms, theta: np.ndarray, q: np.ndarray, order: int) -> Parts:
         """The parts of L at q (d, N), with coefficients θ (P, 1) or (P, N); with ``order`` 1 or 2

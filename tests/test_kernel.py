@@ -20,8 +20,9 @@ from gfnn_jax.flows import kernel
 from gfnn_jax.flows.motion import Form
 
 
-def law_of(d, powers, dry, seed=0):
-    """A law of d coordinates in a gauge, with powers or without, and friction of each kind."""
+def law_of(d, powers, dry, seed=0, shapes=False):
+    """A law of d coordinates in a gauge, with powers and shapes or without, and friction of each
+    kind."""
     rng, unit, none = np.random.default_rng(seed), np.eye(d, dtype=int), np.zeros(d, int)
     last = unit[-1]
     rows = [(2 * one, none, none, 0.0) for one in unit]
@@ -30,6 +31,10 @@ def law_of(d, powers, dry, seed=0):
     if powers:
         rows += [(none, 2 * last, none, 0.0), (2 * last, 2 * last, none, 0.0)]
         rows += [(none, unit[0] + 2 * last, last, 0.4), (last, 3 * unit[0], unit[0], 0.1)]
+    if shapes:
+        radius = " + ".join(f"q{i + 1}**2" for i in range(d))
+        rows += [(none, none, none, 0.0, f"1/sqrt(1 + {radius})")]
+        rows += [(last, unit[0], last, 0.4, f"exp(-q1)*tanh(q{d})**2")]
     friction = [(last, DRY, 0.3), (last, LINEAR, 0.0), (last, QUADRATIC, 0.0)]
     if dry:
         friction[1:1] = [(last, DRY, 0.0)]
@@ -83,8 +88,30 @@ def test_steps_are_those_of_numpy(d, powers, dry, own):
     assert len(kernel.follow.signatures) == 1  # pyright: ignore[reportAttributeAccessIssue]
 
 
+SHAPES = """
+sin(q1*q2) cos(q1)**3 tan(q2/3) exp(-q1) log(2+q1*q1) sqrt(2+q2) sinh(q1) cosh(q2) tanh(q1-q2)
+arctan(q1)/(2+q2*q2) (q1*q1+2)**-1.5 abs(q1-3) T4(q1)*q2 1/(1+q2/8)**9
+"""
+
+
+@pytest.mark.parametrize("shape", SHAPES.split())
+def test_shapes_are_those_of_numpy(shape):
+    """The rates of a law with a term of this shape, and their derivatives."""
+    none, rows = (0, 0), [((2, 0), (0, 0), (0, 0), 0.0), ((0, 2), (0, 0), (0, 0), 0.0)]
+    rows += [(k, none, none, 0.0, shape) for k in ((0, 0), (1, 0), (1, 1))]
+    form = Form(Terms.of(rows, 2), np.zeros(5), np.eye(5), Friction.of([], 2))
+    p, (x, h, _) = np.array([1.0, 1.2, 0.3, 0.2, 0.1]), lanes_of(2, 20)
+    u = np.zeros((20, 2, 6, 0))
+    found, (expected, _) = (
+        form.step(p, 0.3 * x, h, u),
+        motion_oracle.step(motion_oracle.oracle(form), p, 0.3 * x, h, u, 2),
+    )
+    for one, other in zip(found[:3], expected[:3], strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-13)
+
+
 def test_derivatives_are_finite_differences():
-    (form, p), (x, h, u) = law_of(2, True, False), lanes_of(2, 20)
+    (form, p), (x, h, u) = law_of(2, True, False, shapes=True), lanes_of(2, 20)
     found, e = form.step(p, x, h, u), 1e-6
 
     def slope(vary, count):
@@ -117,7 +144,7 @@ def test_hopeless_lanes_end(seed):
     """Random tables: no number is refused, no lane is followed without end, none harms another."""
     rng = np.random.default_rng(seed)
     d, num = int(rng.integers(1, 4)), 40
-    form, p = law_of(d, bool(rng.integers(2)), bool(rng.integers(2)), seed)
+    form, p = law_of(d, bool(rng.integers(2)), bool(rng.integers(2)), seed, shapes=seed > 3)
     form, p = each_its_own(form, p, num)
     x, h, u = lanes_of(d, num, seed)
     expected = form.step(p, x, h, u)
@@ -170,7 +197,7 @@ _ALONE = """
 import os, sys
 import numpy as np
 import test_kernel
-(form, p), (x, h, u) = test_kernel.law_of(3, True, True), test_kernel.lanes_of(3, 30)
+(form, p), (x, h, u) = test_kernel.law_of(3, True, True, 0, True), test_kernel.lanes_of(3, 30)
 step = form.step(p, x, h, u)
 assert np.isfinite(step.states).all()
 child = os.fork()  # after first use

@@ -15,8 +15,16 @@ ROWS = [
     ((1, 0), (0, 1), (2, 0), -np.pi / 2),
     ((0, 0), (0, 0), (1, 0), 0.0),
     ((0, 0), (2, 1), (0, 3), 0.4),
+    ((1, 0), (0, 1), (1, 0), 0.2, "1/sqrt(q1**2 + q2**2 + 1)"),
+    ((0, 0), (0, 0), (0, 0), 0.0, "(q1 - q2)**2*exp(q2)/cosh(q1)**1.5"),
 ]
-THETA = np.array([1.0, 0.7, 0.3, 0.1, 0.2, 2.0, -0.6])
+SHAPES = {
+    "1/sqrt(q1**2 + q2**2 + 1)": lambda q: 1 / jnp.sqrt(q @ q + 1),
+    "(q1 - q2)**2*exp(q2)/cosh(q1)**1.5": lambda q: (
+        (q[0] - q[1]) ** 2 * jnp.exp(q[1]) / jnp.cosh(q[0]) ** 1.5
+    ),
+}
+THETA = np.array([1.0, 0.7, 0.3, 0.1, 0.2, 2.0, -0.6, 0.3, 0.8])
 FRICTION = [((1, 0), LINEAR, 1.0), ((-1, 1), QUADRATIC, 1.0), ((0, 1), DRY, 0.1)]
 RHO = np.array([0.1, 0.2, 0.05])
 GAINS = np.array([[1.0, 0.0, 0.5], [0.0, -2.0, 0.3]])
@@ -30,10 +38,10 @@ def law():
 def plain(q, v):
     """L, term by term, as a person would write it."""
     total = 0.0
-    for theta, (k, n, m, phase) in zip(THETA, ROWS, strict=True):
+    for theta, (k, n, m, phase, *shape) in zip(THETA, ROWS, strict=True):
         wave = jnp.cos(m[0] * q[0] + m[1] * q[1] + phase)
         product = v[0] ** k[0] * v[1] ** k[1] * q[0] ** n[0] * q[1] ** n[1]
-        total = total + theta * product * wave
+        total = total + theta * product * wave * (SHAPES[shape[0]](q) if shape else 1.0)
     return total
 
 
@@ -114,7 +122,7 @@ def test_padding_moves_nothing():
     model = law()
     longer = Lagrangian(
         model.terms.padded(12),
-        np.pad(THETA, (0, 5)),
+        np.pad(THETA, (0, 3)),
         model.friction.padded(6),
         np.pad(RHO, (0, 3)),
         0.03,

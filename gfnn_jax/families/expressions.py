@@ -11,7 +11,7 @@ import ast
 import dataclasses
 import keyword
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property
 from typing import Any
 
@@ -195,6 +195,44 @@ def parse_named(text: str, names: Sequence[str]) -> Expression:
     return _read(text, lambda tree: _parsed(tree, known, text, 0))
 
 
+def summands(text: str, names: Sequence[str]) -> list[tuple[str, Expression]]:
+    """The terms of a sum in variables of these names, as `parse_named` reads each, without the
+    number before it, and its text.
+
+    Raises InputError as `parse` does.
+    """
+    known = {name: coordinate(i) for i, name in enumerate(names)}
+
+    def parts(tree: ast.expr) -> list[tuple[str, Expression]]:
+        found, open_ = [], [tree]
+        while open_:
+            node = open_.pop()
+            if isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Add, ast.Sub)):
+                open_ += [node.right, node.left]
+            elif isinstance(node, ast.UnaryOp):
+                open_.append(node.operand)
+            else:
+                own = _without_number(node)
+                found.append((ast.unparse(node), _parsed(own, known, ast.unparse(node), 0)))
+        return found
+
+    return _read(text, parts)
+
+
+def _without_number(node: ast.expr) -> ast.expr:
+    """A product without its first factor where that is a number, which may be 0."""
+    if not isinstance(node, ast.BinOp) or not isinstance(node.op, (ast.Mult, ast.Div)):
+        return node
+    first = node.left.operand if isinstance(node.left, ast.UnaryOp) else node.left
+    if not isinstance(first, ast.Constant):
+        return ast.BinOp(_without_number(node.left), node.op, node.right)
+    return (
+        node.right
+        if isinstance(node.op, ast.Mult)
+        else ast.BinOp(ast.Constant(1), node.op, node.right)
+    )
+
+
 def names_in(text: str) -> tuple[str, ...]:
     """The names of variables in an expression, in the order in which they appear."""
     nodes = _read(text, lambda tree: list(ast.walk(tree)))
@@ -290,9 +328,11 @@ def to_text(tree: Expression, dim: int, parameters: tuple[str, ...] = ()) -> str
     return _text(tree, (*coordinate_names(dim), *parameters), 2 * dim)[0]
 
 
-def to_named_text(tree: Expression, names: Sequence[str]) -> str:
-    """Write a tree of coordinates of these names as text that `parse_named` reads back."""
-    return _text(tree, tuple(names), len(names))[0]
+def to_named_text(tree: Expression, names: Sequence[str], as_factor: bool = False) -> str:
+    """Write a tree of coordinates of these names as text that `parse_named` reads back; a sum in
+    brackets where other factors will stand before it."""
+    text, binds = _text(tree, tuple(names), len(names))
+    return f"({text})" if as_factor and binds < _PRODUCT else text
 
 
 def _text(tree: Expression, names, width: int) -> tuple[str, int]:
@@ -331,6 +371,53 @@ def depends_on(tree: Expression) -> set[int]:
     if tree.operation == "coordinate":
         return {tree.operands[0]}
     return set().union(*(depends_on(o) for o in tree.operands if isinstance(o, Expression)))
+
+
+def whole_multiples(tree: Expression) -> tuple[dict[int, int], float] | None:
+    """Multiples {i: m} and the number c of a tree Σ m_i z_i + c; None for another tree."""
+    operation, operands = tree.operation, tree.operands
+    if operation == "number":
+        return {}, operands[0]
+    if operation == "coordinate":
+        return {operands[0]: 1}, 0.0
+    if operation == "*":
+        m, inner = operands[0].value, whole_multiples(operands[1])
+        if m is None or not m.is_integer() or inner is None:
+            return None
+        return {i: int(m) * k for i, k in inner[0].items()}, m * inner[1]
+    if operation == "+":
+        left, right = map(whole_multiples, operands)
+        if left is not None and right is not None:
+            both = {i: left[0].get(i, 0) + right[0].get(i, 0) for i in (*left[0], *right[0])}
+            return both, left[1] + right[1]
+    return None
+
+
+def factors_of(tree: Expression) -> dict[Expression, float]:
+    """The factors of a product with their exponents, but for numbers."""
+    operation, operands = tree.operation, tree.operands
+    if operation == "number":
+        return {}
+    if operation in ("*", "/"):
+        found = factors_of(operands[0])
+        for base, exponent in factors_of(operands[1]).items():
+            sign = 1 if operation == "*" else -1
+            found[base] = found.get(base, 0.0) + sign * exponent
+        return found
+    if operation == "power" and operands[1].is_integer():
+        return {base: operands[1] * e for base, e in factors_of(operands[0]).items()}
+    return {operands[0]: operands[1]} if operation == "power" else {tree: 1.0}
+
+
+def product_of(factors: Mapping[Expression, float]) -> Expression:
+    """The product of these powers, those of negative exponents as a denominator."""
+    above, below = number(1.0), number(1.0)
+    for base, exponent in factors.items():
+        if exponent > 0:
+            above = above * power(base, exponent)
+        elif exponent < 0:
+            below = below * power(base, -exponent)
+    return above / below
 
 
 def count_operations(tree: Expression) -> int:

@@ -23,6 +23,11 @@ DERIVATIVES: dict[str, tuple[Callable, Callable, Callable]] = {
     ),
     "exp": (lambda xp, v: xp.exp(v), lambda xp, v, y: y, lambda xp, v, y: y),
     "log": (lambda xp, v: xp.log(v), lambda xp, v, y: 1 / v, lambda xp, v, y: -1 / (v * v)),
+    "abs": (
+        lambda xp, v: xp.abs(v),
+        lambda xp, v, y: v / (y + 1e-300),  # 0 at 0
+        lambda xp, v, y: 0.0 * v,
+    ),
     "sqrt": (
         lambda xp, v: xp.sqrt(v),
         lambda xp, v, y: 0.5 / y,

@@ -13,7 +13,7 @@ from functools import cache, reduce
 from typing import Any
 
 from gfnn_jax.arrays import as_row, namespace
-from gfnn_jax.families.expressions import Expression, coordinate, parameter
+from gfnn_jax.families.expressions import Expression, coordinate, parameter, whole_multiples
 from gfnn_jax.families.functions import CHEBYSHEV, CIRCULAR, DERIVATIVES
 
 
@@ -124,28 +124,11 @@ def _multiple(tree: Expression) -> tuple[Expression, int]:
 
     n is their greatest common divisor. Any other tree gives (tree, 1).
     """
-    found = _whole_multiples(tree)
-    if not found or (n := math.gcd(*found.values())) < 2:
+    found = whole_multiples(tree)
+    if found is None or found[1] or (n := math.gcd(*found[0].values())) < 2:
         return tree, 1
-    parts = [coordinate(i) * (m // n) for i, m in sorted(found.items())]
+    parts = [coordinate(i) * (m // n) for i, m in sorted(found[0].items())]
     return reduce(operator.add, parts), n
-
-
-def _whole_multiples(tree: Expression) -> dict[int, int] | None:
-    """Multiples {i: m} of a tree Σ m_i z_i; None for another tree."""
-    operation, operands = tree.operation, tree.operands
-    if operation == "coordinate":
-        return {operands[0]: 1}
-    if operation == "*":
-        m, inner = operands[0].value, _whole_multiples(operands[1])
-        if m is None or not m.is_integer() or inner is None:
-            return None
-        return {i: int(m) * k for i, k in inner.items()}
-    if operation == "+":
-        left, right = (_whole_multiples(o) for o in operands)
-        if left is not None and right is not None and not left.keys() & right.keys():
-            return left | right
-    return None
 
 
 def _power_derivatives(xp, v, exponent: float, order: int):

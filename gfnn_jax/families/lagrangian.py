@@ -2,10 +2,11 @@
 
     d/dt ∂L/∂v − ∂L/∂q + ∂R/∂v = G u,      L = Σ θ_j ℓ_j(q, v),      R = Σ ρ_k r_k(v)
 
-    ℓ_j = ∏ v_i^k_ji · ∏ q_i^n_ji · cos(m_j·q + φ_j)
+    ℓ_j = ∏ v_i^k_ji · ∏ q_i^n_ji · cos(m_j·q + φ_j) · g_j(q)
 
 k, n and m are whole numbers, and a term has at most two factors v: kinetic, gyroscopic and
-potential terms. With s = c·v, the speed of one coordinate or the relative speed of two, friction is
+potential terms. g, where a term has one, is any other formula: its *shape*, 1/√(q1² + q2²) or
+exp(−q1). With s = c·v, the speed of one coordinate or the relative speed of two, friction is
 linear, r = ½s²; quadratic, r = ⅓|s|³; or dry, r = √(s² + ε²) − ε. Everything is batch first, in
 closed form, and runs in NumPy or JAX. A term is a row of arrays, none of which is static, so that
 another library of as many terms (`Terms.padded`) compiles nothing.
@@ -25,6 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.arrays import as_row, matmul, namespace, pytree
+from gfnn_jax.families.expressions import Expression, depends_on, parse, to_named_text
+from gfnn_jax.families.jets import jets
 from gfnn_jax.families.text import added, barred, combination, power, shown
 
 MAX_POWER = 8  # of one coordinate in one term; powers come from a table of this length
@@ -51,9 +54,25 @@ class Derivatives(NamedTuple):
     by_vv: Any  # (..., d, d)
 
 
-@pytree()
+def shape_of(row: Sequence[Any]) -> str:
+    """The shape of a row (k, n, m, φ, shape), as text in q1, …, qd; "" where it has none."""
+    return row[4] if len(row) > 4 and isinstance(row[4], str) else ""
+
+
+def coordinates_in(row: Sequence[Any], phased: bool = True) -> tuple[bool, ...]:
+    """Return whether the factor f(q) of a row depends on each coordinate; where not ``phased``, by
+    its powers and its shape alone."""
+    powers, wave = row[1:3]
+    found = [bool(n or (m and phased)) for n, m in zip(powers, wave, strict=True)]
+    for i in depends_on(parse(shape_of(row) or "1", len(powers))):
+        found[i] = True
+    return tuple(found)
+
+
+@pytree("shapes")
 class Terms:
-    """The terms ℓ_j of a Lagrangian: whole numbers k, n and m, each (P, d), and phases (P,).
+    """The terms ℓ_j of a Lagrangian: whole numbers k, n and m, each (P, d), phases (P,), and their
+    shapes as text in q1, …, qd, "" of a term without, () where none has one.
 
     A phase is 0 for a cosine and −π/2 for a sine.
     """
@@ -62,17 +81,20 @@ class Terms:
     powers: Any
     modes: Any
     phases: Any
+    shapes: tuple[str, ...] = ()
 
     @staticmethod
     def of(rows: Sequence[Sequence[Any]], dim: int) -> Terms:
-        """Make it of rows (k, n, m, φ). Raises ValueError for more than two factors v, or a power >
-        8."""
+        """Make it of rows (k, n, m, φ) or (k, n, m, φ, shape). Raises ValueError for more than two
+        factors v, or a power > 8."""
         k, n, m = (np.array([r[i] for r in rows], dtype=int).reshape(-1, dim) for i in range(3))
         if (k.sum(1) > 2).any() or k.min(initial=0) < 0:
             raise ValueError("a term of a Lagrangian has at most two factors v")
         if n.max(initial=0) > MAX_POWER or n.min(initial=0) < 0:
             raise ValueError(f"powers of coordinates are from 0 to {MAX_POWER}")
-        return Terms(k, n, m, np.array([float(r[3]) for r in rows]))
+        shapes = tuple(map(shape_of, rows))
+        phases = np.array([float(r[3]) for r in rows])
+        return Terms(k, n, m, phases, shapes if any(shapes) else ())
 
     @property
     def count(self) -> int:
@@ -83,18 +105,24 @@ class Terms:
         return self.speeds.shape[1]
 
     def rows(self) -> list[tuple]:
-        """(k, n, m, φ) of each term, hashable."""
+        """(k, n, m, φ), and the shape where there is one, of each term, hashable."""
         whole = (self.speeds, self.powers, self.modes)
+        shapes = [(s,) if s else () for s in self.shapes] or [()] * self.count
         return [
-            (*(tuple(map(int, a[j])) for a in whole), float(self.phases[j]))
+            (*(tuple(map(int, a[j])) for a in whole), float(self.phases[j]), *shapes[j])
             for j in range(self.count)
         ]
+
+    @cached_property
+    def trees(self) -> dict[int, Expression]:
+        """The shapes of the terms that have one."""
+        return {j: parse(text, self.dim) for j, text in enumerate(self.shapes) if text}
 
     def texts(self, names: Sequence[str], speeds: Sequence[str]) -> tuple[str, ...]:
         """Each term as code in the names of the coordinates and of their velocities; a phase other
         than that of a cosine or a sine stays in the argument."""
         listed = []
-        for k, n, m, phase in self.rows():
+        for j, (k, n, m, phase, *_) in enumerate(self.rows()):
             factors = [power(x, e) for x, e in zip((*speeds, *names), (*k, *n), strict=True) if e]
             if any(m):  # cos or sin of m·q + φ, whichever has the smaller |φ|
                 sine = abs(phase + np.pi / 2) < np.pi / 4
@@ -102,18 +130,26 @@ class Terms:
                 shift = [f"{rest:.5g}"] if abs(rest) > 1e-12 else []
                 inside = added([combination(m, names), *shift])
                 factors.append(f"{'sin' if sine else 'cos'}({inside})")
-            listed.append("*".join(factors) or "1")
+            text = "*".join(factors)
+            if j in self.trees:
+                shape = to_named_text(self.trees[j], names, as_factor=True)
+                below = text and shape.startswith("1/")
+                text = text + shape[1:] if below else "*".join([*factors, shape])
+            listed.append(text or "1")
         return tuple(listed)
 
     def take(self, keep: Any) -> Terms:
         """The terms with these indices, or where this mask holds."""
-        return Terms(self.speeds[keep], self.powers[keep], self.modes[keep], self.phases[keep])
+        shapes = tuple(np.array(self.shapes or [""] * self.count, dtype=object)[keep])
+        own = (self.speeds[keep], self.powers[keep], self.modes[keep], self.phases[keep])
+        return Terms(*own, shapes if any(shapes) else ())
 
     def padded(self, count: int) -> Terms:
         """Pad with constants, which move nothing, to ``count`` terms in all."""
         more = count - self.count
         k, n, m = (np.pad(a, ((0, more), (0, 0))) for a in (self.speeds, self.powers, self.modes))
-        return Terms(k, n, m, np.pad(self.phases, (0, more)))
+        shapes = self.shapes and (*self.shapes, *[""] * more)
+        return Terms(k, n, m, np.pad(self.phases, (0, more)), shapes)
 
     def quadratic(self) -> tuple[Any, Any, Any]:
         """A (P, d, d), b (P, d), c (P,) of ∏ v_i^k_i = ½ vᵀA v + b·v + c."""
@@ -133,7 +169,13 @@ class Terms:
         return (outer - own) * twice[:, None, None], k * once[:, None], never
 
     def potentials(self, q: Any, order: int = 2) -> Potentials:
-        """∏ q_i^n_i cos(m·q + φ) at q (..., d), with its derivatives up to ``order`` 0, 1 or 2."""
+        """∏ q_i^n_i cos(m·q + φ) g(q) at q (..., d), with its derivatives up to ``order`` 0, 1 or
+        2."""
+        found = self._waves(q, order)
+        return _shaped(found, self.trees, q, order) if self.shapes else found
+
+    def _waves(self, q: Any, order: int) -> Potentials:
+        """The same without shapes."""
         xp = namespace(q)
         m = self.modes.astype(q.dtype)
         phase = matmul(q, m.T)
@@ -448,6 +490,43 @@ def _monomials(x: Any, n: Any, order: int) -> tuple[Any, Any, Any]:
         ]
         curvature = xp.stack(entries, axis=-1).reshape(*value.shape, d, d)
     return value, slope, curvature
+
+
+def _shaped(f: Potentials, trees: dict[int, Expression], q: Any, order: int) -> Potentials:
+    """Factors f of terms multiplied by the shapes that some of them have."""
+    xp, d, places = namespace(q), q.shape[-1], np.array(list(trees))
+    with np.errstate(all="ignore"):  # a shape may have a boundary: NaN beyond it
+        found, zero = jets(tuple(trees.values()), q, order), 0 * q[..., 0]
+
+        def rows(entries: list[Any], *shape: int) -> Any:
+            whole = xp.stack([zero + entry for entry in entries], axis=-1)
+            return whole.reshape(*zero.shape, len(places), *shape)
+
+        c, g = f.value[..., places], rows([jet.value for jet in found])
+        parts, slope, curvature = [c * g], None, None
+        if order > 0:
+            dc = f.slope[..., places, :]
+            dg = rows([jet.slope.get(i, 0.0) for jet in found for i in range(d)], d)
+            slope = dc * g[..., None] + c[..., None] * dg
+        if order > 1:
+            pairs = [(min(i, k), max(i, k)) for i in range(d) for k in range(d)]
+            bent = rows([jet.curvature.get(pair, 0.0) for jet in found for pair in pairs], d, d)
+            both = dc[..., :, None] * dg[..., None, :]
+            curvature = f.curvature[..., places, :, :] * g[..., None, None]
+            curvature = curvature + both + xp.swapaxes(both, -1, -2) + c[..., None, None] * bent
+    parts += [slope, curvature]
+    others = [j for j in range(f.value.shape[-1]) if j not in trees]
+    order_of = np.argsort([*others, *places])
+
+    def placed(old: Any, new: Any, axis: int) -> Any:
+        if new is None:
+            return None
+        kept = xp.take(old, np.array(others, dtype=int), axis=axis)
+        return xp.take(xp.concatenate([kept, new], axis=axis), order_of, axis=axis)
+
+    return Potentials(
+        *(placed(a, b, -1 - k) for k, (a, b) in enumerate(zip(f, parts, strict=True)))
+    )
 
 
 def _outer(f: Any, m: Any) -> Any:

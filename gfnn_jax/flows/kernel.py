@@ -7,8 +7,9 @@ explicit:
     ∂a/∂x = −M⁻¹ ∂r/∂x,      ∂a/∂p_k = −M⁻¹ r_k,      r_k the residual of term k alone
 
 Each term is ∏ v_i^k_i (at most two factors) times f = ∏ q_i^n_i cos(m·q + φ), and touches the rows
-of its own coordinates alone. Steps are those of Dormand and Prince, with their derivatives D (2d,
-n) in the state and in the coefficients.
+of its own coordinates alone. f may have another factor, a shape: operations on a stack of numbers
+with their first and second derivatives in the coordinates of the term. Steps are those of Dormand
+and Prince, with their derivatives D (2d, n) in the state and in the coefficients.
 
 Dry friction without a width jumps:
 
@@ -50,32 +51,38 @@ VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN = range(5)  # kinds of friction; COULOMB
 
 # Rows of n: sizes (below); of each term its degree in v, the coordinates of its factors v, its wave
 # m·q, the number of coordinates in its factor f(q), whether it has powers; a term of each wave;
-# where the columns of each term begin among those of ∂θ/∂c without zeros; kinds of friction. Then
-# rows, as many as there are coordinates in an f at the most, of coordinates, of powers and of modes
-# of f.
+# where the columns of each term begin among those of ∂θ/∂c without zeros; kinds of friction; where
+# the operations of each term's shape begin, and operations. Then rows, as many as there are
+# coordinates in an f at the most, of coordinates, of powers and of modes of f.
 SIZES, DEGREE, FIRST_V, LAST_V, WAVE, COUNT, POWERED = range(7)
-WAVES, BEGINS, COLUMNS, KINDS, COORDINATES = range(7, 12)
+WAVES, BEGINS, COLUMNS, KINDS, PROGRAMS, CODE, COORDINATES = range(7, 14)
+
+# Operations: variables and constants are put on the stack, sums and products take two from it.
+VARIABLE, CONSTANT, PLUS, TIMES, SQUARE, INVERSE_OF, ROOT, RAISED = range(8)
+SIN, COS, TAN, EXP, LOG, SINH, COSH, TANH, ARCTAN, ABS = range(8, 18)
 
 # In the row of sizes: numbers of coordinates, terms, waves, frictions, dry ones without a width,
 # inputs, free coefficients of terms, coordinates in an f at the most; then where blocks of rows of
 # f begin: M, M⁻¹, 1 − moved holding, the response of a to forces, moved (of a to λ), gains and
 # directions c (transposed), ∂r/∂(q, v, p), derivatives D at the begin and the end of a step and at
 # a stage, their rates at all stages; holding (of λ to a), small systems; ∂f/∂q and ∂²f/∂q² of
-# terms.
+# terms; values, slopes and curvatures on the stack, a column each.
 DIM, TERMS, NUM_WAVES, FRICTIONS, COULOMBS, INPUTS, FREE_TERMS, MOST = range(8)
 MASSES, INVERSE, FREE, RESPONSE, MOVED, GAINS, DIRECTIONS, RAW = range(8, 16)
-D0, D1, D, SLOPES, HOLDING, ALIKE, MATRIX, RHS, PAIRS, SLOPE, CURVATURE, NUM_SIZES = range(16, 28)
+D0, D1, D, SLOPES, HOLDING, ALIKE, MATRIX, RHS, PAIRS, SLOPE, CURVATURE, JET = range(16, 28)
+NUM_SIZES = 28
 
 # Rows of f: states (q, v) at the begin and the end of a step and at a stage; a at the stage and at
 # the begin; forces; momenta ∂L/∂v; of terms θ, cos φ, sin φ, f, ∂f/∂q · v; cos and sin of each
 # wave; ∂θ/∂c without zeros; of friction ρ, ε, dr/ds, λ, λ at the begin, modes (1 or −1 where it
 # slides, 0 where it sticks), directions that turned, that are carried, and speeds along the modes
-# at the end; a row of derivatives; powers of coordinates with derivatives; rates and inputs at the
-# stages; the tableau of Dormand and Prince. Numbers of other modules would stay as they were in the
-# cache of numba, which looks at this file alone.
+# at the end; a row of derivatives; operands of operations, and a row as long as the stack; powers
+# of coordinates with derivatives; rates and inputs at the stages; the tableau of Dormand and
+# Prince. Numbers of other modules would stay as they were in the cache of numba, which looks at
+# this file alone.
 X0, X1, X, A, A_FIRST, FORCE, MOMENTUM, THETA, COS_PHASE, SIN_PHASE, FACTOR, ALONG = range(12)
 COSINE, SINE, PARTS, LOSSES, WIDTHS, PULL, HELD, HELD_FIRST, MODES, TURNED = range(12, 22)
-CARRIED, AFTER, ROW, POWER, POWER_BY, POWER_BY_TWO, RATES = range(22, 29)
+CARRIED, AFTER, ROW, POWER, POWER_BY, POWER_BY_TWO, OPERANDS, STACK, RATES = range(22, 31)
 _STAGES = 6
 U = RATES + _STAGES
 INSIDE = U + _STAGES
@@ -200,6 +207,111 @@ def _solve(f, matrix, rhs, size, width):
 
 
 @_function
+def _shape(n, f, j):
+    """The shape of a term at X, with its derivatives in the term's coordinates, into the first
+    column of the stack."""
+    count, most, jet, top = n[COUNT, j], n[SIZES, MOST], n[SIZES, JET], -1
+    bent = jet + 1 + most
+    for e in range(n[PROGRAMS, j], n[PROGRAMS, j + 1]):
+        operation, operand = n[CODE, e], f[OPERANDS, e]
+        if operation <= CONSTANT:
+            top += 1
+            for i in range(1 + most + most * most):
+                f[jet + i, top] = 0.0
+            f[jet, top] = operand
+            if operation == VARIABLE:
+                own = int(operand)
+                f[jet, top] = f[X, n[COORDINATES + own, j]]
+                f[jet + 1 + own, top] = 1.0
+        elif operation <= TIMES:
+            top -= 1
+            x, y = f[jet, top], f[jet, top + 1]
+            if operation == PLUS:
+                for i in range(1 + most + most * most):
+                    f[jet + i, top] += f[jet + i, top + 1]
+                continue
+            for i in range(count):
+                for k in range(count):
+                    at, xi, yi = bent + i * most + k, f[jet + 1 + i, top], f[jet + 1 + i, top + 1]
+                    xk, yk = f[jet + 1 + k, top], f[jet + 1 + k, top + 1]
+                    f[at, top] = f[at, top] * y + x * f[at, top + 1] + xi * yk + xk * yi
+            for i in range(count):
+                at = jet + 1 + i
+                f[at, top] = f[at, top] * y + x * f[at, top + 1]
+            f[jet, top] = x * y
+        else:
+            x = f[jet, top]
+            if operation == SQUARE:
+                value, by, by_two = x * x, 2.0 * x, 2.0
+            elif operation == INVERSE_OF:
+                value = 1.0 / x
+                by = -value * value
+                by_two = -2.0 * by * value
+            elif operation == ROOT:
+                value = math.sqrt(x)
+                by = 0.5 / value
+                by_two = -0.5 * by / x
+            elif operation == RAISED:
+                value, by = x**operand, operand * x ** (operand - 1.0)
+                by_two = operand * (operand - 1.0) * x ** (operand - 2.0)
+            elif operation == SIN:
+                value, by = math.sin(x), math.cos(x)
+                by_two = -value
+            elif operation == COS:
+                value, by = math.cos(x), -math.sin(x)
+                by_two = -value
+            elif operation == TAN:
+                value = math.tan(x)
+                by = 1.0 + value * value
+                by_two = 2.0 * value * by
+            elif operation == EXP:
+                value = by = by_two = math.exp(x)
+            elif operation == LOG:
+                value, by = math.log(x), 1.0 / x
+                by_two = -by * by
+            elif operation == SINH:
+                value, by = math.sinh(x), math.cosh(x)
+                by_two = value
+            elif operation == COSH:
+                value, by = math.cosh(x), math.sinh(x)
+                by_two = value
+            elif operation == TANH:
+                value = math.tanh(x)
+                by = 1.0 - value * value
+                by_two = -2.0 * value * by
+            elif operation == ARCTAN:
+                value, by = math.atan(x), 1.0 / (1.0 + x * x)
+                by_two = -2.0 * x * by * by
+            else:
+                value, by, by_two = abs(x), _sign(x), 0.0
+            for i in range(count):
+                for k in range(count):
+                    both = f[jet + 1 + i, top] * f[jet + 1 + k, top]
+                    at = bent + i * most + k
+                    f[at, top] = by * f[at, top] + by_two * both
+            for i in range(count):
+                f[jet + 1 + i, top] *= by
+            f[jet, top] = value
+
+
+@_function
+def _with_shape(n, f, j, value):
+    """Multiply the factor ``value`` of a term and its derivatives by the shape; return f."""
+    count, most, jet = n[COUNT, j], n[SIZES, MOST], n[SIZES, JET]
+    slope, curvature, bent = n[SIZES, SLOPE], n[SIZES, CURVATURE], jet + 1 + most
+    _shape(n, f, j)
+    g = f[jet, 0]
+    for i in range(count):
+        for k in range(count):
+            at = i * most + k
+            both = f[slope + i, j] * f[jet + 1 + k, 0] + f[slope + k, j] * f[jet + 1 + i, 0]
+            f[curvature + at, j] = f[curvature + at, j] * g + both + value * f[bent + at, 0]
+    for i in range(count):
+        f[slope + i, j] = f[slope + i, j] * g + value * f[jet + 1 + i, 0]
+    return value * g
+
+
+@_function
 def _terms(n, f, gamma, order):
     """The terms' factors f = ∏ q_i^n_i cos(m·q + φ) at X with their derivatives, and the masses,
     forces and momenta that the terms make."""
@@ -239,7 +351,6 @@ def _terms(n, f, gamma, order):
                 for m in range(count):
                     of_i *= f[POWER, m] if m != i else 1.0
             f[slope + i, j] = of_i * c - mode * s * product
-            along += f[slope + i, j] * f[X, d + n[COORDINATES + i, j]]
             for k in range(count if order > 0 else 0):
                 bent = -mode * n[modes + k, j] * value
                 if powered:
@@ -250,6 +361,10 @@ def _terms(n, f, gamma, order):
                         both *= f[POWER, m] if m not in (i, k) else 1.0
                     bent += both * c - s * (mode * of_k + n[modes + k, j] * of_i)
                 f[curvature + i * most + k, j] = bent
+        if n[PROGRAMS, j] < n[PROGRAMS, j + 1]:
+            value = _with_shape(n, f, j, value)
+        for i in range(count):
+            along += f[slope + i, j] * f[X, d + n[COORDINATES + i, j]]
         f[FACTOR, j] = value
         f[ALONG, j] = along
         weight, g = f[THETA, j], 1.0

@@ -5,7 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import chebyshev
 
+from gfnn_jax.errors import InputError
+from gfnn_jax.families.expressions import Expression, depends_on, number
+from gfnn_jax.families.functions import CHEBYSHEV
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction, Terms
 from gfnn_jax.flows import kernel as row
 from gfnn_jax.flows.dormand_prince import NODES, STAGES, WEIGHTS
@@ -15,6 +19,21 @@ _KINDS = {
     QUADRATIC: row.CUBIC,
     DRY: row.SMOOTHED,
     UNIFORM: row.EVEN,
+}
+_BINARY = {"+": row.PLUS, "*": row.TIMES}
+_POWERS = {2.0: row.SQUARE, -1.0: row.INVERSE_OF, 0.5: row.ROOT}
+_FUNCTIONS = {
+    "sin": row.SIN,
+    "cos": row.COS,
+    "tan": row.TAN,
+    "exp": row.EXP,
+    "log": row.LOG,
+    "sqrt": row.ROOT,
+    "sinh": row.SINH,
+    "cosh": row.COSH,
+    "tanh": row.TANH,
+    "arctan": row.ARCTAN,
+    "abs": row.ABS,
 }
 _LANES = 4  # numbers that a processor works on at once: rows of derivatives are filled up to it
 
@@ -32,6 +51,8 @@ class Tables(NamedTuple):
         """Make those of terms, whose θ follow coefficients by ``basis`` (P, c), and of friction."""
         count, d = terms.speeds.shape
         touched = (terms.powers != 0) | (terms.modes != 0)
+        for j, tree in terms.trees.items():
+            touched[j, list(depends_on(tree))] = True
         numbers = touched.sum(axis=1)
         most = max(1, int(numbers.max(initial=0)))
         order = np.argsort(~touched, axis=1, kind="stable")[:, :most]
@@ -49,6 +70,12 @@ class Tables(NamedTuple):
         kinds = np.array([_KINDS[int(kind)] for kind in friction.kinds], dtype=np.int64)
         kinds[friction.jumps] = row.COULOMB
         speeds = terms.speeds
+        code: list[Operation] = []
+        begins = [0]
+        for j in range(count):
+            if j in terms.trees:
+                code += operations(terms.trees[j], order[j].tolist())
+            begins.append(len(code))
         by_rows = {
             row.DEGREE: speeds.sum(axis=1),
             row.FIRST_V: np.argmax(speeds > 0, axis=1),
@@ -60,6 +87,8 @@ class Tables(NamedTuple):
             row.BEGINS: np.searchsorted(at, np.arange(count + 1)),
             row.COLUMNS: columns,
             row.KINDS: kinds,
+            row.PROGRAMS: begins,
+            row.CODE: [operation for operation, _ in code],
         }
         for k, table in enumerate((order, powers, modes)):
             by_rows |= {row.COORDINATES + k * most + i: table[:, i] for i in range(most)}
@@ -77,12 +106,20 @@ class Tables(NamedTuple):
             row.FREE_TERMS: basis.shape[1],
             row.MOST: most,
         }
-        lengths = (*[d] * 8, *[2 * d] * 3, 12 * d, *[len(kinds)] * 5, most, most**2)
+        jet = 1 + most + most**2 if code else 0
+        lengths = (*[d] * 8, *[2 * d] * 3, 12 * d, *[len(kinds)] * 5, most, most**2, jet)
         places = np.cumsum([row.BLOCKS, *lengths])
         whole[row.SIZES, list(counts)] = list(counts.values())
         whole[row.SIZES, row.MASSES : row.NUM_SIZES] = places[:-1]
         directions = places[row.DIRECTIONS - row.MASSES] + np.arange(d)
-        parts = ((row.PARTS, basis[at, columns]), (row.WIDTHS, friction.widths))
+        operands = np.array([operand for _, operand in code])
+        stack = np.zeros(_depth(code))
+        parts = (
+            (row.PARTS, basis[at, columns]),
+            (row.WIDTHS, friction.widths),
+            (row.OPERANDS, operands),
+            (row.STACK, stack),
+        )
         columns_of = zip(directions.tolist(), friction.directions.T.astype(float), strict=True)
         stages = zip(range(row.STAGES, row.NODES), STAGES, strict=True)
         tableau = (*stages, (row.NODES, NODES), (row.WEIGHTS, WEIGHTS))
@@ -99,3 +136,46 @@ class Tables(NamedTuple):
         for place, values in self.numbers:
             numbers[place, : len(values)] = values
         return numbers
+
+
+Operation = tuple[int, float]
+
+
+def operations(tree: Expression, slots: list[int]) -> list[Operation]:
+    """The operations of a shape in the order in which a stack computes them; coordinates by their
+    places among ``slots``."""
+    kind, operands = tree.operation, tree.operands
+    if kind == "number":
+        return [(row.CONSTANT, operands[0])]
+    if kind == "coordinate":
+        return [(row.VARIABLE, float(slots.index(operands[0])))]
+    first = operations(operands[0], slots)
+    if CHEBYSHEV.fullmatch(kind):
+        return operations(_chebyshev(int(kind[1:]), operands[0]), slots)
+    if kind == "power":
+        return [*first, (_POWERS.get(operands[1], row.RAISED), operands[1])]
+    if kind in _FUNCTIONS:
+        return [*first, (_FUNCTIONS[kind], 0.0)]
+    if kind == "/":
+        below = [*operations(operands[1], slots), (row.INVERSE_OF, 0.0)]
+        return below if operands[0].value == 1 else [*first, *below, (row.TIMES, 0.0)]
+    if kind in _BINARY:
+        return [*first, *operations(operands[1], slots), (_BINARY[kind], 0.0)]
+    raise InputError(f"terms: '{kind}' is a function that the motion of a law cannot compute")
+
+
+def _chebyshev(n: int, x: Expression) -> Expression:
+    """T_n(x) by its coefficients, as Horner computes it."""
+    found = number(0.0)
+    for c in chebyshev.cheb2poly([0.0] * n + [1.0])[::-1].tolist():
+        found = found * x + c
+    return found
+
+
+def _depth(code: list[Operation]) -> int:
+    """The most numbers that are on the stack at once."""
+    pushed = [
+        1 if op in (row.CONSTANT, row.VARIABLE) else -int(op in (row.PLUS, row.TIMES))
+        for op, _ in code
+    ]
+    return int(np.cumsum(pushed).max(initial=0)) if code else 0

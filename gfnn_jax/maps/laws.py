@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, lift
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian
+from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian, coordinates_in
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre, family_of, law_of
@@ -121,8 +121,7 @@ def conformal(law: Lagrangian, covariance: np.ndarray) -> tuple[Lagrangian, np.n
     mass m and R = ½ρv² alone: γ = ρ/m; and the covariance (n, n) of (θ, γ), from that of (θ, ρ).
     Its map keeps a multiple of the symplectic form. Any other law as it is."""
     rows = law.terms.rows()
-    moved = [(k, n, m) for k, n, m, _ in rows if any(k)]
-    plain = all(sum(k) == 2 and not any(n) and not any(m) for k, n, m in moved)
+    plain = all(sum(row[0]) == 2 and not any(coordinates_in(row)) for row in rows if any(row[0]))
     alone = [row[1] for row in law.friction.rows()] == [LINEAR] and law.uniform == 0
     if law.powers is not None:  # γ is one number for all systems
         of_rate = [p for p, row in zip(law.powers, rows, strict=False) if any(row[0])]

@@ -25,7 +25,7 @@ from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, 
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.starts import best_start
-from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure
+from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import protected, weak_start
 from gfnn_jax.models.lagrangians.zeros import with_zeros_of_runs
 
@@ -74,7 +74,7 @@ def fit_given(given: Given, problem: ArcProblem) -> SearchResult:
     structure = Structure(d, given.terms, friction, (), problem.num_inputs, problem.sensors)
     structure, known = weak_start(structure, problem, prune=False)
     plain = all(row[3] == 0 for row in given.terms)  # a sine or a phase says where zero is
-    zeros = [i for i in problem.turned if plain and any(row[2][i] for row in given.terms)]
+    zeros = structure.with_a_zero(problem.turned) if plain else ()
     structure = structure.plus([("zero", i) for i in zeros])
     first, *longer = options.periods
     model = choose_rule(problem, structure, known, problem.arcs(first), problem.scales.sigma)
@@ -311,7 +311,7 @@ def without_degeneracies(fit: LawFit) -> LawFit:
     fixed, terms = protected(fit.structure), fit.structure.terms
     for row in terms:
         spring = ((0,) * len(row[0]), row[0], *row[2:])
-        couples = max(row[0]) == 1 and not any(row[1]) and not any(row[2])
+        couples = max(row[0]) == 1 and is_constant(row)
         if couples and spring not in fit.structure.terms:
             with_it = fit.again(fit.structure.plus([("term", spring)]), rescale=False)
             fit = with_it if with_it.degenerate() else fit

@@ -22,10 +22,17 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import UNIFORM, Friction, Powers, Terms, functions_of
+from gfnn_jax.families.lagrangian import (
+    UNIFORM,
+    Friction,
+    Powers,
+    Terms,
+    coordinates_in,
+    functions_of,
+)
 from gfnn_jax.flows.motion import Form
 
-Row = tuple[Any, ...]  # (k, n, m, φ), or (k, n, m, φ, powers of parameters)
+Row = tuple[Any, ...]  # (k, n, m, φ), then a shape where it has one, and powers of parameters
 Loss = tuple[Any, ...]  # (c, kind, ε), or (c, kind, ε, powers of parameters)
 Key = tuple[Any, ...]
 
@@ -43,7 +50,7 @@ def powers_of(row: Row | Loss, count: int) -> tuple[int, ...]:
 
 def is_constant(row: Row) -> bool:
     """Return whether a term depends on no coordinate, but on velocities at most."""
-    return not any(row[1]) and not any(row[2])
+    return not any(coordinates_in(row))
 
 
 def _moves(key: Key, part: tuple[int, ...]) -> bool:
@@ -52,8 +59,13 @@ def _moves(key: Key, part: tuple[int, ...]) -> bool:
         return key[1] in part
     if key[0] not in ("term", "loss"):
         return False
-    vectors = key[1][:3] if key[0] == "term" else key[1][:1]
-    return any(vector[i] for vector in vectors for i in part)
+    moved = _touched(key[1]) if key[0] == "term" else key[1][0]
+    return any(moved[i] for i in part)
+
+
+def _touched(row: Row) -> list[bool]:
+    """Return whether a term is one of each coordinate or of its velocity."""
+    return [bool(k or f) for k, f in zip(row[0], coordinates_in(row), strict=True)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,19 +98,20 @@ class Structure:
         return np.array([known.get(key, 0.0) for key in self.keys()])
 
     def with_a_zero(self, angles: Sequence[int]) -> tuple[int, ...]:
-        """The angles that have modes in its terms and no powers: their zero can be fitted."""
+        """The angles that have modes in its terms, and no powers or shapes: their zero can be
+        fitted."""
         moved = [i for i in angles if any(row[2][i] for row in self.terms)]
         return tuple(i for i in moved if not self.has_powers(i))
 
     def has_powers(self, i: int) -> bool:
-        """Return whether a term is a power of coordinate i."""
-        return any(row[1][i] for row in self.terms)
+        """Return whether a term has a power of coordinate i, or a shape of it."""
+        return any(coordinates_in(row, phased=False)[i] for row in self.terms)
 
     @functools.cached_property
     def uncoupled(self) -> tuple[tuple[int, ...], ...]:
         """The coordinates in parts that no term or friction couples, that of the first one first; a
         part that nothing sets in motion belongs to the first. One part where systems differ."""
-        rows = [[any(of) for of in zip(*row[:3], strict=True)] for row in self.terms]
+        rows = [_touched(row) for row in self.terms]
         rows += [list(map(bool, row[0])) for row in self.friction]
         part = np.arange(self.dim) if self.powers is None else np.zeros(self.dim, int)
         for row in rows:
@@ -118,8 +131,7 @@ class Structure:
         own = [k for k, row in enumerate(self.terms) if any(row[0][i] == 2 for i in part)]
 
         def rank(k: int) -> tuple[int, bool]:
-            speeds, powers, wave = self.terms[k][:3]
-            return speeds.index(2), any(powers) or any(wave)
+            return self.terms[k][0].index(2), not is_constant(self.terms[k])
 
         return min(own, key=rank)
 
