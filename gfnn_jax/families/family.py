@@ -19,7 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from gfnn_jax.arrays import as_row, matmul, namespace, pytree
 from gfnn_jax.errors import FitError
-from gfnn_jax.phase_space import TIME
+from gfnn_jax.phase_space import TIME, apply_j, symplectic_form
 
 
 @runtime_checkable
@@ -77,6 +77,24 @@ def at_time(family: Any, args: Any, after: Any) -> Any:
     time = time + after
     still = xp.broadcast_to(args[..., :-1], (*time.shape, args.shape[-1] - 1))
     return xp.concatenate([still, time[..., None]], axis=-1)
+
+
+def turned(family: Any, covector: Any) -> Any:
+    """Velocity of a gradient (..., n): J g, or Ω g of a family that has another constant ``form`` Ω
+    (n, n). NumPy or JAX."""
+    form = getattr(family, "form", None)
+    return apply_j(covector) if form is None else matmul(covector, form.T)
+
+
+def velocity(family: Any, params: Any, w: Any, args: Any = None) -> Any:
+    """Velocity (..., n) of H, a family, at states w: its gradient `turned`."""
+    return turned(family, family.gradient(params, w, args))
+
+
+def form_of(family: Any, width: int) -> Any:
+    """Matrix (width, width) of `turned`."""
+    form = getattr(family, "form", None)
+    return symplectic_form(width // 2) if form is None else form
 
 
 @runtime_checkable

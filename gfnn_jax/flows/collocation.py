@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.family import at_time, parameter_gradients
+from gfnn_jax.families.family import at_time, form_of, parameter_gradients, turned, velocity
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.flows.uniform import Uniform
-from gfnn_jax.phase_space import apply_j, symplectic_form
+from gfnn_jax.phase_space import apply_j
 
 _EPS = float(np.finfo(np.float64).eps)
 _FLOOR = 4 * _EPS  # of a state's size: a change of the stages that small is roundoff
@@ -145,7 +145,7 @@ def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True, 
     Newton's method. scale: as of `images`.
     """
     size = np.abs(z) + (np.abs(z).mean(axis=1, keepdims=True) if scale is None else scale)
-    slopes = np.repeat(apply_j(family.gradient(params, z, args))[None], len(rule.weights), axis=0)
+    slopes = np.repeat(velocity(family, params, z, args)[None], len(rule.weights), axis=0)
     change, earlier = np.full((2, len(z)), np.inf)
     free = matrix_free(family)
     open_, slow = np.ones(len(z), bool), np.zeros(len(z), bool)
@@ -154,7 +154,7 @@ def solve_stages(family, params, z, h, rule, args=None, *, newton: bool = True, 
         step, given = of_lanes(h, lanes), of_lanes(args, lanes)
         inside = z[lanes] + step * _summed(rule.matrix, slopes[:, lanes])
         given = at_stages(family, given, step, rule)
-        new = apply_j(family.gradient(params, inside, given))
+        new = velocity(family, params, inside, given)
         moved = abs(step) * np.abs(new - slopes[:, lanes])
         slopes[:, lanes] = new
         relative = np.max(moved / (size[lanes] + abs(step) * np.abs(new)), axis=(0, 2))
@@ -181,13 +181,14 @@ def _newton(family, params, z, h, rule, args):
     """Newton's method on the stages from constant slopes, each step halved until the residual is
     smaller."""
     count, (lanes, width) = len(rule.weights), z.shape
-    slopes = np.repeat(apply_j(family.gradient(params, z, args))[None], count, axis=0)
+    form = form_of(family, width)
+    slopes = np.repeat(velocity(family, params, z, args)[None], count, axis=0)
     args = at_stages(family, args, h, rule)
 
     def residual(slopes):
         inside = z + h * _summed(rule.matrix, slopes)
         gradient, hessian = family.gradient_and_hessian(params, inside, args)
-        return slopes - apply_j(gradient), hessian
+        return slopes - turned(family, gradient), hessian
 
     error, hessian = residual(slopes)
     norm = _largest(error)
@@ -195,7 +196,7 @@ def _newton(family, params, z, h, rule, args):
     fresh = np.ones(lanes, bool)
     for _ in range(3 * _MOST_NEWTON):
         if fresh.any():
-            matrix = stage_matrix(hessian[:, fresh], of_lanes(h, fresh), rule)
+            matrix = stage_matrix(form, hessian[:, fresh], of_lanes(h, fresh), rule)
             flat = error[:, fresh].transpose(1, 0, 2).reshape(fresh.sum(), -1)
             step[:, fresh] = (
                 solve(matrix, flat[..., None])[..., 0].reshape(-1, count, width).transpose(1, 0, 2)
@@ -223,14 +224,14 @@ def _largest(slopes):
     return np.where(np.isfinite(largest), largest, np.inf)
 
 
-def stage_matrix(hessian, h, rule):
-    """I − h A ⊗ JH'' (B, s·2d, s·2d) from the stages' Hessians (s, B, 2d, 2d): what a change of the
-    slopes K is multiplied by in their equation. h: a number or (B, 1)."""
+def stage_matrix(form, hessian, h, rule):
+    """I − h A ⊗ JH'' (B, s·2d, s·2d) from J and the stages' Hessians (s, B, 2d, 2d): what a change
+    of the slopes K is multiplied by in their equation. h: a number or (B, 1)."""
     count, lanes, width = hessian.shape[:3]
-    turned = symplectic_form(width // 2) @ hessian
+    bent = form @ hessian
     if np.ndim(h):
-        turned, h = h[None, :, :, None] * turned, 1.0
-    coupled = np.einsum("ij,ibkl->bikjl", -h * rule.matrix, turned, optimize=False)
+        bent, h = h[None, :, :, None] * bent, 1.0
+    coupled = np.einsum("ij,ibkl->bikjl", -h * rule.matrix, bent, optimize=False)
     coupled = coupled.reshape(lanes, count * width, count * width)
     coupled[:, np.arange(count * width), np.arange(count * width)] += 1.0
     return coupled
@@ -296,10 +297,10 @@ def _derivatives(family, params, inside, h, rule, args, along):
     dZ = dz + h Σ b_i dK_i: the rows h bᵀ N⁻¹ are solved for once, whatever the number of terms.
     """
     count, lanes, width = inside.shape
-    form = symplectic_form(width // 2)
+    form = form_of(family, width)
     args = at_stages(family, args, h, rule)
     _, hessian = family.gradient_and_hessian(params, inside, args)
-    transposed = stage_matrix(hessian, h, rule).swapaxes(1, 2)
+    transposed = stage_matrix(form, hessian, h, rule).swapaxes(1, 2)
     weights = np.kron(rule.weights[:, None], np.eye(width))
     weights = h[:, :, None] * weights if np.ndim(h) else h * weights
     adjoint = solve(transposed, np.broadcast_to(weights, (lanes, *weights.shape[-2:])))

@@ -21,13 +21,13 @@ from jax.core import Tracer
 
 from gfnn_jax.arrays import as_row, matmul, pytree
 from gfnn_jax.families import as_family
-from gfnn_jax.families.family import at_time
+from gfnn_jax.families.family import at_time, form_of, turned, velocity
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.flows.uniform import Uniform, power
 from gfnn_jax.generating.generated import two_sum
-from gfnn_jax.phase_space import apply_j, area, symplectic_form
+from gfnn_jax.phase_space import apply_j, area
 from gfnn_jax.solve import fixed_point, krylov, newton
 from gfnn_jax.solve.linear import small_solve
 from gfnn_jax.solve.newton import Evaluation, largest
@@ -57,7 +57,7 @@ class StageEquation:
         h = own[0] if own else h
         slopes, inside = self._inside(z, x)
         args = _at_stages(family, args, h, self.stages)
-        field = _weighted(h, inside) * apply_j(family.gradient(params, inside, args))
+        field = _weighted(h, inside) * velocity(family, params, inside, args)
         return self._evaluation(z, slopes, field, scale)
 
     def linearise(self, shared, lanes, x) -> tuple[Evaluation, Any]:
@@ -67,10 +67,10 @@ class StageEquation:
         slopes, inside = self._inside(z, x)
         args = _at_stages(family, args, h, self.stages)
         gradient, hessian = family.gradient_and_hessian(params, inside, args)
-        field = _weighted(h, inside) * apply_j(gradient)
+        field = _weighted(h, inside) * turned(family, gradient)
         evaluation = self._evaluation(z, slopes, field, scale)
         unit = jnp.tile(scale, self.stages) / self.stages
-        return evaluation, stage_matrix(hessian, h, self.stages) / unit[None, :, None]
+        return evaluation, stage_matrix(family, hessian, h, self.stages) / unit[None, :, None]
 
     def unit(self, shared, lanes):
         """The residual's units (B, s·2d)."""
@@ -132,15 +132,24 @@ class Flow:
 
     def value(self, z, args=None):
         """H at states z (..., 2d), NumPy or JAX."""
+        z = z if self._lift is None else self._lift.up(z)
         return self.family.value(self.params, z, args)
+
+    @property
+    def _lift(self):
+        """The lift of the states of a bracket, of `flows.lifts`; None for (q, p)."""
+        return getattr(self.family, "lift", None)
 
     def image(self, z, args=None):
         """Images of the states z (N, 2d), in NumPy: NaN where a stage has no solution. args: (N, k)
         or None."""
         steps = Steps(self.stages, self.substeps)
         params, dt = jax.tree.map(np.asarray, self.params), float(np.asarray(self.dt))
-        scale = np.asarray(self.scale)
-        return images(self.family, params, z, dt, steps, args=args, scale=scale).states
+        lift, scale = self._lift, np.asarray(self.scale)
+        if lift is not None:
+            z, scale = lift.up(z), lift.sizes(scale)
+        states = images(self.family, params, z, dt, steps, args=args, scale=scale).states
+        return states if lift is None else lift.down(states)
 
     def over(self, dt) -> Flow:
         """The flow over another dt, a number or (B,), in substeps that are no longer than those of
@@ -158,7 +167,10 @@ class Flow:
             moved, info = self._increment(z, args, unrolled)
             return z + moved, info
 
-        return self._repeated(substep, z, args)
+        if self._lift is None:
+            return self._repeated(substep, z, args)
+        w, info = self._repeated(substep, self._lift.up(z), args)
+        return self._lift.down(w), info
 
     def compensated_step(self, z, compensation, args=None):
         """(Z, compensation, Info) of z + compensation, which is what rounding has lost so far."""
@@ -168,8 +180,22 @@ class Flow:
             moved, info = self._increment(z, args, False)
             return two_sum(z, moved + lost), info
 
+        if self._lift is not None:
+            return self._lifted_step(z, compensation, args)
         (z, compensation), info = self._repeated(substep, (z, compensation), args)
         return z, compensation, info
+
+    def _lifted_step(self, z, compensation, args):
+        """`compensated_step` of a bracket, which keeps its Casimirs."""
+        lift = self.family.lift
+
+        def substep(both, args):
+            w, total = both
+            moved, info = self._increment(w, args, False)
+            return (w + moved, total + lift.moved(w, moved)), info
+
+        (_, total), info = self._repeated(substep, (lift.up(z), jnp.zeros_like(z)), args)
+        return *self.family.casimirs.kept(z, compensation, total), info
 
     def action(self, z, image, origin, args=None):
         """The action (B,) of the step from z (B, 2d) to its image: the method's own sum
@@ -253,13 +279,14 @@ class Flow:
         h, family = self._substep, self.family
         if isinstance(family, Uniform):
             family, args = family.begun(args, z)
-        shared = (family, self.params, h, self.scale)
+        scale = self.scale if self._lift is None else self._lift.sizes(jnp.asarray(self.scale))
+        shared = (family, self.params, h, scale)
         if self.newton:
             equation = StageEquation(self.stages)
             if args is not None:  # open lanes are taken out of the batch, with their own
                 args = jnp.broadcast_to(args, (z.shape[0], args.shape[-1]))
             lanes = (z, args, h) if jnp.ndim(h) else (z, args)
-            first = h * apply_j(family.gradient(self.params, z, args))
+            first = h * velocity(family, self.params, z, args)
             weights = np.repeat(gauss(self.stages).weights, first.shape[-1])
             guess = jnp.tile(first, self.stages) * jnp.asarray(weights, first.dtype)[None]
             if unrolled:
@@ -286,13 +313,13 @@ def _fixed_point(stages: int, shared, z, args):
     # Of h K, of which L is about an s-th.
     size = jax.lax.stop_gradient(jnp.abs(z) + as_row(scale, z))[None] / stages
     like = jnp.broadcast_to(z[None], (stages, *z.shape))
-    slopes = _weighted(h, like) * apply_j(family.gradient(params, z, args))[None]
+    slopes = _weighted(h, like) * velocity(family, params, z, args)[None]
     lanes = jnp.zeros(z.shape[0], jnp.int32)
 
     def improve(carry):
         slopes, change, open_, iterations = carry
         inside = z[None] + _coupled(slopes)
-        new = _weighted(h, inside) * apply_j(family.gradient(params, inside, at))
+        new = _weighted(h, inside) * velocity(family, params, inside, at)
         moved = jax.lax.stop_gradient(largest(_flat(jnp.abs(new - slopes) / size)))
         settled = (moved <= eps**_SETTLED) & (moved > 0.5 * change)
         goes_on = ~((moved <= _FLOOR_EPS * eps) | settled) & jnp.isfinite(moved)
@@ -341,7 +368,7 @@ def _stages_jvp(stages, primals, tangents):
         family, params, h, _ = shared
         inside = z[None] + _coupled(slopes)
         at = _at_stages(family, args, h, stages)
-        return _weighted(h, inside) * apply_j(family.gradient(params, inside, at))
+        return _weighted(h, inside) * velocity(family, params, inside, at)
 
     _, field_dot = jax.jvp(field, primals, tangents)
     if matrix_free(family):
@@ -353,7 +380,7 @@ def _stages_jvp(stages, primals, tangents):
         inside = z[None] + _coupled(slopes)
         at = _at_stages(family, args, h, stages)
         _, hessian = family.gradient_and_hessian(params, inside, at)
-        solved = small_solve(stage_matrix(hessian, h, stages), _flat(field_dot))
+        solved = small_solve(stage_matrix(family, hessian, h, stages), _flat(field_dot))
     slopes_dot = _of_stages(solved, stages)
     integer_dot: Any = np.zeros(info.status.shape, jax.dtypes.float0)
     info_dot = Info(integer_dot, integer_dot, jnp.zeros_like(info.residual))
@@ -388,12 +415,12 @@ def _of_stages(x, stages: int):
     return jnp.swapaxes(x.reshape(len(x), stages, -1), 0, 1)
 
 
-def stage_matrix(hessian, h, stages: int):
+def stage_matrix(family, hessian, h, stages: int):
     """1 − h b_i μ_ij JH''_i (B, s·2d, s·2d), from the stages' Hessians (s, B, 2d, 2d).
 
     h: a number or (B, 1)."""
     _, lanes, width, _ = hessian.shape
-    form = jnp.asarray(symplectic_form(width // 2), hessian.dtype)
+    form = jnp.asarray(form_of(family, width), hessian.dtype)
     rule = gauss(stages)
     matrix = jnp.asarray(rule.weights[:, None] * rule.coupling, hessian.dtype)
     # Row (i, a), column (j, b): what a change of the slope j adds to stage i, seen by its field.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gfnn_jax.families.family import form_of
 from gfnn_jax.families.sums import matrix_free
-from gfnn_jax.phase_space import apply_j, symplectic_form
+from gfnn_jax.phase_space import apply_j
 
 REACH = 1.0  # h‖H''‖ of one substep: Hénon–Heiles at dt 0.5 to 3, three bodies at dt 0.1 and 0.5
 # States and iterations by which the fastest rate of a large system is estimated.
@@ -33,7 +34,7 @@ def rates(family, coefficients, z, args=None) -> np.ndarray:
     if not matrix_free(family):
         _, hessian = family.gradient_and_hessian(coefficients, z, args)
         finite = np.isfinite(hessian).all(axis=(1, 2))
-        turned = symplectic_form(z.shape[1] // 2) @ hessian[finite]
+        turned = form_of(family, z.shape[1]) @ hessian[finite]
         found = np.full(len(z), np.nan)
         found[finite] = np.abs(np.linalg.eigvals(turned)).max(axis=-1, initial=0.0)
         return found
