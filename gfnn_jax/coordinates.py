@@ -47,6 +47,8 @@ class Coordinates:
 
 
 CARTESIAN = Coordinates("cartesian")
+# Of a log-canonical bracket: not canonical, but its bracket is constant in log z.
+LOG = Coordinates("log", forward=jnp.log, inverse=jnp.exp)
 
 
 def _to_polar(z):

@@ -129,7 +129,7 @@ def stablehlo(map_: SymplecticMap, about: dict[str, Any]) -> bytes:
     if dtype == np.float64:
         require_x64("a float64 map")
     (batch,) = exporting.symbolic_shape("b")
-    shapes = [(batch, 2 * map_.dim)]
+    shapes = [(batch, map_.width)]
     if map_.parameters is not None:
         shapes.append((batch, len(map_.parameters.names)))
     given = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]

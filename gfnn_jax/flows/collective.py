@@ -101,23 +101,22 @@ class Casimirs:
         change: list[Any] = [(jnp.zeros_like(z[:, 0]),) * 2] * count
         slopes = jnp.zeros((len(z), count, z.shape[1]), z.dtype)
         half, below = two_sum(z, 0.5 * moved)
-        below = below + lost
+        below, ended = below + lost, z + moved
         for (number, a, b), value in zip(self.entries, self.values, strict=True):
             by, rest = two_product(value, moved[:, a])
             slope = value
             if b >= 0:
                 by, more = two_product(at := by, half[:, b])
                 rest = more + (at * below[:, b] + rest * half[:, b])
-                slope = value * z[:, b]
+                slope = value * ended[:, b]
             total, lower = change[number]
             total, error = two_sum(total, by)
             change[number] = total, lower + (error + rest)
             slopes = slopes.at[:, number, a].add(slope)
         found = jnp.stack([total + lower for total, lower in change], axis=-1)
         products = jnp.einsum("bia,bja->bij", slopes, slopes, precision="highest")
-        size = jnp.einsum("bii->bi", products)
-        ridge = _PARALLEL * jnp.eye(count, dtype=z.dtype) * size[:, :, None]
-        factors = small_solve(products + ridge, found)
+        ridge = 1.0 + _PARALLEL * jnp.eye(count, dtype=z.dtype)[None]
+        factors = small_solve(products * ridge, found)
         correction = -jnp.einsum("bi,bia->ba", factors, slopes, precision="highest")
         return jnp.where(jnp.isfinite(correction), correction, 0.0)
 
@@ -135,15 +134,19 @@ def casimirs_of(bracket: Bracket) -> Casimirs:
 
 
 def two_product(a, b):
-    """a · b as rounded, and the rounding error (..., to twice the digits), by JAX."""
-    high, low = zip(*map(_halves, (a, b)), strict=True)
-    product = a * b
-    error = (high[0] * high[1] - product) + high[0] * low[1] + low[0] * high[1]
-    return product, error + low[0] * low[1]
+    """a · b as a sum of two numbers, to twice the digits, by JAX.
+
+    All products are exact, so that it does not matter which of them a compiler fuses with a sum.
+    """
+    (a, below_a), (b, below_b) = _halves(a), _halves(b)
+    total, rest = two_sum(a * b, a * below_b)
+    total, more = two_sum(total, below_a * b)
+    return total, rest + (more + below_a * below_b)
 
 
 def _halves(a):
-    """a as a sum of two numbers of half its digits, whose products are exact."""
-    digits = jnp.finfo(a.dtype).nmant
-    high = jax.lax.reduce_precision(a, jnp.finfo(a.dtype).nexp, digits // 2)
+    """a as a sum of two numbers of half its digits."""
+    digits = jnp.finfo(a.dtype)
+    # One digit is implicit: products of a half with the other number are of 26 and 27 digits.
+    high = jax.lax.reduce_precision(a, digits.nexp, digits.nmant // 2 - 1)
     return high, a - high

@@ -244,7 +244,7 @@ class Shear(Lift):
         slopes = xp.stack([slope for slope, _ in found], axis=-2)  # ∂A_j/∂w, (..., d, 2d)
         still = xp.eye(2 * d, dtype=w.dtype)
         top = xp.broadcast_to(still[:d], slopes.shape)
-        bottom = matmul(self.inverse, still[d:] - slopes)
+        bottom = matmul(self.inverse, as_row(still[d:], slopes) - slopes)
         jacobian = xp.concatenate([top, bottom], axis=-2)
         u = matmul(g[..., d:], self.inverse)
         curved = sum(bend * u[..., j, None, None] for j, (_, bend) in enumerate(found))

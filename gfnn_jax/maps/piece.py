@@ -1,7 +1,7 @@
 """Pieces of a map, one protocol: a step of a batch, its inverse and its multiplier.
 
 The derivative A of a step has AᵀJA = μJ: μ = 1 of a symplectic piece, e^(−γ dt) of one with uniform
-friction γ.
+friction γ. Of a bracket it has A B(z) Aᵀ = μ B(Z).
 """
 
 from __future__ import annotations

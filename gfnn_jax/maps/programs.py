@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gfnn_jax.brackets import poisson_defect
 from gfnn_jax.compiling import compiled_sooner
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.inner import applied, inner, reduced
@@ -44,7 +45,7 @@ def step(map_, z, args):
 @partial(compiled_sooner, static_argnums=(3,), seldom_run=True)
 @of_one_or_many
 def defect(map_, z, args, unrolled):
-    """Symplecticity defect ‖AᵀJA − μJ‖ (B,) of the unrolled derivative A, in units of the scale."""
+    """Defect (B,) of the unrolled derivative A, in units of the scale: `SymplecticMap.defect`."""
     multiplier = map_.multiplier(args)
     if multiplier is None:
         return jnp.full(z.shape[0], jnp.nan, z.dtype)
@@ -53,14 +54,18 @@ def defect(map_, z, args, unrolled):
         step = partial(applied, map_, args=args, unrolled=unrolled)
         return jax.jvp(lambda y: step(y)[0], (z,), (jnp.broadcast_to(unit, z.shape),))[1]
 
-    width = z.shape[1]
-    if width > _WIDEST:
+    width, bracket = z.shape[1], map_.bracket
+    if width > _WIDEST and bracket is None:
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (2 * _TANGENT_PAIRS, width))
         before = jnp.asarray(signs / np.sqrt(width), z.dtype) * map_.scale[None]
         after = jax.vmap(tangent)(before)
         return defect_of_pairs(before[:, None], after, map_.scale, multiplier)
     jacobian = jax.vmap(tangent, out_axes=-1)(jnp.eye(z.shape[1], dtype=z.dtype))
-    return symplecticity_defect(jacobian, map_.scale, multiplier)
+    if bracket is None:
+        return symplecticity_defect(jacobian, map_.scale, multiplier)
+    image, _ = applied(map_, z, args)
+    forms = bracket.matrix(z), bracket.matrix(image)
+    return poisson_defect(jacobian, *forms, map_.scale, multiplier)
 
 
 @compiled_sooner

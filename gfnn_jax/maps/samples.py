@@ -128,8 +128,8 @@ class Samples:
         z0 = np.asarray(z0)
         if z0.ndim not in (2, 3) or (z0.ndim == 3 and len(z0) != len(self)):
             raise ValueError(
-                f"expected states of shape (B, {2 * self.map.dim}) or "
-                f"({len(self)}, B, {2 * self.map.dim}), got {z0.shape}"
+                f"expected states of shape (B, {self.map.width}) or "
+                f"({len(self)}, B, {self.map.width}), got {z0.shape}"
             )
         one = self.map._states(z0[0] if z0.ndim == 3 else z0)
         args = self.map._args(params, one, t0)

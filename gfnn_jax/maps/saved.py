@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from gfnn_jax import brackets
-from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.coordinates import CARTESIAN, LOG, Coordinates
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import lagrangian
 from gfnn_jax.families.displacements import OfDisplacement
@@ -32,6 +32,8 @@ from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.sums import Groups, Part, Sums, Windows
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.families.time_step import OfTimeStep
+from gfnn_jax.flows import lifts
+from gfnn_jax.flows.collective import Casimirs, Collective
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.legendre import Legendre
@@ -101,6 +103,12 @@ _TYPES: dict[str, type] = {
         brackets.Log,
         brackets.LieAlgebra,
         brackets.Magnetic,
+        Collective,
+        Casimirs,
+        lifts.Itself,
+        lifts.Logarithms,
+        lifts.Quadratic,
+        lifts.Shear,
     )
 } | {"LagrangianTerms": lagrangian.Terms}
 _NAMES = {kind: name for name, kind in _TYPES.items()}
@@ -271,7 +279,7 @@ def _features(map_: SymplecticMap) -> list:
 def _lender(map_: SymplecticMap, scene: Scene | None) -> str | None:
     """Name of the scene that lends the map its functions; None where it needs none."""
     features = _features(map_)
-    changed = map_.coordinates.forward is not CARTESIAN.forward
+    changed = map_.coordinates.forward not in (CARTESIAN.forward, LOG.forward)
     if not (features or changed):
         return None
     for lender in [scene] if scene is not None else [make() for make in SCENES.values()]:
@@ -301,7 +309,8 @@ def _encode(value: Any) -> tuple[Any, Any]:
         return value.item(), None
     if isinstance(value, Coordinates):
         text = {"name": value.name, "angles": list(value.angles), "cyclic": list(value.cyclic)}
-        change = None if value.forward is CARTESIAN.forward else _OF_SCENE
+        known = {CARTESIAN.forward: None, LOG.forward: LOG.name}
+        change = known.get(value.forward, _OF_SCENE)
         return {"type": "Coordinates", **text, "change": change}, None
     if type(value) in _NAMES:
         names = _fields_of(type(value))
@@ -384,6 +393,8 @@ def _decode_coordinates(text: dict[str, Any], scene: Scene | None) -> Coordinate
     angles, cyclic = tuple(text["angles"]), tuple(text["cyclic"])
     if text["change"] is None:
         return Coordinates(text["name"], angles, cyclic)
+    if text["change"] == LOG.name:
+        return LOG
     if scene is None or (scene.coordinates.angles, scene.coordinates.cyclic) != (angles, cyclic):
         raise InputError(f"needs the {text['name']} coordinates of its scene, which has others")
     return scene.coordinates

@@ -82,7 +82,7 @@ class Sharded:
         z0 = np.asarray(self.map._states(z0))
         if z0.ndim != 2 or not len(z0):
             raise ValueError(
-                f"expected states of shape (B, {2 * self.map.dim}), B > 0; got {z0.shape}"
+                f"expected states of shape (B, {self.map.width}), B > 0; got {z0.shape}"
             )
         return z0, self._args(params, z0, t0)
 

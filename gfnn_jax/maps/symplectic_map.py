@@ -23,6 +23,7 @@ import numpy as np
 from jax.core import Tracer
 
 from gfnn_jax.arrays import pytree
+from gfnn_jax.brackets import Bracket
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.flows.flow import Flow
@@ -66,6 +67,7 @@ class SymplecticMap:
     signals:      names of the inputs that act on the system, or None.
     sensors:      columns of the recording that the map was learned from, with their noise, or None.
                   They are no leaf.
+    bracket:      bracket of the user's coordinates (n,) where these are no (q, p), or None.
     posterior:    posterior of the coefficients, or None. It is no leaf: a map that is made of the
                   leaves (``jit``, ``jax.tree.map``) has none.
 
@@ -90,6 +92,7 @@ class SymplecticMap:
     dt_range: Any = None
     signals: Signals | None = None
     sensors: Sensors | None = None
+    bracket: Bracket | None = None
 
     def __post_init__(self):
         if isinstance(self.dt, (int, float)):
@@ -104,6 +107,11 @@ class SymplecticMap:
     def dim(self) -> int:
         """Number d of degrees of freedom."""
         return self.scale.shape[-1] // 2
+
+    @property
+    def width(self) -> int:
+        """Number of coordinates of a state: 2d, or n of a bracket."""
+        return self.scale.shape[-1]
 
     def save(self, folder, **options) -> None:
         """Write a model folder, which ``gfnn.load`` reads; options: those of `maps.saved.save`."""
@@ -246,13 +254,14 @@ class SymplecticMap:
         if isinstance(args, Mapping):
             lanes = np.broadcast_shapes(*(np.shape(value) for value in args.values()))
             dtype = np.dtype(self.scale.dtype)
-            args = as_args(self.parameters, args, (*lanes, 2 * self.dim), dtype)
+            args = as_args(self.parameters, args, (*lanes, self.width), dtype)
             return jax.tree.map(np.asarray, self).multiplier(np.asarray(args))
         factors = [piece.multiplier(args) for piece in self.pieces]
         return None if any(factor is None for factor in factors) else math.prod(factors, start=1.0)
 
     def defect(self, z, args=None, *, t0=None, iterations=None):
-        """Symplecticity defect ‖AᵀJA − μJ‖ () or (B,) of the step's derivative A at z.
+        """Symplecticity defect ‖AᵀJA − μJ‖ () or (B,) of the step's derivative A at z; of a bracket
+        ‖A B(z) Aᵀ − μ B(Z)‖ relative to that of B(Z).
 
         It is in units of ``scale``, μ the multiplier; NaN where there is none.
 
@@ -322,6 +331,11 @@ class SymplecticMap:
         no flow. Both are NaN where one of these steps fails. Raises ValueError for a driven map,
         and for one with friction, which conserve no energy.
         """
+        if self.bracket is not None:
+            raise ValueError(
+                "expected a map of canonical (q, p); the flow of a law with a bracket has "
+                "map.hamiltonian"
+            )
         if self.parameters is not None and self.parameters.period is not None:
             raise ValueError("expected a map without a drive: a driven one conserves no energy")
         multiplier = self.multiplier()
@@ -478,8 +492,8 @@ class SymplecticMap:
             z = np.asarray(z, dtype)
         elif z.dtype != dtype:
             z = z.astype(dtype)
-        if z.ndim not in (1, 2) or z.shape[-1] != 2 * self.dim:
+        if z.ndim not in (1, 2) or z.shape[-1] != self.width:
             raise ValueError(
-                f"expected states of shape ({2 * self.dim},) or (B, {2 * self.dim}), got {z.shape}"
+                f"expected states of shape ({self.width},) or (B, {self.width}), got {z.shape}"
             )
         return z
