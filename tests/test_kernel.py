@@ -12,6 +12,7 @@ from pathlib import Path
 
 import motion_oracle
 import numpy as np
+import own_module  # noqa: F401
 import pytest
 
 import gfnn_jax
@@ -91,6 +92,7 @@ def test_steps_are_those_of_numpy(d, powers, dry, own):
 SHAPES = """
 sin(q1*q2) cos(q1)**3 tan(q2/3) exp(-q1) log(2+q1*q1) sqrt(2+q2) sinh(q1) cosh(q2) tanh(q1-q2)
 arctan(q1)/(2+q2*q2) (q1*q1+2)**-1.5 abs(q1-3) T4(q1)*q2 1/(1+q2/8)**9
+wall(1.2-q1)*exp(q2)/(2+wall(1+q2))
 """
 
 

@@ -161,6 +161,31 @@ def test_a_term(tmp_path):
         gfnn.register_function(own_module.Wall())
 
 
+def test_a_term_of_a_recording(tmp_path):
+    """The same particle, recorded: V = x²/2 + 4 wall(x), with friction."""
+    t = 0.05 * np.arange(600)
+
+    def field(_, z):
+        return [z[1], -z[0] - 8 * max(z[0] - 1, 0) - 0.05 * z[1]]
+
+    options = {"t_eval": t, "rtol": 1e-10, "atol": 1e-10, "max_step": 0.05}
+    x = solve_ivp(field, (0, t[-1]), [-2.0, 0.0], **options).y[0]
+    seen = x + 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    recording = gfnn.Recording({"t": t, "x": seen}, positions=["x"])
+    terms = ["V: x**2 + wall(x)"]
+    fit = gfnn.fit(recording.slice(stop=20.0), terms=terms, friction="linear")
+    found = {term.term: term for term in fit.lagrangian.terms}
+    assert abs(found["wall(x)"].coefficient + 4) < 4 * found["wall(x)"].std < 0.1
+    again = kept(fit.map, tmp_path / "m")
+    past, later = recording.slice(15.0, 20.0), t[401:440]
+    ahead, same = (map_.forecast(past, later).values["x"] for map_ in (fit.map, again))
+    assert np.abs(ahead[0] - x[401:440]).max() < 3e-3
+    np.testing.assert_array_equal(ahead, same)
+    assert gfnn.export(fit.map, "stablehlo", tmp_path / "m.zip").exists()
+    with pytest.raises(gfnn.InputError, match="your own function"):
+        gfnn.export(fit.map, "c", tmp_path / "m.c")
+
+
 @pytest.mark.parametrize("learn", ["map", "hamiltonian"])
 def test_a_noise_model_is_of_recordings(pairs, learn):
     with pytest.raises(gfnn.FitError, match="loss: not options of"):

@@ -7,6 +7,8 @@ import re
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
 from gfnn_jax.errors import InputError
 
 
@@ -70,6 +72,11 @@ def known_functions() -> tuple[str, ...]:
 _OWN: dict[str, Function] = {}
 
 
+def own_function(name: str) -> Function | None:
+    """The function of a user's own of this name; None where there is none."""
+    return _OWN.get(name)
+
+
 def register_function(function: Function) -> Function:
     """Make a function known to formulas by its name, in terms that are given and in saved maps.
 
@@ -81,9 +88,15 @@ def register_function(function: Function) -> Function:
     if name in known_functions() and _OWN.get(name) is not function:
         raise InputError(f"'{name}' names another function already: choose another name")
     _OWN[name] = function
+
+    def derivatives(v: Any) -> tuple[Any, Any, Any]:
+        if getattr(v, "dtype", None) == np.dtype(object):  # symbols of an export
+            raise InputError(f"'{name}' is your own function, not C's: --to stablehlo")
+        return function.derivatives(v)
+
     DERIVATIVES[name] = (
-        lambda xp, v: function.derivatives(v)[0],
-        lambda xp, v, y: function.derivatives(v)[1],
-        lambda xp, v, y: function.derivatives(v)[2],
+        lambda xp, v: derivatives(v)[0],
+        lambda xp, v, y: derivatives(v)[1],
+        lambda xp, v, y: derivatives(v)[2],
     )
     return function

@@ -7,7 +7,14 @@ from collections.abc import Callable
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.expressions import Expression, as_expression, call, coordinate, power
+from gfnn_jax.families.expressions import (
+    Expression,
+    as_expression,
+    call,
+    coordinate,
+    number,
+    power,
+)
 from gfnn_jax.families.functions import known_functions
 
 
@@ -26,6 +33,20 @@ def traced(function: Callable, dim: int) -> list[Expression]:
     return [tree for out in results for tree in np.ravel(_trees(out)).tolist()]
 
 
+def traced_pieces(functions: Callable) -> list[Expression]:
+    """Trace ``functions(x)``, several of one number x, into expressions of the coordinate 0, which
+    may have pieces: nodes ">" (1 or 0), "max" and "select" (by a condition, of two).
+
+    Raises InputError where a function uses an operation that has no expression here.
+    """
+    import jax
+
+    closed = jax.make_jaxpr(functions)(jax.ShapeDtypeStruct((), np.float64))
+    x = np.asarray(coordinate(0), dtype=object)
+    results = _run(closed.jaxpr, closed.consts, [x], _ELEMENTWISE | _PIECES)
+    return [_trees(out).item() for out in results]
+
+
 _ELEMENTWISE: dict[str, Callable] = {
     "add": lambda a, b: a + b,
     "add_any": lambda a, b: a + b,
@@ -42,6 +63,19 @@ _ELEMENTWISE: dict[str, Callable] = {
     "stop_gradient": lambda a: a,
     **{name: (lambda a, name=name: call(name, a)) for name in known_functions() if name != "sqrt"},
 }
+_PIECES: dict[str, Callable] = {
+    "gt": lambda a, b: Expression(">", (a, b)),
+    "lt": lambda a, b: Expression(">", (b, a)),
+    "ge": lambda a, b: 1.0 - Expression(">", (b, a)),
+    "le": lambda a, b: 1.0 - Expression(">", (a, b)),
+    "max": lambda a, b: Expression("max", (a, b)),
+    "min": lambda a, b: -Expression("max", (-a, -b)),
+    "sign": lambda a: Expression(">", (a, number(0))) - Expression(">", (number(0), a)),
+    "select_n": lambda which, no, yes: Expression("select", (which, yes, no)),
+    "log1p": lambda a: call("log", 1.0 + a),
+    "expm1": lambda a: call("exp", a) - 1.0,
+    "logistic": lambda a: 1.0 / (1.0 + call("exp", -a)),
+}
 _MOVED = ("slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "rev")
 _REARRANGE = (*_MOVED, "gather", "dynamic_slice", "expand_dims")
 
@@ -52,7 +86,7 @@ def _trees(values):
     return _elementwise(as_expression, values) if values.size else values
 
 
-def _run(jaxpr, constants, arguments) -> list:
+def _run(jaxpr, constants, arguments, elementwise=_ELEMENTWISE) -> list:
     """Evaluate a jaxpr on object arrays of expressions; integers stay numbers."""
     known: dict = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True))
     known.update(zip(jaxpr.invars, arguments, strict=True))
@@ -62,18 +96,18 @@ def _run(jaxpr, constants, arguments) -> list:
 
     for equation in jaxpr.eqns:
         values = [read(atom) for atom in equation.invars]
-        results = _applied(equation.primitive, equation.params, values)
+        results = _applied(equation.primitive, equation.params, values, elementwise)
         known.update(zip(equation.outvars, map(np.asarray, results), strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _applied(primitive, params, values) -> list:
+def _applied(primitive, params, values, elementwise) -> list:
     import jax
 
     name = primitive.name
     inner = params.get("jaxpr", params.get("call_jaxpr"))
     if inner is not None and hasattr(inner, "jaxpr"):
-        return _run(inner.jaxpr, inner.consts, values)
+        return _run(inner.jaxpr, inner.consts, values, elementwise)
     if all(v.dtype != object for v in values):  # numbers only
         with jax.enable_x64(True):
             out = primitive.bind(*values, **params)
@@ -89,8 +123,8 @@ def _applied(primitive, params, values) -> list:
     values = [_trees(v) for v in values]
     if name == "stack":
         return [np.stack(values, axis=params["axis"])]
-    if name in _ELEMENTWISE:
-        return [_elementwise(_ELEMENTWISE[name], *values)]
+    if name in elementwise:
+        return [_elementwise(elementwise[name], *values)]
     if name == "integer_pow":
         return [_elementwise(lambda a: power(a, params["y"]), *values)]
     if name == "pow":

@@ -57,9 +57,12 @@ VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN = range(5)  # kinds of friction; COULOMB
 SIZES, DEGREE, FIRST_V, LAST_V, WAVE, COUNT, POWERED = range(7)
 WAVES, BEGINS, COLUMNS, KINDS, PROGRAMS, CODE, COORDINATES = range(7, 14)
 
-# Operations: variables and constants are put on the stack, sums and products take two from it.
-VARIABLE, CONSTANT, PLUS, TIMES, SQUARE, INVERSE_OF, ROOT, RAISED = range(8)
-SIN, COS, TAN, EXP, LOG, SINH, COSH, TANH, ARCTAN, ABS = range(8, 18)
+# Operations: variables, constants and values of the stack are put on it. Of two numbers that are
+# taken from it sum, product, the larger one, whether the first is greater; of three one, by the
+# first; of x, f, f' and f'' f(x).
+VARIABLE, CONSTANT, COPY, PLUS, TIMES, LARGER, GREATER, SELECT, COMPOSE = range(9)
+SQUARE, INVERSE_OF, ROOT, RAISED, SIN, COS, TAN, EXP, LOG = range(9, 18)
+SINH, COSH, TANH, ARCTAN, ABS = range(18, 23)
 
 # In the row of sizes: numbers of coordinates, terms, waves, frictions, dry ones without a width,
 # inputs, free coefficients of terms, coordinates in an f at the most; then where blocks of rows of
@@ -214,21 +217,29 @@ def _shape(n, f, j):
     bent = jet + 1 + most
     for e in range(n[PROGRAMS, j], n[PROGRAMS, j + 1]):
         operation, operand = n[CODE, e], f[OPERANDS, e]
-        if operation <= CONSTANT:
+        if operation <= COPY:
             top += 1
             for i in range(1 + most + most * most):
                 f[jet + i, top] = 0.0
-            f[jet, top] = operand
+            f[jet, top] = f[jet, int(operand)] if operation == COPY else operand
             if operation == VARIABLE:
                 own = int(operand)
                 f[jet, top] = f[X, n[COORDINATES + own, j]]
                 f[jet + 1 + own, top] = 1.0
-        elif operation <= TIMES:
-            top -= 1
+        elif PLUS <= operation <= SELECT:
+            top -= 2 if operation == SELECT else 1
             x, y = f[jet, top], f[jet, top + 1]
-            if operation == PLUS:
+            if operation != TIMES:
+                taken = top + (1 if operation == LARGER and y > x else 0)
+                if operation == SELECT:
+                    taken = top + (1 if x != 0.0 else 2)
                 for i in range(1 + most + most * most):
-                    f[jet + i, top] += f[jet + i, top + 1]
+                    if operation == PLUS:
+                        f[jet + i, top] += f[jet + i, top + 1]
+                    else:
+                        f[jet + i, top] = 0.0 if operation == GREATER else f[jet + i, taken]
+                if operation == GREATER and x > y:
+                    f[jet, top] = 1.0
                 continue
             for i in range(count):
                 for k in range(count):
@@ -240,8 +251,11 @@ def _shape(n, f, j):
                 f[at, top] = f[at, top] * y + x * f[at, top + 1]
             f[jet, top] = x * y
         else:
+            top -= 3 if operation == COMPOSE else 0
             x = f[jet, top]
-            if operation == SQUARE:
+            if operation == COMPOSE:
+                value, by, by_two = f[jet, top + 1], f[jet, top + 2], f[jet, top + 3]
+            elif operation == SQUARE:
                 value, by, by_two = x * x, 2.0 * x, 2.0
             elif operation == INVERSE_OF:
                 value = 1.0 / x

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from gfnn_jax.errors import InputError
 from gfnn_jax.families.expressions import Expression, depends_on, number
-from gfnn_jax.families.functions import CHEBYSHEV
+from gfnn_jax.families.functions import CHEBYSHEV, own_function
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction, Terms
+from gfnn_jax.families.traced import traced_pieces
 from gfnn_jax.flows import kernel as row
 from gfnn_jax.flows.dormand_prince import NODES, STAGES, WEIGHTS
 
@@ -20,7 +20,9 @@ _KINDS = {
     DRY: row.SMOOTHED,
     UNIFORM: row.EVEN,
 }
-_BINARY = {"+": row.PLUS, "*": row.TIMES}
+_BINARY = {"+": row.PLUS, "*": row.TIMES, "max": row.LARGER, ">": row.GREATER}
+_TAKEN = dict.fromkeys(_BINARY.values(), 1) | {row.SELECT: 2, row.COMPOSE: 3}  # from the stack
+_PUSHED = (row.VARIABLE, row.CONSTANT, row.COPY)
 _POWERS = {2.0: row.SQUARE, -1.0: row.INVERSE_OF, 0.5: row.ROOT}
 _FUNCTIONS = {
     "sin": row.SIN,
@@ -141,27 +143,38 @@ class Tables(NamedTuple):
 Operation = tuple[int, float]
 
 
-def operations(tree: Expression, slots: list[int]) -> list[Operation]:
-    """The operations of a shape in the order in which a stack computes them; coordinates by their
-    places among ``slots``."""
+def operations(tree: Expression, slots: list[int], at: int = 0) -> list[Operation]:
+    """The operations of a shape in the order in which a stack that holds ``at`` numbers computes
+    them; coordinates by their places among ``slots``.
+
+    Raises InputError for a function of a user's own that is no formula.
+    """
     kind, operands = tree.operation, tree.operands
     if kind == "number":
         return [(row.CONSTANT, operands[0])]
     if kind == "coordinate":
         return [(row.VARIABLE, float(slots.index(operands[0])))]
-    first = operations(operands[0], slots)
     if CHEBYSHEV.fullmatch(kind):
-        return operations(_chebyshev(int(kind[1:]), operands[0]), slots)
-    if kind == "power":
-        return [*first, (_POWERS.get(operands[1], row.RAISED), operands[1])]
-    if kind in _FUNCTIONS:
-        return [*first, (_FUNCTIONS[kind], 0.0)]
+        return operations(_chebyshev(int(kind[1:]), operands[0]), slots, at)
     if kind == "/":
-        below = [*operations(operands[1], slots), (row.INVERSE_OF, 0.0)]
-        return below if operands[0].value == 1 else [*first, *below, (row.TIMES, 0.0)]
-    if kind in _BINARY:
-        return [*first, *operations(operands[1], slots), (_BINARY[kind], 0.0)]
-    raise InputError(f"terms: '{kind}' is a function that the motion of a law cannot compute")
+        power = Expression("power", (operands[1], -1.0))
+        if operands[0].value == 1:
+            return operations(power, slots, at)
+        return operations(Expression("*", (operands[0], power)), slots, at)
+    trees = [operand for operand in operands if isinstance(operand, Expression)]
+    inner = [o for k, of in enumerate(trees) for o in operations(of, slots, at + k)]
+    if kind == "power":
+        return [*inner, (_POWERS.get(operands[1], row.RAISED), operands[1])]
+    if (own := own_function(kind)) is not None:
+        for k, piece in enumerate(traced_pieces(own.derivatives), 1):
+            inner += _of_place(operations(piece, [0], at + k), at)
+    known = _BINARY | _FUNCTIONS | {"select": row.SELECT}
+    return [*inner, (row.COMPOSE if own else known[kind], 0.0)]
+
+
+def _of_place(code: list[Operation], at: int) -> list[Operation]:
+    """Operations on a variable as those on a number of the stack."""
+    return [(row.COPY, at) if o == row.VARIABLE else (o, c) for o, c in code]
 
 
 def _chebyshev(n: int, x: Expression) -> Expression:
@@ -174,8 +187,7 @@ def _chebyshev(n: int, x: Expression) -> Expression:
 
 def _depth(code: list[Operation]) -> int:
     """The most numbers that are on the stack at once."""
-    pushed = [
-        1 if op in (row.CONSTANT, row.VARIABLE) else -int(op in (row.PLUS, row.TIMES))
-        for op, _ in code
-    ]
-    return int(np.cumsum(pushed).max(initial=0)) if code else 0
+    if not code:
+        return 0
+    steps = [1 if o in _PUSHED else -_TAKEN.get(o, 0) for o, _ in code]
+    return int(np.cumsum(steps).max())
