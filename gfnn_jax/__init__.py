@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from gfnn_jax.data.recording import Recording, read
     from gfnn_jax.errors import FitError, FitWarning, InputError, WorkError
     from gfnn_jax.evaluate import figures, metrics
+    from gfnn_jax.evaluate.discover import discover
     from gfnn_jax.exports.export import export
     from gfnn_jax.families import from_function
     from gfnn_jax.families.functions import register_function
@@ -66,6 +67,7 @@ _HOMES = {
     "SymplecticMap": "maps.symplectic_map",
     "TrainingData": "models.model",
     "WorkError": "errors",
+    "discover": "evaluate.discover",
     "enable_compile_cache": "compiling",
     "export": "exports.export",
     "fit": "learn.fit",
@@ -102,6 +104,7 @@ __all__ = [
     "SymplecticMap",
     "TrainingData",
     "WorkError",
+    "discover",
     "enable_compile_cache",
     "export",
     "figures",

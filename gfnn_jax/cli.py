@@ -11,13 +11,22 @@ import contextlib
 import dataclasses
 import json
 import os
+import shlex
 import sys
+import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from gfnn_jax import processes
-from gfnn_jax.cli_parser import column_options, fit_options, masses, names_roles, parser
+from gfnn_jax.cli_parser import (
+    OF_COLUMNS,
+    column_options,
+    fit_options,
+    masses,
+    names_roles,
+    parser,
+)
 from gfnn_jax.cli_process import (
     Terminated,
     collect_garbage_seldom,
@@ -28,22 +37,20 @@ from gfnn_jax.cli_process import (
 from gfnn_jax.cli_summary import (
     comparison_table,
     print_forecasts,
+    print_law,
     print_predicted,
     print_record,
     print_summary,
     print_table,
-    print_verdict,
 )
 from gfnn_jax.data.files import are_recordings
+from gfnn_jax.data.roles import ROLES
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new
 from gfnn_jax.storage.partial import unfinished_note
 
-_TO_BEGIN = (
-    "try `gfnn run two-body --quick`, or with your own pairs `gfnn fit DATA.npz --out MODEL`; "
-    "`gfnn --help` says more"
-)
+_TO_BEGIN = "try `gfnn double_pendulum`, or your own `gfnn FILE`; `gfnn --help` says more"
 
 
 def process() -> int:
@@ -58,7 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if not argv:
             raise InputError(f"expected a command, got none: {_TO_BEGIN}")
-        arguments = parser().parse_args(argv)
+        arguments = parser().parse_args(["run", *argv] if _is_data(argv[0]) else argv)
+        arguments.typed = shlex.join(["gfnn", *argv])
         with stopped_by_sigterm(), warnings_in_one_line():
             _COMMANDS[arguments.command](arguments)
         return 0
@@ -78,6 +86,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             143 if terminated else 130,
             "; ".join(["terminated" if terminated else "stopped", *kept]),
         )
+
+
+def _is_data(first: str) -> bool:
+    """Return whether this is a file or a record, which stand for ``gfnn run`` with them."""
+    from gfnn_jax.records import RECORDS
+
+    return first not in _COMMANDS and (first in RECORDS or Path(first).is_file())
 
 
 def _fail(status: int, why: object) -> int:
@@ -146,26 +161,55 @@ def _run(arguments: argparse.Namespace) -> None:
     if not arguments.resume:
         ensure_new(out, arguments.overwrite, folder=True)
     if arguments.scene in RECORDS or data.is_file():
-        return _run_record(arguments)
+        return _run_file(arguments)
+    _refuse_given(arguments, _OF_FILES, "only for files and records, not for a scene")
     with _output(arguments) as output:
         from gfnn_jax.jobs.run import run
 
         quick, options = arguments.quick, fit_options(arguments)
         ran = run(arguments.scene, output, quick=quick, dt=arguments.dt, **options)
     print_summary(ran, out)
+    _show(arguments)
     _hold_to(arguments.strict, out / "model")
 
 
-def _run_record(arguments: argparse.Namespace) -> None:
-    """The law and the forecasts of a record of the package, or of a file."""
-    others = tuple(name for name in (*_OF_MAPS, "learn", "dt") if name != "scene")
-    _refuse_given(arguments, others, "not for the law of a recording")
+def _run_file(arguments: argparse.Namespace) -> None:
+    """The law and the forecasts of a record of the package or of a file; the map of states q, p."""
     data, columns = _record_named(Path(arguments.scene))
+    given = column_options(arguments)
+    if not are_recordings(data, with_roles=names_roles(given)):
+        arguments.data = [data]
+        return _run_states(arguments)
+    others = tuple(name for name in (*_OF_MAPS, "learn", "quick") if name != "scene")
+    _refuse_given(arguments, others, "not for the law of a recording")
+    columns |= given | ({"dt": arguments.dt} if arguments.dt is not None else {})
+    options = {"mass": masses(arguments), "despite": arguments.despite}
     with _output(arguments) as output:
         from gfnn_jax.jobs.run_record import run_record
 
-        ran = run_record(data, output, columns=columns)
+        try:
+            ran = run_record(data, output, columns=columns, command=arguments.typed, **options)
+        finally:
+            _show(arguments)
     print_record(ran, arguments.out)
+
+
+def _run_states(arguments: argparse.Namespace) -> None:
+    """The map of states q, p, into a folder with its report."""
+    options = fit_options(arguments) | {"angles": _as_indices(column_options(arguments))}
+    with _output(arguments) as output:
+        from gfnn_jax.jobs.fit import fit
+
+        ran = fit(arguments.data, output, dt=arguments.dt, command=arguments.typed, **options)
+    print_summary(ran, arguments.out)
+    _show(arguments)
+
+
+def _show(arguments: argparse.Namespace) -> None:
+    """Open the report where that is asked for and there is one."""
+    page = arguments.out / "report.html"
+    if arguments.open and page.is_file():
+        webbrowser.open(page.resolve().as_uri())
 
 
 def _record_named(path: Path) -> tuple[Path, dict[str, Any]]:
@@ -271,8 +315,7 @@ def _fit_recording(
     if not is_law:
         return _print_fitted(arguments, ran)
     gains = ran.fit.gains
-    print_verdict(ran.fit)
-    print(ran.fit.table)
+    print_law(ran.fit)
     print(f"written to {arguments.out}")
     if "stop" in columns:  # what no fit has seen is in the file
         compared = f" --to {columns['stop']:g} --compare {arguments.data[0]}"
@@ -300,8 +343,9 @@ def _hold_to(strict: bool, model: Path) -> None:
         raise WorkError(f"{model}: was written, but misses the tolerance (--strict)")
 
 
-# Options of `gfnn fit` that the law of a recording has not; options of `gfnn predict` for steps of
-# a map, and for the forecast of a recording.
+# Options of `gfnn run` for files; of `gfnn fit` that no law of a recording has; of `gfnn predict`
+# for steps of a map, and for the forecast of a recording.
+_OF_FILES = ("despite", *ROLES, *OF_COLUMNS, "std", "observe", "guess", "mass")
 _OF_MAPS = (
     "tolerance",
     "absolute_tolerance",
@@ -324,7 +368,7 @@ def _refuse_given(arguments: argparse.Namespace, names: tuple[str, ...], why: st
     """Raise InputError where one of these options was given."""
     values = {name: getattr(arguments, name, None) for name in names}
     given = [
-        f"--{n.replace('_', '-')}" for n, value in values.items() if value not in (None, False)
+        f"--{n.replace('_', '-')}" for n, value in values.items() if value not in (None, False, ())
     ]
     if given:
         raise InputError(f"{', '.join(given)}: {why}")

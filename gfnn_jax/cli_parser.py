@@ -35,7 +35,7 @@ exit status:
   130  stopped by Ctrl-C
   143  stopped by SIGTERM"""
 # Keywords of `gfnn_jax.read` beside roles, with one value each.
-_OF_COLUMNS = (
+OF_COLUMNS = (
     *("angles", "degrees", "columns", "time", "time_unit", "offset", "scale", "coordinates"),
     *("start", "stop", "every"),
 )
@@ -187,9 +187,17 @@ def _run(command: _Command) -> None:
     names = "a name that `gfnn scenes` or `gfnn records` lists, or the file of a recording"
     command.add("scene", names, "SCENE")
     command.add("--out", "folder (default runs/SCENE)", "DIR", type=Path)
-    command.flag("--quick", "fewer pairs and rollouts")
-    command.add("--dt", "another time step", "H", type=_positive)
-    command.add_fit(tolerance="the scene's own, close to the best attainable")
+    command.flag("--open", "open the report in a browser")
+    command.flag("--quick", "of a scene: fewer pairs and rollouts")
+    command.add(
+        "--dt",
+        "another time step; of a file without times: the one between rows",
+        "H",
+        type=_positive,
+    )
+    command.add_fit(tolerance="of a scene its own, close to the best attainable; else 1e-6")
+    add_column_options(command.parser)
+    _add_despite(command)
 
 
 def _look(command: _Command) -> None:
@@ -211,14 +219,7 @@ def _fit(command: _Command) -> None:
     command.add("--scene", scene, "NAME")
     command.add_fit()
     add_column_options(command.parser)
-    command.add(
-        "--despite",
-        "of a recording: fit although gfnn look finds these mistakes, by kind (in brackets after "
-        "the word wrong), joined by commas",
-        "KIND",
-        type=_split,
-        default=(),
-    )
+    _add_despite(command)
     command.flag(
         "--keep",
         "of a recording: write the law into MODEL although it misses most of the motion; the exit "
@@ -228,6 +229,17 @@ def _fit(command: _Command) -> None:
         "--distributed",
         "this is one of several processes that srun or another launcher has started: each reads "
         "its own rows of DATA, or its own files",
+    )
+
+
+def _add_despite(command: _Command) -> None:
+    command.add(
+        "--despite",
+        "of a recording: fit although gfnn look finds these mistakes, by kind (in brackets after "
+        "the word wrong), joined by commas",
+        "KIND",
+        type=_split,
+        default=(),
     )
 
 
@@ -419,7 +431,7 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
 
 def column_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """The options that were given, as keywords of `gfnn_jax.read`; ``mass`` is none of them."""
-    given = {name: getattr(arguments, name) for name in (*ROLES, *_OF_COLUMNS)}
+    given = {name: getattr(arguments, name) for name in (*ROLES, *OF_COLUMNS)}
     for name in ("std", "observe", "guess"):
         given[name] = dict(pair for pairs in getattr(arguments, name) or () for pair in pairs)
     return {name: value for name, value in given.items() if value not in (None, {})}

@@ -106,19 +106,32 @@ def print_table(table: Any) -> None:
 
 
 def print_record(ran: Any, out: Path) -> None:
-    """Print a law, and its forecasts of the last third of the recording."""
-    print_verdict(ran.learned.fit)
-    print(ran.learned.fit.table)
-    ahead = ", ".join(f"{seconds:.3g}" for seconds in ran.forecasts.ahead)
-    for name, errors in ran.forecasts.median.items():
-        sizes = ", ".join(f"{error:.3g}" for error in errors)
-        unit = f" {ran.held_out.unit(name)}".rstrip()
-        print(
-            f"the last third, which no fit has seen: {name} errs by {sizes}{unit} after {ahead} "
-            "s (medians)"
-        )
-    print(f"{ran.forecasts.within:.0%} of it lies within two standard deviations (95 % expected)")
-    print(f"written to {out}")
+    """Print a law, its physical quantities, and its forecasts of the last third of the
+    recording."""
+    print_law(ran.learned.fit)
+    found = ran.forecasts
+    if found is not None:
+        ahead = ", ".join(f"{seconds:.3g}" for seconds in found.ahead)
+        for name, errors in found.median.items():
+            sizes = ", ".join(f"{error:.3g}" for error in errors)
+            unit = f" {ran.held_out.unit(name)}".rstrip()
+            print(
+                f"the last third, which no fit has seen: {name} errs by {sizes}{unit} after "
+                f"{ahead} s (medians)"
+            )
+        print(f"{found.within:.0%} of it lies within two standard deviations (95 % expected)")
+    print(f"written to {out}; the report is {out / 'report.html'}")
+
+
+def print_law(fit: Any) -> None:
+    """Print the verdict, a law, and its physical quantities."""
+    from gfnn_jax.evaluate.physics import physics
+
+    print_verdict(fit)
+    print(fit.table)
+    for quantity in physics(fit.found).quantities:
+        if not quantity.name.startswith("energy"):
+            print(quantity)
 
 
 def print_forecasts(found: Any, out: Path) -> None:

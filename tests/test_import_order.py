@@ -72,12 +72,15 @@ SHORTHANDS |= {
     ("learn.fitted", "learn.fit"),
     ("learn.fitted", "learn.saved"),
     ("learn.fitted", "evaluate.report"),
+    ("learn.fitted", "evaluate.page"),
+    ("learn.fitted", "evaluate.figures"),
 }
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",
     "charset_normalizer": "data.texts",
     "diffrax": "scenes.trajectories",
     "flax": "families.mlp",
+    "jinja2": "evaluate.page",
     "matplotlib": "evaluate.figures",
     "numba": "flows.kernel",
     "optax": "fitting.adam",

@@ -9,14 +9,10 @@ place in the mapping. The reference is black and comes first.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-from cycler import cycler
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
@@ -25,66 +21,24 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocato
 from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.evaluate.chaos import kl_divergence
 from gfnn_jax.evaluate.errors import error_statistics
+from gfnn_jax.evaluate.figures_of_recordings import forecasts_figure as forecasts_figure
+from gfnn_jax.evaluate.figures_of_recordings import law_figure as law_figure
+from gfnn_jax.evaluate.figures_of_recordings import recording_figure as recording_figure
+from gfnn_jax.evaluate.figures_style import (
+    COLOURS,
+    HEIGHT,
+    LINES,
+    MARKERS,
+    REFERENCE,
+    WIDTH,
+    style,
+)
+from gfnn_jax.evaluate.figures_style import save as save
 from gfnn_jax.phase_space import split
 
-# Okabe & Ito's palette without its yellow, which does not show on white, and with grey.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
-LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)))
-REFERENCE = "black"
-WIDTH, HEIGHT = 4.8, 3.2  # inches, of one panel; a column of a paper is about 3.3 wide
-STYLE: dict[Any, Any] = {
-    "figure.constrained_layout.use": True,
-    "figure.dpi": 100,
-    "font.size": 9,
-    "axes.labelsize": 9,
-    "axes.titlesize": 9,
-    "legend.fontsize": 8,
-    "legend.framealpha": 0.85,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#DDDDDD",
-    "grid.linewidth": 0.5,
-    "axes.axisbelow": True,
-    "axes.formatter.use_mathtext": True,
-    "lines.linewidth": 1.3,
-    "lines.markersize": 4,
-    "pdf.fonttype": 42,
-    "axes.prop_cycle": cycler(color=COLOURS),
-}
 _HALO = [withStroke(linewidth=2, foreground="white")]  # keeps text legible on lines
 _LOG_LOG: dict[str, Any] = {"xscale": "log", "yscale": "log"}
 _ALONE: dict[str, Any] = {"linestyle": "none"}  # points without a line
-
-
-def style():
-    """Style of the package as a context and as a decorator; matplotlib's settings are restored."""
-    return matplotlib.rc_context(STYLE)
-
-
-@style()
-def save(figure: Figure, path, dpi: int = 200) -> None:
-    """Write a figure as ``.png`` (``dpi`` dots per inch) or ``.pdf``, by the suffix of ``path``."""
-    engine = figure.get_layout_engine()
-    if engine is None:
-        figure.savefig(Path(path), dpi=dpi, bbox_inches="tight")
-        return
-    # The engine leaves room for all labels. Matplotlib calls it by a drawing of its own before the
-    # one that is saved; a call without that drawing takes a third less. With one canvas for both,
-    # the labels are set once.
-    canvas, before = figure.canvas, figure.dpi
-    try:
-        FigureCanvasAgg(figure).figure.dpi = dpi
-        engine.execute(figure)
-        figure.set_layout_engine("none")
-        figure.savefig(Path(path), dpi=dpi)
-    finally:
-        figure.dpi = before
-        figure.set_canvas(canvas)
-        figure.set_layout_engine(engine)
 
 
 def _axes_or_new(ax, width=WIDTH, height=HEIGHT) -> Axes:
@@ -124,6 +78,32 @@ def _legend_of_all(figure: Figure, ax: Axes, ncols: int) -> None:
     """Draw the legend of one of its axes above the figure."""
     names = ax.get_legend_handles_labels()
     figure.legend(*names, loc="outside upper center", ncols=ncols, frameon=False)
+
+
+# Candidates of a fit
+
+
+def candidates_figure(fit: Any) -> Figure | None:
+    """Draw error against cost of the candidates of a fit of pairs (`gfnn.Fit`, `Choice`), the
+    chosen one marked; None where its error is not known."""
+    shown = [c for c in fit.candidates if np.isfinite(c.validation_relative)]
+    if fit.chosen not in shown:
+        return None
+    return speed_against_error(
+        [c.operations / 1e3 for c in shown],
+        [c.validation_relative for c in shown],
+        [_labelled(c) for c in shown],
+        shown.index(fit.chosen),
+        fit.tolerance,
+        estimated=[i for i, c in enumerate(shown) if not c.validated],
+    ).figure  # pyright: ignore[reportReturnType]
+
+
+def _labelled(candidate: Any) -> str:
+    """Label of a candidate: chart, family and size, and the time of a step where measured."""
+    microseconds = candidate.microseconds_per_step
+    timed = f", {microseconds:.1f} µs" if microseconds is not None else ""
+    return f"{candidate.chart} {candidate.label}{timed}"
 
 
 # Errors against step number

@@ -4,7 +4,6 @@ file's own names and units."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,15 +12,22 @@ from matplotlib.figure import Figure
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.recording_summary import RecordingSummary
 from gfnn_jax.errors import InputError
-from gfnn_jax.evaluate.figures import COLOURS, save, style
+from gfnn_jax.evaluate.figures_style import COLOURS, style
 from gfnn_jax.evaluate.forecasts import Forecasts
+from gfnn_jax.families.text import in_letters
 from gfnn_jax.signals.steps import spectrum
 
 if TYPE_CHECKING:
+    from gfnn_jax.evaluate.physics import Swings
     from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
+    from gfnn_jax.models.lagrangians.residuals import Trace
 
 _MOST_ROWS = 6  # columns of a recording that a figure shows
 _BLUE, _RED, _GREEN, *_ = COLOURS
+_GAP = 5.0  # times the median step: a pause that no line crosses
+_POINTS = 1_500  # of a series in a figure, whose panels are some 500 pixels wide
+# Labels that are set as formulas take half of the time of a figure, and powers of ten are rare.
+_style = style(axes__formatter__use_mathtext=False)
 
 
 class _Sheet:
@@ -32,13 +38,14 @@ class _Sheet:
         self.figure = Figure(figsize=(4.6 * columns, 2.6 * rows))
         self.axes = self.figure.subplots(rows, columns, squeeze=False, **options)
 
-    def write(self, path: Path) -> Path:
-        save(self.figure, path, dpi=110)
-        return path
-
     def label(self, name: str) -> str:
         unit = self.recording.unit(name)
         return f"{name} [{unit}]" if unit else name
+
+    def speed(self, name: str) -> str:
+        """Label of the derivative of a column."""
+        unit = self.recording.unit(name)
+        return f"d{name}/dt [{unit}/s]" if unit else f"d{name}/dt"
 
     def in_file(self, name: str, run: str) -> np.ndarray:
         """The values of a column, angles unwrapped."""
@@ -46,12 +53,21 @@ class _Sheet:
 
 
 def _thinned(values: np.ndarray) -> np.ndarray:
-    return values[:: max(len(values) // 4_000, 1)]
+    return values[:: max(len(values) // _POINTS, 1)]
 
 
-@style()
-def recording_figure(recording: Recording, summary: RecordingSummary, path: Path) -> Path:
-    """Write time series with gaps marked, phase portraits and spectra, a row for each position and
+def _broken(t: np.ndarray, *series: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Times and series for a line, thinned, with NaN where times pause."""
+    t, *series = map(_thinned, (t, *series))  # pyright: ignore[reportAssignmentType]
+    if len(t) < 3:
+        return (t, *series)
+    pauses = np.flatnonzero(np.diff(t) > _GAP * np.median(np.diff(t))) + 1
+    return tuple(np.insert(np.asarray(x, float), pauses, np.nan) for x in (t, *series))
+
+
+@_style
+def recording_figure(recording: Recording, summary: RecordingSummary) -> Figure:
+    """Draw time series with gaps shaded, phase portraits and spectra, a row for each position and
     input."""
     names = (*recording.positions, *recording.inputs)[:_MOST_ROWS] or recording.columns[:_MOST_ROWS]
     sheet = _Sheet(recording, len(names), 3)
@@ -60,20 +76,22 @@ def recording_figure(recording: Recording, summary: RecordingSummary, path: Path
     for (series, portrait, power), name in zip(sheet.axes, names, strict=True):
         # The longest run, others behind it.
         for run in (*[r for r in recording.runs[:8] if r != longest], longest):
-            t, x = _thinned(recording.times(run)), _thinned(sheet.in_file(name, run))
+            t, x = _broken(recording.times(run), sheet.in_file(name, run))
             strong = {"lw": 0.9, "ms": 2} if run == longest else {"lw": 0.5, "ms": 0, "alpha": 0.3}
             series.plot(t, x, ".-", color=_BLUE, **strong)
         for run, begin, end in summary.gaps:
             if run == longest:
                 series.axvspan(begin, end, color=_RED, alpha=0.25, lw=0)
         title = f"run {longest}" if len(recording.runs) > 1 else ""
+        title += f"{' · ' * bool(title)}gaps shaded" * bool(summary.gaps)
         series.set(ylabel=sheet.label(name), title=title)
         if name in recording.positions:
             place = recording.positions.index(name)
             measured = recording.velocities[place : place + 1]
             for x, v in _phases(sheet, name, measured):
-                portrait.plot(_thinned(x), _thinned(v), lw=0.5)
-            portrait.set(xlabel=name, ylabel=measured[0] if measured else f"d{name}/dt")
+                portrait.plot(x, v, lw=0.5)
+            speed = sheet.label(measured[0]) if measured else sheet.speed(name)
+            portrait.set(xlabel=sheet.label(name), ylabel=speed)
         else:
             portrait.axis("off")
         values = np.concatenate([sheet.in_file(name, run) for run in recording.runs])
@@ -83,23 +101,23 @@ def recording_figure(recording: Recording, summary: RecordingSummary, path: Path
         power.set(ylabel="power density")
     sheet.axes[-1, 0].set_xlabel("t [s]")
     sheet.axes[-1, 2].set_xlabel("frequency [Hz]")
-    return sheet.write(path)
+    return sheet.figure
 
 
-def _phases(sheet: _Sheet, name: str, measured) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _phases(sheet: _Sheet, name: str, measured) -> Iterator[tuple[np.ndarray, ...]]:
     """Positions and velocities, measured or by differences, of the first runs."""
     for run in sheet.recording.runs[:8]:
-        x = sheet.in_file(name, run)
+        t, x = sheet.recording.times(run), sheet.in_file(name, run)
         if measured:
-            yield x, sheet.in_file(measured[0], run)
+            yield _broken(t, x, sheet.in_file(measured[0], run))[1:]
         elif len(x) > 2:
-            yield x, np.gradient(x, sheet.recording.times(run))
+            yield _broken(t, x, np.gradient(x, t))[1:]
 
 
-@style()
-def law_figure(fit: LearnedLaw, recording: Recording, path: Path) -> Path:
-    """Write the figure of a law and the recording that it was learned from: what was measured
-    against a forecast with its band, residuals, whether they are white, and the energy."""
+@_style
+def law_figure(fit: LearnedLaw, recording: Recording) -> Figure:
+    """Draw a law and the recording that it was learned from: what was measured against a forecast
+    with its band, residuals, whether they are white, and the energy."""
     channels = list(fit.whiteness)[:_MOST_ROWS]
     sheet = _Sheet(recording, len(channels) + 1, 3)
     run = max(recording.runs, key=lambda name: np.ptp(recording.times(name)))
@@ -109,80 +127,154 @@ def law_figure(fit: LearnedLaw, recording: Recording, path: Path) -> Path:
         for trace in fit.traces:
             missed = trace.measured[:, place] - trace.fitted[:, place]
             residuals.plot(trace.t, missed, ".", ms=2, color=_BLUE)
-        residuals.axhline(0, color="0.5", lw=0.5)
-        for sign in (-2, 2):
-            residuals.axhline(sign * fit.noise[name], color="0.5", lw=0.7, ls="--")
-        residuals.set(ylabel=f"measured − law, {name}", xlabel="t [s]")
+        _noise_lines(residuals, fit.noise[name])
+        residuals.set(ylabel=f"measured − law, {sheet.label(name)}", xlabel="t [s]")
         of = fit.whiteness[name]
-        whiteness.axhspan(-of.bound, of.bound, color="0.85")
+        whiteness.axhspan(-of.bound, of.bound, color="0.85", label="chance")
         whiteness.stem(of.lags[1:], of.autocorrelation[1:], basefmt=" ")
         for u, one in of.inputs.items():
             whiteness.plot(one.lag, one.correlation, "o", mfc="none", label=f"with {u}")
-        if of.inputs:
-            whiteness.legend()
         whiteness.set(xlabel="lag [s]")
     titles = (
         f"forecast from one state, run {run}",
         "residuals of the fitted arcs",
-        "correlation of residuals, and what chance allows",
+        "correlation of residuals",
     )
     for ax, title in zip(sheet.axes[0], titles, strict=True):
         ax.set_title(title)
-    energy, words, empty = sheet.axes[-1]
-    _energy(energy, fit)
-    words.axis("off")
-    empty.axis("off")
-    law = words.text(0, 1, f"L = {fit.lagrangian}\nR = {fit.friction}", va="top", wrap=True)
-    law.set_in_layout(False)  # a long law makes no panel narrower
-    return sheet.write(path)
+        ax.legend()
+    first, *others = sheet.axes[-1]
+    for ax in others:
+        ax.remove()
+    first.remove()
+    _energy(sheet.figure.add_subplot(len(channels) + 1, 1, len(channels) + 1), fit)
+    return sheet.figure
+
+
+def _noise_lines(ax, sigma: float) -> None:
+    """Draw zero, and two standard deviations of the noise about it."""
+    ax.axhline(0, color="0.5", lw=0.5)
+    ax.axhline(2 * sigma, color="0.5", lw=0.7, ls="--", label="± 2 σ of the noise")
+    ax.axhline(-2 * sigma, color="0.5", lw=0.7, ls="--")
+
+
+@_style
+def residuals_figure(fit: LearnedLaw, recording: Recording) -> Figure:
+    """Draw the residuals of a law against time, the channel itself and its rate of change."""
+    channels = list(fit.whiteness)[:_MOST_ROWS]
+    sheet = _Sheet(recording, len(channels), 3, sharey="row")
+    for place, (name, row) in enumerate(zip(channels, sheet.axes, strict=True)):
+        t, x, rate, missed = (
+            _thinned(np.concatenate(column))
+            for column in zip(*(_residual(trace, place) for trace in fit.traces), strict=True)
+        )
+        for ax, against in zip(row, (t, x, rate), strict=True):
+            ax.plot(against, missed, ".", ms=2, color=_BLUE, alpha=0.6)
+            _noise_lines(ax, fit.noise[name])
+        row[0].set(xlabel="t [s]", ylabel=f"measured − law, {sheet.label(name)}")
+        row[1].set(xlabel=sheet.label(name))
+        row[2].set(xlabel=sheet.speed(name))
+    sheet.axes[0, 0].legend()
+    return sheet.figure
+
+
+def _residual(trace: Trace, place: int) -> tuple[np.ndarray, ...]:
+    """(t, fitted, its rate of change, residual) of a channel along an arc."""
+    fitted = trace.fitted[:, place]
+    rate = np.gradient(fitted, trace.t) if len(fitted) > 1 else np.zeros(len(fitted))
+    return trace.t, fitted, rate, trace.measured[:, place] - fitted
+
+
+@_style
+def swings_figure(swings: Swings, label: str) -> Figure:
+    """Draw frequency and Q of free swings against their amplitude, with two standard errors."""
+    figure = Figure(figsize=(9.2, 2.6))
+    shown = (
+        (swings.frequency, swings.frequency_std, "frequency [Hz]"),
+        (swings.quality, swings.quality_std, "quality factor Q"),
+    )
+    finite = [one for one in shown if np.isfinite(one[0]).any()]
+    axes = figure.subplots(1, len(finite), squeeze=False)[0]
+    for ax, (value, std, name) in zip(axes, finite, strict=True):
+        ax.plot(swings.amplitude, value, color=_BLUE)
+        ax.fill_between(swings.amplitude, value - 2 * std, value + 2 * std, alpha=0.25)
+        ax.set(xlabel=f"amplitude of {label}", ylabel=name)
+    return figure
 
 
 def _forecast(ax, sheet: _Sheet, fit: LearnedLaw, run: str, name: str) -> None:
-    """Two thirds of a run, forecast from the state that the first third tells."""
-    recording, most = sheet.recording, 600
-    t = recording.times(run)
-    begin = t[0] + np.ptp(t) / 3
-    ahead = t[t > begin][:: max(1, int(np.sum(t > begin)) // most)]
-    factor, angle = recording.factors[name], name in recording.angles
-    readings = recording.unwrapped(name, run) if angle else recording.values(name, run)
-    readings = readings / factor
-    ax.plot(t, readings, ".", ms=2, color="0.6", label="measured")
-    own = recording.slice(run=run)
+    """Draw two thirds of a run, forecast from the state that the first third tells."""
+    t = sheet.recording.times(run)
+    own = sheet.recording.slice(run=run)
+    draw_forecast(ax, sheet, fit, own.slice(stop=t[0] + np.ptp(t) / 3), own, name)
+
+
+def draw_forecast(
+    ax, sheet: _Sheet, fit: LearnedLaw, seen: Recording, own: Recording, name: str
+) -> None:
+    """Draw a column of the one run ``own``, and its forecast from the state at the end of ``seen``
+    on."""
+    t, begin = own.times(own.runs[0]), seen.times(seen.runs[0])[-1]
+    ahead = _thinned(t[t > begin])
+    factor, angle = own.factors[name], name in own.angles
+    readings = sheet.in_file(name, own.runs[0])
+    ax.plot(*map(_thinned, (t, readings)), ".", ms=2, color="0.6", label="measured")
+    low, high = np.nanmin(readings), np.nanmax(readings)
+    ax.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
+    ax.set(ylabel=sheet.label(name), xlabel="t [s]")
     try:
-        found = fit.map.forecast(own.slice(stop=begin), ahead, own if recording.inputs else None)
+        found = fit.map.forecast(seen, ahead, own if own.inputs else None)
     except InputError:  # too few samples before
         return
     value, std = found.values[name][0], found.std[name][0]
     if angle:  # the turn that the lift of the measured angle has there
-        begins = np.interp(begin, t[np.isfinite(readings)], readings[np.isfinite(readings)])
+        known = np.isfinite(readings)
+        begins = np.interp(begin, t[known], readings[known])
         turn = 2 * np.pi / factor
         value = value + turn * np.round((begins - value[0]) / turn)
-    ax.plot(ahead, value, lw=1, color=_BLUE, label="forecast")
-    ax.fill_between(ahead, value - 2 * std, value + 2 * std, alpha=0.25)
-    low, high = np.nanmin(readings), np.nanmax(readings)
-    ax.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
-    ax.set(ylabel=sheet.label(name), xlabel="t [s]")
+    t, value, std = _broken(ahead, value, std)
+    ax.plot(t, value, lw=1, color=_BLUE, label="forecast")
+    ax.fill_between(t, value - 2 * std, value + 2 * std, alpha=0.25, label="± 2 σ")
 
 
 def _energy(ax, fit: LearnedLaw) -> None:
     """Draw the ledger of the longest arc: what is stored, lost, supplied, and left unexplained."""
     trace = max(fit.traces, key=lambda one: np.ptp(one.t))
     stored = trace.energy - trace.energy[0]
-    ax.plot(trace.t, stored, lw=1.2, color=_GREEN, label="stored")
-    losses = {f"− lost by {term.term}": -1 for term in fit.friction.terms}
+    ax.plot(trace.t, stored, lw=1.4, color="black", label="stored")
+    losses = {f"− lost by {in_letters(term.term)}": -1 for term in fit.friction.terms}
     gains = {f"supplied by {name}": 1 for name in fit.gains}
     for sums, names in ((trace.lost, losses), (trace.supplied, gains)):
         for column, (name, sign) in zip(sums.T, names.items(), strict=True):
-            ax.plot(trace.t, sign * column, lw=0.8, label=name)
+            ax.plot(trace.t, sign * column, lw=0.9, label=name)
     closure = stored - trace.supplied.sum(axis=1) + trace.lost.sum(axis=1)
-    ax.plot(trace.t, closure, lw=0.8, color="black", ls=":", label="unexplained")
-    ax.set(ylabel="energy since the arc began", xlabel="t [s]")
-    ax.legend()
+    ax.plot(trace.t, closure, lw=0.9, color="0.5", ls=":", label="unexplained")
+    ax.set(ylabel="energy [unit of L]", xlabel="t [s]", title="energy since the longest arc began")
+    ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
 
 
-@style()
-def forecasts_figure(found: Forecasts, recording: Recording, path: Path) -> Path:
-    """Write the figure of three forecasts of what no fit has seen: measured and forecast above,
+@_style
+def coming_figure(fit: LearnedLaw, recording: Recording, begin: float | None = None) -> Figure:
+    """Draw the longest run, and the forecast of what comes after ``begin`` (s) from the one state
+    there; None: after two thirds."""
+    channels = list(fit.whiteness)[:_MOST_ROWS]
+    run = max(recording.runs, key=lambda name: np.ptp(recording.times(name)))
+    own, t = recording.slice(run=run), recording.times(run)
+    begin = t[0] + np.ptp(t) * 2 / 3 if begin is None else begin
+    begin = t[0] + np.ptp(t) / 2 if not t[0] < begin < t[-1] else begin
+    sheet = _Sheet(recording, len(channels), 1, sharex=True)
+    sheet.figure.set_size_inches(9.2, 2.6 * len(channels))
+    for name, (ax,) in zip(channels, sheet.axes, strict=True):
+        draw_forecast(ax, sheet, fit, own.slice(stop=begin), own, name)
+        ax.axvline(begin, color="0.4", lw=0.8, ls="--")
+        ax.legend(loc="upper left", ncols=3)
+        ax.label_outer()
+    return sheet.figure
+
+
+@_style
+def forecasts_figure(found: Forecasts, recording: Recording) -> Figure:
+    """Draw three forecasts of what no fit has seen: measured and forecast above,
     what the forecast missed and its band below."""
     names = list(found.median)[:_MOST_ROWS]
     shown = [found.each[k] for k in sorted({0, len(found.each) // 2, len(found.each) - 1})]
@@ -190,9 +282,9 @@ def forecasts_figure(found: Forecasts, recording: Recording, path: Path) -> Path
     for column, one in zip(sheet.axes.T, shown, strict=True):
         for above, below, name in zip(column[::2], column[1::2], names, strict=True):
             above.plot(one.t, one.measured[name], ".", ms=3, color="0.5", label="measured")
-            above.plot(one.t, one.values[name], lw=1, color=_BLUE, label="forecast")
-            band = 2 * one.std[name]
-            below.fill_between(one.t, -band, band, alpha=0.25, label="± 2 standard deviations")
+            t, value, band = _broken(one.t, one.values[name], 2 * one.std[name])
+            above.plot(t, value, lw=1, color=_BLUE, label="forecast")
+            below.fill_between(t, -band, band, alpha=0.25, label="± 2 standard deviations")
             below.plot(one.t, one.values[name] - one.measured[name], ".", ms=3, color=_BLUE)
         column[-1].set_xlabel("t [s]")
     for name, above, below in zip(names, sheet.axes[::2, 0], sheet.axes[1::2, 0], strict=True):
@@ -200,4 +292,4 @@ def forecasts_figure(found: Forecasts, recording: Recording, path: Path) -> Path
         below.set_ylabel(sheet.label(name).replace(name, "forecast − measured", 1))
     sheet.axes[0, 0].legend()
     sheet.axes[1, 0].legend()
-    return sheet.write(path)
+    return sheet.figure

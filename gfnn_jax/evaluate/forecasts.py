@@ -13,6 +13,8 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 _SAMPLES = 20  # that a state is estimated from
 _STARTS = 24
+_PERIODS = (0.25, 1.0, 2.0)  # of the fastest motion, that is forecast ahead, if there are as many
+PART = 2 / 3  # of a recording, in time, that is learned from where the rest is held out
 
 
 class Ahead(NamedTuple):
@@ -38,6 +40,22 @@ class Forecasts(NamedTuple):
     ahead: tuple[float, ...]
     median: dict[str, tuple[float, ...]]
     within: float
+
+
+def end_of_part(recording: Recording) -> float:
+    """The time (s) up to which a law is learned from a recording whose rest is held out."""
+    times = np.concatenate([recording.times(run) for run in recording.runs])
+    return float(times.min() + PART * np.ptp(times))
+
+
+def forecasts_of(map_: SymplecticMap, held_out: Recording) -> Forecasts:
+    """Forecasts of a held-out part, for up to two periods of the fastest motion, as
+    `forecasts_along`."""
+    assert map_.sensors is not None
+    half = max(np.ptp(held_out.times(run)) for run in held_out.runs) / 2
+    ahead = [periods * 2 * np.pi / map_.sensors.omega for periods in _PERIODS]
+    ahead = [seconds for seconds in ahead if seconds < half] or [half]
+    return forecasts_along(map_, held_out, ahead)
 
 
 def forecasts_along(map_: SymplecticMap, recording: Recording, ahead: Sequence[float]) -> Forecasts:

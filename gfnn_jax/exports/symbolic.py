@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-from gfnn_jax.families.text import Term, added, digits, in_letters, measured
+from gfnn_jax.families.text import GREEK, Term, added, digits, in_letters, measured
+
+_SPACE = '<mspace width="0.17em"></mspace>'
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,15 +25,39 @@ class Formula:
 
     def __str__(self) -> str:
         """Formula as a person writes it: the last digits' standard errors in brackets."""
-        return added(f"{measured(c, s)} {in_letters(t)}" for t, c, s in self.terms) or "0"
+        return added(_times(c, s, in_letters(t)) for t, c, s in self.terms) or "0"
 
     def sympy(self) -> Any:
         """Formula as a sympy expression."""
         return as_sympy(self.formula)
 
     def latex(self) -> str:
-        """Formula in LaTeX's notation, its terms in their order."""
-        return added(f"{digits(c, s)} {as_latex(t)}" for t, c, s in self.terms) or "0"
+        """Formula in LaTeX's notation, its terms in their order, with errors in the last digits."""
+        return added(_times(c, s, as_latex(t)) for t, c, s in self.terms) or "0"
+
+    def mathml(self) -> str:
+        """Formula as presentation MathML, an ``<mrow>`` that browsers typeset, with errors."""
+        parts = []
+        for place, (term, c, s) in enumerate(self.terms):
+            sign = "−" if c < 0 else "+" if place else ""
+            number, _, _ = _times(abs(c), s, "").partition(" ")
+            body = as_mathml(term) if term != "1" or not number else ""
+            parts.append(
+                f"<mo>{sign}</mo>" * bool(sign) + f"<mn>{number}</mn>{_SPACE}" * bool(number) + body
+            )
+        return f"<mrow>{''.join(parts) or '<mn>0</mn>'}</mrow>"
+
+    def _repr_latex_(self) -> str:
+        return f"${self.latex()}$"
+
+    def _repr_html_(self) -> str:
+        return f'<math display="block">{self.mathml()}</math>'
+
+
+def _times(coefficient: float, std: float, term: str) -> str:
+    """A coefficient with its standard error before a term, neither where it is 1."""
+    number = "" if coefficient == 1 and std == 0 and term != "1" else measured(coefficient, std)
+    return " ".join(filter(None, (number, "" if term == "1" else term)))
 
 
 def as_sympy(text: str) -> Any:
@@ -45,10 +71,167 @@ def as_sympy(text: str) -> Any:
 
 
 def as_latex(text: str) -> str:
-    """The formula in LaTeX's notation."""
+    """The formula in LaTeX's notation: names of several letters are upright, theta_dot is a
+    derivative."""
     import sympy
 
-    return sympy.latex(as_sympy(text))
+    expression = as_sympy(text)
+    names = {symbol: _typeset(symbol.name, _LATEX) for symbol in expression.free_symbols}
+    return sympy.latex(expression, symbol_names=names)
+
+
+def as_mathml(text: str) -> str:
+    """The formula as presentation MathML; names as `as_latex` writes them."""
+    import sympy
+    from sympy.printing.mathml import mathml
+
+    expression = as_sympy(text)
+    shown, names = {}, sorted(expression.free_symbols, key=str)
+    for place, symbol in enumerate(names):  # sympy would split names into indices
+        shown[f"<mi>X{_letters(place)}</mi>"] = _typeset(symbol.name, _MATHML)
+    plain = [sympy.Symbol(f"X{_letters(place)}") for place in range(len(names))]
+    typeset = mathml(expression.xreplace(dict(zip(names, plain, strict=True))), "presentation")
+    for placeholder, name in shown.items():
+        typeset = typeset.replace(placeholder, name)
+    typeset = typeset.replace("<mo>(</mo>", '<mo stretchy="false">(</mo>')
+    typeset = typeset.replace("<mo>)</mo>", '<mo stretchy="false">)</mo>')
+    return typeset.replace("<mi>sign</mi>", "<mi>sgn</mi>")
+
+
+def _letters(place: int) -> str:
+    return "".join(chr(ord("a") + int(digit)) for digit in str(place))
+
+
+class _Notation(NamedTuple):
+    """Formats of a name of several letters, a letter, an index, first and second derivatives."""
+
+    name: str
+    letter: str
+    index: str
+    dot: str
+    ddot: str
+
+
+_LATEX = _Notation(r"\mathrm{{{}}}", "{}", "{}_{{{}}}", r"\dot{{{}}}", r"\ddot{{{}}}")
+_MATHML = _Notation(
+    "<mi>{}</mi>",
+    "<mi>{}</mi>",
+    "<msub>{}<mn>{}</mn></msub>",
+    '<mover accent="true">{}<mo>˙</mo></mover>',
+    '<mover accent="true">{}<mo>¨</mo></mover>',
+)
+
+
+def _typeset(name: str, notation: _Notation) -> str:
+    """A symbol, as theta1, swing_angle or x_ddot, in a notation."""
+    for suffix, form in (("_ddot", notation.ddot), ("_dot", notation.dot)):
+        if name.endswith(suffix):
+            return form.format(_typeset(name.removesuffix(suffix), notation))
+    letters = name.rstrip("0123456789")
+    index, letters = name[len(letters) :], letters.rstrip("_") or letters
+    if letters in GREEK:
+        latex = notation is _LATEX
+        shown = f"\\{letters}" if latex else notation.letter.format(GREEK[letters])
+    elif len(letters) == 1:
+        shown = notation.letter.format(letters)
+    else:
+        shown = notation.name.format(letters.replace("_", r"\_" if notation is _LATEX else "_"))
+    return notation.index.format(shown, index) if index else shown
+
+
+class Equation(NamedTuple):
+    """An equation of motion: terms with accelerations, x_ddot of x, equal forces."""
+
+    left: Formula
+    right: Formula
+
+    def __str__(self) -> str:
+        return f"{self.left} = {self.right}"
+
+    def latex(self) -> str:
+        """Equation in LaTeX's notation."""
+        return f"{self.left.latex()} = {self.right.latex()}"
+
+    def mathml(self) -> str:
+        """Equation as presentation MathML."""
+        return f"<mrow>{self.left.mathml()}<mo>=</mo>{self.right.mathml()}</mrow>"
+
+
+def equations_of_motion(
+    lagrangian: Formula,
+    friction: Formula,
+    forces: Sequence[Sequence[Term]],
+    coordinates: Sequence[str],
+    speeds: Sequence[str],
+) -> tuple[Equation, ...]:
+    """d/dt ∂L/∂v − ∂L/∂q + ∂R/∂v = forces, an equation for each coordinate.
+
+    forces: of inputs on each coordinate. Each term keeps the standard error of its coefficient.
+    """
+    import sympy
+
+    q, v, a = (
+        [sympy.Symbol(name, real=True) for name in names]
+        for names in (coordinates, speeds, [f"{name}_ddot" for name in coordinates])
+    )
+    real = {sympy.Symbol(symbol.name): symbol for symbol in (*q, *v)}
+    found = []
+    for i, own in enumerate(forces):
+        left: dict[Any, list[Term]] = {}
+        right: dict[Any, list[Term]] = {}
+        for term in lagrangian.terms:
+            of_term = as_sympy(term.term).xreplace(real)
+            push = sympy.diff(of_term, v[i])
+            inertia = sympy.Add(*(sympy.diff(push, v[k]) * a[k] for k in range(len(q))))
+            moved = sympy.Add(*(sympy.diff(push, q[k]) * v[k] for k in range(len(q))))
+            _collect(left, sympy.expand(inertia), term, 1.0)
+            force = sympy.expand(moved - sympy.diff(of_term, q[i]))
+            for summand in sympy.Add.make_args(force):
+                _collect(right, summand, term, -1.0)
+        for term in friction.terms:
+            _collect(right, _slope(as_sympy(term.term), sympy.Symbol(speeds[i])), term, -1.0)
+        sides = [
+            Formula(tuple(t for each in side.values() for t in each)) for side in (left, right)
+        ]
+        found.append(_by_known_mass(Equation(sides[0], Formula((*sides[1].terms, *own)))))
+    return tuple(found)
+
+
+def _collect(side: dict[Any, list[Term]], expression: Any, term: Term, sign: float) -> None:
+    """Add an expression, times the coefficient of a term, to a side."""
+    import sympy
+
+    number, rest = expression.as_coeff_Mul()
+    if rest.is_Add:
+        content, rest = rest.as_content_primitive()
+        number *= content
+    if expression.is_zero is not True:
+        text, factor = sympy.sstr(rest).replace("Abs(", "abs("), sign * float(number)
+        text = f"({text})" if rest.is_Add else text
+        own = Term(text, factor * term.coefficient, abs(factor) * term.std)
+        side.setdefault(rest, []).append(own)
+
+
+def _slope(loss: Any, v: Any) -> Any:
+    """Derivative of a term of R by a speed: s |s| of |s|³, the sign of s of |s|."""
+    import sympy
+
+    base, power = loss.as_base_exp()
+    if not isinstance(base, sympy.Abs):
+        return sympy.diff(loss, v)
+    s = base.args[0]
+    slope = sympy.sign(s) if power == 1 else s * base ** (power - 2)
+    return power * slope * sympy.diff(s, v)
+
+
+def _by_known_mass(equation: Equation) -> Equation:
+    """The equation divided by its one inertia, where that is a number without an error."""
+    first, *others = equation.left.terms
+    if others or first.std > 0 or not first.term.endswith("_ddot"):
+        return equation
+    by = 1 / first.coefficient
+    scaled = (Term(t, by * c, abs(by) * s) for t, c, s in equation.right.terms)
+    return Equation(Formula((first._replace(coefficient=1.0),)), Formula(tuple(scaled)))
 
 
 def hamiltonian(entries: Mapping[tuple[int, ...], Sequence[str]], potential: str, dim: int) -> Any:

@@ -17,7 +17,7 @@ from gfnn_jax.families.functions import known_functions
 OTHER_NAMES = {"atan": "arctan", "ln": "log"}
 _RAISED = "⁰¹²³⁴⁵⁶⁷⁸⁹"
 _LETTERS = ("theta", "phi", "psi", "alpha", "beta", "gamma", "omega")
-_GREEK = dict(zip(_LETTERS, "θφψαβγω", strict=True))
+GREEK = dict(zip(_LETTERS, "θφψαβγω", strict=True))
 _FACTORS = re.compile(r"([\w.]+|\)) +(?=(\w+|\())")
 
 
@@ -101,6 +101,6 @@ def in_letters(code: str) -> str:
 
     def symbol(found: re.Match) -> str:
         lowered = found[2].translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))
-        return _GREEK.get(found[1], found[1]) + lowered
+        return GREEK.get(found[1], found[1]) + lowered
 
     return re.sub(r"([A-Za-z]+)([0-9]*)", symbol, text)

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import TWO_PI
 from gfnn_jax.dataset.structures import Bodies, structure_of
 from gfnn_jax.evaluate import figures, metrics
@@ -26,16 +25,8 @@ def figures_of_run(
     drawn = _errors(scene, {OURS: measured}, reference)
     band = None if band is None else (steps, band)
     drawn["error"] = figures.error_growth({OURS: (steps, measured.error)}, band=band).figure
-    shown = [c for c in fit.candidates if np.isfinite(c.validation_relative)]
-    if fit.chosen in shown:
-        drawn["candidates"] = figures.speed_against_error(
-            [c.operations / 1e3 for c in shown],
-            [c.validation_relative for c in shown],
-            [_labelled(c) for c in shown],
-            shown.index(fit.chosen),
-            fit.tolerance,
-            estimated=[i for i, c in enumerate(shown) if not c.validated],
-        ).figure
+    candidates = figures.candidates_figure(fit)
+    drawn |= {} if candidates is None else {"candidates": candidates}
     both = {"reference": reference, OURS: predicted}
     if scene.name.startswith("henon-heiles") and scene.dim == 2:
         drawn["section"] = _sections(both)
@@ -113,13 +104,6 @@ def _figures_of_many(scene: Scene, steps, reference, predicted) -> dict[str, Any
     if not structure.angles and structure.fields == 1:
         found["modes"] = figures.modes(*drawn, structure.kind)
     return found
-
-
-def _labelled(candidate: Candidate) -> str:
-    """Label of a candidate: chart, family and size, and the time of a step where measured."""
-    microseconds = candidate.microseconds_per_step
-    timed = f", {microseconds:.1f} µs" if microseconds is not None else ""
-    return f"{candidate.chart} {candidate.label}{timed}"
 
 
 def _coordinates(scene: Scene, predicted: dict[str, Any], reference):

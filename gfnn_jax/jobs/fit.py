@@ -17,8 +17,10 @@ from gfnn_jax.data.sample import read_sample
 from gfnn_jax.data.summary import summary
 from gfnn_jax.errors import FitError, InputError, OutOfTime, WorkError
 from gfnn_jax.evaluate.figures_of_recordings import law_figure
+from gfnn_jax.evaluate.figures_style import save
+from gfnn_jax.evaluate.page import write_page
 from gfnn_jax.fitting import row_blocks
-from gfnn_jax.jobs.output import Output, Ran, publish, units_of, write
+from gfnn_jax.jobs.output import PAGE, Output, Ran, publish, units_of, write
 from gfnn_jax.jobs.search import (
     BEST,
     failures_of_arithmetic,
@@ -57,13 +59,15 @@ def fit(
     dt: float | None = None,
     scene_name: str | None = None,
     group: Group | None = None,
+    command: str | None = None,
     **options: Any,
 ) -> Ran | None:
     """Learn the map of trajectory files, and write it with its report into the model folder.
 
-    scene_name: the scene whose coordinates and features are used. group: the processes that do this
-    job, each with its own rows or files; all but the first return None. options: `FitOptions`;
-    devices are those of each process, and a job may be resumed on others. Returns None where the
+    command: that was typed, where a page is to be written too. scene_name: the scene whose
+    coordinates and features are used. group: the processes that do this job, each with its own
+    rows or files; all but the first return None. options: `FitOptions`; devices are those of each
+    process, and a job may be resumed on others. Returns None where the
     output holds the result of this same job.
     """
     progress = output.progress
@@ -158,6 +162,8 @@ def fit(
             raise
         with atomic_folder(output.out) as folder:
             write(folder, folder, fitted, result, job)
+            if command is not None:
+                write_page(fitted, folder / PAGE, command=command)
     return Ran(fitted, output.out, result)
 
 
@@ -225,7 +231,7 @@ def fit_recording(
     with atomic_folder(output.out) as folder:
         write(folder, folder, fitted, result, job)
         if is_law:
-            law_figure(fitted, recording, folder / LAW_FIGURE)
+            save(law_figure(fitted.found, recording), folder / LAW_FIGURE, dpi=110)
     if refused is not None:
         raise WorkError(f"{refused}; this law is kept in {output.out}")
     return Ran(fitted, output.out, result)

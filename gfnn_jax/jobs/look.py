@@ -26,9 +26,10 @@ def look(
     summary = summarise(recording, options)
     if figure is not None:
         from gfnn_jax.evaluate.figures_of_recordings import recording_figure
+        from gfnn_jax.evaluate.figures_style import save
 
         figure.parent.mkdir(parents=True, exist_ok=True)
-        recording_figure(recording, summary, figure)
+        save(recording_figure(recording, summary), figure, dpi=110)
     return summary
 
 

@@ -23,7 +23,7 @@ from gfnn_jax.phase_space import Pairs
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 
-REPORT, MODEL = "report.json", "model"
+REPORT, PAGE, MODEL = "report.json", "report.html", "model"
 _ANGLES = ("deg", "°", "rad")  # begins of the units that `gfnn_jax.read` turns into radians
 
 

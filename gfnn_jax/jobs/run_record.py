@@ -1,70 +1,92 @@
-"""Job of ``gfnn run RECORD``: the law of the first two thirds of a recording, and forecasts of its
-last third, which no fit sees."""
+"""Job of ``gfnn FILE`` and ``gfnn run RECORD``: the law of the first two thirds of a recording,
+forecasts of its last third, which no fit sees, and the report of both as one page."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from gfnn_jax.data.recording import SECONDS, Recording, read
+from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.evaluate import report
 from gfnn_jax.evaluate.figures_of_recordings import forecasts_figure
-from gfnn_jax.evaluate.forecasts import Forecasts, forecasts_along
+from gfnn_jax.evaluate.figures_style import save
+from gfnn_jax.evaluate.forecasts import Forecasts, end_of_part, forecasts_of
+from gfnn_jax.evaluate.page import write_page, write_refusal
 from gfnn_jax.jobs.fit import fit_recording
-from gfnn_jax.jobs.output import REPORT, Output
+from gfnn_jax.jobs.output import PAGE, REPORT, Output
 from gfnn_jax.jobs.output import Ran as Learned
 from gfnn_jax.storage.outputs import atomic_folder
 
 FIGURE = "forecasts.png"
-_PART = 2 / 3  # of the record, in time, that is learned from
-_PERIODS = (0.25, 1.0, 2.0)  # of the fastest motion, that is forecast ahead, if there are as many
 
 
 class Ran(NamedTuple):
-    """A law, where it was written, its forecasts of the rest, and that part of the recording."""
+    """A law, where it was written, its forecasts of the rest, None where that is too short to
+    forecast, and that part of the recording."""
 
     learned: Learned
-    forecasts: Forecasts
+    forecasts: Forecasts | None
     held_out: Recording
 
 
-def run_record(data: Path, output: Output, *, columns: Mapping[str, Any], **options: Any) -> Ran:
-    """Write the model, its report and the figures of law and forecasts into the output's folder.
+def run_record(
+    data: Path, output: Output, *, columns: Mapping[str, Any], command: str = "", **options: Any
+) -> Ran:
+    """Write the model, its report, as JSON and as a page, and the figures of law and forecasts into
+    the output's folder.
 
-    columns: keywords of `gfnn_jax.read`. options: `FitOptions`. Raises InputError where the file is
-    no recording, or its last third is too short to forecast.
+    columns: keywords of `gfnn_jax.read`. command: that was typed. options: `FitOptions`. Raises
+    InputError where the file is no recording or shows a mistake, WorkError where no law follows it;
+    a page says why.
     """
     whole = read(data, **columns)
-    times = np.concatenate([whole.times(run) for run in whole.runs])
-    end = float(times.min() + _PART * np.ptp(times))
+    end = end_of_part(whole)
     stop = end / SECONDS[whole.time_unit]
     with atomic_folder(output.out) as folder:
-        learned = fit_recording(
-            [data],
-            Output(folder / "model", progress=output.progress),
-            columns={**columns, "stop": stop},
-            **options,
-        )
-        map_ = learned.fit.map
-        assert map_.sensors is not None
-        output.progress.line("forecasting the last third, which no fit has seen")
-        held_out = whole.slice(start=np.nextafter(end, np.inf))
-        half = max(np.ptp(held_out.times(run)) for run in held_out.runs) / 2
-        ahead = [periods * 2 * np.pi / map_.sensors.omega for periods in _PERIODS]
-        ahead = [seconds for seconds in ahead if seconds < half] or [half]
-        found = forecasts_along(map_, held_out, ahead)
-        forecasts_figure(found, held_out, folder / FIGURE)
-        result = learned.report | {
-            "forecasts": {
-                "begin": end,
-                "num": len(found.each),
-                "ahead": list(found.ahead),
-                "median": {name: list(of) for name, of in found.median.items()},
-                "within_two_deviations": found.within,
-            }
+        try:
+            learned = fit_recording(
+                [data],
+                Output(folder / "model", progress=output.progress),
+                columns={**columns, "stop": stop},
+                **options,
+            )
+        except (InputError, WorkError) as error:
+            refused: InputError | WorkError | None = error
+            write_refusal(whole, error, folder / PAGE, command=command)
+        else:
+            refused = None
+            ran = _report(learned, whole, end, folder, output, command)
+    if refused is not None:
+        raise type(refused)(f"{refused} (report: {output.out / PAGE})")
+    return ran
+
+
+def _report(
+    learned: Learned, whole: Recording, end: float, folder: Path, output: Output, command: str
+) -> Ran:
+    fit = dataclasses.replace(learned.fit, data=whole, learned_to=end)
+    held_out = fit.held_out
+    assert held_out is not None
+    output.progress.line("forecasting the last third, which no fit has seen")
+    result = dict(learned.report)
+    try:
+        found = forecasts_of(fit.map, held_out)
+    except InputError as error:
+        found = None
+        output.progress.line(f"no forecasts: {error}")
+    else:
+        save(forecasts_figure(found, held_out), folder / FIGURE, dpi=110)
+        result["forecasts"] = {
+            "begin": end,
+            "num": len(found.each),
+            "ahead": list(found.ahead),
+            "median": {name: list(of) for name, of in found.median.items()},
+            "within_two_deviations": found.within,
         }
-        (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
-    return Ran(learned, found, held_out)
+    (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
+    output.progress.line("writing the report")
+    write_page(fit, folder / PAGE, command=command, forecasts=found)
+    return Ran(learned._replace(fit=fit), found, held_out)

@@ -104,11 +104,11 @@ def fit(
                 )
             except FitError as error:
                 if error.fit is not None:
-                    error.fit = Fit(error.fit.map, error.fit, {"verdict": error.verdict})
+                    error.fit = Fit(error.fit.map, error.fit, {"verdict": error.verdict}, pairs)
                 raise
         for message in law.messages:
             warnings.warn(message, FitWarning, stacklevel=2)
-        return Fit(law.map, law)
+        return Fit(law.map, law, data=pairs)
     options.refuse_others(("hamiltonian", "map"), "pairs, which are no recording")
     budget = options.budget(watch, pairs.dim)
     require_x64("a fit")

@@ -14,6 +14,7 @@ import numpy as np
 from gfnn_jax.budget import COMPILE, ROWS, Budget, within
 from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.damping import LearnedDamping
 from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
@@ -23,6 +24,7 @@ from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.learn.choose import work_of_posterior
+from gfnn_jax.maps.forecasts import Forecast
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
@@ -229,12 +231,30 @@ class Fit:
     `models.lagrangians.learned_law.LearnedLaw`, for recordings; None of a folder that holds a map
     alone. Its attributes are those of the fit too: `candidates`, `met` and `chosen` of the first,
     `gains`, `zeros`, `noise` and `horizon` of the second. stored: what a folder holds beside these:
-    ``verdict`` and ``record``, the report with the job that wrote it.
+    ``verdict`` and ``record``, the report with the job that wrote it. data: the recording, which
+    is not stored; learned_to: the time (s) up to which a law was learned from it, None for all.
     """
 
     map: SymplecticMap
     found: Choice | LearnedLaw | None = None
     stored: dict[str, Any] = dataclasses.field(default_factory=dict)
+    data: Recording | None = None
+    learned_to: float | None = None
+
+    @property
+    def held_out(self) -> Recording | None:
+        """The part of the recording that the law was not learned from."""
+        if self.data is None or self.learned_to is None:
+            return None
+        return self.data.slice(start=np.nextafter(self.learned_to, np.inf))
+
+    @property
+    def seen(self) -> Recording:
+        """The recording that the law was learned from. Raises ValueError where a folder gave the
+        fit, which holds no data, and for a fit of pairs."""
+        if self.data is None:
+            raise ValueError("expected a fit of a recording that still has its data, got none")
+        return self.data if self.learned_to is None else self.data.slice(stop=self.learned_to)
 
     @property
     def law(self) -> LearnedHamiltonian | LearnedLaw | None:
@@ -310,7 +330,7 @@ class Fit:
         """The fit with another map (``map``), and other values of what was found."""
         map_ = changes.pop("map", self.map)
         assert self.found is not None
-        return Fit(map_, dataclasses.replace(self.found, **changes), self.stored)
+        return dataclasses.replace(self, map=map_, found=dataclasses.replace(self.found, **changes))
 
     def save(self, folder, *, scene: Scene | None = None, overwrite: bool = False) -> None:
         """Save the fit as a folder, which `gfnn.load` reads: map, law, verdict and report.
@@ -324,21 +344,64 @@ class Fit:
         scene = scene or getattr(self.found, "scene", None)
         saved.save(self, folder, scene=scene, overwrite=overwrite)
 
-    def report(self, **about: Any) -> dict[str, Any]:
+    def report(self, path: Any = None, **about: Any) -> dict[str, Any]:
         """Make the report, which ``report.json`` holds, with numbers that are not finite as None.
 
-        about: further entries, as of ``assemble`` and ``assemble_law`` in `evaluate.report`.
-        Of a fit that was loaded it is the report that was saved. Raises ValueError where the folder
-        holds none.
-        """
-        from gfnn_jax.evaluate import report  # stands after this module: a shorthand
+        path: of an HTML page to write beside it, whole in one file, as ``report.html``. about:
+        further entries, as of ``assemble`` and ``assemble_law`` in `evaluate.report`. Of a fit that
+        was loaded it is the report that was saved. Raises ValueError where the folder holds none.
 
+            fit.report("report.html")
+        """
+        from gfnn_jax.evaluate import page, report  # stand after this module: a shorthand
+
+        if path is not None:
+            page.write_page(self, path)
         if "record" in self.stored:
             return {name: part for name, part in self.stored["record"].items() if name != "job"}
         if self.found is None:
             raise ValueError("expected a fit, or the folder of one: this one holds a map alone")
         assemble = report.assemble if isinstance(self.found, Choice) else report.assemble_law
         return report.finite(assemble(self, **about))
+
+    def forecast(
+        self, times: Any, *, after: Recording | None = None, inputs: Any = None
+    ) -> Forecast:
+        """Forecast at ``times`` (n,), in s on the clock of the recording, with standard deviations,
+        in the units of its file: `maps.forecasts.Forecast`.
+
+        after: the recording from whose end it starts; None: the one that was learned from.
+        inputs: a recording of the inputs ahead. Raises ValueError where the fit has no data and no
+        ``after``, InputError as `SymplecticMap.forecast` does.
+
+            ahead = fit.forecast(np.arange(10.1, 12.0, 0.1))
+            ahead.values["theta"], ahead.std["theta"]  # (runs, times)
+        """
+        return self.map.forecast(self.seen if after is None else after, times, inputs)
+
+    def predict(self, z0: Any, num_steps: int, **options: Any) -> np.ndarray:
+        """States (B, num_steps + 1, 2d), or (num_steps + 1, 2d), that follow z0 (B, 2d) or (2d,):
+        those of `SymplecticMap.rollout`, whose ``options`` it takes."""
+        return np.asarray(self.map.rollout(z0, num_steps, **options)[0])
+
+    def plot(self) -> Any:
+        """Figure (matplotlib) of the law against its recording, or of the candidates of a map."""
+        from gfnn_jax.evaluate import figures  # stands after this module: a shorthand
+
+        if isinstance(self.found, LearnedLaw):
+            return figures.law_figure(self.found, self.seen)
+        return figures.candidates_figure(self)
+
+    def _repr_html_(self) -> str:
+        from gfnn_jax.evaluate import page  # stands after this module: a shorthand
+
+        return page.summary(self)
+
+    def _repr_latex_(self) -> str | None:
+        """The law as a notebook shows it."""
+        if isinstance(self.found, LearnedLaw):
+            return f"$L = {self.found.lagrangian.latex()}$, $R = {self.found.friction.latex()}$"
+        return None if self.law is None else self.law._repr_latex_()
 
     def accelerate(
         self, *, dt: float | None = None, region=None, num_pairs: int = NUM_PAIRS, **options: Any

@@ -125,7 +125,11 @@ def odds_text(odds: float) -> str:
     """12 : 1, 1 : 3; those above a million are not told apart."""
     if odds >= 1e6:
         return "> 10⁶ : 1"
-    return f"{odds:,.2g} : 1" if odds >= 1 else f"1 : {1 / odds:,.2g}"
+    if odds <= 1e-6:
+        return "1 : > 10⁶"
+    more = f"{max(odds, 1 / odds):.2g}"
+    more = f"{float(more):,.0f}" if "e" in more else more
+    return f"{more} : 1" if odds >= 1 else f"1 : {more}"
 
 
 def kinds_of(rows: Sequence[Loss]) -> tuple[int, ...]:

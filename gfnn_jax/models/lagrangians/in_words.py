@@ -122,6 +122,7 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         seconds=findings.seconds,
         ended="every length of arcs was fitted",
         flaws=tuple(flaws),
+        symbols=(names.coordinates, names.speeds),
     )
 
 

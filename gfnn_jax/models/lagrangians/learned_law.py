@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.data.roles import symbols as code_names
 from gfnn_jax.exports import symbolic
-from gfnn_jax.exports.symbolic import Formula
+from gfnn_jax.exports.symbolic import Equation, Formula, equations_of_motion
 from gfnn_jax.families.lagrangian import DRY, Lagrangian
 from gfnn_jax.families.text import Term, measured
 from gfnn_jax.fitting.evidence import EVIDENCE
@@ -28,8 +29,6 @@ _SHOWN = 3  # pairs of nearly collinear coefficients that are listed
 
 def _time(seconds: float) -> str:
     """A horizon in words."""
-    if seconds == 0:
-        return "at no time, for the noise alone is larger"
     return f"for {seconds:.3g} s" if np.isfinite(seconds) else "for more than eight periods"
 
 
@@ -73,6 +72,7 @@ class LearnedLaw:
     apart. next_motions: those that would tell the most, the best first. horizon: for how long a
     forecast can be trusted. energy: stored, lost, supplied per second, means over the record.
     messages: warnings. steps: what the search did, line by line.
+    symbols: of coordinates and of their speeds in formulas.
     num_samples, seconds (of the processor). ended: why the search ended. flaws: reasons why the law
     is not all of the motion.
     """
@@ -105,6 +105,19 @@ class LearnedLaw:
     seconds: float
     ended: str
     flaws: tuple[str, ...] = ()
+    symbols: tuple[tuple[str, ...], ...] = ((), ())
+
+    @property
+    def equations(self) -> tuple[Equation, ...]:
+        """Equations of motion, one for each coordinate, with standard errors."""
+        sensors = self.map.sensors
+        assert sensors is not None
+        codes = code_names(self.gains)
+        forces = [
+            [Term(code, *self.gains[name][q]) for name, code in zip(self.gains, codes, strict=True)]
+            for q in sensors.positions
+        ]
+        return equations_of_motion(self.lagrangian, self.friction, forces, *self.symbols)
 
     @property
     def verdict(self) -> str:
@@ -137,7 +150,7 @@ class LearnedLaw:
     @property
     def table(self) -> str:
         """The law, its errors and its horizon, a line each."""
-        lines = [f"L = {self.lagrangian}", f"R = {self.friction}", self._units_line]
+        lines = [f"L = {self.lagrangian}", f"R = {self.friction}", self.units_line]
         lines += [f"friction: {self.which_friction}", f"scale of L: {self.gauge}"]
         sensors = self.map.sensors
         if sensors is not None and np.any(law_of_map(self.map).friction.kinds == DRY):
@@ -181,16 +194,22 @@ class LearnedLaw:
                 f"{_of(self.residual[name], self.units[name])}; residuals "
                 f"{self.whiteness[name].text}"
             )
-        for fraction, seconds, predicted in self.horizon:
-            lines.append(
-                f"95 % of forecasts err by less than {fraction:.0%} of the spread: "
-                f"{_time(seconds)} (by the bands {_time(predicted)})"
-            )
+        lines += self.horizon_lines
         lines += [f"to record next: {motion}" for motion in self.next_motions[:1]]
         return "\n".join(lines)
 
     @property
-    def _units_line(self) -> str:
+    def horizon_lines(self) -> list[str]:
+        """How long forecasts hold, as held-out forecasts showed."""
+        lines = [
+            f"95 % of forecasts err by less than {fraction:.0%} of the spread {_time(seconds)}"
+            for fraction, seconds, _ in self.horizon
+            if seconds > 0
+        ]
+        return lines or ["no forecast errs by less than the noise does"] * bool(self.horizon)
+
+    @property
+    def units_line(self) -> str:
         """Units of the variables in L and R."""
         assert self.map.sensors is not None
         units = self.units | dict.fromkeys(self.map.sensors.angles, "rad")

@@ -1,0 +1,48 @@
+"""``gfnn.discover``: from data to a report in one call."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from gfnn_jax.data.recording import ReadOptions, Recording, read
+from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.evaluate.forecasts import end_of_part
+from gfnn_jax.evaluate.page import write_page, write_refusal
+from gfnn_jax.learn.fit import as_pairs_or_recording, fit
+from gfnn_jax.learn.fitted import Fit
+
+
+def discover(data: Any, report: str | Path | None = "report.html", **options: Any) -> Fit:
+    """Learn from the first two thirds of a recording, forecast the rest, and write the report, one
+    HTML page. Pairs of states are learned from as a whole.
+
+    data: as of `gfnn.fit`: a file, a DataFrame, arrays (t, x), a `Recording`, `Pairs`. report: the
+    page to write; None for none. options: keywords of `gfnn.read` and of `gfnn.fit`.
+
+    Raises FitError where no law follows the recording, and InputError where the data cannot be
+    used; the page is written all the same where the data could be read, and says why.
+
+        fit = gfnn.discover("swing.csv")   # and open report.html
+    """
+    reading = {name: options.pop(name) for name in ReadOptions.__annotations__ if name in options}
+    if reading:
+        data = (
+            read(data, **reading) if isinstance(data, (str, Path)) else Recording(data, **reading)
+        )
+    data = as_pairs_or_recording(data)
+    if not isinstance(data, Recording):
+        found = fit(data, **options)
+    else:
+        end = end_of_part(data)
+        try:
+            found = fit(data.slice(stop=end), **options)
+        except (FitError, InputError) as error:
+            if report is not None:
+                write_refusal(data, error, report)
+            raise
+        found = dataclasses.replace(found, data=data, learned_to=end)
+    if report is not None:
+        write_page(found, report)
+    return found

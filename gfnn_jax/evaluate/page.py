@@ -1,0 +1,389 @@
+"""Report of a fit as one HTML page, which needs no network and prints on A4.
+
+Formulas are MathML, figures are SVG inside the page: browsers show both without a script.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jinja2
+import numpy as np
+from matplotlib.figure import Figure
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.evaluate.figures_of_recordings import (
+    coming_figure,
+    forecasts_figure,
+    recording_figure,
+    residuals_figure,
+    swings_figure,
+)
+from gfnn_jax.evaluate.figures_style import as_svg
+from gfnn_jax.evaluate.forecasts import Forecasts, forecasts_of
+from gfnn_jax.evaluate.physics import Physics, physics
+from gfnn_jax.evaluate.report import device
+from gfnn_jax.exports.symbolic import as_mathml
+from gfnn_jax.families.text import in_letters, measured
+from gfnn_jax.fitting.evidence import EVIDENCE
+from gfnn_jax.learn.fitted import Choice, Fit
+from gfnn_jax.maps.saved import versions
+from gfnn_jax.models.lagrangians.friction_choice import odds_text
+from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
+
+_MEANING = {
+    "identified": "The data determine this law: no other one that was tried explains them as well.",
+    "one of several": "The law explains the data, and the data leave open which of several it is.",
+    "partly": "The law explains a part of the motion. Forecasts hold within the bands that were "
+    "calibrated on held-out data; the coefficients are not those of a complete law.",
+    "not fitted": "The data were not fitted as they are.",
+    "no law": "No law that was tried follows the motion.",
+    "not mechanical": "The motion is not that of a mechanical system.",
+    "map": "No law of physics was found or asked for. The step is exactly symplectic all the same.",
+}
+
+
+class Section(NamedTuple):
+    """One part of the page: title, paragraphs, formulas (MathML), a table with its heads, figures
+    (SVG) with captions."""
+
+    title: str
+    lines: Sequence[str] = ()
+    formulas: Sequence[tuple[str, str]] = ()
+    heads: Sequence[str] = ()
+    rows: Sequence[Sequence[str]] = ()
+    figures: Sequence[tuple[str, str]] = ()
+
+    @property
+    def empty(self) -> bool:
+        return not (self.lines or self.formulas or self.rows or self.figures)
+
+
+def page(fit: Fit, *, command: str = "", forecasts: Forecasts | None = None) -> str:
+    """The page of a fit, as text. command: that made it. forecasts: of its held-out part."""
+    found = fit.found
+    if isinstance(found, LearnedLaw):
+        if forecasts is None and fit.held_out is not None:
+            with contextlib.suppress(InputError):  # it is too short
+                forecasts = forecasts_of(fit.map, fit.held_out)
+        sections = list(_of_law(fit, found, forecasts))
+    elif isinstance(found, Choice):
+        sections = list(_of_choice(fit, found))
+    else:
+        raise ValueError("expected a fit, or the folder of one: this one holds a map alone")
+    sections.append(_made(getattr(found, "seconds", float("nan")), command))
+    return _rendered(_source(fit), fit.verdict or "not stored", sections)
+
+
+def _rendered(title: str, verdict: str, sections: Sequence[Section]) -> str:
+    kind, _, reason = verdict.partition(": ")
+    template = files("gfnn_jax.evaluate").joinpath("page.html").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return environment.from_string(template).render(
+        title=title,
+        verdict=kind,
+        reason=reason,
+        meaning=_MEANING.get(kind, ""),
+        sections=[section for section in sections if not section.empty],
+    )
+
+
+def summary(fit: Fit) -> str:
+    """The verdict, the law and its physical quantities, as a notebook shows them."""
+    verdict, found = f"<p><b>{escape(fit.verdict or repr(fit))}</b></p>", fit.found
+    if isinstance(found, LearnedLaw):
+        formulas = (("L", found.lagrangian), ("R", found.friction))
+        lines = [f"<math><mi>{n}</mi><mo>=</mo>{f.mathml()}</math><br>" for n, f in formulas]
+        lines += [f"{escape(str(one))}<br>" for one in physics(found).quantities]
+        return verdict + "".join(lines)
+    return verdict + f"<pre>{escape(fit.formula or repr(fit))}</pre>"
+
+
+def write_page(fit: Fit, path: str | os.PathLike[str], **about: Any) -> None:
+    """Write the page, whole or not at all. about: as of `page`."""
+    _write(page(fit, **about), Path(path))
+
+
+def write_refusal(
+    recording: Recording, error: Exception, path: str | os.PathLike[str], *, command: str = ""
+) -> None:
+    """Write the page of a recording that gave no law: why, what it holds, what to do."""
+    cause = error if isinstance(error, FitError) else error.__cause__
+    verdict = cause.verdict if isinstance(cause, FitError) and cause.verdict else "not fitted"
+    summary = recording.summary()
+    figure = _svg(recording_figure(recording, summary), "The recording.")
+    sections = [
+        Section("Why", lines=[str(error)]),
+        Section("The data", lines=[*recording.notes, *map(str, summary.faults)], figures=[figure]),
+        Section("To do next", lines=[summary.command]),
+        _made(float("nan"), command),
+    ]
+    _write(_rendered(_title(recording), verdict, sections), Path(path))
+
+
+def _write(text: str, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(
+        "w", encoding="utf-8", dir=path.parent, suffix=".html", delete=False
+    ) as file:
+        file.write(text)
+    Path(file.name).chmod(0o644)
+    Path(file.name).replace(path)
+
+
+def _source(fit: Fit) -> str:
+    if fit.data is not None:
+        return _title(fit.data)
+    scene = getattr(fit.found, "scene", None)
+    return scene.name if scene is not None else "pairs of states"
+
+
+def _title(recording: Recording) -> str:
+    return ", ".join(Path(one).name for one in recording.source.split(", "))
+
+
+# Of a recording.
+
+
+def _of_law(fit: Fit, law: LearnedLaw, forecasts: Forecasts | None) -> Iterator[Section]:
+    known = physics(law)
+    yield Section(
+        "Law",
+        lines=[law.units_line, f"Scale of L: {law.gauge}."],
+        formulas=[
+            ("Lagrangian", f"<mi>L</mi><mo>=</mo>{law.lagrangian.mathml()}"),
+            ("Rayleigh's dissipation function", f"<mi>R</mi><mo>=</mo>{law.friction.mathml()}"),
+            *(("Equation of motion", equation.mathml()) for equation in law.equations),
+        ],
+    )
+    yield _physics(law, known)
+    yield from _forecasts(fit, law, forecasts)
+    if law.traces and fit.data is not None:
+        yield Section(
+            "Residuals",
+            lines=[f"{name}: residuals {one.text}." for name, one in law.whiteness.items()],
+            figures=[
+                _svg(
+                    residuals_figure(law, fit.data),
+                    "Measured minus law along the arcs of "
+                    "the fit: against time, the channel, and its rate of change.",
+                )
+            ],
+        )
+    yield Section("Not identified", lines=list(_not_identified(law)))
+    yield Section(
+        "Rivals", heads=("alternative", "odds of this law against it", ""), rows=list(_rivals(law))
+    )
+    yield Section(
+        "What to record next",
+        heads=("release from rest at", "standard errors shrink by"),
+        rows=[
+            (
+                ", ".join(f"{n} = {q:.3g} {m.units[n]}".rstrip() for n, q in m.start.items()),
+                ", ".join(
+                    f"{in_letters(t)}: {min(g, 1000):.2g}×" for t, g in [*m.gains.items()][:4]
+                ),
+            )
+            for m in law.next_motions
+        ],
+    )
+    yield Section("The data", lines=list(_faults(fit, law)))
+
+
+def _physics(law: LearnedLaw, known: Physics) -> Section:
+    figures = []
+    if known.swings is not None:
+        assert law.map.sensors is not None
+        name = law.map.sensors.positions[0]
+        unit = "rad" if name in law.map.sensors.angles else law.units.get(name, "")
+        label = f"{name} [{unit}]" if unit else name
+        figures = [
+            _svg(
+                swings_figure(known.swings, label),
+                "Free swings about rest, by the law: two standard errors are shaded.",
+            )
+        ]
+    return Section(
+        "Physical quantities",
+        heads=("quantity", "value", "unit", ""),
+        rows=[(one.name, one.shown, one.unit, one.about) for one in known.quantities],
+        figures=figures,
+    )
+
+
+def _forecasts(fit: Fit, law: LearnedLaw, found: Forecasts | None) -> Iterator[Section]:
+    if fit.data is None:
+        return
+    figures = [
+        _svg(
+            coming_figure(law, fit.data, fit.learned_to),
+            "Forecast from one state at the "
+            "dashed line on, and what was measured. Two standard deviations are shaded.",
+        )
+    ]
+    rows, lines = [], []
+    if found is not None and fit.held_out is not None:
+        figures.append(
+            _svg(
+                forecasts_figure(found, fit.held_out),
+                "Three forecasts of what no fit has seen, each from the 20 samples before.",
+            )
+        )
+        for name, errors in found.median.items():
+            unit = fit.held_out.unit(name)
+            rows.append((name, *(f"{e:.3g} {unit}".rstrip() for e in errors)))
+        lines.append(
+            f"{found.within:.0%} of what was measured lies within two standard deviations "
+            "(95 % expected)."
+        )
+        heads = ("median error", *(f"after {s:.3g} s" for s in found.ahead))
+    else:
+        heads = ()
+    yield Section(
+        "Forecasts", lines=[*lines, *law.horizon_lines], heads=heads, rows=rows, figures=figures
+    )
+
+
+def _not_identified(law: LearnedLaw) -> Iterator[str]:
+    yield from (f"The record does not tell apart: {in_letters(pair)}." for pair in law.alike)
+    for term, limit in law.which_friction.limits.items():
+        yield (
+            f"No friction of the form {in_letters(term)} is seen: its coefficient in R is below "
+            f"{limit:.2g} (2 σ)."
+        )
+    if law.delay is not None and not np.isfinite(law.delay[1]):
+        yield "The delay of the inputs is not determined."
+
+
+def _rivals(law: LearnedLaw) -> Iterator[tuple[str, str, str]]:
+    for name, odds in sorted(law.which_friction.odds.items(), key=lambda pair: pair[1])[:8]:
+        note = "as likely" if odds < EVIDENCE.decided else ""
+        yield f"friction {name.replace('+', ' + ')}", odds_text(odds), note
+    for rule, cost in law.input_rules.items():
+        yield f"inputs between samples: {rule}", "", f"held-out cost {cost:.4g} × that of this law"
+
+
+def _faults(fit: Fit, law: LearnedLaw) -> Iterator[str]:
+    yield f"{law.num_samples:,} samples."
+    for name, sigma in law.noise.items():
+        unit = law.units.get(name, "")
+        yield (
+            f"{name}: noise σ = {sigma:.3g} {unit}".rstrip()
+            + f", RMS residual {law.residual[name]:.3g} {unit}".rstrip()
+            + "."
+        )
+    if fit.data is not None:
+        yield from fit.data.notes
+        yield from map(str, fit.data.summary().faults)
+        if fit.data.ignored:
+            yield f"Columns that were not used: {', '.join(fit.data.ignored)}."
+    yield from law.messages
+
+
+# Of pairs.
+
+
+def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
+    law = found.law
+    if law is not None and law.formula:
+        with_formula = "Lagrangian" not in law.formula
+        shown = as_mathml(law.formula) if with_formula else f"<mtext>{law.formula}</mtext>"
+        yield Section(
+            "Law",
+            formulas=[("Hamiltonian", f"<mi>H</mi><mo>=</mo>{shown}")],
+            lines=list(law.notes),
+            heads=("term", "coefficient"),
+            rows=[(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms],
+        )
+    best = found.chosen
+    yield Section(
+        "The map",
+        lines=[
+            found.line + ".",
+            f"The search ended: {found.ended}.",
+            *([found.stated_by] if found.stated_by else []),
+            *([str(found.positions)] if found.positions is not None else []),
+            *map(str, found.partial_laws if not found.met else ()),
+        ],
+        heads=("quantity", "value"),
+        rows=[
+            ("time step", f"{float(np.asarray(fit.map.dt)):g}"),
+            ("parameters", f"{best.num_parameters:,}"),
+            ("operations of a step", f"{best.operations:,.0f}"),
+            ("one-step error, RMS", f"{best.validation_rms:.2e}"),
+            ("one-step error ÷ spread", f"{best.validation_relative:.2e}"),
+            ("95 % bound", f"{best.validation_bound:.2e}"),
+            ("tolerance", f"{found.tolerance:g}: {'met' if found.met else 'not met'}"),
+            (
+                "relative error at the outermost 5 % of the states",
+                "–" if best.outside is None else f"{best.outside:.1e}",
+            ),
+        ],
+    )
+    yield Section(
+        "Candidates",
+        heads=(
+            "",
+            "chart",
+            "family",
+            "parameters",
+            "error ÷ spread",
+            "95 % bound",
+            "kflop per step",
+        ),
+        rows=[
+            (
+                "→" if c.chosen else "",
+                c.chart,
+                c.label,
+                f"{c.num_parameters:,}",
+                f"{'' if c.validated else '~'}{c.validation_relative:.2e}",
+                f"{'' if c.validated else '~'}{c.validation_bound:.2e}",
+                f"{c.operations / 1e3:.1f}",
+            )
+            for c in found.candidates
+        ],
+    )
+    null = law.null_terms if law is not None else ()
+    yield Section(
+        "Not identified", lines=[f"The pairs do not tell {', '.join(null)} apart."] if null else []
+    )
+    yield Section(
+        "Rivals",
+        heads=("alternative", "odds of this law against it"),
+        rows=[(r.formula, odds_text(r.odds)) for r in law.rivals] if law is not None else [],
+    )
+    yield Section(
+        "The data",
+        lines=[
+            f"{found.num_pairs:,} pairs.",
+            *(f"Symmetry of the pairs: {one}." for one in found.symmetries),
+            *found.messages,
+        ],
+    )
+
+
+def _made(seconds: float, command: str) -> Section:
+    fitted = f", {seconds:.1f} s of fitting" if np.isfinite(seconds) else ""
+    packages = ", ".join(f"{n} {v}" for n, v in versions().items() if v)
+    return Section(
+        "How this was made",
+        lines=[
+            *([f"Command: {command}"] if command else []),
+            f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {device()}{fitted}.",
+            packages + ".",
+        ],
+    )
+
+
+def _svg(figure: Figure, caption: str) -> tuple[str, str]:
+    return as_svg(figure, caption), caption

@@ -1,0 +1,184 @@
+"""The report page, the physical quantities of a law, its equation of motion, objects of a fit."""
+
+import dataclasses
+import functools
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from command_line import gfnn as command
+
+import gfnn_jax as gfnn
+from gfnn_jax.evaluate.page import page
+from gfnn_jax.evaluate.physics import physics
+from gfnn_jax.exports.symbolic import Formula, as_latex, as_mathml, equations_of_motion
+from gfnn_jax.families.text import Term
+
+OMEGA, DAMPING, REST = 3.0, 0.06, 0.2  # 1/s, 1/s, m
+
+
+def swing(seconds=24.0, dt=0.04, sigma=1e-3):
+    """A damped oscillator x'' = −ω² (x − rest) − 2 δ x' that is let go one metre from rest."""
+    t = np.arange(0.0, seconds, dt)
+    fast = np.sqrt(OMEGA**2 - DAMPING**2)
+    x = np.exp(-DAMPING * t) * (np.cos(fast * t) + DAMPING / fast * np.sin(fast * t))
+    noise = sigma * np.random.default_rng(0).standard_normal(len(t))
+    return t, REST + x + noise
+
+
+@functools.cache
+def discovered():
+    t, x = swing()
+    table = {"t": t, "x": x}
+    return gfnn.discover(table, report=None, positions=["x"])
+
+
+def test_quantities_are_those_of_the_oscillator():
+    by_name = {q.name: q for q in physics(discovered().law).quantities}
+    known = {
+        "rest position, x": REST,
+        "small swings: frequency": np.sqrt(OMEGA**2 - DAMPING**2) / (2 * np.pi),
+        "small swings: damping ratio ζ": DAMPING / OMEGA,
+        "small swings: quality factor Q": OMEGA / (2 * DAMPING),
+        "small swings: time of decay to 1/e": 1 / DAMPING,
+    }
+    for name, value in known.items():
+        found = by_name[name]
+        assert abs(found.value - value) < 4 * found.std, (name, found)
+        assert found.std < 0.02 * abs(value)
+    assert by_name["small swings: frequency"].unit == "Hz"
+
+
+def test_a_pendulum_slows_down_as_elliptic_integrals_say():
+    from scipy.special import ellipk
+
+    law = discovered().law
+    theta = dataclasses.replace(law)  # the map stays: a spring swings at one frequency
+    swings = physics(theta).swings
+    np.testing.assert_allclose(swings.frequency, swings.frequency[0], rtol=1e-9)
+    record = gfnn.records.path("pendulum")
+    pendulum = gfnn.fit(gfnn.read(record, positions=["theta"], angles=["theta"], stop=40.0))
+    found = physics(pendulum.law).swings
+    expected = ellipk(0.0) / ellipk(np.sin(found.amplitude / 2) ** 2)
+    np.testing.assert_allclose(
+        found.frequency / found.frequency[0], expected / expected[0], rtol=2e-5
+    )
+
+
+def test_the_equation_of_motion():
+    lagrangian = Formula((Term("v1**2", 0.5, 0.0), Term("v1*v2*cos(x1 - x2)", 2.0, 0.1)))
+    friction = Formula((Term("abs(v2)**3", 0.1, 0.01), Term("(v2 - v1)**2", 0.2, 0.02)))
+    forces = [[Term("u", 3.0, 0.5)], []]
+    first, second = equations_of_motion(lagrangian, friction, forces, ["x1", "x2"], ["v1", "v2"])
+    assert str(first.left) == "x₁_ddot + 2.0(1) x₂_ddot cos(x₁−x₂)"
+    assert str(first.right) == "-2.0(1) v₂² sin(x₁−x₂) - 0.40(4) (v₁−v₂) + 3.0(5) u"
+    assert "- 0.30(3) v₂ |v₂|" in str(second.right)
+
+
+def test_formulas_in_a_browser_and_in_latex_have_errors_and_whole_names():
+    formula = Formula((Term("swing_angle**2", -62.213, 0.012),))
+    assert formula.latex() == r"-62.21(1) \mathrm{swing\_angle}^{2}"
+    assert "<mn>62.21(1)</mn>" in formula.mathml()
+    assert "<mi>swing_angle</mi>" in formula.mathml()
+    assert as_latex("theta1_ddot") == r"\ddot{\theta_{1}}"
+    assert "¨" in as_mathml("x_ddot")
+
+
+class _Outline(HTMLParser):
+    """Collects ids, headings' text, and whatever a browser would fetch."""
+
+    def __init__(self):
+        super().__init__()
+        self.fetched, self.open = [], []
+
+    def handle_starttag(self, tag, attrs):
+        fetching = {"src", "href", "xlink:href", "data"}
+        self.fetched += [v for k, v in attrs if k in fetching and not (v or "#").startswith("#")]
+
+
+def test_the_page_is_whole_small_and_needs_no_network():
+    text = page(discovered())
+    outline = _Outline()
+    outline.feed(text)
+    assert outline.fetched == []
+    assert "url(http" not in text
+    assert len(text.encode()) < 3e6
+    for title in ("Law", "Physical quantities", "Forecasts", "Residuals", "How this was made"):
+        assert f"<h2>{title}</h2>" in text
+    assert discovered().verdict.partition(":")[0] in text
+
+
+def test_a_refusal_has_its_page(tmp_path):
+    t = np.arange(0.0, 20.0, 0.05)
+    x = np.ones(len(t))  # which moves nowhere
+    with pytest.raises((gfnn.FitError, gfnn.InputError)) as refused:
+        gfnn.discover({"t": t, "x": x}, tmp_path / "report.html", positions=["x"])
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert str(refused.value)[:40] in text
+
+
+def test_one_command_writes_the_report(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    t, x = swing()
+    np.savetxt("swing.csv", np.stack([t, x], axis=1), "%.5f", ",", header="t,x", comments="")
+    assert command("swing.csv") == 0
+    shown = capsys.readouterr().out
+    assert "runs/swing/report.html" in shown
+    assert "small swings: frequency = 0.477" in shown
+    text = (tmp_path / "runs/swing/report.html").read_text(encoding="utf-8")
+    assert "gfnn swing.csv" in text
+
+
+def test_a_fit_forecasts_plots_and_shows_itself(tmp_path):
+    fit = discovered()
+    times = fit.learned_to + np.array([0.5, 1.0])
+    ahead = fit.forecast(times)
+    t, x = swing(sigma=0.0)
+    np.testing.assert_allclose(ahead.values["x"][0], np.interp(times, t, x), atol=5e-3)
+    assert fit.plot().axes
+    assert "<math>" in fit._repr_html_()
+    assert fit._repr_latex_().startswith("$L = ")
+    fit.report(tmp_path / "r.html")
+    fit.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="still has its data"):
+        gfnn.load(tmp_path / "model").forecast(times)
+    assert gfnn.load(tmp_path / "model").forecast(times, after=fit.seen).values["x"].shape == (1, 2)
+
+
+def test_the_page_of_pairs():
+    scene = gfnn.scenes.make("henon-heiles-regular")
+    import jax
+
+    pairs = gfnn.sample_pairs(scene, num_pairs=600, key=jax.random.key(0))
+    fit = gfnn.fit(pairs, scene, tolerance=1e-5, max_seconds=None)
+    text = page(fit)
+    assert "<h2>Candidates</h2>" in text
+    assert "henon-heiles" in text
+    assert fit.predict(pairs.z0[0], 3).shape == (4, 4)
+
+
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here, in which the page is opened")
+def test_the_page_in_a_browser(tmp_path):
+    discovered().report(tmp_path / "report.html")
+    shown = subprocess.run(
+        [
+            CHROMIUM,
+            *("--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"),
+            *("--virtual-time-budget=3000", "--dump-dom", (tmp_path / "report.html").as_uri()),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert not re.findall(r"CONSOLE.*", shown.stderr)
+    assert "<svg" in shown.stdout
