@@ -40,6 +40,7 @@ from gfnn_jax.scenes import Scene  # noqa: E402
 
 HERE = Path(__file__).resolve().parent
 RESULTS, TABLES, README = HERE / "results", HERE / "RESULTS.md", HERE.parent / "README.md"
+PAGE = HERE.parent / "docs" / "results.md"
 FIGURES = HERE / "figures"
 SEED = 0
 

@@ -1,4 +1,4 @@
-"""A million steps of two bodies: the README's figure.
+"""A million steps of two bodies: the figure of docs/results.md.
 
     python benchmarks/kepler.py           measure, then figure and caption
     python benchmarks/kepler.py --quick   small sizes, into runs/kepler, no figure
@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import Any
 
 # Sets float64, so it comes before all of JAX.
-from harness import FIGURES, README, SEED, Numbers, between_markers, main, number, results, timed
+from harness import FIGURES, PAGE, SEED, Numbers, between_markers, main, number, results, timed
 
 # isort: split
 import jax
@@ -119,7 +119,7 @@ def measure(quick: bool) -> Numbers:
 
 
 def draw(result: Numbers) -> None:
-    """The figure, and its caption in the README."""
+    """The figure, and its caption in docs/results.md."""
     methods = result["measured"]["methods"]
     curves = {
         name: (np.array(m["curve"]["steps"]), np.array(m["curve"]["error"], float))
@@ -143,7 +143,7 @@ def draw(result: Numbers) -> None:
         f"{number(learned['microseconds_per_step'])} µs. "
         "Drawn by `benchmarks/kepler.py`.*"
     )
-    between_markers(README, "kepler", textwrap.fill(caption, 100, break_long_words=False))
+    between_markers(PAGE, "kepler", textwrap.fill(caption, 100, break_long_words=False))
 
 
 def tables() -> None:

@@ -5,8 +5,8 @@
     python benchmarks/targets.py --quick                    small sizes, into runs/targets
 
 A row's result is one JSON file, targets-*.json in benchmarks/results. The tables of
-benchmarks/RESULTS.md and of README.md, and the README's figure, are made from these files alone;
---tables makes them again.
+benchmarks/RESULTS.md and of docs/results.md, and the figure of that page, are made from these files
+alone; --tables makes them again.
 All errors are those of states that no fit has seen.
 """
 
@@ -21,7 +21,7 @@ from typing import Any
 # Sets float64, so it comes before all of JAX.
 from harness import (
     FIGURES,
-    README,
+    PAGE,
     SEED,
     TABLES,
     Numbers,
@@ -312,19 +312,19 @@ def table(found: dict[str, Numbers], *, full: bool) -> str:
 
 
 def tables() -> None:
-    """The tables of README.md and RESULTS.md and the README's figure, from the results."""
+    """The tables of docs/results.md and RESULTS.md and the figure, from the results."""
     found = results(PIECES, "targets")
     if not found:
         return
     between_markers(TABLES, "targets", f"{table(found, full=True)}\n\n{provenance(found)}")
-    between_markers(README, "results", f"{table(found, full=False)}\n\n{provenance(found)}")
+    between_markers(PAGE, "results", f"{table(found, full=False)}\n\n{provenance(found)}")
     caption = (
         "*Two bodies, 100 orbits that no fit has seen: mean position error, and a band of one "
         "standard deviation. Both maps are exactly symplectic, and the error of both grows in "
         f"proportion to the step number ({figure(found)}). Drawn by "
         "`benchmarks/targets.py`.*"
     )
-    between_markers(README, "figure", textwrap.fill(caption, 100, break_long_words=False))
+    between_markers(PAGE, "figure", textwrap.fill(caption, 100, break_long_words=False))
 
 
 def figure(found: dict[str, Numbers]) -> str:

@@ -196,7 +196,8 @@ def _run_file(arguments: argparse.Namespace) -> None:
 
 def _run_states(arguments: argparse.Namespace) -> None:
     """The map of states q, p, into a folder with its report."""
-    options = fit_options(arguments) | {"angles": _as_indices(column_options(arguments))}
+    options: dict[str, Any] = fit_options(arguments)
+    options["angles"] = _as_indices(column_options(arguments))
     with _output(arguments) as output:
         from gfnn_jax.jobs.fit import fit
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Sequence
 from typing import Any
 
 
@@ -38,3 +40,10 @@ class OutOfTime(Exception):
 
 class FitWarning(UserWarning):
     """Warning about a fit that continued: what was found and what it means for the result."""
+
+
+def unexpected(owner: str, name: str, names: Sequence[str]) -> str:
+    """Message about a keyword that ``owner`` has not, with the nearest one that it has."""
+    near = difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"expected {', '.join(names)}"
+    return f"{owner}: unexpected keyword argument '{name}', {hint}"

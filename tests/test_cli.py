@@ -116,7 +116,7 @@ def test_help(command, capsys):
 
 # What is typed, and what the refusal names.
 BAD_USAGE = [
-    ("", "gfnn run two-body --quick"),
+    ("", "gfnn double_pendulum"),
     ("rum", "'rum'"),
     ("run", "SCENE"),
     ("run two-bdy", "'two-body'"),

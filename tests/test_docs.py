@@ -18,6 +18,8 @@ SLOW = {
     "args": ("test_args",),
     "bands": ("test_bands", "test_ensembles"),
     "charts-and-families": ("test_charts", "test_positions", "test_monitors", "test_damping"),
+    "cheat-sheet": ("test_report_page", "test_fit"),
+    "command-line": ("test_report_page", "test_cli"),
     "export": ("test_exports",),
     "extending": ("test_own_models",),
     "friction-and-inputs": ("test_friction", "test_law_maps"),

@@ -73,7 +73,6 @@ SHORTHANDS |= {
     ("learn.fitted", "learn.saved"),
     ("learn.fitted", "evaluate.report"),
     ("learn.fitted", "evaluate.page"),
-    ("learn.fitted", "evaluate.figures"),
 }
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",

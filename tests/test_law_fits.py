@@ -252,7 +252,7 @@ def test_text_of_a_law():
     found = terms_of(terms, np.array([0.5, 0.25]), np.array([0, 0.01]), names, speeds)
     assert found.formula == "0.5*omega1**2 + 0.25*omega1*omega2*cos(theta1 - theta2 + 0.1)"
     assert str(found) == "0.5 ω₁² + 0.25(1) ω₁ ω₂ cos(θ₁−θ₂ + 0.1)"
-    assert found.latex().startswith(r"0.5 \omega_{1}^{2} + 0.25 \omega_{1} \omega_{2} \cos")
+    assert found.latex().startswith(r"0.5 \omega_{1}^{2} + 0.25(1) \omega_{1} \omega_{2} \cos")
 
 
 def test_names_of_functions_are_columns_all_the_same():

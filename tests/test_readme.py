@@ -113,6 +113,14 @@ def test_links_lead_somewhere():
 
 
 def test_ci_runs_the_test_command():
-    (command,) = [c for c in blocks("sh")[1].split("&&") if "pytest" in c]
+    (command,) = [c for block in blocks("sh") for c in block.split("&&") if "pytest" in c]
     arguments = command.strip().removeprefix(".venv/bin/python")
     assert f'"$bin/python"{arguments}' in (ROOT / ".ci/run").read_text()
+
+
+def test_it_is_short_and_its_first_screen_has_a_command_and_a_picture():
+    lines = README.splitlines()
+    assert len(lines) <= 150
+    first = "\n".join(lines[:35])
+    assert "gfnn double_pendulum" in first
+    assert "![" in first

@@ -44,7 +44,7 @@ from gfnn_jax.data.tables import (
     second_times,
 )
 from gfnn_jax.data.text_files import from_text
-from gfnn_jax.errors import InputError
+from gfnn_jax.errors import InputError, unexpected
 from gfnn_jax.signals.wrong_values import TURN
 
 if TYPE_CHECKING:
@@ -154,9 +154,8 @@ class Recording:
         rise in a run; without a column of runs a new run begins where they fall. options:
         `ReadOptions`. Raises InputError where names, times or values do not fit.
         """
-        unknown = set(options) - set(ReadOptions.__annotations__)
-        if unknown:
-            raise TypeError(f"Recording has no keyword {', '.join(sorted(unknown))}")
+        for name in set(options) - set(ReadOptions.__annotations__):
+            raise TypeError(unexpected("Recording", name, [*ReadOptions.__annotations__]))
         by_name: dict[str, Any] = dict(options)
         tables = [from_memory(t) for t in (table if isinstance(table, (list, tuple)) else [table])]
         if not tables:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 _MOST_ROWS = 6  # columns of a recording that a figure shows
 _BLUE, _RED, _GREEN, *_ = COLOURS
 _GAP = 5.0  # times the median step: a pause that no line crosses
+_PAGE = 9.2  # inches: the width of figures for a page
 _POINTS = 1_500  # of a series in a figure, whose panels are some 500 pixels wide
 # Labels that are set as formulas take half of the time of a figure, and powers of ten are rare.
 _style = style(axes__formatter__use_mathtext=False)
@@ -33,9 +34,9 @@ _style = style(axes__formatter__use_mathtext=False)
 class _Sheet:
     """A figure of rows of panels about one recording, and what its panels have in common."""
 
-    def __init__(self, recording: Recording, rows: int, columns: int, **options):
+    def __init__(self, recording: Recording, rows: int, columns: int, width=4.6, **options):
         self.recording = recording
-        self.figure = Figure(figsize=(4.6 * columns, 2.6 * rows))
+        self.figure = Figure(figsize=(width * columns, (1.0 + 0.35 * width) * rows))
         self.axes = self.figure.subplots(rows, columns, squeeze=False, **options)
 
     def label(self, name: str) -> str:
@@ -162,7 +163,7 @@ def _noise_lines(ax, sigma: float) -> None:
 def residuals_figure(fit: LearnedLaw, recording: Recording) -> Figure:
     """Draw the residuals of a law against time, the channel itself and its rate of change."""
     channels = list(fit.whiteness)[:_MOST_ROWS]
-    sheet = _Sheet(recording, len(channels), 3, sharey="row")
+    sheet = _Sheet(recording, len(channels), 3, _PAGE / 3, sharey="row")
     for place, (name, row) in enumerate(zip(channels, sheet.axes, strict=True)):
         t, x, rate, missed = (
             _thinned(np.concatenate(column))
@@ -188,7 +189,7 @@ def _residual(trace: Trace, place: int) -> tuple[np.ndarray, ...]:
 @_style
 def swings_figure(swings: Swings, label: str) -> Figure:
     """Draw frequency and Q of free swings against their amplitude, with two standard errors."""
-    figure = Figure(figsize=(9.2, 2.6))
+    figure = Figure(figsize=(_PAGE, 2.6))
     shown = (
         (swings.frequency, swings.frequency_std, "frequency [Hz]"),
         (swings.quality, swings.quality_std, "quality factor Q"),
@@ -237,6 +238,15 @@ def draw_forecast(
     ax.fill_between(t, value - 2 * std, value + 2 * std, alpha=0.25, label="± 2 σ")
 
 
+def begin_of(own: Recording, begin: float | None) -> float:
+    """The time (s) in the one run ``own`` at which a forecast begins: ``begin`` where it is inside
+    the run, else after two thirds."""
+    t = own.times(own.runs[0])
+    if begin is not None and t[0] < begin < t[-1]:
+        return float(begin)
+    return float(t[0] + np.ptp(t) * 2 / 3)
+
+
 def _energy(ax, fit: LearnedLaw) -> None:
     """Draw the ledger of the longest arc: what is stored, lost, supplied, and left unexplained."""
     trace = max(fit.traces, key=lambda one: np.ptp(one.t))
@@ -259,11 +269,10 @@ def coming_figure(fit: LearnedLaw, recording: Recording, begin: float | None = N
     there; None: after two thirds."""
     channels = list(fit.whiteness)[:_MOST_ROWS]
     run = max(recording.runs, key=lambda name: np.ptp(recording.times(name)))
-    own, t = recording.slice(run=run), recording.times(run)
-    begin = t[0] + np.ptp(t) * 2 / 3 if begin is None else begin
-    begin = t[0] + np.ptp(t) / 2 if not t[0] < begin < t[-1] else begin
-    sheet = _Sheet(recording, len(channels), 1, sharex=True)
-    sheet.figure.set_size_inches(9.2, 2.6 * len(channels))
+    own = recording.slice(run=run)
+    begin = begin_of(own, begin)
+    sheet = _Sheet(recording, len(channels), 1, _PAGE, sharex=True)
+    sheet.figure.set_size_inches(_PAGE, 2.6 * len(channels))
     for name, (ax,) in zip(channels, sheet.axes, strict=True):
         draw_forecast(ax, sheet, fit, own.slice(stop=begin), own, name)
         ax.axvline(begin, color="0.4", lw=0.8, ls="--")
@@ -278,7 +287,7 @@ def forecasts_figure(found: Forecasts, recording: Recording) -> Figure:
     what the forecast missed and its band below."""
     names = list(found.median)[:_MOST_ROWS]
     shown = [found.each[k] for k in sorted({0, len(found.each) // 2, len(found.each) - 1})]
-    sheet = _Sheet(recording, 2 * len(names), len(shown), sharey="row")
+    sheet = _Sheet(recording, 2 * len(names), len(shown), _PAGE / len(shown), sharey="row")
     for column, one in zip(sheet.axes.T, shown, strict=True):
         for above, below, name in zip(column[::2], column[1::2], names, strict=True):
             above.plot(one.t, one.measured[name], ".", ms=3, color="0.5", label="measured")

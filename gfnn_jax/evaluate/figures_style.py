@@ -45,7 +45,8 @@ STYLE: dict[Any, Any] = {
 def style(**changes: Any):
     """Style of the package as a context and as a decorator; matplotlib's settings are restored.
     changes: settings, with __ in place of a dot."""
-    return matplotlib.rc_context(STYLE | {n.replace("__", "."): v for n, v in changes.items()})
+    settings: dict[Any, Any] = {**STYLE, **{n.replace("__", "."): v for n, v in changes.items()}}
+    return matplotlib.rc_context(settings)
 
 
 @style()

@@ -17,22 +17,17 @@ from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
-from matplotlib.figure import Figure
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.evaluate.figures_of_recordings import (
-    coming_figure,
-    forecasts_figure,
-    recording_figure,
-    residuals_figure,
-    swings_figure,
-)
+from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate.figures import Figure
 from gfnn_jax.evaluate.figures_style import as_svg
 from gfnn_jax.evaluate.forecasts import Forecasts, forecasts_of
 from gfnn_jax.evaluate.physics import Physics, physics
 from gfnn_jax.evaluate.report import device
-from gfnn_jax.exports.symbolic import as_mathml
+from gfnn_jax.evaluate.simulation import simulation
+from gfnn_jax.exports.symbolic import as_mathml, defines
 from gfnn_jax.families.text import in_letters, measured
 from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.learn.fitted import Choice, Fit
@@ -54,7 +49,7 @@ _MEANING = {
 
 class Section(NamedTuple):
     """One part of the page: title, paragraphs, formulas (MathML), a table with its heads, figures
-    (SVG) with captions."""
+    (SVG) with captions, and the script of a simulation."""
 
     title: str
     lines: Sequence[str] = ()
@@ -62,10 +57,11 @@ class Section(NamedTuple):
     heads: Sequence[str] = ()
     rows: Sequence[Sequence[str]] = ()
     figures: Sequence[tuple[str, str]] = ()
+    script: str | None = None
 
     @property
     def empty(self) -> bool:
-        return not (self.lines or self.formulas or self.rows or self.figures)
+        return not any(self[1:])
 
 
 def page(fit: Fit, *, command: str = "", forecasts: Forecasts | None = None) -> str:
@@ -97,12 +93,19 @@ def _rendered(title: str, verdict: str, sections: Sequence[Section]) -> str:
     )
 
 
+def figure(fit: Fit) -> Figure | None:
+    """Figure of a law against its recording, or of the candidates of a map."""
+    if isinstance(fit.found, LearnedLaw):
+        return figures.law_figure(fit.found, fit.seen)
+    return figures.candidates_figure(fit)
+
+
 def summary(fit: Fit) -> str:
     """The verdict, the law and its physical quantities, as a notebook shows them."""
     verdict, found = f"<p><b>{escape(fit.verdict or repr(fit))}</b></p>", fit.found
     if isinstance(found, LearnedLaw):
         formulas = (("L", found.lagrangian), ("R", found.friction))
-        lines = [f"<math><mi>{n}</mi><mo>=</mo>{f.mathml()}</math><br>" for n, f in formulas]
+        lines = [f"{defines(name)} {formula.mathml()}<br>" for name, formula in formulas]
         lines += [f"{escape(str(one))}<br>" for one in physics(found).quantities]
         return verdict + "".join(lines)
     return verdict + f"<pre>{escape(fit.formula or repr(fit))}</pre>"
@@ -120,10 +123,10 @@ def write_refusal(
     cause = error if isinstance(error, FitError) else error.__cause__
     verdict = cause.verdict if isinstance(cause, FitError) and cause.verdict else "not fitted"
     summary = recording.summary()
-    figure = _svg(recording_figure(recording, summary), "The recording.")
+    drawn = _svg(figures.recording_figure(recording, summary), "The recording.")
     sections = [
         Section("Why", lines=[str(error)]),
-        Section("The data", lines=[*recording.notes, *map(str, summary.faults)], figures=[figure]),
+        Section("The data", lines=[*recording.notes, *map(str, summary.faults)], figures=[drawn]),
         Section("To do next", lines=[summary.command]),
         _made(float("nan"), command),
     ]
@@ -160,20 +163,21 @@ def _of_law(fit: Fit, law: LearnedLaw, forecasts: Forecasts | None) -> Iterator[
         "Law",
         lines=[law.units_line, f"Scale of L: {law.gauge}."],
         formulas=[
-            ("Lagrangian", f"<mi>L</mi><mo>=</mo>{law.lagrangian.mathml()}"),
-            ("Rayleigh's dissipation function", f"<mi>R</mi><mo>=</mo>{law.friction.mathml()}"),
+            ("Lagrangian", f"{defines('L')} {law.lagrangian.mathml()}"),
+            ("Rayleigh's dissipation function", f"{defines('R')} {law.friction.mathml()}"),
             *(("Equation of motion", equation.mathml()) for equation in law.equations),
         ],
     )
     yield _physics(law, known)
     yield from _forecasts(fit, law, forecasts)
+    yield _simulation(fit, law)
     if law.traces and fit.data is not None:
         yield Section(
             "Residuals",
             lines=[f"{name}: residuals {one.text}." for name, one in law.whiteness.items()],
             figures=[
                 _svg(
-                    residuals_figure(law, fit.data),
+                    figures.residuals_figure(law, fit.data),
                     "Measured minus law along the arcs of "
                     "the fit: against time, the channel, and its rate of change.",
                 )
@@ -200,15 +204,15 @@ def _of_law(fit: Fit, law: LearnedLaw, forecasts: Forecasts | None) -> Iterator[
 
 
 def _physics(law: LearnedLaw, known: Physics) -> Section:
-    figures = []
+    drawn = []
     if known.swings is not None:
         assert law.map.sensors is not None
         name = law.map.sensors.positions[0]
         unit = "rad" if name in law.map.sensors.angles else law.units.get(name, "")
         label = f"{name} [{unit}]" if unit else name
-        figures = [
+        drawn = [
             _svg(
-                swings_figure(known.swings, label),
+                figures.swings_figure(known.swings, label),
                 "Free swings about rest, by the law: two standard errors are shaded.",
             )
         ]
@@ -216,25 +220,25 @@ def _physics(law: LearnedLaw, known: Physics) -> Section:
         "Physical quantities",
         heads=("quantity", "value", "unit", ""),
         rows=[(one.name, one.shown, one.unit, one.about) for one in known.quantities],
-        figures=figures,
+        figures=drawn,
     )
 
 
 def _forecasts(fit: Fit, law: LearnedLaw, found: Forecasts | None) -> Iterator[Section]:
     if fit.data is None:
         return
-    figures = [
+    drawn = [
         _svg(
-            coming_figure(law, fit.data, fit.learned_to),
+            figures.coming_figure(law, fit.data, fit.learned_to),
             "Forecast from one state at the "
             "dashed line on, and what was measured. Two standard deviations are shaded.",
         )
     ]
     rows, lines = [], []
     if found is not None and fit.held_out is not None:
-        figures.append(
+        drawn.append(
             _svg(
-                forecasts_figure(found, fit.held_out),
+                figures.forecasts_figure(found, fit.held_out),
                 "Three forecasts of what no fit has seen, each from the 20 samples before.",
             )
         )
@@ -242,15 +246,24 @@ def _forecasts(fit: Fit, law: LearnedLaw, found: Forecasts | None) -> Iterator[S
             unit = fit.held_out.unit(name)
             rows.append((name, *(f"{e:.3g} {unit}".rstrip() for e in errors)))
         lines.append(
-            f"{found.within:.0%} of what was measured lies within two standard deviations "
+            f"{100 * found.within:.0f} % of what was measured lies within two standard deviations "
             "(95 % expected)."
         )
         heads = ("median error", *(f"after {s:.3g} s" for s in found.ahead))
     else:
         heads = ()
     yield Section(
-        "Forecasts", lines=[*lines, *law.horizon_lines], heads=heads, rows=rows, figures=figures
+        "Forecasts", lines=[*lines, *law.horizon_lines], heads=heads, rows=rows, figures=drawn
     )
+
+
+def _simulation(fit: Fit, law: LearnedLaw) -> Section:
+    """The longest run after the part that was learned from, or its last third."""
+    script, data = None, fit.data
+    if data is not None:
+        own = data.slice(run=max(data.runs, key=lambda name: np.ptp(data.times(name))))
+        script = simulation(law, own, figures.begin_of(own, fit.learned_to))
+    return Section("Simulation", script=script)
 
 
 def _not_identified(law: LearnedLaw) -> Iterator[str]:
@@ -296,10 +309,10 @@ def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
     law = found.law
     if law is not None and law.formula:
         with_formula = "Lagrangian" not in law.formula
-        shown = as_mathml(law.formula) if with_formula else f"<mtext>{law.formula}</mtext>"
+        shown = as_mathml(law.formula) if with_formula else f"<mtext>{escape(law.formula)}</mtext>"
         yield Section(
             "Law",
-            formulas=[("Hamiltonian", f"<mi>H</mi><mo>=</mo>{shown}")],
+            formulas=[("Hamiltonian", f"{defines('H')} <math><mrow>{shown}</mrow></math>")],
             lines=list(law.notes),
             heads=("term", "coefficient"),
             rows=[(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms],

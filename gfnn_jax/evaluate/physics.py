@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -292,7 +292,7 @@ class _System(NamedTuple):
         ]
 
     def _dead_band(self, q: np.ndarray) -> list[Quantity]:
-        """How far from rest dry friction holds a body, of one degree of freedom."""
+        """Distance from rest within which dry friction holds a body of one degree of freedom."""
         if self.law.dim > 1 or not np.any(self.law.friction.kinds == DRY):
             return []
 
@@ -348,7 +348,7 @@ class _System(NamedTuple):
         )
         if left is None:
             return np.nan, np.nan
-        left = brentq(above, left, rest)
+        left = float(brentq(above, left, rest))  # pyright: ignore[reportArgumentType]
         half, middle = 0.5 * (right - left), 0.5 * (right + left)
         nodes, weights = np.polynomial.legendre.leggauss(OPTIONS.nodes)
         angle = 0.5 * np.pi * nodes
@@ -449,16 +449,3 @@ def _energies(law: LearnedLaw) -> list[Quantity]:
         std = abs(e) * relative(*strongest)
         found.append(Quantity(f"energy supplied per second by {name}", e, std, unit))
     return found
-
-
-def swings_table(swings: Swings) -> list[tuple[Any, ...]]:
-    """Rows (amplitude, frequency, Q) of a few swings, from small to large."""
-    some = np.unique(np.linspace(0, len(swings.amplitude) - 1, 5).astype(int))
-    return [
-        (
-            f"{swings.amplitude[k]:.3g}",
-            measured(swings.frequency[k], swings.frequency_std[k]),
-            measured(swings.quality[k], swings.quality_std[k]),
-        )
-        for k in some
-    ]

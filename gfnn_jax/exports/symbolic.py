@@ -9,7 +9,18 @@ from typing import Any, NamedTuple
 
 from gfnn_jax.families.text import GREEK, Term, added, digits, in_letters, measured
 
-_SPACE = '<mspace width="0.17em"></mspace>'
+
+def _math(inside: str) -> str:
+    return f"<math><mrow>{inside}</mrow></math>"
+
+
+def defines(name: str) -> str:
+    """MathML of "name =", which stands before a formula."""
+    return _math(f"<mi>{name}</mi><mo>=</mo>")
+
+
+def _number(text: str) -> str:
+    return f'<mn>{text}</mn><mspace width="0.17em"></mspace>' if text else ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,22 +47,21 @@ class Formula:
         return added(_times(c, s, as_latex(t)) for t, c, s in self.terms) or "0"
 
     def mathml(self) -> str:
-        """Formula as presentation MathML, an ``<mrow>`` that browsers typeset, with errors."""
+        """Formula as presentation MathML that browsers typeset, with errors: an element for each
+        term, so that a page can break lines between them."""
         parts = []
         for place, (term, c, s) in enumerate(self.terms):
             sign = "−" if c < 0 else "+" if place else ""
             number, _, _ = _times(abs(c), s, "").partition(" ")
             body = as_mathml(term) if term != "1" or not number else ""
-            parts.append(
-                f"<mo>{sign}</mo>" * bool(sign) + f"<mn>{number}</mn>{_SPACE}" * bool(number) + body
-            )
-        return f"<mrow>{''.join(parts) or '<mn>0</mn>'}</mrow>"
+            parts.append(_math(f"<mo>{sign}</mo>" * bool(sign) + _number(number) + body))
+        return " ".join(parts) or _math("<mn>0</mn>")
 
     def _repr_latex_(self) -> str:
         return f"${self.latex()}$"
 
     def _repr_html_(self) -> str:
-        return f'<math display="block">{self.mathml()}</math>'
+        return self.mathml()
 
 
 def _times(coefficient: float, std: float, term: str) -> str:
@@ -154,7 +164,7 @@ class Equation(NamedTuple):
 
     def mathml(self) -> str:
         """Equation as presentation MathML."""
-        return f"<mrow>{self.left.mathml()}<mo>=</mo>{self.right.mathml()}</mrow>"
+        return f"{self.left.mathml()} {_math('<mo>=</mo>')} {self.right.mathml()}"
 
 
 def equations_of_motion(

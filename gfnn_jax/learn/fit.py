@@ -19,7 +19,7 @@ import numpy as np
 from gfnn_jax.candidates.assemble import block_of
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.files import are_recordings, read_trajectories
-from gfnn_jax.data.recording import Recording, read
+from gfnn_jax.data.recording import ReadOptions, Recording, read
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.diagnosis.outliers import clean, looked_for_errors
 from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
@@ -52,8 +52,12 @@ def fit(
     options: FitOptions | None = None,
     **changes: Any,
 ) -> Fit:
-    """Learn the law or the map of these data: for pairs the cheapest candidate within the
-    tolerance, else the best; for a recording its law, a Lagrangian with friction and inputs.
+    """Learn the law of a recording, a Lagrangian with friction and inputs; or the map of pairs of
+    states, the cheapest candidate within the tolerance, else the best.
+
+        fit = gfnn.fit("swing.csv")                       # a recording: t, theta, …
+        fit = gfnn.fit(gfnn.Pairs(z0, z1, dt=0.1), tolerance=1e-8)
+        print(fit.verdict, fit.law)
 
     data:      `Pairs`, states and images, (N, 2d) each, NumPy or JAX; those of a sequence in their
                order. Of different dt, S is a function of dt too, in the midpoint chart. With
@@ -77,6 +81,8 @@ def fit(
     their neighbours (a few are left out), and where the pairs do not look symplectic; for a
     recording where its law did not converge, misses a drive, or has an input of no effect.
     """
+    require_x64("a fit")
+    _refuse_roles(changes)
     watch = Watch.taken_from(changes)
     options = dataclasses.replace(options or FitOptions(), **changes)
     positions = scene if _is_array(scene) else None
@@ -111,7 +117,6 @@ def fit(
         return Fit(law.map, law, data=pairs)
     options.refuse_others(("hamiltonian", "map"), "pairs, which are no recording")
     budget = options.budget(watch, pairs.dim)
-    require_x64("a fit")
     messages: list[str] = []
 
     def warn(new: Sequence[str]) -> None:
@@ -195,6 +200,16 @@ def fit(
         seed=options.seed,
     )
     return Fit(chosen.candidate.map, choice)
+
+
+def _refuse_roles(changes: Mapping[str, Any]) -> None:
+    """Raises TypeError where a keyword says what columns are."""
+    roles = {*ReadOptions.__annotations__} - {"angles"}
+    for name in roles & {*changes}:
+        raise TypeError(
+            f"fit: unexpected keyword argument '{name}': it belongs to the data. Give it to "
+            f"gfnn.read(path, {name}=…) or gfnn.Recording(table, {name}=…), and fit what they give"
+        )
 
 
 def as_pairs_or_recording(data: Any, more: Any = None) -> Pairs | Recording:

@@ -386,11 +386,9 @@ class Fit:
 
     def plot(self) -> Any:
         """Figure (matplotlib) of the law against its recording, or of the candidates of a map."""
-        from gfnn_jax.evaluate import figures  # stands after this module: a shorthand
+        from gfnn_jax.evaluate import page  # stands after this module: a shorthand
 
-        if isinstance(self.found, LearnedLaw):
-            return figures.law_figure(self.found, self.seen)
-        return figures.candidates_figure(self)
+        return page.figure(self)
 
     def _repr_html_(self) -> str:
         from gfnn_jax.evaluate import page  # stands after this module: a shorthand
@@ -399,8 +397,6 @@ class Fit:
 
     def _repr_latex_(self) -> str | None:
         """The law as a notebook shows it."""
-        if isinstance(self.found, LearnedLaw):
-            return f"$L = {self.found.lagrangian.latex()}$, $R = {self.found.friction.latex()}$"
         return None if self.law is None else self.law._repr_latex_()
 
     def accelerate(

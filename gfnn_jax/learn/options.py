@@ -7,19 +7,19 @@ not loaded.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import inspect
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
 from gfnn_jax.budget import Budget, seconds_allowed
 from gfnn_jax.dataset.structure_names import EXPECTED, STRUCTURES, names_structure
-from gfnn_jax.errors import FitError
+from gfnn_jax.errors import FitError, unexpected
 
+P = ParamSpec("P")
 T = TypeVar("T")
 RUN, FIT = ("gfnn run", "gfnn fit"), ("gfnn fit",)
 
@@ -133,9 +133,7 @@ def _named(cls: type[T]) -> type[T]:
     @functools.wraps(init)
     def checked(self: T, **given: Any) -> None:
         for name in set(given) - set(names):
-            near = difflib.get_close_matches(name, names, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"expected {', '.join(names)}"
-            raise TypeError(f"{cls.__name__}: unexpected keyword argument '{name}', {hint}")
+            raise TypeError(unexpected(cls.__name__, name, names))
         init(self, **given)
 
     cls.__init__ = checked
@@ -444,13 +442,16 @@ _LISTED = "\n".join(f"    {name}: {about.help}." for name, about in OPTIONS.item
 FitOptions.__doc__ = f"{FitOptions.__doc__}\n{_LISTED}\n    "
 
 
-def with_options(function: Callable[..., Any]) -> Callable[..., Any]:
+_WATCHED = ("on_progress", "on_candidate")  # of a `Watch`; jobs give the others
+
+
+def with_options(function: Callable[P, T]) -> Callable[P, T]:
     """Show the options in the signature and the documentation of a function that takes them by
     ``**options``."""
     shown = inspect.signature(function)
     own = [p for p in shown.parameters.values() if p.kind is not p.VAR_KEYWORD]
-    kinds = FitOptions, Watch
-    options = [p for kind in kinds for p in inspect.signature(kind).parameters.values()]
+    watched = inspect.signature(Watch).parameters
+    options = [*inspect.signature(FitOptions).parameters.values(), *map(watched.get, _WATCHED)]
     ordered = sorted([*own, *options], key=lambda p: p.kind is p.KEYWORD_ONLY)
     function.__signature__ = shown.replace(parameters=ordered)  # pyright: ignore[reportFunctionMemberAccess]
     function.__doc__ = f"{function.__doc__}\n    Options:\n\n{_LISTED}\n    "

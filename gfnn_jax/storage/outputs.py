@@ -17,7 +17,7 @@ from gfnn_jax.errors import InputError, WorkError
 
 # Files that mark a folder as written by this package, and the other contents of such a folder.
 # --overwrite deletes no other folder, and none that holds something else, such as data.
-FOLDER_MARKS = ("model.json", "report.json")
+FOLDER_MARKS = ("model.json", "report.json", "report.html")
 _OURS = (*FOLDER_MARKS, "SHA256SUMS", "arrays", "arrays.npz", "model", "*.png")
 
 

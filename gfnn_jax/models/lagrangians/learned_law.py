@@ -137,6 +137,9 @@ class LearnedLaw:
             return f"one of several: friction may be {' or '.join(['+'.join(kinds), *rivals])}"
         return "identified"
 
+    def _repr_latex_(self) -> str:
+        return f"$L = {self.lagrangian.latex()}$, $R = {self.friction.latex()}$"
+
     @property
     def line(self) -> str:
         """L and R."""
@@ -200,7 +203,7 @@ class LearnedLaw:
 
     @property
     def horizon_lines(self) -> list[str]:
-        """How long forecasts hold, as held-out forecasts showed."""
+        """Times for which forecasts hold, as held-out forecasts showed, a line each."""
         lines = [
             f"95 % of forecasts err by less than {fraction:.0%} of the spread {_time(seconds)}"
             for fraction, seconds, _ in self.horizon

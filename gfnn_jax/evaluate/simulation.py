@@ -1,0 +1,155 @@
+"""The simulation in a report: a law as JavaScript beside its data, with a slider for each of its
+coefficients."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.errors import InputError
+from gfnn_jax.exports.javascript import javascript
+from gfnn_jax.families.text import in_letters
+from gfnn_jax.maps.laws import law_of_map, velocities_of
+from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulationOptions:
+    """Sizes of the simulation. points: of the data, which a browser steps through in some ms.
+    errors, share: a slider reaches this many standard errors, and this share of its coefficient, to
+    either side, whichever is more."""
+
+    points: int = 500
+    errors: float = 10.0
+    share: float = 0.5
+
+
+OPTIONS = SimulationOptions()
+
+
+class Slider(NamedTuple):
+    """A coefficient of the law: its place among them, its name, and how far it goes."""
+
+    place: int
+    label: str
+    low: float
+    high: float
+
+
+def simulation(law: LearnedLaw, recording: Recording, begin: float) -> str | None:
+    """The script of a page: the law, the run after ``begin`` (s), and the sliders. None where a
+    sensor shows something else than a coordinate, where the law is no formula, or where too little
+    of the run is before or after."""
+    sensors = law.map.sensors
+    assert sensors is not None
+    if sensors.observation is not None and not sensors.observation.is_plain:
+        return None
+    try:
+        source = javascript(law.map)
+        z, _ = law.map.estimate(recording.slice(stop=begin))
+    except InputError:
+        return None
+    (run,) = recording.runs
+    t = recording.times(run)
+    rows = np.flatnonzero(t >= begin)[:: max(1, int(np.sum(t >= begin)) // OPTIONS.points)]
+    if len(rows) < 2:
+        return None
+    d, args = law.map.dim, _parameters(law, recording, run)
+    v = velocities_of(law.map, z, np.array([args]) if args else None)
+    known = len(sensors.positions)
+    shown = {
+        "t": t[rows].tolist(),
+        "channels": [_channel(recording, run, i, rows, z[0, i]) for i in range(known)],
+        "start": [*z[0, :d], *v[0]],
+        "parameters": args,
+        "inputs": _inputs(law, recording, run, t[rows], args),
+        "coefficients": np.asarray(law.map.pieces[0].params).tolist(),
+        "sliders": [slider._asdict() for slider in _sliders(law)],
+    }
+    text = json.dumps(shown, ensure_ascii=False).replace("</", "<\\/")
+    drawn = files("gfnn_jax.evaluate").joinpath("page.js").read_text(encoding="utf-8")
+    return f"{source}\nconst shown = {text};\n{drawn}"
+
+
+def _channel(recording: Recording, run: str, place: int, rows: Any, start: float) -> dict[str, Any]:
+    """A column of the data in its file's unit, null where missing; turn: of the lift of an angle,
+    beside the simulated one."""
+    name = recording.positions[place]
+    factor, unit = recording.factors[name], recording.unit(name)
+    y = recording.unwrapped(name, run)[rows] / factor
+    known = y[np.isfinite(y)]
+    turn = 0.0
+    if name in recording.angles and len(known):
+        turn = 2 * np.pi / factor * np.round((known[0] - start / factor) * factor / (2 * np.pi))
+    return {
+        "name": re.sub(r"\W", "_", name),
+        "label": f"{name} [{unit}]" if unit else name,
+        "place": place,
+        "factor": factor,
+        "turn": float(turn),
+        "y": [float(value) if np.isfinite(value) else None for value in y],
+    }
+
+
+def _parameters(law: LearnedLaw, recording: Recording, run: str) -> list[float]:
+    names = () if law.map.parameters is None else law.map.parameters.names
+    return [float(recording.values(name, run)[0]) for name in names]
+
+
+def _inputs(
+    law: LearnedLaw, recording: Recording, run: str, t: np.ndarray, args: list[float]
+) -> list[list[float]]:
+    """Parameters and inputs at the times t, those that act there; [] without inputs."""
+    sensors = law.map.sensors
+    assert sensors is not None
+    if not recording.inputs:
+        return []
+    times = recording.times(run)
+    columns = []
+    for name in recording.inputs:
+        values = recording.values(name, run)
+        known = np.isfinite(values)
+        columns.append(np.interp(t - sensors.delay, times[known], values[known]))
+    return [[*args, *row] for row in np.stack(columns, axis=1).tolist()]
+
+
+def _sliders(law: LearnedLaw) -> list[Slider]:
+    """A slider for each coefficient that was fitted."""
+    piece, posterior = law.map.pieces[0], law.map.posterior
+    values = np.asarray(piece.params)
+    std = np.zeros(len(values))
+    if posterior is not None:
+        std = np.sqrt(np.sum(np.asarray(posterior.root) ** 2, axis=0))
+    found = []
+    for place, (value, error) in enumerate(zip(values.tolist(), std.tolist(), strict=True)):
+        if error > 0 and value != 0:
+            reach = max(OPTIONS.errors * error, OPTIONS.share * abs(value))
+            low = max(value - reach, 0.0) if _is_friction(law, place) else value - reach
+            label = _label(law, piece.family.term_names[place])
+            found.append(Slider(place, label, low, value + reach))
+    return found
+
+
+def _is_friction(law: LearnedLaw, place: int) -> bool:
+    """Return whether a coefficient is one of friction, which is no drive."""
+    own = law_of_map(law.map)
+    first, gains = own.terms.count, own.gains.size
+    losses = first + own.friction.count
+    return first <= place < losses or place >= losses + gains
+
+
+def _label(law: LearnedLaw, term: str) -> str:
+    """A term of the map in the names of the recording."""
+    named = dict(zip("qv", law.symbols, strict=True))
+
+    def own(found: re.Match) -> str:
+        names, place = named[found[1]], int(found[2]) - 1
+        return names[place] if place < len(names) else found[0]
+
+    return in_letters(re.sub(r"\b([qv])(\d+)\b", own, term))
