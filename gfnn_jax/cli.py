@@ -433,9 +433,13 @@ def _export(arguments: argparse.Namespace) -> None:
     if arguments.out is not None:
         ensure_new(arguments.out, arguments.overwrite)
     set_up_jax()
-    from gfnn_jax.exports.export import export
+    from gfnn_jax.exports.export import default_out, export
+    from gfnn_jax.learn.saved import load
 
-    out = export(arguments.model, arguments.to, arguments.out, overwrite=arguments.overwrite)
+    model, to = arguments.model, arguments.to
+    out = arguments.out or default_out(model, to)
+    own: Any = load(model) if to == "latex" else model
+    out = export(own, to, out, overwrite=arguments.overwrite)
     print(f"{out}: {arguments.model} as {arguments.to}, {out.stat().st_size / 1e3:.0f} kB")
 
 

@@ -20,12 +20,18 @@ from gfnn_jax.data.roles import ROLES
 from gfnn_jax.errors import InputError
 from gfnn_jax.learn.options import COUNT, DEVICES, OPTIONS, POSITIVE, SEED, FitOptions, Kind
 
-EXPORTS = (
+EXPORTS = (  # those of `exports.export`, whose import would load JAX
     "c",
     "c-taylor",
     "js",
+    "jax",
+    "casadi",
+    "fmu",
+    "mjcf",
+    "urdf",
+    "latex",
     "stablehlo",
-)  # those of `exports.export`, whose import would load JAX
+)
 EXIT_STATUS = """\
 exit status:
   0    success
@@ -331,8 +337,8 @@ def _export(command: _Command) -> None:
     command.add("model", "folder that `gfnn fit` wrote", "MODEL", type=Path)
     command.add(
         "--to",
-        "c: C99 for one state at a time, of polynomials, Fourier harmonics and formulas; c-taylor: "
-        "a law's flow to roundoff, friction that sticks; js: a law as JavaScript; "
+        "c: C99 for one state at a time; of a law c-taylor: C to roundoff, friction that sticks, "
+        "js: JavaScript, jax, casadi, fmu: FMI 3.0, mjcf and urdf: a chain of links, latex; "
         "stablehlo: batches by jax.export, of any map",
         choices=EXPORTS,
         required=True,

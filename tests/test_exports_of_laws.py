@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 
+import jax
 import numpy as np
 import pytest
 from test_exports import (
@@ -23,8 +24,9 @@ import gfnn_jax as gfnn
 from gfnn_jax import cli, cli_parser
 from gfnn_jax.exports.export import SUFFIXES
 from gfnn_jax.families import lagrangian
+from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.maps.inputs import Signals
-from gfnn_jax.maps.laws import map_of_law
+from gfnn_jax.maps.laws import map_of_law, velocities_of
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.solve.status import LEFT_DOMAIN, NOT_CONVERGED
 
@@ -175,11 +177,149 @@ def test_bodies_stick_in_c_as_in_a_rollout(tmp_path):
     )
 
 
+def one_step(to, path, map_):
+    """Function of states (B, 2d) and args (B, k), or None, that this format's file is."""
+    if to == "jax":
+        text = path.read_text()
+        assert "gfnn_jax" not in text.partition('"""\n\nimport')[2]
+        own = {}
+        exec(compile(text, str(path), "exec"), own)
+        step = jax.jit(jax.vmap(own["step"]))
+        return lambda z, u: step(z, np.zeros((len(z), 0)) if u is None else u)
+    if to == "casadi":
+        casadi = pytest.importorskip("casadi", reason="CasADi is an extra")
+        own = casadi.Function.load(str(path))
+
+        def by_casadi(z, u):
+            more = [{}] * len(z) if u is None else [{"u": row} for row in u]
+            return np.array(
+                [own(z=a, **b)["Z"].full().ravel() for a, b in zip(z, more, strict=True)]
+            )
+
+        return by_casadi
+    fmpy = pytest.importorskip("fmpy", reason="fmpy is an extra")
+    from fmpy.fmi3 import FMU3Slave
+    from fmpy.validation import validate_fmu
+
+    assert validate_fmu(str(path)) == []
+    about, folder = fmpy.read_model_description(str(path)), fmpy.extract(str(path))
+    own = FMU3Slave(
+        guid=about.guid, unzipDirectory=folder, modelIdentifier="own", instanceName="one"
+    )
+    own.instantiate()
+    own.enterInitializationMode(startTime=0.0)
+    own.exitInitializationMode()
+    numbers = {v.name: v.valueReference for v in about.modelVariables}
+    dim, dt = map_.dim, float(map_.dt)
+    z_at = [numbers[f"{letter}{i + 1}"] for letter in "qp" for i in range(dim)]
+    u_at = [numbers[name] for name in ("l", "F") if name in numbers]
+
+    def by_fmu(z, u):
+        found = []
+        for n, row in enumerate(z):
+            own.setFloat64(z_at, row.tolist())
+            if u_at:
+                own.setFloat64(u_at, u[n, : len(u_at)].tolist())
+            own.doStep(0.0 if u is None or u_at else float(u[n, 0]), dt)
+            found.append(own.getFloat64(z_at))
+        return np.array(found)
+
+    return by_fmu
+
+
+@needs_cc
+@pytest.mark.parametrize("kind", SMOOTH)
+@pytest.mark.parametrize("to", ["jax", "casadi", "fmu"])
+def test_steps_of_other_tools_are_the_maps(to, kind, tmp_path):
+    map_, z, args = SMOOTH[kind]()
+    if to == "fmu" and kind == "inputs that change":
+        args = args * [1.0, 0.0]  # held
+    z, args = z[:40], None if args is None else args[:40]
+    if to == "casadi":
+        pytest.importorskip("casadi", reason="CasADi is an extra")
+    path = gfnn.export(map_, to, tmp_path / f"own{SUFFIXES[to]}")
+    wanted = expected(map_, z, args) if to == "fmu" else np.asarray(map_.pieces[0].step(z, args)[0])
+    atol = 1e-9 if (to, kind) == ("fmu", "inputs that change") else 1e-13
+    np.testing.assert_allclose(one_step(to, path, map_)(z, args), wanted, rtol=1e-13, atol=atol)
+
+
+def chain(relative=False):
+    """A double pendulum of two links, its motor and friction at the joints; the angles of the first
+    are zero where it is turned by 0.1."""
+    m, c, inertia, long, g = (1.2, 0.7), (0.2, 0.3), (0.03, 0.01), 0.5, 9.81
+    a = inertia[0] + m[0] * c[0] ** 2 + m[1] * long**2
+    b, e = m[1] * long * c[1], inertia[1] + m[1] * c[1] ** 2
+    weights, none, turned = ((m[0] * c[0] + m[1] * long) * g, m[1] * c[1] * g), (0, 0), -0.1
+    if relative:
+        rows = [
+            ((2, 0), none, none, 0.0, (a + e) / 2),
+            ((2, 0), none, (0, 1), 0.0, b),
+            ((0, 2), none, none, 0.0, e / 2),
+            ((1, 1), none, none, 0.0, e),
+            ((1, 1), none, (0, 1), 0.0, b),
+            (none, none, (1, 0), turned, weights[0]),
+            (none, none, (1, 1), turned, weights[1]),
+        ]
+    else:
+        rows = [
+            ((2, 0), none, none, 0.0, a / 2),
+            ((0, 2), none, none, 0.0, e / 2),
+            ((1, 1), none, (1, -1), turned, b),
+            (none, none, (1, 0), turned, weights[0]),
+            (none, none, (0, 1), 0.0, weights[1]),
+        ]
+    second = (0, 1) if relative else (-1, 1)
+    friction = [((1, 0), lagrangian.LINEAR, 0.0), (second, lagrangian.LINEAR, 0.0)]
+    own = lagrangian.Lagrangian(
+        lagrangian.Terms.of([row[:4] for row in rows], 2),
+        np.array([row[4] for row in rows]),
+        lagrangian.Friction.of(friction, 2),
+        np.array([0.02, 0.01]),
+        0.0,
+        np.array([[0.0], [1.0]] if relative else [[-1.0], [1.0]]),
+    )
+    z = np.random.default_rng(0).uniform(-1, 1, (300, 4)) * [1, 1, 0.3, 0.1]
+    return map_of_law(own, z, 0.01, tolerance=1e-12, signals=Signals(("F",))), z
+
+
+@pytest.mark.parametrize("to", ["mjcf", "urdf"])
+@pytest.mark.parametrize("relative", [False, True])
+def test_mujoco_moves_a_chain_of_links_as_its_law_does(relative, to, tmp_path):
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is an extra")
+    map_, z = chain(relative)
+    path = gfnn.export(map_, to, tmp_path / f"own{SUFFIXES[to]}")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.timestep, model.opt.integrator = 1e-3, mujoco.mjtIntegrator.mjINT_RK4
+    data, push = mujoco.MjData(model), 0.1 if to == "mjcf" else 0.0
+    turn = np.array([[1.0, 0.0], [0.0 if relative else 1.0, 1.0]])  # of joints into columns
+    data.qpos[:] = np.linalg.solve(turn, z[0, :2])
+    data.qvel[:] = np.linalg.solve(turn, velocities_of(map_, z[:1])[0])
+    if model.nu:
+        data.ctrl[:] = push
+    for _ in range(1_000):
+        mujoco.mj_step(model, data)
+    states, _ = map_.rollout(z[0], 100, inputs=np.full((101, 1), push))
+    np.testing.assert_allclose(turn @ data.qpos, states[-1, :2], atol=1e-8)
+    np.testing.assert_allclose(model.body_pos[-1], [0, 0, -0.5], atol=1e-12)  # the length is told
+
+
+def test_a_law_that_is_no_chain_has_no_links(tmp_path):
+    rods, _ = two_rods([((1, 0), lagrangian.LINEAR, 0.0)], [0.1])
+    terms = rods.pieces[0].family.family.terms
+    springs = dataclasses.replace(terms, powers=np.array([[0, 0]] * 3 + [[2, 0], [0, 2]]))
+    family = dataclasses.replace(
+        rods.pieces[0].family, family=Legendre(dataclasses.replace(springs, modes=0 * terms.modes))
+    )
+    odd = dataclasses.replace(rods, pieces=(dataclasses.replace(rods.pieces[0], family=family),))
+    with pytest.raises(gfnn.InputError, match=r"no planar chain .* --to fmu"):
+        gfnn.export(odd, "mjcf", tmp_path / "own.xml")
+
+
 def test_formats_of_laws_are_refused_for_what_has_none(tmp_path):
     from test_exports import MAPS
 
     map_, _ = MAPS["type 2"]()
-    for to in ("c-taylor", "js"):
+    for to in ("c-taylor", "js", "jax", "fmu"):
         with pytest.raises(gfnn.InputError, match=r"no law.*--to c"):
             gfnn.export(map_, to, tmp_path / f"own{SUFFIXES[to]}")
     assert set(SUFFIXES) == set(cli_parser.EXPORTS)

@@ -77,6 +77,7 @@ SHORTHANDS |= {
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",
     "charset_normalizer": "data.texts",
+    "casadi": "exports.casadi_function",
     "diffrax": "scenes.trajectories",
     "flax": "families.mlp",
     "jinja2": "evaluate.page",

@@ -6,7 +6,8 @@ import io
 import json
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,38 @@ from jax import export as exporting
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports.c_source import c_source
+from gfnn_jax.exports.casadi_function import casadi_function
+from gfnn_jax.exports.fmu import fmu
 from gfnn_jax.exports.javascript import javascript
+from gfnn_jax.exports.jax_source import jax_source
+from gfnn_jax.exports.links import mjcf, urdf
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import require_x64
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
 
-SUFFIXES = {"c": ".c", "c-taylor": ".c", "js": ".js", "stablehlo": ".zip"}
+SUFFIXES = {
+    "c": ".c",
+    "c-taylor": ".c",
+    "js": ".js",
+    "jax": ".py",
+    "casadi": ".casadi",
+    "fmu": ".fmu",
+    "mjcf": ".xml",
+    "urdf": ".urdf",
+    "latex": ".tex",
+    "stablehlo": ".zip",
+}
+_PRINTERS: dict[str, Callable[[SymplecticMap, str, Mapping[str, Any]], str | bytes]] = {
+    "c": c_source,
+    "c-taylor": partial(c_source, taylor=True),
+    "js": javascript,
+    "jax": jax_source,
+    "casadi": casadi_function,
+    "fmu": fmu,
+    "mjcf": mjcf,
+    "urdf": urdf,
+}
 _KEYWORDS_OF_C = re.compile(
     r"auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for"
     r"|goto|if|inline|int|long|register|restrict|return|short|signed|sizeof|static|struct"
@@ -45,7 +71,10 @@ def export(
           ``NAME_inverse``, NAME that of the file; for float64 maps whose functions are polynomials,
           Fourier harmonics or formulas.
           "c-taylor": the same of a law, by Taylor series to roundoff, with events of dry friction.
-          "js": a law as JavaScript, whose inputs and coefficients are arguments.
+          "js": a law as JavaScript, "jax": as a plain JAX function, "casadi": as a CasADi function,
+          "fmu": as an FMU of FMI 3.0, all with inputs and coefficients as arguments.
+          "mjcf", "urdf": a law that is a planar chain of links, for MuJoCo and robotics.
+          "latex": the law of a fit as a formula.
           "stablehlo": step and inverse of batches of any size, for ``jax.export.deserialize``; for
           any map.
     out:  the file; with None a file beside the folder, of its name.
@@ -55,6 +84,9 @@ def export(
     """
     if to not in SUFFIXES:
         raise InputError(f"expected {' or '.join(SUFFIXES)} to export to, got '{to}'")
+    law = getattr(map_, "law", None)
+    if to == "latex" and law is None:
+        raise InputError("a formula is that of a fit with a law: gfnn.export(gfnn.load(...), …)")
     map_ = getattr(map_, "map", map_)  # a fit
     folder = None if isinstance(map_, SymplecticMap) else Path(map_)
     if out is None and folder is None:
@@ -63,17 +95,26 @@ def export(
     if out.suffix != SUFFIXES[to]:
         raise InputError(f"{out}: is written as {SUFFIXES[to]}, got the suffix '{out.suffix}'")
     ensure_new(out, overwrite)
+    if to == "latex":
+        atomic_write(out, _latex(law))
+        return out
     map_ = map_ if isinstance(map_, SymplecticMap) else saved.load(map_)
     about = _about(folder)
-    if to in ("c", "c-taylor"):
-        atomic_write(out, c_source(map_, _identifier(out), about, to == "c-taylor"))
-    elif to == "js":
-        atomic_write(out, javascript(map_, _identifier(out), about))
+    if to in _PRINTERS:
+        atomic_write(out, _PRINTERS[to](map_, _identifier(out), about))
     else:
         known = {"dim": map_.dim, "dt": float(np.asarray(map_.dt))}
         names = map_.parameters.names if map_.parameters is not None else ()
         atomic_write(out, stablehlo(map_, {**known, "parameters": list(names), **about}))
     return out
+
+
+def _latex(law: Any) -> str:
+    """Formulas of a law in LaTeX: H; or L, and R where there is friction."""
+    if not hasattr(law, "lagrangian"):
+        return f"H = {law.latex()}\n"
+    friction = f"\nR = {law.friction.latex()}" if law.friction.terms else ""
+    return f"L = {law.lagrangian.latex()}{friction}\n"
 
 
 def default_out(folder: Path, to: str) -> Path:

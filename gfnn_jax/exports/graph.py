@@ -92,8 +92,9 @@ class _Signed:
         return np.array(slopes, dtype=object)
 
 
-def graph_of(map_: SymplecticMap) -> LawGraph:
-    """The graph of the law whose flow a map is.
+def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
+    """The graph of the law whose flow a map is; with dry friction that is ``sharp`` where bodies
+    stick in forecasts, else as the map smooths it.
 
     Raises InputError for a map that is no flow of a law in Cartesian coordinates, or whose law is
     no formula.
@@ -124,7 +125,7 @@ def graph_of(map_: SymplecticMap) -> LawGraph:
     speeds, limits, directions = [], [], np.zeros((0, dim), int)
     if is_of_law(map_):
         rates, speeds, limits, directions = _of_lagrangian(
-            tape, family, p, z, args, getattr(sensors, "creep", 0.0)
+            tape, family, p, z, args, getattr(sensors, "creep", 0.0) if sharp else -1.0
         )
     else:
         gradient = family.gradient(p, z, args)[0]
