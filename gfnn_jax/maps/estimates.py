@@ -24,7 +24,7 @@ from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import at_stages
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.parameters import Parameters
-from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.maps.sensors import TUBE, Sensors
 from gfnn_jax.signals.local_cubics import smooth
 from gfnn_jax.signals.splines import splines
 from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
@@ -36,6 +36,7 @@ _FINE = 0.16  # radians of the fastest motion in a step
 _SMALL = 2e-3  # radians of the fastest motion, over which velocities are differenced
 _FEW = 4  # steps between inputs, of which those in between are filled in
 _AT_ONCE = 4_096  # steps whose derivatives are taken together
+_DRAWS = 400  # of errors of a trajectory, whose largest multiple of a band is looked for
 
 
 class Window(NamedTuple):
@@ -133,9 +134,14 @@ def estimate(map_: Any, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 
 
 def forecast(
-    map_: Any, recording: Recording, times: np.ndarray, inputs: Recording | None = None
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
-    """Implement `maps.forecasts.forecast` for the map of a law: values, std, outside."""
+    map_: Any,
+    recording: Recording,
+    times: np.ndarray,
+    inputs: Recording | None = None,
+    whole: float | None = None,
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...], np.ndarray]:
+    """Implement `maps.forecasts.forecast` for the map of a law: values, std, outside, and how many
+    standard deviations (runs,) hold whole trajectories with the probability ``whole``."""
     law = law_of(map_)
     sensors = law.sensors
     windows = windows_of(sensors, recording, map_.parameters)
@@ -170,7 +176,24 @@ def forecast(
             std[n] = np.sqrt(orbits.covariances[..., i, i])
     outside = _outside(map_.parameters, recording, windows)
     beyond = _beyond(map_, [laws[k] for k in which], recording, times, orbits.states)
-    return values, std, outside + beyond
+    tubes = np.full(len(windows), np.nan)
+    if whole is not None:
+        ahead = times[-1] - last
+        wider = np.array([sensors.widening(seconds, whole) for seconds in ahead])
+        tubes = wider * orbits.largest(TUBE)[:, -1]
+        beyond += _uncertified(sensors, recording, ahead)
+    return values, std, outside + beyond, tubes
+
+
+def _uncertified(sensors: Sensors, recording: Recording, ahead: np.ndarray) -> tuple[str, ...]:
+    """Lines about runs that are forecast farther than held-out forecasts went, (runs,) seconds."""
+    most = sensors.leads[-1]
+    return tuple(
+        f"run {run}: no held-out forecast went farther than {most:.3g} s: the band over "
+        f"{seconds:.3g} s is extrapolated"
+        for run, seconds in zip(recording.runs, ahead, strict=True)
+        if seconds > 1.01 * most
+    )
 
 
 def _beyond(
@@ -430,13 +453,38 @@ def _near(sensors: Sensors, t: np.ndarray) -> int:
 
 
 class Orbits(NamedTuple):
-    """Channels (B, n, k) at the times asked, their standard deviations, the states (B, n, 2d), and
-    these states' covariances in the law (B, n, 2d, 2d)."""
+    """Channels (B, n, k) at the times asked, the states (B, n, 2d), these states' covariances in
+    the law (B, n, 2d, 2d), and what the channels' errors are made of: ``modes`` (B, n, k, r), each
+    with one random number for all times of a lane, and ``noise`` (k,) of each reading by itself."""
 
     values: np.ndarray
-    std: np.ndarray
     states: np.ndarray
     covariances: np.ndarray
+    modes: np.ndarray
+    noise: np.ndarray
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard deviations (B, n, k) of the channels."""
+        return np.sqrt(np.sum(self.modes**2, axis=-1) + self.noise**2)
+
+    def with_misfit(self, misfit: np.ndarray) -> Orbits:
+        """These orbits with a misfit (B, n, k) of their law, one random number a channel."""
+        own = misfit[..., None] * np.eye(misfit.shape[-1])
+        return self._replace(modes=np.concatenate([self.modes, own], axis=-1))
+
+    def largest(self, coverage: float) -> np.ndarray:
+        """Multiples (B, n) of the standard deviations that no channel exceeds from the first time
+        until each, with the probability ``coverage``, were all errors Gaussian."""
+        lanes, times, count, rank = self.modes.shape
+        rng, found = np.random.default_rng(0), np.empty((lanes, times))
+        for lane, (modes, std) in enumerate(zip(self.modes, self.std, strict=True)):
+            drawn = modes @ rng.normal(size=(rank, _DRAWS))
+            drawn += self.noise[:, None] * rng.normal(size=(times, count, _DRAWS))
+            largest = np.max(np.abs(drawn) / std[..., None], axis=1)
+            running = np.maximum.accumulate(largest, axis=0)
+            found[lane] = np.quantile(running, coverage, axis=1)
+        return found
 
 
 def propagate(
@@ -477,15 +525,15 @@ def propagate_each(
     orbit = orbit[:, asked]
     at = np.concatenate([u[:, :, 0, 0], u[:, -1:, -1, -1]], axis=1)[:, asked]
     channels, ahead = _channels(laws, which, orbit, at), times - last[:, None]
-    values, shown, further = channels.values, channels.by_state @ spread, 0.0
+    values, modes = channels.values, channels.by_state @ spread
     if sensors.wander is not None:
         left = sensors.wander.fading(ahead)[..., None]
         values = values + left * zeros[:, None]
-        shown = shown + left[..., None] * of_zeros[:, None]
-        further = sensors.wander.size**2 * (1 - left**2) * sensors.sigma**2
-    misfit = sensors.misfit_at(ahead) * large
-    own = np.sum(shown**2, axis=-1) + further + sensors.sigma**2 + misfit**2
-    return Orbits(values, np.sqrt(own), orbit, spread @ spread.swapaxes(2, 3))
+        modes = modes + left[..., None] * of_zeros[:, None]
+    orbits = Orbits(values, orbit, spread @ spread.swapaxes(2, 3), modes, sensors.sigma)
+    if sensors.wander is not None:
+        orbits = orbits.with_misfit(sensors.wander.size * np.sqrt(1 - left**2) * sensors.sigma)
+    return orbits.with_misfit(sensors.misfit_at(ahead) * large)
 
 
 def _followed(

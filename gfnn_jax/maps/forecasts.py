@@ -8,10 +8,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.stats import norm
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.maps import estimates, position_estimates
+from gfnn_jax.maps.sensors import TUBE
 from gfnn_jax.threads import one_thread
 
 
@@ -19,23 +21,25 @@ class Forecast(NamedTuple):
     """Forecast of what sensors will show, and of coordinates that no column is named for: name ->
     (runs, n), and their standard deviations. times: in seconds. units: of the values, "" where it
     is not known. outside: lines about runs whose parameters, or whose motion, lie beyond those that
-    the law was learned from, which the standard deviations leave out."""
+    the law was learned from, which the standard deviations leave out. band: half widths
+    (runs, n) of the band that was asked for, None where none was."""
 
     times: np.ndarray
     values: dict[str, np.ndarray]
     std: dict[str, np.ndarray]
     units: dict[str, str]
     outside: tuple[str, ...] = ()
+    band: dict[str, np.ndarray] | None = None
 
     def in_units_of(self, recording: Recording) -> Forecast:
         """Convert values and standard deviations to the units of a recording's file."""
         factors = recording.factors
-        values, std = (
-            {name: array / factors.get(name, 1.0) for name, array in of.items()}
-            for of in (self.values, self.std)
+        values, std, band = (
+            None if of is None else {name: x / factors.get(name, 1.0) for name, x in of.items()}
+            for of in (self.values, self.std, self.band)
         )
         units = {n: recording.unit(n) if n in factors else unit for n, unit in self.units.items()}
-        return self._replace(values=values, std=std, units=units)
+        return self._replace(values=values, std=std, units=units, band=band)
 
 
 def estimate(map_: Any, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
@@ -44,17 +48,52 @@ def estimate(map_: Any, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
         return _kind(map_).estimate(map_, recording)
 
 
+class Asked(NamedTuple):
+    """Band that is asked for: the probability with which it holds each reading, or the whole
+    trajectory of all channels (``simultaneous``). Raises InputError where it is none of 0 to 1."""
+
+    coverage: float | None = None
+    simultaneous: bool = False
+
+    @property
+    def whole(self) -> float | None:
+        """The probability of whole trajectories, None where it is not asked for."""
+        if self.coverage is not None and not 0 < self.coverage < 1:
+            raise InputError(f"expected a coverage between 0 and 1, got {self.coverage:g}")
+        if not self.simultaneous:
+            return None
+        return TUBE if self.coverage is None else self.coverage
+
+
 def forecast(
-    map_: Any, recording: Recording, times: Any, inputs: Recording | None = None
+    map_: Any,
+    recording: Recording,
+    times: Any,
+    inputs: Recording | None = None,
+    asked: Asked | None = None,
 ) -> Forecast:
     """`SymplecticMap.forecast`, in radians and the units of the columns' numbers."""
     times = np.atleast_1d(np.asarray(times, float))
     if times.ndim != 1 or not np.all(np.diff(times) > 0):
         raise InputError("expected rising times (n,) of a forecast")
+    asked = asked or Asked()
+    kind, whole = _kind(map_), asked.whole
+    if whole is not None and kind is position_estimates:
+        raise InputError("expected a law: of a map of positions alone only bands of each reading")
     with one_thread():
-        values, std, outside = _kind(map_).forecast(map_, recording, times, inputs)
+        if kind is position_estimates:
+            values, std, outside = kind.forecast(map_, recording, times, inputs)
+        else:
+            values, std, outside, tubes = kind.forecast(map_, recording, times, inputs, whole)
     units = {name: "rad" if name in map_.sensors.angles else "" for name in values}
-    return Forecast(times, values, std, units, outside)
+    found = Forecast(times, values, std, units, outside)
+    if whole is not None:
+        return found._replace(band={name: tubes[:, None] * of for name, of in std.items()})
+    if asked.coverage is not None:
+        # Two standard deviations are calibrated to hold 95 % of the readings.
+        factor = 2 * norm.ppf((1 + asked.coverage) / 2) / norm.ppf((1 + TUBE) / 2)
+        return found._replace(band={name: factor * of for name, of in std.items()})
+    return found
 
 
 def _kind(map_: Any) -> Any:

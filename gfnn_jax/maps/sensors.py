@@ -6,9 +6,12 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.solve.noise import Wander
+
+TUBE = 0.95  # of trajectories lie in the tube that scores are multiples of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +29,9 @@ class Sensors:
     σ in a period: of dry friction that is smoothed over no more, forecasts slide or stick.
     middle, reach: (d,) and (2d,) the mean of the coordinates over the data, and the rms of their
     distances from it and of the speeds. relative: whether the misfit is in proportion to how large
-    the motion is, in these units.
+    the motion is, in these units. scores: (B, n) the largest errors of held-out forecasts from
+    their start to each lead, as multiples of the tube that their law gives; None where unknown.
+    observed: seconds of data that they are from.
     """
 
     positions: tuple[str, ...]
@@ -45,6 +50,8 @@ class Sensors:
     middle: Any = None
     reach: Any = None
     relative: bool = False
+    scores: Any = None
+    observed: float = 0.0
 
     @property
     def observation_model(self) -> Observation:
@@ -95,3 +102,24 @@ class Sensors:
         power = np.clip(slope, 0.0, 1.0)
         beyond = np.maximum(1.0, ahead / t[-1])
         return np.stack(columns, axis=-1) * beyond[..., None] ** power
+
+    def widening(self, ahead: float, coverage: float) -> float:
+        """Factor by which a tube over a time ahead has to be wider than the law by itself says, so
+        that it holds the whole of a further trajectory with the probability ``coverage``.
+
+        Held-out forecasts are exchangeable as far as they do not overlap. Where these are many
+        their rank decides (split conformal prediction), where few a prediction interval of the
+        logarithms, by Student's t. NaN where no forecast was held out.
+        """
+        if self.scores is None or not len(self.leads):
+            return np.nan
+        lead = min(int(np.searchsorted(self.leads, ahead)), len(self.leads) - 1)
+        scores = self.scores[np.isfinite(self.scores[:, lead]), lead]
+        if len(scores) < 2:
+            return np.nan
+        count = max(2.0, min(len(scores), self.observed / self.leads[lead]))
+        logs = np.log(scores)
+        reach = stats.t.ppf(coverage, count - 1) * np.sqrt(1 + 1 / count)
+        likely = np.exp(logs.mean() + reach * logs.std(ddof=1))
+        rank = coverage * (1 + 1 / count)
+        return float(np.quantile(scores, rank) if rank < 1 else max(likely, scores.max()))

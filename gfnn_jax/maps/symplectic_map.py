@@ -307,14 +307,19 @@ class SymplecticMap:
 
         return forecasts.estimate(self, recording)
 
-    def forecast(self, recording, times, inputs=None):
+    def forecast(self, recording, times, inputs=None, *, coverage=None, simultaneous=False):
         """`maps.forecasts.Forecast` at ``times`` (n,), the recording's clock, in its units, from
         the state at each run's end; ``inputs`` are a recording of those ahead, matched by run where
-        it has several. Raises InputError as `estimate` does, for times before a run's end, and of a
-        map of positions alone for times between its steps."""
+        it has several. ``coverage`` asks for the half widths ``band`` that hold a reading with this
+        probability, or with ``simultaneous`` all readings of a run at these times (0.95 where no
+        coverage is given), by the largest errors of forecasts of held-out data.
+        Raises InputError as `estimate` does, for times before a run's end, a coverage outside
+        (0, 1), and of a map of positions alone for times between its steps and simultaneous
+        bands."""
         from gfnn_jax.maps import forecasts  # stands after this module: loaded when first used
 
-        return forecasts.forecast(self, recording, times, inputs).in_units_of(recording)
+        asked = forecasts.Asked(coverage, simultaneous)
+        return forecasts.forecast(self, recording, times, inputs, asked).in_units_of(recording)
 
     def linearise(self, z, inputs=None, args=None, *, t0=None):
         """(A, B) of a step: ∂Z/∂z (..., 2d, 2d) and ∂Z/∂u (..., 2d, k), inputs u, (k,) or (B, k),

@@ -24,13 +24,14 @@ from gfnn_jax.dataset.stretches import Scales, Stretch
 from gfnn_jax.fitting.evidence import Comparison
 from gfnn_jax.maps.estimates import (
     Law,
+    Orbits,
     Window,
     estimate_states,
     of_windows,
     propagate_each,
     thinned,
 )
-from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.maps.sensors import TUBE, Sensors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +120,7 @@ def calibrated(
     some = starts[:: -(-len(starts) // OPTIONS.tried)]
     leads = np.array([0.5, 1.0]) * scales.period
     windows = np.repeat(tried, len(some))
-    errors, _, _ = _forecasts(thirds, found, some * len(tried), windows, leads)
+    errors = _forecasts(thirds, found, some * len(tried), windows, leads)[0]
     with np.errstate(all="ignore"):
         sizes = (np.abs(errors) / spread).reshape(len(tried), -1)
         middle = np.nan_to_num(np.nanmedian(sizes, axis=1), nan=np.inf)
@@ -130,16 +131,24 @@ def calibrated(
     )
     leads = leads[leads <= 0.9 * longest]
     windows = np.where(np.arange(len(starts)) % 2, short, best)
-    errors, deviations, x = _forecasts(thirds, found, starts, windows, leads)
-    errors, deviations = _shared(errors), _shared(deviations)
+    own, orbits, x = _forecasts(thirds, found, starts, windows, leads)
+    errors, deviations = _shared(own), _shared(orbits.std)
     sensors, large = _with_size(law.sensors, x, errors, deviations)
     enough = np.isfinite(errors).all(axis=-1).sum(axis=0) >= OPTIONS.fewest
     leads, errors, deviations = leads[enough], errors[:, enough], deviations[:, enough]
+    own, orbits = own[:, enough], orbits._replace(modes=orbits.modes[:, enough])
     if not len(leads):
         return _unknown(law, spread)
     missed = np.nanquantile((errors**2 / 4 - deviations**2) / large**2, OPTIONS.inside, axis=0)
     misfit = np.sqrt(np.maximum(missed, 0.0))
-    sensors = dataclasses.replace(sensors, window=best, leads=leads, misfit=misfit)
+    sensors = dataclasses.replace(
+        sensors,
+        window=best,
+        leads=leads,
+        misfit=misfit,
+        scores=_scores(own, orbits.with_misfit(misfit * large[: len(x)])),
+        observed=float(sum(s.t[-1] - s.t[0] for s in found)),
+    )
     bands = np.where(np.isfinite(errors), 2 * np.hypot(deviations, misfit * large), np.nan)
     measured = np.max(np.nanquantile(np.abs(errors), OPTIONS.inside, axis=0) / spread, axis=1)
     predicted = np.max(np.nanmedian(bands, axis=0) / spread, axis=1)
@@ -182,6 +191,14 @@ def _with_size(
     return chosen
 
 
+def _scores(errors: np.ndarray, orbits: Orbits) -> np.ndarray:
+    """The largest errors (B, n) of any channel from the start of a forecast to each lead, in
+    standard deviations, as multiples of the tube of Gaussian errors of this law; NaN
+    where the record ends before."""
+    sizes = np.max(np.abs(errors) / orbits.std, axis=2)
+    return np.maximum.accumulate(sizes, axis=1) / orbits.largest(TUBE)
+
+
 def _shared(values: np.ndarray) -> np.ndarray:
     """Values (B, n, k) together with those of near leads (B (2 near + 1), n, k)."""
     far = np.pad(values, ((0, 0), (OPTIONS.near, OPTIONS.near), (0, 0)), constant_values=np.nan)
@@ -215,9 +232,9 @@ def _forecasts(
     starts: Sequence[tuple[int, int]],
     windows: np.ndarray,
     leads: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, Orbits, np.ndarray]:
     """Errors (B, n, k) of forecasts by the law without the third in which they start, NaN where the
-    record ends before, their standard deviations, and the states (B, 2d) they start from; times are
+    record ends before, the forecasts, and the states (B, 2d) they start from; times are
     those of the samples nearest to the leads. windows: (B,) seconds from which each state is
     estimated."""
     cut, times, measured = [], [], []
@@ -241,4 +258,4 @@ def _forecasts(
     x, covariance = (np.stack(part) for part in zip(*states, strict=True))
     orbits = propagate_each(laws, which, cut, x, covariance, last, np.array(times))
     d = thirds.laws[0].form.dim
-    return orbits.values - np.array(measured), orbits.std, x[:, : 2 * d]
+    return orbits.values - np.array(measured), orbits, x[:, : 2 * d]
