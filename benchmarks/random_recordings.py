@@ -181,15 +181,74 @@ def law_of(fit: Any, width: float) -> Force:
     return acceleration
 
 
-def case(name: str, draw: int) -> Numbers:
-    rng = np.random.default_rng([list(SYSTEMS).index(name), draw])
-    system = SYSTEMS[name](rng)
+class Record(NamedTuple):
+    """A recording that was drawn: its times (n,), the true states (n, 2d) at its ``count`` samples
+    and beyond them, what the sensors show (n, d), and the true q̈(q, v)."""
+
+    system: System
+    t: np.ndarray
+    states: np.ndarray
+    seen: np.ndarray
+    count: int
+    truth: Force
+    omega: float
+    kind: str
+    samples: float
+    noise: float
+    step: float
+
+    @property
+    def period(self) -> float:
+        return 2 * np.pi / self.omega
+
+    @property
+    def spread(self) -> np.ndarray:
+        return self.states[: self.count, : self.seen.shape[1]].std(axis=0)
+
+    @property
+    def recording(self) -> gfnn.Recording:
+        """What a user has."""
+        names = [f"x{i + 1}" for i in range(self.seen.shape[1])]
+        columns = dict(zip(names, self.seen[: self.count].T, strict=True))
+        angles = [names[i] for i in self.system.angles]
+        table = {"t": self.t[: self.count], **columns}
+        return gfnn.Recording(table, positions=names, angles=angles)
+
+    def error(self, fit: Any) -> float:
+        """Median error of the law's forecasts of a period from true states, ÷ the spread."""
+        d = self.seen.shape[1]
+        ahead = self.period * np.arange(_AHEAD + 1) / _AHEAD
+        law, errors = law_of(fit, _SMOOTH * self.omega), []
+        for k in np.linspace(0, self.count - 1, _STARTS).astype(int):
+            start = self.states[k, :d], self.states[k, d:]
+            try:
+                miss = integrated(law, *start, ahead) - integrated(self.truth, *start, ahead)
+                errors.append(np.sqrt(np.mean((miss[1:, :d] / self.spread) ** 2)))
+            except (ArithmeticError, np.linalg.LinAlgError):
+                errors.append(np.inf)
+        return float(np.median(errors))
+
+    def right(self, error: float) -> bool:
+        return error < max(RIGHT, self.noise)
+
+
+def record(
+    draw_system: Callable[[np.random.Generator], System],
+    rng: np.random.Generator,
+    samples: tuple[float, float] = SAMPLES,
+    periods: tuple[float, float] = PERIODS,
+    noises: tuple[float, ...] = NOISES,
+    beyond: float = 0.0,
+) -> Record:
+    """Draw a system and its recording, which goes on for so many periods ``beyond`` its end."""
+    system = draw_system(rng)
     omega, size = 10 ** rng.uniform(-0.5, 1.5), 10 ** rng.uniform(-2.5, -1)
     kind = str(rng.choice(KINDS, p=SHARES))
-    samples, periods = np.exp([rng.uniform(*np.log(ends)) for ends in (SAMPLES, PERIODS)])
-    noise, step = rng.choice(NOISES), rng.choice(STEPS)
-    count = int(np.clip(samples * periods, LEAST, MOST))
-    t, d = 2 * np.pi / omega / samples * np.arange(count), len(system.start)
+    often, long = np.exp([rng.uniform(*np.log(ends)) for ends in (samples, periods)])
+    noise, step = rng.choice(noises), rng.choice(STEPS)
+    count = int(np.clip(often * long, LEAST, MOST))
+    t = 2 * np.pi / omega / often * np.arange(count + int(beyond * often))
+    d = len(system.start)
 
     def truth(q, v):
         rubbed = np.linalg.solve(system.masses(q), friction(kind, size, v / omega))
@@ -197,23 +256,25 @@ def case(name: str, draw: int) -> Numbers:
 
     states = integrated(truth, system.start, 0 * system.start, t)
     q = states[:, :d]
-    spread = q.std(axis=0)
+    spread = q[:count].std(axis=0)
     seen = q + noise * spread * rng.normal(size=q.shape)
     if step:
         step *= spread.max()
         seen = step * np.round(seen / step)
-    names = [f"x{i}" for i in range(1, d + 1)]
-    columns = dict(zip(names, seen.T, strict=True))
-    recording = gfnn.Recording(
-        {"t": t, **columns}, positions=names, angles=[names[i] for i in system.angles]
-    )
+    facts = kind, float(often), float(noise), float(step)
+    return Record(system, t, states, seen, count, truth, omega, *facts)
+
+
+def case(name: str, draw: int) -> Numbers:
+    drawn = record(SYSTEMS[name], np.random.default_rng([list(SYSTEMS).index(name), draw]))
+    recording = drawn.recording
     found: Numbers = {
         "draw": draw,
-        "friction": kind,
-        "samples": float(samples),
-        "count": count,
-        "noise": float(noise),
-        "step": float(step),
+        "friction": drawn.kind,
+        "samples": drawn.samples,
+        "count": drawn.count,
+        "noise": drawn.noise,
+        "step": drawn.step,
     }
     try:
         with warnings.catch_warnings():
@@ -222,23 +283,13 @@ def case(name: str, draw: int) -> Numbers:
     except FitError as error:
         return found | {"refused": str(error)}
     fit: Any = done.out
-    period = 2 * np.pi / omega
-    ahead = period * np.arange(_AHEAD + 1) / _AHEAD
-    law, errors = law_of(fit, _SMOOTH * omega), []
-    for k in np.linspace(0, count - 1, _STARTS).astype(int):
-        start = states[k, :d], states[k, d:]
-        try:
-            miss = integrated(law, *start, ahead) - integrated(truth, *start, ahead)
-            errors.append(np.sqrt(np.mean((miss[1:, :d] / spread) ** 2)))
-        except (ArithmeticError, np.linalg.LinAlgError):
-            errors.append(np.inf)
-    error = float(np.median(errors))
+    error = drawn.error(fit)
     return found | {
         "formula": fit.formula,
         "rubs": fit.friction.formula,
         "error": error if np.isfinite(error) else None,
-        "right": error < max(RIGHT, noise),
-        "said": bool(fit.messages) or fit.horizon[-1].measured < period,
+        "right": drawn.right(error),
+        "said": bool(fit.messages) or fit.horizon[-1].measured < drawn.period,
         "messages": list(fit.messages),
         "processor_seconds": done.processor_seconds,
     }

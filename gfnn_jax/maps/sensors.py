@@ -12,6 +12,7 @@ from gfnn_jax.maps.observation import Observation
 from gfnn_jax.solve.noise import Wander
 
 TUBE = 0.95  # of trajectories lie in the tube that scores are multiples of
+_PHASES = 3.0  # starts of forecasts within their length that tell something of their own
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,19 +108,17 @@ class Sensors:
         """Factor by which a tube over a time ahead has to be wider than the law by itself says, so
         that it holds the whole of a further trajectory with the probability ``coverage``.
 
-        Held-out forecasts are exchangeable as far as they do not overlap. Where these are many
-        their rank decides (split conformal prediction), where few a prediction interval of the
-        logarithms, by Student's t. NaN where no forecast was held out.
+        A prediction interval of the scores' logarithms, by Student's t: of held-out forecasts that
+        overlap, each stretch as long as their lead counts as ``_PHASES``. NaN where none was held
+        out.
         """
         if self.scores is None or not len(self.leads):
             return np.nan
         lead = min(int(np.searchsorted(self.leads, ahead)), len(self.leads) - 1)
-        scores = self.scores[np.isfinite(self.scores[:, lead]), lead]
-        if len(scores) < 2:
+        scores = self.scores[:, lead]
+        logs = np.log(scores[np.isfinite(scores)])
+        if len(logs) < 2:
             return np.nan
-        count = max(2.0, min(len(scores), self.observed / self.leads[lead]))
-        logs = np.log(scores)
+        count = np.clip(_PHASES * self.observed / self.leads[lead], 2, len(logs))
         reach = stats.t.ppf(coverage, count - 1) * np.sqrt(1 + 1 / count)
-        likely = np.exp(logs.mean() + reach * logs.std(ddof=1))
-        rank = coverage * (1 + 1 / count)
-        return float(np.quantile(scores, rank) if rank < 1 else max(likely, scores.max()))
+        return float(np.exp(logs.mean() + reach * logs.std(ddof=1)))
