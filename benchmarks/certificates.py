@@ -73,7 +73,7 @@ def _lorenz(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     def rates(_, z):
         return [10 * (z[1] - z[0]), z[0] * (28 - z[2]) - z[1], z[0] * z[1] - 8 / 3 * z[2]]
 
-    return _solved(rates, list(rng.normal(size=3) + [1, 1, 25]), t / 8)
+    return _solved(rates, (np.array([1, 1, 25]) + rng.normal(size=3)).tolist(), t / 8)
 
 
 def _prey(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from scipy.stats import norm
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
@@ -29,7 +30,14 @@ from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import HOLDS, at_stages, interpolate
 from gfnn_jax.jobs.forecast import Ahead, forecast_recording
 from gfnn_jax.jobs.output import Output
-from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate, propagate_each
+from gfnn_jax.maps.estimates import (
+    Orbits,
+    Window,
+    estimate_states,
+    law_of,
+    propagate,
+    propagate_each,
+)
 from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.search import search, search_on
@@ -281,8 +289,10 @@ def test_lanes_that_follow_their_own_laws_are_followed_as_if_alone(swing):
     for n, one in enumerate(which):
         own = slice(n, n + 1)
         alone = propagate(laws[one], windows[own], x[own], covariance[own], last[own], times[own])
-        for found, expected in zip(together, alone, strict=True):
-            np.testing.assert_allclose(found[own], expected, rtol=1e-11, atol=1e-14)
+        for name in ("values", "std", "states", "covariances"):
+            expected = getattr(alone, name)
+            found = getattr(together, name)[own]
+            np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-14)
     first = propagate(law, windows, x, covariance, last, times)
     assert np.abs(together.values[0] - first.values[0]).max() > 0.01  # the laws differ
 
@@ -450,6 +460,34 @@ def test_forecasts_hold_what_their_bands_say(swing):
     assert states.shape == (1, 2)
     assert covariance.shape == (1, 2, 2)
     assert abs(states[0, 0] - clean[560]) < 5 * np.sqrt(covariance[0, 0, 0]) + 2e-3
+
+
+def test_a_band_of_whole_trajectories_holds_them(swing):
+    recording, fit = swing
+    clean, t = pendulum(noise=0.0)[1], recording.times("0")
+    inside, wider = [], []
+    for start in np.arange(28.0, 33.0, 0.7):
+        past, times = recording.slice(start - 2.0, start), t[(t > start)][:60]
+        found = fit.map.forecast(past, times, coverage=0.9, simultaneous=True)
+        off = np.abs(found.values["theta"][0] - clean[np.searchsorted(t, times)])
+        inside.append(np.all(off <= found.band["theta"][0]))
+        wider.append(np.median(found.band["theta"] / found.std["theta"]))
+    assert np.mean(inside) > 0.8
+    assert 2.0 < np.median(wider) < 6.0
+    more = fit.map.forecast(past, times, coverage=0.99, simultaneous=True)
+    assert np.all(more.band["theta"] > found.band["theta"])
+    of_each = fit.map.forecast(past, times, coverage=0.95)
+    np.testing.assert_allclose(of_each.band["theta"], 2 * of_each.std["theta"])
+    with pytest.raises(gfnn.InputError, match="between 0 and 1"):
+        fit.map.forecast(past, times, coverage=95)
+
+
+def test_the_largest_of_independent_errors_is_that_of_their_number():
+    still = np.zeros((1, 50, 2))
+    orbits = Orbits(still, still, still, np.zeros((1, 50, 2, 0)), np.array([1.0, 3.0]))
+    count = 2 * np.arange(1, 51)
+    exact = norm.ppf((1 + 0.95 ** (1 / count)) / 2)
+    np.testing.assert_allclose(orbits.largest(0.95)[0], exact, rtol=0.08)
 
 
 def test_a_forecast_says_where_it_leaves_the_motion_that_was_learned(swing):
