@@ -469,7 +469,7 @@ class Orbits(NamedTuple):
         return np.sqrt(np.sum(self.modes**2, axis=-1) + self.noise**2)
 
     def with_misfit(self, misfit: np.ndarray) -> Orbits:
-        """These orbits with a misfit (B, n, k) of their law, one random number a channel."""
+        """Add a misfit (B, n, k) of the law, one random number a channel."""
         own = misfit[..., None] * np.eye(misfit.shape[-1])
         return self._replace(modes=np.concatenate([self.modes, own], axis=-1))
 
