@@ -261,6 +261,8 @@ def _fit(arguments: argparse.Namespace) -> None:
     for path in arguments.data:
         _check_exists(path)
     columns = column_options(arguments)
+    if arguments.states or options.get("structure") == "poisson":
+        return _fit_states(arguments, columns, options)
     if are_recordings(arguments.data, with_roles=names_roles(columns)):
         return _fit_recording(arguments, columns, options)
     if options.get("learn") == "lagrangian":
@@ -295,6 +297,26 @@ def _print_fitted(arguments: argparse.Namespace, ran: Any) -> None:
 
 def _print_next(arguments: argparse.Namespace, options: str) -> None:
     print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]}{options}")
+
+
+def _fit_states(
+    arguments: argparse.Namespace, columns: dict[str, Any], options: dict[str, Any]
+) -> None:
+    """Learn the law of columns that are no positions, with their bracket."""
+    if arguments.states:
+        columns["positions"] = arguments.states
+    if arguments.dt is not None:
+        columns["dt"] = arguments.dt
+    with _output(arguments) as output:
+        from gfnn_jax.jobs.fit import fit_states
+
+        ran: Any = fit_states(arguments.data, output, columns=columns, **options)
+    print_verdict(ran.fit)
+    print(f"H = {ran.fit.law}")
+    print(f"bracket: {ran.fit.bracket}")
+    print(f"Casimirs: {'; '.join(c.formula for c in ran.fit.casimirs) or 'none'}")
+    print(ran.fit.table)
+    print(f"written to {arguments.out}")
 
 
 def _fit_recording(

@@ -413,6 +413,7 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
 
     for role in ROLES:
         names(f"--{role}", f"columns of {role}")
+    names("--states", "columns of states that are no positions (with --structure poisson)")
     angles = "positions with period 2π, or none; of canonical states indices in z, as 0,2"
     group.add("--angles", angles, "A,B", type=_names_or_indices)
     names("--degrees", "columns in degrees")

@@ -89,6 +89,7 @@ def assemble(
             "messages": list(fit.messages),
         },
         "hamiltonian": _hamiltonian(fit),
+        "bracket": _bracket(fit),
         "partial_laws": [law._asdict() for law in fit.partial_laws],
         "map": {
             "multiplier": fit.map.multiplier(),
@@ -146,6 +147,15 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
         "dropped": law.dropped._asdict() if law.dropped is not None else None,
         "search_cut_short": law.ended or None,
     }
+
+
+def _bracket(fit: Fit) -> dict[str, Any] | None:
+    """The bracket of a law of states that are no (q, p)."""
+    if fit.bracket is None:
+        return None
+    casimirs = [casimir.formula for casimir in fit.casimirs]
+    relations = fit.bracket.relations()
+    return {"name": fit.bracket.name, "relations": relations, "casimirs": casimirs}
 
 
 def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[str, Any]:

@@ -182,6 +182,26 @@ def _range(values) -> list[float]:
     return [float(np.min(values)), float(np.max(values))]
 
 
+def fit_states(
+    data: Sequence[Path], output: Output, *, columns: dict[str, Any], **options: Any
+) -> Ran:
+    """Learn the law and the bracket of states in files, and write them with their report into the
+    model folder. columns: keywords of `gfnn_jax.read`, the states as its positions; without them
+    the files hold trajectories, of any number of coordinates. options: `FitOptions`."""
+    progress = output.progress
+    with refusals():
+        asked = FitOptions(**{**options, "structure": "poisson"})
+    recording = read(list(data), **columns)
+    with refusals(), failures_of_arithmetic():
+        fitted = learn_fit(recording, options=asked, on_progress=progress.line)
+    names = list(recording.positions)
+    result = fitted.report(seed=asked.seed, data={"source": recording.source, "states": names})
+    job = {"command": "fit", "data": recording.source, "states": names, **asked.deciding}
+    with atomic_folder(output.out) as folder:
+        write(folder, folder, fitted, result, job)
+    return Ran(fitted, output.out, result)
+
+
 def fit_recording(
     data: Sequence[Path],
     output: Output,

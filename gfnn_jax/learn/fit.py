@@ -32,6 +32,7 @@ from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, Watch, with_options
+from gfnn_jax.learn.poisson import learn_poisson
 from gfnn_jax.learn.positions import learn_positions
 from gfnn_jax.learn.propose import structures_to_try
 from gfnn_jax.learn.request import checked, diagnose_request, paid_for, wrapped
@@ -40,7 +41,7 @@ from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.models.maps_of_laws.draw import Drawing, drawn
-from gfnn_jax.phase_space import Pairs, require_x64
+from gfnn_jax.phase_space import POISSON, Pairs, require_x64
 from gfnn_jax.threads import one_thread
 
 
@@ -88,6 +89,9 @@ def fit(
     positions = scene if _is_array(scene) else None
     scene = None if positions is not None else scene
     pairs = as_pairs_or_recording(data, positions)
+    if POISSON in (options.structure, getattr(pairs, "structure", None)) or options.bracket:
+        with one_thread():
+            return learn_poisson(pairs, options, watch)
     if isinstance(pairs, Recording):
         if scene is not None or options.model is not None:
             given = "model" if scene is None else "scene"

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.brackets import Bracket, Casimir
 from gfnn_jax.budget import COMPILE, ROWS, Budget, within
 from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.candidates.candidate import Candidate
@@ -288,6 +289,18 @@ class Fit:
     def hamiltonian(self) -> Any:
         """H with its terms, where one was found, whether its flow was chosen or not."""
         return None if self.found is None else self.found.hamiltonian
+
+    @property
+    def bracket(self) -> Bracket | None:
+        """The bracket of a law ż = B(z)∇H(z) of states that are no (q, p); None of canonical
+        data."""
+        return self.map.bracket
+
+    @property
+    def casimirs(self) -> tuple[Casimir, ...]:
+        """What every H with the bracket conserves: each has a ``formula`` and is a function of z;
+        () of canonical data."""
+        return () if self.bracket is None else self.bracket.casimirs
 
     @property
     def lagrangian(self) -> Formula | None:

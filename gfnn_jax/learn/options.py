@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
+from gfnn_jax.brackets import Bracket
 from gfnn_jax.budget import Budget, seconds_allowed
 from gfnn_jax.dataset.structure_names import EXPECTED, STRUCTURES, names_structure
 from gfnn_jax.errors import FitError, unexpected
@@ -104,6 +105,9 @@ _TERMS = Kind(
 )
 _TEXT = Kind("text", lambda v: isinstance(v, str))
 _LAW = Kind("a Hamiltonian as text or a function of z", _is_text_or_function)
+_BRACKET = Kind(
+    "a gfnn.Bracket, as Bracket.so3(), or None", lambda v: v is None or isinstance(v, Bracket)
+)
 _INDICES = Kind("a tuple of indices", _are(lambda i: isinstance(i, int), tuple, list))
 _MASSES = Kind("a mapping of a position's name to its mass", lambda v: isinstance(v, Mapping))
 _LOSS = Kind(
@@ -144,9 +148,11 @@ def _named(cls: type[T]) -> type[T]:
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Hamiltonian:
     """H(z), whose flow is the map: of known ``terms``, of those that a library has, or a network
-    (family "mlp"). Options as of `gfnn.fit`."""
+    (family "mlp"); with a ``bracket`` (`gfnn.Bracket`) of states that are no (q, p). Options as of
+    `gfnn.fit`."""
 
     terms: Sequence[str | Callable] = ()
+    bracket: Any = None
     structure: str | None = None
     family: str = "auto"
     max_iterations: int = 250
@@ -219,6 +225,11 @@ OPTIONS: dict[str, About] = {
         'recording those of its law: "omega**2; V: cos(theta); R: omega**2"',
         "TEXT",
     ),
+    "bracket": About(
+        _BRACKET,
+        "known bracket of states that are no positions and momenta: gfnn.Bracket.so3(2)",
+        commands=(),
+    ),
     "base": About(
         _LAW,
         'known part of H: "p1**2/2 - cos(q1)"; its flow is factored out, and S learns the '
@@ -227,6 +238,7 @@ OPTIONS: dict[str, About] = {
     ),
     "structure": About(
         STRUCTURE,
+        "poisson: states that are no positions and momenta, whose bracket is learned too; or a "
         "structure of many degrees of freedom: H is a sum over equal sites, with terms in q1, p1 "
         "of a site and q2, p2, … of the next ones (ring:2 has two q at every site, side by side); "
         "or over bodies and pairs of bodies (bodies:4:abbb: the last three are alike). For a ring "
@@ -336,6 +348,7 @@ class FitOptions:
     absolute_tolerance: float | None = None
     learn: str = "auto"
     terms: Sequence[str | Callable] = ()
+    bracket: Any = None
     base: str | Callable | None = None
     structure: str | None = None
     family: Any = "auto"
@@ -402,6 +415,8 @@ class FitOptions:
     def deciding(self) -> dict[str, Any]:
         """Options that the model depends on, by name, as JSON holds them: what identifies a job."""
         values = {name: getattr(self, name) for name, about in OPTIONS.items() if about.decides}
+        if self.bracket is None:
+            del values["bracket"]  # jobs of canonical data are what they were
         return {n: list(v) if isinstance(v, (tuple, list)) else v for n, v in values.items()}
 
     def budget(self, watch: Watch, dim: int | None) -> Budget:

@@ -145,9 +145,10 @@ def _signed(c: np.ndarray, part: np.ndarray) -> np.ndarray:
 
 def _aligned(rows: np.ndarray) -> np.ndarray:
     """The rows (3, n) turned by a rotation, so that they are nearest to three of the coordinates,
-    in their order."""
+    in their order, or to their opposites where a reflection would be needed."""
     own = np.sort(np.argsort(-np.linalg.norm(rows, axis=0))[:3])
-    u, _, vt = np.linalg.svd(rows[:, own].T)
+    sign = np.sign(np.linalg.det(rows[:, own]))
+    u, _, vt = np.linalg.svd(sign * rows[:, own].T)
     turned = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     return (u @ turned @ vt) @ rows
 

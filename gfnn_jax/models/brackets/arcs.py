@@ -25,8 +25,10 @@ class Options:
     fewest_nodes: int = 4
     # standard errors of a coefficient that stays
     significant: float = 4.0
-    whole: float = 3.0  # of a constant of the bracket, from a whole number that it is then
-    near: float = 0.05  # largest distance from that number
+    # distance of a constant of the bracket from a whole number that it may be, and the rise of
+    # χ² for each that is made one
+    near: float = 0.02
+    whole: float = 4.0
     rounds: int = 5  # of dropping terms
     states: int = 400  # at which the field's rates are taken
     # of the noise: residuals that are none
@@ -160,26 +162,35 @@ def fit_arcs(
     some = y.reshape(-1, y.shape[2])[:: max(1, y[..., 0].size // OPTIONS.states)]
     rate = np.quantile(np.abs(field.jacobian(c, some)).sum(axis=2).max(axis=1), 0.99)
     substeps = int(np.clip(np.ceil(rate * dt / OPTIONS.rate), 1, OPTIONS.most_substeps))
-    library, free, x = field.library, FreeBracket.of(field.bracket), y
-    p = np.concatenate([c, free.values])
-    for last in range(OPTIONS.rounds):
+
+    def fitted_to(library: Terms, free: FreeBracket, p: np.ndarray, x: np.ndarray) -> Fitted:
         model = PoissonArcs(library, free, dt, substeps)
-        fitted = Readings(model, y, sigma).fit(p, x, sigma, least=OPTIONS.least * sigma)
-        p, x, sigma = fitted.p, fitted.x, fitted.sigma
-        count, root = library.num_parameters, _root(fitted)
-        errors = np.sqrt(np.sum(root**2, axis=0))
-        kept = np.flatnonzero(np.abs(p[:count]) > OPTIONS.significant * errors[:count])
-        near = np.round(p[count:])
-        whole = np.abs(p[count:] - near) <= np.minimum(OPTIONS.whole * errors[count:], OPTIONS.near)
-        same = len(kept) == count and not whole.any()
-        if same or not len(kept) or last == OPTIONS.rounds - 1:
+        return Readings(model, y, sigma).fit(p, x, sigma, least=OPTIONS.least * sigma)
+
+    library, free = field.library, FreeBracket.of(field.bracket)
+    fitted = fitted_to(library, free, np.concatenate([c, free.values]), y)
+    for _ in range(OPTIONS.rounds):
+        count = library.num_parameters
+        errors = np.sqrt(np.sum(_root(fitted)[:, :count] ** 2, axis=0))
+        kept = np.flatnonzero(np.abs(fitted.p[:count]) > OPTIONS.significant * errors)
+        if len(kept) in (0, count):
             break
         library = library.take(kept.tolist())
-        bracket = free.moved(np.where(whole, near, p[count:]))
-        free = FreeBracket(bracket, free.places[~whole])
-        p = np.concatenate([p[:count][kept], p[count:][~whole]])
-    found = PoissonField(free.moved(p[count:]), library)
-    return ArcsFit(found, p[:count], root[:, :count], sigma)
+        p = np.concatenate([fitted.p[:count][kept], fitted.p[count:]])
+        fitted = fitted_to(library, free, p, fitted.x)
+    count = library.num_parameters
+    values = fitted.p[count:]
+    whole = np.abs(values - np.round(values)) <= OPTIONS.near
+    if whole.any():
+        bracket = free.moved(np.where(whole, np.round(values), values))
+        fixed = FreeBracket(bracket, free.places[~whole])
+        p = np.concatenate([fitted.p[:count], values[~whole]])
+        tried = fitted_to(library, fixed, p, fitted.x)
+        sizes = [np.sum(one.residuals**2 * (one.sigma / sigma) ** 2) for one in (tried, fitted)]
+        if sizes[0] - sizes[1] <= OPTIONS.whole * whole.sum():
+            free, fitted = fixed, tried
+    found = PoissonField(free.moved(fitted.p[count:]), library)
+    return ArcsFit(found, fitted.p[:count], _root(fitted)[:, :count], fitted.sigma)
 
 
 def _root(fitted: Fitted) -> np.ndarray:

@@ -233,6 +233,8 @@ def _made(
     if algebra.lifted is not None:
         # B is known but for a factor, which H has the inverse of: y is as large as z
         basis = algebra.lifted * np.sqrt(3) / np.linalg.norm(algebra.lifted[:3])
+        if algebra.blocks == ("se3",):  # {M, Γ} = Γ holds for Γ of any size
+            basis[3:] *= np.sqrt(3) / np.linalg.norm(basis[3:])
         for by in (OPTIONS.snapped * zero, zero):
             with contextlib.suppress(FitError):  # rounded to a singular one
                 yield Bracket.lie(algebra.blocks, _rounded(basis, by), names), algebra.name

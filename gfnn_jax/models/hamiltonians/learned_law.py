@@ -21,6 +21,7 @@ from gfnn_jax.exports.symbolic import as_latex, as_sympy
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.collocation import truncation
+from gfnn_jax.flows.collective import Collective
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.rates import rates
@@ -119,6 +120,7 @@ class LearnedHamiltonian:
         """H as ``terms`` and sympy read it: "0.5*p1**2 - cos(q1)" (`learn.formula.as_code`). None
         of a network; of a Lagrangian, which is no expression in q and p, as it is shown."""
         family = without_forces(self.flow.family)
+        family = family.family if isinstance(family, Collective) else family
         return as_code(family, self.terms) if isinstance(family, Terms | Sums) else self.shown
 
     def __str__(self) -> str:

@@ -1,0 +1,223 @@
+"""``gfnn.fit`` of states with another bracket than that of (q, p): the law ż = B(z)∇H(z), the
+bracket given or found, and its map."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.brackets import Bracket, Log
+from gfnn_jax.candidates.assemble import block_of, stepped
+from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.coordinates import CARTESIAN, LOG
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
+from gfnn_jax.dataset.runs import identified
+from gfnn_jax.dataset.split import split_rows
+from gfnn_jax.errors import FitError, FitWarning, InputError
+from gfnn_jax.families.expressions import parse_named, to_named_text
+from gfnn_jax.families.terms import Terms
+from gfnn_jax.flows.collective import collective
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit
+from gfnn_jax.learn.options import FitOptions, Watch
+from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.posterior import Posterior
+from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.brackets.fields import substeps_of
+from gfnn_jax.models.brackets.search import Data, PoissonLaw, law_of
+from gfnn_jax.models.hamiltonians.fitted_law import Term, formula
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
+from gfnn_jax.phase_space import POISSON, Pairs, require_x64, sizes
+from gfnn_jax.search.search import MET
+
+EVEN = 1e-3  # of a sampling interval: what printed times may be off by
+NOISE = 1.15  # times the noise, that the errors of a law may be which misses nothing else
+
+
+def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) -> Fit:
+    """Learn the law and the map of states that are no (q, p): of pairs, or of a recording whose
+    positions they are; the bracket is found, or given by ``options``.
+
+    The pairs are split as others are: the degree of the field is chosen, and the error is stated,
+    by pairs that were not fitted to. Raises FitError where values are missing or depend on
+    parameters or a time, states are none of the bracket's, or there is no law (with a verdict).
+    """
+    require_x64("a fit")
+    bracket, tolerance = options.bracket, Tolerance.of(options)
+    budget = options.budget(watch, None)
+    options.refuse_others(("hamiltonian",), "states with a bracket of their own")
+    pairs = pairs_of_states(data) if isinstance(data, Recording) else data
+    z0, z1 = _checked(pairs, bracket)
+    n = z0.shape[1]
+    names = pairs.names or (bracket.labels if bracket else tuple(f"z{i + 1}" for i in range(n)))
+    pairs = identified(pairs).pairs
+    split = split_rows(pairs, options.seed)
+    dt: Any = np.asarray(pairs.dt) if np.ndim(pairs.dt) else float(pairs.dt)
+    z0, z1, run, place = (np.asarray(a) for a in (pairs.z0, pairs.z1, pairs.run, pairs.place))
+    every = Data(z0, z1, dt, run, place, sizes(z0))
+    training = np.sort(split.training)
+    started = time.perf_counter()
+    law = law_of(
+        every.take(training),
+        every.take(split.validation),
+        names,
+        bracket=bracket and bracket.named(names),
+        terms=_given(options.terms, names),
+        on_progress=watch.on_progress,
+    )
+    seconds = time.perf_counter() - started
+    watch.on_progress(f"compiling the step of {law.name}")
+    map_ = map_of(law, every.z0, float(np.median(dt)))
+    test = split.test if len(split.test) else split.validation
+    steps = stepped(map_, every.z0[test], dt[test] if np.ndim(dt) else None)
+    images = np.where(steps.failed[:, None], np.nan, steps.images)
+    off = images - every.z1[test]
+    error = one_step_error(off, every.spread, tolerance, split.stretch[test])
+    # both states of a pair have the noise that its sequence tells
+    white = law.sigma is not None and bool(
+        np.sqrt(np.mean((off / law.sigma) ** 2)) <= NOISE * np.sqrt(2)
+    )
+    family = law.field.library
+    candidate = Candidate.of(
+        error,
+        label=f"H of {family.num_parameters} terms",
+        family="terms",
+        chart=law.bracket.name,
+        num_parameters=family.num_parameters,
+        operations=float(family.operations[0]),
+        train_rms=law.fit.relative,
+        validated=True,
+        fit_seconds=seconds,
+        chosen=True,
+        learns="hamiltonian",
+        newton_iterations_max=int(steps.iterations.max()),
+        microseconds_per_step=steps.microseconds_per_step,
+    )
+    watch.on_candidate(candidate)
+    met, messages = candidate.validation_bound <= tolerance.bound, list(law.notes)
+    if white and not met and law.sigma is not None:
+        sigma = ", ".join(f"{s:.2g}" for s in law.sigma)
+        messages.append(f"the law leaves no more than the noise of the states, {sigma}")
+    elif not met:
+        messages.append(
+            f"one-step error {candidate.validation_bound:.1e} misses the tolerance "
+            f"{tolerance.bound:g}: pairs with noise, or an H that the library lacks (terms=)"
+        )
+        warnings.warn(messages[-1], FitWarning, stacklevel=4)
+    tested = pairs.take(test[: min(STATES_MEASURED, block_of(n))])
+    choice = Choice(
+        candidates=(candidate,),
+        asked=tolerance,
+        num_pairs=len(pairs) - len(test),
+        determinants={},
+        data_defect=float("nan"),
+        base_map=False,
+        hamiltonian=_learned(law, map_, candidate, messages),
+        noise=law.sigma,
+        messages=tuple(messages),
+        ended=MET if met else "no larger library was more accurate",
+        seconds=budget.seconds,
+        compile_seconds=steps.compile_seconds,
+        test_states=np.asarray(tested.z0),
+        model_determinant_min=float("nan"),
+        pairs=pairs,
+        stated_by=f"{len(test):,} pairs that were not fitted to",
+        validation_pairs=pairs.take(split.validation),
+        test_pairs=pairs.take(split.test) if len(split.test) else None,
+        operations=budget.operations,
+        budget=budget,
+        white=white,
+        seed=options.seed,
+    )
+    return Fit(map_, choice)
+
+
+def pairs_of_states(recording: Recording) -> Pairs:
+    """Pairs of the states that a recording's positions are, each with the next of its run; a row
+    with a missing value is none. Raises InputError where there are fewer than two columns."""
+    names, parts = recording.positions, []
+    if len(names) < 2:
+        raise InputError(f"expected two or more columns of states, got {len(names)}: --states A,B")
+    for number, run in enumerate(recording.runs):
+        z, t = recording.array("positions", run), recording.times(run)
+        known = np.isfinite(z).all(axis=1)
+        rows = np.flatnonzero(known[:-1] & known[1:])
+        runs = np.full(len(rows), number)
+        parts.append((z[rows], z[rows + 1], t[rows + 1] - t[rows], runs, rows))
+    z0, z1, dt, run, place = map(np.concatenate, zip(*parts, strict=True))
+    usual = float(np.median(dt))
+    even = np.abs(dt - usual).max() <= EVEN * usual
+    dt = usual if even else dt
+    return Pairs(z0, z1, dt, run=run, place=place, structure=POISSON, names=names)
+
+
+def _checked(pairs: Any, bracket: Bracket | None) -> tuple[np.ndarray, np.ndarray]:
+    """z0 and z1 (N, n), finite. Raises FitError for other values, or states where the bracket has
+    no step."""
+    if pairs.args is not None or pairs.t0 is not None:
+        raise FitError("a law with a bracket of its own has no parameters and no drive yet")
+    states = []
+    for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
+        z = np.asarray(z, np.float64)
+        bad = np.flatnonzero(~np.isfinite(z).all(axis=1))
+        if len(bad):
+            raise FitError(f"{name}: {len(bad)} rows are not finite, the first is row {bad[0]}")
+        states.append(z)
+    if bracket is not None:
+        if bracket.size != states[0].shape[1]:
+            raise FitError(
+                f"the bracket is one of {bracket.size} coordinates, the states have "
+                f"{states[0].shape[1]}"
+            )
+        bracket.require_inside(states[0])
+    return states[0], states[1]
+
+
+def _given(terms, names: tuple[str, ...]) -> Terms | None:
+    """Family of the terms of H that were given, as text; None without. Raises InputError for one
+    that is no expression in these names."""
+    if not terms:
+        return None
+    texts = tuple(dict.fromkeys(to_named_text(parse_named(t, names), names) for t in terms))
+    eye = np.eye(len(texts), dtype=int)
+    return Terms(0, texts, tuple(map(tuple, eye.tolist())), (), names)
+
+
+def map_of(law: PoissonLaw, z: np.ndarray, dt: float) -> SymplecticMap:
+    """Map of a law over dt, its domain that of the states z (N, n): the flow of H on the lift of
+    the bracket, in the fewest substeps that end in roundoff."""
+    logs = isinstance(law.bracket, Log)
+    y, scale = np.log(z) if logs else z, sizes(z)
+    family = collective(law.field.library, law.bracket)
+    flow = Flow(family, law.fit.c, dt, sizes(y), substeps=substeps_of(law.field, law.fit.c, z, dt))
+    return SymplecticMap(
+        (flow,),
+        LOG if logs else CARTESIAN,
+        covering(y),
+        scale,
+        np.zeros(0),
+        dt,
+        posterior=Posterior(0, law.fit.root),
+        bracket=law.bracket,
+    )
+
+
+def _learned(law, map_, candidate, messages) -> LearnedHamiltonian:
+    """The law as fits have it."""
+    std = np.sqrt(np.sum(law.fit.root**2, axis=0))
+    std = np.where(std > 1e-12 * np.abs(law.fit.c), std, 0.0)
+    named = zip(law.field.library.term_names, law.fit.c, std, strict=True)
+    terms = tuple(Term(name, float(c), float(s)) for name, c, s in named)
+    return LearnedHamiltonian(
+        candidate,
+        map_.pieces[0],
+        terms,
+        formula(terms),
+        float("nan"),
+        messages=tuple(messages),
+        covariance=lambda: law.fit.root,
+    )
