@@ -314,6 +314,8 @@ def _fit_states(
     print_verdict(ran.fit)
     print(f"H = {ran.fit.law}")
     print(f"bracket: {ran.fit.bracket}")
+    for message in ran.fit.messages:
+        print(message)
     print(f"Casimirs: {'; '.join(c.formula for c in ran.fit.casimirs) or 'none'}")
     print(ran.fit.table)
     print(f"written to {arguments.out}")

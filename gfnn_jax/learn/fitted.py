@@ -298,8 +298,8 @@ class Fit:
 
     @property
     def casimirs(self) -> tuple[Casimir, ...]:
-        """What every H with the bracket conserves: each has a ``formula`` and is a function of z;
-        () of canonical data."""
+        """Casimirs, which every H with the bracket conserves: each has a ``formula`` and is a
+        function of z; () of canonical data."""
         return () if self.bracket is None else self.bracket.casimirs
 
     @property

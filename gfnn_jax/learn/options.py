@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
-from gfnn_jax.brackets import Bracket
 from gfnn_jax.budget import Budget, seconds_allowed
 from gfnn_jax.dataset.structure_names import EXPECTED, STRUCTURES, names_structure
 from gfnn_jax.errors import FitError, unexpected
@@ -106,7 +105,8 @@ _TERMS = Kind(
 _TEXT = Kind("text", lambda v: isinstance(v, str))
 _LAW = Kind("a Hamiltonian as text or a function of z", _is_text_or_function)
 _BRACKET = Kind(
-    "a gfnn.Bracket, as Bracket.so3(), or None", lambda v: v is None or isinstance(v, Bracket)
+    "a gfnn.Bracket, as Bracket.so3(), or None",
+    lambda v: v is None or (hasattr(v, "matrix") and hasattr(v, "casimirs")),
 )
 _INDICES = Kind("a tuple of indices", _are(lambda i: isinstance(i, int), tuple, list))
 _MASSES = Kind("a mapping of a position's name to its mass", lambda v: isinstance(v, Mapping))

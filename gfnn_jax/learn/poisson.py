@@ -143,12 +143,12 @@ def pairs_of_states(recording: Recording) -> Pairs:
     if len(names) < 2:
         raise InputError(f"expected two or more columns of states, got {len(names)}: --states A,B")
     for number, run in enumerate(recording.runs):
-        z, t = recording.array("positions", run), recording.times(run)
-        known = np.isfinite(z).all(axis=1)
+        z, t = np.asarray(recording.array("positions", run)), recording.times(run)
+        known = np.asarray(np.isfinite(z).all(axis=1))
         rows = np.flatnonzero(known[:-1] & known[1:])
         runs = np.full(len(rows), number)
         parts.append((z[rows], z[rows + 1], t[rows + 1] - t[rows], runs, rows))
-    z0, z1, dt, run, place = map(np.concatenate, zip(*parts, strict=True))
+    z0, z1, dt, run, place = (np.concatenate(part) for part in zip(*parts, strict=True))
     usual = float(np.median(dt))
     even = np.abs(dt - usual).max() <= EVEN * usual
     dt = usual if even else dt

@@ -20,8 +20,8 @@ from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.exports.symbolic import as_latex, as_sympy
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.flows.collocation import truncation
 from gfnn_jax.flows.collective import Collective
+from gfnn_jax.flows.collocation import truncation
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.rates import rates

@@ -1,0 +1,89 @@
+"""`gfnn.fit` of states with a bracket of their own: pairs, recordings, files, folders."""
+
+import numpy as np
+import pytest
+from test_brackets_found import heavy, lorenz, populations, runs_of, top
+
+import gfnn_jax as gfnn
+from gfnn_jax import cli
+from gfnn_jax.data.text_files import to_text
+from gfnn_jax.errors import FitError
+
+
+def pairs_of(data, **more):
+    known = {"run": data.run, "place": data.place, "structure": "poisson"}
+    return gfnn.Pairs(data.z0, data.z1, data.dt, **known, **more)
+
+
+@pytest.fixture(scope="module")
+def heavy_top():
+    starts = np.random.default_rng(0).normal(size=(30, 6))
+    return gfnn.fit(pairs_of(runs_of(heavy, starts, 0.2, 20))), starts
+
+
+def test_a_heavy_top(heavy_top):
+    fit, starts = heavy_top
+    assert fit.verdict == "identified"
+    assert fit.bracket.blocks == ("se3",)
+    assert fit.formula == "0.1*z4 + 0.2*z5 + 0.9*z6 + 0.25*z1**2 + 0.3*z2**2 + 0.5*z3**2"
+    assert [c.formula for c in fit.casimirs] == [
+        "z1*z4 + z2*z5 + z3*z6",
+        "z4**2 + z5**2 + z6**2",
+    ]
+    states = np.asarray(fit.map.rollout(starts[:4], 2000)[0])
+    for casimir in fit.casimirs:
+        values = casimir(states)
+        assert np.abs(values / values[:, :1] - 1).max() < 5e-15
+    assert fit.report()["bracket"]["name"] == "se(3)"
+    assert fit.symplecticity_defect < 1e-12
+
+
+def test_a_saved_law_is_the_same(heavy_top, tmp_path):
+    fit, starts = heavy_top
+    fit.save(tmp_path / "top")
+    again = gfnn.load(tmp_path / "top")
+    assert (again.formula, str(again.bracket)) == (fit.formula, str(fit.bracket))
+    assert again.verdict == fit.verdict
+    one, other = (np.asarray(f.map.step(starts)[0]) for f in (fit, again))
+    assert np.array_equal(one, other)
+
+
+def test_a_given_bracket():
+    data = runs_of(populations, np.random.default_rng(0).uniform(0.5, 1.5, (20, 4)), 0.2, 20)
+    form = [[0, 1, 0, -0.9], [-1, 0, 0.7, 0], [0, -0.7, 0, 1.3], [0.9, 0, -1.3, 0]]
+    known = gfnn.Bracket.log(form)
+    fit = gfnn.fit(pairs_of(data), model=gfnn.Hamiltonian(bracket=known))
+    assert fit.met
+    assert fit.bracket.name == "log-canonical"
+    beside = np.array(fit.map.step(data.z0[:50])[0])
+    assert np.abs(beside - data.z1[:50]).max() < 1e-12
+    with pytest.raises(FitError, match="not above 0"):
+        gfnn.fit(gfnn.Pairs(data.z0 - 1, data.z1 - 1, 0.2), bracket=known)
+    with pytest.raises(FitError, match="one of 3 coordinates, the states have 4"):
+        gfnn.fit(pairs_of(data), bracket=gfnn.Bracket.so3())
+
+
+def test_a_gyroscope_on_the_command_line(tmp_path, capsys):
+    starts = np.random.default_rng(0).normal(size=(6, 3))
+    data = runs_of(top, starts, 0.05, 300, noise=1e-3)
+    columns = dict(zip(("wx", "wy", "wz"), data.z0.T, strict=True))
+    text = to_text({"run": data.run, "t": 0.05 * data.place, **columns})
+    (tmp_path / "gyro.csv").write_text(text)
+    command = f"fit {tmp_path}/gyro.csv --structure poisson --states wx,wy,wz --out {tmp_path}/m"
+    assert cli.main(command.split()) == 0
+    shown = capsys.readouterr().out
+    assert "verdict: identified" in shown
+    assert "one of a family of 2" in shown
+    assert gfnn.load(tmp_path / "m").bracket.blocks == ("so3",)
+
+
+def test_three_columns_say_what_to_type():
+    with pytest.raises(FitError, match='structure="poisson"'):
+        gfnn.Pairs(np.zeros((5, 3)), np.zeros((5, 3)), 0.1)
+
+
+def test_no_law_has_a_verdict():
+    starts = 8 * np.random.default_rng(0).normal(size=(30, 3)) + [0, 0, 20]
+    with pytest.raises(FitError) as raised:
+        gfnn.fit(pairs_of(runs_of(lorenz, starts, 0.1, 20)))
+    assert raised.value.verdict.startswith("no law: no bracket")
