@@ -311,14 +311,8 @@ def _fit_states(
         from gfnn_jax.jobs.fit import fit_states
 
         ran: Any = fit_states(arguments.data, output, columns=columns, **options)
-    print_verdict(ran.fit)
-    print(f"H = {ran.fit.law}")
-    print(f"bracket: {ran.fit.bracket}")
-    for message in ran.fit.messages:
-        print(message)
-    print(f"Casimirs: {'; '.join(c.formula for c in ran.fit.casimirs) or 'none'}")
-    print(ran.fit.table)
-    print(f"written to {arguments.out}")
+    print_summary(ran, arguments.out)
+    _hold_to(arguments.strict, arguments.out)
 
 
 def _fit_recording(
