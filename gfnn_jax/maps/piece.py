@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any, Protocol, runtime_checkable
 
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.lie import LieFlow
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.solve.status import Info
 
@@ -54,4 +55,6 @@ class PieceWithAction(Piece, Protocol):
 
 def serves_any_dt(piece: Any) -> bool:
     """Return whether a piece can be stepped over any dt."""
-    return isinstance(piece, Flow) or (isinstance(piece, Generated) and piece.serves_any_dt)
+    return isinstance(piece, (Flow, LieFlow)) or (
+        isinstance(piece, Generated) and piece.serves_any_dt
+    )

@@ -37,6 +37,7 @@ from gfnn_jax.flows.collective import Casimirs, Collective
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.legendre import Legendre
+from gfnn_jax.flows.lie import LieFlow, LieGenerated
 from gfnn_jax.flows.systems import OfSystems
 from gfnn_jax.flows.uniform import Uniform
 from gfnn_jax.generating.charts import Chart, TypeOne
@@ -105,6 +106,8 @@ _TYPES: dict[str, type] = {
         brackets.Magnetic,
         Collective,
         Casimirs,
+        LieGenerated,
+        LieFlow,
         lifts.Itself,
         lifts.Logarithms,
         lifts.Quadratic,
