@@ -83,7 +83,7 @@ def export(
     be exported in this form, WorkError where writing fails.
     """
     if to not in SUFFIXES:
-        raise InputError(f"expected {' or '.join(SUFFIXES)} to export to, got '{to}'")
+        raise InputError(f"expected one of {', '.join(SUFFIXES)} to export to, got '{to}'")
     law = getattr(map_, "law", None)
     if to == "latex" and law is None:
         raise InputError("a formula is that of a fit with a law: gfnn.export(gfnn.load(...), …)")
