@@ -107,3 +107,25 @@ def test_masses_of_either_sign_are_no_law():
     recording = recorded(lambda q, v: -q + np.array([v[1], -v[0]]), [1.0, 0.2, 0.0, 0.3], 40)
     with pytest.raises(FitError, match="no law"):
         gfnn.fit(recording, terms=[*rows, *losses])
+
+
+def test_a_drive_that_nobody_recorded_is_found_named_and_forecast(tmp_path):
+    omega, until = 1.37, 1_200
+
+    def rates(t, z):
+        return [z[1], -z[0] - 0.1 * z[1] + 0.3 * np.cos(omega * t + 0.4)]
+
+    whole = np.linspace(0, 100, 1_500)
+    x = solve_ivp(rates, (0, 100), [1.0, 0.0], t_eval=whole, rtol=1e-10, atol=1e-12).y[0]
+    seen = x[:until] + 1e-3 * np.random.default_rng(0).normal(size=until)
+    recording = gfnn.Recording({"t": whole[:until], "x": seen}, positions=["x"])
+    with pytest.warns(gfnn.FitWarning, match="a drive that no column shows"):
+        fit = gfnn.fit(recording)
+    within_errors(fit.lagrangian, {"x_dot**2": 0.5, "x**2": -0.5})
+    (cos, sin) = fit.law.gains
+    assert float(cos.removeprefix("cos(").removesuffix("*t)")) == pytest.approx(omega, rel=1e-4)
+    gains = [fit.law.gains[wave]["x"][0] for wave in (cos, sin)]
+    assert gains == pytest.approx([0.3 * np.cos(0.4), -0.3 * np.sin(0.4)], abs=3e-3)
+    fit.save(tmp_path / "fit")
+    ahead = gfnn.load(tmp_path / "fit").map.forecast(recording, whole[until:])
+    assert np.abs(ahead.values["x"][0] - x[until:]).max() < 0.01

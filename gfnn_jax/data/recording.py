@@ -44,6 +44,7 @@ from gfnn_jax.data.tables import (
     second_times,
 )
 from gfnn_jax.data.text_files import from_text
+from gfnn_jax.data.waves import wave
 from gfnn_jax.errors import InputError, unexpected
 from gfnn_jax.signals.wrong_values import TURN
 
@@ -291,8 +292,12 @@ class Recording:
         return self._times[self._named(run)]
 
     def values(self, name: str, run: str | float) -> np.ndarray:
-        """A column (n,) in a run, NaN where missing; angles in radians, wrapped as they came."""
+        """A column (n,) in a run, NaN where missing; angles in radians, wrapped as they came; or a
+        wave, cos(1.37*t)."""
         found = self._values[self._named(run)]
+        of_time = None if name in found else wave(name, self.times(run))
+        if of_time is not None:
+            return of_time
         if name not in found:
             raise InputError(f"{self.source}: no column {name}, found {', '.join(found)}")
         return found[name]
@@ -325,6 +330,10 @@ class Recording:
         names = getattr(self, role)
         columns = [self.values(name, run) for name in names]
         return np.stack(columns, axis=1) if columns else np.empty((len(self.times(run)), 0))
+
+    def driven_by(self, names: Sequence[str]) -> Recording:
+        """The recording with these waves, cos(1.37*t), as further inputs."""
+        return self._with(inputs=(*self.inputs, *names))
 
     def slice(
         self, start: float = -np.inf, stop: float = np.inf, run: str | float | None = None

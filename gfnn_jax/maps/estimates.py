@@ -18,10 +18,11 @@ import numpy as np
 
 from gfnn_jax.data.channels import args_of, channels_of
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.waves import is_wave, wave
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian, functions_of
 from gfnn_jax.flows.motion import Form
-from gfnn_jax.flows.schedules import at_stages
+from gfnn_jax.flows.schedules import TAPS, at_stages
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.sensors import TUBE, Sensors
@@ -151,7 +152,9 @@ def forecast(
             f"expected rising times, none before the latest end of a run ({last.max():g} s), got "
             f"{times[0]:g} s"
         )
-    if sensors.inputs and inputs is None:
+    if sensors.inputs and inputs is None and all(map(is_wave, sensors.inputs)):
+        windows = [_with_waves(window, sensors, float(times[-1])) for window in windows]
+    elif sensors.inputs and inputs is None:
         raise InputError(
             f"the law has inputs ({', '.join(sensors.inputs)}): give them for the times of the "
             "forecast, --inputs FILE (inputs=)"
@@ -242,7 +245,7 @@ def windows_of(
     channels = sensors.observation_model.channels
     varied = () if parameters is None else parameters.names
     needed = (*sensors.observation_model.needed, *sensors.inputs, *varied)
-    missing = [n for n in needed if n not in recording.columns]
+    missing = [n for n in needed if n not in recording.columns and not is_wave(n)]
     if missing:
         raise InputError(
             f"{recording.source}: has no columns {', '.join(missing)}, which the law was learned "
@@ -289,6 +292,16 @@ def _with_inputs(window: Window, inputs: Recording, sensors: Sensors, run: str) 
     return window._replace(
         inputs_t=np.concatenate([window.inputs_t, t[later]]),
         inputs=np.concatenate([window.inputs, u[later]]),
+    )
+
+
+def _with_waves(window: Window, sensors: Sensors, end: float) -> Window:
+    """The window with inputs that are functions of time as far as a forecast needs them."""
+    t, step = window.inputs_t, float(np.median(np.diff(window.inputs_t)))
+    later = t[-1] + step * np.arange(1, TAPS + 2 + max(0, int((end - t[-1]) / step)))
+    u = np.array([wave(name, later) for name in sensors.inputs], float).T
+    return window._replace(
+        inputs_t=np.concatenate([t, later]), inputs=np.concatenate([window.inputs, u])
     )
 
 

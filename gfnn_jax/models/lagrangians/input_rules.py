@@ -137,10 +137,17 @@ def with_delay(fit: LawFit) -> InputModel:
 def _correction(here: InputModel) -> tuple[float, float]:
     """The change of the delay that fits best, and its standard error, both in seconds; 0 and NaN
     where the coefficients imitate it."""
-    fit, inputs, count = here.fit, here.fit.problem.inputs, here.fit.structure.num_inputs
+    fit, inputs = here.fit, here.fit.problem.inputs
     apart = OPTIONS.apart * fit.problem.scales.dt
     ahead, behind = (inputs.delayed(inputs.delay + by)(fit.arcs) for by in (apart, -apart))
-    both = np.concatenate([inputs(fit.arcs), (ahead - behind) / (2 * apart)], axis=-1)
+    return correction(fit, (ahead - behind) / (2 * apart))
+
+
+def correction(fit: LawFit, slope: np.ndarray) -> tuple[float, float]:
+    """The change of a number that inputs depend on, of which ``slope`` is the derivative along the
+    arcs of a fit, and its standard error; 0 and NaN where the coefficients imitate it."""
+    count = fit.structure.num_inputs
+    both = np.concatenate([fit.problem.inputs(fit.arcs), slope], axis=-1)
     structure = dataclasses.replace(fit.structure, num_inputs=2 * count)
     problem = dataclasses.replace(fit.problem, inputs=lambda arcs: both)
     further = [("gain", i, count + j) for i in range(fit.form.dim) for j in range(count)]

@@ -6,6 +6,7 @@ in the recording's words (`models.lagrangians.in_words`)
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +18,7 @@ import numpy as np
 from gfnn_jax.data.channels import channels_of, parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import by_name, symbols
+from gfnn_jax.data.waves import wave_names
 from gfnn_jax.data.wrong_values import without_wrong_values
 from gfnn_jax.dataset.stretches import (
     Moving,
@@ -27,11 +29,13 @@ from gfnn_jax.dataset.stretches import (
     without_rests,
 )
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.text import measured
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.dependence import search_of_systems
+from gfnn_jax.models.lagrangians.drives import hidden_frequency, with_frequency
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
@@ -64,12 +68,17 @@ class RecordingOptions:
 
     missed: float = 0.8
     above_noise: float = 3.0
+    explained: float = 0.5
     clearly: float = 0.2
     imitated: float = 1e-4
     still: float = 1e-14
 
 
 OPTIONS = RecordingOptions()
+DRIVEN = (
+    "a drive that no column shows acts at {} rad/s: its waves stand among the inputs, with the "
+    "phase of the times in the file. Record the drive, and name it: --inputs (inputs=)"
+)
 
 
 def fit_recording(
@@ -106,13 +115,16 @@ def fit_recording(
     recording, left_out = without_wrong_values(recording)
     for line in left_out:
         note(line)
-    data = samples_of(recording, loss, options=options, on_progress=note)
-    data = dataclasses.replace(data, mass=mass or {})
-    rules = _rules(recording, input_hold)
-    data, found = _found(data, terms, rules)
+
+    def searched(recording: Recording, *rules: str) -> tuple[RecordingData, SearchResult]:
+        data = samples_of(recording, loss, options=options, on_progress=note)
+        return _found(dataclasses.replace(data, mass=mass or {}), terms, rules)
+
+    data, found, of_drive = _with_hidden_drive(recording, searched, _rules(recording, input_hold))
+    recording = data.recording
     missed = no_law(data.problem.scales) if _misses(found.fit) else None
     try:
-        best, findings = _findings(recording, data, found, left_out, steps)
+        best, findings = _findings(recording, data, found, (*left_out, *of_drive), steps)
         findings = findings._replace(seconds=time.process_time() - started)
         law = in_words(recording, best, findings)
     except (FitError, np.linalg.LinAlgError):
@@ -385,6 +397,44 @@ def _found(
     if not found.follows:
         raise no_law(problem.scales)
     return data, found
+
+
+def _with_hidden_drive(
+    recording: Recording,
+    searched: Callable[..., tuple[RecordingData, SearchResult]],
+    rules: tuple[str, ...],
+) -> tuple[RecordingData, SearchResult, tuple[str, ...]]:
+    """The law that a search finds; where it leaves more than noise, that with a drive which nobody
+    recorded, if there are no inputs, the record shows one, and noise alone is left then; and a
+    message on it.
+
+    Raises FitError where no law is found."""
+    data = found = None
+    missed = FitError("")
+    try:
+        data, found = searched(recording, *rules)
+        problem, loud = data.problem, _loudest(found.fit)
+    except FitError as error:
+        missed, problem, loud = error, samples_of(recording).problem, np.inf
+    searches = loud > OPTIONS.above_noise and not recording.inputs
+    omega = hidden_frequency(problem) if searches else None
+    if omega is not None:
+        problem.on_progress(f"a drive that nobody recorded: {omega:.5g} rad/s")
+        with contextlib.suppress(FitError):
+            _, law = searched(recording.driven_by(wave_names(omega)), "band")
+            if _loudest(law.fit) < OPTIONS.explained * loud:
+                _, omega, error = with_frequency(law.fit, omega)
+                driven, law = searched(recording.driven_by(wave_names(omega)), "band")
+                if _loudest(law.fit) < min(OPTIONS.above_noise, OPTIONS.explained * loud):
+                    return driven, law, (DRIVEN.format(measured(omega, error)),)
+    if data is None or found is None:
+        raise missed
+    return data, found, ()
+
+
+def _loudest(fit: LawFit) -> float:
+    """The largest residual of a channel, in units of its noise."""
+    return float(np.max(fit.rms() / fit.problem.scales.sigma))
 
 
 def _misses(fit: LawFit) -> bool:

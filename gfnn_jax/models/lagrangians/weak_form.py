@@ -11,7 +11,7 @@ parts. Terms are eliminated until all are seen.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -34,13 +34,15 @@ from gfnn_jax.models.lagrangians.structure import (
 class WeakOptions:
     """Options of the weak form (`benchmarks/random_recordings.py`).
 
-    lengths: of the windows, in periods. spacing: of a window's length, to the next. overlap: rows
-    that share samples, of which as many count as one. apart: ratio of the weights of coordinates,
-    at most, since a wrong library would make one of them all. rounding: residual of a coordinate to
-    the sizes of its terms, below which a law without mass and force solves the equations.
+    lengths: of the windows, in periods. fewest: samples of a window. spacing: of a window's length,
+    to the next. overlap: rows that share samples, of which as many count as one. apart: ratio of
+    the weights of coordinates, at most, since a wrong library would make one of them all. rounding:
+    residual of a coordinate to the sizes of its terms, below which a law without mass and force
+    solves the equations.
     """
 
     lengths: tuple[float, ...] = (0.5, 1.0)
+    fewest: int = 7
     spacing: float = 0.25
     overlap: float = 3.0
     apart: float = 100.0
@@ -148,27 +150,32 @@ def weak_rows(form: Form, node: Nodes, length: float) -> tuple[np.ndarray, np.nd
     force = (df * g[..., None]).swapaxes(1, 2)
     lost = form.friction.residuals(v).swapaxes(1, 2)
     columns, targets = [], []
-    for start in np.arange(t[0], t[-1] - length, OPTIONS.spacing * length):
-        i, j = np.searchsorted(t, (start, start + length))
-        if j - i < 7:
-            continue
-        s = (t[i:j] - start) / length
-        weight = np.gradient(t[i:j])
-        bump = s * (1 - s)
-        phi, slope = bump**3 * weight, 3 * bump**2 * (1 - 2 * s) / length * weight
-        norm = np.sqrt(np.sum(slope**2))  # of the noise that v brings
-        phi, slope = phi / norm, slope / norm
-        of_terms = -np.tensordot(slope, momentum[i:j], 1) - np.tensordot(phi, force[i:j], 1)
+    for place, phi, slope in bumps(t, length):
+        of_terms = -np.tensordot(slope, momentum[place], 1) - np.tensordot(phi, force[place], 1)
         of_terms = of_terms * weights[: terms.count]
-        row = [of_terms @ form.basis, np.tensordot(phi, lost[i:j], 1) * weights[terms.count :]]
+        row = [of_terms @ form.basis, np.tensordot(phi, lost[place], 1) * weights[terms.count :]]
         if form.num_inputs:
-            push = -np.tensordot(phi, u[i:j], 1)
+            push = -np.tensordot(phi, u[place], 1)
             row.append((push[None, None, :] * np.eye(d)[:, :, None]).reshape(d, -1))
         columns.append(np.concatenate(row, axis=1))
         targets.append(of_terms @ form.fixed)
     if not columns:
         return np.zeros((0, d, form.count)), np.zeros((0, d))
     return np.array(columns), np.array(targets)
+
+
+def bumps(t: np.ndarray, length: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """Windows of this length along times t (n,): the places of their samples, and φ dt and φ̇ dt
+    there, in units of the noise that v brings."""
+    for start in np.arange(t[0], t[-1] - length, OPTIONS.spacing * length):
+        i, j = np.searchsorted(t, (start, start + length))
+        if j - i < OPTIONS.fewest:
+            continue
+        s = (t[i:j] - start) / length
+        weight, bump = np.gradient(t[i:j]), s * (1 - s)
+        phi, slope = bump**3 * weight, 3 * bump**2 * (1 - 2 * s) / length * weight
+        norm = np.sqrt(np.sum(slope**2))
+        yield slice(i, j), phi / norm, slope / norm
 
 
 def _solve(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,0 +1,141 @@
+"""A drive that nobody recorded: a sinusoidal force of one frequency on each coordinate.
+
+In weak form the terms of a library and the two waves of a frequency ω are linear, so that of each
+ω one least-squares problem tells what is left; the ω that leaves least is a drive where it is a
+line, and its likelihood above what chance makes among all that were tried. Along arcs a fit's
+residuals are then linear in a small change of ω, as they are in the coefficients (variable
+projection). Motion of several frequencies has lines too beside a library that lacks its terms: what
+tells is whether the law with the drive leaves noise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.fitting.evidence import EVIDENCE
+from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
+from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
+from gfnn_jax.models.lagrangians.input_rules import correction
+from gfnn_jax.models.lagrangians.structure import Structure
+from gfnn_jax.models.lagrangians.weak_form import OPTIONS as WEAK
+from gfnn_jax.models.lagrangians.weak_form import bumps, weak_rows
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveOptions:
+    """Options of the search for a drive (`benchmarks/vocabulary.py`).
+
+    spacing: of the frequencies tried, in turns over the record. fewest: turns of the slowest.
+    fastest: times the fastest motion's frequency. width: turns over the record, of a line.
+    stands_out: times the logarithm of the likelihood of any other frequency, of what is a line.
+    rank: of the terms' columns, relative. settled: standard errors, within which a frequency is
+    found. most: corrections. apart: turns over the record, by which waves are differentiated.
+    """
+
+    spacing: float = 0.25
+    fewest: float = 2.0
+    fastest: float = 4.0
+    width: float = 2.0
+    stands_out: float = 1.5
+    rank: float = 1e-8
+    settled: float = 0.1
+    most: int = 5
+    apart: float = 0.01
+
+
+OPTIONS = DriveOptions()
+
+
+def hidden_frequency(problem: ArcProblem) -> float | None:
+    """The angular frequency of a drive that the record shows beside a library of terms, in rad/s;
+    None where it shows none."""
+    left, count = _left_of(problem)
+    turn = 2 * np.pi / _duration(problem)
+    fastest = OPTIONS.fastest * problem.scales.omega
+    tried = np.arange(OPTIONS.fewest * turn, fastest, OPTIONS.spacing * turn)
+    if not len(tried):
+        return None
+    shares = np.array([left(omega) for omega in tried])
+    best = float(tried[np.argmin(shares)])
+    beside = shares[np.abs(tried - best) > OPTIONS.width * turn]
+    ends = best - OPTIONS.spacing * turn, best + OPTIONS.spacing * turn
+    found = minimize_scalar(left, bounds=ends, method="bounded")
+    gain, others = (
+        -np.log(max(float(share), 1e-300)) for share in (found.fun, min(beside, default=1.0))
+    )
+    chance = np.log(len(tried)) + problem.dim * np.log(max(count, 1.0))
+    is_line = gain > OPTIONS.stands_out * others
+    return float(found.x) if is_line and 0.5 * count * gain > EVIDENCE.logarithm + chance else None
+
+
+def with_frequency(fit: LawFit, omega: float) -> tuple[LawFit, float, float]:
+    """A fit whose last two inputs are the waves of a frequency, with the frequency that fits best:
+    it, and its standard error, in rad/s."""
+    error = np.nan
+    apart = OPTIONS.apart * 2 * np.pi / _duration(fit.problem)
+    for _ in range(OPTIONS.most):
+        ahead, behind = (_driven(fit.problem, omega + by).inputs for by in (apart, -apart))
+        slope = (ahead(fit.arcs) - behind(fit.arcs)) / (2 * apart)
+        change, error = correction(fit, slope)
+        if not abs(change) > OPTIONS.settled * error:
+            break
+        omega += change
+        fit = fit.again(problem=_driven(fit.problem, omega))
+    return fit, omega, error
+
+
+def _duration(problem: ArcProblem) -> float:
+    return max(n.t[-1] for n in problem.nodes) - min(n.t[0] for n in problem.nodes)
+
+
+def _driven(problem: ArcProblem, omega: float) -> ArcProblem:
+    """The problem whose last two inputs are the waves of this frequency."""
+    nodes = []
+    for n in problem.nodes:
+        u, turned = n.stretch.u.copy(), omega * n.stretch.t
+        u[:, -2], u[:, -1] = np.cos(turned), np.sin(turned)
+        nodes.append(dataclasses.replace(n, stretch=dataclasses.replace(n.stretch, u=u)))
+    old = problem.inputs
+    inputs = ArcInputs(nodes, old.substeps, old.hold, old.delay)
+    return dataclasses.replace(problem, nodes=nodes, inputs=inputs)
+
+
+def _left_of(problem: ArcProblem) -> tuple[Callable[[float], float], float]:
+    """What a drive of a frequency leaves of the squares of the weak residuals of a library, and the
+    number of residuals that are independent."""
+    d, angles = problem.dim, problem.angles
+    rows = libraries.first(d, angles)
+    if d == 1:
+        rows = [row for row in libraries.every(d, angles) if sum(row[0]) < 2 or row in rows]
+    terms = libraries.without_forces(rows, problem.observation.shifts())
+    friction = tuple(libraries.losses(d, (LINEAR,), 0.0)[:d])
+    form = Structure(d, terms, friction, (), problem.num_inputs).form(problem.gauge)
+    lengths = [length * problem.scales.period for length in WEAK.lengths]
+    parts = [weak_rows(form, n, length) for n in problem.nodes for length in lengths]
+    X, y = (np.concatenate(part) for part in zip(*parts, strict=True))
+    X, y = X.reshape(-1, X.shape[-1]), y.reshape(-1)
+    X = X[:, X.any(axis=0)]
+    U, s, _ = np.linalg.svd(X / np.linalg.norm(X, axis=0), full_matrices=False)
+    Q = U[:, s > OPTIONS.rank * s[0]]
+    y = y - Q @ (Q.T @ y)
+    windows = [
+        (n.t[place], phi)
+        for n in problem.nodes
+        for length in lengths
+        for place, phi, _ in bumps(n.t, length)
+    ]
+
+    def left(omega: float) -> float:
+        both = np.array([(phi @ np.cos(omega * t), phi @ np.sin(omega * t)) for t, phi in windows])
+        A = (both[:, None, None, :] * np.eye(d)[:, :, None]).reshape(len(y), 2 * d)
+        A = A - Q @ (Q.T @ A)
+        c = np.linalg.lstsq(A, y, rcond=OPTIONS.rank)[0]
+        return float(np.sum((y - A @ c) ** 2) / max(np.sum(y**2), 1e-300))
+
+    return left, len(y) / WEAK.overlap
