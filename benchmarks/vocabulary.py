@@ -83,7 +83,8 @@ def dipole_field(rng: np.random.Generator) -> System:
     (x, y), (vx, vy) = _plane(rng)
     size = rng.uniform(2, 4)
     term = {"v2*x1/sqrt(x1**2+x2**2)**3": -size, "v1*x2/sqrt(x1**2+x2**2)**3": size}
-    return System({**FREE, **term}, ((1.2 * x, 1.2 * y), (0.5 * vx, 0.5 * vy)))
+    start = (1.2 * x, 1.2 * y), (0.5 * vx, 0.5 * vy)
+    return System({**FREE, **term}, start, period=2 * np.pi / size)
 
 
 def penning(rng: np.random.Generator) -> System:

@@ -93,6 +93,18 @@ def test_a_torsion_spring_between_pendulums_that_stay_within_a_turn():
     assert fit.map.coordinates.angles == ()
 
 
+def test_an_elastic_pendulum_in_the_plane_has_a_distance():
+    """V = 3 (r − 1)² + y: the coefficient of r, and of x² and y²."""
+
+    def acceleration(q, v):
+        r = np.hypot(*q)
+        return -6 * (r - 1) * q / r - np.array([0.0, 1.0])
+
+    fit = gfnn.fit(recorded(acceleration, [0.6, -0.9, 0, 0], 80))
+    exact = {"v1**2": 0.5, "v2**2": 0.5, "x1**2": -3.0, "x2**2": -3.0, "x2": -1.0}
+    within_errors(fit.lagrangian, {**exact, "sqrt(x1**2 + x2**2)": 6.0})
+
+
 def test_a_field_has_one_representative():
     """v_j f(q) and the gradients v·∇χ are independent, and with these any field is one."""
     rows = libraries.gyroscopic(3, (), 2)
@@ -121,7 +133,7 @@ def test_a_drive_that_nobody_recorded_is_found_named_and_forecast(tmp_path):
     recording = gfnn.Recording({"t": whole[:until], "x": seen}, positions=["x"])
     with pytest.warns(gfnn.FitWarning, match="a drive that no column shows"):
         fit = gfnn.fit(recording)
-    within_errors(fit.lagrangian, {"x_dot**2": 0.5, "x**2": -0.5})
+    within_errors(fit.lagrangian, {"v**2": 0.5, "x**2": -0.5})
     (cos, sin) = fit.law.gains
     assert float(cos.removeprefix("cos(").removesuffix("*t)")) == pytest.approx(omega, rel=1e-4)
     gains = [fit.law.gains[wave]["x"][0] for wave in (cos, sin)]

@@ -32,14 +32,18 @@ class DriveOptions:
     """Options of the search for a drive (`benchmarks/vocabulary.py`).
 
     spacing: of the frequencies tried, in turns over the record. fewest: turns of the slowest.
+    windows: independent weak residuals, at least.
     fastest: times the fastest motion's frequency. width: turns over the record, of a line.
     stands_out: times the logarithm of the likelihood of any other frequency, of what is a line.
     rank: of the terms' columns, relative. settled: standard errors, within which a frequency is
     found. most: corrections. apart: turns over the record, by which waves are differentiated.
+    fractions, harmonics: of a frequency, that periodic motion may have; noise: times it, that such
+    motion leaves.
     """
 
     spacing: float = 0.25
     fewest: float = 2.0
+    windows: float = 10.0
     fastest: float = 4.0
     width: float = 2.0
     stands_out: float = 1.5
@@ -47,6 +51,9 @@ class DriveOptions:
     settled: float = 0.1
     most: int = 5
     apart: float = 0.01
+    fractions: tuple[int, ...] = (1, 2, 3)
+    harmonics: int = 12
+    noise: float = 3.0
 
 
 OPTIONS = DriveOptions()
@@ -56,6 +63,8 @@ def hidden_frequency(problem: ArcProblem) -> float | None:
     """The angular frequency of a drive that the record shows beside a library of terms, in rad/s;
     None where it shows none."""
     left, count = _left_of(problem)
+    if not count > OPTIONS.windows:
+        return None
     turn = 2 * np.pi / _duration(problem)
     fastest = OPTIONS.fastest * problem.scales.omega
     tried = np.arange(OPTIONS.fewest * turn, fastest, OPTIONS.spacing * turn)
@@ -71,7 +80,27 @@ def hidden_frequency(problem: ArcProblem) -> float | None:
     )
     chance = np.log(len(tried)) + problem.dim * np.log(max(count, 1.0))
     is_line = gain > OPTIONS.stands_out * others
-    return float(found.x) if is_line and 0.5 * count * gain > EVIDENCE.logarithm + chance else None
+    is_seen = is_line and 0.5 * count * gain > EVIDENCE.logarithm + chance
+    return float(found.x) if is_seen and not _repeats(problem, float(found.x)) else None
+
+
+def _repeats(problem: ArcProblem, omega: float) -> bool:
+    """Return whether the later half of the motion is periodic, with this frequency or a fraction of
+    it: what sustains itself is so too, and a drive would imitate it."""
+    t, q = np.concatenate([n.t for n in problem.nodes]), problem.states[:, : problem.dim]
+    late = t > np.median(t)
+    t, q, sigma = (
+        t[late],
+        q[late],
+        np.median(problem.state_scale(problem.scales.sigma)[: problem.dim]),
+    )
+    for part in OPTIONS.fractions:
+        turned = np.outer(t, omega / part * np.arange(OPTIONS.harmonics + 1))
+        waves = np.concatenate([np.cos(turned), np.sin(turned[:, 1:])], axis=1)
+        rest = q - waves @ np.linalg.lstsq(waves, q, rcond=None)[0]
+        if np.sqrt(np.mean(rest**2)) < OPTIONS.noise * sigma:
+            return True
+    return False
 
 
 def with_frequency(fit: LawFit, omega: float) -> tuple[LawFit, float, float]:
@@ -122,7 +151,7 @@ def _left_of(problem: ArcProblem) -> tuple[Callable[[float], float], float]:
     X, y = X.reshape(-1, X.shape[-1]), y.reshape(-1)
     X = X[:, X.any(axis=0)]
     U, s, _ = np.linalg.svd(X / np.linalg.norm(X, axis=0), full_matrices=False)
-    Q = U[:, s > OPTIONS.rank * s[0]]
+    Q = U[:, s > OPTIONS.rank * np.max(s, initial=0.0)]
     y = y - Q @ (Q.T @ y)
     windows = [
         (n.t[place], phi)

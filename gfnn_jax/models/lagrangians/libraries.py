@@ -10,10 +10,11 @@ asks for.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations, combinations_with_replacement
+from itertools import combinations, combinations_with_replacement, permutations
 
 import numpy as np
 
+from gfnn_jax.families.expressions import parse, product_of, to_text
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM
 from gfnn_jax.models.lagrangians.structure import Loss, Row
 
@@ -140,6 +141,16 @@ def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
         for m in modes(dim, angles, 1):
             rows += [(none, unit(dim, i), m, 0.0), (none, unit(dim, i), m, SINE)]
     return rows
+
+
+def central(dim: int, exponent: float) -> list[Row]:
+    """A potential r^a of the distance from the origin, and the two fields v_j q_i r^a of each plane
+    through it."""
+    distance = parse("sqrt(" + " + ".join(f"q{i + 1}**2" for i in range(dim)) + ")", dim)
+    none, shape = (0,) * dim, to_text(product_of({distance: exponent}), dim)
+    across = permutations(range(dim), 2)
+    fields = [(unit(dim, j), unit(dim, i), none, 0.0, shape) for i, j in across]
+    return [(none, none, none, 0.0, shape), *fields]
 
 
 def springs(dim: int, angles: Sequence[int]) -> list[Row]:

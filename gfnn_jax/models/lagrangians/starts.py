@@ -11,18 +11,21 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from gfnn_jax.dataset.stretches import Scales
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.input_rules import choose_rule
 from gfnn_jax.models.lagrangians.structure import Row, Structure, is_constant
-from gfnn_jax.models.lagrangians.weak_form import weak_start, zeros_of_angles
+from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start, zeros_of_angles
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +36,7 @@ class StartOptions:
     are tried. far: zero of an angle, in radians, that a fit from 0 may not reach. few: samples a
     period, below which more of them are the remedy. plain: times the residual of the larger
     library, that a plainer one's may have. noise: residual, times the noise, that is no more.
+    exponents: of the distance, where a power of it begins; beside: up to which it is then found.
     """
 
     followed: float = 10.0
@@ -41,6 +45,8 @@ class StartOptions:
     few: float = 8.0
     plain: float = 1.5
     noise: float = 2.0
+    exponents: tuple[float, ...] = (-3.0, -2.0, -1.0, -0.5, 0.5, 1.0, 1.5, 3.0, 4.0)
+    beside: float = 0.6
 
 
 OPTIONS = StartOptions()
@@ -88,6 +94,7 @@ def best_start(problem: ArcProblem) -> LawFit:
         some.add(_Library(libraries.relative(d, angles)))
     some.add_richer([*textbook.rows, *springs], 1)
     some.add(_Library(first, 2))
+    some.add_central(textbook.rows, 3, across=False)
     some.add_richer([*first, *libraries.gyroscopic(d, angles, 1)], 3)
     if not some.followed and (zero := some.far_zeros()).any():
         some.add(textbook, zero)
@@ -95,8 +102,9 @@ def best_start(problem: ArcProblem) -> LawFit:
     if d > 1 and not some.followed:
         some.add(_Library(libraries.uncoupled(d, angles), apart=True))
         some.add(_Library(libraries.bodies(d, angles), 2, apart=True))
-    some.add_richer([row for row in every if sum(row[0]) < 2 or row in first], 4)
-    some.add_richer(every, 5)
+    some.add_central(textbook.rows, 4, across=True)
+    some.add_richer([row for row in every if sum(row[0]) < 2 or row in first], 5)
+    some.add_richer(every, 6)
     if not some.fits:
         raise no_law(problem.scales)
     most = OPTIONS.plain * min(map(some.misfit, some.fits))
@@ -153,6 +161,35 @@ class _Starts:
             self.add(_Library(plain, rank, apart=True, equal=True))
         if not self.are_noise:
             self.add(_Library(rows, rank, apart=True))
+
+    def add_central(self, textbook: Sequence[Row], rank: int, across: bool) -> None:
+        """Start from a force along or across the line to the origin by a power of the distance,
+        with equal masses, alone or beside the textbook's, where the residuals of all starts are
+        more than noise: the likeliest, by Schwarz's criterion."""
+        problem, d = self.problem, self.problem.dim
+        if d == 1 or problem.angles or self.are_noise:
+            return
+        periods = sum(np.ptp(n.t) for n in problem.nodes) / problem.scales.period
+
+        def rows(exponent: float, others: Sequence[Row]) -> list[Row]:
+            along, *fields = libraries.central(d, exponent)
+            return [*others, *(fields if across else [along])]
+
+        def share(exponent: float, others: Sequence[Row]) -> float:
+            terms, friction = tuple(rows(exponent, others)), tuple(self.linear[:d])
+            return weak_share(Structure(d, terms, friction, (), problem.num_inputs), problem)
+
+        def unlikely(one: tuple[float, Sequence[Row]]) -> float:
+            return criterion(share(*one), 2 * d * periods, len(one[1]))
+
+        masses = [row for row in textbook if any(row[0])]
+        best, others = min(product(OPTIONS.exponents, (masses, textbook)), key=unlikely)
+        ends = best - OPTIONS.beside, best + OPTIONS.beside
+        found = minimize_scalar(share, bounds=ends, method="bounded", args=(others,))
+        near = float(np.round(2 * found.x) / 2)
+        plain = near != 0 and share(near, others) < OPTIONS.plain**2 * float(found.fun)
+        exponent = near if plain else float(f"{found.x:.4g}")
+        self.add(_Library(rows(exponent, others), rank, apart=True, equal=True))
 
     def misfit(self, fit: LawFit) -> float:
         """The largest residual of a channel, in units of its noise."""

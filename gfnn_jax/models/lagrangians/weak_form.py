@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -61,6 +62,49 @@ def protected(structure: Structure) -> set[Key]:
     return {("term", row) for row in alone}
 
 
+class _Equations(NamedTuple):
+    """X (windows, d, n) c = Y (windows, d) of coefficients ``keys``, of which ``keep`` (indices)
+    act and ``masses`` are ½."""
+
+    keys: list[Key]
+    X: np.ndarray
+    Y: np.ndarray
+    keep: list[int]
+    masses: list[int]
+
+    @classmethod
+    def of(cls, structure: Structure, problem: ArcProblem, equal: bool) -> _Equations:
+        """Make those of a structure, with ``equal`` masses where these are constant."""
+        d, nodes, uneven = structure.dim, problem.nodes, problem.scales.uneven
+        if uneven:
+            nodes = [n.evenly(problem.scales.nodes_of(np.ptp(n.t))) for n in nodes]
+        args = np.repeat([n.stretch.args for n in nodes], [len(n.t) for n in nodes], axis=0)
+        form = structure.form(np.concatenate([n.x[:, :d] for n in nodes]), args)
+        lengths = [length * problem.scales.period for length in OPTIONS.lengths]
+        parts = [
+            # of a run that is shorter than a window, all of it
+            weak_rows(form, node, min(length, 0.999 * np.ptp(node.t)) if uneven else length)
+            for node in nodes
+            for length in lengths
+        ]
+        rows, targets = zip(*parts, strict=True)
+        X, Y = np.concatenate(rows), -np.concatenate(targets)
+        keys = structure.keys()[: form.count]
+        keep = [k for k in range(form.count) if np.any(X[..., k])]
+        masses = [k for k in keep if equal and keys[k] in protected(structure)]
+        keep = [k for k in keep if k not in masses]
+        Y = Y - 0.5 * X[..., masses].sum(axis=-1)
+        return cls(keys, X, Y, keep, masses)
+
+
+def weak_share(structure: Structure, problem: ArcProblem) -> float:
+    """Share of the squares of the equations of motion that all terms of a structure, with equal
+    masses, leave."""
+    _, X, Y, keep, _ = _Equations.of(structure, problem, True)
+    residual = _solve(X[..., keep], Y)[1] if keep else Y
+    return float(np.sum(residual**2) / max(np.sum(Y**2), 1e-300))
+
+
 def weak_start(
     structure: Structure, problem: ArcProblem, prune: bool = True, equal: bool = False
 ) -> tuple[Structure, dict[Key, float]]:
@@ -69,27 +113,9 @@ def weak_start(
 
     Raises FitError where a coordinate without mass and force solves the equations.
     """
-    d, nodes, uneven = structure.dim, problem.nodes, problem.scales.uneven
-    if uneven:
-        nodes = [n.evenly(problem.scales.nodes_of(np.ptp(n.t))) for n in nodes]
-    args = np.repeat([n.stretch.args for n in nodes], [len(n.t) for n in nodes], axis=0)
-    form = structure.form(np.concatenate([n.x[:, :d] for n in nodes]), args)
-    lengths = [length * problem.scales.period for length in OPTIONS.lengths]
-    parts = [
-        # of a run that is shorter than a window, all of it
-        weak_rows(form, node, min(length, 0.999 * np.ptp(node.t)) if uneven else length)
-        for node in nodes
-        for length in lengths
-    ]
-    rows, targets = zip(*parts, strict=True)
-    X, Y = np.concatenate(rows), -np.concatenate(targets)
-    keys = structure.keys()[: form.count]
-    keep = [k for k in range(form.count) if np.any(X[..., k])]
+    keys, X, Y, keep, masses = _Equations.of(structure, problem, equal)
     fixed, significant = protected(structure), problem.options.evidence.significant
-    masses = [k for k in keep if equal and keys[k] in fixed]
-    keep = [k for k in keep if k not in masses]
-    Y = Y - 0.5 * X[..., masses].sum(axis=-1)
-    weight = np.ones(d)
+    weight = np.ones(structure.dim)
     while True:
         for _ in range(2):  # each coordinate's rows in units of their own residual
             c, residual, inverse = _solve(X[..., keep] * weight[:, None], Y * weight)
