@@ -136,7 +136,7 @@ def _driven(problem: ArcProblem, omega: float) -> ArcProblem:
 
 
 def _left_of(problem: ArcProblem) -> tuple[Callable[[float], float], float]:
-    """What a drive of a frequency leaves of the squares of the weak residuals of a library, and the
+    """Share of the squares of a library's weak residuals that a drive of a frequency leaves, and the
     number of residuals that are independent."""
     d, angles = problem.dim, problem.angles
     rows = libraries.first(d, angles)
