@@ -136,8 +136,8 @@ def _driven(problem: ArcProblem, omega: float) -> ArcProblem:
 
 
 def _left_of(problem: ArcProblem) -> tuple[Callable[[float], float], float]:
-    """Share of the squares of a library's weak residuals that a drive of a frequency leaves, and the
-    number of residuals that are independent."""
+    """Share of the squares of a library's weak residuals that a drive of a frequency leaves, and
+    the number of residuals that are independent."""
     d, angles = problem.dim, problem.angles
     rows = libraries.first(d, angles)
     if d == 1:
