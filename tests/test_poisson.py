@@ -82,6 +82,13 @@ def test_three_columns_say_what_to_type():
         gfnn.Pairs(np.zeros((5, 3)), np.zeros((5, 3)), 0.1)
 
 
+def test_states_that_are_taken_for_canonical_are_told_their_bracket():
+    starts = np.random.default_rng(0).uniform(0.5, 1.5, (30, 2))
+    data = runs_of(lambda z: z * np.array([1 - z[1], z[0] - 1]), starts, 0.3, 20)
+    with pytest.warns(gfnn.FitWarning, match="another bracket: {z1,z2} = -z1 z2: log-canonical"):
+        gfnn.fit(gfnn.Pairs(data.z0, data.z1, 0.3, run=data.run), max_operations=10**9)
+
+
 def test_no_law_has_a_verdict():
     starts = 8 * np.random.default_rng(0).normal(size=(30, 3)) + [0, 0, 20]
     with pytest.raises(FitError) as raised:

@@ -20,6 +20,8 @@ from gfnn_jax.diagnosis.local_jacobians import (
     sampled_dimension,
 )
 
+NOT_SYMPLECTIC = "the pairs do not look symplectic"
+
 
 class Diagnosis(NamedTuple):
     """data: without what was factored out. plain: without base map and law, yet without a
@@ -64,7 +66,7 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
         at = centres(at, jacobians, seed)
         differing = where_areas_differ(jacobians, at, plain.scale, plain.parameters)
         messages.append(
-            f"the pairs do not look symplectic: ‖MᵀJM − J‖ is {defect:.2g} ± {error:.1g} (M: local "
+            f"{NOT_SYMPLECTIC}: ‖MᵀJM − J‖ is {defect:.2g} ± {error:.1g} (M: local "
             "Jacobians, coordinates in units of their spread) where a symplectic map has 0. Check "
             "the order q1…qd, p1…pd, and look for friction or a drive. If p are velocities, learn "
             f"the law of a recording (--positions, --velocities; gfnn.Recording).{differing}"

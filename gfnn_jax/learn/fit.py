@@ -21,6 +21,7 @@ from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.files import are_recordings, read_trajectories
 from gfnn_jax.data.recording import ReadOptions, Recording, read
 from gfnn_jax.dataset.runs import identified
+from gfnn_jax.diagnosis.diagnosis import NOT_SYMPLECTIC
 from gfnn_jax.diagnosis.outliers import clean, looked_for_errors
 from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
 from gfnn_jax.errors import FitError, FitWarning, InputError
@@ -32,6 +33,7 @@ from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, Watch, with_options
+from gfnn_jax.learn.other_bracket import other_bracket
 from gfnn_jax.learn.poisson import learn_poisson
 from gfnn_jax.learn.positions import learn_positions
 from gfnn_jax.learn.propose import structures_to_try
@@ -153,6 +155,9 @@ def fit(
             request, data = asked, same
             diagnosis = diagnose_request(request, data)
             warn(diagnosis.messages)
+            if any(NOT_SYMPLECTIC in message for message in diagnosis.messages):
+                watch.on_progress("looking for another bracket")
+                warn(other_bracket(data.pairs))
             if diagnosis.damping is not None:
                 watch.on_progress(str(diagnosis.damping))
             found = searched(request, data, diagnosis)

@@ -14,6 +14,7 @@ import dataclasses
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from scipy.linalg import qr
 
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms
@@ -68,11 +69,63 @@ class Field(Columns, Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
+class Partials:
+    """Library of the partial derivatives of terms: the field of a constant bracket is a sum of
+    these. places: those (coordinate × terms + term) that are independent."""
+
+    terms: Terms
+    places: tuple[int, ...]
+
+    @classmethod
+    def of(cls, terms: Terms, z: np.ndarray) -> Partials:
+        """The partial derivatives that are independent at states z (N, n)."""
+        every = terms.term_gradients(z).reshape(len(z), -1)
+        sizes = np.linalg.norm(every, axis=0)
+        columns = np.flatnonzero(sizes > 0)
+        found: Any = qr(every[:, columns] / sizes[columns], mode="economic", pivoting=True)
+        _, r, order = found
+        rank = int(np.sum(np.abs(np.diag(r)) > OPTIONS.undetermined * abs(r[0, 0])))
+        return cls(terms, tuple(sorted(columns[order[:rank]].tolist())))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coordinates."""
+        return self.terms.names
+
+    @property
+    def num_parameters(self) -> int:
+        """Number of functions."""
+        return len(self.places)
+
+    def term_values(self, z: np.ndarray) -> np.ndarray:
+        """Values (N, K)."""
+        return self.terms.term_gradients(z).reshape(len(z), -1)[:, list(self.places)]
+
+    def term_gradients(self, z: np.ndarray) -> np.ndarray:
+        """Gradients (N, n, K), by complex steps."""
+        out = np.empty((*z.shape, len(self.places)))
+        for k in range(z.shape[1]):
+            moved = z.astype(complex)
+            moved[:, k] += 1e-30j
+            gradients = _complex_gradients(self.terms, moved).reshape(len(z), -1)
+            out[:, k] = np.imag(gradients[:, list(self.places)]) / 1e-30
+        return out
+
+
+def _complex_gradients(terms: Terms, z: np.ndarray) -> np.ndarray:
+    """Gradients (N, n, K) of terms at complex states."""
+    out = np.zeros((*z.shape, terms.num_parameters), complex)
+    for j in range(terms.num_parameters):
+        out[..., j] = terms.take([j]).gradient(np.ones(1), z)
+    return out
+
+
+@dataclasses.dataclass(frozen=True)
 class FreeField:
     """f_i(z) = Σ_k c_ik ψ_k(z): every component has every function of the library, c by rows of
     i."""
 
-    library: Terms
+    library: Terms | Partials
 
     @property
     def width(self) -> int:

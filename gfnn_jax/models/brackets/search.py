@@ -22,6 +22,7 @@ from gfnn_jax.models.brackets.fields import (
     Field,
     FieldFit,
     FreeField,
+    Partials,
     fit_field,
     flow,
     substeps_of,
@@ -159,13 +160,20 @@ def law_of(
 
 def _degree(field: FreeField) -> int:
     """Total degree of a field of polynomials; 1 of others."""
-    return max((sum(row) for row in field.library.powers), default=1)
+    own = field.library
+    return 1 if isinstance(own, Partials) else max(map(sum, own.powers))
 
 
 def _free_field(train, held, names, terms, on_progress):
     """(field, its fit, its error on held-out pairs, notes): of the smallest degree that a higher
     one does not beat."""
     best, notes = None, ()
+    if terms is not None:
+        field = FreeField(Partials.of(terms, train.z0))
+        fit = fit_field(field, *train[:3])
+        best = field, fit, error_on(field, fit.c, held)
+        if best[2] <= OPTIONS.exact:
+            return (*best, ())
     for degree in OPTIONS.degrees:
         library = polynomials(names, degree, constant=True)
         if library.num_parameters * OPTIONS.rows_per_term > len(train.z0):

@@ -1,0 +1,404 @@
+"""Laws of states that are no (q, p): the bracket found too, from pairs and from noisy sequences.
+
+    python benchmarks/brackets.py --processor-time     all rows, then the table in RESULTS.md
+    python benchmarks/brackets.py --only tops --quick
+
+Pairs are of 16 to 75 runs of 20 steps, by DOP853 at 3e-14 (which the one-step errors show), with no
+more told than ``structure="poisson"``; vortices have the terms log r as well. Errors are on fresh
+states: of the field, relative; of a step and after 1,000 steps, largest coordinate, in the median
+over 5 orbits. Casimirs are followed over 10⁶ steps of one orbit. Fields without a bracket are ten
+of which none may get one.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from harness import TABLES, Numbers, between_markers, markdown, number, provenance, results, timed
+from harness import main as run_pieces
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+
+INERTIA = np.array([[2.0, 0.1, 0.05], [0.1, 1.5, 0.15], [0.05, 0.15, 1.0]])
+Field = Callable[[np.ndarray], np.ndarray]
+
+
+def euler(w):
+    return np.linalg.solve(INERTIA, np.cross(INERTIA @ w, w))
+
+
+def heavy(slope: Callable[[float], float]) -> Field:
+    """A top whose potential has this slope along Γ3, and smaller ones along Γ1 and Γ2."""
+
+    def field(z):
+        m, g = z[:3], z[3:]
+        w = np.array([0.5, 0.6, 1.0]) * m
+        return np.concatenate(
+            [np.cross(m, w) + np.cross(g, [0.1, 0.2, slope(g[2])]), np.cross(g, w)]
+        )
+
+    return field
+
+
+def spins(z):
+    """Four spins on a chain with unequal couplings, in a field."""
+    s, bonds = z.reshape(4, 3), np.array([1.0, 0.7, 1.3])
+    easy, b = np.array([1.0, 0.8, 1.2]), np.tile([0.1, 0.2, 0.3], (4, 1))
+    b[:-1] += bonds[:, None] * easy * s[1:]
+    b[1:] += bonds[:, None] * easy * s[:-1]
+    return np.cross(s, b).ravel()
+
+
+def populations(matrix, rest) -> Field:
+    return lambda z: z * (np.array(matrix) @ (z - rest))
+
+
+def vortices(circulations) -> Field:
+    g = np.array(circulations)
+
+    def field(z):
+        x, y = np.split(z, 2)
+        dx, dy = x[:, None] - x, y[:, None] - y
+        square = dx**2 + dy**2 + np.eye(len(g))
+        return np.concatenate([-(g * dy / square).sum(axis=1), (g * dx / square).sum(axis=1)])
+
+    return field
+
+
+def toda(z):
+    """Toda's chain of four bodies by Flaschka's a and b."""
+    a, b = z[:3], z[3:]
+    return np.concatenate([a * np.diff(b), 2 * np.diff([0.0, *a**2, 0.0])])
+
+
+def charged(z):
+    b = 1 + 0.4 * z[0]
+    return np.array([z[2], z[3], b * z[3] - z[0], -b * z[2] - 0.7 * z[1]])
+
+
+def normal(size: int, factor: float = 1.0):
+    return lambda rng: factor * rng.normal(size=size)
+
+
+def positive(size: int):
+    return lambda rng: rng.uniform(0.5, 1.5, size)
+
+
+def apart(bodies: int):
+    """Positions of vortices that are no closer than 0.8."""
+
+    def draw(rng):
+        while True:
+            z = 1.2 * rng.normal(size=2 * bodies)
+            x, y = np.split(z, 2)
+            if all(
+                np.hypot(x[i] - x[j], y[i] - y[j]) > 0.8 for i, j in combinations(range(bodies), 2)
+            ):
+                return z
+
+    return draw
+
+
+def unit_gravity(rng):
+    g = rng.normal(size=3)
+    return np.concatenate([rng.normal(size=3), g / np.linalg.norm(g) * rng.uniform(0.7, 1.2)])
+
+
+def chain(rng):
+    return np.concatenate([rng.uniform(0.3, 1.0, 3), 0.5 * rng.normal(size=4)])
+
+
+CIRCULAR = [[0, 1, 0, -0.9], [-1, 0, 0.7, 0], [0, -0.7, 0, 1.3], [0.9, 0, -1.3, 0]]
+TWICE = [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, -0.8], [0, 0, 0.7, 0]]
+# name -> field, states, dt, runs, the bracket's name, the given terms
+SYSTEMS: dict[str, tuple[Field, Any, float, int, str]] = {
+    "free top, full inertia": (euler, normal(3), 0.2, 20, "so(3)"),
+    "heavy top": (heavy(lambda x: 0.9), normal(6), 0.2, 30, "se(3)"),
+    "four spins": (spins, normal(12, 0.7), 0.2, 75, "so(3)⁴"),
+    "predators and prey": (
+        populations([[0, -1], [1, 0]], 1.0),
+        positive(2),
+        0.3,
+        20,
+        "log-canonical",
+    ),
+    "two pairs of them": (populations(TWICE, 1.0), positive(4), 0.3, 40, "log-canonical"),
+    "four in a circle": (populations(CIRCULAR, 1.0), positive(4), 0.2, 40, "log-canonical"),
+    "rock, paper, scissors, unequal": (
+        populations([[0, 1, -1.4], [-1, 0, 0.7], [1.4, -0.7, 0]], 0.0),
+        positive(3),
+        0.2,
+        20,
+        "log-canonical",
+    ),
+    "three vortices": (vortices([1, 0.6, -0.8]), apart(3), 0.2, 20, "constant"),
+    "four vortices": (vortices([1, 0.6, 0.8, 1.3]), apart(4), 0.2, 20, "constant"),
+    "Toda's chain by Flaschka": (toda, chain, 0.2, 75, "a Lie algebra"),
+    "charge, field 1 + 0.4 x": (charged, normal(4, 0.7), 0.2, 40, "canonical by p = m v + A(x)"),
+    "top, V = 1/(1.5 + Γ3)": (heavy(lambda x: -1 / (1.5 + x) ** 2), unit_gravity, 0.2, 30, "se(3)"),
+    "top, V = exp Γ3": (heavy(np.exp), unit_gravity, 0.2, 30, "se(3)"),
+    "top, V = cos 2Γ3": (heavy(lambda x: -2 * np.sin(2 * x)), unit_gravity, 0.2, 30, "se(3)"),
+    "top, V = √(2 + Γ3²)": (
+        heavy(lambda x: x / np.sqrt(2 + x * x)),
+        unit_gravity,
+        0.2,
+        30,
+        "se(3)",
+    ),
+}
+
+
+def damped_top(w):
+    return euler(w) - np.array([0.05, 0.15, 0.3]) * w
+
+
+def dry_top(w):
+    return euler(w) - 0.1 * np.tanh(20 * w)
+
+
+def food_chain(z):
+    x, y, w = z
+    eaten, more = 1.7 * x * y / (1 + 1.5 * x), 0.5 * y * w / (1 + 0.8 * y)
+    return np.array([x * (1 - x) - eaten, eaten - more - 0.2 * y, more - 0.1 * w])
+
+
+WITHOUT: dict[str, tuple[Field, Any, float]] = {
+    "Lorenz": (
+        lambda z: (
+            0.2
+            * np.array([10 * (z[1] - z[0]), z[0] * (28 - z[2]) - z[1], z[0] * z[1] - 8 / 3 * z[2]])
+        ),
+        lambda rng: 8 * rng.normal(size=3) + [0, 0, 20],
+        0.1,
+    ),
+    "Van der Pol": (lambda z: np.array([z[1], (1 - z[0] ** 2) * z[1] - z[0]]), normal(2), 0.2),
+    "food chain with saturation": (food_chain, positive(3), 0.2),
+    "top, dry friction": (dry_top, normal(3), 0.2),
+    "top, unequal friction": (damped_top, normal(3), 0.2),
+    "Rössler": (
+        lambda z: np.array([-z[1] - z[2], z[0] + 0.2 * z[1], 0.2 + z[2] * (z[0] - 2.0)]),
+        normal(3),
+        0.1,
+    ),
+    "Brusselator": (
+        lambda z: np.array([1 + z[0] ** 2 * z[1] - 3 * z[0], 2 * z[0] - z[0] ** 2 * z[1]]),
+        positive(2),
+        0.2,
+    ),
+    "FitzHugh–Nagumo": (
+        lambda z: np.array([z[0] - z[0] ** 3 / 3 - z[1] + 0.5, 0.3 * (z[0] + 0.7 - 0.8 * z[1])]),
+        normal(2),
+        0.2,
+    ),
+    "competition": (
+        populations([[-1, -0.5, -0.3], [-0.2, -1, -0.6], [-0.7, -0.4, -1]], 0.6),
+        positive(3),
+        0.2,
+    ),
+    "Halvorsen": (
+        lambda z: 0.2 * (-1.4 * z - 4 * np.roll(z, -1) - 4 * np.roll(z, -2) - np.roll(z, -1) ** 2),
+        normal(3),
+        0.1,
+    ),
+}
+
+
+def orbit(field: Field, start: np.ndarray, dt: float, steps: int) -> np.ndarray:
+    """States (steps + 1, n) of one run."""
+    times = dt * np.arange(steps + 1)
+    how = {"method": "DOP853", "rtol": 3e-14, "atol": 1e-15, "t_eval": times}
+    return solve_ivp(lambda t, z: field(z), (0, times[-1]), start, **how).y.T
+
+
+def pairs_of(runs: list[np.ndarray], dt: float, names: tuple[str, ...] = ()) -> gfnn.Pairs:
+    z0, z1 = np.concatenate([r[:-1] for r in runs]), np.concatenate([r[1:] for r in runs])
+    run = np.repeat(np.arange(len(runs)), [len(r) - 1 for r in runs])
+    return gfnn.Pairs(z0, z1, dt, run=run, structure="poisson", names=names)
+
+
+def learned(pairs: gfnn.Pairs, **options: Any) -> tuple[gfnn.Fit, float]:
+    """A fit, and the processor's seconds."""
+    started = time.process_time()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        fit = gfnn.fit(pairs, max_seconds=None, **options)
+    return fit, time.process_time() - started
+
+
+def of_system(name: str, quick: bool) -> Numbers:
+    """Everything about one system with a bracket."""
+    field, draw, dt, count, expected = SYSTEMS[name]
+    rng = np.random.default_rng(0)
+    runs = [orbit(field, draw(rng), dt, 20) for _ in range(count)]
+    names, options = (), {}
+    if "vortices" in name:
+        bodies = range(1, runs[0].shape[1] // 2 + 1)
+        names = tuple(f"{axis}{i}" for axis in "xy" for i in bodies)
+        squares = (f"log((x{i} - x{j})**2 + (y{i} - y{j})**2)" for i, j in combinations(bodies, 2))
+        options = {"terms": list(squares)}
+    fit, seconds = learned(pairs_of(runs, dt, names), **options)
+    assert fit.bracket is not None
+    fresh, steps = [draw(rng) for _ in range(5)], 100 if quick else 1000
+    states = np.array(fresh)
+    rates = np.array([field(z) for z in fresh])
+    reference = np.array([orbit(field, z, dt, steps) for z in fresh])
+    rollout = np.asarray(fit.map.rollout(states, steps)[0])
+    flow = fit.map.pieces[0]
+    off = np.abs(rollout - reference).max(axis=2)
+    own = fit.bracket.matrix(states) @ gradient_of(fit, states)[..., None]
+    long = np.asarray(
+        fit.map.rollout(states[0], 10_000 if quick else 1_000_000, save_every=1_000)[0]
+    )
+    drift = [np.abs(c(long) / c(long)[0] - 1).max() for c in fit.casimirs]
+    one = timed(lambda: fit.map.rollout(states[0], 20_000, save_every=20_000)[0])
+    return {
+        "pairs": 20 * count,
+        "expected": expected,
+        "found": fit.bracket.name,
+        "law": str(fit.law),
+        "field": float(np.abs(own[..., 0] - rates).max() / np.abs(rates).max()),
+        "one_step": float(np.median(off[:, 1])),
+        "last": float(np.median(off[:, -1])),
+        "casimirs": float(max(drift)) if drift else None,
+        "defect": fit.symplecticity_defect,
+        "microseconds": 1e6 * one.seconds / 20_000,
+        "substeps": getattr(flow, "substeps", None),
+        "cpu_seconds": seconds,
+    }
+
+
+def gradient_of(fit: gfnn.Fit, z: np.ndarray) -> np.ndarray:
+    """∇H (N, n) of a law."""
+    law = fit.map.pieces[0]
+    family = getattr(law.family, "family", law.family)
+    return family.gradient(np.asarray(law.params), z)
+
+
+def without(quick: bool) -> Numbers:
+    """What is said of fields without a bracket."""
+    found = {}
+    for name, (field, draw, dt) in list(WITHOUT.items())[: 3 if quick else None]:
+        rng = np.random.default_rng(0)
+        runs = [orbit(field, draw(rng), dt, 20) for _ in range(40)]
+        try:
+            fit, _ = learned(pairs_of(runs, dt))
+            found[name] = f"claimed: {fit.bracket}; {fit.verdict}"
+        except gfnn.FitError as error:
+            found[name] = error.verdict
+    return found
+
+
+def noisy(quick: bool) -> Numbers:
+    """Sequences with noise of 1e-3 on every number."""
+    found = {}
+    cases = {
+        "gyroscope": (euler, normal(3), 6, 400),
+        "heavy top": (SYSTEMS["heavy top"][0], normal(6), 20, 200),
+    }
+    for name, (field, draw, count, steps) in cases.items():
+        for seed in range(1 if quick else 5):
+            rng = np.random.default_rng(seed)
+            runs = [orbit(field, draw(rng), 0.05, steps) for _ in range(count)]
+            runs = [r + 1e-3 * rng.normal(size=r.shape) for r in runs]
+            fit, seconds = learned(pairs_of(runs, 0.05))
+            assert fit.bracket is not None
+            fresh = np.array([draw(rng) for _ in range(20)])
+            last = np.array([orbit(field, z, 0.05, 100)[-1] for z in fresh])
+            off = np.linalg.norm(np.asarray(fit.map.rollout(fresh, 100)[0])[:, -1] - last, axis=1)
+            long = np.asarray(fit.map.rollout(fresh[:5], 20_000, save_every=200)[0])
+            casimir = (
+                np.sum((long @ INERTIA) ** 2, -1)
+                if name == "gyroscope"
+                else np.sum(long[..., 3:] ** 2, -1)
+            )
+            found[f"{name}, seed {seed}"] = {
+                "found": fit.bracket.name,
+                "verdict": fit.verdict,
+                "step_100": float(np.sqrt(np.mean(off**2))),
+                "step_100_median": float(np.median(off)),
+                "casimir": float(np.median(np.abs(casimir / casimir[:, :1] - 1).max(axis=1))),
+                "cpu_seconds": seconds,
+            }
+    return found
+
+
+PIECES = {
+    name.replace(" ", "-").replace("/", "over"): (lambda quick, name=name: of_system(name, quick))
+    for name in SYSTEMS
+} | {"without": without, "noisy": noisy}
+
+
+def tables() -> None:
+    found = results(PIECES, "brackets")
+    rows = [
+        [
+            name,
+            number(m["pairs"]),
+            m["found"],
+            *(
+                number(m[key])
+                for key in (
+                    "field",
+                    "one_step",
+                    "last",
+                    "casimirs",
+                    "defect",
+                    "microseconds",
+                    "cpu_seconds",
+                )
+            ),
+        ]
+        for name, result in found.items()
+        if "found" in (m := result["measured"])
+    ]
+    heads = (
+        "system",
+        "pairs",
+        "bracket found",
+        "field",
+        "one step",
+        "step 1,000",
+        "Casimirs, 10⁶ steps",
+        "defect",
+        "µs/step",
+        "fit, CPU s",
+    )
+    text = markdown(heads, rows)
+    if "without" in found:
+        said = [[name, verdict] for name, verdict in found["without"]["measured"].items()]
+        text += "\n\n" + markdown(("field without a bracket", "what is said"), said)
+    if "noisy" in found:
+        said = [
+            [
+                name,
+                m["found"],
+                m["verdict"].partition(":")[0],
+                *(
+                    number(m[key])
+                    for key in ("step_100", "step_100_median", "casimir", "cpu_seconds")
+                ),
+            ]
+            for name, m in found["noisy"]["measured"].items()
+        ]
+        heads = (
+            "sequences, σ 10⁻³",
+            "bracket",
+            "verdict",
+            "step 100, RMS",
+            "median",
+            "true Casimir off, 20,000 steps",
+            "CPU s",
+        )
+        text += "\n\n" + markdown(heads, said)
+    between_markers(TABLES, "brackets", f"{text}\n\n{provenance(found)}")
+
+
+if __name__ == "__main__":
+    run_pieces(__doc__ or "", PIECES, "brackets", tables, sys.argv[1:], ("heavy-top", "without"))
