@@ -183,7 +183,8 @@ def _run_file(arguments: argparse.Namespace) -> None:
     others = tuple(name for name in (*_OF_MAPS, "learn", "quick") if name != "scene")
     _refuse_given(arguments, others, "not for the law of a recording")
     columns |= given | ({"dt": arguments.dt} if arguments.dt is not None else {})
-    options = {"mass": masses(arguments), "despite": arguments.despite}
+    options = fit_options(arguments)
+    options |= {"mass": masses(arguments), "despite": arguments.despite}
     with _output(arguments) as output:
         from gfnn_jax.jobs.run_record import run_record
 

@@ -18,7 +18,16 @@ from typing import Any, NoReturn
 from gfnn_jax.data.recording import SECONDS
 from gfnn_jax.data.roles import ROLES
 from gfnn_jax.errors import InputError
-from gfnn_jax.learn.options import COUNT, DEVICES, OPTIONS, POSITIVE, SEED, FitOptions, Kind
+from gfnn_jax.learn.options import (
+    COUNT,
+    DEVICES,
+    OPTIONS,
+    POSITIVE,
+    SEED,
+    FitOptions,
+    Kind,
+    Lagrangian,
+)
 
 EXPORTS = (  # those of `exports.export`, whose import would load JAX
     "c",
@@ -32,6 +41,15 @@ EXPORTS = (  # those of `exports.export`, whose import would load JAX
     "latex",
     "stablehlo",
 )
+WORKFLOW = """\
+all in one:
+  gfnn FILE --open              look, learn from two thirds, forecast the rest, write the report
+                                (a recording, or states q, p; `gfnn pendulum` is an example)
+step by step:
+  gfnn look FILE                what a recording holds; prints the command to type next
+  gfnn fit FILE --out model     learn its law, or the map of states q, p
+  gfnn predict model --initial FILE --num-steps 1000 --out prediction.csv
+  gfnn export model --to c      for programs without Python"""
 EXIT_STATUS = """\
 exit status:
   0    success
@@ -45,6 +63,7 @@ OF_COLUMNS = (
     *("angles", "degrees", "columns", "time", "time_unit", "offset", "scale", "coordinates"),
     *("start", "stop", "every"),
 )
+LAGRANGIAN_OPTIONS = {field.name for field in dataclasses.fields(Lagrangian)}
 DISTRIBUTED_STATUS = "  134  with --distributed: another process of the job was lost"
 WORDS = """\
 the table of candidates:
@@ -93,26 +112,32 @@ class _Command:
         self.flag("--resume", "continue an unfinished output")
 
     def add_fit(self, **defaults: str) -> None:
-        """Add the options of `FitOptions` that the command has. defaults: words for some."""
+        """Add the options of `FitOptions` that the command has, in groups by the data that they are
+        for. defaults: words for some."""
+        both = _Command(self.parser.add_argument_group("what is learned"))
+        of_law = _Command(self.parser.add_argument_group("the law of a recording"))
+        of_map = _Command(self.parser.add_argument_group("the map of states q, p"))
         for field in dataclasses.fields(FitOptions):
             name, about = field.name, OPTIONS[field.name]
             if self.parser.prog not in about.commands:
                 continue
+            for_law = name in LAGRANGIAN_OPTIONS
+            group = both if name in ("learn", "terms", "seed") else of_law if for_law else of_map
             default = defaults.get(name, "" if field.default in (None, ()) else str(field.default))
             shown = about.help.replace("%", "%%")
             shown += f" (default {default})" if default and "default" not in shown else ""
             given: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS}
             given |= {"choices": about.kind.choices} if about.kind.choices else {}
             given |= {"type": _reader(about.kind)} if about.metavar else {}
-            self.add(f"--{name.replace('_', '-')}", shown, about.metavar, **given)
-        self.add(
+            group.add(f"--{name.replace('_', '-')}", shown, about.metavar, **given)
+        of_map.add(
             "--scalar",  # the old name of --family
             argparse.SUPPRESS,
             dest="family",
             choices=OPTIONS["family"].kind.choices,
             default=argparse.SUPPRESS,
         )
-        self.flag("--strict", "exit status 1 where the tolerance is not met")
+        of_map.flag("--strict", "exit status 1 where the tolerance is not met")
         self.add_output()
 
 
@@ -121,8 +146,8 @@ def parser() -> argparse.ArgumentParser:
     plain: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
     found = _Parser(
         prog="gfnn",
-        description="Learn exactly symplectic maps, predict with them.",
-        epilog=f"{EXIT_STATUS}\n{DISTRIBUTED_STATUS}",
+        description="Find the law of motion in data, predict with exactly symplectic maps.",
+        epilog=f"{WORKFLOW}\n\n{EXIT_STATUS}\n{DISTRIBUTED_STATUS}",
         **plain,
     )
     found.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
@@ -191,8 +216,8 @@ def parser() -> argparse.ArgumentParser:
 
 def _run(command: _Command) -> None:
     names = "a name that `gfnn scenes` or `gfnn records` lists, or the file of a recording"
-    command.add("scene", names, "SCENE")
-    command.add("--out", "folder (default runs/SCENE)", "DIR", type=Path)
+    command.add("scene", names, "FILE|NAME")
+    command.add("--out", "folder (default runs/NAME)", "DIR", type=Path)
     command.flag("--open", "open the report in a browser")
     command.flag("--quick", "of a scene: fewer pairs and rollouts")
     command.add(

@@ -118,7 +118,7 @@ def test_help(command, capsys):
 BAD_USAGE = [
     ("", "gfnn double_pendulum"),
     ("rum", "'rum'"),
-    ("run", "SCENE"),
+    ("run", "FILE|NAME"),
     ("run two-bdy", "'two-body'"),
     ("run two-body --dt 0", "--dt"),
     ("run two-body --dt nan", "--dt"),
@@ -450,7 +450,15 @@ def test_silence_is_never_long(capsys, monkeypatch):
         time.sleep(0.5)
     lines = [line.split("] ")[1] for line in capsys.readouterr().err.splitlines()]
     assert lines[:2] == ["factorising", "a candidate, error 1e-3"]
-    assert lines[2] == "not shown: too soon …"
+    assert lines[2] == "not shown: too soon … 0 s so far"
+
+
+def test_parts_tell_the_time_left():
+    left = progress._Left()
+    assert left.of("bands (1 of 4)", 10.0) == ""
+    assert left.of("bands (2 of 4)", 16.0) == ", about 18 s left"
+    assert left.of("another step", 17.0) == ""
+    assert left.of("folds (1 of 2)", 20.0) == ""
 
 
 def test_failing_arithmetic_is_one_line(tmp_path, capsys, monkeypatch):

@@ -386,7 +386,7 @@ def test_the_friction_that_a_record_shows(swing):
     assert found.odds["none"] > 1e6
     assert found.odds["dry"] > 20
     assert all(0 < limit < 0.002 for limit in found.limits.values())
-    assert "not seen, coefficients in R (2 σ): of |ω|³ below 0.00" in str(found)
+    assert "not seen, coefficients in R (2 σ): |ω|³ < 0.00" in str(found)
     without = gfnn.fit(undamped())
     assert without.friction.terms == ()
     assert without.which_friction.kinds == ()

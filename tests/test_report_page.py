@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from html.parser import HTMLParser
 
+import jax
 import numpy as np
 import pytest
 from command_line import gfnn as command
@@ -150,14 +151,49 @@ def test_a_fit_forecasts_plots_and_shows_itself(tmp_path):
 
 def test_the_page_of_pairs():
     scene = gfnn.scenes.make("henon-heiles-regular")
-    import jax
-
     pairs = gfnn.sample_pairs(scene, num_pairs=600, key=jax.random.key(0))
     fit = gfnn.fit(pairs, scene, tolerance=1e-5, max_seconds=None)
     text = page(fit)
     assert "<h2>Candidates</h2>" in text
     assert "henon-heiles" in text
     assert fit.predict(pairs.z0[0], 3).shape == (4, 4)
+
+
+def test_a_wrong_keyword_is_named_with_the_nearest_right_one():
+    t, x = swing(2.0)
+    for call, hint in (
+        (lambda: gfnn.fit(t, x, tolerence=1e-3), "did you mean tolerance"),
+        (lambda: gfnn.fit(t, x, positions=["x"]), "gfnn.read"),
+        (lambda: gfnn.Recording({"t": t, "x": x}, postions=["x"]), "did you mean positions"),
+    ):
+        with pytest.raises(TypeError, match=hint):
+            call()
+
+
+def test_forecasts_are_in_the_degrees_of_the_file():
+    t, x = swing(sigma=1e-3)
+    table = {"t": t, "angle": 20 * x}
+    fit = gfnn.fit(gfnn.Recording(table, positions=["angle"], degrees=["angle"]))
+    ahead = fit.forecast(t[-1] + np.array([0.1, 0.2]))
+    (name,) = ahead.values
+    assert ahead.units[name] == "deg"
+    assert 0.5 < np.abs(ahead.values[name]).max() < 30
+
+
+def test_a_fit_without_float64_says_so_at_once():
+    t, x = swing(2.0)
+    with jax.enable_x64(False), pytest.raises(RuntimeError, match="jax_enable_x64"):
+        gfnn.fit(t, x)
+
+
+def test_options_of_columns_serve_the_one_command(tmp_path, monkeypatch, capsys):
+    """What `gfnn look` proposes, `gfnn FILE` takes."""
+    monkeypatch.chdir(tmp_path)
+    t, x = swing(12.0)
+    np.savetxt("swing.csv", np.stack([t, 20 * x], axis=1), "%.4f", ",", header="t,angle")
+    options = ("--degrees", "angle", "--friction", "linear", "--out", "out")
+    assert command("swing.csv", *options) == 0
+    assert "angle in rad" in capsys.readouterr().out
 
 
 CHROMIUM = next(

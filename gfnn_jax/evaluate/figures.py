@@ -72,8 +72,18 @@ def _without_minor_ticks(*axes: Axes) -> None:
             axis.set_minor_locator(NullLocator())
 
 
+_LETTERS_PER_INCH, _OF_HANDLE = (
+    13,
+    8,
+)  # of a legend, and the letters that a handle takes the place of
+
+
 def _legend_above(ax, ncols=3, **options) -> None:
-    """Draw the legend above the axes, where it covers no data."""
+    """Draw the legend above the axes, where it covers no data, in as many columns as there is room
+    for."""
+    longest = max(map(len, ax.get_legend_handles_labels()[1]), default=0)
+    room = ax.get_position().width * ax.figure.get_figwidth() * _LETTERS_PER_INCH
+    ncols = max(1, min(ncols, int(room // (longest + _OF_HANDLE))))
     options |= {"frameon": False, "borderaxespad": 0.2, "handlelength": 2.4, "columnspacing": 1.2}
     ax.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=ncols, **options)
 

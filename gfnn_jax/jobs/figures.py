@@ -39,7 +39,9 @@ def figures_of_run(
     else:
         lane = _whole_lane(reference)
         orbits = {n: (z[lane, :, 0], z[lane, :, 1]) for n, z in both.items()}
-        drawn["portrait"] = figures.phase_portrait(orbits, ("$q_1$", "$q_2$")).figure
+        portrait = figures.phase_portrait(orbits, ("$q_1$", "$q_2$"))
+        portrait.set_aspect("equal", "datalim")  # an orbit in space
+        drawn["portrait"] = portrait.figure
     return drawn
 
 

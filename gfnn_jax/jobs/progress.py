@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import sys
 import threading
 import time
@@ -48,28 +49,59 @@ def on_stderr() -> Iterator[Progress]:
         )
 
 
+_PART = re.compile(r"(.*) \((\d+) of (\d+)\)$")  # a message about the k-th of n equal parts
+
+
+class _Left:
+    """Estimate of the time left of work in equal parts, by the messages that begin them."""
+
+    def __init__(self):
+        self._what, self._began, self._first = "", 0.0, 1
+
+    def of(self, message: str, now: float) -> str:
+        """Words for behind a message, "" where nothing is known."""
+        found = _PART.match(message)
+        if found is None:
+            return ""
+        what, part, count = found[1], int(found[2]), int(found[3])
+        if what != self._what:
+            self._what, self._began, self._first = what, now, part
+        done = part - self._first
+        left = (now - self._began) / done * (count - part + 1) if done else 0.0
+        return f", about {left:.0f} s left" if left >= 1 else ""
+
+
 class _Lines:
     """Writer of lines with the seconds since the start; a thread repeats the last status, or the
-    last line of a job that gives none."""
+    last line of a job that gives none, with the seconds that it has taken."""
 
     def __init__(self):
         self._started = time.perf_counter()
         self._last = self._started - BETWEEN  # the first line comes at once
         self._message, self._has_status = "starting", False
+        self._since, self._left = self._started, _Left()
         self._lock, self._stopped = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._repeat, daemon=True)
         self._thread.start()
 
     def status(self, message: str) -> None:
         with self._lock:
-            self._message, self._has_status = message, True
+            self._take(message, True)
             if time.perf_counter() >= self._last + BETWEEN:
-                self._print(message)
+                self._print(self._message)
 
     def line(self, message: str) -> None:
         with self._lock:
-            self._message = self._message if self._has_status else message.strip()
-            self._print(message)
+            if not self._has_status:
+                self._take(message.strip(), False)
+            self._print(message + self._left.of(message, time.perf_counter()))
+
+    def _take(self, message: str, has_status: bool) -> None:
+        """Note what is being done, and since when."""
+        now = time.perf_counter()
+        shown = message + self._left.of(message, now)
+        self._since = self._since if shown == self._message else now
+        self._message, self._has_status = shown, has_status
 
     def stop(self) -> None:
         self._stopped.set()
@@ -78,8 +110,9 @@ class _Lines:
     def _repeat(self) -> None:
         while not self._stopped.wait(LONGEST_SILENCE / 10):
             with self._lock:
-                if time.perf_counter() >= self._last + 0.8 * LONGEST_SILENCE:
-                    self._print(f"{self._message} …")
+                now = time.perf_counter()
+                if now >= self._last + 0.8 * LONGEST_SILENCE:
+                    self._print(f"{self._message} … {now - self._since:.0f} s so far")
 
     def _print(self, message: str) -> None:
         self._last = time.perf_counter()

@@ -49,7 +49,7 @@ class Sizes:
 
 
 WHOLE = Sizes()
-QUICK = Sizes(4_000, 1e-7, 25, 3_000, 1e-5, 60, 0, 0)
+QUICK = Sizes(4_000, 1e-6, 25, 3_000, 1e-5, 60, 0, 0)
 
 
 def run(
@@ -62,7 +62,7 @@ def run(
 ) -> Ran | None:
     """Run a scene: reference data, fit, rollouts, metrics, figures, report, into a folder.
 
-    quick: fewer pairs and rollouts, a tolerance of 1e-7 or larger, no band in the figure of errors.
+    quick: fewer pairs and rollouts, a tolerance of 1e-6 or larger, no band in the figure of errors.
     options: `FitOptions`; without a tolerance the scene's own, close to the best attainable.
     Returns None where the output holds the result of this same job.
     """

@@ -303,14 +303,11 @@ OPTIONS: dict[str, About] = {
         "for a recording, friction by its force: auto, none, linear (viscous, ∝ v), quadratic "
         "(drag, ∝ v |v|), dry (Coulomb), uniform (R = γT); several joined by +",
         "KIND",
-        FIT,
     ),
     "input_hold": About(
         _one_of("auto", "hold", "linear", "band"),
         "for a recording, inputs between samples: hold (zero order), linear, band (band-limited), "
         "or auto, by held-out data",
-        None,
-        FIT,
     ),
     "mass": About(
         _MASSES,

@@ -113,11 +113,11 @@ class WhichFriction:
         text = "+".join(self.kinds) or "none"
         if self.odds:
             rival = min(self.odds, key=lambda name: self.odds[name])
-            text += f", on held-out arcs odds of {odds_text(self.odds[rival])} against {rival}"
+            text += f"; odds of {odds_text(self.odds[rival])} against {rival} on held-out parts"
             if self.odds[rival] < 1:
                 decided = EVIDENCE.decided
-                text += f"; of sets within odds of {decided:.0f} : 1 that of fewest kinds is kept"
-        below = [f"of {in_letters(term)} below {limit:.2g}" for term, limit in self.limits.items()]
+                text += f", and of sets within {decided:.0f} : 1 the one of fewest kinds is chosen"
+        below = [f"{in_letters(term)} < {limit:.2g}" for term, limit in self.limits.items()]
         return text + (f"; not seen, coefficients in R (2 σ): {', '.join(below)}" if below else "")
 
 

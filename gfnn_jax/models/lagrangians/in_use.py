@@ -165,7 +165,8 @@ def _sensors(data: RecordingData, fit: LawFit) -> Sensors:
 def _thirds(data: RecordingData, fit: LawFit, sensors: Sensors) -> Thirds:
     """The laws of the record without each third, of which less data tell less."""
     fewer, laws, begins = np.sqrt(FOLDS / (FOLDS - 1)), [], []
-    for other, run, t in fit.without_thirds():
+    for part, (other, run, t) in enumerate(fit.without_thirds(), start=1):
+        fit.problem.on_progress(f"bands: forecasts by the law without a third ({part} of {FOLDS})")
         law, covariance = in_columns(other)
         own = sensors
         if sensors.observation is not None:
