@@ -214,6 +214,7 @@ class _System(NamedTuple):
         d = self.law.dim
         values, std = self.with_errors(lambda other: _else_nan(other.rest_from(q), d))
         std = np.hypot(std, self.zeros)
+        values, std = (np.where(np.abs(x) < 1e-9 * self.size, 0.0, x) for x in (values, std))
         kind = "rest position" if stable else "unstable rest position"
         about = "the potential is least there" if stable else "the forces vanish there"
         found = [
