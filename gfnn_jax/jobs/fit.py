@@ -251,7 +251,8 @@ def fit_recording(
     with atomic_folder(output.out) as folder:
         write(folder, folder, fitted, result, job)
         if is_law:
-            save(law_figure(fitted.found, recording), folder / LAW_FIGURE, dpi=110)
+            law: Any = fitted.found
+            save(law_figure(law, recording), folder / LAW_FIGURE, dpi=110)
     if refused is not None:
         raise WorkError(f"{refused}; this law is kept in {output.out}")
     return Ran(fitted, output.out, result)
