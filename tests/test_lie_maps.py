@@ -116,5 +116,22 @@ def test_map_without_a_law():
 
 
 def test_only_for_brackets_with_that_chart():
-    with pytest.raises(gfnn.FitError, match="Lie algebra or a constant"):
-        lie_generated(lambda p, z: z[0], None, gfnn.Bracket.log([[0, 1], [-1, 0]]), 0.1, np.ones(2))
+    bracket = gfnn.Bracket.magnetic([[0, 1], [-1, 0]])
+    with pytest.raises(gfnn.FitError, match="got one canonical by p"):
+        lie_generated(lambda p, z: z[0], None, bracket, 0.1, np.ones(4))
+
+
+def test_fit_of_a_map_without_a_law(tmp_path):
+    """Lotka–Volterra by S alone, through gfnn.fit; without a bracket it says what to type."""
+    bracket, z = gfnn.Bracket.log([[0, -1], [1, 0]]), RNG.uniform(0.6, 1.6, (400, 2))
+    z1 = flow_of(bracket, lambda y: 1 - 1 / y, z, 0.2)
+    pairs = gfnn.Pairs(z, z1, 0.2, structure="poisson", names=("prey", "predators"))
+    fit = gfnn.fit(pairs, model=gfnn.GeneratingFunction(bracket=bracket), tolerance=1e-6)
+    assert fit.law is None
+    assert fit.verdict.startswith("map")
+    np.testing.assert_allclose(fit.map.step(z)[0], z1, atol=1e-7)
+    assert np.max(fit.map.defect(z[:20])) < 1e-13
+    fit.save(tmp_path / "model")
+    np.testing.assert_array_equal(gfnn.load(tmp_path / "model").map.step(z)[0], fit.map.step(z)[0])
+    with pytest.raises(gfnn.FitError, match="needs its bracket"):
+        gfnn.fit(pairs, learn="map")

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.arrays import as_row, matmul, namespace, pytree
-from gfnn_jax.brackets import Bracket, Constant, LieAlgebra
+from gfnn_jax.brackets import Bracket, Constant, LieAlgebra, Log
 from gfnn_jax.errors import FitError
 from gfnn_jax.families import as_family
 from gfnn_jax.families.family import (
@@ -171,10 +171,22 @@ def _step(piece, z, args):
     return piece.step(z, args)
 
 
-def lie_generated(family, params, bracket: Bracket, dt, scale) -> LieGenerated:
-    """`LieGenerated` with the bracket's Casimirs. Raises FitError for a bracket of another kind."""
+def chart_of(bracket: Bracket) -> Constant | LieAlgebra:
+    """The bracket of the states that the chart is one of: of log z where it is log-canonical.
+    Raises FitError for a bracket that is neither constant, log-canonical nor a Lie algebra."""
+    if isinstance(bracket, Log):
+        return Constant(bracket.form)
     if not isinstance(bracket, (Constant, LieAlgebra)):
-        raise FitError(f"expected a Lie algebra or a constant bracket, got {bracket.name}")
+        raise FitError(
+            f"expected a Lie algebra, a constant or a log-canonical bracket, got one {bracket.name}"
+        )
+    return bracket
+
+
+def lie_generated(family, params, bracket: Bracket, dt, scale) -> LieGenerated:
+    """`LieGenerated` with the bracket's Casimirs; of log z where it is log-canonical. Raises
+    FitError as `chart_of` does."""
+    bracket = chart_of(bracket)
     dt = np.asarray(dt, float) if isinstance(dt, (int, float)) else dt
     return LieGenerated(as_family(family), params, bracket, dt, scale, casimirs_of(bracket))
 
@@ -212,6 +224,16 @@ class LieFlow:
 
     short: LieGenerated
     substeps: int = 1
+
+    @property
+    def family(self):
+        """H."""
+        return self.short.family
+
+    @property
+    def params(self):
+        """Coefficients of H."""
+        return self.short.params
 
     @property
     def dt(self):

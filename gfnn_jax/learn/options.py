@@ -174,8 +174,10 @@ class Lagrangian:
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GeneratingFunction:
     """S, whose step is an implicit equation: of a ``family`` in a ``chart``, beside the flow of a
-    known ``base``. Options as of `gfnn.fit`."""
+    known ``base``; with a ``bracket`` (`gfnn.Bracket`) of states that are no (q, p). Options as of
+    `gfnn.fit`."""
 
+    bracket: Any = None
     family: Any = "auto"
     chart: str = "auto"
     base: str | Callable | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,14 +20,13 @@ from gfnn_jax.dataset.split import split_rows
 from gfnn_jax.errors import FitError, FitWarning, InputError
 from gfnn_jax.families.expressions import parse_named, to_named_text
 from gfnn_jax.families.terms import Terms
-from gfnn_jax.flows.collective import collective
-from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.lie import chart_of, law_flow
 from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit
 from gfnn_jax.learn.options import FitOptions, Watch
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.brackets.fields import substeps_of
+from gfnn_jax.models.brackets.lie_maps import fit_lie_map
 from gfnn_jax.models.brackets.search import Data, PoissonLaw, law_of
 from gfnn_jax.models.hamiltonians.fitted_law import Term, formula
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
@@ -40,7 +39,8 @@ NOISE = 1.15  # times the noise, that the errors of a law may be which misses no
 
 def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) -> Fit:
     """Learn the law and the map of states that are no (q, p): of pairs, or of a recording whose
-    positions they are; the bracket is found, or given by ``options``.
+    positions they are; the bracket is found, or given by ``options``. With learn="map" S of a map
+    without a law is fitted instead, in the chart of a given bracket.
 
     The pairs are split as others are: the degree of the field is chosen, and the error is stated,
     by pairs that were not fitted to. Raises FitError where values are missing or depend on
@@ -49,7 +49,7 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
     require_x64("a fit")
     bracket, tolerance = options.bracket, Tolerance.of(options)
     budget = options.budget(watch, None)
-    options.refuse_others(("hamiltonian",), "states with a bracket of their own")
+    options.refuse_others(("hamiltonian", "map"), "states with a bracket of their own")
     pairs = pairs_of_states(data) if isinstance(data, Recording) else data
     z0, z1 = _checked(pairs, bracket)
     n = z0.shape[1]
@@ -59,49 +59,43 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
     dt: Any = np.asarray(pairs.dt) if np.ndim(pairs.dt) else float(pairs.dt)
     z0, z1, run, place = (np.asarray(a) for a in (pairs.z0, pairs.z1, pairs.run, pairs.place))
     every = Data(z0, z1, dt, run, place, sizes(z0))
-    training = np.sort(split.training)
-    started = time.perf_counter()
-    law = law_of(
-        every.take(training),
-        every.take(split.validation),
-        names,
-        bracket=bracket and bracket.named(names),
-        terms=_given(options.terms, names),
-        on_progress=watch.on_progress,
-    )
-    seconds = time.perf_counter() - started
-    watch.on_progress(f"compiling the step of {law.name}")
-    map_ = map_of(law, every.z0, float(np.median(dt)))
+    train, held = every.take(np.sort(split.training)), every.take(split.validation)
+    bracket, started = bracket and bracket.named(names), time.perf_counter()
+    if options.learn == "map":
+        learned = _generated(train, bracket)
+    else:
+        terms, report = _given(options.terms, names), watch.on_progress
+        law = law_of(train, held, names, bracket=bracket, terms=terms, on_progress=report)
+        learned = _of_law(law, every.z0, float(np.median(dt)))
+    seconds, map_, sigma = time.perf_counter() - started, learned.map_, learned.sigma
+    watch.on_progress(f"compiling the step of {learned.label}")
     test = split.test if len(split.test) else split.validation
     steps = stepped(map_, every.z0[test], dt[test] if np.ndim(dt) else None)
     images = np.where(steps.failed[:, None], np.nan, steps.images)
     off = images - every.z1[test]
     error = one_step_error(off, every.spread, tolerance, split.stretch[test])
     # both states of a pair have the noise that its sequence tells
-    white = law.sigma is not None and bool(
-        np.sqrt(np.mean((off / law.sigma) ** 2)) <= NOISE * np.sqrt(2)
-    )
-    family = law.field.library
+    white = sigma is not None and bool(np.sqrt(np.mean((off / sigma) ** 2)) <= NOISE * np.sqrt(2))
     candidate = Candidate.of(
         error,
-        label=f"H of {family.num_parameters} terms",
-        family="terms",
-        chart=law.bracket.name,
-        num_parameters=family.num_parameters,
-        operations=float(family.operations[0]),
-        train_rms=law.fit.relative,
+        label=learned.label,
+        family=learned.family.name,
+        chart=learned.bracket.name,
+        num_parameters=learned.family.num_parameters,
+        operations=float(learned.family.operations[0]),
+        train_rms=learned.relative,
         validated=True,
         fit_seconds=seconds,
         chosen=True,
-        learns="hamiltonian",
+        learns="map" if learned.law is None else "hamiltonian",
         newton_iterations_max=int(steps.iterations.max()),
         microseconds_per_step=steps.microseconds_per_step,
     )
     watch.on_candidate(candidate)
-    met, messages = candidate.validation_bound <= tolerance.bound, list(law.notes)
-    if white and not met and law.sigma is not None:
-        sigma = ", ".join(f"{s:.2g}" for s in law.sigma)
-        messages.append(f"the law leaves no more than the noise of the states, {sigma}")
+    met, messages = candidate.validation_bound <= tolerance.bound, list(learned.notes)
+    if white and not met and sigma is not None:
+        noise = ", ".join(f"{s:.2g}" for s in sigma)
+        messages.append(f"the law leaves no more than the noise of the states, {noise}")
     elif not met:
         messages.append(
             f"one-step error {candidate.validation_bound:.1e} misses the tolerance "
@@ -116,8 +110,8 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         determinants={},
         data_defect=float("nan"),
         base_map=False,
-        hamiltonian=_learned(law, map_, candidate, messages),
-        noise=law.sigma,
+        hamiltonian=learned.law and _learned(learned.law, map_, candidate, messages),
+        noise=sigma,
         messages=tuple(messages),
         ended=MET if met else "no larger library was more accurate",
         seconds=budget.seconds,
@@ -187,22 +181,56 @@ def _given(terms, names: tuple[str, ...]) -> Terms | None:
     return Terms(0, texts, tuple(map(tuple, eye.tolist())), (), names)
 
 
-def map_of(law: PoissonLaw, z: np.ndarray, dt: float) -> SymplecticMap:
-    """Map of a law over dt, its domain that of the states z (N, n): the flow of H on the lift of
-    the bracket, in the fewest substeps that end in roundoff."""
-    logs = isinstance(law.bracket, Log)
-    y, scale = np.log(z) if logs else z, sizes(z)
-    family = collective(law.field.library, law.bracket)
-    flow = Flow(family, law.fit.c, dt, sizes(y), substeps=substeps_of(law.field, law.fit.c, z, dt))
+class _Learned(NamedTuple):
+    """A map with what its line in the table says; ``law`` where there is one; sigma: noise (n,)."""
+
+    map_: SymplecticMap
+    bracket: Bracket
+    label: str
+    family: Any
+    relative: float
+    law: PoissonLaw | None = None
+    notes: tuple[str, ...] = ()
+    sigma: np.ndarray | None = None
+
+
+def _of_law(law: PoissonLaw, z: np.ndarray, dt: float) -> _Learned:
+    """The flow of a law over dt."""
+    family = law.field.library
+    piece = law_flow(family, law.fit.c, law.bracket, dt, _inner(z, law.bracket))
+    map_ = _map(piece, law.bracket, z, dt, Posterior(0, law.fit.root))
+    label = f"H of {family.num_parameters} terms"
+    return _Learned(map_, law.bracket, label, family, law.fit.relative, law, law.notes, law.sigma)
+
+
+def _generated(data: Data, bracket: Bracket | None) -> _Learned:
+    """The map without a law that S generates in the chart of a bracket. Raises FitError without a
+    bracket, and for pairs of several dt."""
+    if bracket is None:
+        raise FitError(
+            "a map without a law needs its bracket, such as "
+            "model=gfnn.GeneratingFunction(bracket=gfnn.Bracket.so3())"
+        )
+    if np.ndim(data.dt):
+        raise FitError("a map without a law is one of pairs with one dt")
+    y0, y1 = (_inner(z, bracket) for z in (data.z0, data.z1))
+    found = fit_lie_map(y0, y1, chart_of(bracket), data.dt)
+    map_ = _map(found.piece, bracket, data.z0, data.dt)
+    label = f"S of degree {found.degree}"
+    return _Learned(map_, bracket, label, found.piece.family, found.error)
+
+
+def _inner(z: np.ndarray, bracket: Bracket) -> np.ndarray:
+    """States as pieces have them."""
+    return np.log(z) if isinstance(bracket, Log) else z
+
+
+def _map(piece, bracket: Bracket, z: np.ndarray, dt: float, posterior=None) -> SymplecticMap:
+    """The map of a piece, its domain that of the states z (N, n)."""
+    inner = LOG if isinstance(bracket, Log) else CARTESIAN
+    domain, angles = covering(_inner(z, bracket)), np.zeros(0)
     return SymplecticMap(
-        (flow,),
-        LOG if logs else CARTESIAN,
-        covering(y),
-        scale,
-        np.zeros(0),
-        dt,
-        posterior=Posterior(0, law.fit.root),
-        bracket=law.bracket,
+        (piece,), inner, domain, sizes(z), angles, dt, posterior=posterior, bracket=bracket
     )
 
 
