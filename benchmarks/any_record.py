@@ -21,6 +21,7 @@ import numpy as np
 from harness import TABLES, Numbers, between_markers, main, markdown, number, once, provenance
 from harness import results as results_of
 from random_recordings import SYSTEMS, friction, integrated, law_of
+from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
@@ -144,6 +145,146 @@ def sampled(sampling: str, quick: bool) -> Numbers:
     return {"cases": cases}
 
 
+# Records that no law of the vocabulary makes
+
+
+def hysteresis(rng: np.random.Generator) -> np.ndarray:
+    """A spring of Bouc and Wen beside a linear one, let go."""
+    share, stiffness, c = rng.uniform(0.3, 0.7), rng.uniform(5, 20), rng.uniform(0.02, 0.1)
+
+    def rates(_, s):
+        x, v, z = s
+        dz = v - 1.5 * abs(v) * z - 0.8 * v * abs(z)
+        return [v, -stiffness * ((1 - share) * x + share * z) - c * v, dz]
+
+    return _orbit(rates, [rng.uniform(1, 3), 0, 0])[:, :1]
+
+
+def impacts(rng: np.random.Generator) -> np.ndarray:
+    """A mass on a spring between stiff walls."""
+    stiffness, wall, hard = rng.uniform(2, 8), rng.uniform(0.3, 0.7), rng.uniform(3e3, 1e4)
+
+    def rates(_, s):
+        over = max(s[0] - wall, 0.0) - max(-s[0] - wall, 0.0)
+        return [s[1], -stiffness * s[0] - hard * over - (5.0 if over else 0.02) * s[1]]
+
+    return _orbit(rates, [0.0, rng.uniform(3, 6)], max_step=1e-3)[:, :1]
+
+
+def random_walk(rng: np.random.Generator) -> np.ndarray:
+    """Sums of independent steps, of one column or two, some drawn back to zero."""
+    back = float(rng.choice([0.0, 0.01, 0.05]))
+    steps = rng.normal(size=(len(TIMES), rng.integers(1, 3)))
+    for k in range(1, len(steps)):
+        steps[k] += (1 - back) * steps[k - 1]
+    return steps
+
+
+def food_chain(rng: np.random.Generator) -> np.ndarray:
+    """Hastings and Powell's chain of three species with saturation."""
+    b1 = rng.uniform(2.2, 3.2)
+
+    def rates(_, s):
+        x, y, z = s
+        eaten, prey = 5 * x * y / (1 + b1 * x), 0.1 * y * z / (1 + 2 * y)
+        return 4 * np.array([x * (1 - x) - eaten, eaten - prey - 0.4 * y, prey - 0.01 * z])
+
+    return _orbit(rates, [rng.uniform(0.6, 0.9), rng.uniform(0.1, 0.3), rng.uniform(8, 11)])
+
+
+def unrecorded_force(rng: np.random.Generator) -> np.ndarray:
+    """A pendulum or a spring under a force of broad spectrum."""
+    angle, omega2, c = bool(rng.integers(2)), rng.uniform(4, 20), rng.uniform(0.1, 0.5)
+    force = _band(rng, 3.0 * np.sqrt(omega2) / (2 * np.pi)) * omega2 * rng.uniform(0.3, 0.8)
+
+    def rates(t, s):
+        pull = np.sin(s[0]) if angle else s[0]
+        return [s[1], -omega2 * pull - c * s[1] + np.interp(t, TIMES, force)]
+
+    return _orbit(rates, [0.3, 0.0])[:, :1]
+
+
+def maglev(rng: np.random.Generator) -> np.ndarray:
+    """A ball under a magnet whose current a controller sets, unrecorded."""
+    target = 1 + 0.15 * np.sign(np.sin(TIMES * rng.uniform(0.6, 1.2))) + 0.1 * _band(rng, 1.0)
+    kp, kd, lag = rng.uniform(25, 40), rng.uniform(6, 9), rng.uniform(0.03, 0.08)
+
+    def rates(t, s):
+        x, v, i = s
+        asked = 3.1 + kp * (x - np.interp(t, TIMES, target)) / 3 + kd * v / 3
+        return [v, 9.81 - max(i, 0.0) ** 2 / max(x, 0.2) ** 2, (asked - i) / lag]
+
+    return _orbit(rates, [1.0, 0.0, 3.1])[:, :1]
+
+
+def turbulence(rng: np.random.Generator) -> np.ndarray:
+    """Gaussian noise whose power falls with the frequency to the power of 5/3."""
+    count, columns = len(TIMES), int(rng.integers(1, 3))
+    f = np.fft.rfftfreq(count)
+    size = np.where(f > rng.uniform(1e-3, 5e-3), np.maximum(f, 1e-9) ** (-5 / 6), 0.0)
+    return np.fft.irfft(
+        size[:, None] * np.fft.rfft(rng.normal(size=(count, columns)), axis=0), axis=0
+    )
+
+
+def _band(rng: np.random.Generator, highest: float) -> np.ndarray:
+    """Noise (n,) of unit size up to a frequency (Hz)."""
+    f = np.fft.rfftfreq(len(TIMES), TIMES[1])
+    found = np.fft.irfft(np.where(f < highest, np.fft.rfft(rng.normal(size=len(TIMES))), 0))
+    return found / found.std()
+
+
+def _orbit(rates: Callable, start: Any, **options: Any) -> np.ndarray:
+    span = (0, TIMES[-1])
+    return solve_ivp(rates, span, start, t_eval=TIMES, rtol=1e-8, atol=1e-10, **options).y.T
+
+
+TIMES = 0.02 * np.arange(2_000)
+OUTSIDE = {  # generator -> words of a verdict that names what the record is
+    "hysteresis": (hysteresis, ("memory", "hysteresis")),
+    "impacts": (impacts, ("impact", "jump")),
+    "random walks": (random_walk, ("chance",)),
+    "food chain": (food_chain, ("first order",)),
+    "unrecorded broadband force": (unrecorded_force, ("unrecorded",)),
+    "maglev, current unrecorded": (maglev, ("unrecorded",)),
+    "turbulence-like noise": (turbulence, ("chance",)),
+}
+EACH = (6, 6, 6, 5, 6, 5, 6)
+
+
+def outside_case(name: str, draw: int) -> Numbers:
+    """A record outside the vocabulary, and what is said of it."""
+    rng = np.random.default_rng([*name.encode(), draw])
+    make, words = OUTSIDE[name]
+    x = make(rng)
+    x = x + NOISE * x.std(axis=0) * rng.normal(size=x.shape)
+    names = [f"x{i}" for i in range(1, x.shape[1] + 1)]
+    table = {"t": TIMES, **dict(zip(names, x.T, strict=True))}
+    _, said = _fitted(gfnn.Recording(table, positions=names, angles=[]))
+    verdict = said["verdict"] or f"refused: {said.get('refused')}"
+    return said | {
+        "draw": draw,
+        "class": name,
+        "verdict": verdict,
+        "identified": verdict.startswith("identified"),
+        "named": any(word in verdict for word in words),
+    }
+
+
+def outside(quick: bool) -> Numbers:
+    """All records outside the vocabulary."""
+    cases = []
+    for name, count in zip(OUTSIDE, EACH, strict=True):
+        for draw in range(1 if quick else count):
+            c = outside_case(name, draw)
+            cases.append(c)
+            print(
+                f"  {name} {draw}: {'named' if c['named'] else 'NOT'}: {c['verdict'][:150]}",
+                flush=True,
+            )
+    return {"cases": cases}
+
+
 def _sampling(name: str) -> Callable[[bool], Numbers]:
     return lambda quick: sampled(name, quick)
 
@@ -153,6 +294,7 @@ def _slug(name: str) -> str:
 
 
 PIECES = {_slug(name): _sampling(name) for name in (*SAMPLINGS, SHORT)}
+PIECES |= {"outside": outside}
 
 
 def tables() -> None:

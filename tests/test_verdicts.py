@@ -8,6 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
+from gfnn_jax.dataset.stretches import measure, stretches
+from gfnn_jax.models.lagrangians.nature import nature
 
 TIMES = np.arange(400) * 0.05
 
@@ -30,12 +32,77 @@ def test_noise_has_no_law(tmp_path):
     x = np.random.default_rng(0).normal(size=400)
     with pytest.raises(gfnn.FitError) as refused:
         gfnn.fit(TIMES, x)
-    assert refused.value.verdict.startswith("no law")
+    assert refused.value.verdict.startswith("not mechanical: chance")
     fit = refused.value.fit
     assert isinstance(fit, gfnn.Fit)
     assert fit.verdict == fit.report()["verdict"] == refused.value.verdict
     fit.save(tmp_path / "kept")
     assert gfnn.load(tmp_path / "kept").verdict == fit.verdict
+
+
+def orbit(rates, start, **options):
+    options = {"rtol": 1e-8, "atol": 1e-10, **options}
+    t = np.arange(2_000) * 0.02
+    x = solve_ivp(rates, (0, 40), start, t_eval=t, **options).y.T
+    return x + 1e-3 * x.std(axis=0) * np.random.default_rng(0).normal(size=x.shape)
+
+
+def prey_and_predators():
+    return orbit(lambda _, z: [z[0] * (2 - z[1]), z[1] * (z[0] - 1)], [1.5, 1.0])
+
+
+def van_der_pol():
+    return orbit(lambda _, z: [z[1], 2 * (1 - z[0] ** 2) * z[1] - 4 * z[0]], [1.0, 0.0])[:, :1]
+
+
+def ball_between_walls():
+    def rates(_, z):
+        over = max(z[0] - 0.5, 0.0) - max(-z[0] - 0.5, 0.0)
+        return [z[1], -4 * z[0] - 5e3 * over - (5.0 if over else 0.02) * z[1]]
+
+    return orbit(rates, [0.0, 4.0], max_step=2e-3)[:, :1]
+
+
+def pushed_at_random():
+    t, rng = np.arange(400) * 0.1, np.random.default_rng(1)
+    force = np.convolve(rng.normal(size=400), np.ones(5), "same")
+    return orbit(lambda s, z: [z[1], -9 * z[0] - 0.2 * z[1] + np.interp(s, t, force)], [0.3, 0.0])[
+        :, :1
+    ]
+
+
+def walk():
+    return np.cumsum(np.random.default_rng(2).normal(size=(2_000, 1)), axis=0)
+
+
+@pytest.mark.parametrize(
+    ("make", "verdict"),
+    [
+        (walk, "not mechanical: chance"),
+        (prey_and_predators, "not mechanical: first order"),
+        (van_der_pol, "not mechanical: self-excited"),
+        (ball_between_walls, "no law: impacts"),
+        (pushed_at_random, "no law: unrecorded"),
+    ],
+)
+def test_a_record_is_named_for_what_it_is(make, verdict):
+    """Whether a law was found or not: the signal tells."""
+    x = make()
+    names = [f"x{i}" for i in range(x.shape[1])]
+    columns = dict(zip(names, x.T, strict=True))
+    found = stretches(gfnn.Recording({"t": np.arange(2_000) * 0.02, **columns}, positions=names))
+    assert nature(found, measure(found), ()).verdict.startswith(verdict)
+
+
+@pytest.mark.parametrize("noise", [1e-5, 1e-3, 0.03])
+def test_a_pendulum_is_none_of_these(noise):
+    x = orbit(lambda _, z: [z[1], -9 * np.sin(z[0]) - 0.05 * z[1]], [1.2, 0.0])[:, 0]
+    x += noise * np.random.default_rng(1).normal(size=len(x))
+    table = {"t": np.arange(2_000) * 0.02, "theta": x}
+    found = stretches(gfnn.Recording(table, positions=["theta"], angles=["theta"]))
+    what = nature(found, measure(found), (0,))
+    assert what.kind == "no law"
+    assert "noise hides" in what.reason or "by a force that the terms tried lack" in what.reason
 
 
 @pytest.mark.parametrize(

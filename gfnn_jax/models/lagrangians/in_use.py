@@ -82,7 +82,10 @@ def best_in_use(data: RecordingData, fit: LawFit, choice: FrictionChoice) -> Cal
     if wander is None:
         return steady
     fit = fit.again(problem=dataclasses.replace(fit.problem, wander=wander))
-    wandering = CalibratedLaw.of(data, fit, choice)
+    try:
+        wandering = CalibratedLaw.of(data, fit, choice)
+    except np.linalg.LinAlgError:  # zeros that wander by so much that they follow everything
+        return steady
     apart = wandering.calibration.against(steady.calibration)
     fit.problem.on_progress(
         f"zeros that wander by {wander.size:.2g} σ over {wander.time:.3g} s: held-out forecasts "

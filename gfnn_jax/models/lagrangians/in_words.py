@@ -44,7 +44,8 @@ class WarningOptions:
     of parameters in a term, of which laws of physics have fewer. followed: % of a channel's
     variation, of which a law that explains it follows more. beyond: times the noise, above which
     correlated residuals are motion that the law lacks, unless it follows ``nearly`` all, in %:
-    there they may be a series that a library ends. alike: correlation of two coefficients that the
+    there they may be a series that a library ends. complete: %, above which what is left is no
+    energy that is gained. alike: correlation of two coefficients that the
     record cannot tell apart.
     """
 
@@ -52,7 +53,8 @@ class WarningOptions:
     many: int = 3
     followed: float = 90.0
     beyond: float = 3.0
-    nearly: float = 99.9
+    nearly: float = 99.99
+    complete: float = 99.999
     alike: float = 0.99
 
 
@@ -216,9 +218,12 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
             "its coefficients and standard errors are not reliable. Fit a shorter part of the "
             "record (--from, --to) or fewer terms (--terms)"
         )
-    if best.choice.gains:
+    worst = min(one.fit_percent for one in found.values())
+    if best.choice.gains and worst < OPTIONS.complete:
         flaws["the record gains energy that no input explains"] = (
-            "if the system is driven, name its drive: --inputs NAME (inputs=)"
+            "a force is missing beside the inputs that are named"
+            if best.law.num_inputs
+            else "if the system is driven, name its drive: --inputs NAME (inputs=)"
         )
     return flaws
 

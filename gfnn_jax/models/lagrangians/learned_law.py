@@ -74,7 +74,7 @@ class LearnedLaw:
     messages: warnings. steps: what the search did, line by line.
     symbols: of coordinates and of their speeds in formulas.
     num_samples, seconds (of the processor). ended: why the search ended. flaws: reasons why the law
-    is not all of the motion.
+    is not all of the motion; nature: what the record is then (`nature`).
     """
 
     map: SymplecticMap
@@ -106,6 +106,7 @@ class LearnedLaw:
     ended: str
     flaws: tuple[str, ...] = ()
     symbols: tuple[tuple[str, ...], ...] = ((), ())
+    nature: str = ""
 
     @property
     def equations(self) -> tuple[Equation, ...]:
@@ -123,7 +124,7 @@ class LearnedLaw:
     def verdict(self) -> str:
         """Verdict of the recording: identified, one of several, or partly, with the reason."""
         if self.flaws:
-            return f"partly: {'; '.join(self.flaws)}"
+            return f"partly: {'; '.join((*self.flaws, *filter(None, [self.nature])))}"
         together = [names for names in self.alike if names.endswith(ONLY_TOGETHER)]
         if together:
             return f"one of several: {'; '.join(together)}"

@@ -45,6 +45,7 @@ from gfnn_jax.models.lagrangians.in_words import Findings, in_words
 from gfnn_jax.models.lagrangians.input_rules import RULES, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS
+from gfnn_jax.models.lagrangians.nature import nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions
 from gfnn_jax.models.lagrangians.search import SearchResult, fit_given, search, search_on
 from gfnn_jax.models.lagrangians.starts import no_law
@@ -118,7 +119,11 @@ def fit_recording(
 
     def searched(recording: Recording, *rules: str) -> tuple[RecordingData, SearchResult]:
         data = samples_of(recording, loss, options=options, on_progress=note)
-        return _found(dataclasses.replace(data, mass=mass or {}), terms, rules)
+        data = dataclasses.replace(data, mass=mass or {})
+        try:
+            return _found(data, terms, rules)
+        except FitError as error:
+            raise _with_nature(error, data) from None
 
     data, found, of_drive = _with_hidden_drive(recording, searched, _rules(recording, input_hold))
     recording = data.recording
@@ -129,14 +134,27 @@ def fit_recording(
         law = in_words(recording, best, findings)
     except (FitError, np.linalg.LinAlgError):
         if missed is not None:
-            raise missed from None
+            raise _with_nature(missed, data) from None
         raise
     if all(one.fit_percent < 100 * (1 - OPTIONS.missed) for one in law.whiteness.values()):
         missed = missed or no_law(data.problem.scales)
+    if missed is None and law.flaws:
+        what = nature(data.segments, data.problem.scales, data.problem.angles)
+        if what.partly:
+            return dataclasses.replace(law, nature=what.reason)
+        missed = no_law(data.problem.scales)
     if missed is not None:
         missed.fit = law
-        raise missed
+        raise _with_nature(missed, data)
     return law
+
+
+def _with_nature(error: FitError, data: RecordingData) -> FitError:
+    """The error where no law was found, with what the record is."""
+    if not error.verdict:
+        return error
+    what = nature(data.segments, data.problem.scales, data.problem.angles)
+    return FitError(f"{error}. The record: {what.reason}", what.verdict, error.fit)
 
 
 def _findings(

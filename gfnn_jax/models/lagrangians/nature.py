@@ -1,0 +1,282 @@
+"""Nature of a record whose law was not found: chance, first order, self-excited, impacts, memory,
+or moved by what is not recorded. Each is a property of the record and of no library of terms.
+
+- *Chance*: mean squares of differences over a time τ grow as τ² where there is a velocity, as τ in
+  a random walk, as τ^(2/3) in turbulence, and not at all in white noise.
+- *First order*: the velocities are functions of the positions.
+- *Impacts*: a few samples hold most of the squares of second differences.
+- *Self-excited*: accelerations are functions of positions and velocities, and friction is negative
+  where motion is slow.
+- *Memory*: they are, once the past is counted in by a play between position and force.
+- *Unrecorded*: they are not; an input or a coordinate is missing.
+
+Shares are of squares that a polynomial explains in quarters of the record it was not fitted to.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from itertools import combinations_with_replacement
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.dataset.stretches import Scales, Stretch
+from gfnn_jax.signals.local_cubics import smooth
+from gfnn_jax.signals.splines import Splines
+
+
+@dataclasses.dataclass(frozen=True)
+class NatureOptions:
+    """Limits (`benchmarks/any_record.py`, outside).
+
+    rough: power of time by which differences grow, below which there is no velocity. early: of the
+    variance, up to which they are looked at. lags: samples, at most. first: share of the velocities
+    that positions explain. second: share of the accelerations that positions and velocities
+    explain. real: share of the squares of accelerations that is no noise. few, most: share of
+    samples that hold a share of the squares. gains: share of what was left, that memory explains.
+    degree: of polynomials. samples: that are looked at. plays: widths, in amplitudes. blocks: of
+    ``parts`` of the record in turn.
+    """
+
+    rough: float = 1.5
+    early: float = 0.3
+    lags: int = 40
+    first: float = 0.95
+    second: float = 0.97
+    real: float = 0.5
+    few: float = 0.05
+    most: float = 0.7
+    gains: float = 0.6
+    degree: int = 3
+    samples: int = 4_000
+    plays: tuple[float, ...] = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.6)
+    blocks: int = 4
+    parts: int = 32
+
+
+OPTIONS = NatureOptions()
+
+
+class Nature(NamedTuple):
+    """Nature of a record: kind of the verdict, and the reason; whether a law of the terms tried may
+    follow part of it all the same."""
+
+    kind: str
+    reason: str
+    partly: bool = True
+
+    @property
+    def verdict(self) -> str:
+        return f"{self.kind}: {self.reason}"
+
+
+def nature(found: Sequence[Stretch], scales: Scales, angles: Sequence[int]) -> Nature:
+    """Tell what the record of these stretches is, whose law was not found."""
+    exponent = roughness([(s.t, s.y) for s in found])
+    if exponent < OPTIONS.rough:
+        grows = f"as time to the power of {exponent:.2g}" if exponent > 0 else "by no more"
+        return Nature(
+            "not mechanical",
+            f"chance: differences of neighbouring samples grow {grows}, so that there is no "
+            "velocity; noise or a random walk",
+            partly=False,
+        )
+    q, v, a, u, block = _states(found, scales)
+    real = _reliability(a, scales)
+    if real < OPTIONS.real:
+        return Nature("no law", "noise hides what its accelerations depend on")
+    first = _best(_variables(q, angles), v, block)
+    state = np.concatenate([_variables(q, angles), v / v.std(axis=0), u], axis=1)
+    plain = _best(state, a, block)
+    second = min(1.0, plain / real)
+    if q.shape[1] > 1 and first > max(OPTIONS.first, plain):  # alone it would not come back
+        return Nature(
+            "not mechanical",
+            f"first order: positions alone tell {100 * first:.1f} % of the velocities, as of "
+            "populations or concentrations",
+            partly=False,
+        )
+    jumps, when = _jumps(found)
+    if jumps > OPTIONS.most:
+        return Nature(
+            "no law",
+            f"impacts: {100 * OPTIONS.few:.0f} % of the samples hold {100 * jumps:.0f} % of the "
+            f"accelerations, velocities jump, as at {when:.4g} s. Cut them off (--from, --to)",
+        )
+    if second > OPTIONS.second:
+        rate = _rate_at_rest(state, a / v.std(axis=0), state.shape[1] - v.shape[1] - u.shape[1])
+        if rate > 0:
+            return Nature(
+                "not mechanical",
+                "self-excited: friction is negative where motion is slow, "
+                f"{rate:.2g} 1/s, and feeds the energy that faster motion loses",
+            )
+    memory = min(1.0, _best(state, a, block, _plays(q)) / real)
+    if 1 - memory < (1 - OPTIONS.gains) * (1 - second):
+        return Nature(
+            "no law",
+            f"memory (hysteresis): positions and velocities tell {100 * second:.0f} % of the "
+            f"accelerations, with the past of the positions {100 * memory:.0f} %",
+        )
+    if second > OPTIONS.second:
+        return Nature(
+            "no law",
+            f"positions and velocities tell {100 * second:.1f} % of the accelerations, by a force "
+            "that the terms tried lack: give terms that you know (--terms)",
+        )
+    return Nature(
+        "no law",
+        f"unrecorded: positions and velocities tell only {100 * second:.0f} % of the "
+        "accelerations. An input is missing (--inputs), or a coordinate",
+    )
+
+
+def roughness(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
+    """The power of time by which mean squares of differences grow beyond the noise, of the
+    smoothest column of runs t (n,), y (n, k); 2 where samples are too far apart to tell it."""
+    return max(_power([y[:, k] for _, y in runs]) for k in range(runs[0][1].shape[1]))
+
+
+def _power(columns: Sequence[np.ndarray]) -> float:
+    longest = min(OPTIONS.lags, max(map(len, columns)) // 4)
+    if longest < 4:
+        return 2.0
+    squares = np.array([_square(columns, lag) for lag in range(1, longest + 1)])
+    whole = 2 * float(np.nanvar(np.concatenate(columns)))
+    count = sum(len(column) for column in columns)
+    if np.all(np.abs(1 - squares / whole) < 5 / np.sqrt(count)):
+        return 0.0  # white
+    early = squares < OPTIONS.early * whole
+    last = longest if early.all() else int(np.argmin(early))
+    if last < 4:
+        return 2.0
+    lags, squares = np.arange(1.0, last + 1), squares[:last]
+    powers, left = np.arange(0.1, 2.05, 0.05), []
+    for power in powers:
+        rows = np.stack([np.ones(last), lags**power], axis=1) / squares[:, None]
+        c = np.linalg.lstsq(rows, np.ones(last), rcond=None)[0]
+        if c[0] < 0:
+            c = np.array([0.0, np.sum(rows[:, 1]) / np.sum(rows[:, 1] ** 2)])
+        left.append(np.sum((rows @ c - 1) ** 2) if c[1] > 0 else np.inf)
+    return float(powers[int(np.argmin(left))])
+
+
+def _square(columns: Sequence[np.ndarray], lag: int) -> float:
+    apart = [column[lag:] - column[:-lag] for column in columns if len(column) > lag]
+    return float(np.nanmean(np.concatenate(apart) ** 2))
+
+
+def _states(
+    found: Sequence[Stretch], scales: Scales
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """q, v, a, u (n, ·) at even samples of the stretches, and the block (n,) that each lies in."""
+    every = max(1, sum(len(s.t) for s in found) // OPTIONS.samples)
+    parts = []
+    for s in found:
+        at = np.arange(1, len(s.t) - 1, every)
+        if isinstance(scales.half, Splines):
+            q, v, a = scales.half.smooth(s.t, s.q, s.t[at])
+        else:
+            q, v, a = smooth(s.t, s.q, scales.half, at)[0]
+        known = np.isfinite(q).all(axis=1)
+        parts.append((q[known], v[known], a[known], s.u[at][known]))
+    q, v, a, u = (np.concatenate(part) for part in zip(*parts, strict=True))
+    spread = u.std(axis=0)
+    u = (u - u.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    return q, v, a, u, np.arange(len(q)) * OPTIONS.parts // len(q) % OPTIONS.blocks
+
+
+def _reliability(a: np.ndarray, scales: Scales) -> float:
+    """The share of the squares of accelerations (n, d) by local cubics that is no noise."""
+    if isinstance(scales.half, Splines) or len(scales.sigma) != a.shape[1]:
+        return 1.0
+    x = np.linspace(-1.0, 1.0, 2 * scales.half + 1)[:, None] ** np.arange(4)
+    span = scales.half * scales.dt
+    noise = 4 * scales.sigma**2 * np.linalg.inv(x.T @ x)[2, 2] / span**4
+    return float(np.min(1 - np.minimum(noise / np.var(a, axis=0), 1.0)))
+
+
+def _variables(q: np.ndarray, angles: Sequence[int]) -> np.ndarray:
+    """Positions of unit size; of angles sines and cosines."""
+    lengths = [i for i in range(q.shape[1]) if i not in angles]
+    turning = q[:, list(angles)]
+    plain = (q[:, lengths] - q[:, lengths].mean(axis=0)) / q[:, lengths].std(axis=0)
+    return np.concatenate([plain, np.sin(turning), np.cos(turning)], axis=1)
+
+
+def _products(x: np.ndarray, degree: int) -> np.ndarray:
+    """Products of columns x (n, k) up to a degree, of two for many columns."""
+    degree = degree if x.shape[1] <= 6 else min(degree, 2)
+    rows = [np.ones(len(x))]
+    for size in range(1, degree + 1):
+        for chosen in combinations_with_replacement(range(x.shape[1]), size):
+            rows.append(np.prod(x[:, list(chosen)], axis=1))
+    return np.stack(rows, axis=1)
+
+
+def _best(
+    x: np.ndarray, target: np.ndarray, block: np.ndarray, beside: np.ndarray | None = None
+) -> float:
+    """The largest share that polynomials of some degree in columns x (n, k) explain."""
+    more = x[:, :0] if beside is None else beside
+    shares = [
+        _explained(np.concatenate([_products(x, degree), more], axis=1), target, block)
+        for degree in range(1, OPTIONS.degree + 1)
+    ]
+    return max(0.0, *shares)
+
+
+def _explained(rows: np.ndarray, target: np.ndarray, block: np.ndarray) -> float:
+    """The share of the squares of each target (n, d) that rows explain in blocks that they were not
+    fitted to; of the target that they explain least."""
+    left = np.zeros(target.shape[1])
+    for k in np.unique(block):
+        own = block == k
+        c = np.linalg.lstsq(rows[~own], target[~own], rcond=1e-8)[0]
+        left += np.sum((target[own] - rows[own] @ c) ** 2, axis=0)
+    whole = np.sum((target - target.mean(axis=0)) ** 2, axis=0)
+    return float(np.min(1 - left / np.maximum(whole, 1e-300)))
+
+
+def _rate_at_rest(state: np.ndarray, a: np.ndarray, first: int) -> float:
+    """The largest ∂a/∂v (1/s) of a coordinate at rest in the middle of the positions, of states
+    whose speeds stand from place ``first`` on, in units of which a (n, d) is."""
+    rows = _products(state, OPTIONS.degree)
+    c = np.linalg.lstsq(rows, a, rcond=1e-8)[0]
+    middle, rates = np.mean(state, axis=0), []
+    for i in range(a.shape[1]):
+        ends = np.tile(middle, (2, 1))
+        ends[:, first : first + a.shape[1]] = 0.0
+        ends[:, first + i] = [-0.05, 0.05]
+        low, high = _products(ends, OPTIONS.degree) @ c[:, i]
+        rates.append((high - low) / 0.1)
+    return float(max(rates))
+
+
+def _jumps(found: Sequence[Stretch]) -> tuple[float, float]:
+    """The share of the squares of second differences that a few samples hold, and when the largest
+    is; of the column that has the largest share."""
+    best = (0.0, 0.0)
+    for k in range(found[0].q.shape[1]):
+        parts = [(s.t[1:-1], np.diff(s.q[:, k], 2) ** 2) for s in found if len(s.t) > 2]
+        t, squares = (np.concatenate(part) for part in zip(*parts, strict=True))
+        t, squares = t[np.isfinite(squares)], squares[np.isfinite(squares)]
+        order = np.argsort(squares)[::-1]
+        most = np.sum(squares[order[: max(1, int(OPTIONS.few * len(order)))]])
+        best = max(best, (float(most / max(np.sum(squares), 1e-300)), float(t[order[0]])))
+    return best
+
+
+def _plays(q: np.ndarray) -> np.ndarray:
+    """Positions behind plays of some widths, (n, d w)."""
+    columns = []
+    for x in ((q - q.mean(axis=0)) / np.abs(q - q.mean(axis=0)).max(axis=0)).T:
+        for width in OPTIONS.plays:
+            p, last = np.empty_like(x), x[0]
+            for k, one in enumerate(x.tolist()):
+                last = min(max(last, one - width), one + width)
+                p[k] = last
+            columns.append(p)
+    return np.stack(columns, axis=1)
