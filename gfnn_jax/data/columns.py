@@ -26,6 +26,7 @@ _LIKE = 0.85  # likeness of a column to the derivative of another, that tells
 _MOST_COLUMNS = 12  # whose names do not tell, that are compared
 _ALONE = 1.3  # times the noise, up to which a column's spread is noise alone
 _ONE_AXIS = 0.1  # ratio of strengths of turning, below which one axis is enough
+_FIRST_ORDER = 0.4  # part of the rates' variance that functions of the columns may leave
 _STD = "_std"  # end of the name of a column that holds the σ of another
 Names = Sequence[str] | str | None
 Runs = Mapping[str, tuple[np.ndarray, dict[str, np.ndarray]]]
@@ -198,12 +199,35 @@ def _unclear(
 ) -> Undecided:
     """Options for columns that nothing tells apart."""
     typed = shlex.quote(",".join(moving))
+    if len(moving) > 1 and _of_first_order(np.stack([columns[name] for name in moving])):
+        return Undecided(
+            f"{source}: the names {', '.join(columns)} do not show what was measured; their rates "
+            f"are functions of {', '.join(moving)} themselves, as of states without velocities, of "
+            f"populations say: --structure poisson --states {typed}. If they are positions: "
+            f"--positions {typed}",
+            {"structure": "poisson", "states": tuple(moving)},
+        )
     return Undecided(
         f"{source}: the names {', '.join(columns)} do not show what was measured, and "
         f"{', '.join(shown)} may be motion or what drives it. Name them: --positions {typed}, or "
         "some of them and --inputs",
         {"positions": tuple(moving)},
     )
+
+
+def _of_first_order(columns: np.ndarray) -> bool:
+    """Return whether the rates of columns (k, T) are quadratic functions of them, each one's with
+    the others' help."""
+    x = columns / np.nanstd(columns, axis=1, keepdims=True)
+    rates, x = (x[:, 2:] - x[:, :-2]).T, x[:, 1:-1]
+    known = np.isfinite(x).all(axis=0) & np.isfinite(rates).all(axis=1)
+    products = [a * b for a, b in itertools.combinations_with_replacement(x, 2)]
+    table = np.stack([np.ones(x.shape[1]), *x, *products], axis=1)[known]
+    rates = rates[known]
+    if len(table) < 4 * table.shape[1]:
+        return False
+    left = rates - table @ np.linalg.lstsq(table, rates, rcond=None)[0]
+    return bool(np.all(left.var(axis=0) < _FIRST_ORDER * rates.var(axis=0)))
 
 
 def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tuple[str, str]]:

@@ -15,11 +15,18 @@ from typing import Any
 import numpy as np
 from scipy import signal
 
+from gfnn_jax.data.accelerations import (
+    accelerations,
+    fitted,
+    functions,
+    held_out,
+    missed,
+    scaled,
+)
 from gfnn_jax.data.columns import SECONDS
 from gfnn_jax.data.traits import Traits
 from gfnn_jax.data.wrong_values import in_words
 from gfnn_jax.signals.derivatives import Relation, difference
-from gfnn_jax.signals.local_polynomials import local_fits
 from gfnn_jax.signals.steps import drift
 from gfnn_jax.signals.wrong_values import TURN
 
@@ -37,6 +44,7 @@ WRONG = (
     "clipped",
     "drifting clock",
     "different systems",
+    "circle",
 )
 
 
@@ -53,9 +61,10 @@ class _Options:
     or 1000. off: logarithm of a factor that no filter makes. filtered: deviation of a factor from
     1, and late: steps of lag, that are reported.
 
-    For different systems: most runs, fewest windows of a run, windows fitted or judged together; a
-    run moves by another law where the common fit misses its accelerations by ``worse`` times its
-    own residual, and by ``missed`` of their spread. ridge: of the fits.
+    For different systems: most runs, fewest windows of a run; a run moves by another law where the
+    common fit misses its accelerations by ``worse`` times its own residual, and by ``missed`` of
+    their spread. drives: part of what is missed without a column that is missed with it as an
+    input, at most, where it is one.
     """
 
     wide: float = 0.75 * np.pi
@@ -70,10 +79,9 @@ class _Options:
     late: float = 0.4
     most_runs: int = 40
     fewest_windows: int = 40
-    block: int = 8
     worse: float = 6.0
     missed: float = 0.04
-    ridge: float = 1e-8
+    drives: float = 0.9
 
 
 _OPTIONS = _Options()
@@ -85,6 +93,7 @@ class Fault:
 
     kind: one of WRONG, or of a note. message: what was found. remedy: what mends it, "" for nothing
     to do. options: those of `gfnn_jax.read` that do, if any. wrong: whether a fit must not begin.
+    proposed: whether the command to type has these options, of a note too.
     """
 
     kind: str
@@ -92,6 +101,7 @@ class Fault:
     remedy: str = ""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     wrong: bool = True
+    proposed: bool = False
 
     def __str__(self) -> str:
         return f"{self.message}. {self.remedy}" if self.remedy else self.message
@@ -241,6 +251,9 @@ def _other_order(traits: Traits, declared: list[tuple[str, str]]) -> list[tuple[
     best = max(_pairings(names), key=lambda pairs: sum(scores[pair] for pair in pairs))
     gain = sum(scores[pair] for pair in best) - sum(scores[pair] for pair in declared)
     good = gain > _OPTIONS.better and all(scores[pair] > 0.9 for pair in best)
+    turned = (r for pair in declared if (r := related[pair]) is not None)
+    if all(abs(r.factor + 1) < _OPTIONS.near and r.explained > 0.9 for r in turned):
+        return None  # velocities of the wrong sign: of an oscillator x is that of v, too
     if not good or set(best) == set(declared):
         return None
     return sorted(best, key=lambda pair: names.index(pair[0]))
@@ -278,6 +291,8 @@ def _of_pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fau
         part = f"{100 * relation.explained:.0f} % of its variance"
         finding = f"{v} is not the derivative of {x}: d{x}/dt explains {part}"
         remedy = f"Name {v} as an input (--inputs {typed}), {without}"
+        if _drives(traits, v):
+            alone = {"positions": positions, "inputs": (*traits.recording.inputs, v)}
         yield Fault("no derivative", finding, remedy, alone)
     elif abs(factor * degree - 1) < near:
         remedy = f"The unit of {x} is degrees: --degrees {_typed(x)}"
@@ -292,6 +307,18 @@ def _of_pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fau
         yield Fault("factor", finding, remedy, alone)
     else:
         yield from _derived(traits, x, v, relation)
+
+
+def _drives(traits: Traits, name: str) -> bool:
+    """Return whether accelerations follow a column as they follow an input."""
+    recording = traits.recording
+    angles = [n in recording.angles for n in recording.positions]
+    without = accelerations(traits, recording.inputs)
+    beside = accelerations(traits, (*recording.inputs, name))
+    if without is None or beside is None or without.q.shape != beside.q.shape:
+        return False
+    ratio = beside.held_out(angles) / np.maximum(without.held_out(angles), 1e-300)
+    return bool(np.any(ratio < _OPTIONS.drives))
 
 
 def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
@@ -479,68 +506,26 @@ def _of_other_systems(traits: Traits) -> list[str]:
     varied = any(np.ptp(traits.range(name)) > 0 for name in recording.parameters)
     if len(recording.runs) < 2 or not recording.positions or dim > 3 or varied:
         return []
-    # Second derivatives want narrower windows than values do.
-    size = max(2 * min(traits.noise[n].size for n in recording.positions) // 3, 9)
-    columns = np.stack([traits.columns[n] for n in (*recording.positions, *recording.inputs)])
-    fits = local_fits(traits.times, columns, size, 5)
-    if fits is None:
+    known = accelerations(traits, recording.inputs)
+    if known is None:
         return []
     angles = [n in recording.angles for n in recording.positions]
-    table = _functions(fits.values[:dim], fits.slopes[:dim], angles, fits.values[dim:])
-    target = fits.curvatures[:dim].T
-    known = np.isfinite(table).all(axis=1) & np.isfinite(target).all(axis=1)
-    table, target, run = table[known], target[known], fits.run[known]
+    table = scaled(functions(known.q, known.v, angles, known.u))
+    target, run = known.a.T, known.run
     fewest, most = _OPTIONS.fewest_windows, _OPTIONS.most_runs
     runs = [r for r in range(len(recording.runs)) if np.sum(run == r) >= fewest][:most]
     if len(runs) < 2:
         return []
-    table = table / np.maximum(table.std(axis=0) + np.abs(table.mean(axis=0)), 1e-300)
     rows = [np.flatnonzero(run == r) for r in runs]
-    missed = _OPTIONS.missed * target.std(axis=0)
-    own = np.array([_own(table[k], target[k]) for k in rows])
-    if np.any(own > missed):
+    least = _OPTIONS.missed * target.std(axis=0)
+    own = np.array([held_out(table[k], target[k]) for k in rows])
+    if np.any(own > least):
         return []
     together = np.concatenate(rows)
-    common = _fitted(table[together], target[together])
-    shared = np.array([_missed(table[k], target[k], common) for k in rows])
-    apart = np.any((shared > _OPTIONS.worse * own) & (shared > missed), axis=1)
+    common = fitted(table[together], target[together])
+    shared = np.array([missed(table[k], target[k], common) for k in rows])
+    apart = np.any((shared > _OPTIONS.worse * own) & (shared > least), axis=1)
     return [recording.runs[r] for r, is_apart in zip(runs, apart, strict=True) if is_apart]
-
-
-def _fitted(table: np.ndarray, target: np.ndarray) -> np.ndarray:
-    normal = table.T @ table / len(table) + _OPTIONS.ridge * np.eye(table.shape[1])
-    return np.linalg.solve(normal, table.T @ target / len(table))
-
-
-def _missed(table: np.ndarray, target: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """RMS (dim,) of the accelerations that coefficients leave."""
-    return np.sqrt(np.mean((target - table @ c) ** 2, axis=0))
-
-
-def _own(table: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """RMS (dim,) that fits to every other block of windows leave of the blocks between."""
-    half = np.arange(len(table)) // _OPTIONS.block % 2
-    left = [
-        _missed(table[half == b], target[half == b], _fitted(table[half != b], target[half != b]))
-        for b in (0, 1)
-    ]
-    return np.sqrt(np.mean(np.square(left), axis=0))
-
-
-def _functions(q: np.ndarray, v: np.ndarray, angles: list[bool], u: np.ndarray) -> np.ndarray:
-    """(W, k) functions of positions, speeds and inputs that accelerations are made of."""
-    found = [np.ones_like(q[0]), *v, *(x * np.abs(x) for x in v), *u]
-    scaled = (q - q.mean(axis=1, keepdims=True)) / np.maximum(q.std(axis=1, keepdims=True), 1e-300)
-    for x, s, angle in zip(q, scaled, angles, strict=True):
-        found += [np.sin(x), np.cos(x), np.sin(2 * x), np.cos(2 * x)] if angle else [s, s**2, s**3]
-    for i, j in itertools.combinations(range(len(q)), 2):
-        if not (angles[i] and angles[j]):
-            found.append(scaled[i] * scaled[j])
-            continue
-        apart, products = q[i] - q[j], (v[i] ** 2, v[j] ** 2, v[i] * v[j])
-        found += [f(m * apart) for m in (1, 2) for f in (np.sin, np.cos)]
-        found += [f(apart) * w for f in (np.sin, np.cos) for w in products]
-    return np.stack(found, axis=1)
 
 
 def _reading(traits: Traits) -> Iterator[Fault]:

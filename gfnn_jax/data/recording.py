@@ -274,6 +274,11 @@ class Recording:
         return clock_of(self.time_unit)[0]
 
     @property
+    def second(self) -> float:
+        """What one of the file's unit of time is in that of `times`."""
+        return SECONDS[self.time_unit]
+
+    @property
     def explained(self) -> frozenset[str]:
         """Columns whose sensor is told by ``observe``, an offset or a scale."""
         return frozenset({*self.observe, *self.offsets, *self.scales})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import io
 import shlex
 from collections.abc import Mapping, Sequence
@@ -13,7 +14,8 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from gfnn_jax.data.faults import WRONG, Fault, faults
+from gfnn_jax.data.faults import WRONG, Fault
+from gfnn_jax.data.proposals import findings
 from gfnn_jax.data.roles import ROLES
 from gfnn_jax.data.traits import Traits, of_rows, traits
 from gfnn_jax.data.wrong_values import WrongValues
@@ -79,7 +81,8 @@ class RecordingSummary:
     runs: name -> (number of samples, begin, end in s). steps: (shortest, median, longest without
     gaps) in s. gaps: (run, begin, end in s). period: of the motion, in s. coarsest: step in s that
     would tell the motion as well. loss: of energy per period. faults: the wrong ones first.
-    command: to type next.
+    options: keywords of `gfnn_jax.read` (or of a fit) that were given, that mend what is wrong and
+    that are proposed. command: to type next, with these.
     """
 
     source: str
@@ -92,7 +95,9 @@ class RecordingSummary:
     loss: energy.Loss | None
     driven: bool
     faults: tuple[Fault, ...]
+    options: Mapping[str, Any]
     command: str
+    clock: str = "s"
 
     @property
     def dt_median(self) -> float:
@@ -127,6 +132,7 @@ class RecordingSummary:
                 {"kind": f.kind, "message": f.message, "remedy": f.remedy, "wrong": f.wrong}
                 for f in self.faults
             ],
+            "options": dict(self.options),
             "command": self.command,
         }
         return _without_nan(plain)
@@ -141,10 +147,11 @@ class RecordingSummary:
         return console
 
     def __str__(self) -> str:
-        return self._printed().export_text().rstrip()
+        return f"{self._printed().export_text().rstrip()}\nnext: {self.command}"
 
     def _repr_html_(self) -> str:
-        return self._printed().export_html(inline_styles=True, code_format=_NOTEBOOK)
+        screen = self._printed().export_html(inline_styles=True, code_format=_NOTEBOOK)
+        return f"{screen}<pre>next: {html.escape(self.command)}</pre>"
 
 
 def _without_nan(value: Any) -> Any:
@@ -156,13 +163,17 @@ def _without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def summarise(recording: Recording, options: Mapping[str, Any] | None = None) -> RecordingSummary:
+def summarise(
+    recording: Recording,
+    options: Mapping[str, Any] | None = None,
+    proposals: Sequence[Fault] = (),
+) -> RecordingSummary:
     """The summary of a recording, in seconds for a million samples.
 
-    options: those that it was read with, for the command to type.
+    options: those that it was read with, for the command to type. proposals: further ones.
     """
     known = traits(recording)
-    found = faults(known)
+    found = (*proposals, *findings(known))
     counts = {
         run: (len(t), float(t[0]), float(t[-1]))
         for run, t in zip(recording.runs, known.times, strict=True)
@@ -173,6 +184,8 @@ def summarise(recording: Recording, options: Mapping[str, Any] | None = None) ->
     longest = min((b - a for _, a, b in holes), default=np.inf)
     between = steps[steps < longest] if len(steps) else np.array([np.nan])
     period, loss = _motion(known)
+    typed = _options(found, options or {})
+    files = " ".join(shlex.quote(path) for path in recording.source.split(", "))
     return RecordingSummary(
         recording.source,
         counts,
@@ -184,7 +197,9 @@ def summarise(recording: Recording, options: Mapping[str, Any] | None = None) ->
         loss,
         bool(recording.inputs),
         found,
-        _command(recording, found, options or {}),
+        typed,
+        f"gfnn fit {files}{as_typed(typed)} --out model",
+        recording.clock,
     )
 
 
@@ -195,7 +210,7 @@ def refuse_mistakes(recording: Recording, despite: Sequence[str] = ()) -> None:
     unknown = [kind for kind in despite if kind not in WRONG]
     if unknown:
         raise InputError(f"--despite: expected some of {', '.join(WRONG)}, got {unknown[0]!r}")
-    wrong = [f for f in faults(traits(recording)) if f.wrong and f.kind not in despite]
+    wrong = [f for f in findings(traits(recording)) if f.wrong and f.kind not in despite]
     if wrong:
         more = f" gfnn look shows {len(wrong) - 1} more." if len(wrong) > 1 else ""
         kind = shlex.quote(wrong[0].kind)
@@ -222,9 +237,12 @@ def _motion(known: Traits) -> tuple[float | None, energy.Loss | None]:
     middle = known.sound[fits.rows[:, fits.rows.shape[1] // 2]]
     inputs = np.array([known.columns[name][middle] for name in recording.inputs])
     period = energy.mean_period(fits, len(recording.runs))
+    if period is None:  # longer than the record: no balance over periods
+        return None, None
     angles = [name in recording.angles for name in recording.positions]
     inputs = inputs.reshape(len(recording.inputs), len(middle))
-    return period, energy.loss(fits, angles, inputs, period)
+    stretch = min(period, 0.6 * float(np.median([np.ptp(t) for t in known.times])))
+    return period, energy.loss(fits, angles, inputs, stretch)
 
 
 def _coarsest(known: Traits) -> float | None:
@@ -243,6 +261,8 @@ def _column(known: Traits, name: str) -> Column:
     have = np.isfinite(values).any()
     given = recording.std.get(name)
     sigma = given if given is not None else noise.sigma if noise else None
+    moves = have and np.nanmin(values) < np.nanmax(values)
+    sigma = sigma if moves else None
     return Column(
         name,
         role,
@@ -256,7 +276,7 @@ def _column(known: Traits, name: str) -> Column:
         of,
         None if relation is None else relation.factor,
         None if relation is None else relation.lag,
-        tuple(dominant_frequencies(known.times, _turning(known, name))) if noise and have else (),
+        tuple(dominant_frequencies(known.times, _turning(known, name))) if noise and moves else (),
         int(np.sum(~np.isfinite(values))),
         *_counts(known.wrong.get(name, ())),
     )
@@ -285,17 +305,17 @@ def _derivative_of(known: Traits, name: str):
     return max(good, key=lambda pair: pair[1].explained, default=(None, None))
 
 
-def _command(recording: Recording, found: tuple[Fault, ...], options: Mapping[str, Any]) -> str:
-    """``gfnn fit`` with the options that were given and those that mend what is wrong."""
-    typed = dict(options)
-    for fault in found:
-        if fault.wrong:
-            for option, value in fault.options.items():
-                before = () if option == "positions" else typed.get(option, ())
-                joined = isinstance(value, tuple) and isinstance(before, tuple)
-                typed[option] = tuple(dict.fromkeys([*before, *value])) if joined else value
-    files = " ".join(shlex.quote(path) for path in recording.source.split(", "))
-    return f"gfnn fit {files}{as_typed(typed)} --out model"
+def _options(found: tuple[Fault, ...], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that were given, those that mend what is wrong, and those that are proposed."""
+    typed = dict(given)
+    for fault in (f for f in found if f.wrong or f.proposed):
+        if {"coordinates", "states"} & set(fault.options):  # in place of what columns show
+            typed = {name: value for name, value in typed.items() if name not in ROLES}
+        for option, value in fault.options.items():
+            before = () if option == "positions" else typed.get(option, ())
+            joined = isinstance(value, tuple) and isinstance(before, tuple) and option != "angles"
+            typed[option] = tuple(dict.fromkeys([*before, *value])) if joined else value
+    return typed
 
 
 def _short(value: Any) -> str:
@@ -327,7 +347,7 @@ def _screen(summary: RecordingSummary) -> Group:
     found = [_fault(fault) for fault in summary.faults[: _SHOWN.most]]
     more = len(summary.faults) - _SHOWN.most
     found += [Text(f"and {more} more")] if more > 0 else []
-    return Group(*lines, _columns(summary), *found, Text(f"next: {summary.command}"))
+    return Group(*lines, _columns(summary), *found)
 
 
 def _samples(summary: RecordingSummary) -> str:
@@ -335,7 +355,7 @@ def _samples(summary: RecordingSummary) -> str:
     spans = [end - begin for _, begin, end in summary.runs.values()]
     names = ", ".join([*summary.runs][: _SHOWN.most]) + ", …" * (len(counts) > _SHOWN.most)
     runs = f"{len(counts)} run{'s' * (len(counts) > 1)}"
-    of = f"{sum(counts)} samples in {sum(spans):.4g} s"
+    of = f"{sum(counts)} samples in {sum(spans):.4g} {summary.clock}"
     each = f" ({min(counts)} to {max(counts)} samples each: {names})" if len(counts) > 1 else ""
     return f"{summary.source}: {runs}, {of}{each}"
 
@@ -343,12 +363,13 @@ def _samples(summary: RecordingSummary) -> str:
 def _times(summary: RecordingSummary) -> str:
     low, usual, high = summary.steps
     even = high - low < 1e-3 * usual
-    steps = f"{usual:.6g} s" if even else f"{usual:.6g} s, {low:.4g} to {high:.4g}"
+    unit = summary.clock
+    steps = f"{usual:.6g} {unit}" if even else f"{usual:.6g} {unit}, {low:.4g} to {high:.4g}"
     holes = summary.gaps
     if not holes:
         return f"steps: {steps}; no gaps"
     run, begin, end = max(holes, key=lambda hole: hole[2] - hole[1])
-    longest = f"the longest {end - begin:.3g} s at {begin:.5g} s"
+    longest = f"the longest {end - begin:.3g} {unit} at {begin:.5g} {unit}"
     return f"steps: {steps}; {len(holes)} gaps, {longest}" + f" of run {run}" * (
         len(summary.runs) > 1
     )
@@ -356,11 +377,13 @@ def _times(summary: RecordingSummary) -> str:
 
 def _moving(summary: RecordingSummary) -> str:
     if summary.period is None:
-        return ""
+        moves = any(c.role == "positions" for c in summary.columns)
+        return "motion: its period is longer than the runs show" if moves else ""
     per = summary.period / summary.dt_median
-    parts = [f"motion: mean period {summary.period:.4g} s, {per:.3g} samples"]
+    unit = summary.clock
+    parts = [f"motion: mean period {summary.period:.4g} {unit}, {per:.3g} samples"]
     if summary.coarsest and summary.coarsest > 1.5 * summary.dt_median:
-        parts.append(f"steps of {summary.coarsest:.3g} s would suffice")
+        parts.append(f"steps of {summary.coarsest:.3g} {unit} would suffice")
     return "; ".join([*parts, _loss(summary)])
 
 
@@ -375,7 +398,9 @@ def _loss(summary: RecordingSummary) -> str:
     if not loss.significant:
         return f"no friction found{beside} ({size})"
     if loss.per_period < 0:
-        return f"a gain of {size}{beside}: a drive is missing (--inputs)"
+        if summary.driven:
+            return f"a gain of {size}{beside}: a force acts that no column shows"
+        return f"a gain of {size}: name what drives it (--inputs), if a column shows it"
     kind = f"; {loss.kind} friction fits best" if loss.kind else ""
     return f"friction takes {size}{beside}{kind}"
 

@@ -59,15 +59,15 @@ class Loss:
         return abs(self.per_period) > max(errors * self.error, least)
 
 
-def mean_period(fits: LocalFits, runs: int) -> float:
-    """2π √(⟨v²⟩ / ⟨v̇²⟩) in s, the mean over the columns' squares in units of their spread; at most
-    0.6 of the median duration of the runs."""
+def mean_period(fits: LocalFits, runs: int) -> float | None:
+    """2π √(⟨v²⟩ / ⟨v̇²⟩) in s, the mean over the columns' squares in units of their spread; None
+    where it is longer than the median duration of the runs, which do not show it then."""
     v, a = fits.slopes, fits.curvatures
     scale = np.nanmean(v**2, axis=1, keepdims=True)
     squares = np.nanmean(a**2 / np.where(scale > 0, scale, 1))
     spans = [np.ptp(fits.centres[fits.run == r]) for r in range(runs) if np.any(fits.run == r)]
     period = 2 * np.pi / np.sqrt(squares) if squares > 0 else np.inf
-    return float(min(period, 0.6 * np.median(spans)))
+    return float(period) if period <= np.median(spans) else None
 
 
 def loss(fits: LocalFits, angles: Sequence[bool], inputs: np.ndarray, period: float) -> Loss | None:

@@ -1,0 +1,312 @@
+"""What a table holds beyond its names: points on a circle, angles and lengths, a hand that lets go.
+
+Each check yields faults that propose options: `gfnn look` puts them into the command to type, and
+nothing is done without them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from collections.abc import Iterator
+
+import numpy as np
+from scipy import optimize, signal
+
+from gfnn_jax.data.accelerations import Accelerations, accelerations
+from gfnn_jax.data.faults import Fault, faults
+from gfnn_jax.data.traits import Traits
+
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Thresholds, chosen on pendulums, springs and orbits drawn at random (tests of proposals).
+
+    round: times the noise, up to which distances from a centre are equal. bent: times those, that
+    the points lie off a straight line. even: scatter of the speed round a circle, relative to its
+    mean, below which the motion may be an orbit's. wide: range in rad from which on an angle is no
+    length. turns, straight: part of what a length, or an angle, leaves of the accelerations that
+    the other kind leaves at most (of small motions both leave as much, to 3 %). follows: part of
+    the accelerations' spread that the better kind leaves at most. still: samples at rest before or
+    behind a motion, and times the noise that they scatter. moved: times the noise of a motion.
+    most_ways: of a hand, to and fro. early: part of a record within which it lets go. large: part
+    of the largest swing. swings: at least, of a motion that is caught. uneven: relative scatter of
+    steps that rounding makes.
+    """
+
+    round: float = 3.0
+    bent: float = 10.0
+    even: float = 0.25
+    wide: float = 3.0
+    turns: float = 0.87
+    straight: float = 0.6
+    follows: float = 0.08
+    still: int = 5
+    at_rest: float = 5.0
+    moved: float = 30.0
+    most_ways: int = 2
+    early: float = 0.5
+    large: float = 0.3
+    swings: int = 8
+    uneven: float = 0.02
+
+
+_OPTIONS = _Options()
+
+
+def findings(traits: Traits) -> tuple[Fault, ...]:
+    """Mistakes and proposals, the wrong ones first."""
+    found = [*faults(traits), *(fault for check in _CHECKS for fault in check(traits))]
+    return tuple(sorted(found, key=lambda fault: not fault.wrong))
+
+
+# Points that a rod or a string holds.
+
+
+@dataclasses.dataclass(frozen=True)
+class _Circle:
+    """A circle of a radius about a centre (2,), and the angle (n,) of each point from straight
+    down."""
+
+    centre: np.ndarray
+    radius: float
+    angle: np.ndarray
+
+
+def _circle(x: np.ndarray, y: np.ndarray, sigma: float, fixed: bool) -> _Circle | None:
+    """The circle that points (n,) lie on to their noise, about the origin where ``fixed``; None
+    where they do not, where they lie on a line, and where an orbit may have led them."""
+    known = np.isfinite(x) & np.isfinite(y)
+    x, y = x[known], y[known]
+    if len(x) < 10:
+        return None
+    points = np.stack([x, y])
+    middle = points.mean(axis=1)
+    line = float(np.linalg.svd(points - middle[:, None], compute_uv=False)[1]) / np.sqrt(len(x))
+    table = np.stack([*points, np.ones(len(x))])
+    start = np.linalg.lstsq(table.T, (points**2).sum(axis=0), rcond=None)[0]
+    size = float(np.sqrt(max(start[2] + (start[:2] ** 2).sum() / 4, 1e-300)))
+    first = np.array([size] if fixed else [*start[:2] / 2, size])
+
+    def off(c: np.ndarray) -> np.ndarray:
+        centre = np.zeros(2) if fixed else c[:2]
+        return np.hypot(x - centre[0], y - centre[1]) - c[-1]
+
+    c = optimize.least_squares(off, first, x_scale=np.maximum(np.abs(first), 1e-12)).x
+    rms = float(np.sqrt(np.mean(off(c) ** 2)))
+    centre, radius = (np.zeros(2) if fixed else c[:2]), float(abs(c[-1]))
+    if rms > _OPTIONS.round * sigma or line < _OPTIONS.bent * max(rms, sigma):
+        return None
+    angle = np.unwrap(np.arctan2(x - centre[0], centre[1] - y))
+    ways = np.diff(angle)
+    if abs(ways.mean()) > 0 and ways.std() < _OPTIONS.even * abs(ways.mean()):
+        return None
+    return _Circle(centre, radius, angle)
+
+
+def _circles(traits: Traits) -> Iterator[Fault]:
+    """Pairs of positions on a circle about a fixed point or about another such pair."""
+    recording = traits.recording
+    names = [n for n in recording.positions if n not in (*recording.angles, *recording.explained)]
+    if len(names) % 2 or not 2 <= len(names) <= 6 or len(recording.coordinates) != len(names):
+        return
+    pairs = list(zip(names[::2], names[1::2], strict=True))
+    angles = ["theta"] if len(pairs) == 1 else [f"theta{k + 1}" for k in range(len(pairs))]
+    before: tuple[str, str] | None = None
+    shows, guess, told = {}, {}, []
+    for k, (pair, angle) in enumerate(zip(pairs, angles, strict=True)):
+        found, mark = None, str(k + 1) if len(pairs) > 1 else ""
+        x, y = (traits.columns[n] for n in pair)
+        sigma = max(traits.noise[n].sigma or 0.0 for n in (*pair, *(before or ())))
+        sigma = max(sigma, max(traits.resolution[n] or 0.0 for n in pair) / 2)
+        if before is None:
+            found, base = _circle(x, y, sigma, fixed=False), ("x0", "y0")
+        else:
+            a, b = (traits.columns[n] for n in before)
+            found, base = (
+                _circle(x - a, y - b, 2 * sigma, fixed=True),
+                tuple(shows[n] for n in before),
+            )
+        if found is None:
+            return
+        if before is None:
+            guess |= {"x0": float(found.centre[0]), "y0": float(found.centre[1])}
+        guess[f"l{mark}"] = found.radius
+        shows[pair[0]] = f"{base[0]} + l{mark}*sin({angle})"
+        shows[pair[1]] = f"{base[1]} - l{mark}*cos({angle})"
+        about = ", ".join(before) if before else f"({guess['x0']:.4g}, {guess['y0']:.4g})"
+        told.append(f"{', '.join(pair)} lie on a circle of {found.radius:.4g} about {about}")
+        before = pair
+    guess = {name: float(f"{value:.4g}") for name, value in guess.items()}
+    options = {"coordinates": tuple(angles), "observe": shows, "guess": guess}
+    typed = " ".join(f"--observe {shlex.quote(f'{n} = {text}')}" for n, text in shows.items())
+    start = ",".join(f"{n}={value:g}" for n, value in guess.items())
+    remedy = f"What moves is an angle: --coordinates {','.join(angles)} {typed} --guess {start}"
+    yield Fault("circle", "; ".join(told), remedy, options)
+
+
+# Angles, in radians or degrees, and lengths.
+
+
+def _kinds(traits: Traits) -> Iterator[Fault]:
+    """Positions whose accelerations are those of an angle, or of a length, against their names."""
+    recording = traits.recording
+    if len(recording.positions) > 2 or recording.angles_given or recording.explained:
+        return
+    known = accelerations(traits, recording.inputs)
+    if known is None or known.q.shape[1] < 4 * 8:
+        return
+    begin = _let_go(traits)
+    if begin is not None:
+        known = known.taken(known.time > begin)
+    now = [n in recording.angles for n in recording.positions]
+    least = _OPTIONS.follows * known.a.std(axis=1)
+    for k, name in enumerate(recording.positions):
+        unit = recording.units.get(name, "")
+        if recording.factors[name] != 1 or (unit and not unit.startswith("rad")):
+            continue
+        kinds = {"length": _left(known, now, k, False), "rad": _left(known, now, k, True)}
+        mine, wide = ("rad" if now[k] else "length"), float(np.ptp(known.q[k]))
+        if not unit and not now[k]:
+            kinds["degrees"] = _left(known, now, k, True, np.pi / 180)
+        good = {
+            kind
+            for kind, turn in (("rad", 1.0), ("degrees", np.pi / 180))
+            if kind in kinds
+            and wide * turn > _OPTIONS.wide
+            and kinds[kind] < _OPTIONS.turns * kinds["length"]
+        }
+        good |= {"length"} if kinds["length"] < _OPTIONS.straight * kinds["rad"] else set()
+        best = min(good or {mine}, key=lambda kind: kinds[kind])
+        if best == mine or kinds[best] > float(least[k]):
+            continue
+        times = kinds[mine] / max(kinds[best], 1e-300)
+        others = [n for n in recording.angles if n != name]
+        angles = tuple(n for n in recording.positions if n in (*others, *[name] * (best == "rad")))
+        options = {"degrees": (name,)} if best == "degrees" else {"angles": angles}
+        what = {"length": "a length, and are not periodic", "rad": "an angle in radians"}
+        found = (
+            f"the accelerations of {name} are those of {what.get(best, 'an angle in degrees')}: "
+            f"{times:.2g} times closer"
+        )
+        typed = f"To say so: --degrees {shlex.quote(name)}"
+        if best != "degrees":
+            typed = f"To say so: --angles {shlex.quote(','.join(angles) or 'none')}"
+        yield Fault("kind", found, typed, options, wrong=False, proposed=True)
+
+
+def _left(known: Accelerations, now: list[bool], k: int, angle: bool, factor: float = 1.0) -> float:
+    """What fits leave of the accelerations of position k as an angle, or as a length."""
+    q = known.q.copy()
+    q[k] *= factor
+    angles = [angle if i == k else of for i, of in enumerate(now)]
+    u = np.concatenate([known.u, np.sign(known.v)])  # dry friction
+    return float(dataclasses.replace(known, q=q, u=u).held_out(angles)[k])
+
+
+# The begin and the end of a free motion.
+
+
+def _let_go(traits: Traits) -> float | None:
+    """The time at which a motion that began at rest is free: that of its largest deflection; None
+    where it did not begin so."""
+    recording = traits.recording
+    if len(recording.runs) > 1 or recording.inputs or not recording.positions:
+        return None
+    times = traits.times[0]
+    for name in recording.positions:
+        x, sigma = traits.columns[name], traits.noise[name].sigma
+        if name in recording.explained or not sigma or not np.isfinite(x).all():
+            return None
+        sigma = max(sigma, traits.resolution[name] or 0.0)
+        off = x - np.median(x[: _OPTIONS.still])
+        largest = int(np.argmax(np.abs(off)))
+        away = np.abs(off[: largest + 1]) > _OPTIONS.at_rest * sigma
+        rest = int(np.argmax(away)) if away.any() else largest
+        wide = off[rest : largest + 1]
+        wide = np.sign(wide[np.abs(wide) > _OPTIONS.large * np.abs(off[largest])])
+        free = x[largest:]
+        centre, reach = (free.max() + free.min()) / 2, (free.max() - free.min()) / 2
+        good = (
+            rest >= _OPTIONS.still
+            and abs(x[0] - centre) < 0.5 * reach  # no release from a turning point
+            and np.abs(off[largest]) > _OPTIONS.moved * sigma
+            and largest < _OPTIONS.early * len(x)
+            and np.sum(np.diff(wide) != 0) < _OPTIONS.most_ways
+        )
+        if good:
+            return float(times[largest])
+    return None
+
+
+def _caught(traits: Traits) -> float | None:
+    """The time of the last free swing of a motion that ends at rest at once; None where it does not
+    end so."""
+    recording = traits.recording
+    if len(recording.runs) > 1 or recording.inputs or not recording.positions:
+        return None
+    for name in recording.positions:
+        x, sigma = traits.columns[name], traits.noise[name].sigma
+        if name in recording.explained or not sigma or not np.isfinite(x).all():
+            return None
+        sigma = max(sigma, traits.resolution[name] or 0.0)
+        off = x - np.median(x[-_OPTIONS.still :])
+        away = np.flatnonzero(np.abs(off) > _OPTIONS.at_rest * sigma)
+        if not len(away) or len(x) - away[-1] <= _OPTIONS.still:
+            continue
+        swing = off[: away[-1] + 1]
+        size = float(np.ptp(swing))
+        prominent = (
+            signal.find_peaks(s * swing, prominence=_OPTIONS.large * size) for s in (1, -1)
+        )
+        wide = np.sort(np.concatenate([peaks for peaks, _ in prominent]))
+        if len(wide) < _OPTIONS.swings or size < _OPTIONS.moved * sigma:
+            continue
+        half = float(np.median(np.diff(wide)))  # of a period, in samples
+        if len(x) - away[-1] > half and away[-1] - wide[-1] < 2 * half:
+            return float(traits.times[0][wide[-1]])
+    return None
+
+
+def _hands(traits: Traits) -> Iterator[Fault]:
+    """A hand that moves a body before it is let go, and one that stops it."""
+    second = traits.recording.second
+    begin, end = _let_go(traits), _caught(traits)
+    if begin is not None:
+        shown = float(f"{begin / second:.6g}")
+        found = (
+            f"the motion begins at rest and is free from {shown:g} on at the earliest: before it "
+            "something moves the body that no column shows"
+        )
+        yield Fault(
+            "let go", found, f"To begin there: --from {shown:g}", {"start": shown}, False, True
+        )
+    if end is not None:
+        shown = float(f"{end / second:.6g}")
+        found = f"the motion stops at once behind {shown:g}, as if caught"
+        yield Fault("caught", found, f"To end there: --to {shown:g}", {"stop": shown}, False, True)
+
+
+def _rounded_times(traits: Traits) -> Iterator[Fault]:
+    """Times that are an even step, rounded to few digits."""
+    steps = []
+    for t in traits.times:
+        places = (10.0**-k for k in range(13) if np.ptp(t) > 10.0 ** (1 - k))
+        off = ((u, np.abs(t / u - np.round(t / u)).max()) for u in places)
+        unit = next((u for u, rest in off if rest < 1e-3), None)
+        if unit is None or len(t) < 10:
+            return
+        step, begin = np.polyfit(np.arange(len(t)), t, 1)
+        line = t - begin - step * np.arange(len(t))
+        if np.ptp(line) > 1.2 * unit or np.ptp(np.diff(t)) < _OPTIONS.uneven * step:
+            return
+        steps.append((float(step), unit / len(t)))
+    step, error = min(steps, key=lambda one: one[1])
+    short = next((d for d in range(1, 9) if abs(float(f"{step:.{d}g}") - step) < error), 9)
+    told = float(f"{step:.{short}g}")
+    if traits.recording.clock == "s" and all(abs(s - told) < 2 * e for s, e in steps):
+        found = f"the times are rounded: an even step of {told:g} s agrees with all of them"
+        yield Fault("rounded times", found, f"To take it: --dt {told:g}", {"dt": told}, False, True)
+
+
+_CHECKS = (_circles, _kinds, _hands, _rounded_times)

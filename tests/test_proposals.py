@@ -1,0 +1,225 @@
+"""`gfnn look` proposes what a table holds, on systems drawn at random, and nothing else."""
+
+import shlex
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.cli import main
+from gfnn_jax.cli_parser import column_options, parser
+from gfnn_jax.data.recording_summary import refuse_mistakes
+from gfnn_jax.errors import InputError
+
+T = 0.03 * np.arange(300)
+
+
+def moved(rate, start, t=T):
+    """Positions of ẍ = rate(x, v) from (x, v)."""
+    found = solve_ivp(
+        lambda s, z: [z[1], rate(*z)], (t[0], t[-1]), start, "DOP853", t, rtol=1e-10, atol=1e-10
+    )
+    return found.y[0]
+
+
+def pendulum(rng, amplitude, t=T):
+    k, c = rng.uniform(10, 30), rng.uniform(0.02, 0.2)
+    return moved(lambda x, v: -k * np.sin(x) - c * v, (amplitude, 0.0), t)
+
+
+def spring(rng, amplitude, t=T):
+    k, b, c = rng.uniform(10, 25), rng.uniform(0, 0.3), rng.uniform(0.02, 0.3)
+    return moved(lambda x, v: -k * x - b * x**3 - c * v, (amplitude, 0.0), t)
+
+
+def noisy(rng, x, size=1e-3):
+    return x + size * np.std(x) * rng.standard_normal(np.shape(x))
+
+
+def summary(columns, **options):
+    return gfnn.Recording({"t": T, **columns}, **options).summary()
+
+
+def kinds(found):
+    return [fault.kind for fault in found.faults if fault.kind != "reading"]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_an_angle_by_its_accelerations(seed):
+    rng = np.random.default_rng(seed)
+    x = noisy(rng, pendulum(rng, rng.uniform(2.0, 2.8)))
+    assert summary({"position": x}).options == {"angles": ("position",)}
+    assert summary({"position": np.degrees(x)}).options == {"degrees": ("position",)}
+    assert summary({"theta": x}).options == {}
+    assert kinds(summary({"theta": x})) == []
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_length_by_its_accelerations(seed):
+    rng = np.random.default_rng(seed)
+    x = noisy(rng, spring(rng, rng.uniform(3.0, 5.0)))
+    assert summary({"theta": x}).options.get("angles") == ()
+    assert kinds(summary({"x": x})) == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_small_motions_propose_nothing(seed):
+    rng = np.random.default_rng(seed)
+    for x in (pendulum(rng, 0.4), spring(rng, 0.4)):
+        assert kinds(summary({"x": noisy(rng, x)})) == []
+        assert kinds(summary({"theta": noisy(rng, x)})) == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_points_on_a_circle_are_an_angle_and_the_command_has_it(seed):
+    rng = np.random.default_rng(seed)
+    x0, y0, length = rng.uniform(-3, 3), rng.uniform(-3, 3), rng.uniform(0.3, 3)
+    theta = pendulum(rng, rng.uniform(0.4, 2.5))
+    x, y = x0 + length * np.sin(theta), y0 - length * np.cos(theta)
+    table = {"x": noisy(rng, x), "y": noisy(rng, y)}
+    found = summary(table)
+    assert kinds(found) == ["circle"]
+    assert found.options["guess"] == pytest.approx({"x0": x0, "y0": y0, "l": length}, abs=2e-2)
+    read = {n: v for n, v in found.options.items() if n != "mass"}
+    again = gfnn.Recording({"t": T, **table}, **read)
+    assert again.coordinates == again.angles == ("theta",)
+    assert kinds(again.summary()) == []
+    with pytest.raises(InputError, match="--coordinates theta --observe"):
+        refuse_mistakes(gfnn.Recording({"t": T, **table}))
+    refuse_mistakes(gfnn.Recording({"t": T, **table}), ["circle"])
+
+
+def test_two_rods_are_two_angles():
+    rng = np.random.default_rng(3)
+    one, two = pendulum(rng, 1.2), pendulum(rng, 0.8)
+    x1, y1 = 0.7 * np.sin(one), -0.7 * np.cos(one)
+    table = {"x1": x1, "y1": y1, "x2": x1 + 0.4 * np.sin(two), "y2": y1 - 0.4 * np.cos(two)}
+    found = summary({name: noisy(rng, x) for name, x in table.items()})
+    assert found.options["coordinates"] == ("theta1", "theta2")
+    assert found.options["guess"] == pytest.approx(
+        {"x0": 0, "y0": 0, "l1": 0.7, "l2": 0.4}, abs=1e-2
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_orbit_is_no_pendulum(seed):
+    rng = np.random.default_rng(seed)
+    phase = rng.uniform(0.6, 2.0) * T + rng.uniform(0, 6)
+    assert "circle" not in kinds(summary({"x": np.cos(phase), "y": np.sin(phase)}))
+    free = {"x": spring(rng, 1.0), "y": spring(rng, 0.5)}
+    assert "circle" not in kinds(summary({n: noisy(rng, x) for n, x in free.items()}))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_hand_that_lets_go_and_one_that_catches(seed):
+    rng = np.random.default_rng(seed)
+    free = pendulum(rng, rng.uniform(0.6, 1.2))
+    t = 0.03 * np.arange(420)
+    led = free[0] * 0.5 * (1 - np.cos(np.pi * np.arange(60) / 60))
+    x = np.concatenate([np.zeros(60), led, free])
+    x = x + 1e-3 * rng.standard_normal(len(x))
+    found = gfnn.Recording({"t": t, "theta": x}).summary()
+    assert found.options["start"] == pytest.approx(t[120], abs=0.1)
+    end = np.concatenate([free[:250], np.zeros(170)]) + 1e-3 * rng.standard_normal(420)
+    found = gfnn.Recording({"t": t, "theta": end}).summary()
+    assert "start" not in found.options
+    assert 0 <= t[250] - found.options["stop"] < 1.5
+    for kept in (x[120:], end[: int(found.options["stop"] / 0.03)]):
+        again = gfnn.Recording({"t": t[: len(kept)], "theta": kept}).summary()
+        assert kinds(again) == []
+
+
+def test_a_release_from_rest_in_fine_steps_is_no_hand():
+    t = 1e-3 * np.arange(4000)
+    x = pendulum(np.random.default_rng(0), 1.0, t) + 1e-3 * np.random.default_rng(1).normal(
+        size=4000
+    )
+    assert kinds(gfnn.Recording({"t": t, "theta": x}).summary()) == []
+
+
+def test_dry_friction_that_stops_a_motion_is_no_hand():
+    t = 0.03 * np.arange(500)
+    x = moved(lambda x, v: -9 * x - 0.5 * np.tanh(v / 1e-3), (1.5, 0.0), t)
+    x = np.where(t > 13, x[-1], x) + 1e-3 * np.random.default_rng(0).standard_normal(len(t))
+    assert not {"let go", "caught"} & set(kinds(gfnn.Recording({"t": t, "x": x}).summary()))
+
+
+@pytest.mark.parametrize(("step", "digits"), [(1 / 30, 2), (2.5e-3, 3), (0.1, 3)])
+def test_rounded_times_propose_the_even_step(step, digits):
+    t = np.round(step * np.arange(300), digits)
+    found = gfnn.Recording({"t": t, "x": np.cos(0.3 * np.arange(300))}).summary()
+    if digits == 3 and step == 0.1:
+        assert "dt" not in found.options
+    else:
+        assert found.options["dt"] == pytest.approx(step, rel=1e-3)
+
+
+def test_a_voltage_called_v_is_an_input():
+    rng = np.random.default_rng(0)
+    v = 2 * np.sin(1.3 * T) + np.sign(np.sin(3.1 * T))
+    found = solve_ivp(
+        lambda s, z: [z[1], -12 * z[0] - 0.5 * z[1] + 9 * np.interp(s, T, v)],
+        (0, T[-1]),
+        (0.3, 0),
+        t_eval=T,
+        rtol=1e-8,
+        atol=1e-8,
+    )
+    x = noisy(rng, found.y[0])
+    assert summary({"x": x, "v": v}).options == {"positions": ("x",), "inputs": ("v",)}
+
+
+def test_a_velocity_of_the_wrong_sign_is_no_swapped_column():
+    x = pendulum(np.random.default_rng(0), 0.3)
+    found = summary({"theta": x, "omega": -np.gradient(x, T)})
+    assert kinds(found) == ["sign"]
+
+
+def test_exact_velocities_are_no_differences_and_no_period_is_told_that_is_not_seen():
+    phase = 2 * np.pi * 0.6 * np.arange(200) / 200
+    t = 18.0 * np.arange(200)
+    rate = 2 * np.pi * 0.6 / 3600
+    x, y = np.cos(phase), np.sin(phase)
+    table = {"t": t, "x": x, "y": y, "vx": -rate * y, "vy": rate * x}
+    found = gfnn.Recording(table).summary()
+    assert found.faults == ()
+    assert found.period is None
+    assert found.loss is None
+    assert "its period is longer than the runs show" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("axes", "options"),
+    [
+        (1, {"coordinates": ("theta",), "observe": {"Gyroscope x": "omega + b"}}),
+        (3, {"structure": "poisson", "states": ("Gyroscope x", "Gyroscope y", "Gyroscope z")}),
+    ],
+)
+def test_rates_of_turning_without_an_angle(tmp_path, capsys, axes, options):
+    rates = [np.cos((k + 1) * T + k) for k in range(axes)]
+    lines = ["t (s)," + ",".join(f"Gyroscope {n} (rad/s)" for n in "xyz"[:axes])]
+    lines += [",".join(f"{x:.6f}" for x in row) for row in zip(T, *rates, strict=True)]
+    (tmp_path / "g.csv").write_text("\n".join(lines) + "\n")
+    figure = str(tmp_path / "g.png")
+    assert main(["look", str(tmp_path / "g.csv"), "--figure", figure]) == 0
+    command = capsys.readouterr().out.split("next: gfnn ")[1].splitlines()[0]
+    if axes == 1:
+        typed = parser().parse_args(shlex.split(command))
+        assert column_options(typed) == options
+    else:
+        assert "--structure poisson --states 'Gyroscope x,Gyroscope y,Gyroscope z'" in command
+
+
+def test_populations_are_states_of_first_order():
+    def rates(s, z):
+        return [z[0] * (0.8 - 0.02 * z[1]), z[1] * (0.03 * z[0] - 0.9)]
+
+    t = np.arange(1900.0, 1960)
+    found = solve_ivp(rates, (t[0], t[-1]), (31, 19.5), t_eval=t, rtol=1e-9)
+    table = {"Year": t, "Prey": found.y[0], "Predator": 10 * found.y[1]}
+    with pytest.raises(InputError, match="--structure poisson --states Prey,Predator"):
+        gfnn.Recording(table)
+    carts = {"t": T, "one": np.cos(T) + np.cos(1.7 * T), "two": np.cos(T) - np.cos(1.7 * T)}
+    with pytest.raises(InputError, match="or some of them and --inputs"):
+        gfnn.Recording(carts)
