@@ -1,4 +1,4 @@
-"""What a table holds beyond its names: points on a circle, angles and lengths, a hand that lets go.
+"""Contents of a table beyond its names: points on a circle, angles and lengths, a hand that lets go.
 
 Each check yields faults that propose options: `gfnn look` puts them into the command to type, and
 nothing is done without them.
@@ -55,8 +55,11 @@ _OPTIONS = _Options()
 
 
 def findings(traits: Traits) -> tuple[Fault, ...]:
-    """Mistakes and proposals, the wrong ones first."""
-    found = [*faults(traits), *(fault for check in _CHECKS for fault in check(traits))]
+    """Mistakes and proposals, the wrong ones first; columns with mistakes in them are not judged by
+    their accelerations."""
+    found = list(faults(traits))
+    checks = _CHECKS if any(fault.wrong for fault in found) else (*_CHECKS, _kinds)
+    found += [fault for check in checks for fault in check(traits)]
     return tuple(sorted(found, key=lambda fault: not fault.wrong))
 
 
@@ -196,7 +199,7 @@ def _kinds(traits: Traits) -> Iterator[Fault]:
 
 
 def _left(known: Accelerations, now: list[bool], k: int, angle: bool, factor: float = 1.0) -> float:
-    """What fits leave of the accelerations of position k as an angle, or as a length."""
+    """The accelerations of position k that fits leave, as an angle or as a length."""
     q = known.q.copy()
     q[k] *= factor
     angles = [angle if i == k else of for i, of in enumerate(now)]
@@ -309,4 +312,4 @@ def _rounded_times(traits: Traits) -> Iterator[Fault]:
         yield Fault("rounded times", found, f"To take it: --dt {told:g}", {"dt": told}, False, True)
 
 
-_CHECKS = (_circles, _kinds, _hands, _rounded_times)
+_CHECKS = (_circles, _hands, _rounded_times)

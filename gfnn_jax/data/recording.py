@@ -275,7 +275,7 @@ class Recording:
 
     @property
     def second(self) -> float:
-        """What one of the file's unit of time is in that of `times`."""
+        """The file's unit of time, in that of `times`."""
         return SECONDS[self.time_unit]
 
     @property
