@@ -1,4 +1,4 @@
-"""Contents of a table beyond its names: points on a circle, angles and lengths, a hand that lets go.
+"""Contents of a table beyond its names: circles, angles and lengths, a hand that lets go.
 
 Each check yields faults that propose options: `gfnn look` puts them into the command to type, and
 nothing is done without them.
