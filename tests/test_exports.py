@@ -120,7 +120,7 @@ def in_polar():
 
 
 def two_rods():
-    """A double pendulum by its Lagrangian."""
+    """A double pendulum by its Lagrangian, whose bobs attract each other."""
     none = (0, 0)
     terms = lagrangian.Terms.of(
         [
@@ -129,12 +129,13 @@ def two_rods():
             ((1, 1), none, (1, -1), 0.0),
             (none, none, (1, 0), 0.0),
             (none, (0, 2), none, 0.0),
+            (none, none, none, 0.0, "1/sqrt(4 + (q1 - q2)**2)"),
         ],
         2,
     )
     law = lagrangian.Lagrangian(
         terms,
-        np.array([1.0, 0.5, 1.0, 2.0, -0.5]),
+        np.array([1.0, 0.5, 1.0, 2.0, -0.5, 0.7]),
         lagrangian.Friction.of([], 2),
         np.zeros(0),
         0.0,
@@ -594,6 +595,7 @@ def test_every_function_of_formulas_has_its_c(tmp_path):
         "cosh(q1)",
         "tanh(q1)",
         "arctan(q1)",
+        "abs(q1 - 3)",
         "q1**-3",
         "q1**0.3",
         "T5(q1)",
