@@ -35,10 +35,12 @@ class Bracket:
         gfnn.Bracket.constant([[0, 1], [-1, 0]])
         gfnn.Bracket.log([[0, -1], [1, 0]])      # {z1, z2} = −z1 z2: predator and prey
 
-    ``names`` are those of the coordinates, z1 … zn where there are none.
+    ``names`` are those of the coordinates, z1 … zn where there are none; ``note`` is said behind
+    the name, as of one of several that were found.
     """
 
     names: tuple[str, ...] = ()
+    note: str = ""
 
     @staticmethod
     def constant(matrix, names: Sequence[str] = ()) -> Constant:
@@ -190,15 +192,17 @@ class Bracket:
         raise NotImplementedError
 
     def __str__(self) -> str:
-        return f"{'; '.join(self.relations()) or 'all brackets 0'}: {self.name}"
+        text = f"{'; '.join(self.relations()) or 'all brackets 0'}: {self.name}"
+        return f"{text}, {self.note}" if self.note else text
 
 
-@pytree("names", repr=False)
+@pytree("names", "note", repr=False)
 class Constant(Bracket):
     """{z_i, z_j} = B_ij."""
 
     form: Any
     names: tuple[str, ...] = ()
+    note: str = ""
 
     @property
     def name(self) -> str:
@@ -222,12 +226,13 @@ class Constant(Bracket):
         return added([(self.form[i, j], "")])
 
 
-@pytree("names", repr=False)
+@pytree("names", "note", repr=False)
 class Log(Bracket):
     """{z_i, z_j} = B_ij z_i z_j, z > 0."""
 
     form: Any
     names: tuple[str, ...] = ()
+    note: str = ""
 
     _undefined = "a coordinate is not above 0"
 
@@ -257,7 +262,7 @@ class Log(Bracket):
         return added([(self.form[i, j], f"{self.labels[i]} {self.labels[j]}")])
 
 
-@pytree("blocks", "names", repr=False)
+@pytree("blocks", "names", "note", repr=False)
 class LieAlgebra(Bracket):
     """{z_i, z_j} = Σ_k c_ijk z_k. blocks: the algebra's parts where L z, L the ``basis``, has their
     standard constants; () for an algebra that is none of them."""
@@ -266,6 +271,7 @@ class LieAlgebra(Bracket):
     basis: Any
     blocks: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
+    note: str = ""
 
     _undefined = "Γ = 0, or a value is missing,"
 
@@ -323,7 +329,7 @@ class LieAlgebra(Bracket):
         return added(list(zip(self.constants[i, j], self.labels, strict=True)))
 
 
-@pytree("powers", "names", repr=False)
+@pytree("powers", "names", "note", repr=False)
 class Magnetic(Bracket):
     """{x_i, v_j} = (m⁻¹)_ij, {v_i, v_j} = (m⁻¹ F(x) m⁻¹)_ij, F = Σ_n field_n Π x^powers_n:
     canonical in (x, p), p = m v + A(x)."""
@@ -332,6 +338,7 @@ class Magnetic(Bracket):
     mass: Any
     powers: tuple[tuple[int, ...], ...]
     names: tuple[str, ...] = ()
+    note: str = ""
 
     @property
     def name(self) -> str:
