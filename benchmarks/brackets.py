@@ -12,10 +12,12 @@ orbit, of slow steps over 10⁵. Fields without a bracket are ten of which none 
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -261,6 +263,7 @@ def of_system(name: str, quick: bool) -> Numbers:
     long = np.asarray(fit.map.rollout(states[0], count_of, save_every=1_000)[0])
     drift = [np.abs(c(long) / c(long)[0] - 1).max() for c in fit.casimirs]
     return {
+        "system": name,
         "pairs": 20 * count,
         "expected": expected,
         "found": fit.bracket.name,
@@ -331,17 +334,20 @@ def noisy(quick: bool) -> Numbers:
     return found
 
 
-PIECES = {
-    name.replace(" ", "-").replace("/", "over"): (lambda quick, name=name: of_system(name, quick))
-    for name in SYSTEMS
-} | {"without": without, "noisy": noisy}
+def piece_of(name: str) -> str:
+    """Name of a system's piece: letters, digits and hyphens."""
+    return re.sub("[^a-z0-9]+", "-", name.lower()).strip("-")
+
+
+PIECES = {piece_of(name): partial(of_system, name) for name in SYSTEMS}
+PIECES |= {"without": without, "noisy": noisy}
 
 
 def tables() -> None:
     found = results(PIECES, "brackets")
     rows = [
         [
-            name,
+            m["system"],
             number(m["pairs"]),
             m["found"],
             *(
@@ -357,8 +363,8 @@ def tables() -> None:
                 )
             ),
         ]
-        for name, result in found.items()
-        if "found" in (m := result["measured"])
+        for result in found.values()
+        if "system" in (m := result["measured"])
     ]
     heads = (
         "system",
