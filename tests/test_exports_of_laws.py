@@ -26,7 +26,7 @@ from gfnn_jax.exports.export import SUFFIXES
 from gfnn_jax.families import lagrangian
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.maps.inputs import Signals
-from gfnn_jax.maps.laws import map_of_law, velocities_of
+from gfnn_jax.maps.laws import law_of_map, map_of_law, velocities_of
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.solve.status import LEFT_DOMAIN, NOT_CONVERGED
 
@@ -301,6 +301,21 @@ def test_mujoco_moves_a_chain_of_links_as_its_law_does(relative, to, tmp_path):
     states, _ = map_.rollout(z[0], 100, inputs=np.full((101, 1), push))
     np.testing.assert_allclose(turn @ data.qpos, states[-1, :2], atol=1e-8)
     np.testing.assert_allclose(model.body_pos[-1], [0, 0, -0.5], atol=1e-12)  # the length is told
+
+
+def test_forces_of_a_motion_make_it():
+    map_, z = chain(relative=True)
+    law = law_of_map(map_)
+    q, v = z[:50, :2], z[:50, 2:]
+    a = law.acceleration(q, v, np.full((50, 1), 0.3))
+    found = map_.inverse_dynamics(q, v, a)
+    np.testing.assert_allclose(found.inputs, 0.3, atol=1e-12)
+    np.testing.assert_allclose(found.left, 0, atol=1e-12)
+    unforced = map_.inverse_dynamics(q, v, law.acceleration(q, v) + np.eye(2)[0])
+    np.testing.assert_allclose(unforced.forces, map_.mass_matrix(q)[..., 0], atol=1e-12)
+    np.testing.assert_allclose(unforced.left, unforced.forces * [1.0, 0.0], atol=1e-12)
+    with pytest.raises(ValueError, match="of one shape"):
+        map_.inverse_dynamics(q, v, a[:3])
 
 
 def test_a_law_that_is_no_chain_has_no_links(tmp_path):

@@ -65,6 +65,7 @@ SHORTHANDS = {
         "saved",
         "forecasts",
         "events",
+        "laws",
     )
 }
 SHORTHANDS |= {

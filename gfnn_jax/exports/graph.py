@@ -99,11 +99,12 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
     Raises InputError for a map that is no flow of a law in Cartesian coordinates, or whose law is
     no formula.
     """
-    piece = map_.pieces[0]
-    if len(map_.pieces) != 1 or not isinstance(piece, Flow):
+    if len(map_.pieces) != 1 or not isinstance(map_.pieces[0], Flow):
         raise InputError(
             "this map has no law, whose rates would be exported: use --to c or --to stablehlo"
         )
+    if map_.bracket is not None:
+        raise InputError("this law has a bracket of its own: use --to stablehlo")
     if map_.coordinates.forward is not CARTESIAN.forward:
         raise InputError(
             f"this law is one in {map_.coordinates.name} coordinates: use --to c or --to stablehlo"

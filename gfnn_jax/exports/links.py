@@ -179,7 +179,7 @@ def _masses(chain: _Chain, lengths: np.ndarray, beta: np.ndarray) -> tuple[np.nd
             moment, left = beta[j] - lengths[j] * below, chain.a[j] - lengths[j] ** 2 * below
             if left <= 0:
                 break
-            least = 1e-6 * left / max(lengths.max(), 1e-6) ** 2
+            least = 1e-6 * left / (lengths.max() or 1.0) ** 2  # of a link without a moment
             masses[j] = max(rod * moment**2 / left, least)
             centres[j] = moment / masses[j]
             inertias[j] = left - moment * centres[j]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -175,6 +175,47 @@ def velocities_of(map_: SymplecticMap, z, args=None):
     """v (..., d) of states z = (q, p) (..., 2d), as `states_of`."""
     law = law_of_map(map_).at(args)
     return Legendre(law.terms).velocity(law.coefficients, np.asarray(z))
+
+
+class InverseDynamics(NamedTuple):
+    """Generalised forces (..., d) of a motion, in the unit of L by those of the coordinates; the
+    inputs (..., k) that come closest to them, in their own units; and the forces (..., d) that are
+    left, 0 where every coordinate is driven."""
+
+    forces: np.ndarray
+    inputs: np.ndarray
+    left: np.ndarray
+
+
+def inverse_dynamics(map_: SymplecticMap, q, v, a, args=None) -> InverseDynamics:
+    """The forces beside friction that make a motion, M a − (∂L/∂q − …) + ∂R/∂v, as
+    `SymplecticMap.inverse_dynamics`."""
+    q, v, a = (np.asarray(values, float) for values in (q, v, a))
+    if not q.shape == v.shape == a.shape or q.shape[-1:] != (map_.dim,):
+        raise ValueError(
+            f"expected q, v and a of one shape (..., {map_.dim}), got {q.shape}, {v.shape}, "
+            f"{a.shape}"
+        )
+    law = _law_at(map_, args)
+    masses, forces = law.balance(q, v)
+    needed = np.einsum("...ij,...j->...i", masses, a) - forces
+    gains = np.broadcast_to(law.gains, (*q.shape[:-1], *law.gains.shape[-2:]))
+    inputs = np.einsum("...ki,...i->...k", np.linalg.pinv(gains), needed)
+    return InverseDynamics(needed, inputs, needed - np.einsum("...ik,...k->...i", gains, inputs))
+
+
+def mass_matrix(map_: SymplecticMap, q, args=None) -> np.ndarray:
+    """M(q) (..., d, d) of positions (..., d), as `SymplecticMap.mass_matrix`."""
+    return _law_at(map_, args).masses(np.asarray(q, float))
+
+
+def _law_at(map_: SymplecticMap, args) -> Lagrangian:
+    """The law of a map for a system. Raises ValueError of another map, and without parameters that
+    it depends on."""
+    law = law_of_map(map_)
+    if law.powers is not None and args is None:
+        raise ValueError("expected the parameters of the system (args=): the law depends on them")
+    return law.at(None if args is None else np.asarray(args, float))
 
 
 def _steps(law: Lagrangian, flow: Flow, z, args, tolerance: float) -> Steps:

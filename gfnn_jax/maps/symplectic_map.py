@@ -328,6 +328,24 @@ class SymplecticMap:
         z = self._states(z)
         return programs.linearised(self, z, self._args(args, z, t0, inputs))
 
+    def inverse_dynamics(self, q, v, a, args=None):
+        """`maps.laws.InverseDynamics` of positions, velocities and accelerations (..., d): the
+        forces that make this motion against the law's friction, and the inputs that do.
+
+        Angles are in radians; args are the parameters of the system, where the law depends on some.
+        Friction that holds a body at rest is counted as 0 there. Raises ValueError for other shapes
+        and for a map that is no flow of a Lagrangian.
+        ``fit.map.inverse_dynamics(q, v, a).inputs`` are the torques of a robot's motion."""
+        from gfnn_jax.maps import laws  # stands after this module
+
+        return laws.inverse_dynamics(self, q, v, a, args)
+
+    def mass_matrix(self, q, args=None):
+        """M(q) (..., d, d) of positions (..., d), in the unit of L: as `inverse_dynamics`."""
+        from gfnn_jax.maps import laws  # stands after this module
+
+        return laws.mass_matrix(self, q, args)
+
     def modified_hamiltonian(self, z, args=None) -> ModifiedHamiltonian:
         """Value and error, each () or (B,), of the Hamiltonian H̃ whose flow over dt is this map.
 

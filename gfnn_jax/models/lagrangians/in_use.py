@@ -45,6 +45,21 @@ class RecordingData:
         return np.array([self.recording.std[name] or np.nan for name in channels])
 
 
+class GaugedLaw(NamedTuple):
+    """A fit, its law and covariance in the columns' units, the factor of L and what fixes it."""
+
+    fit: LawFit
+    law: Lagrangian
+    covariance: np.ndarray
+    scale: float
+    gauge: str
+
+    @classmethod
+    def of(cls, data: RecordingData, fit: LawFit) -> GaugedLaw:
+        """Give a fit the units of its columns."""
+        return cls(fit, *_in_gauge(data, fit))
+
+
 class CalibratedLaw(NamedTuple):
     """A fit, how its friction was chosen, its law and covariance in the columns' units, the law
     that moves with a root of its covariance, the factor of L and what fixes it, and its

@@ -16,7 +16,7 @@ from gfnn_jax.families.lagrangian import Powers
 from gfnn_jax.families.text import Term
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.fit import LawFit
-from gfnn_jax.models.lagrangians.in_use import CalibratedLaw
+from gfnn_jax.models.lagrangians.in_use import CalibratedLaw, GaugedLaw
 from gfnn_jax.models.lagrangians.input_rules import InputModel
 from gfnn_jax.models.lagrangians.learned_law import (
     ONLY_TOGETHER,
@@ -128,6 +128,12 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
     )
 
 
+def line_of(recording: Recording, found: GaugedLaw) -> str:
+    """L and R of a law, before its bands are known."""
+    lagrangian, friction = _expressions(found, _names(recording))
+    return f"L = {lagrangian}; R = {friction}"
+
+
 class _Names(NamedTuple):
     """Symbols of coordinates, of their speeds, and of parameters, as formulas write them."""
 
@@ -143,7 +149,9 @@ def _names(recording: Recording) -> _Names:
     return _Names(listed[:d], listed[d : 2 * d], listed[2 * d :])
 
 
-def _standard_errors(best: CalibratedLaw) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def _standard_errors(
+    best: CalibratedLaw | GaugedLaw,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Standard errors of the terms of L, of R, of the gains (d, m), and of the last coefficient,
     the rate γ of uniform friction where there is one; NaN of terms that are not determined."""
     std = np.sqrt(np.maximum(np.diag(best.covariance), 0.0))
@@ -153,7 +161,7 @@ def _standard_errors(best: CalibratedLaw) -> tuple[np.ndarray, np.ndarray, np.nd
     return of_terms, of_losses, rest[: law.gains.size].reshape(law.gains.shape), float(std[-1])
 
 
-def _expressions(best: CalibratedLaw, names: _Names) -> tuple[Formula, Formula]:
+def _expressions(best: CalibratedLaw | GaugedLaw, names: _Names) -> tuple[Formula, Formula]:
     """L and Rayleigh's R; uniform friction enters R as γ T."""
     law = best.law
     of_terms, of_losses, _, of_rate = _standard_errors(best)

@@ -40,8 +40,13 @@ from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_terms import given_terms
-from gfnn_jax.models.lagrangians.in_use import CalibratedLaw, RecordingData, best_in_use
-from gfnn_jax.models.lagrangians.in_words import Findings, in_words
+from gfnn_jax.models.lagrangians.in_use import (
+    CalibratedLaw,
+    GaugedLaw,
+    RecordingData,
+    best_in_use,
+)
+from gfnn_jax.models.lagrangians.in_words import Findings, in_words, line_of
 from gfnn_jax.models.lagrangians.input_rules import RULES, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS
@@ -166,6 +171,7 @@ def _findings(
 ) -> tuple[CalibratedLaw, Findings]:
     """The law that was found, made ready for forecasts, and what its fit shows."""
     note, options = data.problem.on_progress, data.problem.options
+    note(f"law, its bands are yet to come: {line_of(recording, GaugedLaw.of(data, found.fit))}")
     model, choice, _ = _forecasting_best(found, data)
     fit = with_fine_steps(model.fit)
     measured = velocities(recording, fit)
