@@ -1,0 +1,196 @@
+"""Maps with a bracket and no law, and what a bracket is worth: Casimirs and orbits over 10⁵ steps.
+
+    python benchmarks/bracket_maps.py --processor-time     all rows, then the table in RESULTS.md
+    python benchmarks/bracket_maps.py --only beside --quick
+
+A map without a law is S in the chart of a known bracket, up to degree 8 (heavy top 4), fitted to
+80 % of 1,000 to 1,300 pairs; its error is that of the executed step on 200 further ones, RMS ÷
+spread. ``beside``: a free top from the same 400 pairs by the law with its bracket, and by a field
+of all terms of degree 2, fitted to finite differences and through a Runge–Kutta step of order 4,
+which then steps both; orbits are compared with the flow of the true law.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from harness import TABLES, Numbers, between_markers, markdown, number, provenance, results
+from harness import main as run_pieces
+from scipy.integrate import solve_ivp
+from scipy.optimize import least_squares
+
+import gfnn_jax as gfnn
+from gfnn_jax.flows.lie import law_flow
+from gfnn_jax.models.brackets.lie_maps import fit_lie_map
+
+INVERSE = np.linalg.inv([[1.0, 0.2, 0.1], [0.2, 1.7, 0.3], [0.1, 0.3, 2.5]])
+SPIN, TOP = gfnn.Bracket.so3(), gfnn.Bracket.se3()
+CHAIN = gfnn.Bracket.constant(
+    [[0, 1.3, 0.3, -1], [-1.3, 0, 1, 0.3], [-0.3, -1, 0, 1.3], [1, -0.3, -1.3, 0]]
+)
+
+
+def shell(rng, count: int, low: float, high: float) -> np.ndarray:
+    z = rng.normal(size=(count, 3))
+    return z * (rng.uniform(low, high, count) / np.linalg.norm(z, axis=1))[:, None]
+
+
+def flow(bracket, gradient, z, dt):
+    """Images of z (N, n) by DOP853."""
+
+    def field(_, y):
+        y = y.reshape(z.shape)
+        return bracket.apply(y, gradient(y)).ravel()
+
+    solved = solve_ivp(field, (0, dt), z.ravel(), method="DOP853", rtol=1e-13, atol=1e-14)
+    return solved.y[:, -1].reshape(z.shape)
+
+
+def kicked(z, angle=0.5):
+    """A turn about the second axis, then one about the third by its coordinate."""
+    c, s = np.cos(angle), np.sin(angle)
+    x, y, w = (z @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])).T
+    return np.stack([x * np.cos(w) - y * np.sin(w), x * np.sin(w) + y * np.cos(w), w], axis=1)
+
+
+def case(name: str, rng) -> tuple:
+    """(bracket, z0, z1, dt, degree)."""
+    if name == "kicked top":
+        z = shell(rng, 1200, 0.8, 1.2)
+        return SPIN, z, kicked(z), 1.0, 8
+    if name == "free top":
+        z = shell(rng, 1200, 0.5, 1.2)
+        return SPIN, z, flow(SPIN, lambda y: y @ INVERSE, z, 0.3), 0.3, 8
+    if name == "heavy top":
+        z = np.concatenate([shell(rng, 1500, 0.3, 1.0), shell(rng, 1500, 0.9, 1.1)], axis=1)
+        pull = np.tile([0.1, 0.0, 1.0], (len(z), 1))
+        return TOP, z, flow(TOP, lambda y: np.c_[y[:, :3] @ INVERSE, pull], z, 0.3), 0.3, 4
+    y = np.log(rng.uniform(0.6, 1.6, (1500, 4)))
+    rest = np.array([1, 0.9, 1.1, 1])
+    return CHAIN, y, flow(CHAIN, lambda y: np.exp(y) - rest, y, 0.3), 0.3, 8
+
+
+def without_law(name: str, quick: bool) -> Numbers:
+    """S of one system: its error, and its Casimirs over 1,000 steps."""
+    bracket, z0, z1, dt, degree = case(name, np.random.default_rng(0))
+    started = time.process_time()
+    found = fit_lie_map(z0[:-200], z1[:-200], bracket, dt, min(degree, 4) if quick else degree)
+    seconds = time.process_time() - started
+    images, info = jax.jit(found.piece.step)(jnp.asarray(z0[-200:]))
+    off = (np.asarray(images) - z1[-200:]) / found.piece.scale
+
+    def step(both, _):
+        z, lost, _ = found.piece.compensated_step(*both)
+        return (z, lost), z
+
+    begun = jnp.asarray(z0[:5])
+    _, states = jax.jit(partial(jax.lax.scan, step, length=1000))((begun, jnp.zeros_like(begun)))
+    drift = [np.nanmax(np.abs(c(np.asarray(states)) / c(z0[:5]) - 1)) for c in bracket.casimirs]
+    return {
+        "terms": found.piece.family.num_parameters,
+        "degree": found.degree,
+        "error": float(np.sqrt(np.mean(off**2))),
+        "failed": int(np.sum(np.asarray(info.status) > 0)),
+        "casimirs": float(max(drift)) if drift else None,
+        "cpu_seconds": seconds,
+    }
+
+
+def beside(quick: bool) -> Numbers:
+    """A free top by its law with the bracket, and by fields without one."""
+    rng, dt, steps = np.random.default_rng(0), 0.1, 10_000 if quick else 100_000
+    starts = shell(rng, 20, 0.5, 1.2)
+    runs = [starts]
+    for _ in range(20):
+        runs.append(flow(SPIN, lambda y: y @ INVERSE, runs[-1], dt))
+    orbits = np.stack(runs, axis=1)
+    z0, z1 = orbits[:, :-1].reshape(-1, 3), orbits[:, 1:].reshape(-1, 3)
+    fit = gfnn.fit(
+        gfnn.Pairs(z0, z1, dt, run=np.repeat(np.arange(20), 20), structure="poisson"),
+        max_seconds=None,
+    )
+    fresh = jnp.asarray(shell(rng, 5, 0.5, 1.2))
+
+    def features(z):
+        i, j = np.triu_indices(3)
+        return jnp.concatenate([z, z[..., i] * z[..., j]], axis=-1)
+
+    def field(c, z):
+        return jnp.matmul(features(z), c, precision="highest")
+
+    def runge_kutta(c, z):
+        a = field(c, z)
+        b = field(c, z + 0.5 * dt * a)
+        d = field(c, z + 0.5 * dt * b)
+        e = field(c, z + dt * d)
+        return z + dt / 6 * (a + 2 * b + 2 * d + e)
+
+    middle = np.linalg.lstsq(np.asarray(features(0.5 * (z0 + z1))), (z1 - z0) / dt, rcond=None)[0]
+    residual = jax.jit(lambda c: (runge_kutta(c.reshape(9, 3), z0) - z1).ravel())
+    through = least_squares(
+        lambda c: np.asarray(residual(c)), middle.ravel(), xtol=1e-15, ftol=1e-15, gtol=1e-15
+    ).x.reshape(9, 3)
+    energy = gfnn.from_function(lambda inverse, z: 0.5 * z @ inverse @ z)
+    truth = law_flow(energy, INVERSE, SPIN, dt, np.asarray(fresh))
+
+    def rolled(step):
+        def more(z, _):
+            return jax.lax.scan(lambda y, _: (step(y), None), z, length=steps // 100)[0], None
+
+        states = [fresh]
+        run = jax.jit(lambda z: more(z, None)[0])
+        for _ in range(100):
+            states.append(run(states[-1]))
+        return np.asarray(states)
+
+    reference = rolled(lambda z: truth.step(z)[0])
+    found = {}
+    for name, states in {
+        "law with its bracket": np.asarray(
+            fit.map.rollout(fresh, steps, save_every=steps // 100)[0]
+        ).swapaxes(0, 1),
+        "field by finite differences, Runge–Kutta 4": rolled(partial(runge_kutta, middle)),
+        "field through Runge–Kutta 4": rolled(partial(runge_kutta, through)),
+    }.items():
+        length = np.linalg.norm(states, axis=-1)
+        found[name] = {
+            "casimir": float(np.nanmax(np.abs(length / length[0] - 1)[-1])),
+            "orbit": float(np.nanmedian(np.abs(states - reference).max(axis=2)[-1])),
+            "finite": bool(np.isfinite(states).all()),
+        }
+    return found
+
+
+NAMES = ("kicked top", "free top", "heavy top", "four populations in logs")
+PIECES = {
+    name.replace(" ", "-"): (lambda quick, name=name: without_law(name, quick)) for name in NAMES
+} | {"beside": beside}
+
+
+def tables() -> None:
+    found = results(PIECES, "bracket_maps")
+    keys = ("terms", "error", "casimirs", "cpu_seconds")
+    rows = [
+        [name, *(number(result["measured"][key]) for key in keys)]
+        for name, result in found.items()
+        if name != "beside"
+    ]
+    heads = ("map without a law", "terms of S", "one step", "Casimirs, 10³ steps", "fit, CPU s")
+    text = markdown(heads, rows)
+    if "beside" in found:
+        rows = [
+            [name, number(m["casimir"]), number(m["orbit"])]
+            for name, m in found["beside"]["measured"].items()
+        ]
+        heads = ("free top, 400 pairs; after 10⁵ steps", "Casimir", "orbit")
+        text += "\n\n" + markdown(heads, rows)
+    between_markers(TABLES, "bracket_maps", f"{text}\n\n{provenance(found)}")
+
+
+if __name__ == "__main__":
+    run_pieces(__doc__ or "", PIECES, "bracket_maps", tables, sys.argv[1:], ("free-top",))
