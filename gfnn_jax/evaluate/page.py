@@ -64,19 +64,26 @@ class Section(NamedTuple):
         return not any(self[1:])
 
 
-def page(fit: Fit, *, command: str = "", forecasts: Forecasts | None = None) -> str:
-    """The page of a fit, as text. command: that made it. forecasts: of its held-out part."""
+class About(NamedTuple):
+    """Facts that a fit does not hold: the command that made it, and what was done to its data."""
+
+    command: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def page(fit: Fit, *, about: About = About(), forecasts: Forecasts | None = None) -> str:  # noqa: B008
+    """The page of a fit, as text. forecasts: of its held-out part."""
     found = fit.found
     if isinstance(found, LearnedLaw):
         if forecasts is None and fit.held_out is not None:
             with contextlib.suppress(InputError):  # it is too short
                 forecasts = forecasts_of(fit.map, fit.held_out)
-        sections = list(_of_law(fit, found, forecasts))
+        sections = list(_of_law(fit, found, forecasts, about.notes))
     elif isinstance(found, Choice):
         sections = list(_of_choice(fit, found))
     else:
         raise ValueError("expected a fit, or the folder of one: this one holds a map alone")
-    sections.append(_made(getattr(found, "seconds", float("nan")), command))
+    sections.append(_made(getattr(found, "seconds", float("nan")), about.command))
     return _rendered(_source(fit), fit.verdict or "not stored", sections)
 
 
@@ -111,13 +118,16 @@ def summary(fit: Fit) -> str:
     return verdict + f"<pre>{escape(fit.formula or repr(fit))}</pre>"
 
 
-def write_page(fit: Fit, path: str | os.PathLike[str], **about: Any) -> None:
-    """Write the page, whole or not at all. about: as of `page`."""
-    _write(page(fit, **about), Path(path))
+def write_page(fit: Fit, path: str | os.PathLike[str], **options: Any) -> None:
+    """Write the page, whole or not at all. options: of `page`."""
+    _write(page(fit, **options), Path(path))
 
 
 def write_refusal(
-    recording: Recording, error: Exception, path: str | os.PathLike[str], *, command: str = ""
+    recording: Recording,
+    error: Exception,
+    path: str | os.PathLike[str],
+    about: About = About(),  # noqa: B008
 ) -> None:
     """Write the page of a recording that gave no law: why, what it holds, what to do."""
     cause = error if isinstance(error, FitError) else error.__cause__
@@ -126,9 +136,13 @@ def write_refusal(
     drawn = _svg(figures.recording_figure(recording, summary), "The recording.")
     sections = [
         Section("Why", lines=[str(error)]),
-        Section("The data", lines=[*recording.notes, *map(str, summary.faults)], figures=[drawn]),
+        Section(
+            "The data",
+            lines=[*about.notes, *recording.notes, *map(str, summary.faults)],
+            figures=[drawn],
+        ),
         Section("To do next", lines=[summary.command]),
-        _made(float("nan"), command),
+        _made(float("nan"), about.command),
     ]
     _write(_rendered(_title(recording), verdict, sections), Path(path))
 
@@ -157,7 +171,9 @@ def _title(recording: Recording) -> str:
 # Of a recording.
 
 
-def _of_law(fit: Fit, law: LearnedLaw, forecasts: Forecasts | None) -> Iterator[Section]:
+def _of_law(
+    fit: Fit, law: LearnedLaw, forecasts: Forecasts | None, notes: Sequence[str]
+) -> Iterator[Section]:
     known = physics(law)
     yield Section(
         "Law",
@@ -200,7 +216,7 @@ def _of_law(fit: Fit, law: LearnedLaw, forecasts: Forecasts | None) -> Iterator[
             for m in law.next_motions
         ],
     )
-    yield Section("The data", lines=list(_faults(fit, law)))
+    yield Section("The data", lines=[*notes, *_faults(fit, law)])
 
 
 def _physics(law: LearnedLaw, known: Physics) -> Section:

@@ -18,7 +18,7 @@ from gfnn_jax.data.summary import summary
 from gfnn_jax.errors import FitError, InputError, OutOfTime, WorkError
 from gfnn_jax.evaluate.figures_of_recordings import law_figure
 from gfnn_jax.evaluate.figures_style import save
-from gfnn_jax.evaluate.page import write_page
+from gfnn_jax.evaluate.page import About, write_page
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.jobs.output import PAGE, Output, Ran, publish, units_of, write
 from gfnn_jax.jobs.search import (
@@ -163,7 +163,7 @@ def fit(
         with atomic_folder(output.out) as folder:
             write(folder, folder, fitted, result, job)
             if command is not None:
-                write_page(fitted, folder / PAGE, command=command)
+                write_page(fitted, folder / PAGE, about=About(command))
     return Ran(fitted, output.out, result)
 
 

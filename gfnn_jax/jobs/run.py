@@ -10,7 +10,7 @@ import numpy as np
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import figures
-from gfnn_jax.evaluate.page import write_page
+from gfnn_jax.evaluate.page import About, write_page
 from gfnn_jax.jobs.figures import figures_of_run
 from gfnn_jax.jobs.measure import NUM_STEPS, NUM_TRAJECTORIES, map_rollouts, measure
 from gfnn_jax.jobs.output import MODEL, PAGE, Output, Ran, pairs_digest, write
@@ -115,7 +115,8 @@ def run(
         progress.status("figures")
         with atomic_folder(output.out) as folder:
             write(folder, folder / MODEL, fitted, result, job)
-            write_page(fitted, folder / PAGE, command=f"gfnn run {name}{' --quick' * quick}")
+            about = About(f"gfnn run {name}{' --quick' * quick}")
+            write_page(fitted, folder / PAGE, about=about)
             # Samples are stepped by a program of their own, which takes as long to compile.
             band = None if quick else _band(fitted.map, z0, measured.predicted, given)
             for file, figure in figures_of_run(fitted, scene, measured, reference, band).items():

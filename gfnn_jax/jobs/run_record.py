@@ -8,14 +8,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gfnn_jax.data.recording import SECONDS, Recording, read
+from gfnn_jax.data.recording import SECONDS, ReadOptions, Recording, read
+from gfnn_jax.data.recording_summary import as_typed
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.evaluate import report
 from gfnn_jax.evaluate.figures_of_recordings import forecasts_figure
 from gfnn_jax.evaluate.figures_style import save
 from gfnn_jax.evaluate.forecasts import Forecasts, end_of_part, forecasts_of
-from gfnn_jax.evaluate.page import write_page, write_refusal
+from gfnn_jax.evaluate.page import About, write_page, write_refusal
 from gfnn_jax.jobs.fit import fit_recording
+from gfnn_jax.jobs.look import look
 from gfnn_jax.jobs.output import PAGE, REPORT, Output
 from gfnn_jax.jobs.output import Ran as Learned
 from gfnn_jax.storage.outputs import atomic_folder
@@ -42,30 +44,53 @@ def run_record(
     InputError where the file is no recording or shows a mistake, WorkError where no law follows it;
     a page says why.
     """
+    columns, asked, taken = _as_proposed(data, columns)
+    for line in taken:
+        output.progress.line(line)
     whole = read(data, **columns)
     end = end_of_part(whole)
     stop = end / SECONDS[whole.time_unit]
+    about = About(command, tuple(taken))
     with atomic_folder(output.out) as folder:
         try:
             learned = fit_recording(
                 [data],
                 Output(folder / "model", progress=output.progress),
                 columns={**columns, "stop": stop},
-                **options,
+                **{**asked, **options},
             )
         except (InputError, WorkError) as error:
             refused: InputError | WorkError | None = error
-            write_refusal(whole, error, folder / PAGE, command=command)
+            write_refusal(whole, error, folder / PAGE, about)
         else:
             refused = None
-            ran = _report(learned, whole, end, folder, output, command)
+            ran = _report(learned, whole, end, folder, output, about)
     if refused is not None:
         raise type(refused)(f"{refused} (report: {output.out / PAGE})")
     return ran
 
 
+def _as_proposed(
+    data: Path, columns: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
+    """The keywords of `gfnn_jax.read` that were given and that `gfnn look` proposes, the options of
+    a fit that it proposes, and a line on each that is taken."""
+    summary = look([data], columns)
+    proposed = dict(getattr(summary, "options", columns))
+    states = proposed.pop("states", None)
+    if states is not None:
+        proposed["positions"] = states
+    known = {*ReadOptions.__annotations__, "start", "stop", "every"}
+    reading = {name: value for name, value in proposed.items() if name in known}
+    asked = {name: value for name, value in proposed.items() if name not in known}
+    new = {n: value for n, value in proposed.items() if columns.get(n) != value}
+    why = [str(f) for f in summary.faults if set(f.options) & {*new, "states"}]
+    taken = [f"taken as gfnn look proposes:{as_typed(new)}", *why] if new else []
+    return reading, asked, taken
+
+
 def _report(
-    learned: Learned, whole: Recording, end: float, folder: Path, output: Output, command: str
+    learned: Learned, whole: Recording, end: float, folder: Path, output: Output, about: About
 ) -> Ran:
     fit = dataclasses.replace(learned.fit, data=whole, learned_to=end)
     held_out = fit.held_out
@@ -88,5 +113,5 @@ def _report(
         }
     (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
     output.progress.line("writing the report")
-    write_page(fit, folder / PAGE, command=command, forecasts=found)
+    write_page(fit, folder / PAGE, about=about, forecasts=found)
     return Ran(learned._replace(fit=fit), found, held_out)
