@@ -100,7 +100,9 @@ def _ahead(map_: SymplecticMap, recording: Recording, run: str, k: int, longest:
     own = recording.slice(run=run) if recording.inputs else None
     found = map_.forecast(start, later.times(run), own)
     measured, values, std = {}, {}, {}
-    for name in found.values:
+    for name in recording.columns:  # a coordinate that none shows is forecast too, and not judged
+        if name not in found.values:
+            continue
         factor, values[name] = recording.factors[name], found.values[name][0]
         measured[name] = later.values(name, run) / factor
         if name in recording.angles:
