@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -17,6 +18,8 @@ from gfnn_jax.evaluate.page import page
 from gfnn_jax.evaluate.physics import physics
 from gfnn_jax.exports.symbolic import Formula, as_latex, as_mathml, equations_of_motion
 from gfnn_jax.families.text import Term
+from gfnn_jax.jobs import run_record
+from gfnn_jax.jobs.output import Output
 
 OMEGA, DAMPING, REST = 3.0, 0.06, 0.2  # 1/s, 1/s, m
 
@@ -201,20 +204,44 @@ CHROMIUM = next(
 )
 
 
+def test_what_look_proposes_is_taken_and_said(tmp_path, monkeypatch):
+    """Angles and a first time that `gfnn look` proposes, as though they had been typed."""
+    t, x = swing(12.0)
+    path = tmp_path / "swing.csv"
+    np.savetxt(path, np.stack([t, x], axis=1), "%.4f", ",", header="t,x")
+    proposed = SimpleNamespace(options={"angles": ("x",), "start": 2.0}, faults=())
+    monkeypatch.setattr(run_record, "look", lambda paths, columns: proposed)
+    ran = run_record.run_record(path, Output(tmp_path / "out"), columns={}, despite=("degrees",))
+    assert ran.learned.fit.data.angles == ("x",)
+    assert ran.learned.fit.data.times("0")[0] == pytest.approx(2.0)
+    text = (tmp_path / "out/report.html").read_text(encoding="utf-8")
+    assert "taken as gfnn look proposes: --angles x --from 2.0" in text
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here, in which the page is opened")
 def test_the_page_in_a_browser(tmp_path):
-    discovered().report(tmp_path / "report.html")
-    shown = subprocess.run(
-        [
-            CHROMIUM,
-            *("--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"),
-            *("--virtual-time-budget=3000", "--dump-dom", (tmp_path / "report.html").as_uri()),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
+    """No error in the console; a slider moves the curve and the button brings it back; A4."""
+    moved = """<script>
+        const curve = document.querySelector("#simulation path[fill=none]");
+        const before = curve.getAttribute("d");
+        const slider = document.querySelector("#sliders input");
+        slider.value = slider.max;
+        slider.dispatchEvent(new Event("input"));
+        const after = curve.getAttribute("d");
+        document.getElementById("reset").click();
+        document.title = `${before !== after} ${before === curve.getAttribute("d")}`;
+    </script></body>"""
+    path = tmp_path / "report.html"
+    path.write_text(page(discovered()).replace("</body>", moved), encoding="utf-8")
+
+    def chromium(*options):
+        fixed = ("--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr")
+        command = [CHROMIUM, *fixed, *options, path.as_uri()]
+        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+
+    shown = chromium("--virtual-time-budget=3000", "--dump-dom")
     assert not re.findall(r"CONSOLE.*", shown.stderr)
-    assert "<svg" in shown.stdout
+    assert "<title>true true</title>" in shown.stdout
+    chromium(f"--print-to-pdf={tmp_path / 'report.pdf'}")
+    assert (tmp_path / "report.pdf").stat().st_size > 20_000
