@@ -76,7 +76,7 @@ def _as_proposed(
     """The keywords of `gfnn_jax.read` that were given and that `gfnn look` proposes, the options of
     a fit that it proposes, and a line on each that is taken."""
     summary = look([data], columns)
-    proposed = dict(getattr(summary, "options", columns))
+    proposed = dict(summary.options)
     states = proposed.pop("states", None)
     if states is not None:
         proposed["positions"] = states
