@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gfnn_jax.data.faults import WRONG, Fault
-from gfnn_jax.data.proposals import findings
+from gfnn_jax.data.proposals import findings, mistakes
 from gfnn_jax.data.roles import ROLES
 from gfnn_jax.data.traits import Traits, of_rows, traits
 from gfnn_jax.data.wrong_values import WrongValues
@@ -210,7 +210,7 @@ def refuse_mistakes(recording: Recording, despite: Sequence[str] = ()) -> None:
     unknown = [kind for kind in despite if kind not in WRONG]
     if unknown:
         raise InputError(f"--despite: expected some of {', '.join(WRONG)}, got {unknown[0]!r}")
-    wrong = [f for f in findings(traits(recording)) if f.wrong and f.kind not in despite]
+    wrong = [f for f in mistakes(traits(recording)) if f.wrong and f.kind not in despite]
     if wrong:
         more = f" gfnn look shows {len(wrong) - 1} more." if len(wrong) > 1 else ""
         kind = shlex.quote(wrong[0].kind)
