@@ -72,9 +72,15 @@ class Nature(NamedTuple):
         return f"{self.kind}: {self.reason}"
 
 
-def nature(found: Sequence[Stretch], scales: Scales, angles: Sequence[int]) -> Nature:
-    """Tell what the record of these stretches is, whose law was not found."""
-    exponent = roughness([(s.t, s.y) for s in found])
+def nature(
+    found: Sequence[Stretch],
+    scales: Scales,
+    angles: Sequence[int],
+    runs: Sequence[np.ndarray] = (),
+) -> Nature:
+    """Tell what the record of these stretches is, whose law was not found. runs: channels (n, k) of
+    whole runs, also where a body would be at rest; by default those of the stretches."""
+    exponent = roughness(runs or [s.y for s in found])
     if exponent < OPTIONS.rough:
         grows = f"as time to the power of {exponent:.2g}" if exponent > 0 else "by no more"
         return Nature(
@@ -133,10 +139,10 @@ def nature(found: Sequence[Stretch], scales: Scales, angles: Sequence[int]) -> N
     )
 
 
-def roughness(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
+def roughness(runs: Sequence[np.ndarray]) -> float:
     """The power of time by which mean squares of differences grow beyond the noise, of the
-    smoothest column of runs t (n,), y (n, k); 2 where samples are too far apart to tell it."""
-    return max(_power([y[:, k] for _, y in runs]) for k in range(runs[0][1].shape[1]))
+    smoothest column of runs y (n, k); 2 where samples are too far apart to tell it."""
+    return max(_power([y[:, k] for y in runs]) for k in range(runs[0].shape[1]))
 
 
 def _power(columns: Sequence[np.ndarray]) -> float:

@@ -50,7 +50,7 @@ from gfnn_jax.models.lagrangians.in_words import Findings, in_words, line_of
 from gfnn_jax.models.lagrangians.input_rules import RULES, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS
-from gfnn_jax.models.lagrangians.nature import nature
+from gfnn_jax.models.lagrangians.nature import Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions
 from gfnn_jax.models.lagrangians.search import SearchResult, fit_given, search, search_on
 from gfnn_jax.models.lagrangians.starts import no_law
@@ -144,7 +144,7 @@ def fit_recording(
     if all(one.fit_percent < 100 * (1 - OPTIONS.missed) for one in law.whiteness.values()):
         missed = missed or no_law(data.problem.scales)
     if missed is None and law.flaws:
-        what = nature(data.segments, data.problem.scales, data.problem.angles)
+        what = _nature(data)
         if what.partly:
             return dataclasses.replace(law, nature=what.reason)
         missed = no_law(data.problem.scales)
@@ -154,11 +154,18 @@ def fit_recording(
     return law
 
 
+def _nature(data: RecordingData) -> Nature:
+    recording, problem = data.recording, data.problem
+    names = problem.observation.channels
+    runs = [channels_of(recording, names, run)[0] for run in recording.runs]
+    return nature(data.segments, problem.scales, problem.angles, runs)
+
+
 def _with_nature(error: FitError, data: RecordingData) -> FitError:
     """The error where no law was found, with what the record is."""
     if not error.verdict:
         return error
-    what = nature(data.segments, data.problem.scales, data.problem.angles)
+    what = _nature(data)
     return FitError(f"{error}. The record: {what.reason}", what.verdict, error.fit)
 
 
