@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -11,10 +12,12 @@ import numpy as np
 from gfnn_jax.data.channels import args_of, parameters_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
+from gfnn_jax.errors import FitError
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.lagrangian import Powers
 from gfnn_jax.families.text import Term
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.in_use import CalibratedLaw, GaugedLaw
 from gfnn_jax.models.lagrangians.input_rules import InputModel
@@ -26,6 +29,7 @@ from gfnn_jax.models.lagrangians.learned_law import (
 )
 from gfnn_jax.models.lagrangians.next_motion import Motion
 from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness, whiteness
+from gfnn_jax.models.lagrangians.structure import Structure, is_constant
 from gfnn_jax.models.lagrangians.text import (
     friction_of,
     of_systems,
@@ -34,6 +38,7 @@ from gfnn_jax.models.lagrangians.text import (
     word_of,
 )
 from gfnn_jax.models.lagrangians.velocities import Velocity
+from gfnn_jax.models.lagrangians.weak_form import trend
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +61,7 @@ class WarningOptions:
     nearly: float = 99.99
     complete: float = 99.999
     alike: float = 0.99
+    left: float = 0.05
 
 
 OPTIONS = WarningOptions()
@@ -231,9 +237,32 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
         flaws["the record gains energy that no input explains"] = (
             "a force is missing beside the inputs that are named"
             if best.law.num_inputs
-            else "if the system is driven, name its drive: --inputs NAME (inputs=)"
+            else "if the system is driven, name its drive: --inputs NAME (inputs=); if not, it "
+            "excites itself, as friction below zero does, which is no term of R"
         )
-    return flaws
+    return flaws | _trend(best.fit)
+
+
+def _trend(fit: LawFit) -> dict[str, str]:
+    """A plainer law with a coefficient that changes in time, which explains the motion as the terms
+    do that it lacks: with an amplitude that dies down these imitate what ages."""
+    problem, structure = fit.problem, fit.structure
+    constant = [row for row in structure.terms if sum(row[0]) < 2 or is_constant(row)]
+    textbook = libraries.textbook(structure.dim, problem.angles)
+    for rows in map(tuple, (textbook, constant)):
+        if len(rows) >= len(structure.terms) or problem.parameters:
+            continue
+        plain = Structure(structure.dim, rows, structure.friction, (), structure.num_inputs)
+        with contextlib.suppress(FitError):
+            found = trend(plain, problem)
+            if found is not None and found[2] < OPTIONS.left:
+                word = problem.word(found[0])
+                return {
+                    f"{word} may change along the record, by {found[1]:+.1%} of it, with fewer "
+                    "terms": "a system that ages, or a clock that drifts, looks so. Fit its parts "
+                    "one by one (--from, --to), and compare"
+                }
+    return {}
 
 
 def _not_seen(gains: Gains) -> list[str]:

@@ -64,13 +64,14 @@ def protected(structure: Structure) -> set[Key]:
 
 class _Equations(NamedTuple):
     """X (windows, d, n) c = Y (windows, d) of coefficients ``keys``, of which ``keep`` (indices)
-    act and ``masses`` are ½."""
+    act and ``masses`` are ½; t (windows,) where their windows are."""
 
     keys: list[Key]
     X: np.ndarray
     Y: np.ndarray
     keep: list[int]
     masses: list[int]
+    t: np.ndarray
 
     @classmethod
     def of(cls, structure: Structure, problem: ArcProblem, equal: bool) -> _Equations:
@@ -81,27 +82,54 @@ class _Equations(NamedTuple):
         args = np.repeat([n.stretch.args for n in nodes], [len(n.t) for n in nodes], axis=0)
         form = structure.form(np.concatenate([n.x[:, :d] for n in nodes]), args)
         lengths = [length * problem.scales.period for length in OPTIONS.lengths]
-        parts = [
+        windows = [
             # of a run that is shorter than a window, all of it
-            weak_rows(form, node, min(length, 0.999 * np.ptp(node.t)) if uneven else length)
+            (node, min(length, 0.999 * np.ptp(node.t)) if uneven else length)
             for node in nodes
             for length in lengths
         ]
-        rows, targets = zip(*parts, strict=True)
+        rows, targets = zip(*(weak_rows(form, *window) for window in windows), strict=True)
+        t = [np.mean(n.t[place]) for n, length in windows for place, *_ in bumps(n.t, length)]
         X, Y = np.concatenate(rows), -np.concatenate(targets)
         keys = structure.keys()[: form.count]
         keep = [k for k in range(form.count) if np.any(X[..., k])]
         masses = [k for k in keep if equal and keys[k] in protected(structure)]
         keep = [k for k in keep if k not in masses]
         Y = Y - 0.5 * X[..., masses].sum(axis=-1)
-        return cls(keys, X, Y, keep, masses)
+        return cls(keys, X, Y, keep, masses, np.array(t))
 
 
 def weak_share(structure: Structure, problem: ArcProblem) -> float:
     """Share of the squares of the equations of motion that all terms of a structure, with equal
     masses, leave."""
-    _, X, Y, keep, _ = _Equations.of(structure, problem, True)
-    residual = _solve(X[..., keep], Y)[1] if keep else Y
+    _, X, Y, keep, *_ = _Equations.of(structure, problem, True)
+    return _share(X[..., keep], Y)
+
+
+def trend(structure: Structure, problem: ArcProblem) -> tuple[Key, float, float] | None:
+    """The force whose coefficient, did it change in proportion to time, would leave least of the
+    equations of motion of a structure; its change from the record's begin to its end, relative to
+    its mean; and the share of the squares of the residuals that it leaves. None where there is no
+    force."""
+    keys, X, Y, keep, _, t = _Equations.of(structure, problem, False)
+    place = (t - np.mean(t)) / max(np.ptp(t), 1e-300)
+    X, keys = X[..., keep], [keys[k] for k in keep]
+    before, found = _share(X, Y), []
+    for k, key in enumerate(keys):
+        if key[0] == "term" and not any(key[1][0]):
+            more = np.concatenate([X, X[..., [k]] * place[:, None, None]], axis=-1)
+            c = _solve(more, Y)[0]
+            change = float(c[-1] / c[k]) if c[k] else np.inf
+            found.append((_share(more, Y) / max(before, 1e-300), key, change))
+    if not found:
+        return None
+    share, key, change = min(found, key=lambda one: one[0])
+    return key, change, share
+
+
+def _share(X: np.ndarray, Y: np.ndarray) -> float:
+    """Share of the squares of Y that X c leaves."""
+    residual = _solve(X, Y)[1] if X.shape[-1] else Y
     return float(np.sum(residual**2) / max(np.sum(Y**2), 1e-300))
 
 
@@ -113,7 +141,7 @@ def weak_start(
 
     Raises FitError where a coordinate without mass and force solves the equations.
     """
-    keys, X, Y, keep, masses = _Equations.of(structure, problem, equal)
+    keys, X, Y, keep, masses, _ = _Equations.of(structure, problem, equal)
     fixed, significant = protected(structure), problem.options.evidence.significant
     weight = np.ones(structure.dim)
     while True:
