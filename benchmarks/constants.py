@@ -135,7 +135,7 @@ def record() -> Outcome:
         angle.append(z[0, 0])
         z = moved(PENDULUM, z, 0.1)
     noisy = np.array(angle) + 2e-3 * rng.standard_normal(600)
-    fit = gfnn.fit(
+    fit: Any = gfnn.fit(
         gfnn.Recording({"t": 0.1 * np.arange(600), "x": noisy}, positions=["x"], angles=["x"])
     )
     law = {term.term: term.coefficient for term in fit.lagrangian.terms}

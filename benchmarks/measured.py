@@ -172,7 +172,7 @@ def measure(name: str, path: Path, fold: int, told: Any = None) -> dict[str, Any
     recording = gfnn.read(path, **columns)
     training, held = split(recording, fold)
     started = time.process_time()
-    fit = gfnn.fit(training, on_progress=told or (lambda line: None))
+    fit: Any = gfnn.fit(training, on_progress=told or (lambda line: None))
     seconds = time.process_time() - started
     times, unit, asked, most = RECORDS[name]
     errors, within = forecasts(fit.map, held, times)

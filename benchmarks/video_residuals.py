@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", default=RESULTS)
     arguments = parser.parse_args()
     recording = gfnn.read(arguments.folder / f"{NAME}.csv")
-    fit = gfnn.fit(recording, terms=TERMS, on_progress=lambda line: None)
+    fit: Any = gfnn.fit(recording, terms=TERMS, on_progress=lambda line: None)
     print(fit.formula, fit.friction.formula, sep="\n")
     found = {f"{seconds:g}": causes(law_of(fit.map), recording, seconds) for seconds in LENGTHS}
     out = arguments.out / "video-residuals.json"
@@ -78,7 +78,8 @@ def main() -> None:
 def causes(law: Law, recording: Any, seconds: float) -> dict[str, Any]:
     """Mean squares of the held-out residuals by cause, and the torques of arcs of that length."""
     found = stretches(recording)
-    scales, size = measure(found), round(seconds / measure(found).dt)
+    scales: Any = measure(found)
+    size = round(seconds / scales.dt)
     places = [(s, k) for s in found for k in range(0, len(s.t) - size, size)]
     places = places[:: max(1, len(places) // ARCS)]
     t = np.array([s.t[k : k + size] for s, k in places])

@@ -179,6 +179,7 @@ def of_kind(name: str, quick: bool) -> Numbers:
         labels[f"{fit.chosen.chart} {fit.chosen.label}"] += 1
         if fit.map.posterior is None:
             continue
+        info: Any
         states, info = fit.map.rollout(
             kind.z0, STEPS[-1], samples=SAMPLES, key=jax.random.key(seed), **kind.ahead
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from harness import SEED, Numbers, once
@@ -35,11 +36,8 @@ def learned(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", gfnn.FitWarning)
             pairs = gfnn.Pairs(before[:count], after[:count], 1 / (len(sectors) - 1), given)
-            fits.append(
-                gfnn.fit(
-                    pairs, learn="map", tolerance=tolerance, max_seconds=None, seed=SEED, **options
-                )
-            )
+            asked: Any = {"tolerance": tolerance, "max_seconds": None, "seed": SEED} | options
+            fits.append(gfnn.fit(pairs, learn="map", **asked))
     map_ = fits[0].map
     for fit in fits[1:]:
         map_ = map_.then(fit.map)

@@ -339,7 +339,7 @@ class LawFit:
         """Coefficients that some combination which moves nothing is of."""
         if not self.follows:
             return set()
-        parts = np.any(self.linearised.null_space() != 0, axis=0).tolist()
+        parts = np.atleast_1d(np.any(self.linearised.null_space() != 0, axis=0)).tolist()
         keys = self.structure.keys()
         return {key for key, part in zip(keys, parts, strict=True) if part}
 

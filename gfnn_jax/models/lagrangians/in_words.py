@@ -51,13 +51,15 @@ class WarningOptions:
     correlated residuals are motion that the law lacks, unless it follows ``nearly`` all, in %:
     there they may be a series that a library ends. complete: %, above which what is left is no
     energy that is gained. alike: correlation of two coefficients that the
-    record cannot tell apart.
+    record cannot tell apart. energies: range of the energy, as a share of the largest kinetic one,
+    below which a motion of one coordinate shows M and V together only.
     """
 
     clear: float = 3.0
     many: int = 3
     followed: float = 90.0
     beyond: float = 3.0
+    energies: float = 0.1
     nearly: float = 99.99
     complete: float = 99.999
     alike: float = 0.99
@@ -324,10 +326,25 @@ def _alike(fit: LawFit, lagrangian: Formula, friction: Formula) -> tuple[str, ..
     listed, open_ = list(names.values()), fit.undetermined
     together = [name for key, name in names.items() if key in open_]
     only = (f"{', '.join(together)}: {ONLY_TOGETHER}",) if together else ()
+    if _is_of_one_energy(fit):
+        only += (f"M and V, of whose motion one energy was recorded: {ONLY_TOGETHER}",)
     return only + tuple(
         f"{listed[i]} and {listed[j]} (correlation {rho:+.3f})"
         for i, j, rho in fit.linearised.collinear(OPTIONS.alike)
     )
+
+
+def _is_of_one_energy(fit: LawFit) -> bool:
+    """Return whether the states of a law of one coordinate with masses M(q) have one energy, so
+    that any M with some V gives the same speed at each position."""
+    masses = [row for row in fit.structure.terms if row[0] == (2,)]
+    if fit.form.dim > 1 or all(is_constant(row) for row in masses):
+        return False
+    law = fit.form.lagrangian(fit.p[: fit.form.count]).at(fit.problem.args)
+    q, v = np.split(fit.problem.states, 2, axis=1)
+    energy = np.quantile(law.energy(q, v), (0.05, 0.95))
+    moving = 0.5 * law.masses(q)[:, 0, 0] * v[:, 0] ** 2
+    return bool(np.ptp(energy) < OPTIONS.energies * np.quantile(moving, 0.95))
 
 
 def _energy(traces: Sequence[Trace], friction: Formula, inputs: tuple[str, ...]) -> dict[str, Any]:

@@ -1,0 +1,33 @@
+"""Masses that depend on the only coordinate: what one energy shows of them, and several."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+
+
+def disc(amplitude, t):
+    """L = ½(1 + q²) v² − ½ q²."""
+    done = solve_ivp(
+        lambda _, z: [z[1], -z[0] * (1 + z[1] ** 2) / (1 + z[0] ** 2)],
+        (0, t[-1]),
+        [amplitude, 0.0],
+        t_eval=t,
+        rtol=1e-10,
+        atol=1e-12,
+    )
+    return done.y[0]
+
+
+@pytest.mark.parametrize(("amplitudes", "kind"), [((0.9,), "one"), ((0.9, 0.4), "identified")])
+def test_masses_of_one_coordinate_are_told_by_several_energies(amplitudes, kind):
+    t, rng = np.linspace(0, 60, 800), np.random.default_rng(1)
+    q = np.concatenate([disc(a, t) for a in amplitudes])
+    table = {
+        "run": np.repeat(np.arange(len(amplitudes)), len(t)),
+        "t": np.tile(t, len(amplitudes)),
+        "x": q + 1e-3 * rng.normal(size=len(q)),
+    }
+    fit = gfnn.fit(gfnn.Recording(table, positions=["x"]), terms=["v**2", "v**2*x**2", "x**2"])
+    assert fit.verdict.split()[0] == kind
