@@ -88,7 +88,7 @@ def test_an_encoder_that_was_switched_on_anywhere(zero):
         lambda q, v: -2 * np.sin(q - zero) - 0.02 * v, [zero + 1, 0], ["theta"], angles=["theta"]
     )
     _, potential = gfnn.fit(swings).lagrangian.terms
-    law = sp.sympify(str(potential.coefficient)) * sp.sympify(potential.term)
+    law = sp.sympify(f"{float(potential.coefficient)!r} * ({potential.term})")
     at = np.linspace(-3, 3, 7)
     np.testing.assert_allclose(
         sp.lambdify(sp.Symbol("theta"), law)(at), 2 * np.cos(at - zero), atol=1e-4

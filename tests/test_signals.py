@@ -270,6 +270,7 @@ def test_what_an_input_supplies_is_no_gain():
     x = solve_ivp(driven, (0, 20), [0, 0], "DOP853", T, rtol=1e-10).y[:1]
     fits = local_fits([T], x, 21, 4)
     period = energy.mean_period(fits, 1)
+    assert period is not None
     found = energy.loss(fits, [False], np.sin(2.5 * fits.centres)[None], period)
     assert found.per_period == pytest.approx(0.3 * period, rel=0.05)
 

@@ -173,6 +173,8 @@ class _System(NamedTuple):
         for _ in range(OPTIONS.iterations):
             found = self.law.derivatives(q, v)
             step = np.linalg.lstsq(found.by_qq, found.by_q, rcond=None)[0]
+            if np.any(np.abs(found.by_qq @ step - found.by_q) > 1e-6 * np.abs(found.by_q).max()):
+                return None  # a force that no displacement balances
             step = step * min(1.0, 1.0 / max(np.max(np.abs(step / self.size)), 1e-300))
             q = q - step
             if np.all(np.abs(step) < 1e-12 * self.size):

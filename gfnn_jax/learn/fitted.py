@@ -67,6 +67,10 @@ class OfPositions:
         )
 
 
+# Noise in a step, of the spread, under which laws differ by less than it (`benchmarks/laws.py`).
+_HIDES = 0.2
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Choice:
     """A choice of a map among candidates.
@@ -151,6 +155,12 @@ class Choice:
         # Sums over sites have terms that vanish or add up to nothing, whatever the data.
         if law.null_terms and not isinstance(law.flow.family, Sums):
             return f"one of several: the pairs do not tell {', '.join(law.null_terms)} apart"
+        relative = self.chosen.validation_relative
+        if relative > _HIDES:
+            return (
+                f"one of several: noise of {relative:.0%} of the spread in a step hides what another "
+                "law would leave"
+            )
         rivals = [rival.formula for rival in law.rivals if rival.odds < EVIDENCE.decided]
         return f"one of several: {'; '.join(rivals)} is as likely" if rivals else "identified"
 

@@ -269,7 +269,8 @@ def _through_flow(
         fit = fit._replace(c=own.c, root=own.root)
     if found.several > 1:
         note = f"one of a family of {found.several}"
-        field = dataclasses.replace(field, bracket=dataclasses.replace(field.bracket, note=note))
+        bracket: Any = field.bracket
+        field = dataclasses.replace(field, bracket=dataclasses.replace(bracket, note=note))
         notes = (
             *notes,
             f"one of a family of {found.several} brackets, each of which makes the same motion "
