@@ -94,6 +94,7 @@ def test_several_brackets_are_said_to_be():
     assert "one of a family of 2 brackets" in " ".join(law.notes)
 
 
+@pytest.mark.slow
 def test_h_that_is_no_polynomial():
     def field(z):
         return heavy(z, lambda x: -1 / (1.5 + x) ** 2)

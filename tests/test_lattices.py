@@ -481,7 +481,7 @@ def test_kicked_sites_of_plain_coordinates():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"structure": "torus"}, "expected a structure among ring, chain, bodies:N"),
+        ({"structure": "torus"}, "expected a structure among"),
         ({"structure": "ring:0"}, "expected a structure among"),
         ({"structure": "ring:3"}, "expected 3 q of every site; got 20"),
         ({"structure": "chain:10"}, "at least 5 sites, got 2"),

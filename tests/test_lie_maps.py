@@ -53,6 +53,7 @@ def test_mean_of_arc():
     np.testing.assert_allclose(slope[0], jax.jacfwd(mean)(xi), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_law_without_a_lift(tmp_path):
     """Toda in Flaschka's variables: accuracy, Poisson defect, Casimir, saving, another dt."""
     bracket = gfnn.Bracket.from_constants(TODA)

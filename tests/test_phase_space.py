@@ -87,7 +87,7 @@ def test_float64_is_required_by_name():
     [
         ([[0.0, 1.0]], [[0.0, 1.0]], "got a list"),
         (np.zeros((3, 2)), np.zeros((2, 2)), r"got \(3, 2\) and \(2, 2\)"),
-        (np.zeros((3, 3)), np.zeros((3, 3)), r"\(N, 2d\)"),
+        (np.zeros((3, 3)), np.zeros((3, 3)), "no positions and momenta"),
         (np.zeros(4), np.zeros(4), r"\(N, 2d\)"),
     ],
 )

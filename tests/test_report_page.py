@@ -189,6 +189,7 @@ def test_a_fit_without_float64_says_so_at_once():
         gfnn.fit(t, x)
 
 
+@pytest.mark.slow
 def test_options_of_columns_serve_the_one_command(tmp_path, monkeypatch, capsys):
     """What `gfnn look` proposes, `gfnn FILE` takes."""
     monkeypatch.chdir(tmp_path)

@@ -158,8 +158,8 @@ class Choice:
         relative = self.chosen.validation_relative
         if relative > _HIDES:
             return (
-                f"one of several: noise of {relative:.0%} of the spread in a step hides what another "
-                "law would leave"
+                f"one of several: noise of {relative:.0%} of the spread in a step hides what "
+                "another law would leave"
             )
         rivals = [rival.formula for rival in law.rivals if rival.odds < EVIDENCE.decided]
         return f"one of several: {'; '.join(rivals)} is as likely" if rivals else "identified"
