@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import importlib
 import itertools
 import os
 import signal
@@ -42,6 +43,8 @@ def pytest_configure(config):
     if config.getoption("typecheck"):
         from jaxtyping import install_import_hook
 
+        # Numba compiles and keeps plain functions, no wrappers of them.
+        importlib.import_module("gfnn_jax.flows.kernel")
         install_import_hook("gfnn_jax", "typechecker.checked")
     if "XLA_FLAGS" not in os.environ:  # which JAX reads when it is first used
         # XLA ends a process that asks for what it does not know: that of another release might.

@@ -59,7 +59,7 @@ def text_of(path: Path) -> Text:
             head = stream.read(_OPTIONS.sniffed)
     encoding = _encoding(path, head)
 
-    def text() -> TextIO:
+    def text() -> io.TextIOBase:
         return io.TextIOWrapper(opened(), encoding, errors="strict")
 
     begin = head.decode(encoding, "ignore")

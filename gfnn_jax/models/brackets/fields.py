@@ -11,7 +11,7 @@ is one least-squares problem whose columns are means of v_j along the paths. It 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.linalg import qr
@@ -43,6 +43,7 @@ class Options:
 OPTIONS = Options()
 
 
+@runtime_checkable
 class Columns(Protocol):
     """Vector fields v_j."""
 
@@ -51,6 +52,7 @@ class Columns(Protocol):
         ...
 
 
+@runtime_checkable
 class Field(Columns, Protocol):
     """Family of vector fields, linear in its coefficients c (J,). All in NumPy, z (N, n)."""
 
