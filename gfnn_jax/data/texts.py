@@ -14,7 +14,7 @@ import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import Any, BinaryIO, TextIO
 
 from gfnn_jax.data.blocks import damage
 from gfnn_jax.errors import InputError
@@ -59,7 +59,7 @@ def text_of(path: Path) -> Text:
             head = stream.read(_OPTIONS.sniffed)
     encoding = _encoding(path, head)
 
-    def text() -> io.TextIOBase:
+    def text() -> Any:  # a TextIO, which io.TextIOWrapper is not at run time
         return io.TextIOWrapper(opened(), encoding, errors="strict")
 
     begin = head.decode(encoding, "ignore")
