@@ -99,6 +99,7 @@ def test_step(name, tmp_path):
     assert str(again.bracket) == str(bracket)
 
 
+@pytest.mark.slow
 def test_transformations():
     """jit, vmap and grad, in states and coefficients, by the implicit function theorem."""
     map_, z = made("top")

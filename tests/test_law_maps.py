@@ -299,6 +299,7 @@ def test_a_rollout_across_a_stop():
     np.testing.assert_array_equal(held[1:], np.broadcast_to(states[0, -1], (10, 2)))
 
 
+@pytest.mark.slow
 def test_a_rollout_under_jit_smooths_dry_friction():
     map_, z = learned_block(), np.array([0.42, 0.0])
     exact = map_.rollout(z, 20)[0]

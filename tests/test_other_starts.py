@@ -32,6 +32,7 @@ def coefficients(expression):
     return {term.term: term.coefficient for term in expression.terms}
 
 
+@pytest.mark.slow
 def test_a_trap_whose_axes_are_not_coupled_has_its_law():
     trap = recorded(lambda q, v: -np.array([1.0, 2.3]) * q - 0.01 * v, [1, 0.7, 0, 0], ["x", "y"])
     fit = gfnn.fit(trap)
@@ -58,6 +59,7 @@ def test_two_pendulums_in_one_file_have_their_laws():
     assert len(found) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [[0.2, 0.1, 0.1, 0.3], [0.2, 0.25, 0, 0]], ids=["turns", "rest"])
 def test_henon_and_heiles_potential_from_positions(start):
     """From rest the motion is nearly along a line, of which a law with couplings alone makes

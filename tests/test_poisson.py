@@ -82,6 +82,7 @@ def test_three_columns_say_what_to_type():
         gfnn.Pairs(np.zeros((5, 3)), np.zeros((5, 3)), 0.1)
 
 
+@pytest.mark.slow
 def test_states_that_are_taken_for_canonical_are_told_their_bracket():
     starts = np.random.default_rng(0).uniform(0.5, 1.5, (30, 2))
     data = runs_of(lambda z: z * np.array([1 - z[1], z[0] - 1]), starts, 0.3, 20)

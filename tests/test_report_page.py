@@ -205,6 +205,7 @@ CHROMIUM = next(
 )
 
 
+@pytest.mark.slow
 def test_what_look_proposes_is_taken_and_said(tmp_path, monkeypatch):
     """Angles and a first time that `gfnn look` proposes, as though they had been typed."""
     t, x = swing(12.0)

@@ -197,6 +197,7 @@ def test_a_killed_process_ends_the_others(killed, folder):
         predictions.number_of_parts(out, Share(0, 3), resume=False)
 
 
+@pytest.mark.slow
 def test_a_killed_job_resumes_to_the_same_bits(folder, alone, monkeypatch):
     """Resume where only the beginning of one of two parts is there."""
     from gfnn_jax.jobs import predict as job

@@ -260,6 +260,7 @@ def test_a_rollout_takes_the_parameter(of_lengths):
     assert fit.map.multiplier() == pytest.approx(np.exp(-0.1 * dt), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_the_formula_can_be_given_again(of_lengths):
     recording, fit = of_lengths
     again = gfnn.fit(recording, terms=[fit.formula, "R: omega**2"])
@@ -271,6 +272,7 @@ def test_the_formula_can_be_given_again(of_lengths):
         gfnn.fit(recording, terms=["V: cos(theta)/sqrt(l)"])
 
 
+@pytest.mark.slow
 def test_a_column_that_does_not_matter_changes_nothing():
     runs = [swings((1.0,), end=9.0) for _ in range(3)]
     tables = [

@@ -58,6 +58,7 @@ def test_a_foucault_pendulum_has_its_field_and_its_hamiltonian():
     assert float(fit.hamiltonian.sympy().subs(at)) == pytest.approx(float(H.subs(at)), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_field_with_a_gradient_from_motion_that_drifts():
     def acceleration(q, v):
         return (1 + 0.4 * q[0]) * np.array([v[1], -v[0]])
@@ -82,6 +83,7 @@ def test_a_bead_on_a_wire_has_a_mass_that_depends_on_its_place():
     within_errors(fit.lagrangian, {"v1**2": 0.5, "v1**2*x1**2": 0.5, "x1**2": -0.5}, scale)
 
 
+@pytest.mark.slow
 def test_a_torsion_spring_between_pendulums_that_stay_within_a_turn():
     def acceleration(q, v):
         twist = 1.2 * (q[1] - q[0])
