@@ -32,6 +32,7 @@ def test_what_is_said_is_true(name):
     assert measured["wrong"] == [], measured["messages"]
 
 
+@pytest.mark.slow
 def test_the_quick_cases_write_their_result(tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark, "measure", lambda name: MEASURED | {"messages": [name]})
     benchmark.main(["--quick", "--out", str(tmp_path)])

@@ -138,6 +138,7 @@ def test_bands_hold_the_true_error(fit, noise):
         assert np.sqrt(np.mean(error**2)) < noise
 
 
+@pytest.mark.slow
 def test_a_saved_ensemble_keeps_its_members_and_predicts_bands(fit, tmp_path):
     fit.map.save(tmp_path / "m")
     again, z, key = gfnn.load(tmp_path / "m").map, states(5, 5), jax.random.key(2)

@@ -132,6 +132,7 @@ def looked_for(spoilt, monkeypatch):
     return looked
 
 
+@pytest.mark.slow
 def test_without_a_budget_gross_errors_are_left_out(looked_for):
     budget = Budget()
     left, asked = looked_for(budget)

@@ -210,6 +210,7 @@ assert same and os.waitpid(child, 0)[1] == 0
 """
 
 
+@pytest.mark.slow
 def test_an_installation_that_cannot_be_written(tmp_path):
     """The cache goes to a temporary folder. Numba checks every place in an array meanwhile."""
     package = tmp_path / "gfnn_jax"

@@ -49,6 +49,7 @@ def coefficients_of(family, params, w):
     return least_squares.fit(family, rows, rows, np.ones(2)).coefficients
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "chart", [MIDPOINT, pytest.param(TYPE2, marks=pytest.mark.slow)], ids=["midpoint", "type2"]
 )

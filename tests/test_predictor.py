@@ -144,6 +144,7 @@ def there_and_back(piece, z):
     return image, info, *piece.inverse().step(image)
 
 
+@pytest.mark.slow
 def test_a_close_start_saves_updates_and_changes_only_roundoff():
     plain = generated(pendulum, 1.0, MIDPOINT, DT)
     image, info, _, _ = there_and_back(plain, STATES)

@@ -133,6 +133,7 @@ def test_a_gyroscope_alone(gyroscope):
     )
 
 
+@pytest.mark.slow
 def test_a_gyroscope_from_the_command_line(gyroscope, tmp_path, capsys):
     path, model = tmp_path / "phone.csv", tmp_path / "model"
     rows = np.stack([*gyroscope.values()], axis=1)

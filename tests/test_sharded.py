@@ -100,6 +100,7 @@ assert predicted("stopped.npz", 2, resume=True) == whole, "resumed on other devi
 """
 
 
+@pytest.mark.slow
 def test_the_same_bits_on_any_number_of_devices(folder):
     run_python(ON_DEVICES, folder, devices=3)
 
@@ -290,6 +291,7 @@ def sampled_folder(folder, tmp_path_factory):
     return more
 
 
+@pytest.mark.slow
 def test_samples_of_any_number_of_processes(sampled_folder):
     """Compare numbers of processes; a stopped job resumes on fewer than began it."""
     from gfnn_jax.jobs import predict as job

@@ -54,6 +54,7 @@ def test_derivatives_are_those_of_jax():
     assert np.abs(terms).max(axis=(0, 1)).min() > 0
 
 
+@pytest.mark.slow
 def test_any_step_of_the_range(learned):
     assert (learned.chosen.learns, learned.chosen.chart) == ("map", "midpoint")
     assert learned.chosen.validation_relative < 1e-5

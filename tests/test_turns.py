@@ -72,6 +72,7 @@ def test_a_step_that_is_too_long_is_named(dt, said):
     assert not long_step(data, gfnn.scenes.make("standard-map-regular"))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
 @pytest.mark.parametrize("dt", [4.0, pytest.param(5.5, marks=pytest.mark.slow)])
 def test_a_law_of_few_terms_is_found_beyond_half_a_turn_and_that_is_said(dt):
