@@ -100,8 +100,8 @@ def nature(
     if q.shape[1] > 1 and first > max(OPTIONS.first, plain):  # alone it would not come back
         return Nature(
             "not mechanical",
-            f"first order: positions alone tell {100 * first:.1f} % of the velocities, as of "
-            "populations or concentrations",
+            f"first order, or one orbit: positions tell {100 * first:.1f} % of the velocities, "
+            "as of populations or concentrations",
             partly=False,
         )
     jumps, when = _jumps(found)
