@@ -87,6 +87,9 @@ def test_formulas_in_a_browser_and_in_latex_have_errors_and_whole_names():
     assert formula.latex() == r"-62.21(1) \mathrm{swing\_angle}^{2}"
     assert "<mn>62.21(1)</mn>" in formula.mathml()
     assert "<mi>swing_angle</mi>" in formula.mathml()
+    relative = Formula((Term("(v1 - v2)", -0.5, 0.0),))  # the coefficient is of the whole sum
+    assert relative.latex().startswith(r"-0.5 \left(")
+    assert relative.mathml().index("(</mo>") < relative.mathml().index("<mi>v</mi>")
     assert as_latex("theta1_ddot") == r"\ddot{\theta_{1}}"
     assert "¨" in as_mathml("x_ddot")
 

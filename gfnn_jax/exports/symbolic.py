@@ -44,7 +44,10 @@ class Formula:
 
     def latex(self) -> str:
         """Formula in LaTeX's notation, its terms in their order, with errors in the last digits."""
-        return added(_times(c, s, as_latex(t)) for t, c, s in self.terms) or "0"
+        texts = (
+            rf"\left({as_latex(t)}\right)" if _is_sum(t) else as_latex(t) for t, _, _ in self.terms
+        )
+        return added(_times(c, s, t) for t, (_, c, s) in zip(texts, self.terms, strict=True)) or "0"
 
     def mathml(self) -> str:
         """Formula as presentation MathML that browsers typeset, with errors: an element for each
@@ -54,6 +57,8 @@ class Formula:
             sign = "−" if c < 0 else "+" if place else ""
             number, _, _ = _times(abs(c), s, "").partition(" ")
             body = as_mathml(term) if term != "1" or not number else ""
+            if _is_sum(term):
+                body = f'<mo stretchy="false">(</mo>{body}<mo stretchy="false">)</mo>'
             parts.append(_math(f"<mo>{sign}</mo>" * bool(sign) + _number(number) + body))
         return " ".join(parts) or _math("<mn>0</mn>")
 
@@ -62,6 +67,11 @@ class Formula:
 
     def _repr_html_(self) -> str:
         return self.mathml()
+
+
+def _is_sum(term: str) -> bool:
+    """Return whether a term is a sum, which a coefficient multiplies as a whole."""
+    return bool(as_sympy(term).is_Add)
 
 
 def _times(coefficient: float, std: float, term: str) -> str:
