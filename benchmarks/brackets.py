@@ -142,7 +142,7 @@ SYSTEMS: dict[str, tuple[Field, Any, float, int, str]] = {
     ),
     "three vortices": (vortices([1, 0.6, -0.8]), apart(3), 0.2, 20, "constant"),
     "four vortices": (vortices([1, 0.6, 0.8, 1.3]), apart(4), 0.2, 20, "constant"),
-    "Toda's chain by Flaschka": (toda, chain, 0.2, 75, "a Lie algebra"),
+    "Toda's chain by Flaschka": (toda, chain, 0.2, 75, "aff(1)³ + R"),
     "charge, field 1 + 0.4 x": (charged, normal(4, 0.7), 0.2, 40, "canonical by p = m v + A(x)"),
     "top, V = 1/(1.5 + Γ3)": (heavy(lambda x: -1 / (1.5 + x) ** 2), unit_gravity, 0.2, 30, "se(3)"),
     "top, V = exp Γ3": (heavy(np.exp), unit_gravity, 0.2, 30, "se(3)"),

@@ -22,8 +22,8 @@ from gfnn_jax.phase_space import symplectic_form
 
 # Relative to the largest entry: below it a constant is roundoff, and Jacobi's identity holds.
 _ROUNDOFF = 1e-10
-_BLOCKS = {"so3": 3, "se3": 6, "centre": 1}
-_NAMES = {"so3": "so(3)", "se3": "se(3)", "centre": "R"}
+_BLOCKS = {"so3": 3, "se3": 6, "aff": 2, "centre": 1}
+_NAMES = {"so3": "so(3)", "se3": "se(3)", "aff": "aff(1)", "centre": "R"}
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -70,7 +70,8 @@ class Bracket:
 
     @staticmethod
     def lie(blocks: Sequence[str], basis=None, names: Sequence[str] = ()) -> LieAlgebra:
-        """Sum of algebras "so3", "se3" and "centre" (one coordinate that has bracket 0 with all).
+        """Sum of algebras "so3", "se3", "aff" ({a, b} = a, a > 0: scalings of a line, of which
+        Toda's chain is made) and "centre" (one coordinate that has bracket 0 with all).
 
         basis: L (n, n), where L z and not z has the standard constants, block after block.
         Raises FitError for another block, and where L is not invertible.
@@ -273,7 +274,7 @@ class LieAlgebra(Bracket):
     names: tuple[str, ...] = ()
     note: str = ""
 
-    _undefined = "Γ = 0, or a value is missing,"
+    _undefined = "Γ = 0 in se(3), a ≤ 0 in aff(1), or a value is missing,"
 
     @property
     def size(self) -> int:
@@ -294,13 +295,26 @@ class LieAlgebra(Bracket):
         return matmul(z, self.constants.reshape(n * n, n).T).reshape(*z.shape[:-1], n, n)
 
     def outside(self, z):
-        """Flag (...) of states with Γ = 0 in a part se(3)."""
+        """Flag (...) of states with Γ = 0 in a part se(3), or a ≤ 0 in a part aff(1)."""
         xp, bad = namespace(z), super().outside(z)
-        for place in places(self.blocks):
-            if place.stop - place.start == _BLOCKS["se3"]:
-                y = matmul(z, self.basis.T)[..., place]
+        for block, place in zip(self.blocks, places(self.blocks), strict=True):
+            y = matmul(z, self.basis.T)[..., place]
+            if block == "se3":
                 bad = bad | (xp.max(xp.abs(y[..., 3:]), axis=-1) == 0)
+            elif block == "aff":
+                bad = bad | (y[..., 0] <= 0)
         return bad
+
+    @property
+    def opposite(self) -> LieAlgebra:
+        """The bracket −B."""
+        if not self.blocks:
+            return dataclasses.replace(self, constants=-self.constants)
+        basis = -self.basis
+        for block, place in zip(self.blocks, places(self.blocks), strict=True):
+            if block == "aff":  # of {a, b} = a it is b that changes its sign
+                basis[place.start] *= -1.0
+        return Bracket.lie(self.blocks, basis, self.names)
 
     @cached_property
     def casimirs(self) -> tuple[Casimir, ...]:
@@ -453,11 +467,13 @@ def standard_constants(blocks: Sequence[str]) -> np.ndarray:
     found = np.zeros((sum(_BLOCKS[b] for b in blocks),) * 3)
     for block, place in zip(blocks, places(blocks), strict=True):
         own = np.zeros((_BLOCKS[block],) * 3)
-        if block != "centre":
+        if block in ("so3", "se3"):
             own[:3, :3, :3] = spin
         if block == "se3":
             own[:3, 3:, 3:] = spin
             own[3:, :3, 3:] = spin
+        if block == "aff":
+            own[0, 1, 0], own[1, 0, 0] = 1.0, -1.0
         found[place, place, place] = own
     return found
 

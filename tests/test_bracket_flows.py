@@ -32,6 +32,11 @@ SYSTEMS = {  # bracket, terms of H in q1.. p.., a state
         ("q1+q2", "p1"),
         [0.8, 1.4, 0.5],
     ),
+    "scalings": (
+        B.lie(("aff", "centre"), basis=[[1, 0, 0], [0.3, 1, 0], [0, 1, 1]]),
+        ("q1**2", "q2**2/2+p1**2/2"),
+        [0.8, -0.4, 0.5],
+    ),
     "degenerate": (
         B.constant([[0, 1, 0.3], [-1, 0, 0.2], [-0.3, -0.2, 0]]),
         ("q1**4", "q2**2+p1**2"),
@@ -121,7 +126,12 @@ def test_transformations():
 
 
 @pytest.mark.parametrize(
-    ("name", "bad"), [("top", [1, 2, 3, 0, 0, 0]), ("rock-paper-scissors", [1, -1, 1])]
+    ("name", "bad"),
+    [
+        ("top", [1, 2, 3, 0, 0, 0]),
+        ("rock-paper-scissors", [1, -1, 1]),
+        ("scalings", [-0.1, 1, 1]),
+    ],
 )
 def test_states_without_a_step_have_a_status(name, bad):
     map_, z = made(name)

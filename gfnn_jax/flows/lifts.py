@@ -8,6 +8,7 @@ of z (R. I. McLachlan, K. Modin & O. Verdier, "Collective symplectic integrators
 - so(3): Hopf's π: R⁴ -> R³, |w|² = 4|z|.
 - se(3): π: T*ℍ -> R⁶, Π = −½ Im(q̄ p), Γ = q̄ k q, where Γ is not 0.
 - velocities in a magnetic field: v = m⁻¹ (p − A(x)).
+- aff(1): a = q², b = q p / 2, where a > 0.
 - a Casimir coordinate: y = q p.
 - a constant bracket is its own lift, and a log-canonical one that of y = log z.
 """
@@ -26,7 +27,7 @@ from gfnn_jax.families.terms import Terms
 from gfnn_jax.phase_space import split
 
 # Coordinates of a block, and half those of its lift.
-_SIZES = {"so3": (3, 2), "se3": (6, 4), "centre": (1, 1)}
+_SIZES = {"so3": (3, 2), "se3": (6, 4), "aff": (2, 1), "centre": (1, 1)}
 
 
 def lift_of(bracket: Bracket) -> Any:
@@ -386,6 +387,24 @@ def _diagonal(values):
     return values[..., None] * as_row(np.eye(values.shape[-1]), values[..., None])
 
 
+def _up_scaled(y):
+    """(q, p) (..., 1) of (a, b) (..., 2)."""
+    q = namespace(y).sqrt(y[..., :1])
+    return q, 2.0 * y[..., 1:] / q
+
+
+def _scaled(u, w):
+    """Bilinear form (..., 2) of states (q, p)."""
+    (q, p), (r, s) = u, w
+    return namespace(q, r).concatenate([q * r, 0.25 * (q * s + p * r)], axis=-1)
+
+
+def _pulled_scaled(w, g):
+    """Covector (..., 1) of q and of p."""
+    q, p = w
+    return 2.0 * q * g[..., :1] + 0.5 * p * g[..., 1:], 0.5 * q * g[..., 1:]
+
+
 def _up_still(y):
     """(q, p) = (y, 1) of a Casimir y = q p (..., 1)."""
     return y, namespace(y).ones_like(y)
@@ -401,6 +420,6 @@ def _pulled_still(w, g):
     return g * w[1], g * w[0]
 
 
-_UP = {"so3": _up_spin, "se3": _up_top, "centre": _up_still}
-_PRODUCTS = {"so3": _spin, "se3": _top, "centre": _still}
-_PULLED = {"so3": _pulled_spin, "se3": _pulled_top, "centre": _pulled_still}
+_UP = {"so3": _up_spin, "se3": _up_top, "aff": _up_scaled, "centre": _up_still}
+_PRODUCTS = {"so3": _spin, "se3": _top, "aff": _scaled, "centre": _still}
+_PULLED = {"so3": _pulled_spin, "se3": _pulled_top, "aff": _pulled_scaled, "centre": _pulled_still}

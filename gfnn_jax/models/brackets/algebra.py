@@ -4,8 +4,8 @@ standard.
     {z_i, z_j} = Σ_k c_ijk z_k
 
 Constants (n, n, n), antisymmetric in the first two indices. so(3)^k is what has a negative definite
-Killing form and ideals of dimension three; se(3) has three rotations that turn an abelian radical.
-NumPy.
+Killing form and ideals of dimension three; se(3) has three rotations that turn an abelian radical;
+aff(1)^k, {a_i, b_i} = a_i, has what commutes and what the rest multiplies. NumPy.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.brackets import standard_constants
+from gfnn_jax.models.brackets.poisson_field import sparse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,6 +78,9 @@ def analysed(c: np.ndarray, zero: float = OPTIONS.zero) -> Algebra:
         lifted = _euclidean(c, values, vectors)
         if lifted is not None:
             return Algebra("se(3)", ("se3",), lifted)
+    scaled = _scalings(c, zero)
+    if scaled is not None:
+        return scaled
     if _solvable(c, zero):
         return Algebra(f"solvable, n = {n}")
     kind = "semisimple" if plus + minus == n else "with a radical"
@@ -151,6 +155,34 @@ def _aligned(rows: np.ndarray) -> np.ndarray:
     u, _, vt = np.linalg.svd(sign * rows[:, own].T)
     turned = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     return (u @ turned @ vt) @ rows
+
+
+def _scalings(c: np.ndarray, zero: float) -> Algebra | None:
+    """aff(1)^k + R^m: what an element h of general position multiplies, a_i with {a_i, h} = λ_i a_i
+    to real and different λ_i, and as many b_i of those that commute with h; None of any other."""
+    h = np.random.default_rng(OPTIONS.seed).normal(size=len(c))
+    turned = np.einsum("ijk,j->ki", c, h)  # of an element, by its coordinates: {·, h}
+    values, vectors = np.linalg.eig(turned)
+    limit = np.sqrt(zero) * np.abs(values).max(initial=0.0)
+    if np.abs(np.imag(values)).max() > limit:
+        return None
+    scaled = np.real(vectors).T[np.abs(values) > limit]
+    still = np.linalg.svd(turned)[2][len(scaled) :]
+    scaled = scaled / np.abs(scaled).max(axis=1, keepdims=True)
+    rates = np.einsum("ai,bj,ijk,ak->ab", scaled, still, c, scaled, optimize=True)
+    rates = rates / np.sum(scaled**2, axis=1)[:, None]  # {a_i, still_j} = rates_ij a_i
+    if not len(scaled) or np.linalg.matrix_rank(rates, tol=limit) < len(scaled):
+        return None
+    kernel = np.linalg.svd(rates)[2][len(scaled) :]  # of what commutes with all
+    centre = kernel @ still
+    partners = [sparse(row @ still, centre) for row in np.linalg.pinv(rates).T]
+    pairs = [row for both in zip(scaled, partners, strict=True) for row in both]
+    lifted = np.array([*pairs, *centre])
+    blocks = ("aff",) * len(scaled) + ("centre",) * len(centre)
+    if np.abs(changed(c, lifted) - standard_constants(blocks)).max() > 0.05:
+        return None
+    name = _power("aff(1)", len(scaled))
+    return Algebra(name + (" + " + _power("R", len(centre)) if len(centre) else ""), blocks, lifted)
 
 
 def _euclidean(c: np.ndarray, values: np.ndarray, vectors: np.ndarray) -> np.ndarray | None:

@@ -11,6 +11,7 @@ is one least-squares problem whose columns are means of v_j along the paths. It 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -32,9 +33,12 @@ class Options:
     solved: float = 3e-16  # of the sizes: a change of the stages that is roundoff
     most_stage_iterations: int = 60
     most_iterations: int = 40
+    most_halvings: int = 8  # of the first coefficients, until there is a flow
+    shares: tuple[float, ...] = (1.0, 0.4, 0.15, 0.05)  # of a step, that are tried
     # of the spread: residuals that are roundoff, and a gain of an iteration that is none
     roundoff: float = 1e-15
     gain: float = 0.9
+    dependent: float = 1e-13  # singular value ÷ the largest: columns that depend on others
     # singular value ÷ the largest, columns of unit length, below which pairs without noise do not
     # determine a combination of terms
     undetermined: float = 1e-10
@@ -44,16 +48,7 @@ OPTIONS = Options()
 
 
 @runtime_checkable
-class Columns(Protocol):
-    """Vector fields v_j."""
-
-    def columns(self, z: np.ndarray) -> np.ndarray:
-        """v_j (N, n, J)."""
-        ...
-
-
-@runtime_checkable
-class Field(Columns, Protocol):
+class Field(Protocol):
     """Family of vector fields, linear in its coefficients c (J,). All in NumPy, z (N, n)."""
 
     @property
@@ -67,6 +62,28 @@ class Field(Columns, Protocol):
 
     def jacobian(self, c: np.ndarray, z: np.ndarray) -> np.ndarray:
         """∂f/∂z (N, n, n)."""
+        ...
+
+    def columns(self, z: np.ndarray) -> np.ndarray:
+        """v_j (N, n, J)."""
+        ...
+
+
+@runtime_checkable
+class Shaped(Field, Protocol):
+    """Family with constants θ (I,) inside its v_j."""
+
+    @property
+    def constants(self) -> np.ndarray:
+        """θ."""
+        ...
+
+    def by_constants(self, c: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """∂f/∂θ (N, n, I)."""
+        ...
+
+    def with_constants(self, theta: np.ndarray) -> Shaped:
+        """The family with other θ."""
         ...
 
 
@@ -195,8 +212,9 @@ def substeps_of(field: Field, c: np.ndarray, z: np.ndarray, dt: Any) -> int:
 class FieldFit(NamedTuple):
     """A field that was fitted to pairs.
 
-    c: (J,). residual: (N, n) what it leaves of the images, relative: its RMS ÷ the spread. root:
-    (J, J), rootᵀ root the covariance of c. iterations: that it took.
+    c: (J,). residual: (N, n) what it leaves of the images. relative: its RMS ÷ the spread. root:
+    (J, J), rootᵀ root the covariance of c. iterations: that it took. field: the family, with
+    constants of its own as they were fitted.
     """
 
     c: np.ndarray
@@ -204,96 +222,142 @@ class FieldFit(NamedTuple):
     relative: float
     root: np.ndarray
     iterations: int
+    field: Any
+
+
+class Path(NamedTuple):
+    """Flow of a field along pairs (N, n), as far as a step of its coefficients needs it.
+
+    residual: (N, n) of the images, and relative, its RMS ÷ the spread. target: what a change of the
+    field has to add along the paths. nodes: the states of these (m, N, n), moved so that they end
+    at the second states.
+    """
+
+    residual: np.ndarray
+    relative: float
+    target: np.ndarray
+    nodes: np.ndarray
+    weights: np.ndarray
+
+
+def path_of(field: Field, c: np.ndarray, z0, z1, dt: Any, spread: np.ndarray) -> Path:
+    """Follow the flow of a field from z0 (N, n); relative is inf where it has none."""
+    with np.errstate(all="ignore"):
+        moved = flow(field, c, z0, dt, substeps_of(field, c, z0, dt))
+        residual = z1 - moved.images
+        relative = float(np.sqrt(np.mean((residual / spread) ** 2)))
+        if not np.isfinite(relative):
+            return Path(residual, np.inf, residual, moved.nodes, moved.weights)
+        a = 0.5 * np.reshape(dt, (-1, 1, 1)) * field.jacobian(c, 0.5 * (moved.images + z0))
+    eye = np.eye(z0.shape[1])
+    half = eye + a @ (eye + 0.5 * a @ (eye + a / 3))  # M(h, h/2), from f' at one state
+    target = np.linalg.solve(half, residual[..., None])[..., 0]
+    nodes = moved.nodes + moved.times[:, None, None] * residual
+    return Path(residual, relative, target, nodes, moved.weights)
 
 
 def fit_field(
     field: Field, z0: np.ndarray, z1: np.ndarray, dt: Any, c: np.ndarray | None = None
 ) -> FieldFit:
-    """Fit c to pairs of states (N, n), dt apart, a number or (N,).
+    """Fit c, and the constants of a `Shaped` field, to pairs of states (N, n).
 
-    c: to start from; None: the field along the straight line between the states. The columns are
-    taken along the path of the flow, moved so that it ends at z₁. Raises FitError where no field
-    of the family has a flow over dt.
+    dt: between these, a number or (N,). c: to start from; None: the field along the straight line
+    between the states. The columns are taken along the path of the flow, moved so that it ends at
+    z₁. Raises FitError where no field of the family has a flow over dt.
     """
     h, spread = np.reshape(dt, (-1, 1)), sizes(np.concatenate([z0, z1]))
-    rule = gauss(OPTIONS.stages)
-    if c is None:
-        straight = z0 + rule.nodes[:, None, None] * (z1 - z0)
-        c = _solved(field, straight, rule.weights, h, z1 - z0, spread)[0]
-    best, share, iterations = None, 1.0, 0
-    step = np.zeros_like(c)
-    for iterations in range(1, OPTIONS.most_iterations + 1):
-        moved = flow(field, c, z0, dt, substeps_of(field, c, z0, dt))
-        residual = z1 - moved.images
-        relative = float(np.sqrt(np.mean((residual / spread) ** 2)))
-        if not np.isfinite(relative) or (best is not None and relative > 3 * best.relative):
-            if (best is None and iterations > 8) or share < 0.01:
-                break
-            share *= 0.3
-            c = (c if best is None else best.c) * (0.5 if best is None else 1.0)
-            c = c + share * step
-            continue
-        gained = best is None or relative < OPTIONS.gain * best.relative
-        if best is None or relative < best.relative:
-            best = FieldFit(c, residual, relative, np.zeros((0, 0)), iterations)
-        if relative <= OPTIONS.roundoff or not gained:
+    at: np.ndarray = np.array(_along_line(field, z0, z1, h, spread) if c is None else c)
+    here = path_of(field, at, z0, z1, dt, spread)
+    for _ in range(OPTIONS.most_halvings):
+        if here.relative < np.inf:
             break
-        half = half_step(field, c, 0.5 * (moved.images + z0), h)
-        target = np.linalg.solve(half, residual[..., None])[..., 0]
-        pinned = moved.nodes + moved.times[:, None, None] * residual
-        step = _solved(field, pinned, moved.weights, h, target, spread)[0]
-        share = 1.0
-        c = c + step
-    if best is None:
+        at *= 0.5
+        here = path_of(field, at, z0, z1, dt, spread)
+    if here.relative == np.inf:
         raise FitError("no field of the library has a flow over dt: take pairs of a shorter dt")
-    moved = flow(field, best.c, z0, dt, substeps_of(field, best.c, z0, dt))
-    free = max(1.0, best.residual.size - field.num)
-    root = _solved(field, moved.nodes, moved.weights, h, best.residual, spread)[1]
-    sigma = np.sqrt(np.sum((best.residual / spread) ** 2) / free)
-    return best._replace(root=max(sigma, 1e-16) * root, iterations=iterations)
+    iterations = 0
+    while here.relative > OPTIONS.roundoff and iterations < OPTIONS.most_iterations:
+        iterations += 1
+        stepped, gains = _step(field, at, here, h, spread)
+        before = here.relative
+        for share in OPTIONS.shares if gains else OPTIONS.shares[:1]:
+            there = stepped(share)
+            path = path_of(*there, z0, z1, dt, spread)
+            if path.relative < before:
+                (field, at), here = there, path
+                break
+        if not here.relative < OPTIONS.gain * before:
+            break
+    free = max(1.0, here.residual.size - field.num)
+    root = _least(_columns(field, here.nodes, here.weights, h), here.residual, spread)[1]
+    sigma = np.sqrt(np.sum((here.residual / spread) ** 2) / free)
+    return FieldFit(at, here.residual, here.relative, max(sigma, 1e-16) * root, iterations, field)
 
 
-def half_step(field: Field, c, z, h) -> np.ndarray:
-    """M(h, h/2) (N, n, n), from f' at one state of each path (N, n)."""
-    a = 0.5 * h[..., None] * field.jacobian(c, z)
-    eye = np.eye(z.shape[1])
-    return eye + a @ (eye + 0.5 * a @ (eye + a / 3))
+def _along_line(field: Field, z0, z1, h, spread) -> np.ndarray:
+    """c (J,) of the field along the straight lines between the states."""
+    rule = gauss(OPTIONS.stages)
+    straight = z0 + rule.nodes[:, None, None] * (z1 - z0)
+    return _least(_columns(field, straight, rule.weights, h), z1 - z0, spread)[0]
 
 
-def mean_columns(field: Columns, nodes, weights, h) -> np.ndarray:
-    """∫ v_j dt (N, n, J), or of a free field ∫ ψ_k dt (N, 1, K)."""
-    total = 0.0
-    for inside, weight in zip(nodes, weights, strict=True):
-        if isinstance(field, FreeField):
-            values = field.library.term_values(inside)[:, None]
-        else:
-            values = field.columns(inside)
-        total = total + weight * values
-    return h[..., None] * total
+def _step(
+    field: Any, c: np.ndarray, path: Path, h, spread
+) -> tuple[Callable[[float], tuple], bool]:
+    """Shares of the next step -> (field, c), and whether it would gain anything to speak of.
+
+    Constants inside a field go along curved valleys of what is left: with them moved, c is solved
+    for anew (variable projection, Golub & Pereyra 1973).
+    """
+    own = _columns(field, path.nodes, path.weights, h)
+    shaped = isinstance(field, Shaped) and len(field.constants)
+    inner = _mean(lambda z: field.by_constants(c, z), path.nodes, path.weights, h) if shaped else ()
+    both = np.concatenate([own, inner], axis=2) if shaped else own
+    step, _, left = _least(both, path.target, spread)
+    size = [np.sum((one / spread) ** 2) for one in (left, path.target)]
+
+    def stepped(share: float) -> tuple:
+        if not shaped:
+            return field, c + share * step
+        with np.errstate(all="ignore"):
+            moved = field.with_constants(field.constants + share * step[len(c) :])
+            new = _columns(moved, path.nodes, path.weights, h)
+            target = path.target - (new - own) @ c
+        return moved, c + (_least(new, target, spread)[0] if np.isfinite(target).all() else np.nan)
+
+    return stepped, bool(size[0] < OPTIONS.gain**2 * size[1])
 
 
-def _solved(field: Field, nodes, weights, h, target, spread) -> tuple[np.ndarray, np.ndarray]:
-    """c (J,) of least squares, Σ c_j ∫ v_j dt = target (N, n), and the root (J, J) of its
-    covariance for residuals of one in units of the spread (n,)."""
-    columns = mean_columns(field, nodes, weights, h)
+def _mean(columns: Callable[[np.ndarray], np.ndarray], nodes, weights, h) -> np.ndarray:
+    """∫ v_j dt (N, n, J) of columns v_j along paths."""
+    parts = zip(nodes, weights, strict=True)
+    return h[..., None] * sum(weight * columns(inside) for inside, weight in parts)
+
+
+def _columns(field: Field, nodes, weights, h) -> np.ndarray:
+    """∫ v_j dt (N, n, J), or of a free field ∫ ψ_k dt (N, 1, K), the same of each component."""
     if isinstance(field, FreeField):
-        matrix, right = columns[:, 0], target
-        units = np.linalg.norm(matrix, axis=0)
-        units = np.where(units > 0, units, 1.0)
-        u, s, vt = np.linalg.svd(matrix / units, full_matrices=False)
-        kept = s > 1e-13 * s[0]
-        inverse = np.where(kept, 1 / np.where(kept, s, 1.0), 0.0)
-        solved = (vt.T * inverse) @ (u.T @ right) / units[:, None]
-        one = (inverse[:, None] * vt) / units
-        return solved.T.ravel(), np.kron(np.diag(spread), one)
-    matrix = (columns / spread[:, None]).reshape(-1, field.num)
-    right = (target / spread).ravel()
+        return _mean(lambda z: field.library.term_values(z)[:, None], nodes, weights, h)
+    return _mean(field.columns, nodes, weights, h)
+
+
+def _least(columns, target, spread) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """c (J,) of least squares, Σ c_j columns_j = target (N, n), the root (J, J) of its covariance
+    for residuals of one in units of the spread (n,), and what is left of the target."""
+    free = columns.shape[1] != target.shape[1]  # the same columns for each component
+    matrix = columns[:, 0] if free else (columns / spread[:, None]).reshape(target.size, -1)
+    right = target if free else (target / spread).ravel()
     units = np.linalg.norm(matrix, axis=0)
     units = np.where(units > 0, units, 1.0)
     u, s, vt = np.linalg.svd(matrix / units, full_matrices=False)
-    kept = s > 1e-13 * s[0]
+    kept = s > OPTIONS.dependent * s[0]
     inverse = np.where(kept, 1 / np.where(kept, s, 1.0), 0.0)
-    return (vt.T * inverse) @ (u.T @ right) / units, (inverse[:, None] * vt) / units
+    one = (inverse[:, None] * vt) / units
+    solved = one.T @ (u.T @ right)
+    left = right - matrix @ solved
+    if free:
+        return solved.T.ravel(), np.kron(np.diag(spread), one), left
+    return solved, one, left.reshape(target.shape) * spread
 
 
 def undetermined(field: FreeField, z: np.ndarray, floor: float) -> np.ndarray:

@@ -19,7 +19,7 @@ from scipy.optimize import least_squares, minimize
 from gfnn_jax.brackets import Bracket, jacobi_failure
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms, exponents
-from gfnn_jax.models.brackets.algebra import analysed
+from gfnn_jax.models.brackets.algebra import Algebra, analysed
 from gfnn_jax.models.brackets.null_space import CONSTANT, LINEAR, LOG, NullSpace
 from gfnn_jax.models.brackets.poisson_field import OfField, hamiltonian_of, sparse, term_sizes
 
@@ -101,7 +101,7 @@ def brackets_of(
     for vector, rule in _combinations(null, z, noise):
         made = [
             (name, *_with_energy(bracket, library, z, f, noise))
-            for bracket, name in _made(null, vector, library.names, noise)
+            for bracket, name in _made(null, vector, library.names, noise, z)
         ]
         least = min((own.misfit for *_, own in made), default=0.0)
         limit = min(max(OPTIONS.misfit, 3 * noise), OPTIONS.rounded * least + OPTIONS.misfit)
@@ -206,9 +206,10 @@ def _units(c: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def _made(
-    null: NullSpace, vector: np.ndarray, names: tuple[str, ...], noise: float
+    null: NullSpace, vector: np.ndarray, names: tuple[str, ...], noise: float, z: np.ndarray
 ) -> Iterator[tuple[Bracket, str]]:
-    """The bracket of a null vector, in standard constants where there are such."""
+    """The bracket of a null vector, in standard constants where there are such and all states z
+    (N, n) have a step."""
     n, zero = null.tensors.width, max(OPTIONS.zero, noise)
     if null.tensors.kind != LINEAR:
         form = np.zeros((n, n))
@@ -231,17 +232,33 @@ def _made(
     tried = [analysed(c, min(factor * zero, 0.1)) for factor in (10.0, 100.0)]
     algebra = next((a for a in tried if a.lifted is not None), tried[0])
     if algebra.lifted is not None:
-        # B is known but for a factor, which H has the inverse of: y is as large as z
-        basis = algebra.lifted * np.sqrt(3) / np.linalg.norm(algebra.lifted[:3])
-        if algebra.blocks == ("se3",):  # {M, Γ} = Γ holds for Γ of any size
-            basis[3:] *= np.sqrt(3) / np.linalg.norm(basis[3:])
+        basis, inside = _sized(algebra, z), False
         for by in (OPTIONS.snapped * zero, zero):
             with contextlib.suppress(FitError):  # rounded to a singular one
-                yield Bracket.lie(algebra.blocks, _rounded(basis, by), names), algebra.name
-    else:
-        c = _rounded(c / np.abs(c).max(), zero)
-        if jacobi_failure(c) <= 1e-10:
-            yield Bracket.from_constants(c, names), algebra.name
+                bracket = Bracket.lie(algebra.blocks, _rounded(basis, by), names)
+                if not bracket.outside(z).any():
+                    inside = True
+                    yield bracket, algebra.name
+        if inside:
+            return
+    c = _rounded(c / np.abs(c).max(), zero)
+    if jacobi_failure(c) <= 1e-10:
+        yield Bracket.from_constants(c, names), algebra.name
+
+
+def _sized(algebra: Algebra, z: np.ndarray) -> np.ndarray:
+    """L of an algebra, y = Lz as large as z: B is known but for a factor, which H has the inverse
+    of."""
+    basis = np.array(algebra.lifted)
+    if "aff" in algebra.blocks:  # {a, b} = a holds for a of any size and sign
+        a, b = (np.arange(2 * algebra.blocks.count("aff"))[k::2] for k in (0, 1))
+        basis[a] *= np.sign(np.median(z @ basis[a].T, axis=0))[:, None]
+        basis[b] /= np.abs(basis[b]).max()
+        return basis
+    basis *= np.sqrt(3) / np.linalg.norm(basis[:3])
+    if algebra.blocks == ("se3",):  # {M, Γ} = Γ holds for Γ of any size
+        basis[3:] *= np.sqrt(3) / np.linalg.norm(basis[3:])
+    return basis
 
 
 def _rounded(values: np.ndarray, zero: float) -> np.ndarray:
@@ -293,9 +310,7 @@ def upright(bracket: Any, library: Terms, c: np.ndarray, z: np.ndarray) -> tuple
 def _reversed(bracket: Any) -> Any:
     """−B."""
     if hasattr(bracket, "constants"):
-        if bracket.blocks:
-            return Bracket.lie(bracket.blocks, -bracket.basis, bracket.names)
-        return Bracket.from_constants(-bracket.constants, bracket.names)
+        return bracket.opposite
     if hasattr(bracket, "form"):
         return dataclasses.replace(bracket, form=-bracket.form)
     return dataclasses.replace(bracket, field=-bracket.field, mass=-bracket.mass)

@@ -333,8 +333,7 @@ def _of_shapes(bracket, train: Data, held: Data, on_progress) -> PoissonLaw | No
     """H of quadratic terms and shapes; None where there is none."""
     base = library_of(_kind_of(bracket), bracket.labels, 2, None)
     try:
-        found = with_shapes(bracket, base, train[:3], on_progress)
-        return _lean(bracket, found.library, found.c, train, held)
+        return _lean(bracket, *with_shapes(bracket, base, train[:3], on_progress), train, held)
     except FitError:
         return None
 
