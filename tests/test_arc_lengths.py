@@ -97,7 +97,9 @@ def test_arcs_that_no_orbit_follows_are_not_taken(longest, followed):
     assert (longer is not None and longer.arcs.t.shape[1] > 40) == followed
 
 
-@pytest.mark.parametrize("search", [search, partial(fit_given, GIVEN)])
+@pytest.mark.parametrize(
+    "search", [pytest.param(search, marks=pytest.mark.slow), partial(fit_given, GIVEN)]
+)
 def test_shorter_arcs_tell_more_where_unknown_torques_act(search):
     """The oracle are the pulls that made the data: the law of shorter arcs is nearer to them."""
     # Of these runs two processors take the same terms; of those of seed 0 one leaves friction out.

@@ -73,10 +73,11 @@ def wide(casimirs, number, lanes):
     )
 
 
+@pytest.mark.parametrize("steps", [1_000, pytest.param(10_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_step(name, tmp_path):
-    """The step is the flow of B∇H, exactly Poisson by the derivative of what ran; Casimirs stay
-    over 10,000 steps; it is undone by its inverse and saved."""
+def test_step(name, steps, tmp_path):
+    """The step is the flow of B∇H, exactly Poisson by the derivative of what ran; Casimirs stay;
+    it is undone by its inverse and saved."""
     map_, z = made(name)
     bracket, flow = map_.bracket, map_.pieces[0]
 
@@ -91,7 +92,7 @@ def test_step(name, tmp_path):
     assert np.max(map_.defect(states)) < 1e-13
     np.testing.assert_allclose(map_.inverse(after)[0], states, atol=2e-14)
     begun = map_.start(states)
-    lanes, saved = map_.advance(begun, 1, save_every=10_000)
+    lanes, saved = map_.advance(begun, 1, save_every=steps)
     casimirs = flow.family.casimirs
     for number in range(len(bracket.casimirs)):
         values = [wide(casimirs, number, of) for of in (begun, lanes)]

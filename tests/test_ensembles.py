@@ -106,7 +106,7 @@ def test_shares_are_the_weights_of_the_pairs():
     assert found.validation_rms == pytest.approx(other.validation_rms, rel=1e-6)
 
 
-def test_the_map_is_the_mean_and_its_samples_are_symplectic(fit):
+def test_the_map_is_the_mean(fit):
     piece, z = fit.map.pieces[0], states(5, 3)
     one = [
         piece.family.network.gradient(jax.tree.map(lambda a, i=i: a[i], piece.family.members), z)
@@ -118,6 +118,11 @@ def test_the_map_is_the_mean_and_its_samples_are_symplectic(fit):
     samples = fit.sample(jax.random.key(0), 3)
     assert samples.params.shape == (3, 4)
     np.testing.assert_allclose(np.sum(samples.params, axis=1), 1.0, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_samples_are_symplectic(fit):
+    samples, z = fit.sample(jax.random.key(0), 3), states(5, 3)
     assert float(np.max(np.asarray(samples[1].defect(z)))) < 1e-13
     energy = np.sum(np.asarray(samples.rollout(z, 50)[0]) ** 2, axis=-1)
     assert np.max(np.abs(energy[..., -1] - energy[..., 0])) < 0.02
@@ -153,6 +158,7 @@ def test_a_saved_ensemble_keeps_its_members_and_predicts_bands(fit, tmp_path):
         assert (file["std"][:, 1:] > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
 def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypatch):
     options = FitOptions(

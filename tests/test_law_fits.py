@@ -309,22 +309,24 @@ def test_a_damped_pendulum_from_noisy_angles(swing):
     assert abs(fit.energy["closure"]) < 0.01 * abs(fit.energy["stored"])
 
 
-@pytest.mark.parametrize("wrong", ["stuck", "burst"])
-def test_wrong_values_are_left_out_of_a_fit_and_told(wrong):
+def test_wrong_values_are_left_out_of_a_fit_and_told():
     """The law is that of the record in which they are missing."""
     t, x = pendulum()
     rows = np.arange(311, 322)
-    missing, spoilt = x.copy(), x.copy()
-    missing[rows] = np.nan
-    spoilt[rows] = x[310] if wrong == "stuck" else x[rows] + 0.6
-    of = {"positions": ["theta"], "angles": ["theta"]}
-    expected = gfnn.fit(gfnn.Recording({"t": t, "theta": missing}, **of))
-    with pytest.warns(gfnn.FitWarning, match="left out"):
-        found = gfnn.fit(gfnn.Recording({"t": t, "theta": spoilt}, **of))
-    assert str(found) == str(expected)
-    kind = "stuck" if wrong == "stuck" else "outliers"
-    for named in ("theta", kind, "11", "15.55 s"):
-        assert named in found.messages[0]
+
+    def fitted(values):
+        theta = x.copy()
+        theta[rows] = values
+        of = {"positions": ["theta"], "angles": ["theta"]}
+        return gfnn.fit(gfnn.Recording({"t": t, "theta": theta}, **of))
+
+    expected = fitted(np.nan)
+    for kind, values in (("stuck", x[310]), ("outliers", x[rows] + 0.6)):
+        with pytest.warns(gfnn.FitWarning, match="left out"):
+            found = fitted(values)
+        assert str(found) == str(expected)
+        for named in ("theta", kind, "11", "15.55 s"):
+            assert named in found.messages[0]
 
 
 def test_a_driven_mass_has_a_law_of_one_term():
@@ -645,7 +647,7 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     np.testing.assert_allclose(p, found["hold"].fit.p, atol=2 * error.max())
 
 
-@pytest.mark.parametrize("hold", ["hold", "linear"])
+@pytest.mark.parametrize("hold", [pytest.param("hold", marks=pytest.mark.slow), "linear"])
 def test_rules_that_chance_tells_apart_have_no_delay(hold):
     """ẍ = −36.8 x − 0.32 ẋ + 1.24 u, u slow beside its samples: held, or linear in between. Half a
     sample later one rule acts as the other does."""

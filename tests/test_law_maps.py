@@ -368,7 +368,9 @@ def test_samples_of_a_law_that_sticks():
     np.testing.assert_array_equal(bands.std[1], 0.0)
 
 
-@pytest.mark.parametrize("hold", ["hold", "linear", "band"])
+@pytest.mark.parametrize(
+    "hold", ["hold", *(pytest.param(hold, marks=pytest.mark.slow) for hold in ("linear", "band"))]
+)
 def test_a_rollout_with_inputs_and_turns(hold):
     """A pendulum with dry friction that a motor turns over: what JAX's steps of a narrower width
     tend to, angles counted, inputs by their rule, with parameters of the system."""

@@ -22,7 +22,7 @@ def moved(z, dt=DT):
 
 @pytest.fixture(scope="module")
 def fit():
-    z = states(400, 0)
+    z = states(200, 0)
     return gfnn.fit(
         gfnn.Pairs(z, moved(z), DT),
         angles=(0,),

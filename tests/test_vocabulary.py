@@ -124,12 +124,12 @@ def test_masses_of_either_sign_are_no_law():
 
 
 def test_a_drive_that_nobody_recorded_is_found_named_and_forecast(tmp_path):
-    omega, until = 1.37, 1_200
+    omega, until = 1.37, 400
 
     def rates(t, z):
         return [z[1], -z[0] - 0.1 * z[1] + 0.3 * np.cos(omega * t + 0.4)]
 
-    whole = np.linspace(0, 100, 1_500)
+    whole = np.linspace(0, 100, 500)
     x = solve_ivp(rates, (0, 100), [1.0, 0.0], t_eval=whole, rtol=1e-10, atol=1e-12).y[0]
     seen = x[:until] + 1e-3 * np.random.default_rng(0).normal(size=until)
     recording = gfnn.Recording({"t": whole[:until], "x": seen}, positions=["x"])
