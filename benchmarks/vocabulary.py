@@ -227,6 +227,24 @@ def drive_of_two_phases(rng: np.random.Generator) -> System:
     )
 
 
+def cubic_drag(rng: np.random.Generator) -> System:
+    return System(
+        {"v1**2": 0.5, "cos(x1)": 1.0},
+        ((rng.uniform(1.5, 2.5),), (0.0,)),
+        (0,),
+        {"abs(v1)**4": rng.uniform(0.01, 0.05)},
+    )
+
+
+def one_sided_friction(rng: np.random.Generator) -> System:
+    sides = rng.uniform(0.002, 0.02, 2)
+    return System(
+        {"v1**2": 0.5, "x1**2": -0.5},
+        ((rng.uniform(1, 2),), (0.0,)),
+        friction=dict(zip(("(abs(v1) + v1)**2", "(abs(v1) - v1)**2"), sides, strict=True)),
+    )
+
+
 SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
     f.__name__.replace("_", "-"): f
     for f in (
@@ -234,7 +252,7 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
         *(penning, coriolis_pair, rotating_saddle),
         *(two_wells, hoop, ball_and_beam, rocking_disc, wire, central),
         *(springs_between_angles, elastic_pendulum, relativistic),
-        *(drive_not_recorded, drive_of_two_phases),
+        *(drive_not_recorded, drive_of_two_phases, cubic_drag, one_sided_friction),
     )
 }
 

@@ -64,7 +64,8 @@ def two_rods(friction, losses, gain=False):
 
 def viscous():
     linear = lagrangian.LINEAR
-    return two_rods([((1, 0), linear, 0.0), ((-1, 1), linear, 0.0)], [0.1, 0.05])
+    rows = [((1, 0), linear, 0.0), ((-1, 1), linear, 0.0), ((0, 1), lagrangian.POWER, 3.0)]
+    return two_rods(rows, [0.1, 0.05, 0.02])
 
 
 def sticking():
@@ -75,8 +76,9 @@ def sticking():
         ((0, 1), lagrangian.DRY, 1e-4),
         ((-1, 1), lagrangian.DRY, 1e-4),
         ((0, 1), lagrangian.QUADRATIC, 0.0),
+        ((1, 0), lagrangian.ONE_SIDED, 0.0),
     ]
-    return two_rods(rows, [0.6, 0.4, 0.4, 0.1], gain=True)
+    return two_rods(rows, [0.6, 0.4, 0.4, 0.1, 0.3], gain=True)
 
 
 def exactly(map_):

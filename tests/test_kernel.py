@@ -16,7 +16,16 @@ import own_module  # noqa: F401
 import pytest
 
 import gfnn_jax
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction, Terms
+from gfnn_jax.families.lagrangian import (
+    DRY,
+    LINEAR,
+    ONE_SIDED,
+    POWER,
+    QUADRATIC,
+    UNIFORM,
+    Friction,
+    Terms,
+)
 from gfnn_jax.flows import kernel
 from gfnn_jax.flows.motion import Form
 
@@ -112,8 +121,21 @@ def test_shapes_are_those_of_numpy(shape):
         np.testing.assert_allclose(one, other, atol=1e-13)
 
 
-def test_derivatives_are_finite_differences():
+@pytest.mark.parametrize("leaders", [(), (0,), (1,)])
+def test_derivatives_are_finite_differences(leaders):
+    """And steps are along accelerations of the law, with powers of speeds and sides, of coordinates
+    that drive others."""
     (form, p), (x, h, u) = law_of(2, True, False, shapes=True), lanes_of(2, 20)
+    more = [((1, 0), POWER, 3.0), ((0, 1), POWER, 1.5), ((0, 1), ONE_SIDED, 0.0)]
+    friction = Friction.of([*form.friction.rows()[:2], *more, *form.friction.rows()[-1:]], 2)
+    terms = dataclasses.replace(form.terms, leaders=leaders)
+    form = dataclasses.replace(form, terms=terms, friction=friction)
+    p = np.insert(p, form.basis.shape[1] + 3, [0.2, 0.3])
+    x[:, 2:] += np.where(np.abs(x[:, 2:]) < 0.1, 0.3, 0.0)  # of a side no turn
+    law = form.lagrangian(p)
+    ahead, behind = (form.step(p, x, s * h / 1e3, u[:, :1], 0).states for s in (1, -1))
+    rates = (ahead - behind)[:, 2:] / (2e-3 * h[:, None])
+    np.testing.assert_allclose(rates, law.acceleration(x[:, :2], x[:, 2:], u[:, 0, 0]), atol=1e-6)
     found, e = form.step(p, x, h, u), 1e-6
 
     def slope(vary, count):

@@ -5,7 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import (
+    DRY,
+    LINEAR,
+    ONE_SIDED,
+    POWER,
+    QUADRATIC,
+    Friction,
+    Lagrangian,
+    Terms,
+)
 
 ROWS = [
     ((2, 0), (0, 0), (0, 0), 0.0),
@@ -26,7 +35,8 @@ SHAPES = {
 }
 THETA = np.array([1.0, 0.7, 0.3, 0.1, 0.2, 2.0, -0.6, 0.3, 0.8])
 FRICTION = [((1, 0), LINEAR, 1.0), ((-1, 1), QUADRATIC, 1.0), ((0, 1), DRY, 0.1)]
-RHO = np.array([0.1, 0.2, 0.05])
+FRICTION += [((1, 0), POWER, 1.5), ((0, -1), ONE_SIDED, 0.0)]
+RHO = np.array([0.1, 0.2, 0.05, 0.3, 0.4])
 GAINS = np.array([[1.0, 0.0, 0.5], [0.0, -2.0, 0.3]])
 
 
@@ -47,9 +57,14 @@ def plain(q, v):
 
 def rayleigh(v):
     s = v[1] - v[0]
-    return (
-        RHO[0] * v[0] ** 2 / 2 + RHO[1] * jnp.abs(s) ** 3 / 3 + RHO[2] * jnp.sqrt(v[1] ** 2 + 0.01)
+    of_all = (
+        v[0] ** 2 / 2,
+        jnp.abs(s) ** 3 / 3,
+        jnp.sqrt(v[1] ** 2 + 0.01),
+        jnp.abs(v[0]) ** 2.5 / 2.5,
+        jnp.maximum(-v[1], 0) ** 2 / 2,
     )
+    return sum(rho * term for rho, term in zip(RHO, of_all, strict=True))
 
 
 def states(count=5):
@@ -66,6 +81,7 @@ def derivatives_of_the_plain_sum(q, v):
         by_v(q, v),
         jax.hessian(plain)(q, v),
         jax.jacfwd(by_v)(q, v),
+        jax.jacfwd(by_v)(q, v).T,
         jax.hessian(plain, 1)(q, v),
     )
 
@@ -123,7 +139,7 @@ def test_padding_moves_nothing():
     longer = Lagrangian(
         model.terms.padded(12),
         np.pad(THETA, (0, 3)),
-        model.friction.padded(6),
+        model.friction.padded(8),
         np.pad(RHO, (0, 3)),
         0.03,
         GAINS,

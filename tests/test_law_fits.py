@@ -38,6 +38,7 @@ from gfnn_jax.maps.estimates import (
     propagate,
     propagate_each,
 )
+from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.search import search, search_on
@@ -373,6 +374,33 @@ def test_a_burst_in_a_measured_record_leaves_its_law(recwarn):
     )
     assert len(of_whole) == 5
     np.testing.assert_allclose(of_spoilt, of_whole, rtol=2e-3)
+
+
+RARE = {
+    "cubic": (lambda v: 0.1 * v**3, {"abs(v)**4": 0.025}),
+    "one-sided": (
+        lambda v: np.where(v > 0, 0.03, 0.01) * v,
+        {"(abs(v) + v)**2": 0.03 / 8, "(abs(v) - v)**2": 0.01 / 8},
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", [pytest.param("cubic", marks=pytest.mark.slow), "one-sided"])
+def test_friction_of_rare_kinds(kind):
+    """An oscillator's, from noisy positions; and as terms that are given again."""
+    force, truth = RARE[kind]
+    t = 0.2 * np.arange(200)
+    found = solve_ivp(
+        lambda _, z: [z[1], -z[0] - force(z[1])], (0, 40), [1.5, 0], t_eval=t, rtol=1e-9
+    )
+    x = found.y[0] + 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    fit = gfnn.fit(gfnn.Recording({"t": t, "x": x}, positions=["x"]))
+    assert fit.which_friction.kinds == (kind,)
+    assert [term.term for term in fit.friction.terms] == list(truth)
+    for term, expected in zip(fit.friction.terms, truth.values(), strict=True):
+        assert abs(term.coefficient - expected) < 4 * term.std
+    given = given_terms([f"R: {fit.friction.formula}"], ["x"], ["v"]).friction
+    assert given == tuple(law_of(fit.map).form.friction.rows())
 
 
 def undamped():

@@ -22,7 +22,7 @@ from gfnn_jax.exports.c_pieces import on_symbols, why_not_piece
 from gfnn_jax.exports.symbols import Symbol, Tape
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Friction
+from gfnn_jax.families.lagrangian import DRY, LINEAR, ONE_SIDED, POWER, QUADRATIC, Friction
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.legendre import Legendre, law_of
@@ -86,9 +86,17 @@ class _Signed:
         for s, kind, width, sign in zip(
             own.directions @ v, own.kinds, own.widths, self.signs, strict=True
         ):
-            smooth = s if kind == LINEAR else s / (s * s + width**2).sqrt()
-            signed = sign if kind == DRY else sign * s * s
-            slopes.append(smooth if _is_zero(sign) else signed)
+            signed = not _is_zero(sign)
+            if kind == LINEAR:
+                slopes.append(s)
+            elif kind == POWER:
+                slopes.append(sign * (sign * s) ** width if signed else s ** float(width))
+            elif kind == ONE_SIDED:
+                slopes.append(0.5 * (1.0 + sign) * s)
+            elif kind == QUADRATIC:
+                slopes.append(sign * s * s)
+            else:
+                slopes.append(sign if signed else s / (s * s + width**2).sqrt())
         return np.array(slopes, dtype=object)
 
 
@@ -186,7 +194,9 @@ def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
     law = law_of(family, p)
     own, dim = law.friction, law.dim
     sharp = (own.kinds == DRY) & (own.widths <= creep)
-    signed = np.flatnonzero(sharp | (own.kinds == QUADRATIC))
+    kinked = np.isin(own.kinds, (QUADRATIC, ONE_SIDED))
+    kinked |= (own.kinds == POWER) & (own.widths % 2 != 1)  # odd powers are smooth
+    signed = np.flatnonzero(sharp | kinked)
     signs = np.zeros(own.count, dtype=object)
     signs[signed] = tape.inputs("sigma", len(signed))[0] if len(signed) else []
     if law.powers is not None:

@@ -205,7 +205,7 @@ def _with_forces(map_: SymplecticMap, law: Lagrangian, chain: _Chain) -> Links:
         if kind in (LINEAR, DRY):
             (damping if kind == LINEAR else dry).append((row @ joints, float(size)))
         else:
-            notes.append("quadratic friction is left out: these formats have none")
+            notes.append("friction that is not linear or dry is left out: these formats have none")
     if law.uniform and dim == 1:
         damping.append((np.ones(1), float(law.uniform) * float(chain.a[0])))
     elif law.uniform:

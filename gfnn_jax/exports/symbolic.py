@@ -233,10 +233,13 @@ def _collect(side: dict[Any, list[Term]], expression: Any, term: Term, sign: flo
 
 
 def _slope(loss: Any, v: Any) -> Any:
-    """Derivative of a term of R by a speed: s |s| of |s|³, the sign of s of |s|."""
+    """Derivative of a term of R by a speed: s |s| of |s|³, the sign of s of |s|, and |s| + s of
+    (|s| + s)²."""
     import sympy
 
     base, power = loss.as_base_exp()
+    if base.is_Add and base.has(sympy.Abs):
+        return 4 * base * sympy.diff(base.replace(sympy.Abs, lambda s: 0), v)
     if not isinstance(base, sympy.Abs):
         return sympy.diff(loss, v)
     s = base.args[0]

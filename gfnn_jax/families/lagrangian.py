@@ -7,9 +7,11 @@
 k, n and m are whole numbers, and a term has at most two factors v: kinetic, gyroscopic and
 potential terms. g, where a term has one, is any other formula: its *shape*, 1/√(q1² + q2²) or
 exp(−q1). With s = c·v, the speed of one coordinate or the relative speed of two, friction is
-linear, r = ½s²; quadratic, r = ⅓|s|³; or dry, r = √(s² + ε²) − ε. Everything is batch first, in
-closed form, and runs in NumPy or JAX. A term is a row of arrays, none of which is static, so that
-another library of as many terms (`Terms.padded`) compiles nothing.
+linear, r = ½s²; quadratic, r = ⅓|s|³; dry, r = √(s² + ε²) − ε; a power a of the speed, r = |s|^(a +
+1)/(a + 1); or one-sided, r = ½ max(s, 0)², which beside linear friction makes it depend on the
+direction. Everything is batch first, in closed form, and runs in NumPy or JAX. A term is a row of
+arrays, none of which is static, so that another library of as many terms (`Terms.padded`) compiles
+nothing.
 
 Of systems that differ in parameters μ, a length or a mass, each coefficient is multiplied by a
 product of whole powers of these: L = Σ θ_j ∏ μ_i^a_ji ℓ_j(q, v), and R and G alike. The law of one
@@ -32,7 +34,9 @@ from gfnn_jax.families.text import added, barred, combination, power, shown
 
 MAX_POWER = 8  # of one coordinate in one term; powers come from a table of this length
 Powers = tuple[tuple[int, ...], ...]  # of the parameters, (m, k), for each coefficient
-LINEAR, QUADRATIC, DRY, UNIFORM = range(4)  # UNIFORM stands in a fit's `flows.motion.Form` alone
+# Kinds of friction. UNIFORM stands in a fit's `flows.motion.Form` alone.
+LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED = range(6)
+_FACTORS = {1 / 2: "½ ", 1 / 3: "⅓ ", 1 / 4: "¼ ", 1 / 8: "⅛ ", 1.0: ""}
 
 
 class Potentials(NamedTuple):
@@ -44,13 +48,15 @@ class Potentials(NamedTuple):
 
 
 class Derivatives(NamedTuple):
-    """L and its derivatives; ``by_vq`` [..., i, j] is ∂²L/∂v_i∂q_j, ``by_vv`` the masses M."""
+    """L and its derivatives; ``by_vq`` [..., i, j] is ∂²L/∂v_i∂q_j, ``by_qv`` ∂²L/∂q_i∂v_j, and
+    ``by_vv`` the masses M. Rows i are those of the terms that act on coordinate i."""
 
     value: Any  # (...)
     by_q: Any  # (..., d)
     by_v: Any  # (..., d)
     by_qq: Any  # (..., d, d)
     by_vq: Any  # (..., d, d)
+    by_qv: Any  # (..., d, d)
     by_vv: Any  # (..., d, d)
 
 
@@ -69,12 +75,14 @@ def coordinates_in(row: Sequence[Any], phased: bool = True) -> tuple[bool, ...]:
     return tuple(found)
 
 
-@pytree("shapes")
+@pytree("shapes", "leaders")
 class Terms:
     """The terms ℓ_j of a Lagrangian: whole numbers k, n and m, each (P, d), phases (P,), and their
     shapes as text in q1, …, qd, "" of a term without, () where none has one.
 
-    A phase is 0 for a cosine and −π/2 for a sine.
+    A phase is 0 for a cosine and −π/2 for a sine. leaders: coordinates that move others and are not
+    moved by them, as a cart whose motor holds its course: a term with one of the others acts on the
+    others alone.
     """
 
     speeds: Any
@@ -82,9 +90,10 @@ class Terms:
     modes: Any
     phases: Any
     shapes: tuple[str, ...] = ()
+    leaders: tuple[int, ...] = ()
 
     @staticmethod
-    def of(rows: Sequence[Sequence[Any]], dim: int) -> Terms:
+    def of(rows: Sequence[Sequence[Any]], dim: int, leaders: tuple[int, ...] = ()) -> Terms:
         """Make it of rows (k, n, m, φ) or (k, n, m, φ, shape). Raises ValueError for more than two
         factors v, or a power > 8."""
         k, n, m = (np.array([r[i] for r in rows], dtype=int).reshape(-1, dim) for i in range(3))
@@ -94,7 +103,7 @@ class Terms:
             raise ValueError(f"powers of coordinates are from 0 to {MAX_POWER}")
         shapes = tuple(map(shape_of, rows))
         phases = np.array([float(r[3]) for r in rows])
-        return Terms(k, n, m, phases, shapes if any(shapes) else ())
+        return Terms(k, n, m, phases, shapes if any(shapes) else (), leaders)
 
     @property
     def count(self) -> int:
@@ -142,14 +151,33 @@ class Terms:
         """The terms with these indices, or where this mask holds."""
         shapes = tuple(np.array(self.shapes or [""] * self.count, dtype=object)[keep])
         own = (self.speeds[keep], self.powers[keep], self.modes[keep], self.phases[keep])
-        return Terms(*own, shapes if any(shapes) else ())
+        return Terms(*own, shapes if any(shapes) else (), self.leaders)
 
     def padded(self, count: int) -> Terms:
         """Pad with constants, which move nothing, to ``count`` terms in all."""
         more = count - self.count
         k, n, m = (np.pad(a, ((0, more), (0, 0))) for a in (self.speeds, self.powers, self.modes))
         shapes = self.shapes and (*self.shapes, *[""] * more)
-        return Terms(k, n, m, np.pad(self.phases, (0, more)), shapes)
+        return Terms(k, n, m, np.pad(self.phases, (0, more)), shapes, self.leaders)
+
+    @property
+    def follows(self) -> Any:
+        """Return whether each term (P,) is one of coordinates that are moved by ``leaders``."""
+        others = [i for i in range(self.dim) if i not in self.leaders]
+        touched = (self.speeds != 0) | (self.powers != 0) | (self.modes != 0)
+        of_shape = np.zeros(touched.shape, bool)
+        for j, tree in self.trees.items():
+            of_shape[j, list(depends_on(tree))] = True
+        return (touched | of_shape)[:, others].any(axis=1)
+
+    def acting(self, values: Any, axes: int = 1) -> Any:
+        """Values (..., P, d, …) of the terms, with this many ``axes`` from d on, 0 in the rows d of
+        coordinates that a term does not act on."""
+        if not self.leaders:
+            return values
+        leads = np.isin(np.arange(self.dim), self.leaders)
+        acts = ~(self.follows[:, None] & leads).reshape(*self.speeds.shape, *(1,) * (axes - 1))
+        return values * acts.astype(values.dtype)
 
     def quadratic(self) -> tuple[Any, Any, Any]:
         """A (P, d, d), b (P, d), c (P,) of ∏ v_i^k_i = ½ vᵀA v + b·v + c."""
@@ -218,13 +246,14 @@ class Terms:
         A, _, _ = self.quadratic()
         push = matmul(a, A.reshape(-1, self.dim).T).reshape(*a.shape[:-1], *A.shape[:2])
         along = (df * v[..., None, :]).sum(-1)
-        return push * f[..., None] + dg * along[..., None] - g[..., None] * df
+        return self.acting(push * f[..., None] + dg * along[..., None] - g[..., None] * df)
 
 
 @pytree()
 class Friction:
-    """Terms r_k of Rayleigh's R: directions c (F, d), whole numbers; kinds (F,), LINEAR, QUADRATIC
-    or DRY; widths ε (F,), which dry friction alone uses, in units of v."""
+    """Terms r_k of Rayleigh's R: directions c (F, d), whole numbers; kinds (F,), LINEAR, QUADRATIC,
+    DRY, POWER or ONE_SIDED; widths (F,): ε of dry friction, in units of v, and the exponent a of
+    POWER."""
 
     directions: Any
     kinds: Any
@@ -252,11 +281,13 @@ class Friction:
 
     def texts(self, speeds: Sequence[str]) -> tuple[tuple[str, float], ...]:
         """Each term as code in the names of the velocities, and the number before it: ("v1**2", ½),
-        ("abs(v2 - v1)**3", ⅓), ("abs(v2)", 1); uniform friction, a row without a direction, is γ T.
+        ("abs(v2 - v1)**3", ⅓), ("abs(v2)", 1), ("(abs(v1) + v1)**2", ⅛) of one-sided friction;
+        uniform friction, a row without a direction, is γ T.
         """
         listed = []
         for direction, kind, width in self.rows():
             speed = combination(direction[::-1], [*speeds][::-1])
+            size = f"abs({speed.removeprefix('-')})"
             squared = f"({speed})**2" if sum(map(bool, direction)) > 1 else f"{speed}**2"
             listed.append(
                 {
@@ -264,6 +295,8 @@ class Friction:
                     QUADRATIC: (f"abs({speed})**3", 1 / 3),
                     DRY: (f"sqrt({squared} + {width**2:.4g})" if width else f"abs({speed})", 1.0),
                     UNIFORM: ("T", 1.0),
+                    POWER: (f"abs({speed})**{width + 1:g}", 1 / (width + 1)),
+                    ONE_SIDED: (f"({added([size, speed])})**2", 1 / 8),
                 }[kind]
             )
         return tuple(listed)
@@ -272,9 +305,10 @@ class Friction:
     def names(self) -> tuple[str, ...]:
         """Each term as it stands in a formula: "½ v1²", "⅓ |v2 - v1|³", "|v2|"."""
         speeds = [f"v{i + 1}" for i in range(self.directions.shape[1])]
-        sharp = dataclasses.replace(self, widths=np.zeros(self.count))
-        before = {1 / 2: "½ ", 1 / 3: "⅓ ", 1.0: ""}
-        return tuple(before[part] + barred(shown(t)) for t, part in sharp.texts(speeds))
+        sharp = dataclasses.replace(self, widths=np.where(self.kinds == DRY, 0.0, self.widths))
+        return tuple(
+            _FACTORS.get(part, f"{part:.4g} ") + barred(shown(t)) for t, part in sharp.texts(speeds)
+        )
 
     @property
     def jumps(self) -> np.ndarray:
@@ -303,10 +337,22 @@ class Friction:
         # At rest with ε = 0 there is no direction to push.
         root = root + (root == 0).astype(root.dtype)
         linear, quadratic = kinds == LINEAR, kinds == QUADRATIC
+        dry = (widths / root) ** 2 / root  # small speeds would underflow in ε²/root³
         value = xp.where(linear, 0.5 * s * s, xp.where(quadratic, size**3 / 3, root - widths))
         slope = xp.where(linear, s, xp.where(quadratic, s * size, s / root))
-        dry = (widths / root) ** 2 / root  # small speeds would underflow in ε²/root³
         curvature = xp.where(linear, xp.ones_like(s), xp.where(quadratic, 2 * size, dry))
+        if xp is np and not np.any(self.kinds >= POWER):
+            return value, slope, curvature
+        power, one_sided = kinds == POWER, kinds == ONE_SIDED
+        exponent, forward = xp.where(power, widths, 1.0), xp.maximum(s, 0.0)
+        base = xp.where(size > 0, size, 1.0)  # |s|^(a − 1) has no value at rest where a < 1
+        raised = xp.where(size > 0, base ** (exponent - 1), 0.0)
+        of_power = raised * size * size / (exponent + 1), raised * s, exponent * raised
+        of_side = 0.5 * forward**2, forward, (s > 0).astype(s.dtype)
+        found = zip((value, slope, curvature), of_power, of_side, strict=True)
+        value, slope, curvature = (
+            xp.where(power, b, xp.where(one_sided, c, a)) for a, b, c in found
+        )
         return value, slope, curvature
 
     def residuals(self, v: Any) -> Any:
@@ -360,27 +406,34 @@ class Lagrangian:
         f, df, ddf = self.terms.potentials(q)
         g, dg = self.terms.motion(v)
         A, _, _ = self.terms.quadratic()
-        theta = as_row(self.coefficients, f)
-        weight = theta * g
+        theta, acting = as_row(self.coefficients, f), self.terms.acting
+        weight, swapped = theta * g, namespace(f).swapaxes
+        by_vq = (theta[..., None, None] * acting(dg)[..., :, None] * df[..., None, :]).sum(-3)
+        by_qv = swapped(by_vq, -1, -2)
+        if self.terms.leaders:
+            by_qv = (theta[..., None, None] * acting(df)[..., :, None] * dg[..., None, :]).sum(-3)
         return Derivatives(
             (weight * f).sum(-1),
-            (weight[..., None] * df).sum(-2),
-            ((theta * f)[..., None] * dg).sum(-2),
-            (weight[..., None, None] * ddf).sum(-3),
-            (theta[..., None, None] * dg[..., :, None] * df[..., None, :]).sum(-3),
+            (weight[..., None] * acting(df)).sum(-2),
+            ((theta * f)[..., None] * acting(dg)).sum(-2),
+            (weight[..., None, None] * acting(ddf, 2)).sum(-3),
+            by_vq,
+            by_qv,
             self._masses(f, A),
         )
 
     def _masses(self, f: Any, A: Any) -> Any:
         d = self.dim
         weighted = as_row(self.coefficients, f) * f
-        return matmul(weighted, A.reshape(-1, d * d)).reshape(*f.shape[:-1], d, d)
+        return matmul(weighted, self.terms.acting(A, 2).reshape(-1, d * d)).reshape(
+            *f.shape[:-1], d, d
+        )
 
     def momentum(self, q: Any, v: Any) -> Any:
         """p = ∂L/∂v (..., d)."""
         f, _, _ = self.terms.potentials(q, order=0)
         _, dg = self.terms.motion(v)
-        return ((as_row(self.coefficients, f) * f)[..., None] * dg).sum(-2)
+        return ((as_row(self.coefficients, f) * f)[..., None] * self.terms.acting(dg)).sum(-2)
 
     def masses(self, q: Any) -> Any:
         """M = ∂²L/∂v∂v (..., d, d), which depends on q alone."""
@@ -415,7 +468,8 @@ class Lagrangian:
         g, dg = self.terms.motion(v)
         theta = as_row(self.coefficients, f)
         along = (df * v[..., None, :]).sum(-1)
-        force = ((theta * g)[..., None] * df - (theta * along)[..., None] * dg).sum(-2)
+        force = self.terms.acting((theta * g)[..., None] * df - (theta * along)[..., None] * dg)
+        force = force.sum(-2)
         return self._masses(f, self.terms.quadratic()[0]), force + self.forces(q, v, u)
 
     def acceleration(self, q: Any, v: Any, u: Any = None) -> Any:

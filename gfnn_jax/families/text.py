@@ -71,7 +71,8 @@ def superscript(number: int | str) -> str:
 
 def shown(code: str) -> str:
     """Write code as people read it: "p1² cos(q1)" of "p1**2*cos(q1)"."""
-    return re.sub(r"\*\*(\d+)", lambda n: superscript(n[1]), code).replace("*", " ")
+    raised = re.sub(r"\*\*(\d+)(?![.\d])", lambda n: superscript(n[1]), code)
+    return re.sub(r"(?<!\*)\*(?!\*)", " ", raised)
 
 
 def plain(text: str) -> str:

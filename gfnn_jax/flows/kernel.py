@@ -11,6 +11,9 @@ of its own coordinates alone. f may have another factor, a shape: operations on 
 with their first and second derivatives in the coordinates of the term. Steps are those of Dormand
 and Prince, with their derivatives D (2d, n) in the state and in the coefficients.
 
+Where coordinates drive others that do not act back on them, a term acts on those coordinates alone
+that have its own level, the highest of a coordinate in it: M is not symmetric then.
+
 Dry friction without a width jumps:
 
     M a = f(q, v) − Σ c λ,      λ = ρ sign(s) where s slides,      |λ| ≤ ρ, c·a = 0 where it sticks
@@ -47,15 +50,17 @@ from numba.core import config, event
 from numba.core.llvm_bindings import llvm
 
 FINE, UNFINISHED, LOST = range(3)  # status of a lane: followed; too many events; not finite
-VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN = range(5)  # kinds of friction; COULOMB: dry, no width
+# Kinds of friction; COULOMB: dry, without a width.
+VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN, RAISED_SPEED, ONE_SIDED = range(7)
 
 # Rows of n: sizes (below); of each term its degree in v, the coordinates of its factors v, its wave
-# m·q, the number of coordinates in its factor f(q), whether it has powers; a term of each wave;
-# where the columns of each term begin among those of ∂θ/∂c without zeros; kinds of friction; where
-# the operations of each term's shape begin, and operations. Then rows, as many as there are
-# coordinates in an f at the most, of coordinates, of powers and of modes of f.
-SIZES, DEGREE, FIRST_V, LAST_V, WAVE, COUNT, POWERED = range(7)
-WAVES, BEGINS, COLUMNS, KINDS, PROGRAMS, CODE, COORDINATES = range(7, 14)
+# m·q, the number of coordinates in its factor f(q), whether it has powers, and its level; the level
+# of each coordinate; a term of each wave; where the columns of each term begin among those of ∂θ/∂c
+# without zeros; kinds of friction; where the operations of each term's shape begin, and operations.
+# Then rows, as many as there are coordinates in an f at the most, of coordinates, of powers and of
+# modes of f.
+SIZES, DEGREE, FIRST_V, LAST_V, WAVE, COUNT, POWERED, LEVEL, LEVELS = range(9)
+WAVES, BEGINS, COLUMNS, KINDS, PROGRAMS, CODE, COORDINATES = range(9, 16)
 
 # Operations: variables, constants and values of the stack are put on it. Of two numbers that are
 # taken from it sum, product, the larger one, whether the first is greater; of three one, by the
@@ -344,7 +349,7 @@ def _terms(n, f, gamma, order):
         f[COSINE, wave + 1] = math.cos(phase)
         f[SINE, wave + 1] = math.sin(phase)
     for j in range(n[SIZES, TERMS]):
-        degree, a, b, count = n[DEGREE, j], n[FIRST_V, j], n[LAST_V, j], n[COUNT, j]
+        degree, count = n[DEGREE, j], n[COUNT, j]
         powered, wave, product = n[POWERED, j] > 0, n[WAVE, j], 1.0
         c = f[COSINE, wave] * f[COS_PHASE, j] - f[SINE, wave] * f[SIN_PHASE, j]
         s = f[SINE, wave] * f[COS_PHASE, j] + f[COSINE, wave] * f[SIN_PHASE, j]
@@ -383,21 +388,20 @@ def _terms(n, f, gamma, order):
         f[ALONG, j] = along
         weight, g = f[THETA, j], 1.0
         turning = weight * (along + gamma * value)
-        if degree == 2:
-            va, vb = f[X, d + a], f[X, d + b]
-            g = va * vb
-            f[masses + a, b] += weight * value
-            f[masses + b, a] += weight * value
-            f[FORCE, a] -= turning * vb
-            f[FORCE, b] -= turning * va
-            f[MOMENTUM, a] += weight * value * vb
-            f[MOMENTUM, b] += weight * value * va
-        elif degree == 1:
-            g = f[X, d + a]
-            f[FORCE, a] -= turning
-            f[MOMENTUM, a] += weight * value
+        for side in range(degree):  # the derivative of g in v of this side is v of the other
+            row, other, dg = n[FIRST_V + side, j], n[LAST_V - side, j], 1.0
+            if degree == 2:
+                dg = f[X, d + other]
+            g *= f[X, d + row]
+            if n[LEVELS, row] == n[LEVEL, j]:
+                f[FORCE, row] -= turning * dg
+                f[MOMENTUM, row] += weight * value * dg
+                if degree == 2:
+                    f[masses + row, other] += weight * value
         for i in range(count):
-            f[FORCE, n[COORDINATES + i, j]] += weight * g * f[slope + i, j]
+            at = n[COORDINATES + i, j]
+            if n[LEVELS, at] == n[LEVEL, j]:
+                f[FORCE, at] += weight * g * f[slope + i, j]
 
 
 @_function
@@ -420,6 +424,13 @@ def _friction(n, f, order):
             root = math.hypot(speed, f[WIDTHS, k])
             ratio = f[WIDTHS, k] / root
             pull, stiffness = speed / root, ratio * ratio / root  # ε²/root³ would underflow
+        elif kind == RAISED_SPEED:
+            if speed != 0.0:
+                stiffness = abs(speed) ** (f[WIDTHS, k] - 1.0)
+            pull, stiffness = speed * stiffness, f[WIDTHS, k] * stiffness
+        elif kind == ONE_SIDED:
+            pull = max(speed, 0.0)
+            stiffness = 1.0 if speed > 0.0 else 0.0
         else:
             pull = f[MODES, k]
         f[PULL, k] = pull
@@ -525,6 +536,8 @@ def _derivatives(n, f, gamma, order):
             g *= f[X, d + n[LAST_V, j]]
         for i in range(count):
             at = n[COORDINATES + i, j]
+            if n[LEVELS, at] != n[LEVEL, j]:
+                continue
             for k in range(count):
                 bent = f[curvature + i * most + k, j]
                 f[raw + at, n[COORDINATES + k, j]] -= weight * g * bent
@@ -532,19 +545,22 @@ def _derivatives(n, f, gamma, order):
                 f[raw + at, 2 * d + n[COLUMNS, e]] -= f[PARTS, e] * g * f[slopes + i, j]
         for side in range(degree):  # the derivative of g in v of this side is v of the other
             row, other = n[FIRST_V + side, j], n[LAST_V - side, j]
-            dg, push = 1.0, 0.0
+            dg, push, acts = 1.0, 0.0, n[LEVELS, row] == n[LEVEL, j]
             if degree == 2:
                 dg, push = f[X, d + other], f[A, other]
-                f[raw + row, d + other] += weight * (along + gamma * value)
+                if acts:
+                    f[raw + row, d + other] += weight * (along + gamma * value)
             for k in range(count):
                 at, slope, bent = n[COORDINATES + k, j], f[slopes + k, j], 0.0
                 for i in range(count):
                     bent += f[curvature + k * most + i, j] * f[X, d + n[COORDINATES + i, j]]
-                f[raw + row, at] += weight * (slope * (push + gamma * dg) + dg * bent)
-                f[raw + row, d + at] += weight * dg * slope
-                f[raw + at, d + row] -= weight * dg * slope
+                if acts:
+                    f[raw + row, at] += weight * (slope * (push + gamma * dg) + dg * bent)
+                    f[raw + row, d + at] += weight * dg * slope
+                if n[LEVELS, at] == n[LEVEL, j]:
+                    f[raw + at, d + row] -= weight * dg * slope
             own = value * (push + gamma * dg) + dg * along
-            for e in range(n[BEGINS, j], n[BEGINS, j + 1] if order > 1 else 0):
+            for e in range(n[BEGINS, j], n[BEGINS, j + 1] if order > 1 and acts else 0):
                 f[raw + row, 2 * d + n[COLUMNS, e]] += f[PARTS, e] * own
 
 

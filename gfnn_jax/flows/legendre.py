@@ -96,12 +96,15 @@ class Legendre:
         v, found = self._derivatives(params, w)
         xp, turn = namespace(w), partial(namespace(w).swapaxes, axis1=-1, axis2=-2)
         unit = xp.broadcast_to(np.eye(self.dim, dtype=w.dtype), found.by_vv.shape)
-        inverse = _solved(found.by_vv, unit)
-        inverse = 0.5 * (inverse + turn(inverse))
+        inverse = turn(_solved(found.by_vv, unit))
         by_q = -_solved(found.by_vv, turn(found.by_vq))  # (..., q, v): rows are solved for
-        bent = -found.by_qq + by_q @ -found.by_vq
-        bent = 0.5 * (bent + turn(bent))
-        above = xp.concatenate([bent, by_q], axis=-1)
+        if self.terms.leaders:  # no Hessian: the derivative of the field, not symmetric
+            bent = -found.by_qq - found.by_qv @ turn(by_q)
+            above = xp.concatenate([bent, -found.by_qv @ inverse], axis=-1)
+        else:
+            inverse = 0.5 * (inverse + turn(inverse))
+            bent = -found.by_qq + by_q @ -found.by_vq
+            above = xp.concatenate([0.5 * (bent + turn(bent)), by_q], axis=-1)
         below = xp.concatenate([turn(by_q), inverse], axis=-1)
         gradient = xp.concatenate([-found.by_q, v], axis=-1)
         return gradient, xp.concatenate([above, below], axis=-2)
@@ -116,8 +119,8 @@ class Legendre:
         terms = self.terms if along is None else along.terms
         value, slope, _ = terms.potentials(q, order=1)
         motion, by_motion = terms.motion(v)
-        by_v = -_solved(found.by_vv, value[..., None] * by_motion)  # (..., P, d)
-        by_q = -slope * motion[..., None] - by_v @ found.by_vq
+        by_v = -_solved(found.by_vv, value[..., None] * terms.acting(by_motion))  # (..., P, d)
+        by_q = terms.acting(-slope * motion[..., None]) - by_v @ np.swapaxes(found.by_qv, -1, -2)
         return np.swapaxes(np.concatenate([by_q, by_v], axis=-1), -1, -2)
 
     def _derivatives(self, params, w) -> tuple[Any, Derivatives]:
@@ -133,7 +136,7 @@ class Legendre:
 
 
 def _solved(matrix, rows):
-    """matrix⁻¹ of each row of (..., n, d); matrix (..., d, d) is symmetric."""
+    """matrix⁻¹ of each row of (..., n, d)."""
     return small_solve(matrix[..., None, :, :], rows)
 
 
@@ -145,7 +148,7 @@ def family_of(law: Lagrangian, degree: int = 0) -> tuple[Any, np.ndarray]:
     """
     family: Any = Legendre(law.terms)
     params = [np.asarray(law.coefficients)]
-    if law.friction.count or law.num_inputs:
+    if law.friction.count or law.num_inputs or law.terms.leaders:
         family = Forced(family, law.friction, law.num_inputs, degree)
         params += [np.asarray(law.losses), np.asarray(law.gains).ravel()]
     if law.powers is not None:

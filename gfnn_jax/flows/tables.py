@@ -9,7 +9,16 @@ from numpy.polynomial import chebyshev
 
 from gfnn_jax.families.expressions import Expression, depends_on, number
 from gfnn_jax.families.functions import CHEBYSHEV, own_function
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction, Terms
+from gfnn_jax.families.lagrangian import (
+    DRY,
+    LINEAR,
+    ONE_SIDED,
+    POWER,
+    QUADRATIC,
+    UNIFORM,
+    Friction,
+    Terms,
+)
 from gfnn_jax.families.traced import traced_pieces
 from gfnn_jax.flows import kernel as row
 from gfnn_jax.flows.dormand_prince import NODES, STAGES, WEIGHTS
@@ -19,6 +28,8 @@ _KINDS = {
     QUADRATIC: row.CUBIC,
     DRY: row.SMOOTHED,
     UNIFORM: row.EVEN,
+    POWER: row.RAISED_SPEED,
+    ONE_SIDED: row.ONE_SIDED,
 }
 _BINARY = {"+": row.PLUS, "*": row.TIMES, "max": row.LARGER, ">": row.GREATER}
 _TAKEN = dict.fromkeys(_BINARY.values(), 1) | {row.SELECT: 2, row.COMPOSE: 3}  # from the stack
@@ -85,6 +96,8 @@ class Tables(NamedTuple):
             row.WAVE: [numbered[one] for one in rows],
             row.COUNT: numbers,
             row.POWERED: powers.any(axis=1),
+            row.LEVEL: terms.follows if terms.leaders else [0] * count,
+            row.LEVELS: [int(bool(terms.leaders) and i not in terms.leaders) for i in range(d)],
             row.WAVES: list(waves.values())[1:],
             row.BEGINS: np.searchsorted(at, np.arange(count + 1)),
             row.COLUMNS: columns,

@@ -303,7 +303,8 @@ OPTIONS: dict[str, About] = {
     "friction": About(
         _TEXT,
         "for a recording, friction by its force: auto, none, linear (viscous, ∝ v), quadratic "
-        "(drag, ∝ v |v|), dry (Coulomb), uniform (R = γT); several joined by +",
+        "(drag, ∝ v |v|), cubic, dry (Coulomb), one-sided (viscous, of one direction), uniform "
+        "(R = γT); several joined by +",
         "KIND",
     ),
     "input_hold": About(

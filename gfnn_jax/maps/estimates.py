@@ -20,7 +20,7 @@ from gfnn_jax.data.channels import args_of, channels_of
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.waves import is_wave, wave
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.lagrangian import UNIFORM, Friction, Lagrangian, functions_of
+from gfnn_jax.families.lagrangian import DRY, UNIFORM, Friction, Lagrangian, functions_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import TAPS, at_stages
 from gfnn_jax.maps.laws import law_of_map
@@ -93,7 +93,10 @@ def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> La
     """Prepare a Lagrangian and the root (m, n) of the covariance of (θ, ρ, G), and of γ where there
     is uniform friction. Dry friction that creeps by less than the sensors see slides or sticks."""
     count, losses = law.terms.count, law.losses
-    rows = [(c, kind, ε if ε > sensors.creep else 0.0) for c, kind, ε in law.friction.rows()]
+    rows = [
+        (c, kind, ε if kind != DRY or ε > sensors.creep else 0.0)
+        for c, kind, ε in law.friction.rows()
+    ]
     order = np.arange(count + law.friction.count + law.gains.size)
     if law.uniform != 0:  # γ, the last of all, stands behind ρ in a form
         rows, losses = [*rows, ((0,) * law.dim, UNIFORM, 0.0)], np.append(losses, law.uniform)

@@ -16,7 +16,8 @@ where of N residuals those that are correlated, over τ samples, count once. Of 
 which the best has odds of less than 20 the one with the fewest kinds is taken: uniform friction,
 which has one coefficient and keeps a multiple of the symplectic form, before linear friction, and
 that before quadratic and dry friction. Uniform friction is tried beside linear friction only where
-both are asked for.
+both are asked for. Rare kinds, cubic and one-sided friction, come last: one of them beside the
+others, or in place of one, where that has odds of 20 against the set without it.
 
 Odds alone let chance in: a direction that is not there takes up a part of what the other
 coefficients miss on the arcs that they are not from. Where there is a choice, a set is therefore
@@ -42,7 +43,7 @@ from gfnn_jax.fitting.evidence import EVIDENCE, correlation_time, criterion
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit
-from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, losses
+from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, RARE, losses
 from gfnn_jax.models.lagrangians.structure import Loss
 from gfnn_jax.models.lagrangians.text import friction_of
 from gfnn_jax.solve.linear import non_negative
@@ -89,7 +90,8 @@ class FrictionChoice(NamedTuple):
             return "+".join(FRICTIONS[KINDS.index(k)] for k in kinds) or "none"
 
         plain = {direction for direction, _, _ in losses(dim, KINDS, 0.0)}
-        rows = [r for r in self.limits if r[1] not in self.kinds and r[0] in plain and len(r) == 3]
+        rows = [r for r in self.limits if r[0] in plain and len(r) == 3]
+        rows = [r for r in rows if r[1] not in (*self.kinds, *RARE)]
         largest = scale * np.array([self.limits[row] for row in rows])
         terms = friction_of(Friction.of(rows, dim), largest, 0 * largest, speeds).terms
         return WhichFriction(
@@ -187,7 +189,8 @@ def chosen(
     ``before`` stay. rows: friction that has been taken, where only its odds are asked for. Odds are
     those against sets whose coefficients are all seen."""
     kinds = sorted({row[1] for row in table.candidates})
-    every = (chosen for n in range(len(kinds) + 1) for chosen in combinations(kinds, n))
+    usual = [kind for kind in kinds if not (choose and kind in RARE)]
+    every = (chosen for n in range(len(usual) + 1) for chosen in combinations(usual, n))
     every = (chosen for chosen in every if not (choose and {LINEAR, UNIFORM} <= set(chosen)))
     sets = [judged for judged in map(table.leanest, every) if judged is not None]
     if not choose:
@@ -203,6 +206,11 @@ def chosen(
     tied = [s for s in seen if odds(best, s) < EVIDENCE.decided]
     known = before.kinds if before else ()
     taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, s.plainness))
+    if choose:
+        likelier = [s for s in _with_rare(table, taken) if odds(s, taken) > EVIDENCE.decided]
+        likeliest = min(likelier, key=lambda s: s.cost, default=taken)
+        tied = [s for s in likelier if odds(likeliest, s) < EVIDENCE.decided]
+        taken = min(tied, key=lambda s: (len(s.kinds), s.cost), default=taken)
     if rows is not None and set(rows) <= set(table.candidates):
         taken = table.judged([table.candidates.index(row) for row in rows])
         seen = [s for s in seen if s.kinds != taken.kinds]
@@ -210,6 +218,14 @@ def chosen(
     alone = table.others(taken.rows).values()
     gains = not taken.rows and any(rho < -OPTIONS.drives * error for rho, error in alone)
     return FrictionChoice(taken.rows, against, table.limits(taken.rows), gains)
+
+
+def _with_rare(table: Table, taken: _Judged) -> list[_Judged]:
+    """The set with a rare kind of friction beside its own, or in place of one, where it is seen."""
+    kinds, rare = set(taken.kinds), {row[1] for row in table.candidates if row[1] in RARE}
+    sets = [kinds - gone | {new} for new in sorted(rare) for gone in [set(), *({k} for k in kinds)]]
+    found = [table.leanest(tuple(sorted(one))) for one in sets]
+    return [one for one in found if one is not None and one.is_seen]
 
 
 def table_of(fit: LawFit, candidates: Sequence[Loss]) -> Table:

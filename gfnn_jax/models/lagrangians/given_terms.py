@@ -26,7 +26,15 @@ from gfnn_jax.families.expressions import (
     to_text,
     whole_multiples,
 )
-from gfnn_jax.families.lagrangian import DRY, LINEAR, MAX_POWER, QUADRATIC, coordinates_in
+from gfnn_jax.families.lagrangian import (
+    DRY,
+    LINEAR,
+    MAX_POWER,
+    ONE_SIDED,
+    POWER,
+    QUADRATIC,
+    coordinates_in,
+)
 from gfnn_jax.models.lagrangians.libraries import SINE
 from gfnn_jax.models.lagrangians.structure import Loss, Row, with_powers
 
@@ -142,8 +150,13 @@ class _Reader(NamedTuple):
             raise self.refused(text)
         ((inside, exponent),) = factors.items()
         kind, width, d = LINEAR, 0.0, len(self.positions)
-        if inside.operation == "abs" and exponent in (1, 3):
-            inside, kind = inside.operands[0], (DRY if exponent == 1 else QUADRATIC)
+        if inside.operation == "abs" and exponent >= 1:
+            inside, kind = inside.operands[0], _OF_POWER.get(exponent, POWER)
+            width = exponent - 1 if kind == POWER else 0.0
+        elif exponent == 2 and (side := _side(inside)) is not None:
+            inside, kind = side, ONE_SIDED
+        elif exponent == 4:
+            kind, width = POWER, exponent - 1
         elif inside.operation == "sqrt" and exponent == 1:
             inside, width = self.smoothed(inside.operands[0], text)
             kind = DRY
@@ -168,8 +181,21 @@ class _Reader(NamedTuple):
         return InputError(
             f"terms: '{text}' is no term of a law. A term of L or V is a formula of "
             f"{', '.join(self.positions)}, in L times up to two of {', '.join(self.speeds)}; one "
-            f"of R is v**2, abs(v)**3 or abs(v){of}"
+            f"of R is v**2, abs(v)**a, abs(v) or (abs(v) + v)**2{of}"
         )
+
+
+_OF_POWER = {1: DRY, 2: LINEAR, 3: QUADRATIC}  # the kind of |v| to this power in R
+
+
+def _side(tree: Expression) -> Expression | None:
+    """v of |v| + v; None of another tree."""
+    if tree.operation != "+":
+        return None
+    parts = [part for part in tree.operands if part.operation != "abs"]
+    sizes = [part.operands[0] for part in tree.operands if part.operation == "abs"]
+    alike = len(parts) == len(sizes) == 1 and sizes[0] in (parts[0], -parts[0])
+    return parts[0] if alike else None
 
 
 def _index(tree: Expression) -> int:

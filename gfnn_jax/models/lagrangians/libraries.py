@@ -15,12 +15,14 @@ from itertools import combinations, combinations_with_replacement, permutations
 import numpy as np
 
 from gfnn_jax.families.expressions import parse, product_of, to_text
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM
+from gfnn_jax.families.lagrangian import DRY, LINEAR, ONE_SIDED, POWER, QUADRATIC, UNIFORM
 from gfnn_jax.models.lagrangians.structure import Loss, Row
 
 SINE = -np.pi / 2
-KINDS = (LINEAR, QUADRATIC, DRY, UNIFORM)
-FRICTIONS = ("linear", "quadratic", "dry", "uniform")  # their names
+KINDS = (LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED)
+FRICTIONS = ("linear", "quadratic", "dry", "uniform", "cubic", "one-sided")  # their names
+RARE = (POWER, ONE_SIDED)  # taken only where they explain a record much better than the others do
+CUBIC = 3.0  # the power of the speed that is tried
 
 
 def unit(dim: int, *axes: int) -> tuple[int, ...]:
@@ -189,8 +191,11 @@ def modes(dim: int, angles: tuple[int, ...], order: int) -> list[tuple[int, ...]
 
 def losses(dim: int, kinds: tuple[int, ...], width: float) -> list[Loss]:
     """Friction of each coordinate, and of the relative speed of neighbours (a joint); uniform
-    friction has no direction."""
+    friction has no direction. Rare kinds are those of single coordinates, one-sided friction of
+    either side."""
     directions = [unit(dim, i) for i in range(dim)]
+    of_power = [(c, POWER, CUBIC) for c in directions if POWER in kinds]
+    sides = [(tuple(side * i for i in c), ONE_SIDED, 0.0) for c in directions for side in (1, -1)]
     for i in range(dim - 1):
         wave = [0] * dim
         wave[i], wave[i + 1] = -1, 1
@@ -198,9 +203,10 @@ def losses(dim: int, kinds: tuple[int, ...], width: float) -> list[Loss]:
     rows = [
         (c, kind, width if kind == DRY else 0.0)
         for kind in kinds
-        if kind != UNIFORM
+        if kind not in (UNIFORM, *RARE)
         for c in directions
     ]
+    rows += of_power + sides * (ONE_SIDED in kinds)
     return rows + [((0,) * dim, UNIFORM, 0.0)] * (UNIFORM in kinds)
 
 
@@ -208,6 +214,6 @@ def opposite(row: Loss) -> Loss | None:
     """Friction of the sum of two speeds for that of their difference: the drag on an arm that hangs
     from another, and what a negative coefficient of the difference stands for. Else None."""
     direction, kind, width = row
-    if min(direction) >= 0:
+    if min(direction) >= 0 or max(direction) <= 0:
         return None
     return tuple(map(abs, direction)), kind, width

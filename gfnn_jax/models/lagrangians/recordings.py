@@ -99,12 +99,11 @@ def fit_recording(
 ) -> LearnedLaw:
     """The law of a recording, from its positions and inputs.
 
-    friction: "auto", "none", "linear", "quadratic", "dry", or several of them, as
-    "linear+dry". input_hold: "auto", or the inputs between samples: "hold", "linear" or
-    "band". mass: the known mass (or moment of inertia) of one position, which fixes the scale of L.
-    terms: those of L, V and R, as text in the names of columns (`models.lagrangians.given_terms`),
-    which are then all that is fitted. loss: of residuals in units of their noise; None: the soft L1
-    of `solve.noise`.
+    friction: "auto", "none", or kinds of `libraries.FRICTIONS`, as "linear+dry". input_hold:
+    "auto", or the inputs between samples: "hold", "linear" or "band". mass: the known mass (or
+    moment of inertia) of one position, which fixes the scale of L. terms: those of L, V and R, as
+    text in the names of columns (`models.lagrangians.given_terms`), which are then all that is
+    fitted. loss: of residuals in units of their noise; None: the soft L1 of `solve.noise`.
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found; its ``fit`` is then the `LearnedLaw` that misses most of the motion, where there is one.
     """
