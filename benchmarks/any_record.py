@@ -13,10 +13,11 @@ the median.
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from harness import TABLES, Numbers, between_markers, main, markdown, number, once, provenance
@@ -270,11 +271,136 @@ def outside_case(name: str, draw: int) -> Numbers:
     }
 
 
-def outside(name: str, count: int, quick: bool) -> Numbers:
-    """Records of one kind outside the vocabulary."""
+# Positions that tell the velocities
+
+
+class Motion(NamedTuple):
+    """Rates of a motion of two positions, with their speeds behind them where it is a law of
+    forces; where it starts, and about how long it takes to come back."""
+
+    rates: Callable
+    start: Any
+    period: float
+
+
+def membrane(rng: np.random.Generator) -> Motion:
+    """FitzHugh and Nagumo's."""
+    a, b, slow, current = rng.uniform((0.5, 0.6, 0.06, 0.4), (0.8, 0.9, 0.15, 0.7))
+
+    def rates(_, z):
+        return [z[0] - z[0] ** 3 / 3 - z[1] + current, slow * (z[0] + a - b * z[1])]
+
+    return Motion(rates, [rng.uniform(-1, 1), rng.uniform(-0.5, 1)], 40.0)
+
+
+def prey(rng: np.random.Generator) -> Motion:
+    """Lotka and Volterra's."""
+    a, b, c, d = rng.uniform(0.5, 1.5, 4)
+    start = rng.uniform((0.7, 0.5), (2.0, 1.5)) * [d / c, a / b]
+    return Motion(
+        lambda _, z: [z[0] * (a - b * z[1]), z[1] * (c * z[0] - d)], start, 7 / np.sqrt(a * d)
+    )
+
+
+def brusselator(rng: np.random.Generator) -> Motion:
+    """An oscillating reaction."""
+    a = rng.uniform(0.8, 1.2)
+    b = 1 + a * a + rng.uniform(0.1, 0.6)
+
+    def rates(_, z):
+        made = z[0] ** 2 * z[1]
+        return [a + made - (b + 1) * z[0], b * z[0] - made]
+
+    return Motion(rates, [1.0, 1.0], 7.0)
+
+
+def two_columns_of_van_der_pol(rng: np.random.Generator) -> Motion:
+    """In Liénard's plane."""
+    m = rng.uniform(0.3, 1.5)
+    return Motion(lambda _, z: [m * (z[0] - z[0] ** 3 / 3 - z[1]), z[0] / m], [0.5, 0.0], 7.0)
+
+
+def decay(rng: np.random.Generator) -> Motion:
+    """Two linear equations, whose spiral two equal springs with friction have too."""
+    g, w, k = rng.uniform((0.01, 0.8, 0.5), (0.04, 1.5, 2.0))
+    return Motion(
+        lambda _, z: [-g * z[0] - w * k * z[1], w / k * z[0] - g * z[1]], [1.0, 0.3], 6.28 / w
+    )
+
+
+def planet(rng: np.random.Generator) -> Motion:
+    """An ellipse about a sun."""
+    e, m = rng.uniform((0.05, 0.5), (0.6, 2.0))
+    fast = np.sqrt(m * (1 + e) / (1 - e))
+
+    def rates(_, z):
+        pull = -m / np.hypot(z[0], z[1]) ** 3
+        return [z[2], z[3], pull * z[0], pull * z[1]]
+
+    return Motion(rates, [1 - e, 0.0, 0.0, fast], 6.28 / np.sqrt(m))
+
+
+def equal_springs(rng: np.random.Generator) -> Motion:
+    """An ellipse about its middle, with or without friction."""
+    w, g = rng.uniform(0.8, 2.0), float(rng.choice([0.0, 0.02]))
+    start = [1.0, 0.0, rng.uniform(-0.5, 0.5) * w, rng.uniform(0.3, 1.2) * w]
+    return Motion(
+        lambda _, z: [z[2], z[3], -w * w * z[0] - g * z[2], -w * w * z[1] - g * z[3]],
+        start,
+        6.28 / w,
+    )
+
+
+def rosette(rng: np.random.Generator) -> Motion:
+    """A hardening spring in the plane, whose orbit crosses itself."""
+    b = rng.uniform(0.2, 1.0)
+
+    def rates(_, z):
+        pull = -(1 + b * (z[0] ** 2 + z[1] ** 2))
+        return [z[2], z[3], pull * z[0], pull * z[1]]
+
+    return Motion(rates, [1.0, 0.0, 0.0, rng.uniform(0.4, 1.2)], 5.5)
+
+
+ORBITS = {
+    "membrane": (membrane, ("first order",)),
+    "prey and predators": (prey, ("first order",)),
+    "reaction": (brusselator, ("first order",)),
+    "Van der Pol in Liénard's plane": (two_columns_of_van_der_pol, ("first order",)),
+    "two linear equations": (decay, ("first order",)),
+    "ellipse about a sun": (planet, ("identified",)),
+    "ellipse about its middle": (equal_springs, ("identified", "first order or mechanical")),
+    "rosette": (rosette, ("identified",)),
+}
+EACH_ORBIT = 5
+
+
+def orbit_case(name: str, draw: int) -> Numbers:
+    """One orbit, 3 to 15 periods of it, and what is said of it."""
+    rng = np.random.default_rng([*name.encode(), draw])
+    make, words = ORBITS[name]
+    motion = make(rng)
+    t = np.arange(0, rng.uniform(3, 15) * motion.period, motion.period / rng.uniform(40, 80))
+    options = {"t_eval": t, "rtol": 1e-9, "atol": 1e-11}
+    x = solve_ivp(motion.rates, (0, t[-1]), motion.start, **options).y.T[:, :2]
+    x = x + NOISE * x.std(axis=0) * rng.normal(size=x.shape)
+    table = {"t": t, "x1": x[:, 0], "x2": x[:, 1]}
+    _, said = _fitted(gfnn.Recording(table, positions=["x1", "x2"], angles=[]))
+    verdict = said["verdict"] or f"refused: {said.get('refused')}"
+    return said | {
+        "draw": draw,
+        "class": name,
+        "verdict": verdict,
+        "identified": verdict.startswith("identified"),
+        "named": any(word in verdict for word in words),
+    }
+
+
+def drawn(one: Callable[[str, int], Numbers], name: str, count: int, quick: bool) -> Numbers:
+    """Draws of records of one kind, and what is said of each."""
     cases = []
     for draw in FIRST + np.arange(1 if quick else count):
-        c = outside_case(name, int(draw))
+        c = one(name, int(draw))
         cases.append(c)
         named = "named" if c["named"] else "NOT"
         print(f"  {name} {draw}: {named}: {c['verdict'][:150]}", flush=True)
@@ -282,7 +408,8 @@ def outside(name: str, count: int, quick: bool) -> Numbers:
 
 
 def _slug(name: str) -> str:
-    return name.lower().replace(" %", "-percent").replace(",", "").replace(" ", "-")
+    plain = name.lower().replace(" %", "-percent").replace("é", "e")
+    return re.sub("[^a-z0-9-]", "", plain.replace(" ", "-"))
 
 
 ROWS = [
@@ -293,8 +420,10 @@ ROWS = [
 ]
 PIECES = {_slug(f"{s} {name}"): partial(sampled, s, name) for s, name in ROWS}
 PIECES |= {
-    _slug(f"outside {n}"): partial(outside, n, k) for n, k in zip(OUTSIDE, EACH, strict=True)
+    _slug(f"outside {n}"): partial(drawn, outside_case, n, k)
+    for n, k in zip(OUTSIDE, EACH, strict=True)
 }
+PIECES |= {_slug(f"orbit {n}"): partial(drawn, orbit_case, n, EACH_ORBIT) for n in ORBITS}
 
 
 def tables() -> None:
@@ -330,13 +459,17 @@ def tables() -> None:
         "CPU s",
     )
     text = markdown(heads, rows)
-    rows = []
-    for name in OUTSIDE:
-        own = cases.get(_slug(f"outside {name}"), [])
-        named, identified = (sum(c[k] for c in own) for k in ("named", "identified"))
-        if own:
-            rows.append([name, f"{named} of {len(own)}", str(identified)])
-    text += "\n\n" + markdown(("outside the vocabulary", "named", "*identified*"), rows)
+    for kind, names, head in (
+        ("outside", OUTSIDE, "outside the vocabulary"),
+        ("orbit", ORBITS, "one orbit, of first order or of a law"),
+    ):
+        rows = []
+        for name in names:
+            own = cases.get(_slug(f"{kind} {name}"), [])
+            named, identified = (sum(c[k] for c in own) for k in ("named", "identified"))
+            if own:
+                rows.append([name, f"{named} of {len(own)}", str(identified)])
+        text += "\n\n" + markdown((head, "named for what it is", "*identified*"), rows)
     between_markers(TABLES, "any-record", f"{text}\n\n{provenance(found)}")
 
 

@@ -18,6 +18,7 @@ from gfnn_jax.families.lagrangian import Powers
 from gfnn_jax.families.text import Term
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.first_order import rival
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.in_use import CalibratedLaw, GaugedLaw
 from gfnn_jax.models.lagrangians.input_rules import InputModel
@@ -133,6 +134,7 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         ended="every length of arcs was fitted",
         flaws=tuple(flaws),
         symbols=(names.coordinates, names.speeds),
+        rival=rival(fit, names.coordinates),
     )
 
 

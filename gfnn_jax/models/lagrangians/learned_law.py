@@ -74,7 +74,8 @@ class LearnedLaw:
     messages: warnings. steps: what the search did, line by line.
     symbols: of coordinates and of their speeds in formulas.
     num_samples, seconds (of the processor). ended: why the search ended. flaws: reasons why the law
-    is not all of the motion; nature: what the record is then (`nature`).
+    is not all of the motion; nature: what the record is then (`nature`). rival: a law of first
+    order that follows the record as well, "" where there is none.
     """
 
     map: SymplecticMap
@@ -107,6 +108,7 @@ class LearnedLaw:
     flaws: tuple[str, ...] = ()
     symbols: tuple[tuple[str, ...], ...] = ((), ())
     nature: str = ""
+    rival: str = ""
 
     @property
     def equations(self) -> tuple[Equation, ...]:
@@ -125,6 +127,8 @@ class LearnedLaw:
         """Verdict of the recording: identified, one of several, or partly, with the reason."""
         if self.flaws:
             return f"partly: {'; '.join((*self.flaws, *filter(None, [self.nature])))}"
+        if self.rival:
+            return f"one of several: {self.rival}"
         together = [names for names in self.alike if names.endswith(ONLY_TOGETHER)]
         if together:
             return f"one of several: {'; '.join(together)}"

@@ -77,9 +77,11 @@ def nature(
     scales: Scales,
     angles: Sequence[int],
     runs: Sequence[np.ndarray] = (),
+    field: str = "",
 ) -> Nature:
     """Tell what the record of these stretches is, whose law was not found. runs: channels (n, k) of
-    whole runs, also where a body would be at rest; by default those of the stretches."""
+    whole runs, also where a body would be at rest; by default those of the stretches. field:
+    equations of first order that follow it to its noise, "" where none were found."""
     exponent = roughness(runs or [s.y for s in found])
     if exponent < OPTIONS.rough:
         grows = f"as time to the power of {exponent:.2g}" if exponent > 0 else "by no more"
@@ -97,11 +99,12 @@ def nature(
     state = np.concatenate([_variables(q, angles), v / v.std(axis=0), u], axis=1)
     plain = _best(state, a, block)
     second = min(1.0, plain / real)
-    if q.shape[1] > 1 and first > max(OPTIONS.first, plain):  # alone it would not come back
+    alone = q.shape[1] == 1  # it would not come back
+    if field or (not alone and first > max(OPTIONS.first, plain)):
         return Nature(
             "not mechanical",
             f"first order, or one orbit: positions tell {100 * first:.1f} % of the velocities, "
-            "as of populations or concentrations",
+            "as of populations or concentrations" + (f": {field} to the noise" if field else ""),
             partly=False,
         )
     jumps, when = _jumps(found)
@@ -137,6 +140,12 @@ def nature(
         f"unrecorded: positions and velocities tell only {100 * second:.0f} % of the "
         "accelerations. An input is missing (--inputs), or a coordinate",
     )
+
+
+def told_by_positions(q: np.ndarray, v: np.ndarray, angles: Sequence[int]) -> bool:
+    """Return whether positions q (n, d) in the order of time tell the velocities v (n, d), as of
+    first order or along one orbit; of one coordinate they do not where it comes back."""
+    return q.shape[1] > 1 and _best(_variables(q, angles), v, _blocks(len(q))) > OPTIONS.first
 
 
 def roughness(runs: Sequence[np.ndarray]) -> float:
@@ -191,7 +200,12 @@ def _states(
     q, v, a, u = (np.concatenate(part) for part in zip(*parts, strict=True))
     spread = u.std(axis=0)
     u = (u - u.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
-    return q, v, a, u, np.arange(len(q)) * OPTIONS.parts // len(q) % OPTIONS.blocks
+    return q, v, a, u, _blocks(len(q))
+
+
+def _blocks(count: int) -> np.ndarray:
+    """The block (count,) that each of samples in the order of time lies in."""
+    return np.arange(count) * OPTIONS.parts // count % OPTIONS.blocks
 
 
 def _reliability(a: np.ndarray, scales: Scales) -> float:

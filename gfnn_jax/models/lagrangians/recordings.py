@@ -37,6 +37,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.dependence import search_of_systems
 from gfnn_jax.models.lagrangians.drives import hidden_frequency, with_frequency
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
+from gfnn_jax.models.lagrangians.first_order import plain_field
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_terms import given_terms
@@ -65,7 +66,8 @@ class RecordingOptions:
     """Limits at which a law is refused, and at which one of shorter arcs is taken
     (`benchmarks/as_a_user.py`, `measured.py`).
 
-    missed: of a channel's variation: no law that leaves as much follows the recording.
+    missed: of a channel's variation: no law that leaves as much follows the recording. followed: %
+    of it, of which a law that is one follows more, unless the rest is noise.
     above_noise: times: such a rest is no noise. clearly: share by which errors of forecasts are
     smaller, which chance does not make. imitated: share of what a sensor's parameter changes that
     no coefficient of the law does, below which it is not identifiable. still: range of a position
@@ -73,6 +75,7 @@ class RecordingOptions:
     """
 
     missed: float = 0.8
+    followed: float = 70.0
     above_noise: float = 3.0
     explained: float = 0.5
     clearly: float = 0.2
@@ -140,7 +143,7 @@ def fit_recording(
         if missed is not None:
             raise _with_nature(missed, data) from None
         raise
-    if all(one.fit_percent < 100 * (1 - OPTIONS.missed) for one in law.whiteness.values()):
+    if _is_no_law(law):
         missed = missed or no_law(data.problem.scales)
     if missed is None and law.flaws:
         what = _nature(data)
@@ -153,11 +156,25 @@ def fit_recording(
     return law
 
 
+def _is_no_law(law: LearnedLaw) -> bool:
+    """Return whether a law leaves nearly all of every channel, or much of one that is no noise."""
+    left = law.whiteness.items()
+    if all(one.fit_percent < 100 * (1 - OPTIONS.missed) for _, one in left):
+        return True
+    return any(
+        one.fit_percent < OPTIONS.followed
+        and not one.white
+        and law.residual[name] > OPTIONS.above_noise * law.noise[name]
+        for name, one in left
+    )
+
+
 def _nature(data: RecordingData) -> Nature:
     recording, problem = data.recording, data.problem
     names = problem.observation.channels
     runs = [channels_of(recording, names, run)[0] for run in recording.runs]
-    return nature(data.segments, problem.scales, problem.angles, runs)
+    field = plain_field(problem, symbols(recording.coordinates))
+    return nature(data.segments, problem.scales, problem.angles, runs, field)
 
 
 def _with_nature(error: FitError, data: RecordingData) -> FitError:

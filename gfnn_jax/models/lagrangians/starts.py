@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Sequence
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +23,7 @@ from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.input_rules import choose_rule
+from gfnn_jax.models.lagrangians.nature import told_by_positions
 from gfnn_jax.models.lagrangians.structure import Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start, zeros_of_angles
 
@@ -105,7 +105,7 @@ def best_start(problem: ArcProblem) -> LawFit:
     some.add_central(textbook.rows, 4, across=True)
     some.add_richer([row for row in every if sum(row[0]) < 2 or row in first], 5)
     some.add_richer(every, 6)
-    if not some.fits:
+    if not some.fits or (some.one_valued and not some.followed):
         raise no_law(problem.scales)
     most = OPTIONS.plain * min(map(some.misfit, some.fits))
     ranked = zip(some.ranks, some.fits, strict=True)
@@ -119,6 +119,8 @@ class _Starts:
     def __init__(self, problem: ArcProblem):
         self.problem, self.fits, self.ranks = problem, [], []
         self.linear = libraries.losses(problem.dim, (LINEAR,), 0.0)
+        q, v = np.split(problem.states, 2, axis=1)
+        self.one_valued = told_by_positions(q, v, problem.angles)
 
     def add(self, library: _Library, zero: np.ndarray | None = None) -> None:
         """Start from the terms of a library that the weak form shows, if it determines them.
@@ -155,7 +157,10 @@ class _Starts:
 
     def add_richer(self, rows: Sequence[Row], rank: int) -> None:
         """Start from a richer library where the residuals of all starts are more than noise: of
-        lengths with equal masses first."""
+        lengths with equal masses first. Not where positions tell the velocities: of what is of
+        first order, or one orbit, many terms follow anything."""
+        if self.one_valued:
+            return
         plain = [row for row in rows if sum(row[0]) < 2 or (max(row[0]) == 2 and is_constant(row))]
         if not self.are_noise and not self.problem.angles:
             self.add(_Library(plain, rank, apart=True, equal=True))
@@ -172,6 +177,8 @@ class _Starts:
         periods = sum(np.ptp(n.t) for n in problem.nodes) / problem.scales.period
 
         def rows(exponent: float, others: Sequence[Row]) -> list[Row]:
+            if exponent == 2:
+                return list(textbook)  # springs
             along, *fields = libraries.central(d, exponent)
             return [*others, *(fields if across else [along])]
 
@@ -179,17 +186,25 @@ class _Starts:
             terms, friction = tuple(rows(exponent, others)), tuple(self.linear[:d])
             return weak_share(Structure(d, terms, friction, (), problem.num_inputs), problem)
 
-        def unlikely(one: tuple[float, Sequence[Row]]) -> float:
-            return criterion(share(*one), 2 * d * periods, len(one[1]))
+        def unlikely(exponent: float, others: Sequence[Row]) -> float:
+            return criterion(share(exponent, others), 2 * d * periods, len(others))
+
+        def exponents(others: Sequence[Row]) -> tuple[float, float]:
+            """The nearest half of a whole number, and what the weak form prefers."""
+            best = min(OPTIONS.exponents, key=lambda e: share(e, others))
+            ends = best - OPTIONS.beside, best + OPTIONS.beside
+            found = minimize_scalar(share, bounds=ends, method="bounded", args=(others,))
+            return float(np.round(2 * found.x) / 2), float(f"{found.x:.4g}")
 
         masses = [row for row in textbook if any(row[0])]
-        best, others = min(product(OPTIONS.exponents, (masses, textbook)), key=unlikely)
-        ends = best - OPTIONS.beside, best + OPTIONS.beside
-        found = minimize_scalar(share, bounds=ends, method="bounded", args=(others,))
-        near = float(np.round(2 * found.x) / 2)
-        plain = near != 0 and share(near, others) < OPTIONS.plain**2 * float(found.fun)
-        exponent = near if plain else float(f"{found.x:.4g}")
-        self.add(_Library(rows(exponent, others), rank, apart=True, equal=True))
+        found = [(others, exponents(others)) for others in (masses, textbook)]
+        if not self.one_valued:  # else many forces suit the orbit, and the plainest is taken
+            found.sort(key=lambda one: unlikely(one[1][1], one[0]))
+        for which in range(2):
+            for others, of in found:
+                if of[which] and not self.are_noise:
+                    own = rows(of[which], others)
+                    self.add(_Library(own, rank, apart=True, equal=True))
 
     def misfit(self, fit: LawFit) -> float:
         """The largest residual of a channel, in units of its noise."""

@@ -1,0 +1,278 @@
+"""First order, q̇ = f(q): the rival of a law of forces where positions tell the velocities.
+
+Along one closed orbit, and of populations and membranes, velocities are functions of the positions,
+and both follow the record. Every orbit of q̇ = f(q) is one of L = ½|q̇ − f(q)|², a
+mechanical law with as many terms as f, f² and their gradients have. So the number of numbers
+decides: coefficients, and d or 2d for the state that each part of the record begins with, beside
+what they leave of it (Schwarz's criterion). An ellipse about a sun is a law of one force, and of a
+dozen terms of f; a membrane is the other way round.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.dataset.stretches import Arcs
+from gfnn_jax.families.text import added, digits, power
+from gfnn_jax.fitting.evidence import criterion
+from gfnn_jax.fitting.linearised import Linearised
+from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
+from gfnn_jax.models.lagrangians.nature import told_by_positions
+from gfnn_jax.solve.latent_arcs import Defects, Fitted, Readings, observed_whole
+
+
+@dataclasses.dataclass(frozen=True)
+class FirstOrderOptions:
+    """Options of the rival (`benchmarks/any_record.py`, one orbit).
+
+    degree: of the polynomials f, at most. columns: of them at most. as_well: times the law's
+    residual, up to which the rival's is another draw of the noise. significant: standard errors of
+    a term that stays. rate: largest h‖f'‖ of a Runge–Kutta step; most: of them between nodes.
+    decided: of twice the logarithm of the odds of the law, above which it alone is named.
+    """
+
+    degree: int = 3
+    columns: int = 60
+    as_well: float = 1.1
+    significant: float = 4.0
+    rate: float = 0.3
+    most: int = 8
+    decided: float = 6.0
+
+
+OPTIONS = FirstOrderOptions()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Products:
+    """Products φ_j of lengths, and of sines and cosines of ``angles``. factors: of each, numbers of
+    variables: first the lengths, in the order of coordinates, then sines, then cosines."""
+
+    dim: int
+    angles: tuple[int, ...]
+    factors: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def of(cls, dim: int, angles: tuple[int, ...], degree: int) -> Products:
+        """Every product up to a degree."""
+        count = dim + len(angles)
+        every = range(count)
+        factors = [f for n in range(degree + 1) for f in combinations_with_replacement(every, n)]
+        sines = range(dim - len(angles), dim)
+        twice = [f for f in factors if not any(f.count(k) > 1 for k in sines)]  # sin² is 1 − cos²
+        return cls(dim, angles, tuple(twice))
+
+    @property
+    def lengths(self) -> list[int]:
+        return [i for i in range(self.dim) if i not in self.angles]
+
+    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """φ (N, J) and ∂φ/∂q (N, J, d) at positions q (N, d)."""
+        turned, lengths = q[:, list(self.angles)], self.lengths
+        s, c = np.sin(turned), np.cos(turned)
+        w = np.concatenate([q[:, lengths], s, c], axis=1)
+        slope = np.concatenate([np.ones((len(q), len(lengths))), c, -s], axis=1)
+        owner = [*lengths, *self.angles, *self.angles]
+        values = np.ones((len(q), len(self.factors)))
+        slopes = np.zeros((*values.shape, self.dim))
+        for j, own in enumerate(self.factors):
+            values[:, j] = np.prod(w[:, list(own)], axis=1)
+            for k in set(own):
+                rest = list(own)
+                rest.remove(k)
+                by = own.count(k) * np.prod(w[:, rest], axis=1) * slope[:, k]
+                slopes[:, j, owner[k]] += by
+        return values, slopes
+
+    def text(self, j: int, names: tuple[str, ...]) -> str:
+        """φ_j as code."""
+        turned = [names[i] for i in self.angles]
+        of = [names[i] for i in self.lengths]
+        of += [f"sin({n})" for n in turned] + [f"cos({n})" for n in turned]
+        own = self.factors[j]
+        return "*".join(power(of[k], own.count(k)) for k in dict.fromkeys(own)) or "1"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FieldOnArcs:
+    """q̇_i = Σ p_k φ_j of the pairs (i, j) = places (K, 2) along arcs of steps h (A, L − 1): the
+    model of `Readings.fit`, by Runge–Kutta steps of order 4."""
+
+    products: Products
+    places: np.ndarray
+    h: np.ndarray
+    substeps: int = 1
+
+    def take(self, arcs: np.ndarray) -> FieldOnArcs:
+        return dataclasses.replace(self, h=self.h[arcs])
+
+    def observe(self, p: np.ndarray, x: np.ndarray) -> Any:
+        return observed_whole(x, len(p))
+
+    def matrix(self, p: np.ndarray) -> np.ndarray:
+        """The coefficients as (d, J)."""
+        c = np.zeros((self.products.dim, len(self.products.factors)))
+        c[tuple(self.places.T)] = p
+        return c
+
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
+        arcs, length, d = x.shape
+        z, c = x[:, :-1].reshape(-1, d), self.matrix(p)
+        h = self.h.reshape(-1, 1) / self.substeps
+        slope = np.zeros((len(z), d, d + len(p)))
+        slope[:, range(d), range(d)] = 1.0
+        i, j = self.places.T
+        own = np.arange(len(p))
+
+        def rates(z: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            values, slopes = self.products(z)
+            moving = np.einsum("ij,njk->nik", c, slopes, optimize=True) @ slope
+            moving[:, i, d + own] += values[:, j]
+            return values @ c.T, moving
+
+        for _ in range(self.substeps):
+            total, change, at = np.zeros_like(z), np.zeros_like(slope), (z, slope)
+            for part, weight in zip((0.5, 0.5, 1.0, 0.0), (1, 2, 2, 1), strict=True):
+                rate, moving = rates(*at)
+                total, change = total + weight * rate / 6, change + weight * moving / 6
+                at = z + part * h * rate, slope + part * h[..., None] * moving
+            z, slope = z + h * total, slope + h[..., None] * change
+        ends = z.reshape(arcs, length - 1, d)
+        slope = slope.reshape(arcs, length - 1, d, -1)
+        return Defects(ends - x[:, 1:], slope[..., :d], slope[..., d:])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FirstOrder:
+    """A field q̇ = f(q) that was fitted to arcs; rms (k,) of what it leaves for each free number."""
+
+    model: FieldOnArcs
+    fitted: Fitted
+    rms: np.ndarray
+
+    def text(self, names: tuple[str, ...]) -> str:
+        """The equations, in the names of coordinates."""
+        errors, parts = Linearised.of_arcs(self.fitted).errors, [[] for _ in names]
+        for (i, j), c, e in zip(self.model.places, self.fitted.p, errors, strict=True):
+            term = self.model.products.text(int(j), names)
+            number = digits(float(c), float(e))
+            parts[i].append(number if term == "1" else f"{number}*{term}")
+        return ", ".join(
+            f"{name}_dot = {added(own) or '0'}" for name, own in zip(names, parts, strict=True)
+        )
+
+
+def first_order(
+    arcs: Arcs, angles: tuple[int, ...], sigma: np.ndarray, most: np.ndarray
+) -> FirstOrder | None:
+    """The plainest field that leaves at most ``most`` (k,) of arcs whose channels are the
+    coordinates, with noise σ (k,); None where there is none."""
+    d = arcs.y.shape[2]
+    x, seen = arcs.x[..., :d], np.isfinite(arcs.y).all(axis=2)
+    q, v = x[seen], arcs.x[..., d:][seen]
+    h = np.diff(arcs.t, axis=1)
+    for degree in range(1, OPTIONS.degree + 1):
+        products = Products.of(d, angles, degree)
+        if len(products.factors) > OPTIONS.columns:
+            break
+        values, slopes = products(q)
+        size = np.linalg.norm(values, axis=0)
+        c = (np.linalg.lstsq(values / size, v, rcond=1e-9)[0] / size[:, None]).T
+        rate = np.abs(np.einsum("ij,njk->nik", c, slopes, optimize=True)).sum(axis=2).max(axis=1)
+        fast = float(np.quantile(rate, 0.99) * np.max(h)) / OPTIONS.rate
+        places = np.argwhere(np.ones_like(c, bool))
+        model = FieldOnArcs(products, places, h, int(np.clip(np.ceil(fast), 1, OPTIONS.most)))
+        found = _fitted(model, c.ravel(), arcs, x, sigma)
+        if found is not None and np.all(found.rms <= OPTIONS.as_well * most):
+            return _pruned(found, arcs, sigma, OPTIONS.as_well * most)
+    return None
+
+
+def _fitted(
+    model: FieldOnArcs, p: np.ndarray, arcs: Arcs, x: np.ndarray, sigma: np.ndarray
+) -> FirstOrder | None:
+    """The field fitted from coefficients p and states x (A, L, d); None where it follows none."""
+    noise = sigma * arcs.noise
+    speed = np.max(np.abs(np.diff(x, axis=1)), axis=(0, 1))
+    scale = np.maximum(sigma, 1e-6 * speed)
+    fitted = Readings(model, arcs.y, noise).fit(p, x, scale, tolerance=1e-3, max_iterations=15)
+    if not np.isfinite(fitted.cost):
+        return None
+    left = fitted.residuals * noise
+    count = np.isfinite(left).sum(axis=(0, 1))
+    free = np.maximum(count - len(x) - len(p) / x.shape[2], 1)
+    return FirstOrder(model, fitted, np.sqrt(np.nansum(left**2, axis=(0, 1)) / free))
+
+
+def _pruned(found: FirstOrder, arcs: Arcs, sigma: np.ndarray, most: np.ndarray) -> FirstOrder:
+    """The field without terms that are not significant, the least first, close to the fit."""
+    while True:
+        model, near = found.model, Linearised.of_arcs(found.fitted)
+        triangle = near.triangle.rebased(near.p)
+        target, kept = triangle.factor[:, -1], list(range(len(near.p)))
+        while len(kept) > 1:
+            A = near.columns[:, kept]
+            size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+            u, s, vt = np.linalg.svd(A / size, full_matrices=False)
+            inverse = (vt.T / np.maximum(s, 1e-12 * s[0])).T
+            p = inverse.T @ (u.T @ target)
+            z = np.abs(p) / np.linalg.norm(inverse, axis=0)
+            if z.min() > OPTIONS.significant:
+                break
+            del kept[int(np.argmin(z))]
+        if len(kept) == len(near.p):
+            return found
+        p = np.linalg.lstsq(near.columns[:, kept], target, rcond=None)[0]
+        smaller = dataclasses.replace(model, places=model.places[kept])
+        other = _fitted(smaller, p, arcs, found.fitted.x, sigma)
+        if other is None or np.any(other.rms > most):
+            return found
+        found = other
+
+
+def plain_field(problem: ArcProblem, names: tuple[str, ...]) -> str:
+    """The equations of first order that follow the arcs of a problem to their noise, in the names
+    of coordinates; "" where there are none, or inputs act."""
+    if not _applies(problem):
+        return ""
+    sigma = problem.scales.sigma
+    found = first_order(problem.arcs(1.0), problem.angles, sigma, sigma)
+    return "" if found is None else found.text(names)
+
+
+def _applies(problem: ArcProblem) -> bool:
+    """Return whether a problem has a rival of first order: one of several coordinates that are seen
+    as they are, without inputs or parameters, whose positions tell their velocities."""
+    q, v = np.split(problem.states, 2, axis=1)
+    others = problem.num_inputs or problem.parameters or not problem.observation.is_plain
+    return not others and told_by_positions(q, v, problem.angles)
+
+
+def rival(fit: LawFit, names: tuple[str, ...]) -> str:
+    """A line on the field of first order that follows a record as a law does, with as few numbers;
+    "" where there is none, or where the law has clearly fewer."""
+    problem, d = fit.problem, fit.form.dim
+    if not _applies(problem):
+        return ""
+    arcs = dataclasses.replace(fit.followed, y=fit.arcs.y - fit.zeros)
+    count = np.isfinite(arcs.y).sum(axis=(0, 1))
+    free = np.maximum(count - 2 * len(arcs.t) - len(fit.p) / d, 1)
+    own = fit.rms() * np.sqrt(count / free)
+    found = first_order(arcs, problem.angles, fit.sigma, own)
+    if found is None:
+        return ""
+    parts, n = len({i for i, _, _ in arcs.home}), float(count.sum()) / fit.correlation
+    numbers = len(found.fitted.p) + d * parts, len(fit.p) + 2 * d * parts
+    costs = [np.exp(2 * np.mean(np.log(rms))) for rms in (found.rms, own)]
+    unlikely, likely = (criterion(c, n, k) for c, k in zip(costs, numbers, strict=True))
+    if unlikely - likely > OPTIONS.decided:
+        return ""
+    return (
+        "first order or mechanical: along this record positions tell the velocities, and "
+        f"{found.text(names)} follows it as the law does, with {numbers[0]} numbers for its "
+        f"{numbers[1]}. Another start at the same positions would decide"
+    )
