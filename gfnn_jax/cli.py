@@ -312,8 +312,7 @@ def _fit_states(
         from gfnn_jax.jobs.fit import fit_states
 
         ran: Any = fit_states(arguments.data, output, columns=columns, **options)
-    print_summary(ran, arguments.out)
-    _hold_to(arguments.strict, arguments.out)
+    _print_fitted(arguments, ran)
 
 
 def _fit_recording(

@@ -1,5 +1,7 @@
 """`gfnn.fit` of states with a bracket of their own: pairs, recordings, files, folders."""
 
+import shlex
+
 import numpy as np
 import pytest
 from test_brackets_found import heavy, lorenz, populations, runs_of, top
@@ -66,15 +68,30 @@ def test_a_given_bracket():
 def test_a_gyroscope_on_the_command_line(tmp_path, capsys):
     starts = np.random.default_rng(0).normal(size=(6, 3))
     data = runs_of(top, starts, 0.05, 300, noise=1e-3)
-    columns = dict(zip(("wx", "wy", "wz"), data.z0.T, strict=True))
+    names = tuple(f"Gyroscope {axis} (rad/s)" for axis in "xyz")
+    columns = dict(zip(names, data.z0.T, strict=True))
     text = to_text({"run": data.run, "t": 0.05 * data.place, **columns})
     (tmp_path / "gyro.csv").write_text(text)
-    command = f"fit {tmp_path}/gyro.csv --structure poisson --states wx,wy,wz --out {tmp_path}/m"
-    assert cli.main(command.split()) == 0
+    figure = str(tmp_path / "look.png")
+    assert cli.main(["look", str(tmp_path / "gyro.csv"), "--figure", figure]) == 0
+    command = capsys.readouterr().out.split("next: gfnn ")[1].splitlines()[0]
+    assert "--structure poisson --states 'Gyroscope x,Gyroscope y,Gyroscope z'" in command
+    assert cli.main(shlex.split(command.replace("--out model", f"--out {tmp_path}/m"))) == 0
     shown = capsys.readouterr().out
     assert "verdict: identified" in shown
     assert "one of a family of 2" in shown
     assert str(gfnn.load(tmp_path / "m").bracket).endswith("so(3), one of a family of 2")
+    command = shown.split("next: gfnn ")[1].replace("prediction.npz", f"{tmp_path}/p.npz")
+    assert cli.main(shlex.split(command.replace("1000", "20"))) == 0
+    with np.load(tmp_path / "p.npz") as file:
+        ends = [data.z0[data.run == run][-1] for run in range(6)]
+        assert file["trajectories"].shape == (6, 21, 3)
+        assert np.abs(file["trajectories"][:, 0] - ends).max() < 1e-6
+    wrong = tmp_path / "four.npy"
+    np.save(wrong, np.zeros((2, 4)))
+    predict = f"predict {tmp_path}/m --initial {wrong} --num-steps 5 --out {tmp_path}/q.npz"
+    assert cli.main(predict.split()) == 2
+    assert "expected states Gyroscope_x, Gyroscope_y, Gyroscope_z" in capsys.readouterr().err
 
 
 def test_three_columns_say_what_to_type():

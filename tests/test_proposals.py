@@ -211,6 +211,67 @@ def test_rates_of_turning_without_an_angle(tmp_path, capsys, axes, options):
         assert "--structure poisson --states 'Gyroscope x,Gyroscope y,Gyroscope z'" in command
 
 
+def tumbling(rng, count, noise=0.01):
+    """Runs of the rates of a body of random inertia, with noise relative to their spread."""
+    root = rng.normal(size=(3, 3))
+    inertia = root @ root.T + rng.uniform(1, 3) * np.eye(3)
+
+    def rates(t, w):
+        return np.linalg.solve(inertia, np.cross(inertia @ w, w))
+
+    t = 0.02 * np.arange(200)
+    runs = [
+        solve_ivp(rates, (0, t[-1]), 3 * rng.normal(size=3), t_eval=t, rtol=1e-8).y.T
+        for _ in range(count)
+    ]
+    w = np.concatenate(runs)
+    w += noise * w.std(axis=0) * rng.normal(size=w.shape)
+    return {"run": np.repeat(np.arange(count), len(t)), "t": np.tile(t, count)}, w.T
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_rates_of_a_body_are_no_positions(seed):
+    begin, w = tumbling(np.random.default_rng(seed), 6)
+    for names in (("wx", "wy", "wz"), ("x", "y", "z")):
+        recording = gfnn.Recording(begin | dict(zip(names, w, strict=True)), positions=names)
+        assert kinds(recording.summary()) == ["first order"]
+        command = f"--structure poisson --states {','.join(names)}"
+        assert command in recording.summary().command
+        with pytest.raises(InputError, match=f"no positions. Learn their bracket: {command}"):
+            refuse_mistakes(recording)
+
+
+@pytest.mark.parametrize("names", [("wx", "wy", "wz"), ("gyro_x", "gyro_y", "gyro_z")])
+def test_names_tell_rates_of_turning(names):
+    begin, w = tumbling(np.random.default_rng(0), 1)
+    with pytest.raises(InputError, match=r"about three axes.*wants runs of 3 speeds or more"):
+        gfnn.Recording(begin | dict(zip(names, w, strict=True)))
+
+
+@pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_bodies_on_springs_and_in_orbits_are_positions(seed, dim):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(dim, dim))
+    stiffness, damping = root @ root.T + 2 * np.eye(dim), rng.choice([0, 0.3])
+    t, runs = 0.05 * np.arange(200), []
+
+    def springs(t, z):
+        return np.concatenate([z[dim:], -stiffness @ z[:dim] - damping * z[dim:]])
+
+    def orbits(t, z):
+        return np.concatenate([z[dim:], -z[:dim] / np.linalg.norm(z[:dim]) ** 3])
+
+    for rates, turned in ((springs, 0.0), (orbits, 1.0)):
+        starts = rng.normal(size=(5, 2 * dim))
+        starts[:, 0], starts[:, dim + 1] = 1 + 0.2 * starts[:, 0], turned + 0.2 * starts[:, dim + 1]
+        runs = [solve_ivp(rates, (0, t[-1]), z, t_eval=t, rtol=1e-8).y[:dim] for z in starts]
+        table = {"run": np.repeat(np.arange(5), len(t)), "t": np.tile(t, 5)}
+        table |= dict(zip("xyz", np.concatenate(runs, axis=1), strict=False))
+        found = gfnn.Recording(table, positions=list("xyz"[:dim])).summary()
+        assert "first order" not in kinds(found)
+
+
 def test_populations_are_states_of_first_order():
     def rates(s, z):
         return [z[0] * (0.8 - 0.02 * z[1]), z[1] * (0.03 * z[0] - 0.9)]

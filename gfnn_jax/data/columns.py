@@ -12,7 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.data.roles import OF_CALENDAR, ROLES, by_name, is_angle, plain
+from gfnn_jax.data.first_order import first_order
+from gfnn_jax.data.roles import (
+    OF_CALENDAR,
+    ROLES,
+    by_name,
+    is_angle,
+    is_rate_of_turning,
+    plain,
+)
 from gfnn_jax.data.tables import Table
 from gfnn_jax.errors import InputError
 from gfnn_jax.signals.derivatives import derivatives, window
@@ -26,7 +34,8 @@ _LIKE = 0.85  # likeness of a column to the derivative of another, that tells
 _MOST_COLUMNS = 12  # whose names do not tell, that are compared
 _ALONE = 1.3  # times the noise, up to which a column's spread is noise alone
 _ONE_AXIS = 0.1  # ratio of strengths of turning, below which one axis is enough
-_FIRST_ORDER = 0.4  # part of the rates' variance that functions of the columns may leave
+_FIRST_ORDER = 0.6  # share of the rates' variance that functions of the columns explain of states
+_RUNS_OF_A_BODY = 3  # whose energies and |M|² determine the law of a body that turns
 _STD = "_std"  # end of the name of a column that holds the σ of another
 Names = Sequence[str] | str | None
 Runs = Mapping[str, tuple[np.ndarray, dict[str, np.ndarray]]]
@@ -90,6 +99,9 @@ def roles_of(
         verbs = ("differs", "is taken as a parameter"), ("differ", "are taken as parameters")
         differ, taken = verbs[len(varied) > 1]
         notes.append(f"{', '.join(varied)} {differ} from run to run, and {taken}")
+    if not roles["positions"] and all(is_rate_of_turning(n) for n in roles["velocities"]):
+        rest = [name for name in names if name in (*rest, *roles["velocities"])]
+        roles["velocities"] = ()
     if not any(roles[role] for role in ("positions", "velocities", "momenta")):
         found, told = _by_data(source, runs, rest, units)
         roles |= {role: (*roles[role], *of_role) for role, of_role in found.items()}
@@ -147,8 +159,9 @@ def _by_data(
         notes.append(f"the data show that {paired[0]} are derivatives of {paired[1]}")
     rest = [name for name in moving if not any(name in pair for pair in pairs)]
     turning = [n for n in rest if _OF_TURNING.fullmatch(units.get(n, ""))]
+    turning = turning or [n for n in rest if is_rate_of_turning(n)]
     if turning and not pairs:
-        raise _of_rates(source, turning, np.stack([columns[name] for name in turning]))
+        raise _of_rates(source, turning, np.stack([columns[name] for name in turning]), len(runs))
     inputs = [n for n in rest if _OF_DRIVES.fullmatch(units.get(n, ""))]
     lengths = [n for n in rest if _OF_LENGTHS.fullmatch(units.get(n, "").lower())]
     unclear = [n for n in rest if n not in (*inputs, *lengths)]
@@ -159,7 +172,9 @@ def _by_data(
         driving = f", {', '.join(inputs)} inputs" * bool(inputs)
         notes.append(f"by their units {', '.join(lengths)} are positions{driving}")
     if unclear or (inputs and not (pairs or lengths)):
-        raise _unclear(source, columns, moving, unclear or inputs)
+        own = [np.stack([values[n] for n in moving], axis=1) for _, values in runs.values()]
+        explained = first_order(times, own).explained if len(moving) > 1 else 0.0
+        raise _unclear(source, columns, moving, unclear or inputs, explained)
     return {
         "positions": (*(x for x, _ in pairs), *lengths),
         "velocities": tuple(v for _, v in pairs),
@@ -173,8 +188,8 @@ def _is_noise(column: np.ndarray, size: Noise) -> bool:
     return size.white and size.sigma is not None and spread < _ALONE * size.sigma
 
 
-def _of_rates(source: str, names: Sequence[str], columns: np.ndarray) -> Undecided:
-    """Options for rates of turning whose angles no column shows."""
+def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int) -> Undecided:
+    """Options for rates of turning whose angles no column shows. runs: number of them."""
     known = columns[:, np.isfinite(columns).all(axis=0)]
     strengths = np.linalg.svd(known, compute_uv=False) if known.size else np.ones(len(names))
     shown = f"{', '.join(names)} {'is a rate' if len(names) == 1 else 'are rates'} of turning"
@@ -182,7 +197,9 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray) -> Undecid
         states = ",".join(names)
         return Undecided(
             f"{source}: {shown} about three axes: --structure poisson --states "
-            f"{shlex.quote(states)} learns the bracket of a body that turns",
+            f"{shlex.quote(states)} learns the bracket of a body that turns"
+            + f", which wants runs of {_RUNS_OF_A_BODY} speeds or more"
+            * (runs < _RUNS_OF_A_BODY),
             {"structure": "poisson", "states": tuple(names)},
         )
     main = names[int(np.argmax(known.std(axis=1)))] if known.size else names[0]
@@ -195,11 +212,16 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray) -> Undecid
 
 
 def _unclear(
-    source: str, columns: Mapping[str, np.ndarray], moving: Sequence[str], shown: Sequence[str]
+    source: str,
+    columns: Mapping[str, np.ndarray],
+    moving: Sequence[str],
+    shown: Sequence[str],
+    explained: float,
 ) -> Undecided:
-    """Options for columns that nothing tells apart."""
+    """Options for columns that nothing tells apart. explained: share of their rates that functions
+    of them explain."""
     typed = shlex.quote(",".join(moving))
-    if len(moving) > 1 and _of_first_order(np.stack([columns[name] for name in moving])):
+    if explained > _FIRST_ORDER:
         return Undecided(
             f"{source}: the names {', '.join(columns)} do not show what was measured; their rates "
             f"are functions of {', '.join(moving)} themselves, as of states without velocities, of "
@@ -213,21 +235,6 @@ def _unclear(
         "some of them and --inputs",
         {"positions": tuple(moving)},
     )
-
-
-def _of_first_order(columns: np.ndarray) -> bool:
-    """Return whether the rates of columns (k, T) are quadratic functions of them, each one's with
-    the others' help."""
-    x = columns / np.nanstd(columns, axis=1, keepdims=True)
-    rates, x = (x[:, 2:] - x[:, :-2]).T, x[:, 1:-1]
-    known = np.isfinite(x).all(axis=0) & np.isfinite(rates).all(axis=1)
-    products = [a * b for a, b in itertools.combinations_with_replacement(x, 2)]
-    table = np.stack([np.ones(x.shape[1]), *x, *products], axis=1)[known]
-    rates = rates[known]
-    if len(table) < 4 * table.shape[1]:
-        return False
-    left = rates - table @ np.linalg.lstsq(table, rates, rcond=None)[0]
-    return bool(np.all(left.var(axis=0) < _FIRST_ORDER * rates.var(axis=0)))
 
 
 def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tuple[str, str]]:

@@ -45,6 +45,7 @@ WRONG = (
     "drifting clock",
     "different systems",
     "circle",
+    "first order",
 )
 
 
@@ -487,10 +488,7 @@ def _systems(traits: Traits) -> Iterator[Fault]:
     runs = _of_other_systems(traits)
     if runs:
         found = f"runs {', '.join(runs[:8])} do not follow the law of the others"
-        remedy = (
-            "Check their units and signs, name what differs (--parameters), or fit them apart. Of "
-            "columns that are no positions, as rates of a body: --structure poisson --states A,B,C"
-        )
+        remedy = "Check their units and signs, name what differs (--parameters), or fit them apart"
         yield Fault("different systems", found, remedy)
 
 

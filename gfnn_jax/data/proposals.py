@@ -15,6 +15,8 @@ from scipy import optimize, signal
 
 from gfnn_jax.data.accelerations import Accelerations, accelerations
 from gfnn_jax.data.faults import Fault, faults
+from gfnn_jax.data.first_order import TOLD, first_order
+from gfnn_jax.data.roles import is_rate_of_turning
 from gfnn_jax.data.traits import Traits
 
 
@@ -50,14 +52,16 @@ class _Options:
     large: float = 0.3
     swings: int = 8
     uneven: float = 0.02
+    most_states: int = 12
 
 
 _OPTIONS = _Options()
 
 
 def mistakes(traits: Traits) -> list[Fault]:
-    """Faults, and points on a circle, which are no free coordinates."""
-    return [*faults(traits), *_circles(traits)]
+    """Faults, points on a circle, which are no free coordinates, and states that are no positions;
+    of these nothing else is said, for it would be judged by accelerations."""
+    return [*_states(traits)] or [*faults(traits), *_circles(traits)]
 
 
 def findings(traits: Traits) -> tuple[Fault, ...]:
@@ -67,6 +71,31 @@ def findings(traits: Traits) -> tuple[Fault, ...]:
     checks = _CHECKS if any(fault.wrong for fault in found) else (*_CHECKS, _kinds)
     found += [fault for check in checks for fault in check(traits)]
     return tuple(sorted(found, key=lambda fault: not fault.wrong))
+
+
+# Populations, rates of a body that turns: states that are no positions.
+
+
+def _states(traits: Traits) -> Iterator[Fault]:
+    """Positions whose rates are functions of themselves, with an energy that each run keeps."""
+    recording, names = traits.recording, traits.recording.positions
+    others = (*recording.velocities, *recording.momenta, *recording.inputs, *recording.sensors)
+    if not 2 <= len(names) <= _OPTIONS.most_states or others or recording.explained:
+        return
+    runs = [np.stack(x, axis=1) for x in zip(*map(traits.by_run, names), strict=True)]
+    found, shown = first_order(traits.times, runs), ", ".join(names)
+    if not found.told and not (found.explained > TOLD and all(map(is_rate_of_turning, names))):
+        return
+    populations = all((x > 0).all() for x in runs)
+    what = "of populations" if populations else "of the rates of a body that turns"
+    keeps = f", and each run keeps {found.constants} of these" * (found.constants > 0)
+    yield Fault(
+        "first order",
+        f"the rates of {shown} are functions of {shown} themselves{keeps}, as {what}: these are "
+        "no positions",
+        f"Learn their bracket: --structure poisson --states {shlex.quote(','.join(names))}",
+        {"structure": "poisson", "states": names},
+    )
 
 
 # Points that a rod or a string holds.

@@ -107,6 +107,12 @@ def is_angle(name: str) -> bool:
     return bool(found) and found[1] in _ANGLES
 
 
+def is_rate_of_turning(name: str) -> bool:
+    """Return whether this is the usual name of a rate of turning about an axis: wx, omega_y,
+    Gyroscope z."""
+    return re.fullmatch(r"(w|omega|gyro|gyroscope|gyr)_?[xyz]", _bare(name)) is not None
+
+
 def unit_in(name: str) -> str:
     """The unit that a name ends with: deg of theta_deg, mm/s of v_mm_s; "" of none."""
     found = _UNIT.search(name.strip())

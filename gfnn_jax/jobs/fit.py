@@ -11,7 +11,7 @@ import numpy as np
 
 from gfnn_jax.budget import READING
 from gfnn_jax.data.files import iterate_pairs, read_trajectories
-from gfnn_jax.data.recording import read
+from gfnn_jax.data.recording import Recording, read
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.data.summary import summary
@@ -196,10 +196,16 @@ def fit_states(
         fitted = learn_fit(recording, options=asked, on_progress=progress.line)
     names = list(recording.positions)
     result = fitted.report(seed=asked.seed, data={"source": recording.source, "states": names})
-    job = {"command": "fit", "data": recording.source, "states": names, **asked.deciding}
+    job = {**_job(recording, columns, asked), "states": names}
     with atomic_folder(output.out) as folder:
         write(folder, folder, fitted, result, job)
     return Ran(fitted, output.out, result)
+
+
+def _job(recording: Recording, columns: dict[str, Any], asked: FitOptions) -> dict[str, Any]:
+    """Record of a job by which another recording is read as this one was."""
+    job = {"command": "fit", "data": recording.source, **asked.deciding, **units_of(recording)}
+    return job | {"reading": {n: columns[n] for n in ("columns", "dt", "time") if n in columns}}
 
 
 def fit_recording(
@@ -224,8 +230,7 @@ def fit_recording(
         asked = FitOptions(**options)
     recording = read(list(data), **columns)
     refuse_mistakes(recording, despite)
-    job = {"command": "fit", "data": recording.source, **asked.deciding, **units_of(recording)}
-    job["reading"] = {n: columns[n] for n in ("columns", "dt", "time") if n in columns}
+    job = _job(recording, columns, asked)
     is_law = asked.learn != "map"
     refused: FitError | None = None
     with refusals(), failures_of_arithmetic():

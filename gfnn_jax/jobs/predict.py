@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.brackets import Bracket
+from gfnn_jax.data.blocks import damage
 from gfnn_jax.data.files import are_recordings, read_initial, read_initial_noise
 from gfnn_jax.data.predictions import (
     PredictionJob,
@@ -22,7 +24,7 @@ from gfnn_jax.data.predictions import (
     part_of,
     put_together,
 )
-from gfnn_jax.errors import InputError
+from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.jobs.output import Output, read_in_units, refuse_other_units
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.bands import bands, horizon
@@ -128,7 +130,11 @@ def predict(
     if asked.dt is not None:
         with _refused_as("--dt"):
             map_ = map_.over(asked.dt)
-    if map_.of_positions and are_recordings(initial):
+    if map_.bracket is not None:
+        if asked.horizon is not None:
+            raise InputError("--horizon: is a length of positions, and these states have none")
+        z0, params = _states_of(map_.bracket, model, initial), None
+    elif map_.of_positions and are_recordings(initial):
         z0, params = _last_states(map_, model, initial), None
     else:
         names = () if map_.parameters is None else map_.parameters.names
@@ -199,6 +205,33 @@ def _refused_as(option: str) -> Iterator[None]:
         yield
     except ValueError as error:
         raise InputError(f"{option}: {error}") from error
+
+
+def _states_of(bracket: Bracket, model: Path, initial: Path) -> np.ndarray:
+    """(B, n): the rows of an array, ``z0`` of an archive, or the last state of every run of a file
+    with the columns that the model was learned from."""
+    if initial.suffix.lower() in (".npy", ".npz") and not are_recordings(initial):
+        with damage(initial, "the array"):
+            found: Any = np.load(initial, allow_pickle=False)
+            if initial.suffix.lower() == ".npz":
+                found = found["z0"] if "z0" in found.files else found["trajectories"][:, -1]
+        z0 = np.atleast_2d(np.asarray(found, np.float64))
+    else:
+        job = saved.record(model).get("job", {})
+        states = job.get("states", bracket.labels)
+        recording = read_in_units(initial, job, {"positions": states})
+        refuse_other_units(recording, job)
+        z0 = np.array([recording.array("positions", run)[-1] for run in recording.runs])
+    if z0.ndim != 2 or z0.shape[1] != bracket.size or not np.isfinite(z0).all():
+        raise InputError(
+            f"{initial}: expected states {', '.join(bracket.labels)} that are finite, got an array "
+            f"{z0.shape}"
+        )
+    try:
+        bracket.require_inside(z0)
+    except FitError as error:
+        raise InputError(f"{initial}: {error}") from error
+    return z0
 
 
 def _last_states(map_: SymplecticMap, model: Path, initial: Path) -> np.ndarray:

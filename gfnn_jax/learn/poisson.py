@@ -14,6 +14,7 @@ from gfnn_jax.candidates.assemble import block_of, stepped
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.coordinates import CARTESIAN, LOG
 from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.roles import symbols
 from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.dataset.split import split_rows
@@ -146,7 +147,7 @@ def pairs_of_states(recording: Recording) -> Pairs:
     usual = float(np.median(dt))
     even = np.abs(dt - usual).max() <= EVEN * usual
     dt = usual if even else dt
-    return Pairs(z0, z1, dt, run=run, place=place, structure=POISSON, names=names)
+    return Pairs(z0, z1, dt, run=run, place=place, structure=POISSON, names=symbols(names))
 
 
 def _checked(pairs: Any, bracket: Bracket | None) -> tuple[np.ndarray, np.ndarray]:
