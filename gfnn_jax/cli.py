@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import difflib
 import json
 import os
 import shlex
@@ -89,10 +90,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _is_data(first: str) -> bool:
-    """Return whether this is a file or a record, which stand for ``gfnn run`` with them."""
+    """Return whether this is a file, or looks like the name of one, or a record: they stand for
+    ``gfnn run`` with them."""
     from gfnn_jax.records import RECORDS
 
-    return first not in _COMMANDS and (first in RECORDS or Path(first).is_file())
+    looks_so = bool(Path(first).suffix) or os.sep in first
+    named = first in RECORDS or Path(first).is_file() or looks_so
+    return first not in _COMMANDS and not first.startswith("-") and named
 
 
 def _fail(status: int, why: object) -> int:
@@ -108,6 +112,14 @@ def _check_exists(path: Path) -> None:
     except OSError as error:  # a name too long, a folder that may not be entered
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     raise InputError(f"{path}: no such file or folder")
+
+
+def _unknown(name: str, known: Sequence[str]) -> InputError:
+    """The error of a name that is neither a file nor one of these."""
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"Did you mean {near[0]}? " if near else ""
+    listed = "`gfnn records` and `gfnn scenes` list what comes with the package"
+    return InputError(f"{name}: no such file, record or scene. {hint}{listed}")
 
 
 # The commands. The heavy imports are here, after the checks that need none of them.
@@ -155,6 +167,7 @@ def _processes(arguments: argparse.Namespace) -> Iterator[Callable[[], processes
 
 def _run(arguments: argparse.Namespace) -> None:
     from gfnn_jax.records import RECORDS
+    from gfnn_jax.scenes import SCENES
 
     data = Path(arguments.scene)
     out = arguments.out = arguments.out or Path("runs") / data.stem
@@ -162,6 +175,8 @@ def _run(arguments: argparse.Namespace) -> None:
         ensure_new(out, arguments.overwrite, folder=True)
     if arguments.scene in RECORDS or data.is_file():
         return _run_file(arguments)
+    if arguments.scene not in SCENES:
+        raise _unknown(arguments.scene, [*RECORDS, *SCENES])
     _refuse_given(arguments, _OF_FILES, "only for files and records, not for a scene")
     with _output(arguments) as output:
         from gfnn_jax.jobs.run import run
@@ -226,11 +241,15 @@ def _record_named(path: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def _look(arguments: argparse.Namespace) -> None:
+    from gfnn_jax.records import RECORDS
+
     if arguments.figure is not None:
         ensure_new(arguments.figure, arguments.overwrite)
     named = [_record_named(path) for path in arguments.data]
     paths = [path for path, _ in named]
     for path in paths:
+        if not path.suffix and not path.exists():
+            raise _unknown(str(path), [*RECORDS])
         _check_exists(path)
     figure = arguments.figure
     if figure is None and not arguments.json:

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import math
 import re
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -65,6 +66,24 @@ OF_COLUMNS = (
 )
 LAGRANGIAN_OPTIONS = {field.name for field in dataclasses.fields(Lagrangian)}
 DISTRIBUTED_STATUS = "  134  with --distributed: another process of the job was lost"
+EXAMPLES = {
+    "run": """\
+gfnn pendulum --open            a measured record; a file of yours stands in its place
+gfnn run two-body --quick       a simulated system""",
+    "look": """\
+gfnn look pendulum
+gfnn look swing.csv --degrees angle""",
+    "fit": """\
+gfnn fit swing.csv --out model                      a recording: t, theta, …
+gfnn fit pairs.npz --tolerance 1e-8 --out model     states q, p: z0, z1 and dt""",
+    "predict": """\
+gfnn predict model --initial swing.csv --num-steps 1000 --out forecast.csv
+gfnn predict model --initial start.npy --num-steps 1000 --out prediction.npz""",
+    "export": """\
+gfnn export model --to c        writes model.c""",
+    "compare": """\
+gfnn compare two-body --quick --methods hnn,gfnn""",
+}
 WORDS = """\
 the table of candidates:
   chart      where the generating function S is evaluated: type2 at (q, P), type3 at (Q, p),
@@ -154,7 +173,10 @@ def parser() -> argparse.ArgumentParser:
     commands = found.add_subparsers(required=True, metavar="COMMAND")
 
     def command(name: str, about: str, description: str = "", epilog: str = EXIT_STATUS):
-        given = {"description": description, "epilog": epilog, **plain} if description else {}
+        given = {}
+        if description:
+            shown = f"{textwrap.fill(description, 79)}\n\n{EXAMPLES[name]}"
+            given = {"description": shown, "epilog": epilog, **plain}
         made = commands.add_parser(name, help=about, **given)
         made.set_defaults(command=name)
         return _Command(made)

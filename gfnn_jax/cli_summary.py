@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -113,30 +114,40 @@ def print_table(table: Any) -> None:
 def print_record(ran: Any, out: Path) -> None:
     """Print a law, its physical quantities, and its forecasts of the last third of the
     recording."""
-    print_law(ran.learned.fit)
-    found = ran.forecasts
-    if found is not None:
-        ahead = ", ".join(f"{seconds:.3g}" for seconds in found.ahead)
-        for name, errors in found.median.items():
-            sizes = ", ".join(f"{error:.3g}" for error in errors)
-            unit = f" {ran.held_out.unit(name)}".rstrip()
-            print(
-                f"the last third, which no fit has seen: {name} errs by {sizes}{unit} after "
-                f"{ahead} s (medians)"
-            )
-        print(f"{found.within:.0%} of it lies within two standard deviations (95 % expected)")
+    print_law(ran.learned.fit, lambda: _print_ahead(ran.forecasts, ran.held_out))
     print(f"written to {out}; the report is {out / 'report.html'}")
 
 
-def print_law(fit: Any) -> None:
-    """Print the verdict, a law, and its physical quantities."""
+def _print_ahead(found: Any, held_out: Any) -> None:
+    """Print how forecasts compare with the part of a recording that no fit has seen."""
+    if found is None:
+        return
+    ahead = ", ".join(f"{seconds:.3g}" for seconds in found.ahead)
+    for name, errors in found.median.items():
+        sizes = ", ".join(f"{error:.3g}" for error in errors)
+        unit = f" {held_out.unit(name)}".rstrip()
+        print(
+            f"forecasts of the last third, which no fit has seen: median error of {name} "
+            f"{sizes}{unit} after {ahead} s"
+        )
+    print(f"{100 * found.within:.0f} % of it lies within two standard deviations (95 % expected)")
+
+
+def print_law(fit: Any, ahead: Callable[[], None] | None = None) -> None:
+    """Print the verdict, a law, its physical quantities and how far forecasts hold; what ``ahead``
+    prints; and the details."""
     from gfnn_jax.evaluate.physics import physics
 
     print_verdict(fit)
-    print(fit.table)
-    for quantity in physics(fit.found).quantities:
-        if not quantity.name.startswith("energy"):
-            print(quantity)
+    law = fit.found
+    quantities = [str(q) for q in physics(law).quantities if not q.name.startswith("energy")]
+    for line in (*law.result_lines, *quantities, *law.horizon_lines):
+        print(line)
+    if ahead is not None:
+        ahead()
+    print("details:")
+    for line in law.detail_lines:
+        print(f"  {line}")
 
 
 def print_forecasts(found: Any, out: Path) -> None:

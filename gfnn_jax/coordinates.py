@@ -37,6 +37,7 @@ class Coordinates:
                for the map only (the standard map's p), and S need not be periodic in it.
     cyclic:    indices of y that do not enter S at all; the conjugate variable is conserved.
     forward, inverse: the canonical change z -> y and back, for one state of shape (2d,).
+    names: of y, as people write them; () for q1 … pd.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Coordinates:
     cyclic: tuple[int, ...] = ()
     forward: Callable = _identity
     inverse: Callable = _identity
+    names: tuple[str, ...] = ()
 
 
 CARTESIAN = Coordinates("cartesian")
@@ -71,7 +73,12 @@ def polar(*, cyclic: bool) -> Coordinates:
     conserved to roundoff. The change is not defined at r = 0.
     """
     return Coordinates(
-        "polar", angles=(1,), cyclic=(1,) if cyclic else (), forward=_to_polar, inverse=_from_polar
+        "polar",
+        angles=(1,),
+        cyclic=(1,) if cyclic else (),
+        forward=_to_polar,
+        inverse=_from_polar,
+        names=("r", "φ", "p_r", "p_φ"),
     )
 
 

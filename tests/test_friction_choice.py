@@ -85,7 +85,7 @@ def test_friction_kept_against_odds_is_said_to_be_that_of_fewest_kinds():
     kept = WhichFriction(("linear",), {"none": 1e7, "linear+dry": 1 / 3.9}, {})
     assert str(kept) == (
         "linear; odds of 1 : 3.9 against linear+dry on held-out parts, "
-        "and of sets within 20 : 1 the one of fewest kinds is chosen"
+        "too few (below 20 : 1) for a further kind"
     )
     assert "kept" not in str(WhichFriction(("linear",), {"none": 1e7, "linear+dry": 30.0}, {}))
 

@@ -416,7 +416,7 @@ def test_the_friction_that_a_record_shows(swing):
     assert found.odds["none"] > 1e6
     assert found.odds["dry"] > 20
     assert all(0 < limit < 0.002 for limit in found.limits.values())
-    assert "not seen, coefficients in R (2 σ): |ω|³ < 0.00" in str(found)
+    assert "not significant, coefficients in R below 2 σ: |ω|³ < 0.00" in str(found)
     without = gfnn.fit(undamped())
     assert without.friction.terms == ()
     assert without.which_friction.kinds == ()
@@ -637,7 +637,7 @@ def test_a_recording_is_run_from_file_to_forecasts(tmp_path, capsys):
     arguments = ["run", str(tmp_path / "swing.csv"), "--out", str(out)]
     assert main(arguments) == 0
     told = capsys.readouterr().out
-    assert "the last third, which no fit has seen: theta errs by 0.00" in told
+    assert "which no fit has seen: median error of theta 0.00" in told
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert report["data"]["num_samples"] == pytest.approx(2 / 3 * len(t), abs=1)
     found = report["forecasts"]

@@ -103,6 +103,12 @@ def roles_of(
         rest = [name for name in names if name in (*rest, *roles["velocities"])]
         roles["velocities"] = ()
     if not any(roles[role] for role in ("positions", "velocities", "momenta")):
+        if roles["inputs"] and not rest:
+            sole = ", ".join(roles["inputs"])
+            raise InputError(
+                f"{source}: by its name {sole} is what drives a motion, and no column shows what "
+                f"moves. If it is what moves, say so: --positions {shlex.quote(sole)}"
+            )
         found, told = _by_data(source, runs, rest, units)
         roles |= {role: (*roles[role], *of_role) for role, of_role in found.items()}
         notes += told

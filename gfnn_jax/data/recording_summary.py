@@ -183,7 +183,10 @@ def summarise(
     steps = np.concatenate([np.diff(t) for t in times])
     longest = min((b - a for _, a, b in holes), default=np.inf)
     between = steps[steps < longest] if len(steps) else np.array([np.nan])
-    period, loss = _motion(known)
+    doubted = frozenset(
+        name for f in found if f.wrong and f.kind == "degrees" for name in f.options["degrees"]
+    )
+    period, loss = _motion(known, doubted)
     typed = _options(found, options or {})
     files = " ".join(shlex.quote(path) for path in recording.source.split(", "))
     return RecordingSummary(
@@ -191,7 +194,7 @@ def summarise(
         counts,
         (float(between.min()), known.step, float(between.max())),
         tuple((recording.runs[r], a, b) for r, a, b in holes),
-        tuple(_column(known, name) for name in known.columns),
+        tuple(_column(known, name, doubted) for name in known.columns),
         period,
         _coarsest(known),
         loss,
@@ -220,8 +223,8 @@ def refuse_mistakes(recording: Recording, despite: Sequence[str] = ()) -> None:
         )
 
 
-def _motion(known: Traits) -> tuple[float | None, energy.Loss | None]:
-    """(period in s, loss of energy) of the positions."""
+def _motion(known: Traits, doubted: frozenset[str]) -> tuple[float | None, energy.Loss | None]:
+    """(period in s, loss of energy) of the positions; doubted: those that may be in degrees."""
     recording, local = known.recording, known.local
     if local is None or not recording.positions:
         return None, None
@@ -239,7 +242,7 @@ def _motion(known: Traits) -> tuple[float | None, energy.Loss | None]:
     period = energy.mean_period(fits, len(recording.runs))
     if period is None:  # longer than the record: no balance over periods
         return None, None
-    angles = [name in recording.angles for name in recording.positions]
+    angles = [name in recording.angles and name not in doubted for name in recording.positions]
     inputs = inputs.reshape(len(recording.inputs), len(middle))
     stretch = min(period, 0.6 * float(np.median([np.ptp(t) for t in known.times])))
     return period, energy.loss(fits, angles, inputs, stretch)
@@ -251,7 +254,7 @@ def _coarsest(known: Traits) -> float | None:
     return known.step * max(min(sizes) // _SHOWN.window, 1) if sizes else None
 
 
-def _column(known: Traits, name: str) -> Column:
+def _column(known: Traits, name: str, doubted: frozenset[str]) -> Column:
     recording, values = known.recording, known.columns[name]
     factor = recording.factors[name]
     role = next((r for r in ROLES if name in getattr(recording, r)), "ignored")
@@ -263,10 +266,11 @@ def _column(known: Traits, name: str) -> Column:
     sigma = given if given is not None else noise.sigma if noise else None
     moves = have and np.nanmin(values) < np.nanmax(values)
     sigma = sigma if moves else None
+    shown = values if name in doubted else _turning(known, name)
     return Column(
         name,
         role,
-        recording.unit(name),
+        "rad or deg?" if name in doubted else recording.unit(name),
         float(np.nanmin(values)) / factor if have else np.nan,
         float(np.nanmax(values)) / factor if have else np.nan,
         None if resolution is None else resolution / factor,
@@ -276,7 +280,7 @@ def _column(known: Traits, name: str) -> Column:
         of,
         None if relation is None else relation.factor,
         None if relation is None else relation.lag,
-        tuple(dominant_frequencies(known.times, _turning(known, name))) if noise and moves else (),
+        tuple(dominant_frequencies(known.times, shown)) if noise and moves else (),
         int(np.sum(~np.isfinite(values))),
         *_counts(known.wrong.get(name, ())),
     )

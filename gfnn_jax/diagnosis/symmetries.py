@@ -73,7 +73,7 @@ def _conserved(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPai
     first = before[np.concatenate([[True], ~goes_on])]
     last = after[np.concatenate([~goes_on, [True]])]
     moved = np.sqrt(np.mean(((last - first) / data.scale) ** 2))
-    for text, generator in generators(data.dim, angles):
+    for text, generator in generators(data.dim, angles, data.coordinates.names):
         values = [_generated(generator, z) for z in (before, first, last)]
         spread = np.std(values[0])
         if not spread > 0 or not moved > 0:
@@ -128,13 +128,16 @@ def _some(rows: np.ndarray, most: int) -> np.ndarray:
 # What is looked for, of pairs and of laws
 
 
-def generators(dim: int, angles: tuple[int, ...]) -> Iterator[tuple[str, np.ndarray]]:
-    """(text, [A b] (2d, 2d + 1)) of the generators I = ½ zᵀA z + bᵀz."""
+def generators(
+    dim: int, angles: tuple[int, ...], names: tuple[str, ...] = ()
+) -> Iterator[tuple[str, np.ndarray]]:
+    """(text, [A b] (2d, 2d + 1)) of the generators I = ½ zᵀA z + bᵀz; names: of z."""
     one = dim == 1
+    names = names or tuple(f"{letter}{i + 1}" for letter in "qp" for i in range(dim))
     plain = [i for i in range(dim) if i not in angles]
     for i in range(dim):
         yield (
-            f"translation of q{i + 1}: p{i + 1} conserved",
+            f"translation of {names[i]}: {names[i + dim]} conserved",
             _generator(dim, linear={i + dim: 1.0}),
         )
     if not one:
@@ -144,8 +147,8 @@ def generators(dim: int, angles: tuple[int, ...]) -> Iterator[tuple[str, np.ndar
         )
     for i, j in combinations(plain, 2):
         yield (
-            f"rotation in (q{i + 1}, q{j + 1}): angular momentum "
-            f"q{i + 1} p{j + 1} − q{j + 1} p{i + 1} conserved",
+            f"rotation in ({names[i]}, {names[j]}): angular momentum "
+            f"{names[i]} {names[j + dim]} − {names[j]} {names[i + dim]} conserved",
             _generator(dim, {(i, j + dim): 1.0, (j, i + dim): -1.0}),
         )
     if len(plain) == dim:

@@ -30,6 +30,7 @@ from gfnn_jax.evaluate.figures_of_recordings import residuals_figure as residual
 from gfnn_jax.evaluate.figures_of_recordings import swings_figure as swings_figure
 from gfnn_jax.evaluate.figures_style import (
     COLOURS,
+    GREY,
     HEIGHT,
     LINES,
     MARKERS,
@@ -496,7 +497,7 @@ def work_precision_panels(panels: Mapping, ylabel) -> Figure:
     # A name looks alike in all panels, also where one of them lacks another.
     named = [n for group in ("ours", "known") for p in panels.values() for n in p[group]]
     place = {name: i for i, name in enumerate(dict.fromkeys(named))}
-    grey = COLOURS[-1]
+    grey = GREY
     cross: dict[str, Any] = {"color": REFERENCE, "ms": 4}
     for ax, (title, groups) in zip(axes, panels.items(), strict=True):
         _front(ax, [*groups["ours"].values(), *groups["float32"].values()])

@@ -36,17 +36,21 @@ class _Sheet:
 
     def __init__(self, recording: Recording, rows: int, columns: int, width=4.6, **options):
         self.recording = recording
+        self.units: dict[str, str] = {}  # in place of the recording's
         self.figure = Figure(figsize=(width * columns, (1.0 + 0.35 * width) * rows))
         self.axes = self.figure.subplots(rows, columns, squeeze=False, **options)
 
+    def unit(self, name: str) -> str:
+        return self.units.get(name, self.recording.unit(name))
+
     def label(self, name: str) -> str:
-        unit = self.recording.unit(name)
+        unit = self.unit(name)
         return f"{name} [{unit}]" if unit else name
 
     def speed(self, name: str) -> str:
         """Label of the derivative of a column."""
-        unit = self.recording.unit(name)
-        return f"d{name}/dt [{unit}/s]" if unit else f"d{name}/dt"
+        unit = self.unit(name)
+        return f"d{name}/dt [{unit}/s]" if unit and "?" not in unit else f"d{name}/dt"
 
     def in_file(self, name: str, run: str) -> np.ndarray:
         """The values of a column, angles unwrapped."""
@@ -72,6 +76,7 @@ def recording_figure(recording: Recording, summary: RecordingSummary) -> Figure:
     input."""
     names = (*recording.positions, *recording.inputs)[:_MOST_ROWS] or recording.columns[:_MOST_ROWS]
     sheet = _Sheet(recording, len(names), 3)
+    sheet.units = {column.name: column.unit for column in summary.columns}
     longest = max(recording.runs, key=lambda run: len(recording.times(run)))
     times = [recording.times(run) for run in recording.runs]
     for (series, portrait, power), name in zip(sheet.axes, names, strict=True):
@@ -144,11 +149,10 @@ def law_figure(fit: LearnedLaw, recording: Recording) -> Figure:
     for ax, title in zip(sheet.axes[0], titles, strict=True):
         ax.set_title(title)
         ax.legend()
-    first, *others = sheet.axes[-1]
-    for ax in others:
+    grid = sheet.axes[0, 0].get_gridspec()
+    for ax in sheet.axes[-1]:
         ax.remove()
-    first.remove()
-    _energy(sheet.figure.add_subplot(len(channels) + 1, 1, len(channels) + 1), fit)
+    _energy(sheet.figure.add_subplot(grid[-1, :2]), fit)
     return sheet.figure
 
 
@@ -251,16 +255,17 @@ def _energy(ax, fit: LearnedLaw) -> None:
     """Draw the ledger of the longest arc: what is stored, lost, supplied, and left unexplained."""
     trace = max(fit.traces, key=lambda one: np.ptp(one.t))
     stored = trace.energy - trace.energy[0]
-    ax.plot(trace.t, stored, lw=1.4, color="black", label="stored")
+    ax.plot(trace.t, stored, lw=2.6, color="0.6", label="stored")
     losses = {f"− lost by {in_letters(term.term)}": -1 for term in fit.friction.terms}
     gains = {f"supplied by {name}": 1 for name in fit.gains}
     for sums, names in ((trace.lost, losses), (trace.supplied, gains)):
         for column, (name, sign) in zip(sums.T, names.items(), strict=True):
             ax.plot(trace.t, sign * column, lw=0.9, label=name)
     closure = stored - trace.supplied.sum(axis=1) + trace.lost.sum(axis=1)
-    ax.plot(trace.t, closure, lw=0.9, color="0.5", ls=":", label="unexplained")
+    ax.plot(trace.t, closure, lw=0.9, color="black", ls=":", label="unexplained")
     ax.set(ylabel="energy [unit of L]", xlabel="t [s]", title="energy since the longest arc began")
-    ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
+    beside = ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), frameon=False)
+    beside.set_in_layout(False)  # the place beside is free
 
 
 @_style
@@ -299,6 +304,7 @@ def forecasts_figure(found: Forecasts, recording: Recording) -> Figure:
     for name, above, below in zip(names, sheet.axes[::2, 0], sheet.axes[1::2, 0], strict=True):
         above.set_ylabel(sheet.label(name))
         below.set_ylabel(sheet.label(name).replace(name, "forecast − measured", 1))
-    sheet.axes[0, 0].legend()
-    sheet.axes[1, 0].legend()
+    shown = [ax.get_legend_handles_labels() for ax in sheet.axes[:2, 0]]
+    handles, labels = ([*above, *below] for above, below in zip(*shown, strict=True))
+    sheet.figure.legend(handles, labels, loc="outside upper left", ncols=3, frameon=False)
     return sheet.figure

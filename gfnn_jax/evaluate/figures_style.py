@@ -12,13 +12,14 @@ from cycler import cycler
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-# Okabe & Ito's palette without its yellow, which does not show on white, and with grey; then wine
-# and indigo of Tol's, so that nine methods differ.
+# Okabe & Ito's palette without its yellow, which does not show on white, and with grey; then wine,
+# indigo, olive and sand of Tol's: all methods of a comparison differ.
+GREY = "#777777"
 COLOURS = (
-    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777"),
-    *("#882255", "#332288"),
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", GREY),
+    *("#882255", "#332288", "#999933", "#B8A24A"),
 )
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "*")
 LINES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)))
 REFERENCE = "black"
 WIDTH, HEIGHT = 4.8, 3.2  # inches, of one panel; a column of a paper is about 3.3 wide

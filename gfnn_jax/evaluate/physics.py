@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
+from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.families.lagrangian import DRY, Lagrangian
 from gfnn_jax.families.text import in_letters, measured
 from gfnn_jax.maps.laws import is_of_law, law_of_map
@@ -193,11 +194,10 @@ class _System(NamedTuple):
                 q = self.rest_from(start)
                 if q is None or np.any(np.abs(q - self.middle) > 2.5 * self._reach()):
                     continue
-                for i in self.angles:
-                    q[i] = np.arctan2(np.sin(q[i]), np.cos(q[i]))
-                if not any(
-                    np.allclose(q, other, atol=1e-6 * self.size.max()) for other, _ in found
-                ):
+                places = list(self.angles)
+                q[places] = nearest_image(q, self.angles)[places]
+                away = (nearest_image(q - other, self.angles) for other, _ in found)
+                if not any(np.allclose(gap, 0.0, atol=1e-6 * self.size.max()) for gap in away):
                     holds = bool(np.all(np.linalg.eigvalsh(-self._curvature(q)) > 0))
                     found.append((q, holds))
         return sorted(found, key=lambda one: (not one[1], *one[0]))

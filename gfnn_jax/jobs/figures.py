@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,17 +14,31 @@ from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.scenes import Scene
 
 BINS = 50  # bins of the histograms that KL divergences compare
-OURS = "GFNN"
+OURS, AFFINE = "GFNN", "affine map of the same pairs"
+
+
+class Beside(NamedTuple):
+    """Companions of a run's errors in their figure: their band (B, L), and the errors (B, L)
+    of a linear regression of the same pairs, where there are any."""
+
+    band: np.ndarray | None = None
+    affine: np.ndarray | None = None
+
+
+_NOTHING = Beside()
 
 
 def figures_of_run(
-    fit: Fit, scene: Scene, measured: Measured, reference, band=None
+    fit: Fit, scene: Scene, measured: Measured, reference, beside: Beside = _NOTHING
 ) -> dict[str, Any]:
-    """Draw a run's figures, by file name. band: that of the error (B, L)."""
+    """Draw a run's figures, by file name."""
     steps, predicted = measured.steps, measured.predicted
     drawn = _errors(scene, {OURS: measured}, reference)
-    band = None if band is None else (steps, band)
-    drawn["error"] = figures.error_growth({OURS: (steps, measured.error)}, band=band).figure
+    band = None if beside.band is None else (steps, beside.band)
+    errors = {OURS: measured.error} | ({} if beside.affine is None else {AFFINE: beside.affine})
+    drawn["error"] = figures.error_growth(
+        {name: (steps, error) for name, error in errors.items()}, band=band
+    ).figure
     candidates = figures.candidates_figure(fit)
     drawn |= {} if candidates is None else {"candidates": candidates}
     both = {"reference": reference, OURS: predicted}
@@ -37,8 +51,8 @@ def figures_of_run(
         points = {n: (z[..., 0], z[..., 1]) for n, z in both.items()}
         drawn["portrait"] = figures.sections(points, *plane_of(scene))[0].figure
     else:
-        lane = _whole_lane(reference)
-        orbits = {n: (z[lane, :, 0], z[lane, :, 1]) for n, z in both.items()}
+        some = _whole_lanes(reference, 3)
+        orbits = {n: (z[some, :, 0], z[some, :, 1]) for n, z in both.items()}
         portrait = figures.phase_portrait(orbits, ("$q_1$", "$q_2$"))
         portrait.set_aspect("equal", "datalim")  # an orbit in space
         drawn["portrait"] = portrait.figure
@@ -46,7 +60,10 @@ def figures_of_run(
 
 
 def figures_of_comparison(scene: Scene, measured: dict[str, Measured], reference) -> dict[str, Any]:
-    """Draw a comparison's figures, by file name. measured: by the methods' titles."""
+    """Draw a comparison's figures, by file name. measured: by the methods' titles; the last one is
+    ours, and is drawn first: in the colour that it has in the figures of a run."""
+    *others, ours = measured
+    measured = {name: measured[name] for name in (ours, *others)}
     drawn = _errors(scene, measured, reference)
     predicted = {n: m.predicted for n, m in measured.items()}
     shown = {"reference": reference, **predicted}
@@ -86,6 +103,15 @@ def _sections(shown: dict[str, Any]):
     """Draw (q₂, p₂) on the section q₁ = 0."""
     sections = {n: section_points(z) for n, z in shown.items()}
     return figures.sections({n: (z[:, 1], z[:, 3]) for n, z in sections.items()})[0].figure
+
+
+def _whole_lanes(states, most: int) -> list[int]:
+    """At most so many trajectories of (B, L, 2d) that stay finite, from those with the smallest
+    positions to those with the largest."""
+    whole = np.flatnonzero(np.isfinite(states).all(axis=(1, 2)))
+    half = states.shape[-1] // 2
+    order = whole[np.argsort(np.abs(states[whole, :, :half]).max(axis=(1, 2)))]
+    return order[np.linspace(0, len(order) - 1, min(most, len(order))).astype(int)].tolist()
 
 
 def _whole_lane(states) -> int:

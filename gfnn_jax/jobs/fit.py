@@ -233,6 +233,7 @@ def fit_recording(
     job = _job(recording, columns, asked)
     is_law = asked.learn != "map"
     refused: FitError | None = None
+    progress.line(f"learning from {recording.source}")
     with refusals(), failures_of_arithmetic():
         try:
             fitted = learn_fit(

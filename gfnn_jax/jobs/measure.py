@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.evaluate import metrics, report
 from gfnn_jax.maps.rollout import rollout
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.phase_space import sizes
+from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.scenes import Scene
 from gfnn_jax.solve.status import NON_FINITE, OK
 
@@ -78,6 +78,22 @@ def without_runaways(rollouts: Rollouts, reference) -> Rollouts:
     states = np.where(lost[..., None], np.nan, rollouts.states)
     status = np.where(lost[:, -1] & (rollouts.status == OK), NON_FINITE, rollouts.status)
     return Rollouts(states, status, rollouts.seconds)
+
+
+def affine_errors(pairs: Pairs, scene: Scene, reference: np.ndarray) -> np.ndarray:
+    """Position errors (B, L) of the simplest map: the linear regression Z = A z + b of the same
+    pairs, rolled out from the reference's first states."""
+    angles = angles_of_z(scene)
+    table = np.column_stack([pairs.z0, np.ones(len(pairs.z0))])
+    moved = nearest_image(np.asarray(pairs.z1) - pairs.z0, angles)
+    a = np.linalg.lstsq(table, moved, rcond=None)[0]
+    states = np.empty_like(reference)
+    states[:, 0] = reference[:, 0]
+    for k in range(1, reference.shape[1]):
+        z = states[:, k - 1]
+        states[:, k] = z + z @ a[:-1] + a[-1]
+    rolled = Rollouts(states, np.full(len(states), OK), 0.0)
+    return metrics.position_error(without_runaways(rolled, reference).states, reference, angles)
 
 
 class Measured(NamedTuple):

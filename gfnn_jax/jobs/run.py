@@ -11,8 +11,14 @@ import numpy as np
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import figures
 from gfnn_jax.evaluate.page import About, write_page
-from gfnn_jax.jobs.figures import figures_of_run
-from gfnn_jax.jobs.measure import NUM_STEPS, NUM_TRAJECTORIES, map_rollouts, measure
+from gfnn_jax.jobs.figures import Beside, figures_of_run
+from gfnn_jax.jobs.measure import (
+    NUM_STEPS,
+    NUM_TRAJECTORIES,
+    affine_errors,
+    map_rollouts,
+    measure,
+)
 from gfnn_jax.jobs.output import MODEL, PAGE, Output, Ran, pairs_digest, write
 from gfnn_jax.jobs.search import refusals, scene_named, search
 from gfnn_jax.learn.options import FitOptions
@@ -119,7 +125,9 @@ def run(
             write_page(fitted, folder / PAGE, about=about)
             # Samples are stepped by a program of their own, which takes as long to compile.
             band = None if quick else _band(fitted.map, z0, measured.predicted, given)
-            for file, figure in figures_of_run(fitted, scene, measured, reference, band).items():
+            plain = scene.parameters or scene.any_phase
+            beside = Beside(band, None if plain else affine_errors(pairs, scene, reference))
+            for file, figure in figures_of_run(fitted, scene, measured, reference, beside).items():
                 figures.save(figure, folder / f"{file}.png")
     return Ran(fitted, output.out, result)
 

@@ -44,6 +44,7 @@ def run_record(
     InputError where the file is no recording or shows a mistake, WorkError where no law follows it;
     a page says why.
     """
+    output.progress.line(f"reading {data}")
     columns, asked, taken = _as_proposed(data, columns)
     for line in taken:
         output.progress.line(line)

@@ -393,8 +393,14 @@ class SymplecticMap:
         """Advance by ``num_saved`` blocks of ``save_every`` steps.
 
         Returns the lanes after them, and the saved states (B, num_saved, 2d). params, t0: those
-        that the lanes were started with. inputs: of all steps from their start on.
+        that the lanes were started with. inputs: of all steps from their start on. Raises
+        ValueError for anything but lanes, as for states.
         """
+        if not isinstance(lanes, Lanes):
+            raise ValueError(
+                "expected lanes of map.start or map.advance, got states: map.rollout takes these, "
+                "and jax.grad passes through it"
+            )
         args = self._schedule(params, lanes.y, t0, inputs)
         saving = Saving(num_saved, save_every, stop_outside)
         followed = self._followed(lanes, args)

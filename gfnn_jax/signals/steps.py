@@ -16,7 +16,9 @@ class _Options:
     """gap: times the 95th percentile of the steps, above which a step is a gap. even: part of a
     step that times may be off. drifting: samples, at least, of a run whose drift is told. nearby:
     steps whose median counts those in a gap. parabola: part of the squares of times' deviations
-    from even ones that a drift explains. longest: samples of a segment of a spectrum."""
+    from even ones that a drift explains. longest: samples of a segment of a spectrum. across:
+    periods of the strongest line, up to which a spectrum goes over a gap on a straight line. kept:
+    periods that a part between longer gaps must have."""
 
     gap: float = 1.5
     even: float = 0.05
@@ -24,6 +26,8 @@ class _Options:
     nearby: int = 101
     parabola: float = 0.97
     longest: int = 1 << 16
+    across: float = 0.25
+    kept: float = 2.0
 
 
 _OPTIONS = _Options()
@@ -85,13 +89,35 @@ def spectrum(times: Sequence[np.ndarray], values: np.ndarray) -> tuple[np.ndarra
     """(frequencies (F,) in Hz, power density (F,) in units²/Hz) by Welch's method with Hann
     windows; the mean over runs, weighted by their length.
 
-    Values between samples and in gaps are interpolated on a straight line.
+    Values between samples and in short gaps are interpolated on a straight line. Parts of a run
+    between gaps that a swing does not bridge count as runs.
     """
     step = median_step(times)
     length = min(max(len(t) for t in times), _OPTIONS.longest)
-    total, weight, frequencies = 0.0, 0, np.fft.rfftfreq(length, step)
     ends = np.cumsum([len(t) for t in times])[:-1]
-    for t, x in zip(times, np.split(values, ends), strict=True):
+    runs = list(zip(times, np.split(values, ends), strict=True))
+    frequencies, power = _welch(runs, step, length)
+    strongest = frequencies[np.argmax(power)] if len(power) else 0.0
+    if not strongest > 0:
+        return frequencies, power
+    parts = [part for t, x in runs for part in _between_gaps(t, x, _OPTIONS.across / strongest)]
+    whole = [(t, x) for t, x in parts if np.ptp(t) * strongest >= _OPTIONS.kept]
+    return _welch(whole, step, length) if len(parts) > len(runs) and whole else (frequencies, power)
+
+
+def _between_gaps(t: np.ndarray, x: np.ndarray, longest: float) -> list[tuple[np.ndarray, ...]]:
+    """The parts of a run between steps longer than this, without missing values."""
+    known = np.isfinite(x)
+    t, x = t[known], x[known]
+    cuts = np.flatnonzero(np.diff(t) > max(longest, longest_step(np.diff(t)))) + 1
+    parts = zip(np.split(t, cuts), np.split(x, cuts), strict=True)
+    return [part for part in parts if len(part[0]) > 1]
+
+
+def _welch(runs: list, step: float, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """The `spectrum` of runs (times, values), those of fewer than 8 samples left out."""
+    total, weight, frequencies = 0.0, 0, np.fft.rfftfreq(length, step)
+    for t, x in runs:
         known = np.isfinite(x)
         if known.sum() < 8:
             continue
@@ -115,8 +141,9 @@ def dominant_frequencies(
     if len(peaks) == 0:
         return []
     order = peaks[np.argsort(power[peaks])[::-1]]
-    order = order[power[order] > 1e-2 * power[order[0]]][:most]
-    return [_refined(frequencies, power, int(k)) for k in order]
+    # Beside a stronger line, what a run shows once is a drift.
+    order = order[(power[order] > 1e-2 * power[order[0]]) & ((order > 1) | (order == order[0]))]
+    return [_refined(frequencies, power, int(k)) for k in order[:most]]
 
 
 def _refined(frequencies: np.ndarray, power: np.ndarray, k: int) -> float:

@@ -117,10 +117,10 @@ class WhichFriction:
             rival = min(self.odds, key=lambda name: self.odds[name])
             text += f"; odds of {odds_text(self.odds[rival])} against {rival} on held-out parts"
             if self.odds[rival] < 1:
-                decided = EVIDENCE.decided
-                text += f", and of sets within {decided:.0f} : 1 the one of fewest kinds is chosen"
+                text += f", too few (below {EVIDENCE.decided:.0f} : 1) for a further kind"
         below = [f"{in_letters(term)} < {limit:.2g}" for term, limit in self.limits.items()]
-        return text + (f"; not seen, coefficients in R (2 σ): {', '.join(below)}" if below else "")
+        absent = f"; not significant, coefficients in R below 2 σ: {', '.join(below)}"
+        return text + absent * bool(below)
 
 
 def odds_text(odds: float) -> str:

@@ -157,9 +157,19 @@ class LearnedLaw:
 
     @property
     def table(self) -> str:
-        """The law, its errors and its horizon, a line each."""
-        lines = [f"L = {self.lagrangian}", f"R = {self.friction}", self.units_line]
-        lines += [f"friction: {self.which_friction}", f"scale of L: {self.gauge}"]
+        """The law and how far its forecasts hold, a line each, and under them the details."""
+        details = [f"  {line}" for line in self.detail_lines]
+        return "\n".join([*self.result_lines, *self.horizon_lines, "details:", *details])
+
+    @property
+    def result_lines(self) -> list[str]:
+        """L, Rayleigh's R, and the units of their variables, a line each."""
+        return [f"L = {self.lagrangian}", f"R = {self.friction}", self.units_line]
+
+    @property
+    def detail_lines(self) -> list[str]:
+        """Details: choices beside the law, and how well it is known, a line each."""
+        lines = [f"friction: {self.which_friction}", f"scale of L: {self.gauge}"]
         sensors = self.map.sensors
         if sensors is not None and np.any(law_of_map(self.map).friction.kinds == DRY):
             lines.append(
@@ -202,17 +212,20 @@ class LearnedLaw:
                 f"{_of(self.residual[name], self.units[name])}; residuals "
                 f"{self.whiteness[name].text}"
             )
-        lines += self.horizon_lines
         lines += [f"to record next: {motion}" for motion in self.next_motions[:1]]
-        return "\n".join(lines)
+        return lines
 
     @property
     def horizon_lines(self) -> list[str]:
-        """Times for which forecasts hold, as held-out forecasts showed, a line each."""
+        """Times for which forecasts hold, as held-out forecasts showed, a line each; of fractions
+        that none of them passed the smallest."""
+        told = [(fraction, seconds) for fraction, seconds, _ in self.horizon if seconds > 0]
+        never = [fraction for fraction, seconds in told if np.isinf(seconds)]
         lines = [
-            f"95 % of forecasts err by less than {fraction:.0%} of the spread {_time(seconds)}"
-            for fraction, seconds, _ in self.horizon
-            if seconds > 0
+            f"95 % of forecasts err by less than {100 * fraction:.0f} % of the spread "
+            f"{_time(seconds)}"
+            for fraction, seconds in told
+            if np.isfinite(seconds) or fraction == min(never)
         ]
         return lines or ["no forecast errs by less than the noise does"] * bool(self.horizon)
 
