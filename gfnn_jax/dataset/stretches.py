@@ -151,8 +151,8 @@ class Nodes:
 class Scales:
     """Scales of the samples, from the samples: noise σ (k,) of the channels, rms speeds (d,), the
     fastest frequency ω (1/s), the usual step dt, the window of the local cubics (samples to either
-    side) or, where sampling is uneven, the splines, and the largest rms step of a channel ÷ its
-    standard deviation."""
+    side) or, where sampling is uneven, the splines, the largest rms step of a channel ÷ its
+    standard deviation, and the time that the longest stretch lasts."""
 
     sigma: np.ndarray
     speed: np.ndarray
@@ -160,6 +160,7 @@ class Scales:
     dt: float
     half: int | Splines
     stride: float
+    longest: float
 
     @property
     def period(self) -> float:
@@ -167,8 +168,9 @@ class Scales:
 
     @property
     def every(self) -> int:
-        """Samples from one node to the next, where sampling is even."""
-        return max(1, round(self.period / self.dt / PER_PERIOD))
+        """Samples from one node to the next, where sampling is even: as many nodes as a period has
+        also in a stretch that is shorter."""
+        return max(1, round(min(self.period, self.longest) / self.dt / PER_PERIOD))
 
     @property
     def uneven(self) -> bool:
@@ -308,7 +310,8 @@ def measure(found: Sequence[Stretch]) -> Scales:
     omega = max(_frequency(own, OPTIONS.slow * speed) for own in systems.values())
     with np.errstate(invalid="ignore"):
         stride = size / np.nanstd(np.concatenate([s.y for s in found]), axis=0)
-    return Scales(sigma, speed, omega, dt, half, float(np.nanmax(stride)))
+    longest = max(float(np.ptp(s.t)) for s in found)
+    return Scales(sigma, speed, omega, dt, half, float(np.nanmax(stride)), longest)
 
 
 def _inside(t: np.ndarray) -> np.ndarray:

@@ -118,14 +118,15 @@ def calibrated(
     short = (OPTIONS.short - 1) * scales.dt
     tried = np.unique(np.maximum(np.array(OPTIONS.choices) * scales.period, short))
     some = starts[:: -(-len(starts) // OPTIONS.tried)]
-    leads = np.array([0.5, 1.0]) * scales.period
+    longest = max(s.t[-1] - s.t[0] for s in found)
+    reach = scales.period if scales.period < longest else longest / 2
+    leads = np.array([0.5, 1.0]) * reach
     windows = np.repeat(tried, len(some))
     errors = _forecasts(thirds, found, some * len(tried), windows, leads)[0]
     with np.errstate(all="ignore"):
         sizes = (np.abs(errors) / spread).reshape(len(tried), -1)
         middle = np.nan_to_num(np.nanmedian(sizes, axis=1), nan=np.inf)
     best = float(tried[np.argmin(middle)])
-    longest = max(s.t[-1] - s.t[0] for s in found)
     leads = np.geomspace(
         max(OPTIONS.first * scales.period, scales.dt), OPTIONS.last * scales.period, OPTIONS.leads
     )

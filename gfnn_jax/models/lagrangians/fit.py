@@ -37,7 +37,8 @@ class SearchOptions:
     tried. as_well: times the cost, with which a law follows the record as well. settled: ratio of
     noise scales that needs no second fit. least_left: of the squares of residuals, that an added
     term may leave. imitated: share of what a term changes, below which the fitted ones imitate it.
-    frictions: kinds that are tried; choose_friction: by held-out arcs, else all of these.
+    rounding: residual, of a channel's spread, that is the rounding of data and steps. frictions:
+    kinds that are tried; choose_friction: by held-out arcs, else all of these.
     """
 
     periods: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
@@ -50,6 +51,7 @@ class SearchOptions:
     settled: float = 1.15
     least_left: float = 1e-4
     imitated: float = 0.03
+    rounding: float = 1e-9
     frictions: tuple[str, ...] = FRICTIONS
     choose_friction: bool = True
 
@@ -347,6 +349,12 @@ class LawFit:
         """Root mean square residual (k,), in units of the channels."""
         left = self.fitted.residuals * self.arcs.noise
         return np.sqrt(np.nanmean(left**2, axis=(0, 1))) * self.sigma
+
+    @property
+    def is_exact(self) -> bool:
+        """Return whether the residuals are rounding, in which no further term is seen."""
+        spread = np.nanstd(self.arcs.y, axis=(0, 1))
+        return bool(np.all(self.rms() < self.problem.options.rounding * spread))
 
     def __str__(self) -> str:
         """A line for people; residuals in units of their channels' standard deviations."""

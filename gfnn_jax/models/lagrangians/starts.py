@@ -36,7 +36,8 @@ class StartOptions:
     are tried. far: zero of an angle, in radians, that a fit from 0 may not reach. few: samples a
     period, below which more of them are the remedy. plain: times the residual of the larger
     library, that a plainer one's may have. noise: residual, times the noise, that is no more.
-    exponents: of the distance, where a power of it begins; beside: up to which it is then found.
+    exponents: of the distance, where a power of it begins; beside: up to which it is then found;
+    rounded: up to which it is a half, or whole.
     """
 
     followed: float = 10.0
@@ -47,6 +48,7 @@ class StartOptions:
     noise: float = 2.0
     exponents: tuple[float, ...] = (-3.0, -2.0, -1.0, -0.5, 0.5, 1.0, 1.5, 3.0, 4.0)
     beside: float = 0.6
+    rounded: float = 0.1
 
 
 OPTIONS = StartOptions()
@@ -200,11 +202,29 @@ class _Starts:
         found = [(others, exponents(others)) for others in (masses, textbook)]
         if not self.one_valued:  # else many forces suit the orbit, and the plainest is taken
             found.sort(key=lambda one: unlikely(one[1][1], one[0]))
+        tried: dict[tuple[int, float], float] = {}
+
+        def attempt(exponent: float, others: Sequence[Row]) -> None:
+            if exponent and (len(others), exponent) not in tried and not self.are_noise:
+                before = len(self.fits)
+                self.add(_Library(rows(exponent, others), rank, apart=True, equal=True))
+                misfit = min(map(self.misfit, self.fits[before:]), default=np.inf)
+                tried[len(others), exponent] = misfit
+
         for which in range(2):
             for others, of in found:
-                if of[which] and not self.are_noise:
-                    own = rows(of[which], others)
-                    self.add(_Library(own, rank, apart=True, equal=True))
+                attempt(of[which], others)
+        for others, (a, b) in found:
+            at_a, at_b = (tried.get((len(others), e), np.inf) for e in (a, b))
+            least = min(map(self.misfit, self.fits), default=0.0)
+            if a == b or min(at_a, at_b) > least or not np.isfinite(max(at_a, at_b)):
+                continue
+            for sign in (-1, 1):  # misfits are proportional to the distance from the exponent
+                best = (a * at_b + sign * b * at_a) / (at_b + sign * at_a)
+                plain = float(np.round(2 * best) / 2)
+                attempt(
+                    plain if abs(best - plain) < OPTIONS.rounded else float(f"{best:.4g}"), others
+                )
 
     def misfit(self, fit: LawFit) -> float:
         """The largest residual of a channel, in units of its noise."""

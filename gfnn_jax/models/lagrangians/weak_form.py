@@ -35,14 +35,16 @@ from gfnn_jax.models.lagrangians.structure import (
 class WeakOptions:
     """Options of the weak form (`benchmarks/random_recordings.py`).
 
-    lengths: of the windows, in periods. fewest: samples of a window. spacing: of a window's length,
-    to the next. overlap: rows that share samples, of which as many count as one. apart: ratio of
-    the weights of coordinates, at most, since a wrong library would make one of them all. rounding:
-    residual of a coordinate to the sizes of its terms, below which a law without mass and force
-    solves the equations.
+    lengths: of the windows, in periods. periods: of the longest run, below which windows are
+    shorter too, for there would be few of them, or none. fewest: samples of a window. spacing: of a
+    window's length, to the next. overlap: rows that share samples, of which as many count as one.
+    apart: ratio of the weights of coordinates, at most, since a wrong library would make one of
+    them all. rounding: residual of a coordinate to the sizes of its terms, below which a law
+    without mass and force solves the equations.
     """
 
     lengths: tuple[float, ...] = (0.5, 1.0)
+    periods: float = 2.0
     fewest: int = 7
     spacing: float = 0.25
     overlap: float = 3.0
@@ -81,7 +83,8 @@ class _Equations(NamedTuple):
             nodes = [n.evenly(problem.scales.nodes_of(np.ptp(n.t))) for n in nodes]
         args = np.repeat([n.stretch.args for n in nodes], [len(n.t) for n in nodes], axis=0)
         form = structure.form(np.concatenate([n.x[:, :d] for n in nodes]), args)
-        lengths = [length * problem.scales.period for length in OPTIONS.lengths]
+        period = min(problem.scales.period, max(np.ptp(n.t) for n in nodes) / OPTIONS.periods)
+        lengths = [length * period for length in OPTIONS.lengths]
         windows = [
             # of a run that is shorter than a window, all of it
             (node, min(length, 0.999 * np.ptp(node.t)) if uneven else length)
