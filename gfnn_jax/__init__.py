@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from gfnn_jax.maps.saved import register
     from gfnn_jax.maps.stroboscopic import stroboscopic
     from gfnn_jax.maps.symplectic_map import SymplecticMap
+    from gfnn_jax.models.arms.arm import Arm
     from gfnn_jax.models.model import Fitted, TrainingData
     from gfnn_jax.phase_space import Pairs
     from gfnn_jax.scenes import Scene
@@ -48,6 +49,7 @@ _MODULES = {
     "scenes": "scenes",
 }
 _HOMES = {
+    "Arm": "models.arms.arm",
     "Bracket": "brackets",
     "CHARTS": "generating.charts",
     "Chart": "generating.charts",
@@ -86,6 +88,7 @@ _HOMES = {
 
 __all__ = [
     "CHARTS",
+    "Arm",
     "Bracket",
     "Chart",
     "Fit",

@@ -40,6 +40,7 @@ ORDER = (
     "diagnosis",
     "models.model",
     "models.parameters",
+    "models.arms",
     "models.positions",
     "models.lagrangians",
     "models.textbook",
@@ -88,6 +89,7 @@ HOMES = {  # the module, and those whose names begin as its own does
     "orbax": "storage.checkpoints",
     "pandas": "data.text",
     "sympy": "exports.symbolic",
+    "yourdfpy": "models.arms.kinematics",
 }
 
 

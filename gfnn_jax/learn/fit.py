@@ -95,6 +95,10 @@ def fit(
         with one_thread():
             return learn_poisson(pairs, options, watch)
     if isinstance(pairs, Recording):
+        if scene is None and hasattr(options.model, "fit_recording"):
+            with one_thread():
+                arm = options.model.fit_recording(pairs, watch.on_progress)
+            return _told(Fit(arm.map, arm, data=pairs))
         if scene is not None or options.model is not None:
             given = "model" if scene is None else "scene"
             raise InputError(f"{given}: only for pairs of states q, p, got a recording")
@@ -118,9 +122,7 @@ def fit(
                 if error.fit is not None:
                     error.fit = Fit(error.fit.map, error.fit, {"verdict": error.verdict}, pairs)
                 raise
-        for message in law.messages:
-            warnings.warn(message, FitWarning, stacklevel=2)
-        return Fit(law.map, law, data=pairs)
+        return _told(Fit(law.map, law, data=pairs))
     options.refuse_others(("hamiltonian", "map"), "pairs, which are no recording")
     budget = options.budget(watch, pairs.dim)
     messages: list[str] = []
@@ -209,6 +211,13 @@ def fit(
         seed=options.seed,
     )
     return Fit(chosen.candidate.map, choice)
+
+
+def _told(fitted: Fit) -> Fit:
+    """The fit, with warnings of its messages."""
+    for message in fitted.messages:
+        warnings.warn(message, FitWarning, stacklevel=4)
+    return fitted
 
 
 def _refuse_roles(changes: Mapping[str, Any]) -> None:

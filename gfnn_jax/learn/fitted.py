@@ -27,6 +27,7 @@ from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.learn.choose import work_of_posterior
 from gfnn_jax.maps.forecasts import Forecast
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.arms.learned_arm import LearnedArm
 from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
@@ -239,7 +240,8 @@ class Fit:
 
     map: the map that was chosen, which rolls out, estimates and forecasts. found: how it was found:
     a `Choice` among candidates, for pairs and for maps of positions; a
-    `models.lagrangians.learned_law.LearnedLaw`, for recordings; None of a folder that holds a map
+    `models.lagrangians.learned_law.LearnedLaw`, for recordings; a
+    `models.arms.learned_arm.LearnedArm`, for logs of an arm; None of a folder that holds a map
     alone. Its attributes are those of the fit too: `candidates`, `met` and `chosen` of the first,
     `gains`, `zeros`, `noise` and `horizon` of the second. stored: what a folder holds beside these:
     ``verdict`` and ``record``, the report with the job that wrote it. data: the recording, which
@@ -247,7 +249,7 @@ class Fit:
     """
 
     map: SymplecticMap
-    found: Choice | LearnedLaw | None = None
+    found: Choice | LearnedLaw | LearnedArm | None = None
     stored: dict[str, Any] = dataclasses.field(default_factory=dict)
     data: Recording | None = None
     learned_to: float | None = None
@@ -268,7 +270,7 @@ class Fit:
         return self.data if self.learned_to is None else self.data.slice(stop=self.learned_to)
 
     @property
-    def law(self) -> LearnedHamiltonian | LearnedLaw | None:
+    def law(self) -> LearnedHamiltonian | LearnedLaw | LearnedArm | None:
         """The law: H where it meets the tolerance or was chosen, or L with its friction. None of a
         generated map without a law, and where none is stored."""
         return self.found.law if isinstance(self.found, Choice) else self.found
@@ -378,12 +380,16 @@ class Fit:
         """
         from gfnn_jax.evaluate import page, report  # stand after this module: a shorthand
 
+        if path is not None and isinstance(self.found, LearnedArm):
+            raise ValueError("an arm has no page: print(fit.law), or fit.report() without a path")
         if path is not None:
             page.write_page(self, path)
         if "record" in self.stored:
             return {name: part for name, part in self.stored["record"].items() if name != "job"}
         if self.found is None:
             raise ValueError("expected a fit, or the folder of one: this one holds a map alone")
+        if isinstance(self.found, LearnedArm):
+            return report.finite(self.found.report())
         assemble = report.assemble if isinstance(self.found, Choice) else report.assemble_law
         return report.finite(assemble(self, **about))
 

@@ -192,10 +192,11 @@ _OF_MODEL = {
     for learn, model in MODELS.items()
 }
 _MODEL = Kind(
-    "gfnn.Hamiltonian(), Lagrangian(), GeneratingFunction(), or a model with a name, sizes(data) "
-    "and fit(data, size)",
+    "gfnn.Hamiltonian(), Lagrangian(), GeneratingFunction(), Arm(), or a model with a name, "
+    "sizes(data) and fit(data, size)",
     lambda v: (
         isinstance(v, tuple(MODELS.values()))
+        or hasattr(v, "fit_recording")
         or all(hasattr(v, name) for name in ("name", "sizes", "fit"))
     ),
 )

@@ -16,8 +16,11 @@ from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.text import Term
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.learn.fitted import Choice, Fit, OfPositions
 from gfnn_jax.maps import saved as maps
+from gfnn_jax.models.arms.identify import BaseParameters, Columns, Identified, Prior
+from gfnn_jax.models.arms.learned_arm import LearnedArm
 from gfnn_jax.models.hamiltonians.fitted_law import Dropped, PartialLaw, Proposal, Rival
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.calibration import Horizon
@@ -28,12 +31,16 @@ from gfnn_jax.models.lagrangians.velocities import Velocity
 from gfnn_jax.scenes.scene import Scene
 
 for _kind in (
+    BaseParameters,
     Choice,
     Candidate,
     ChartDeterminant,
+    Columns,
     Dropped,
     Hamiltonian,
     Horizon,
+    Identified,
+    LearnedArm,
     LearnedDamping,
     LearnedHamiltonian,
     LearnedLaw,
@@ -47,8 +54,10 @@ for _kind in (
     Whiteness,
     Formula,
     PartialLaw,
+    Prior,
     Rival,
     Term,
+    Triangle,
     WhichFriction,
 ):
     maps.register(_kind)
@@ -108,12 +117,13 @@ def load(folder, scene: Scene | None = None) -> Fit:
     return Fit(map_, found, kept)
 
 
-def _portable(found: Choice | LearnedLaw | None) -> Any:
+def _portable(found: Choice | LearnedLaw | LearnedArm | None) -> Any:
     """Strip what was found of the data, the map and the functions that compute from the data."""
     if found is None:
         return None
     if not isinstance(found, Choice):
-        return dataclasses.replace(found, map=None, traces=())
+        own = {"traces": ()} if hasattr(found, "traces") else {}
+        return dataclasses.replace(found, map=None, **own)
     law = found.hamiltonian
     if law is not None:
         law = dataclasses.replace(

@@ -15,8 +15,10 @@ import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, lift
 from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian, coordinates_in
+from gfnn_jax.flows.bodies import BodiesLaw, OfBodies
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.legendre import Legendre, family_of, law_of
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.maps.domain import covering
@@ -140,7 +142,7 @@ def conformal(law: Lagrangian, covariance: np.ndarray) -> tuple[Lagrangian, np.n
     return even, by[:, None] * covariance * by
 
 
-def stiffness(law: Lagrangian, q: np.ndarray) -> float:
+def stiffness(law: Lagrangian | BodiesLaw, q: np.ndarray) -> float:
     """The fastest rate at which dry friction brings bodies to rest at positions q (n, d), 1/time;
     0 without dry friction."""
     if not np.any(law.friction.kinds == DRY):
@@ -164,16 +166,29 @@ def law_of_map(map_: SymplecticMap) -> Lagrangian:
     return law_of(piece.family, np.asarray(piece.params))
 
 
+def dynamics_of(map_: SymplecticMap) -> Lagrangian | BodiesLaw:
+    """The law of a map with its masses and forces, of bodies on joints too. Raises ValueError for
+    any other map."""
+    piece = map_.pieces[0]
+    family = getattr(piece, "family", None)
+    if isinstance(family, Forced) and isinstance(family.family, OfBodies):
+        own, losses, gains = family.parts(np.asarray(piece.params))
+        return family.family.law(own, family.friction, losses, gains)
+    return law_of_map(map_)
+
+
 def states_of(map_: SymplecticMap, q, v, args=None):
     """z = (q, p) (..., 2d) of positions and velocities (..., d); args (..., k): parameters of the
     system, of a map that has such."""
-    law = law_of_map(map_).at(args)
+    law = dynamics_of(map_).at(args)
     return np.concatenate([q, law.momentum(np.asarray(q), np.asarray(v))], axis=-1)
 
 
 def velocities_of(map_: SymplecticMap, z, args=None):
     """v (..., d) of states z = (q, p) (..., 2d), as `states_of`."""
-    law = law_of_map(map_).at(args)
+    law = dynamics_of(map_).at(args)
+    if isinstance(law, BodiesLaw):
+        return law.velocity(*split(np.asarray(z)))
     return Legendre(law.terms).velocity(law.coefficients, np.asarray(z))
 
 
@@ -209,10 +224,10 @@ def mass_matrix(map_: SymplecticMap, q, args=None) -> np.ndarray:
     return _law_at(map_, args).masses(np.asarray(q, float))
 
 
-def _law_at(map_: SymplecticMap, args) -> Lagrangian:
+def _law_at(map_: SymplecticMap, args) -> Lagrangian | BodiesLaw:
     """The law of a map for a system. Raises ValueError of another map, and without parameters that
     it depends on."""
-    law = law_of_map(map_)
+    law = dynamics_of(map_)
     if law.powers is not None and args is None:
         raise ValueError("expected the parameters of the system (args=): the law depends on them")
     return law.at(None if args is None else np.asarray(args, float))

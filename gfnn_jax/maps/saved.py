@@ -28,11 +28,13 @@ from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.lagrangian import Friction
 from gfnn_jax.families.mlp import Mlp
 from gfnn_jax.families.products import Products
+from gfnn_jax.families.rigid_bodies import Bodies
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.families.sums import Groups, Part, Sums, Windows
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.flows import lifts
+from gfnn_jax.flows.bodies import OfBodies
 from gfnn_jax.flows.collective import Casimirs, Collective
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
@@ -67,6 +69,7 @@ _TYPES: dict[str, type] = {
         Predictor,
         PolynomialModel,
         Affine,
+        Bodies,
         Chart,
         TypeOne,
         Domain,
@@ -95,6 +98,7 @@ _TYPES: dict[str, type] = {
         Sensors,
         Wander,
         Observation,
+        OfBodies,
         SoftL1,
         Biweight,
         Damping,
