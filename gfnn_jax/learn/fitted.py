@@ -380,7 +380,8 @@ class Fit:
         """
         from gfnn_jax.evaluate import page, report  # stand after this module: a shorthand
 
-        if path is not None and isinstance(self.found, LearnedArm):
+        own = getattr(self.found, "report", None)
+        if path is not None and own is not None:
             raise ValueError("an arm has no page: print(fit.law), or fit.report() without a path")
         if path is not None:
             page.write_page(self, path)
@@ -388,8 +389,8 @@ class Fit:
             return {name: part for name, part in self.stored["record"].items() if name != "job"}
         if self.found is None:
             raise ValueError("expected a fit, or the folder of one: this one holds a map alone")
-        if isinstance(self.found, LearnedArm):
-            return report.finite(self.found.report())
+        if own is not None:
+            return report.finite(own())
         assemble = report.assemble if isinstance(self.found, Choice) else report.assemble_law
         return report.finite(assemble(self, **about))
 
