@@ -163,7 +163,7 @@ def motion_of(recording: Recording, gains: np.ndarray) -> tuple[Motion, np.ndarr
 
 
 def prior_of(kinematics: Kinematics, motion: Motion, columns: Columns) -> tuple[Prior, np.ndarray]:
-    """What is expected of the parameters, and parameters that are possible to start from."""
+    """Prior of the parameters, and parameters that are possible to start from."""
     bodies, pi = kinematics.bodies, kinematics.prior.ravel()
     inertias = pseudo_inertias(pi)
     for J in inertias:  # point masses and rods of a CAD model have a little width

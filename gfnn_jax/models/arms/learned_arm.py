@@ -97,7 +97,7 @@ class LearnedArm:
 
     @property
     def line(self) -> str:
-        """What the law is."""
+        """Number of bodies and parameters."""
         return (
             f"{len(self.names)} bodies on joints, {len(self.base.names)} base parameters, "
             f"{int(self.base.determined.sum())} determined"
@@ -136,7 +136,7 @@ class LearnedArm:
         return f"LearnedArm({self.line})"
 
     def report(self) -> dict[str, Any]:
-        """What ``report.json`` holds."""
+        """Return what ``report.json`` holds."""
         base = zip(
             self.base.names, self.base.values, self.base.errors, self.base.determined, strict=True
         )
