@@ -79,8 +79,8 @@ class Motion:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Columns:
-    """Parameters that forces are linear in: π (10 k), rotors (k), offsets (k), and friction of these kinds,
-    (k) each; widths (k,) of Coulomb friction."""
+    """Parameters that forces are linear in: π (10 k), rotors (k), offsets (k), and friction of
+    these kinds, (k) each; widths (k,) of Coulomb friction."""
 
     bodies: Bodies
     kinds: tuple[str, ...]
@@ -291,7 +291,7 @@ class BaseParameters:
 
     @property
     def determined(self) -> np.ndarray:
-        """Mask (m,) of those that the data tell to a part of their size, or better than the prior."""
+        """Mask (m,) of those that the data tell, to a part of their size or of the prior."""
         return self.errors < OPTIONS.sharpened * np.maximum(self.expected, np.abs(self.values))
 
 
