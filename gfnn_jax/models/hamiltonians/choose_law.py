@@ -17,11 +17,12 @@ from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.scenes.scene import Scene
 
-# Beside a map only a law of few terms is looked for: a larger one is no shorter to say than S. Its
+# Beside a map only a law of few terms is looked for, of all powers to 4 in two degrees of freedom
+# or to 3 in three: a larger one is no shorter to say than S. Its
 # budget is counted, so that a busy machine chooses no other candidate: 20 and 30 seconds of a quiet
 # core, which makes 5e8 of these operations a second, of modes 7e8 (two bodies, PCR3BP, pendulums).
 _BESIDE = dataclasses.replace(
-    OPTIONS, most_terms=60, most_modes=150, max_operations=1e10, mode_operations=2e10
+    OPTIONS, most_terms=90, most_modes=150, max_operations=1e10, mode_operations=2e10
 )
 # A law holds outside the data and at any time step: so much dearer a step it may be.
 MAX_COST_RATIO = 4.0
