@@ -160,7 +160,7 @@ def flow(name: str, quick: bool) -> Numbers:
     times = dt * np.arange(TRAINED + AHEAD)
     z = solve_ivp(rates, (0, times[-1]), start, t_eval=times, **_TOLERANCES).y.T
     options: dict[str, Any] = {"angles": angles} if angles else {}
-    structure = "canonical" if len(start) % 2 == 0 else "poisson"
+    structure = None if len(start) % 2 == 0 else "poisson"
     pairs = gfnn.Pairs(z[: TRAINED - 1], z[1:TRAINED], dt, structure=structure)
     fit, result = fitted(lambda: gfnn.fit(pairs, **options))
     result["best_of_the_table"] = best
@@ -196,7 +196,7 @@ def _learned(t: np.ndarray, y: np.ndarray, name: int) -> gfnn.Fit:
     """The fit of one system: a recording of a position and its velocity, or states with a bracket."""
     if name in POISSON:
         dt = float(t[1] - t[0])
-        return gfnn.fit(gfnn.Pairs.from_trajectory(y, dt, structure="poisson"))
+        return gfnn.fit(gfnn.Pairs(y[:-1], y[1:], dt, structure="poisson"))
     table = {"t": t, "x": y[:, 0], "v": y[:, 1]}
     angles = ["x"] if MECHANICAL[name] else ()
     return gfnn.fit(gfnn.Recording(table, positions=["x"], velocities=["v"], angles=angles))

@@ -167,10 +167,11 @@ class Choice:
 
     @property
     def _error(self) -> str:
-        """The one-step error of the chosen candidate, in the unit of the tolerance."""
+        """The one-step error of the chosen candidate with its bound, in the unit of the tolerance."""
         best, relative = self.chosen, self.asked.relative
         error = best.validation_relative if relative else best.validation_rms
-        return f"a one-step error of {error:.1e}{relative * ' of the spread'}"
+        bound = f"at most {best.validation_bound:.1e} with 95 % confidence"
+        return f"a one-step error of {error:.1e}{relative * ' of the spread'}, {bound},"
 
     @property
     def line(self) -> str:
