@@ -1,8 +1,8 @@
 """Public tables: their systems, splits and metrics, beside the best figure that each table has.
 
-    python benchmarks/public.py                              the flows of dysts, which are made here
-    python benchmarks/public.py --odebench strogatz_extended.json    those of ODEBench, from its file
-    python benchmarks/public.py --quick                      two flows, into runs/
+    python benchmarks/public.py                     the flows of dysts, which are made here
+    python benchmarks/public.py --odebench FILE     ODEBench too, FILE its strogatz_extended.json
+    python benchmarks/public.py --quick             two flows, into runs/
 
 dysts (Gilpin, arXiv:2110.05266): Hamiltonian and nearly Hamiltonian flows at its initial states and
 parameters, 1,000 samples at 100 a period without noise, then 200 steps ahead; the metric is its
@@ -193,7 +193,7 @@ def odebench(path: Path, gamma: float, quick: bool) -> Numbers:
 
 
 def _learned(t: np.ndarray, y: np.ndarray, name: int) -> gfnn.Fit:
-    """The fit of one system: a recording of a position and its velocity, or states with a bracket."""
+    """The fit of one system: of a recording of a position and its velocity, or of states."""
     if name in POISSON:
         dt = float(t[1] - t[0])
         return gfnn.fit(gfnn.Pairs(y[:-1], y[1:], dt, structure="poisson"))

@@ -167,7 +167,7 @@ class Choice:
 
     @property
     def _error(self) -> str:
-        """The one-step error of the chosen candidate with its bound, in the unit of the tolerance."""
+        """One-step error of the chosen candidate and its bound, in the unit of the tolerance."""
         best, relative = self.chosen, self.asked.relative
         error = best.validation_relative if relative else best.validation_rms
         bound = f"at most {best.validation_bound:.1e} with 95 % confidence"
