@@ -59,7 +59,7 @@ def lagrangian_of(
 
 
 def _fitted(problem: LawProblem, family: Legendre, start: np.ndarray, forces) -> FittedLaw:
-    """These terms of L and these forces, fitted to the training pairs."""
+    """Fit these terms of L and these forces to the training pairs."""
     rows = problem.data.training
     if forces is not None:
         family = forces(family)
