@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +115,12 @@ def print_table(table: Any) -> None:
 def print_record(ran: Any, out: Path) -> None:
     """Print a law, its physical quantities, and its forecasts of the last third of the
     recording."""
-    print_law(ran.learned.fit, lambda: _print_ahead(ran.forecasts, ran.held_out))
+    fit, ahead = ran.learned.fit, partial(_print_ahead, ran.forecasts, ran.held_out)
+    if fit.bracket is None:
+        print_law(fit, ahead)
+    else:
+        print_summary(ran.learned, out / "model")
+        ahead()
     print(f"written to {out}; the report is {out / 'report.html'}")
 
 

@@ -1,5 +1,6 @@
 """`gfnn.fit` of states with a bracket of their own: pairs, recordings, files, folders."""
 
+import re
 import shlex
 
 import numpy as np
@@ -65,13 +66,42 @@ def test_a_given_bracket():
         gfnn.fit(pairs_of(data), bracket=gfnn.Bracket.so3())
 
 
-def test_a_gyroscope_on_the_command_line(tmp_path, capsys):
-    starts = np.random.default_rng(0).normal(size=(6, 3))
+def gyroscope(path, count):
+    """Runs of a gyroscope, written to a file as a phone does."""
+    starts = np.random.default_rng(0).normal(size=(count, 3))
     data = runs_of(top, starts, 0.05, 300, noise=1e-3)
     names = tuple(f"Gyroscope {axis} (rad/s)" for axis in "xyz")
     columns = dict(zip(names, data.z0.T, strict=True))
-    text = to_text({"run": data.run, "t": 0.05 * data.place, **columns})
-    (tmp_path / "gyro.csv").write_text(text)
+    path.write_text(to_text({"run": data.run, "t": 0.05 * data.place, **columns}))
+    return data
+
+
+@pytest.mark.slow
+def test_a_file_of_a_gyroscope_gets_its_law_forecasts_and_report(tmp_path, capsys):
+    gyroscope(tmp_path / "gyro.csv", 6)
+    assert cli.main(["run", str(tmp_path / "gyro.csv"), "--out", str(tmp_path / "r")]) == 0
+    shown = capsys.readouterr().out
+    assert "verdict: identified" in shown
+    assert f"written to {tmp_path}/r/model" in shown
+    errors = re.findall(r"error of Gyroscope . ([\d.e-]+), ([\d.e-]+), ([\d.e-]+) rad/s", shown)
+    assert np.array(errors, float).shape == (3, 3)
+    assert np.array(errors, float).max() < 5e-3
+    page = (tmp_path / "r" / "report.html").read_text()
+    assert "Three forecasts of what no fit has seen, each from a measured state." in page
+    assert "Casimirs: " in page
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_runs_with_noise_are_told_to_be_too_few(count):
+    starts = np.random.default_rng(0).normal(size=(count, 3))
+    data = runs_of(top, starts, 0.05, 300, noise=1e-3)
+    with pytest.raises(FitError, match="more runs that start at other values") as raised:
+        gfnn.fit(pairs_of(data))
+    assert raised.value.verdict == f"no law: {count} run{'s' * (count > 1)} do not determine it"
+
+
+def test_a_gyroscope_on_the_command_line(tmp_path, capsys):
+    data = gyroscope(tmp_path / "gyro.csv", 6)
     figure = str(tmp_path / "look.png")
     assert cli.main(["look", str(tmp_path / "gyro.csv"), "--figure", figure]) == 0
     command = capsys.readouterr().out.split("next: gfnn ")[1].splitlines()[0]

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
+from gfnn_jax.learn.fitted import Choice, Fit
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 _SAMPLES = 20  # that a state is estimated from
 _STARTS = 24
+_DRAWN = 16  # states about a measured one, whose motions tell how far it is trusted
 _PERIODS = (0.25, 1.0, 2.0)  # of the fastest motion, that is forecast ahead, if there are as many
 PART = 2 / 3  # of a recording, in time, that is learned from where the rest is held out
 
@@ -48,11 +51,14 @@ def end_of_part(recording: Recording) -> float:
     return float(times.min() + PART * np.ptp(times))
 
 
-def forecasts_of(map_: SymplecticMap, held_out: Recording) -> Forecasts:
+def forecasts_of(fit: Fit, held_out: Recording) -> Forecasts:
     """Forecasts of a held-out part, for up to two periods of the fastest motion, as
-    `forecasts_along`."""
-    assert map_.sensors is not None
+    `forecasts_along`; of states with a bracket for up to half of it, each from one state."""
+    map_ = fit.map
     half = max(np.ptp(held_out.times(run)) for run in held_out.runs) / 2
+    if map_.sensors is None:
+        noise = fit.noise if isinstance(fit.found, Choice) else None
+        return _forecasts(partial(_of_state, map_, noise), held_out, [half / 4, half / 2, half])
     ahead = [periods * 2 * np.pi / map_.sensors.omega for periods in _PERIODS]
     ahead = [seconds for seconds in ahead if seconds < half] or [half]
     return forecasts_along(map_, held_out, ahead)
@@ -64,6 +70,13 @@ def forecasts_along(map_: SymplecticMap, recording: Recording, ahead: Sequence[f
 
     Raises InputError where no run holds that many samples and as much time behind them.
     """
+    return _forecasts(partial(_ahead, map_), recording, ahead)
+
+
+def _forecasts(
+    forecast: Callable[..., Ahead], recording: Recording, ahead: Sequence[float]
+) -> Forecasts:
+    """Forecasts along a recording. forecast: one, of (recording, run, its sample, seconds)."""
     times = {run: recording.times(run) for run in recording.runs}
     starts = [
         (run, k)
@@ -78,7 +91,7 @@ def forecasts_along(map_: SymplecticMap, recording: Recording, ahead: Sequence[f
         )
     chosen = np.linspace(0, len(starts) - 1, min(_STARTS, len(starts))).astype(int)
     begins = (starts[i] for i in chosen)
-    each = tuple(_ahead(map_, recording, run, k, ahead[-1]) for run, k in begins)
+    each = tuple(forecast(recording, run, k, ahead[-1]) for run, k in begins)
     names = list(each[0].values)
 
     def median(name: str, s: float) -> float:
@@ -110,3 +123,28 @@ def _ahead(map_: SymplecticMap, recording: Recording, run: str, k: int, longest:
             measured[name] += turn * np.round((values[name] - measured[name]) / turn)
         std[name] = found.std[name][0]
     return Ahead(begin, later.times(run), measured, values, std)
+
+
+def _of_state(
+    map_: SymplecticMap,
+    noise: np.ndarray | None,
+    recording: Recording,
+    run: str,
+    k: int,
+    longest: float,
+) -> Ahead:
+    """The forecast of a run from its sample k as it was measured; its deviations are those of
+    states that are drawn about it with the noise (d,)."""
+    t, z, dt = recording.times(run), recording.array("positions", run), float(map_.dt)
+    steps = int(longest / dt * (1 + 1e-9))
+    sigma = np.zeros(z.shape[1]) if noise is None else noise
+    starts = z[k] + sigma * np.random.default_rng(k).normal(size=(_DRAWN, z.shape[1]))
+    found = np.asarray(map_.rollout(np.concatenate([z[k : k + 1], starts]), steps)[0])[:, 1:]
+    later = t[k] + dt * np.arange(1, steps + 1)
+    spread = np.sqrt(np.nanmean((found[1:] - found[0]) ** 2, axis=0) + sigma**2)
+    measured, values, std = {}, {}, {}
+    for i, name in enumerate(recording.positions):
+        factor = recording.factors[name]
+        measured[name] = np.interp(later, t, z[:, i]) / factor
+        values[name], std[name] = found[0, :, i] / factor, spread[:, i] / factor
+    return Ahead(float(t[k]), later, measured, values, std)

@@ -74,13 +74,15 @@ class About(NamedTuple):
 def page(fit: Fit, *, about: About = About(), forecasts: Forecasts | None = None) -> str:  # noqa: B008
     """The page of a fit, as text. forecasts: of its held-out part."""
     found = fit.found
+    if forecasts is None and fit.held_out is not None:
+        with contextlib.suppress(InputError):  # it is too short
+            forecasts = forecasts_of(fit, fit.held_out)
     if isinstance(found, LearnedLaw):
-        if forecasts is None and fit.held_out is not None:
-            with contextlib.suppress(InputError):  # it is too short
-                forecasts = forecasts_of(fit.map, fit.held_out)
         sections = list(_of_law(fit, found, forecasts, about.notes))
     elif isinstance(found, Choice):
         sections = list(_of_choice(fit, found))
+        if fit.held_out is not None:
+            sections.insert(1, _forecasts(fit, [], [], forecasts))
     else:
         raise ValueError("expected a fit, or the folder of one: this one holds a map alone")
     sections.append(_made(getattr(found, "seconds", float("nan")), about.command))
@@ -185,7 +187,7 @@ def _of_law(
         ],
     )
     yield _physics(law, known)
-    yield from _forecasts(fit, law, forecasts)
+    yield _forecasts(fit, _coming(fit, law), law.horizon_lines, forecasts)
     yield _simulation(fit, law)
     if law.traces and fit.data is not None:
         yield Section(
@@ -240,36 +242,39 @@ def _physics(law: LearnedLaw, known: Physics) -> Section:
     )
 
 
-def _forecasts(fit: Fit, law: LearnedLaw, found: Forecasts | None) -> Iterator[Section]:
+def _coming(fit: Fit, law: LearnedLaw) -> list[tuple[str, str]]:
+    """Figure of the forecast from the end of what was learned from."""
     if fit.data is None:
-        return
-    drawn = [
+        return []
+    return [
         _svg(
             figures.coming_figure(law, fit.data, fit.learned_to),
             "Forecast from one state at the "
             "dashed line on, and what was measured. Two standard deviations are shaded.",
         )
     ]
-    rows, lines = [], []
-    if found is not None and fit.held_out is not None:
-        drawn.append(
-            _svg(
-                figures.forecasts_figure(found, fit.held_out),
-                "Three forecasts of what no fit has seen, each from the 20 samples before.",
-            )
-        )
-        for name, errors in found.median.items():
-            unit = fit.held_out.unit(name)
-            rows.append((name, *(f"{e:.3g} {unit}".rstrip() for e in errors)))
-        lines.append(
-            f"{100 * found.within:.0f} % of what was measured lies within two standard deviations "
-            "(95 % expected)."
-        )
-        heads = ("median error", *(f"after {s:.3g} s" for s in found.ahead))
-    else:
-        heads = ()
-    yield Section(
-        "Forecasts", lines=[*lines, *law.horizon_lines], heads=heads, rows=rows, figures=drawn
+
+
+def _forecasts(
+    fit: Fit, drawn: Sequence[tuple[str, str]], lines: Sequence[str], found: Forecasts | None
+) -> Section:
+    """Forecasts of the held-out part, behind other figures, with their errors before other
+    lines."""
+    if found is None or fit.held_out is None:
+        return Section("Forecasts", lines=lines, figures=drawn)
+    begun = "from a measured state" if fit.map.sensors is None else "from the 20 samples before"
+    caption = f"Three forecasts of what no fit has seen, each {begun}."
+    units = {name: fit.held_out.unit(name) for name in found.median}
+    share = f"{100 * found.within:.0f} % of what was measured lies within two standard deviations"
+    return Section(
+        "Forecasts",
+        lines=[f"{share} (95 % expected).", *lines],
+        heads=("median error", *(f"after {s:.3g} s" for s in found.ahead)),
+        rows=[
+            (name, *(f"{e:.3g} {units[name]}".rstrip() for e in errors))
+            for name, errors in found.median.items()
+        ],
+        figures=[*drawn, _svg(figures.forecasts_figure(found, fit.held_out), caption)],
     )
 
 
@@ -321,6 +326,14 @@ def _faults(fit: Fit, law: LearnedLaw) -> Iterator[str]:
 # Of pairs.
 
 
+def _bracket(fit: Fit) -> list[str]:
+    """Lines on a bracket that is not that of (q, p)."""
+    if fit.bracket is None:
+        return []
+    casimirs = "; ".join(casimir.formula for casimir in fit.casimirs) or "none"
+    return [f"Bracket: {fit.bracket}.", f"Casimirs: {casimirs}."]
+
+
 def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
     law = found.law
     if law is not None and law.formula:
@@ -329,7 +342,7 @@ def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
         yield Section(
             "Law",
             formulas=[("Hamiltonian", f"{defines('H')} <math><mrow>{shown}</mrow></math>")],
-            lines=list(law.notes),
+            lines=[*_bracket(fit), *law.notes],
             heads=("term", "coefficient"),
             rows=[(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms],
         )

@@ -16,10 +16,11 @@ from gfnn_jax.evaluate.figures_of_recordings import forecasts_figure
 from gfnn_jax.evaluate.figures_style import save
 from gfnn_jax.evaluate.forecasts import Forecasts, end_of_part, forecasts_of
 from gfnn_jax.evaluate.page import About, write_page, write_refusal
-from gfnn_jax.jobs.fit import fit_recording
+from gfnn_jax.jobs.fit import fit_recording, fit_states
 from gfnn_jax.jobs.look import look
 from gfnn_jax.jobs.output import PAGE, REPORT, Output
 from gfnn_jax.jobs.output import Ran as Learned
+from gfnn_jax.phase_space import POISSON
 from gfnn_jax.storage.outputs import atomic_folder
 
 FIGURE = "forecasts.png"
@@ -54,11 +55,15 @@ def run_record(
     about = About(command, tuple(taken))
     with atomic_folder(output.out) as folder:
         try:
-            learned = fit_recording(
+            asked |= options
+            of_states = asked.get("structure") == POISSON
+            if of_states:
+                asked = {n: value for n, value in asked.items() if n not in ("mass", "despite")}
+            learned = (fit_states if of_states else fit_recording)(
                 [data],
                 Output(folder / "model", progress=output.progress),
                 columns={**columns, "stop": stop},
-                **{**asked, **options},
+                **asked,
             )
         except (InputError, WorkError) as error:
             refused: InputError | WorkError | None = error
@@ -99,7 +104,7 @@ def _report(
     output.progress.line("forecasting the last third, which no fit has seen")
     result = dict(learned.report)
     try:
-        found = forecasts_of(fit.map, held_out)
+        found = forecasts_of(fit, held_out)
     except InputError as error:
         found = None
         output.progress.line(f"no forecasts: {error}")

@@ -32,6 +32,7 @@ from gfnn_jax.models.brackets.find import Found, brackets_of, library_of, polyno
 from gfnn_jax.models.brackets.null_space import CONSTANT, LINEAR, LOG, null_spaces
 from gfnn_jax.models.brackets.poisson_field import PoissonField, hamiltonian_of
 from gfnn_jax.phase_space import sizes
+from gfnn_jax.signals.noise import noise
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Options:
     long: float = 0.6
     fewest: int = 8
     grown: float = 1.6
+    hidden: float = 2.0  # times what noise makes of a relation: one that noise may hide
     standard: int = 1  # brackets of which H is looked for among shapes
     # times the error of the free field, that a Poisson field may leave
     worse: float = 3.0
@@ -124,6 +126,8 @@ def law_of(
     if bracket is not None:
         return _of_bracket(bracket, train, held, terms, on_progress)
     field, fit, error, notes = _free_field(train, held, names, terms, on_progress)
+    if error > OPTIONS.exact and terms is None:
+        _refuse_relations_in_noise(train, names, fit)
     noisy = _noise(field, fit, error, train)
     fit = fit if noisy is None else noisy.fit
     if noisy is None and error > OPTIONS.exact and terms is None:
@@ -136,7 +140,7 @@ def law_of(
     drawn = [rng.normal(size=len(fit.root)) @ fit.root for _ in range(OPTIONS.draws)]
     draws = [(field.rate(c, some), field.jacobian(c, some)) for c in drawn]
     off = [np.mean((one[0] / sizes(f)) ** 2) for one in draws]
-    noise = float(np.sqrt(np.mean(off)))
+    unsure = float(np.sqrt(np.mean(off)))
     nearest: dict[str, float] = {}
     for null in null_spaces(some, f, slope, draws):
         kind = null.tensors.kind
@@ -145,15 +149,16 @@ def law_of(
         if not len(null.vectors):
             continue
         library = library_of(kind, names, _degree(field), terms)
-        for found in brackets_of(null, some, f, library, OPTIONS.errors * noise):
+        for found in brackets_of(null, some, f, library, OPTIONS.errors * unsure):
             law = _through_flow(found, train, held, notes, noisy)
             if law.error <= max(OPTIONS.worse * error, OPTIONS.exact):
                 return law
+    more = ". With noise more runs may show one" if noisy is not None else ""
     values = ", ".join(f"{value:.2g} ({kind})" for kind, value in nearest.items())
     raise FitError(
         f"no bracket: L_f B = 0 has no solution among these, the nearest singular value being "
         f"{values}, where 0 is a bracket. The field of degree {_degree(field)} leaves {error:.1e} "
-        "of the spread",
+        f"of the spread{more}",
         f"no law: no bracket, nearest singular value {min(nearest.values()):.2g}",
     )
 
@@ -209,6 +214,27 @@ _SHELL = (
     "all states lie on one surface ({count} function of the state is the same in every run): off "
     "it the law is not determined by these data"
 )
+
+
+def _refuse_relations_in_noise(train: Data, names: tuple[str, ...], fit: FieldFit) -> None:
+    """Raise FitError where noise hides that the runs keep more than one relation of degree 2, which
+    its functions without a constant then still have."""
+    library = polynomials(names, 2)
+    sequences = arcs_of(train.z0, train.z1, train.run, train.place)
+    columns = np.concatenate(sequences).T
+    known = noise([np.arange(float(len(s))) for s in sequences], columns)
+    left = np.sqrt(np.mean(fit.residual**2, axis=0) / 2)
+    sigma = np.array(
+        [s if n.sigma is None else min(n.sigma, s) for n, s in zip(known, left, strict=True)]
+    )
+    values = library.term_values(train.z0)
+    units = np.linalg.norm(values, axis=0)
+    _, s, vt = np.linalg.svd(values / units, full_matrices=False)
+    slopes = np.einsum("njk,mk->nmj", library.term_gradients(train.z0), vt / units)
+    by_noise = np.sqrt(np.sum((slopes * sigma) ** 2, axis=(0, 2)))
+    hidden = int(np.sum(s <= OPTIONS.hidden * by_noise))
+    if hidden:
+        raise _too_few_runs(hidden + 1, 2, len(np.unique(train.run)))
 
 
 def _too_few_runs(missing: int, degree: int, runs: int) -> FitError:
