@@ -132,6 +132,17 @@ def as_a_user():
         jax.config.update(name, value)
 
 
+@pytest.fixture(scope="session")
+def swing():
+    """A recording of a damped pendulum over 40 s, and the law of its first 28 s."""
+    from test_law_fits import pendulum, recorded
+
+    import gfnn_jax as gfnn
+
+    recording = recorded(*pendulum())
+    return recording, gfnn.fit(recording.slice(stop=28.0))
+
+
 _compiled = []
 
 

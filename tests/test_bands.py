@@ -328,6 +328,7 @@ def test_the_posterior_of_s_with_parameters_tells_noise_from_misfit(kicked):
     assert 0.5 < np.sqrt(np.mean(std**2) / np.mean(error**2)) < 2
 
 
+@pytest.mark.slow
 def test_bands_of_a_polynomial_with_parameters(kicked):
     with pytest.warns(gfnn.FitWarning):
         fit = gfnn.fit(kicked, angles=(0,), family="polynomial", chart="type2", tolerance=1e-8)

@@ -82,9 +82,8 @@ def quartic(number):
     return gfnn.Pairs(z, images(family, np.array([0.5, 0.25]), z, DT, Steps(12, 8)).states, DT)
 
 
-@pytest.mark.parametrize(
-    "kind", ["map", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("law", "networks"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["map", "law", "networks"])
 def test_the_same_bits_on_any_number_of_devices(kind):
     run_python(FITS, kind, devices=3)
 

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_law_fits import chain, pendulum
+from test_law_fits import chain, pendulum, recorded
 
 import gfnn_jax as gfnn
 from gfnn_jax.maps.sensors import Sensors
@@ -12,10 +12,6 @@ from gfnn_jax.models.lagrangians.calibration import Thirds, _with_size
 from gfnn_jax.models.lagrangians.fit import SearchOptions
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.search import search
-
-
-def recorded(t, theta):
-    return gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
 
 
 def covered(fit, recording, starts, ahead):
@@ -72,13 +68,6 @@ def test_bands_of_a_law_that_is_right_hold_no_more(swing):
     assert fit.map.sensors.wander is None
     with_misfit, _ = covered(fit, recording, np.arange(30.5, 38.5, 0.7), 1.5)
     assert 0.9 < with_misfit < 0.995
-
-
-@pytest.fixture(scope="module")
-def swing():
-    t, theta = pendulum(end=40.0)
-    recording = recorded(t, theta)
-    return recording, gfnn.fit(recording.slice(stop=28.0))
 
 
 def test_misfit_beyond_the_last_lead_grows_as_it_did():

@@ -47,6 +47,10 @@ from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
 
 
+def recorded(t, theta):
+    return gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+
+
 def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):
     """θ̈ = −2 sin θ − γ θ̇, by SciPy."""
     t = np.arange(0, end, dt)
@@ -270,13 +274,6 @@ def test_names_of_functions_are_columns_all_the_same():
     assert str(found.sympy()) == "gamma**2 + cos(beta)"
 
 
-@pytest.fixture(scope="module")
-def swing():
-    t, theta = pendulum()
-    recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
-    return recording, gfnn.fit(recording.slice(stop=28.0))
-
-
 def test_lanes_that_follow_their_own_laws_are_followed_as_if_alone(swing):
     law = law_of(swing[1].map)
     laws = [law, law._replace(p=1.1 * law.p, root=2 * law.root)]
@@ -318,8 +315,7 @@ def test_wrong_values_are_left_out_of_a_fit_and_told():
     def fitted(values):
         theta = x.copy()
         theta[rows] = values
-        of = {"positions": ["theta"], "angles": ["theta"]}
-        return gfnn.fit(gfnn.Recording({"t": t, "theta": theta}, **of))
+        return gfnn.fit(recorded(t, theta))
 
     expected = fitted(np.nan)
     for kind, values in (("stuck", x[310]), ("outliers", x[rows] + 0.6)):
@@ -404,8 +400,7 @@ def test_friction_of_rare_kinds(kind):
 
 
 def undamped():
-    t, theta = pendulum(gamma=0.0, end=25.0)
-    return gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+    return recorded(*pendulum(gamma=0.0, end=25.0))
 
 
 def test_the_friction_that_a_record_shows(swing):
@@ -467,9 +462,8 @@ def test_uniform_friction_of_a_double_pendulum(tmp_path):
 
 def test_energy_that_no_input_explains_is_named():
     t, theta = pendulum(gamma=-0.03, end=25.0, amplitude=0.6)
-    recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
     with pytest.warns(gfnn.FitWarning, match="gains energy that no input explains"):
-        fit = gfnn.fit(recording)
+        fit = gfnn.fit(recorded(t, theta))
     assert fit.friction.terms == ()
 
 
@@ -525,7 +519,7 @@ def test_a_forecast_says_where_it_leaves_the_motion_that_was_learned(swing):
     assert fit.map.forecast(recording.slice(26.0, 28.0), np.array([28.5, 30.0])).outside == ()
     largest = np.abs(recording.values("theta", "0")).max()
     t, theta = pendulum(end=4.0, amplitude=1.5 * largest)
-    wide = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
+    wide = recorded(t, theta)
     (line,) = fit.map.forecast(wide.slice(stop=1.0), t[t > 1.0]).outside
     assert "run 0" in line
     assert "lies beyond the motion" in line
@@ -569,8 +563,7 @@ def test_a_double_pendulum_has_its_five_terms():
 
 def test_a_known_mass_scales_the_law():
     t, theta = pendulum(end=15.0)
-    recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
-    fit = gfnn.fit(recording, friction="linear", mass={"theta": 3.0})
+    fit = gfnn.fit(recorded(t, theta), friction="linear", mass={"theta": 3.0})
     assert fit.lagrangian.terms[0].coefficient == pytest.approx(1.5)
     assert fit.lagrangian.terms[1].coefficient == pytest.approx(6.0, rel=0.01)
 

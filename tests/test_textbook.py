@@ -237,6 +237,7 @@ def test_a_softened_distance_is_found():
     assert found == pytest.approx(expected, abs=1e-11)
 
 
+@pytest.mark.slow
 def test_a_slightly_broken_symmetry_is_found():
     assert read(searched(broken_kepler_pairs(200, 1e-4)))["q1²"] == pytest.approx(1e-4, rel=1e-8)
 
@@ -264,6 +265,7 @@ def test_centres_beside_the_origin_are_found_told_nothing():
     assert found == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_heavy_top_in_eulers_angles_is_found_told_nothing():
     rng = np.random.default_rng(0)
     low, high = [-3, 0.5, -3, -1, -1, -1], [3, 2.6, 3, 1, 1, 1]
@@ -294,6 +296,7 @@ def test_a_good_approximation_is_no_formula():
     assert searched(pairs_of(gradient, z0, dt=0.2)) is None
 
 
+@pytest.mark.slow
 def test_a_law_outside_of_the_dictionary_is_no_formula_and_the_closest_are_told():
     pairs = outside_pairs(150)
     search = Textbook(

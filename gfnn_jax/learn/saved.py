@@ -19,6 +19,7 @@ from gfnn_jax.families.text import Term
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.learn.fitted import Choice, Fit, OfPositions
 from gfnn_jax.maps import saved as maps
+from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.arms.identify import BaseParameters, Columns, Identified, Prior
 from gfnn_jax.models.arms.learned_arm import LearnedArm
 from gfnn_jax.models.hamiltonians.fitted_law import Dropped, PartialLaw, Proposal, Rival
@@ -30,6 +31,20 @@ from gfnn_jax.models.lagrangians.residuals import OfInput, Whiteness
 from gfnn_jax.models.lagrangians.velocities import Velocity
 from gfnn_jax.scenes.scene import Scene
 
+
+@dataclasses.dataclass(frozen=True)
+class WithoutMap:
+    """What was found, of the class ``kind``, without the map, which a folder holds once."""
+
+    kind: str
+    fields: dict[str, Any]
+
+    def of(self, map_: SymplecticMap) -> LearnedLaw | LearnedArm:
+        """What was found, with its map."""
+        kind = LearnedArm if self.kind == LearnedArm.__name__ else LearnedLaw
+        return kind(map=map_, **self.fields)
+
+
 for _kind in (
     BaseParameters,
     Choice,
@@ -40,10 +55,8 @@ for _kind in (
     Hamiltonian,
     Horizon,
     Identified,
-    LearnedArm,
     LearnedDamping,
     LearnedHamiltonian,
-    LearnedLaw,
     NextMotion,
     OfInput,
     OfPositions,
@@ -59,6 +72,7 @@ for _kind in (
     Term,
     Triangle,
     WhichFriction,
+    WithoutMap,
 ):
     maps.register(_kind)
 
@@ -91,8 +105,8 @@ def state_of(fit: Fit) -> dict[str, Any]:
     stored = {"verdict": fit.verdict, "record": fit.stored.get("record") or _record(fit)}
     stored = {name: value for name, value in stored.items() if value}
     found = _portable(fit.found)
-    if found is not None and not isinstance(found, Choice):
-        found = dataclasses.replace(found, map=fit.map)
+    if isinstance(found, WithoutMap):
+        found = found.of(fit.map)
     return {"map": fit.map, "found": found, "stored": stored}
 
 
@@ -112,7 +126,7 @@ def load(folder, scene: Scene | None = None) -> Fit:
     if isinstance(found, Choice):
         found = dataclasses.replace(found, scene=scene)
     elif found is not None:
-        found = dataclasses.replace(found, map=map_)
+        found = found.of(map_)
     kept = {name: beside[name] for name in ("verdict", "record") if beside.get(name)}
     return Fit(map_, found, kept)
 
@@ -122,8 +136,10 @@ def _portable(found: Choice | LearnedLaw | LearnedArm | None) -> Any:
     if found is None:
         return None
     if not isinstance(found, Choice):
-        own = {"traces": ()} if hasattr(found, "traces") else {}
-        return dataclasses.replace(found, map=None, **own)
+        fields = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
+        del fields["map"]
+        own = {"traces": ()} if "traces" in fields else {}
+        return WithoutMap(type(found).__name__, fields | own)
     law = found.hamiltonian
     if law is not None:
         law = dataclasses.replace(
