@@ -34,13 +34,13 @@ from gfnn_jax.scenes.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class WithoutMap:
-    """What was found, of the class ``kind``, without the map, which a folder holds once."""
+    """Findings of the class ``kind`` as fields, without the map, which a folder holds once."""
 
     kind: str
     fields: dict[str, Any]
 
     def of(self, map_: SymplecticMap) -> LearnedLaw | LearnedArm:
-        """What was found, with its map."""
+        """The findings with their map."""
         kind = LearnedArm if self.kind == LearnedArm.__name__ else LearnedLaw
         return kind(map=map_, **self.fields)
 
