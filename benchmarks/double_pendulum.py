@@ -22,6 +22,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import gfnn_jax as gfnn
+from gfnn_jax.evaluate.figures_style import COLOURS, style
 
 ANGLES = ("theta1", "theta2")
 SAMPLES, AHEAD, STARTS = 20, 1.0, 3  # of a start; seconds; starts in the figure
@@ -77,15 +78,32 @@ def measured() -> dict:
     }
 
 
-def draw(found: dict, path: Path) -> None:
-    """Measured angles and forecasts above, what forecasts missed and their bands below, a column a
-    start."""
-    figure, axes = plt.subplots(
-        2, STARTS, figsize=(10, 4.6), sharex=True, sharey="row", layout="constrained"
+def typeset(law: str) -> str:
+    """L or R as matplotlib sets it: 0.16(1) ω₂² becomes 0.16(1)\\,\\omega_2^2."""
+    signs = dict(
+        zip("₁₂²³ωθ−|", ("_1", "_2", "^2", "^3", r"\omega", r"\theta", "-", r"\vert "), strict=True)
     )
+    return (
+        "".join(signs.get(letter, letter) for letter in law)
+        .replace("cos", r"\cos")
+        .replace(" ", r"\,")
+    )
+
+
+@style()
+def draw(found: dict, path: Path) -> None:
+    """The law on top; measured angles and forecasts, and under them the errors of forecasts with
+    their bands, a column a start."""
+    figure, axes = plt.subplots(
+        2, STARTS, figsize=(10, 5.0), sharex=True, sharey="row", layout="constrained"
+    )
+    law = (
+        f"${name} = {typeset(found[of])}$" for name, of in (("L", "lagrangian"), ("R", "friction"))
+    )
+    figure.suptitle("\n".join(law), fontsize=10, linespacing=1.6)
     for (above, below), forecast in zip(axes.T, found["forecasts"], strict=True):
         t = np.array(forecast["t"]) - forecast["start"]
-        for i, (name, colour) in enumerate(zip(("θ₁", "θ₂"), ("C0", "C1"), strict=True)):
+        for i, (name, colour) in enumerate(zip(("θ₁", "θ₂"), COLOURS[:2], strict=True)):
             above.plot(
                 forecast["line_t"],
                 forecast["line"][i],

@@ -109,7 +109,7 @@ LINES: list[tuple[str, Callable[[], str], str, bool]] = [
     ("A law from 100 raw pairs: Hénon–Heiles", law, "laws", True),
     ("The same at a step of half a period, 400 pairs", long_step, "laws", False),
     ("A pendulum's length as a parameter, told nothing", parameter, "args", False),
-    ("A ring of 1,000 springs from 40 pairs, told that it is a ring", ring, "many", True),
+    ("A ring of 1,000 springs from 40 pairs, given that it is a ring", ring, "many", True),
     ("One turn of a storage ring", storage_ring, "storage_ring", True),
     ("Bands of two standard deviations, with noise and without", bands, "bands", True),
     ("The first answer, nothing compiled before", first_answer, "speed", False),

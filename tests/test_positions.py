@@ -324,7 +324,7 @@ def test_forecasts_of_wrapped_readings_go_on_over_whole_turns(of_noisy):
 
 
 def test_latent_positions_of_a_ring_of_equal_sites():
-    """The coupling of a ring of six from noisy angles, told that it is a ring."""
+    """The coupling of a ring of six from noisy angles, given that it is a ring."""
     names = [f"theta{i}" for i in range(1, 7)]
     recording = recorded(noisy(ring(60, 12, 6, 0), 1e-3, 5), names, names)
     triples = triples_of(recording, sites=True)
