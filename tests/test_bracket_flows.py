@@ -1,5 +1,7 @@
 """Flows of laws with a bracket: exactly Poisson, Casimirs kept, and all that maps can do."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from gfnn_jax.coordinates import CARTESIAN, LOG
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collective import collective
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.lifted import STAGES, Stepper
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.solve.status import NON_FINITE, OK
 
@@ -50,13 +53,13 @@ SYSTEMS = {  # bracket, terms of H in q1.. p.., a state
 }
 
 
-def made(name, dt=0.1):
+def made(name, dt=0.1, stages=6):
     bracket, terms, z = SYSTEMS[name]
     n = bracket.size
     family = given_terms(-(-n // 2), terms)
     log = bracket.name == "log-canonical"
     params = np.linspace(0.7, 1.1, family.num_parameters)
-    flow = Flow(collective(family, bracket), params, dt, np.ones(n))
+    flow = Flow(collective(family, bracket), params, dt, np.ones(n), stages)
     domain = covering(np.zeros((1, n)), ignore=tuple(range(n)))
     return gfnn.SymplecticMap(
         (flow,), LOG if log else CARTESIAN, domain, np.ones(n), np.zeros(0), dt, bracket=bracket
@@ -103,6 +106,33 @@ def test_step(name, steps, tmp_path):
     again = gfnn.load(tmp_path / "model").map
     np.testing.assert_array_equal(again.step(states)[0], after)
     assert str(again.bracket) == str(bracket)
+
+
+@pytest.mark.parametrize(
+    "name", ["top", *(pytest.param(n, marks=pytest.mark.slow) for n in SYSTEMS)]
+)
+def test_long_rollouts(name):
+    """Compiled steps are those of JAX; Casimirs stay to the last digit."""
+    map_, z = made(name, stages=STAGES)
+    assert Stepper.of(map_.pieces[0]) is not None
+    states, info = map_.rollout(z, 10_000)
+    few, _ = map_.rollout(z, 30)
+    np.testing.assert_allclose(states[:31], few, rtol=5e-14, atol=5e-14)
+    fine = np.asarray(states)[np.isfinite(states).all(axis=1)]
+    assert (len(fine) == len(states)) == (info.status == OK)
+    for casimir in map_.bracket.casimirs:
+        assert np.max(abs(casimir(fine) / casimir(z) - 1)) < 6e-15
+
+
+def test_long_rollouts_leave_the_domain():
+    map_, z = made("top", stages=STAGES)
+    domain = covering(np.random.default_rng(0).uniform(-1, 1, (200, 6)) * 0.2 + z)
+    map_ = dataclasses.replace(map_, domain=domain)
+    both = [map_.rollout(z, n, stop_outside=True) for n in (60, 10_000)]
+    few, many = (info for _, info in both)
+    assert few.left_at > 0
+    assert (few.left_at, few.status) == (many.left_at, many.status)
+    np.testing.assert_allclose(both[1][0][:61], both[0][0], atol=1e-14)
 
 
 @pytest.mark.slow

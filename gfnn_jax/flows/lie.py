@@ -37,8 +37,9 @@ _MOST = 40  # Newton updates
 # Of the series of ψ(M): to roundoff for ‖M‖ ≤ π, beyond which the chart ends.
 _TERMS = 32
 # States, largest number of substeps, and the change in units of the coordinates' sizes by which
-# they are judged: roundoff of a step of 6 stages or 17 maps.
-_PROBES, _MOST_SUBSTEPS, _RESOLVED = 64, 64, 2e-14
+# they are judged: roundoff of the largest of a few hundred numbers.
+_PROBES, _MOST_SUBSTEPS, _RESOLVED = 64, 64, 4e-15
+_STAGES = 8  # of a law's step, of order 16, as compiled rollouts have them (`flows.lifted`)
 # The symmetric composition of 17 steps and order 8 of W. Kahan & R.-C. Li, Math. Comp. 66 (1997),
 # 1089: the first nine of its weights.
 _WEIGHTS = (
@@ -203,7 +204,7 @@ def law_flow(family, params, bracket: Bracket, dt: float, z) -> Flow | LieFlow:
     z = z[:: -(-len(z) // _PROBES)]
     lifted = not isinstance(bracket, LieAlgebra) or bool(bracket.blocks)
     if lifted:
-        piece = Flow(collective(family, bracket), params, dt, scale)
+        piece = Flow(collective(family, bracket), params, dt, scale, _STAGES)
     else:
         piece = LieFlow(lie_generated(family, params, bracket, dt, scale))
     image, before = piece.image(z), np.inf

@@ -47,6 +47,9 @@ class Lift:
     """π from states w, whose bracket is the constant ``form``, None for J, to states z."""
 
     form: Any
+    # (casimir, a, b) of Σ value w_a w_b / 2, and values, of the fibres' momenta: what a lift's flow
+    # conserves by itself. (): z's Casimirs stand for them; None: not known.
+    quadratic_invariants: Any = None
 
     def argument(self, w):
         """State at which H is evaluated: that of w."""
@@ -66,6 +69,8 @@ class Itself(Lift):
     """z = w: the bracket is the constant ``form`` (n, n)."""
 
     form: Any
+
+    quadratic_invariants = ()
 
     def up(self, z):
         """The state w of z."""
@@ -163,6 +168,35 @@ class Quadratic(Lift):
         halves = [xp.broadcast_to(xp.sqrt(xp.mean(half * half)), q.shape) for half in (q, p)]
         return xp.concatenate(halves)
 
+    @property
+    def quadratic_invariants(self) -> tuple:
+        """|w|² of each spin, |q|² and ⟨k q, p⟩ of each se(3), q p of each Casimir coordinate."""
+        half, at, found = sum(_SIZES[block][1] for block in self.blocks), 0, []
+        for block in self.blocks:
+            q = range(at, at + _SIZES[block][1])
+            p = [half + i for i in q]
+            at += len(q)
+            if block == "so3":
+                found.append([(i, i, 1.0) for i in (*q, *p)])
+            elif block == "se3":
+                found.append([(i, i, 1.0) for i in q])
+                turned = zip((3, 2, 1, 0), (-1.0, -1.0, 1.0, 1.0), strict=True)
+                found.append([(q[j], p[i], v) for i, (j, v) in enumerate(turned)])
+            elif block == "centre":
+                found.append([(q[0], p[0], 1.0)])
+        both = [[*rows, *((b, a, v) for a, b, v in rows if a != b)] for rows in found]
+        entries = [(k, a, b) for k, rows in enumerate(both) for a, b, _ in rows]
+        return entries, [v for rows in both for *_, v in rows]
+
+    @property
+    def fibres(self) -> list[tuple[int, int, bool]]:
+        """Places of q and p whose fibre has no end: of se(3), where p − s q is the same state
+        (True), and of Casimir coordinates, where s q and p / s are."""
+        ends = np.cumsum([0, *(_SIZES[block][1] for block in self.blocks)]).tolist()
+        starts = zip(self.blocks, ends, strict=False)
+        some = ((block, at) for block, at in starts if block in ("se3", "centre"))
+        return [(at, ends[-1] + at, block == "se3") for block, at in some]
+
     def _groups(self):
         """(block, how many follow each other)."""
         n = 0
@@ -208,6 +242,7 @@ class Shear(Lift):
     inverse: Any
 
     form = None
+    quadratic_invariants = ()
 
     def up(self, z):
         """(x, p) of (x, v)."""
