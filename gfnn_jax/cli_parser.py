@@ -465,7 +465,7 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
     group.add("--angles", angles, "A,B", type=_names_or_indices)
     names("--degrees", "columns in degrees")
     names("--columns", "columns to read; names of all of them where the file has none")
-    group.add("--time", "the column of times, where its name does not tell", "NAME")
+    group.add("--time", "the column of times, where its name does not say so", "NAME")
     group.add("--time-unit", "of the times (default s)", choices=tuple(SECONDS))
     noise = "noise of a column, known: a number, or the column that holds it for each value"
     pairs("--std", noise, _sigmas, "NAME=σ")

@@ -63,6 +63,25 @@ def test_links_lead_somewhere(page):
     assert not [path for path in local if not (page.parent / path).exists()]
 
 
+# Pages of more than one idea still.
+LONG = {"architecture", "args", "bands", "charts-and-families", "export", "extending"}
+LONG |= {"friction-and-inputs", "laws", "laws-from-recordings", "mathematics", "recordings"}
+LONG |= {"scaling", "your-own-data"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_pages_and_paragraphs_are_short(page):
+    text = page.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 150 or page.stem in LONG
+    if page.stem in ("architecture", "extending"):
+        return
+    prose = re.sub(r"^```.*?^```$", "", text, flags=re.S | re.M)
+    other = re.compile(r"\s*(\||- |\d+\. |#|    |<!--|\*[A-Z]|!\[)")
+    paragraphs = [block.strip("\n").split("\n") for block in prose.split("\n\n")]
+    plain = [lines for lines in paragraphs if not any(map(other.match, lines))]
+    assert not [lines[0] for lines in plain if len(lines) > 6]
+
+
 def test_what_slow_pages_show_is_tested_elsewhere():
     assert set(SLOW) < {page.stem for page in PAGES}
     assert all((ROOT / "tests" / f"{n}.py").exists() for names in SLOW.values() for n in names)

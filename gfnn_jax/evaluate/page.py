@@ -288,7 +288,7 @@ def _simulation(fit: Fit, law: LearnedLaw) -> Section:
 
 
 def _not_identified(law: LearnedLaw) -> Iterator[str]:
-    yield from (f"The record does not tell apart: {in_letters(pair)}." for pair in law.alike)
+    yield from (f"The record does not distinguish: {in_letters(pair)}." for pair in law.alike)
     for term, limit in law.which_friction.limits.items():
         yield (
             f"No friction of the form {in_letters(term)} is seen: its coefficient in R is below "
@@ -397,7 +397,7 @@ def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
     )
     null = law.null_terms if law is not None else ()
     yield Section(
-        "Not identified", lines=[f"The pairs do not tell {', '.join(null)} apart."] if null else []
+        "Not identified", lines=[f"The pairs do not distinguish {', '.join(null)}."] if null else []
     )
     yield Section(
         "Rivals",

@@ -155,7 +155,7 @@ class Choice:
             return f"partly: {self._error} misses the tolerance, for {self.ended}"
         # Sums over sites have terms that vanish or add up to nothing, whatever the data.
         if law.null_terms and not isinstance(law.flow.family, Sums):
-            return f"one of several: the pairs do not tell {', '.join(law.null_terms)} apart"
+            return f"one of several: the pairs do not distinguish {', '.join(law.null_terms)}"
         relative = self.chosen.validation_relative
         if relative > _HIDES:
             return (

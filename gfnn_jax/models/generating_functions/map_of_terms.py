@@ -62,7 +62,7 @@ class Options:
 
 OPTIONS = Options()
 
-_FEWER_TERMS = "dropping the terms of S that the pairs do not ask for"
+_FEWER_TERMS = "removing terms of S that are not significant"
 
 
 class LearnedMap(NamedTuple):

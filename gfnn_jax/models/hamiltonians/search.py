@@ -146,7 +146,7 @@ def _simplified(
             work.capped(np.inf)  # what is pruned is soon fitted
             with work.again(what, (best.larger or best).family, len(data.training)):
                 best = without_noise(problem, best)
-        what = "dropping the terms of H that the pairs do not ask for"
+        what = "removing terms of H that are not significant"
         with work.again(what, best.family, len(best.fit.used)):
             best = sparse(problem, best)
         if len(there.validation) and len(far):

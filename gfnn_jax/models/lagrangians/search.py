@@ -169,7 +169,7 @@ class TermSearch:
             return found
         periods = shorter.arcs.t.shape[1] / fit.problem.scales.per_period
         fit.problem.on_progress(
-            f"arcs of {periods:.2g} periods tell more than longer ones: {shorter}"
+            f"arcs of {periods:.2g} periods determine more than longer ones: {shorter}"
         )
         return found._replace(shorter=self._settled(*self.with_friction(shorter)))
 

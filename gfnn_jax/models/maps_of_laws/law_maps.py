@@ -116,7 +116,7 @@ class LawMapSearch:
             if not laws:
                 break
             try:
-                name = "what the flow of H leaves over"
+                name = "the residual of the flow of H"
                 with self.problem.budget.unit(name, FLOW, self._work(len(data))):
                     flows = [flow_of(family, c, data) for family, c in laws]
                     flow, rest = factored_out(flows, data, self.seed)
