@@ -79,6 +79,7 @@ SHORTHANDS |= {
 HOMES = {  # the module, and those whose names begin as its own does
     "argparse": "cli",
     "charset_normalizer": "data.texts",
+    "narwhals": "data.tables",
     "casadi": "exports.casadi_function",
     "diffrax": "scenes.trajectories",
     "flax": "families.mlp",

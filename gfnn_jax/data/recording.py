@@ -438,6 +438,18 @@ def read(
     return Recording(tables, **options)
 
 
+def as_recording(source: Any, **options: Any) -> Recording:
+    """The recording of files, as `read` gives it, or of a table, by the same keywords."""
+    several = source if isinstance(source, (list, tuple)) else [source]
+    if all(isinstance(one, (str, Path)) for one in several):
+        return read(source, **options)
+    rows = {name: options.pop(name) for name in ("start", "stop", "every") if name in options}
+    if rows.pop("every", 1) != 1:
+        raise InputError("every: only of files")
+    found = Recording(source, **options)
+    return found.slice(**{name: time * found.second for name, time in rows.items()})
+
+
 def _timed(table: Table, time: str | None) -> Table:
     """The table with this column of times."""
     if time is not None and time not in table.columns:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import html
 import io
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,12 @@ from gfnn_jax.signals.steps import dominant_frequencies, gaps
 if TYPE_CHECKING:
     from gfnn_jax.data.recording import Recording
 
+# An option with its value, up to the punctuation of a sentence, and the keyword beside it.
+_VALUE = r"(?!(?:and|or|with|if|goes|learns|has)\b)('[^']*'|[^\s()]+?)(?=[.,;:)]*(?:\s|$))"
+_TYPED = re.compile(rf"--([a-z][a-z-]+)(?: {_VALUE})?(?: \(\w+=\))?")
+_LISTS = (*ROLES, "angles", "degrees", "columns", "coordinates", "offset", "scale", "states")
+_IN_PYTHON = {"from": "start", "to": "stop"}
+_OF_FITS = ("structure", "states", "mass")
 _NOTEBOOK = '<pre style="line-height:normal;white-space:pre">{code}</pre>'
 
 
@@ -137,21 +144,40 @@ class RecordingSummary:
         }
         return _without_nan(plain)
 
+    @property
+    def read_as(self) -> str:
+        """Python that reads the data with the options that were given and are proposed."""
+        known = {n: value for n, value in self.options.items() if n not in _OF_FITS}
+        if "states" in self.options:
+            known["positions"] = self.options["states"]
+        words = [f"{name}={_as_code(value)}" for name, value in known.items()]
+        files = self.source.split(", ")
+        if self.source == "the table":
+            return f"gfnn.Recording({', '.join(['table', *words])})"
+        return f"gfnn.read({', '.join([repr(files[0] if len(files) == 1 else files), *words])})"
+
+    @property
+    def call(self) -> str:
+        """Python that fits the data as `command` does."""
+        of_fit = {n: self.options[n] for n in ("structure", "mass") if n in self.options}
+        words = [f"{name}={_as_code(value)}" for name, value in of_fit.items()]
+        return f"gfnn.fit({', '.join([self.read_as, *words])})"
+
     def __rich__(self) -> Group:
         return _screen(self)
 
     def _printed(self) -> Console:
         # A notebook would take it for its own display.
         console = Console(file=io.StringIO(), width=_SHOWN.width, record=True, force_jupyter=False)
-        console.print(_screen(self))
+        console.print(_screen(self, python=True))
         return console
 
     def __str__(self) -> str:
-        return f"{self._printed().export_text().rstrip()}\nnext: {self.command}"
+        return f"{self._printed().export_text().rstrip()}\nnext: {self.call}"
 
     def _repr_html_(self) -> str:
         screen = self._printed().export_html(inline_styles=True, code_format=_NOTEBOOK)
-        return f"{screen}<pre>next: {html.escape(self.command)}</pre>"
+        return f"{screen}<pre>next: {html.escape(self.call)}</pre>"
 
 
 def _without_nan(value: Any) -> Any:
@@ -326,6 +352,34 @@ def _short(value: Any) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
 
+def _as_code(value: Any) -> str:
+    return repr(list(value) if isinstance(value, tuple) else value)
+
+
+def in_python(text: str) -> str:
+    """Text with options of the command line as keywords: ``--degrees angle`` is
+    ``degrees=['angle']``."""
+
+    def keyword(found: re.Match[str]) -> str:
+        name, value = found[1].replace("-", "_"), found[2]
+        name = _IN_PYTHON.get(name, name)
+        if value is None:
+            return f"{name}="
+        value = shlex.split(value)[0]
+        if name == "observe":
+            value = dict([value.split(" = ", 1)])
+        elif name in _LISTS:
+            value = [] if value == "none" else value.split(",")
+        elif name == "guess":
+            pairs = (pair.split("=", 1) for pair in value.split(","))
+            value = {of: float(number) for of, number in pairs}
+        elif name in ("start", "stop", "dt"):
+            value = float(value)
+        return f"{name}={value!r}"
+
+    return _TYPED.sub(keyword, text)
+
+
 def as_typed(options: Mapping[str, Any]) -> str:
     """Keywords of `gfnn_jax.read` as options of the command line, with a blank before each."""
     words = {"start": "from", "stop": "to", "time_unit": "time-unit"}
@@ -345,10 +399,11 @@ def as_typed(options: Mapping[str, Any]) -> str:
 # The screen.
 
 
-def _screen(summary: RecordingSummary) -> Group:
-    """Screen that `gfnn look` prints."""
-    lines = [Text(line) for line in (_samples(summary), _times(summary), _moving(summary)) if line]
-    found = [_fault(fault) for fault in summary.faults[: _SHOWN.most]]
+def _screen(summary: RecordingSummary, python: bool = False) -> Group:
+    """Screen that `gfnn look` prints; with the words of ``python`` that a notebook shows."""
+    told = filter(None, (_samples(summary), _times(summary), _moving(summary)))
+    lines = [Text(in_python(line) if python else line) for line in told]
+    found = [_fault(fault, python) for fault in summary.faults[: _SHOWN.most]]
     more = len(summary.faults) - _SHOWN.most
     found += [Text(f"and {more} more")] if more > 0 else []
     return Group(*lines, _columns(summary), *found)
@@ -451,9 +506,9 @@ def _remarks(column: Column) -> str:
     return ", ".join(parts)
 
 
-def _fault(fault) -> Text:
+def _fault(fault: Fault, python: bool) -> Text:
     text = Text(
         f"wrong ({fault.kind}): " if fault.wrong else "note: ",
         style="bold red" if fault.wrong else "yellow",
     )
-    return text.append(str(fault), style="not bold default")
+    return text.append(in_python(str(fault)) if python else str(fault), style="not bold default")

@@ -58,6 +58,14 @@ _INDEXED = re.compile(r"([a-z]+?)_?(\d+|[xyz])?")
 _UNIT = re.compile(
     r"_((?i:deg|rad)|[µumcdk]?m|px|[mk]?N|Nm|[mk]?V|m?A)((?:_|_?per_?|/)(s|sec))?$", re.ASCII
 )
+# A name with its unit in brackets.
+_BRACKETS = re.compile(r"^\s*([^\[(]*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))?\s*$")
+# A name over its unit, as ISO 80000 has it: Zeit/ms, x / mm, v/(m/s).
+_OVER = re.compile(
+    r"^\s*(?P<name>[^/\[(]+?)\s*/\s*(?P<open>\()?"
+    r"(?P<unit>(?:[nµum]?s|[nµumck]?m|m?rad|k?g|[mk]?N|[µumk]?V|[µum]?A|min|h|deg|°|Nm|px)"
+    r"(?:/(?:ms|s|min))?)(?(open)\))\s*$"
+)
 # A derivative of another column: theta_dot, thetadot, dtheta, dtheta_dt, dtheta/dt, d_theta, θ̇.
 _DERIVATIVES = (
     re.compile(r"(?P<of>.+?)_?(dot|prime|')(?P<index>_?\d*)"),
@@ -114,14 +122,27 @@ def is_rate_of_turning(name: str) -> bool:
 
 
 def unit_in(name: str) -> str:
-    """The unit that a name ends with: deg of theta_deg, mm/s of v_mm_s; "" of none."""
+    """The unit that a name ends with: deg of theta_deg, mm/s of v_mm_s, rad of Angle (rad); "" of
+    none."""
+    if unit := split_unit(name)[1]:
+        return unit
     found = _UNIT.search(name.strip())
     return found[1] + ("/s" if found[3] else "") if found else ""
 
 
 def _bare(name: str) -> str:
     """The plain name without a unit at its end."""
-    return plain(_UNIT.sub("", name.strip()))
+    return plain(_UNIT.sub("", split_unit(name)[0].strip()))
+
+
+def split_unit(cell: str) -> tuple[str, str]:
+    """Name, and its unit where brackets or a stroke before it give one."""
+    if over := _OVER.match(cell):
+        return over["name"], over["unit"]
+    match = _BRACKETS.match(cell)
+    if match is None or not match[1]:
+        return cell, ""
+    return match[1], (match[2] or match[3] or "").strip()
 
 
 def derivative_of(name: str) -> str | None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import narwhals.stable.v2 as nw
 import numpy as np
 
 from gfnn_jax.data.blocks import damage
@@ -52,13 +53,16 @@ def rows_of(table: Table, start: float, stop: float, every: int) -> Table:
 
 
 def from_memory(table: Any) -> Table:
-    """The columns of a dict of arrays or of a DataFrame.
+    """The columns of a dict of arrays or of a table: of pandas, polars, pyarrow, xarray.
 
     Arrays of a dict are (T,), or (T, k) for the columns name1 … namek.
     Raises InputError where lengths differ or a column holds no numbers.
     """
     if isinstance(table, Table):
         return table
+    if hasattr(table, "to_dataframe"):  # of xarray
+        table = table.to_dataframe().reset_index()
+    frame = nw.from_native(table, eager_only=True, pass_through=True)
     if isinstance(table, Mapping):
         try:
             named = {str(name): np.asarray(values) for name, values in table.items()}
@@ -66,8 +70,7 @@ def from_memory(table: Any) -> Table:
             raise InputError(f"expected columns of numbers: {error}") from error
     elif isinstance(table, np.ndarray) and table.dtype.names:
         named = {name: table[name] for name in table.dtype.names}
-    elif hasattr(table, "columns") and hasattr(table, "to_numpy"):  # a DataFrame
-        frame: Any = table
+    elif isinstance(frame, nw.DataFrame):
         named = {str(name): frame[name].to_numpy() for name in frame.columns}
     else:
         raise InputError(

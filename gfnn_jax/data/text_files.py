@@ -19,7 +19,7 @@ import numpy as np
 
 from gfnn_jax.data.blocks import damage
 from gfnn_jax.data.columns import resolved
-from gfnn_jax.data.roles import is_run, is_time
+from gfnn_jax.data.roles import is_run, is_time, split_unit
 from gfnn_jax.data.tables import Table, rows_of
 from gfnn_jax.data.texts import text_of
 from gfnn_jax.errors import InputError
@@ -32,13 +32,6 @@ _DIALECTS = tuple(itertools.product((";", "\t", ",", _BLANKS), (".", ",")))
 _OF_RUN = re.compile(
     r"\s*((?P<before>latest|run\s*#?\d+)\s*:)?\s*(?P<name>.*?)\s*(?P<behind>run\s*#\s*\d+)?\s*",
     re.IGNORECASE,
-)
-_BRACKETS = re.compile(r"^\s*([^\[(]*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))?\s*$")
-# A name over its unit, as ISO 80000 has it: Zeit/ms, x / mm, v/(m/s).
-_OVER = re.compile(
-    r"^\s*(?P<name>[^/\[(]+?)\s*/\s*(?P<open>\()?"
-    r"(?P<unit>(?:[nµum]?s|[nµumck]?m|m?rad|k?g|[mk]?N|[µumk]?V|[µum]?A|min|h|deg|°|Nm|px)"
-    r"(?:/(?:ms|s|min))?)(?(open)\))\s*$"
 )
 
 
@@ -217,7 +210,7 @@ class TextFile:
         if len(set(filter(None, labels))) < 2:
             return bare
         runs = [re.sub(r"\D", "", label) or label for label in labels]
-        names, units = zip(*(_split_unit(name) for name in bare), strict=True)
+        names, units = zip(*(split_unit(name) for name in bare), strict=True)
         found = [f"{n} {run}".strip() for n, run in zip(names, runs, strict=True)]
         self.runs = dict(zip(found, zip(names, runs, strict=True), strict=True))
         return [f"{n} [{u}]" if u else n for n, u in zip(found, units, strict=True)]
@@ -586,17 +579,7 @@ def _cleaned(column: Any) -> Any:
     return column.str.strip().str.replace(r"\s+", " ", regex=True).str.replace(",", ".")
 
 
-def _split_unit(cell: str) -> tuple[str, str]:
-    """Name, and its unit where brackets or a stroke before it give one."""
-    if over := _OVER.match(cell):
-        return over["name"], over["unit"]
-    match = _BRACKETS.match(cell)
-    if match is None or not match[1]:
-        return cell, ""
-    return match[1], (match[2] or match[3] or "").strip()
-
-
 def _named(cells: list[str]) -> tuple[list[str], dict[str, str]]:
     """Names, and units by name where brackets, or a stroke before them, give them."""
-    found = [_split_unit(cell) for cell in cells]
+    found = [split_unit(cell) for cell in cells]
     return [name for name, _ in found], {name: unit for name, unit in found if unit}

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from pathlib import Path
 from typing import Any
 
-from gfnn_jax.data.recording import ReadOptions, Recording, read
-from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.data.recording import ReadOptions, Recording
+from gfnn_jax.errors import FitError, FitWarning, InputError
 from gfnn_jax.evaluate.forecasts import end_of_part
-from gfnn_jax.evaluate.page import write_page, write_refusal
-from gfnn_jax.learn.fit import as_pairs_or_recording, fit
+from gfnn_jax.evaluate.page import About, write_page, write_refusal
+from gfnn_jax.learn.fit import as_pairs_or_recording, fit, said_of
 from gfnn_jax.learn.fitted import Fit
 
 
@@ -18,8 +19,9 @@ def discover(data: Any, report: str | Path | None = "report.html", **options: An
     """Learn from the first two thirds of a recording, forecast the rest, and write the report, one
     HTML page. Pairs of states are learned from as a whole.
 
-    data: as of `gfnn.fit`: a file, a DataFrame, arrays (t, x), a `Recording`, `Pairs`. report: the
-    page to write; None for none. options: keywords of `gfnn.read` and of `gfnn.fit`.
+    data: as of `gfnn.fit`: a file, a table, arrays (t, x), a `Recording`, `Pairs`. Files and tables
+    are read as `gfnn look` proposes, with a warning that says how. report: the page to write; None
+    for none. options: keywords of `gfnn.read` and of `gfnn.fit`.
 
     Raises FitError where no law follows the recording, and InputError where the data cannot be
     used; the page is written all the same where the data could be read, and says why.
@@ -27,11 +29,13 @@ def discover(data: Any, report: str | Path | None = "report.html", **options: An
         fit = gfnn.discover("swing.csv")   # and open report.html
     """
     reading = {name: options.pop(name) for name in ReadOptions.__annotations__ if name in options}
-    if reading:
-        data = (
-            read(data, **reading) if isinstance(data, (str, Path)) else Recording(data, **reading)
-        )
-    data = as_pairs_or_recording(data)
+    data, proposed = as_pairs_or_recording(data, reading=reading)
+    about = About()
+    if proposed is not None:
+        options = {**proposed.asked, **options}
+        about = About(notes=said_of(proposed))
+        for line in about.notes:
+            warnings.warn(line, FitWarning, stacklevel=2)
     if not isinstance(data, Recording):
         found = fit(data, **options)
     else:
@@ -40,9 +44,9 @@ def discover(data: Any, report: str | Path | None = "report.html", **options: An
             found = fit(data.slice(stop=end), **options)
         except (FitError, InputError) as error:
             if report is not None:
-                write_refusal(data, error, report)
+                write_refusal(data, error, report, about)
             raise
         found = dataclasses.replace(found, data=data, learned_to=end)
     if report is not None:
-        write_page(found, report)
+        write_page(found, report, about=about)
     return found

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.data.columns import Undecided
-from gfnn_jax.data.faults import Fault
 from gfnn_jax.data.files import are_recordings, read_trajectories
-from gfnn_jax.data.recording import Recording, read
+from gfnn_jax.data.proposed import summarised
+from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.recording_summary import RecordingSummary, summarise
 from gfnn_jax.errors import InputError
 
@@ -23,12 +22,11 @@ def look(
 
     options: keywords of `gfnn_jax.read`, and ``mass``, which only goes into the command to type.
     """
-    reading = {name: value for name, value in options.items() if name != "mass"}
-    try:
-        recording = _of_states(paths, reading) if _hold_states(paths) else read(paths, **reading)
+    if _hold_states(paths):
+        recording = _of_states(paths, {n: value for n, value in options.items() if n != "mass"})
         summary = summarise(recording, options)
-    except Undecided as error:
-        recording, summary = _proposed(paths, options, reading, error)
+    else:
+        recording, summary = summarised(list(paths), options)
     if figure is not None:
         from gfnn_jax.evaluate.figures_of_recordings import recording_figure
         from gfnn_jax.evaluate.figures_style import save
@@ -36,19 +34,6 @@ def look(
         figure.parent.mkdir(parents=True, exist_ok=True)
         save(recording_figure(recording, summary), figure, dpi=110)
     return summary
-
-
-def _proposed(
-    paths: Sequence[Path], options: Mapping[str, Any], reading: dict[str, Any], error: Undecided
-) -> tuple[Recording, RecordingSummary]:
-    """A recording read by the roles that are proposed, and its summary with the proposal first."""
-    told = error.options
-    of_fit = {name: told[name] for name in ("structure", "states") if name in told}
-    roles = {name: value for name, value in told.items() if name not in of_fit}
-    recording = read(paths, **{**reading, **(roles or {"positions": told.get("states", ())})})
-    message = str(error).removeprefix(f"{recording.source}: ")
-    fault = Fault("roles", message, "", of_fit, wrong=False, proposed=True)
-    return recording, summarise(recording, {**options, **roles}, [fault])
 
 
 def _hold_states(paths: Sequence[Path]) -> bool:

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gfnn_jax.data.recording import SECONDS, ReadOptions, Recording, read
+from gfnn_jax.data.proposed import as_proposed
+from gfnn_jax.data.recording import SECONDS, Recording
 from gfnn_jax.data.recording_summary import as_typed
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.evaluate import report
@@ -17,7 +18,6 @@ from gfnn_jax.evaluate.figures_style import save
 from gfnn_jax.evaluate.forecasts import Forecasts, end_of_part, forecasts_of
 from gfnn_jax.evaluate.page import About, write_page, write_refusal
 from gfnn_jax.jobs.fit import fit_recording, fit_states
-from gfnn_jax.jobs.look import look
 from gfnn_jax.jobs.output import PAGE, REPORT, Output
 from gfnn_jax.jobs.output import Ran as Learned
 from gfnn_jax.phase_space import POISSON
@@ -46,10 +46,12 @@ def run_record(
     a page says why.
     """
     output.progress.line(f"reading {data}")
-    columns, asked, taken = _as_proposed(data, columns)
+    proposed = as_proposed(data, columns)
+    whole, columns, asked = proposed.recording, proposed.reading, proposed.asked
+    taken = [f"taken as gfnn look proposes:{as_typed(proposed.new)}"] if proposed.new else []
+    taken += proposed.why
     for line in taken:
         output.progress.line(line)
-    whole = read(data, **columns)
     end = end_of_part(whole)
     stop = end / SECONDS[whole.time_unit]
     about = About(command, tuple(taken))
@@ -74,25 +76,6 @@ def run_record(
     if refused is not None:
         raise type(refused)(f"{refused} (report: {output.out / PAGE})")
     return ran
-
-
-def _as_proposed(
-    data: Path, columns: Mapping[str, Any]
-) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
-    """The keywords of `gfnn_jax.read` that were given and that `gfnn look` proposes, the options of
-    a fit that it proposes, and a line on each that is taken."""
-    summary = look([data], columns)
-    proposed = dict(summary.options)
-    states = proposed.pop("states", None)
-    if states is not None:
-        proposed["positions"] = states
-    known = {*ReadOptions.__annotations__, "start", "stop", "every"}
-    reading = {name: value for name, value in proposed.items() if name in known}
-    asked = {name: value for name, value in proposed.items() if name not in known}
-    new = {n: value for n, value in proposed.items() if columns.get(n) != value}
-    why = [str(f) for f in summary.faults if set(f.options) & {*new, "states"}]
-    taken = [f"taken as gfnn look proposes:{as_typed(new)}", *why] if new else []
-    return reading, asked, taken
 
 
 def _report(

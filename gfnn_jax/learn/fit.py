@@ -19,7 +19,9 @@ import numpy as np
 from gfnn_jax.candidates.assemble import block_of
 from gfnn_jax.candidates.candidate import Candidate
 from gfnn_jax.data.files import are_recordings, read_trajectories
-from gfnn_jax.data.recording import ReadOptions, Recording, read
+from gfnn_jax.data.proposed import Proposed, as_proposed
+from gfnn_jax.data.recording import ReadOptions, Recording
+from gfnn_jax.data.recording_summary import in_python
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.diagnosis.diagnosis import NOT_SYMPLECTIC
 from gfnn_jax.diagnosis.outliers import clean, looked_for_errors
@@ -68,9 +70,10 @@ def fit(
                family="polynomial" or learn="map" ask for. Or a `Recording`, of which ``learn``
                ("auto" or "lagrangian"), ``terms``, ``friction``, ``input_hold``, ``mass`` and
                ``loss`` apply (`models.lagrangians.recordings`); with learn="map" the map of its
-               positions is learned (`learn.positions`). Or a table, a DataFrame or arrays by name,
-               or a file, of either kind. Or times (n,), with positions x1 … xd, (n,) or (n, d),
-               behind them: ``fit(t, x)``.
+               positions is learned (`learn.positions`). Or a table (of pandas, polars, xarray, or
+               arrays by name) or a file, of either kind: read as `gfnn look` proposes, with a
+               warning that says how. Or times (n,), with positions x1 … xd, (n,) or (n, d), behind
+               them: ``fit(t, x)``.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
     options:   a `FitOptions`, which the keywords below change; None: its defaults.
     The other keywords are those of `FitOptions` and `Watch`: ``on_progress`` and ``on_candidate``
@@ -87,10 +90,15 @@ def fit(
     require_x64("a fit")
     _refuse_roles(changes)
     watch = Watch.taken_from(changes)
-    options = dataclasses.replace(options or FitOptions(), **changes)
     positions = scene if _is_array(scene) else None
     scene = None if positions is not None else scene
-    pairs = as_pairs_or_recording(data, positions)
+    pairs, proposed = as_pairs_or_recording(data, positions)
+    if proposed is not None:
+        changes = {**proposed.asked, **changes}
+        for line in said_of(proposed):
+            watch.on_progress(line)
+            warnings.warn(line, FitWarning, stacklevel=2)
+    options = dataclasses.replace(options or FitOptions(), **changes)
     if POISSON in (options.structure, getattr(pairs, "structure", None)) or options.bracket:
         with one_thread():
             return learn_poisson(pairs, options, watch)
@@ -230,15 +238,26 @@ def _refuse_roles(changes: Mapping[str, Any]) -> None:
         )
 
 
-def as_pairs_or_recording(data: Any, more: Any = None) -> Pairs | Recording:
-    """Data that `fit` takes, as pairs or a recording. more: of times ``data`` (n,) the positions
-    x1 … xd, (n,) or (n, d)."""
+_OF_TABLES = ("columns", "to_dataframe")  # attributes
+
+
+def as_pairs_or_recording(
+    data: Any, more: Any = None, reading: Mapping[str, Any] | None = None
+) -> tuple[Pairs | Recording, Proposed | None]:
+    """Data that `fit` takes, as pairs or a recording; and what was proposed of files and tables.
+
+    more: of times ``data`` (n,) the positions x1 … xd, (n,) or (n, d). reading: keywords of
+    `gfnn_jax.read`.
+    """
     if isinstance(data, (Pairs, Recording)):
-        return data
-    if isinstance(data, (str, Path)):
-        return read(data) if are_recordings(data) else read_trajectories(Path(data)).pairs()
-    if hasattr(data, "columns") or isinstance(data, Mapping):  # a table
-        return Recording(data)
+        return data, None
+    is_file = isinstance(data, (str, Path))
+    if is_file and not are_recordings(data, with_roles=bool(reading)):
+        return read_trajectories(Path(data)).pairs(), None
+    is_table = isinstance(data, Mapping) or any(hasattr(data, n) for n in _OF_TABLES)
+    if is_file or reading or is_table:
+        proposed = as_proposed(data, reading or {})
+        return proposed.recording, proposed
     if more is None and isinstance(data, tuple) and len(data) == 2:
         data, more = data
     if more is None:
@@ -246,7 +265,14 @@ def as_pairs_or_recording(data: Any, more: Any = None) -> Pairs | Recording:
             "expected gfnn.Pairs(z0, z1, dt), a gfnn.Recording, a table, a file, or arrays (t, x), "
             f"got {type(data).__name__}"
         )
-    return _of_arrays(data, more)
+    return _of_arrays(data, more), None
+
+
+def said_of(proposed: Proposed) -> tuple[str, ...]:
+    """Lines on the options that were proposed and taken."""
+    if not proposed.new:
+        return ()
+    return (f"read as proposed: {proposed.summary.read_as}", *map(in_python, proposed.why))
 
 
 def _of_arrays(t: Any, x: Any) -> Recording:
