@@ -429,9 +429,8 @@ def _times(summary: RecordingSummary) -> str:
         return f"steps: {steps}; no gaps"
     run, begin, end = max(holes, key=lambda hole: hole[2] - hole[1])
     longest = f"the longest {end - begin:.3g} {unit} at {begin:.5g} {unit}"
-    return f"steps: {steps}; {len(holes)} gaps, {longest}" + f" of run {run}" * (
-        len(summary.runs) > 1
-    )
+    count = f"{len(holes)} gap{'s' * (len(holes) > 1)}"
+    return f"steps: {steps}; {count}, {longest}" + f" of run {run}" * (len(summary.runs) > 1)
 
 
 def _moving(summary: RecordingSummary) -> str:
