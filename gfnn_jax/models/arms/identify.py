@@ -142,10 +142,11 @@ class Columns:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Prior:
-    """J₀ (k, 4, 4) of the links, and the sizes x₀ of what has to be positive."""
+    """J₀ (k, 4, 4) of the links, the sizes x₀ of what has to be positive, and the weight γ."""
 
     inertias: np.ndarray
     sizes: np.ndarray
+    weight: float = OPTIONS.prior
 
     @property
     def inverse(self) -> np.ndarray:
@@ -180,7 +181,7 @@ def minimum(
             return np.inf
         volume = 2 * np.sum(np.log(np.diagonal(factors, axis1=1, axis2=2)))
         shares = x[positive] / prior.sizes
-        return 0.5 * np.sum((A @ x - b) ** 2) + OPTIONS.prior * (
+        return 0.5 * np.sum((A @ x - b) ** 2) + prior.weight * (
             along @ x[:rigid] - volume + np.sum(shares - np.log(shares))
         )
 
@@ -188,12 +189,12 @@ def minimum(
     for _ in range(OPTIONS.most):
         turned = np.linalg.inv(pseudo_inertias(x[:rigid]))[:, None] @ PSEUDO
         slope, hessian = normal @ x - target, normal.copy()
-        slope[:rigid] += OPTIONS.prior * (along - np.trace(turned, axis1=2, axis2=3).ravel())
+        slope[:rigid] += prior.weight * (along - np.trace(turned, axis1=2, axis2=3).ravel())
         for i, own in enumerate(turned):
             at = slice(PER_LINK * i, PER_LINK * (i + 1))
-            hessian[at, at] += OPTIONS.prior * np.einsum("pij,qji->pq", own, own)
-        slope[positive] += OPTIONS.prior * (1 / prior.sizes - 1 / x[positive])
-        hessian[positive, positive] += OPTIONS.prior / x[positive] ** 2
+            hessian[at, at] += prior.weight * np.einsum("pij,qji->pq", own, own)
+        slope[positive] += prior.weight * (1 / prior.sizes - 1 / x[positive])
+        hessian[positive, positive] += prior.weight / x[positive] ** 2
         scale = 1 / np.sqrt(np.diag(hessian))
         step = -scale * np.linalg.solve(scale[:, None] * hessian * scale, scale * slope)
         fall, share = -slope @ step, 1.0
