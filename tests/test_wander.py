@@ -7,7 +7,7 @@ import pytest
 from test_law_fits import pendulum
 
 import gfnn_jax as gfnn
-from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Lagrangian, Terms
 from gfnn_jax.maps.estimates import Window, estimate_states, law_in_use, propagate
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.maps.sensors import Sensors
@@ -96,6 +96,51 @@ def test_a_state_and_its_zero_are_those_of_the_normal_distribution(rng, size):
     cov = K[20:, 20:] + sigma**2 * np.eye(2) - c @ np.linalg.solve(C, c.T) + rest @ P @ rest.T
     np.testing.assert_allclose(orbits.values[0, :, 0], mean, atol=1e-6 * sigma)
     np.testing.assert_allclose(orbits.std[0, :, 0], np.sqrt(np.diag(cov)), rtol=1e-6)
+
+
+def sliding_body(level, friction, sigma=1e-4):
+    """A body, driven, with dry and viscous friction that are known but for their level."""
+    law = Lagrangian(
+        Terms.of([((2,), (0,), (0,), 0.0)], 1),
+        np.array([0.5]),
+        Friction.of([((1,), LINEAR, 0.0), ((1,), DRY, 0.0)], 1),
+        np.array(friction),
+        0.0,
+        np.ones((1, 1)),
+    )
+    own = free_body(sigma, None).sensors
+    return law_in_use(law, None, dataclasses.replace(own, inputs=("F",), level=level, window=2.0))
+
+
+def test_the_level_of_friction_is_that_of_the_window():
+    """Friction is 5 % stronger than the law has it: a window shows it, and the forecast goes by it;
+    its deviation is that of scattered windows."""
+    t = np.arange(0, 4, 0.02)
+    u, friction = 2 * np.sin(3 * t)[:, None], np.array([0.4, 0.3])
+    true = sliding_body(0.0, 1.05 * friction)
+    x = np.array([[0.2, 0.5]])
+    drive = Window(t, np.zeros((len(t), 1)), t, u)
+    covariance = np.zeros((1, 2, 2))
+    path = propagate(true, [drive], x, covariance, t[:1], t[None, 1:]).values[0, :, 0]
+    path = np.append(x[0, 0], path)
+    rng, end, found = np.random.default_rng(0), 120, []
+    windows = [
+        Window(t[:end], (path[:end] + 1e-4 * rng.normal(size=end))[:, None], t, u) for _ in range(8)
+    ]
+    law, stiff = sliding_body(0.1, friction), sliding_body(0.0, friction)
+    x, covariance = estimate_states(law, windows)
+    assert x.shape == (8, 3)
+    std = np.sqrt(covariance[:, 2, 2])
+    assert np.abs((x[:, 2] - 0.05) / std).max() < 3
+    assert 0.5 < np.std(x[:, 2]) / std.mean() < 2
+    last, ahead = np.full(8, t[end - 1]), np.broadcast_to(t[end:], (8, len(t) - end))
+    errors = []
+    for one in (law, stiff):
+        orbits = propagate(one, windows, *estimate_states(one, windows), last, ahead)
+        errors.append(orbits.values[..., 0] - path[end:])
+        found.append(orbits.std[..., 0])
+    assert np.abs(errors[0]).max() < 0.1 * np.abs(errors[1]).max()
+    assert np.sqrt(np.mean((errors[0] / found[0]) ** 2)) < 1.5
 
 
 @pytest.fixture(scope="module")

@@ -215,6 +215,7 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
         "sensors": {name: {"value": c, "std": s} for name, (c, s) in fit.sensors.items()},
         "noise": {n: {"sigma": s, "residual": fit.residual[n]} for n, s in fit.noise.items()},
         "units": fit.units,
+        "friction_level": sensors.level,
         "wander": None if sensors.wander is None else dataclasses.asdict(sensors.wander),
         "velocities": {name: one._asdict() for name, one in fit.velocities.items()},
         "whiteness": {

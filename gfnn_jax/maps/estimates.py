@@ -4,7 +4,8 @@ The samples before a time are fitted by one arc of the law, its first state unkn
 state there with its covariance, and where zeros of channels wander, these too. A forecast is the
 orbit from it, on zeros that go back to their mean. Its band holds the error of that state, of the
 law's coefficients, the noise of a sample, and the law's own misfit, as forecasts of data that it
-was not learned from have shown it.
+was not learned from have shown it. Where friction is stronger at one time than at another, by its
+temperature or load, its level, all of it times 1 + λ, is one more unknown of each window.
 """
 
 from __future__ import annotations
@@ -61,6 +62,14 @@ class Law(NamedTuple):
     p: np.ndarray
     root: np.ndarray
     sensors: Sensors
+
+    @property
+    def friction(self) -> np.ndarray:
+        """p (n,) of friction, 0 elsewhere: what a level multiplies."""
+        first, own = self.form.basis.shape[1], np.zeros_like(self.p)
+        losses = slice(first, first + self.form.friction.count)
+        own[losses] = self.p[losses]
+        return own
 
     def at(self, args: np.ndarray | None) -> Law:
         """The law of the system with these parameters (k,)."""
@@ -326,7 +335,8 @@ def _check_inputs(t: np.ndarray, begin: float, end: float, run: str) -> None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Windows:
-    """Windows of equal length as arcs whose law is known: what `Readings.fit` asks for."""
+    """Windows of equal length as arcs whose law is known: what `Readings.fit` asks for. States
+    (q, v), and the level of friction behind them where the law's sensors have one."""
 
     law: Law
     h: np.ndarray
@@ -334,26 +344,42 @@ class _Windows:
 
     def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         arcs, length, m = x.shape
-        num = arcs * (length - 1)
+        num, d = arcs * (length - 1), 2 * self.law.form.dim
         u = self.u.reshape(num, *self.u.shape[2:])
-        start = x[:, :-1].reshape(num, m)
-        step = self.law.form.step(self.law.p, start, self.h.reshape(num), u, order=1)
+        start, level = np.split(x[:, :-1].reshape(num, m), [d], axis=1)
+        order, p = 1 + level.shape[1], self.law.p
+        p = p + level * self.law.friction if order > 1 else p
+        step = self.law.form.step(p, start, self.h.reshape(num), u, order=order)
+        ends = np.concatenate([step.states, level], axis=1)
+        by = np.zeros((num, m, m))
+        by[:, :d, :d] = step.by_state
+        if order > 1:
+            by[:, :d, d] = step.by_coefficients @ self.law.friction
+            by[:, d, d] = 1.0
         shape = (arcs, length - 1, m)
-        closing = step.states.reshape(shape) - x[:, 1:]
-        return Defects(closing, step.by_state.reshape(*shape, m), np.zeros((*shape, 0)))
+        closing = ends.reshape(shape) - x[:, 1:]
+        return Defects(closing, by.reshape(*shape, m), np.zeros((*shape, 0)))
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         u = np.concatenate([self.u[:, :, 0, 0], self.u[:, -1:, -1, -1]], axis=1)
+        x, level = np.split(x, [2 * self.law.form.dim], axis=2)
         shown = _channels([self.law], np.zeros(len(x), int), x, u)
-        return shown._replace(by_coefficients=shown.by_coefficients[..., :0])
+        shown = shown._replace(by_coefficients=shown.by_coefficients[..., :0])
+        if not level.shape[2]:
+            return shown
+        by = np.pad(shown.by_state, ((0, 0), (0, 0), (0, 1), (0, 1)))
+        by[..., -1, -1] = 1.0  # the level is read as what is expected of it
+        none = np.pad(shown.by_coefficients, ((0, 0), (0, 0), (0, 1), (0, 0)))
+        return Observed(np.concatenate([shown.values, level], axis=2), by, none)
 
     def take(self, arcs: np.ndarray) -> _Windows:
         return dataclasses.replace(self, h=self.h[arcs], u=self.u[arcs])
 
 
 def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
-    """(q, v, b) (B, m) at the last sample of each window, and its covariance (B, m, m) in the law:
-    b (k,) the zeros of the channels where these wander, of length 0 where they do not."""
+    """(q, v, λ, b) (B, m) at the last sample of each window, and its covariance (B, m, m) in the
+    law: λ (1,) the level of friction where the sensors have one, b (k,) the zeros of the channels
+    where these wander, each of length 0 where not."""
     sensors = law.sensors
     windows, starts = zip(*(_started(sensors, w) for w in windows), strict=True)
     length = max(len(w.t) for w in windows)
@@ -378,12 +404,23 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
     )
     noise_of_readings = np.where(np.isfinite(y), np.array(noise), np.inf)
     white = None if wander is None else wander.whitening(t, noise_of_readings)
+    if sensors.level:
+        known = np.full((*t.shape, 1), np.nan)
+        known[:, -1] = 0.0
+        y, x = np.concatenate([y, known], axis=2), np.pad(x, ((0, 0), (0, 0), (0, 1)))
+        sigma = np.concatenate([sigma, np.full(known.shape, sensors.level)], axis=2)
+        scale = np.append(scale, sensors.level)
+        if white is not None:
+            unit = np.broadcast_to(np.eye(t.shape[1]), (len(t), 1, t.shape[1], t.shape[1]))
+            white = np.concatenate([white, unit], axis=1)
     readings = Readings(arcs, y, sigma, loss, white)
     found = readings.fit(np.zeros(0), x, scale)
     if wander is None or white is None:
         return found.x[:, -1], found.last_covariance()
     J, last = readings.linearised(np.zeros(0), found.x)
-    near = white @ wander.latest(t, noise_of_readings).swapaxes(1, 2)[..., None]
+    near = wander.latest(t, noise_of_readings)
+    near = np.pad(near, ((0, 0), (0, 0), (0, y.shape[2] - count)))
+    near = white @ near.swapaxes(1, 2)[..., None]
     weights = np.sqrt(np.nan_to_num(loss.weights(found.whitened)))
     near = weights * near[..., 0].swapaxes(1, 2)
     return _with_zeros(found.x[:, -1], J, last, near, wander.size**2, sensors.sigma)
@@ -399,13 +436,14 @@ def _with_zeros(
 ) -> tuple[np.ndarray, np.ndarray]:
     """States x (B, m) with the zeros that the same samples tell, and the covariance of both.
 
-    J, last: of `linearised`. near: (B, L, k) covariance of the rows' values with the zeros.
+    J, last: of `linearised`. near: (B, L, K) covariance of the rows' values with the zeros, those
+    of the k channels first.
     variance: of the zeros, in units of σ². Of c = ``near``, rows J for the first state and r of the
     residuals, and P = (JᵀJ)⁻¹: the zeros are cᵀr, their covariance is that of no samples less
     cᵀc − cᵀJ P Jᵀc, and with the first state −P Jᵀc.
     """
-    lanes, length, k = near.shape
-    c = (near[..., None] * np.eye(k)).reshape(lanes, length * k, k)
+    (lanes, length, rows), k = near.shape, len(sigma)
+    c = (near[..., None] * np.eye(rows)).reshape(lanes, length * rows, rows)[..., :k]
     m, r = x.shape[1], J[..., -1:]
     Q, R = np.linalg.qr(J[..., :-1])
     root, own = last[..., :m] @ np.linalg.pinv(R), Q.swapaxes(1, 2) @ c
@@ -531,13 +569,14 @@ def propagate_each(
     all else of the sensors is that of the first.
     """
     law, d, sensors = laws[0], laws[0].form.dim, laws[0].sensors
-    x, zeros = np.split(x, [2 * d], axis=1)
+    x, level, zeros = np.split(x, [2 * d, 2 * d + bool(sensors.level)], axis=1)
     large = sensors.size_of(x)[:, None, None]
     root = covariance_root(covariance).swapaxes(1, 2)
     ends, asked = _in_steps(sensors, np.concatenate([last[:, None], times], axis=1))
     u = _inputs(law, windows, ends, 1)
-    orbit, spread = _followed(laws, which, x, root[:, : 2 * d], np.diff(ends, axis=1), u, asked)
-    of_zeros = np.pad(root[:, 2 * d :], ((0, 0), (0, 0), (0, spread.shape[-1] - root.shape[-1])))
+    x, own = np.concatenate([x, level], axis=1), 2 * d + level.shape[1]
+    orbit, spread = _followed(laws, which, x, root[:, :own], np.diff(ends, axis=1), u, asked)
+    of_zeros = np.pad(root[:, own:], ((0, 0), (0, 0), (0, spread.shape[-1] - root.shape[-1])))
     orbit = orbit[:, asked]
     at = np.concatenate([u[:, :, 0, 0], u[:, -1:, -1, -1]], axis=1)[:, asked]
     channels, ahead = _channels(laws, which, orbit, at), times - last[:, None]
@@ -561,11 +600,15 @@ def _followed(
     u: np.ndarray,
     asked: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Orbits (B, M + 1, 2d) of the laws from states x (B, 2d), whose covariance is root rootᵀ, by
-    steps h (B, M) with inputs u; and the roots (B, n, 2d, ·) of the covariances after the steps
-    that are ``asked`` (n,), with that of the coefficients."""
+    """Orbits (B, M + 1, 2d) of the laws from states x (B, 2d), and levels of friction behind them,
+    whose covariance is root rootᵀ, by steps h (B, M) with inputs u; and the roots (B, n, 2d, ·) of
+    the covariances after the steps that are ``asked`` (n,), with that of the coefficients."""
     form, p, roots = _side_by_side(laws, which)
     size, count, modes = root.shape[-1], roots.shape[-1], None
+    x, level = np.split(x, [2 * form.dim], axis=1)
+    root, of_level = np.split(root, [2 * form.dim], axis=1)
+    friction = np.stack([law.friction for law in laws])[which] if level.size else 0 * p
+    p = p + level * friction if level.size else p
     spread = np.concatenate([root, np.zeros((*x.shape, roots.shape[1]))], axis=2)
     orbit, spreads, most = [x[:, None]], [], max(1, _AT_ONCE // len(x))
     for first in range(0, h.shape[1], most):
@@ -577,6 +620,9 @@ def _followed(
         for k in range(further.shape[1]):
             spread = step.by_state[:, k] @ spread
             spread[..., size:] += further[:, k]
+            if level.size:
+                push = step.by_coefficients[:, k, :, :count] @ friction[..., None]
+                spread[..., :size] += push @ of_level
             if first + k + 1 == asked[len(spreads)]:
                 spreads.append(spread)
     return np.concatenate(orbit, axis=1), np.stack(spreads, axis=1)

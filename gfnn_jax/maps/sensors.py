@@ -32,7 +32,8 @@ class Sensors:
     distances from it and of the speeds. relative: whether the misfit is in proportion to how large
     the motion is, in these units. scores: (B, n) the largest errors of held-out forecasts from
     their start to each lead, as multiples of the tube that their law gives; None where unknown.
-    observed: seconds of data that they are from.
+    observed: seconds of data that they are from. level: relative standard deviation of the strength
+    of friction between times of the data; where it is not 0 each state is estimated with its own.
     """
 
     positions: tuple[str, ...]
@@ -53,6 +54,7 @@ class Sensors:
     relative: bool = False
     scores: Any = None
     observed: float = 0.0
+    level: float = 0.0
 
     @property
     def observation_model(self) -> Observation:

@@ -41,7 +41,9 @@ class CalibrationOptions:
     windows, tried: starts of forecasts, and those that choose the window. choices: periods from
     which a state may be estimated. first, last, leads: periods ahead, and how many times between
     these. near: leads to either side that share their errors. short: samples, at least, of the
-    shortest window. fewest: errors that determine a quantile ``inside``, which are within two
+    shortest window. widest: standard deviation of levels of friction, whose scatter is looked for.
+    alike: share by which median errors of windows differ by chance.
+    fewest: errors that determine a quantile ``inside``, which are within two
     standard deviations. parts: of the record, in the jackknife of its errors. fractions: of the
     spread, that horizons are stated for.
     """
@@ -54,6 +56,8 @@ class CalibrationOptions:
     leads: int = 24
     near: int = 2
     short: int = 20
+    widest: float = 0.3
+    alike: float = 0.1
     fewest: int = 20
     inside: float = 0.95
     parts: int = 8
@@ -106,6 +110,13 @@ class Thirds(NamedTuple):
         """The third that a sample lies in."""
         return max(0, bisect(self.begins, (stretch, t)) - 1)
 
+    def with_level(self, level: float) -> Thirds:
+        """The same with the level of friction estimated, of this standard deviation."""
+        laws = [
+            law._replace(sensors=dataclasses.replace(law.sensors, level=level)) for law in self.laws
+        ]
+        return self._replace(laws=tuple(laws))
+
 
 def calibrated(
     law: Law, thirds: Thirds, found: Sequence[Stretch], scales: Scales, spread: np.ndarray
@@ -127,6 +138,8 @@ def calibrated(
         sizes = (np.abs(errors) / spread).reshape(len(tried), -1)
         middle = np.nan_to_num(np.nanmedian(sizes, axis=1), nan=np.inf)
     best = float(tried[np.argmin(middle)])
+    if law.sensors.level:  # which a longer window determines better
+        best = float(tried[middle <= (1 + OPTIONS.alike) * np.min(middle)][-1])
     leads = np.geomspace(
         max(OPTIONS.first * scales.period, scales.dt), OPTIONS.last * scales.period, OPTIONS.leads
     )
@@ -164,6 +177,25 @@ def calibrated(
         parts = np.stack([np.nanmedian(sizes[part != k], axis=0) for k in range(OPTIONS.parts)])
     median = np.nanmedian(sizes, axis=0)
     return Calibration(law._replace(sensors=sensors), horizons, median, parts)
+
+
+def level_of_friction(thirds: Thirds, found: Sequence[Stretch], scales: Scales) -> float:
+    """Relative standard deviation of the level of friction over a record, by laws that were not
+    learned from it there: the scatter of levels about 0 beyond their standard errors, 0 of none."""
+    starts = _starts(found, scales)
+    if not starts or not thirds.laws[0].form.friction.count:
+        return 0.0
+    starts = starts[:: -(-len(starts) // OPTIONS.tried)]
+    wide, excess = thirds.with_level(OPTIONS.widest).laws, []
+    for i, k in starts:
+        s = found[i]
+        first = int(np.searchsorted(s.t, s.t[k] - scales.period))
+        window = thinned(_window(s, min(first, max(0, k - OPTIONS.short + 1)), k + 1))
+        laws, (one,) = of_windows(wide, np.array([thirds.of(i, s.t[k])]), [window])
+        (x,), (covariance,) = estimate_states(laws[one], [window])
+        d = 2 * laws[one].form.dim
+        excess.append(x[d] ** 2 - covariance[d, d])
+    return float(np.sqrt(max(0.0, np.median(excess))))
 
 
 def _unknown(law: Law, spread: np.ndarray) -> Calibration:

@@ -18,7 +18,12 @@ from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.maps.estimates import law_in_use
 from gfnn_jax.maps.laws import conformal
 from gfnn_jax.maps.sensors import Sensors
-from gfnn_jax.models.lagrangians.calibration import Calibration, Thirds, calibrated
+from gfnn_jax.models.lagrangians.calibration import (
+    Calibration,
+    Thirds,
+    calibrated,
+    level_of_friction,
+)
 from gfnn_jax.models.lagrangians.fit import FOLDS, ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.learned_law import in_columns, scaled
@@ -76,14 +81,20 @@ class CalibratedLaw(NamedTuple):
     calibration: Calibration
 
     @classmethod
-    def of(cls, data: RecordingData, fit: LawFit, choice: FrictionChoice) -> CalibratedLaw:
-        """Make a fit ready for forecasts."""
+    def of(
+        cls, data: RecordingData, fit: LawFit, choice: FrictionChoice, levels: bool = False
+    ) -> CalibratedLaw:
+        """Make a fit ready for forecasts. levels: with a level of friction for each, as it
+        scatters."""
         law, covariance, scale, gauge = _in_gauge(data, fit)
         moving, of_moving = conformal(law, covariance)
         root, sensors = covariance_root(of_moving), _sensors(data, fit)
         spread = np.nanstd(np.concatenate([s.y for s in data.segments]), axis=0)
-        used = law_in_use(moving, root, sensors)
         thirds, scales = _thirds(data, fit, sensors), fit.problem.scales
+        if levels:
+            level = level_of_friction(thirds, data.segments, scales)
+            thirds, sensors = thirds.with_level(level), dataclasses.replace(sensors, level=level)
+        used = law_in_use(moving, root, sensors)
         calibration = calibrated(used, thirds, data.segments, scales, spread)
         return cls(fit, choice, law, covariance, moving, root, scale, gauge, calibration)
 
@@ -91,7 +102,8 @@ class CalibratedLaw(NamedTuple):
 def best_in_use(data: RecordingData, fit: LawFit, choice: FrictionChoice) -> CalibratedLaw:
     """The fit as it is, or fitted anew with zeros of channels that wander: where its residuals show
     these (the likelihood's evidence) and forecasts of held-out data do not err more with them than
-    chance makes."""
+    chance makes. The strength of friction may wander too: then each forecast has its own level of
+    it, where these err less."""
     steady = CalibratedLaw.of(data, fit, choice)
     wander = wander_of(fit)
     if wander is None:
@@ -106,7 +118,15 @@ def best_in_use(data: RecordingData, fit: LawFit, choice: FrictionChoice) -> Cal
         f"zeros that wander by {wander.size:.2g} σ over {wander.time:.3g} s: held-out forecasts "
         f"err by {apart.cost:.3g} times as much"
     )
-    return steady if apart.is_higher(1.0) else wandering
+    best = steady if apart.is_higher(1.0) else wandering
+    levelled = CalibratedLaw.of(data, best.fit, choice, levels=True)
+    level = levelled.calibration.law.sensors.level
+    apart = levelled.calibration.against(best.calibration)
+    fit.problem.on_progress(
+        f"friction whose strength varies by {level:.2%}: held-out forecasts err by "
+        f"{apart.cost:.3g} times as much (standard error {apart.error:.2g})"
+    )
+    return levelled if level and apart.apart < -apart.error else best
 
 
 def _in_gauge(data: RecordingData, fit: LawFit) -> tuple[Lagrangian, np.ndarray, float, str]:

@@ -195,6 +195,11 @@ class LearnedLaw:
             f"unexplained {energy['closure']:.1g}"
         )
         wander = sensors.wander if sensors is not None else None
+        if sensors is not None and sensors.level:
+            lines.append(
+                f"friction is stronger or weaker by {sensors.level:.2g} of itself from time to "
+                "time: forecasts take its level from the samples before them"
+            )
         for name, sigma in self.noise.items():
             zero = (
                 ""
