@@ -64,10 +64,10 @@ class Log:
 
     def filtered(self) -> tuple[np.ndarray, ...]:
         """q, v, a and currents (n, 6) by the makers' filters."""
-        slow, current = butter(5, 0.15), butter(5, 0.2)
-        v, a = filtfilt(*slow, self.v, axis=0), np.zeros_like(self.v)
+        (b, c), (b_of_i, c_of_i) = (butter(5, cut)[:2] for cut in (0.15, 0.2))
+        v, a = filtfilt(b, c, self.v, axis=0), np.zeros_like(self.v)
         a[1:-1] = (v[2:] - v[:-2]) / (self.t[2:] - self.t[:-2])[:, None]
-        return self.q, v, filtfilt(*slow, a, axis=0), filtfilt(*current, self.i, axis=0)
+        return self.q, v, filtfilt(b, c, a, axis=0), filtfilt(b_of_i, c_of_i, self.i, axis=0)
 
     def smooth(self) -> tuple[np.ndarray, ...]:
         """q, v, a (n, 6) by splines."""
@@ -93,9 +93,9 @@ def by_sdp(log: Log, arm: gfnn.Arm) -> Any:
     x, _ = minimum(columns.triangle(motion, np.ones(6)), columns, prior, start)
 
     def torques(log: Log) -> np.ndarray:
-        return np.concatenate(
-            [rows @ x for rows, _ in columns.blocks(Motion(*log.filtered(), (len(log.t),)))]
-        )
+        q, v, a, i = log.filtered()
+        motion = Motion(q, v, a, i, (len(q),))
+        return np.concatenate([rows @ x for rows, _ in columns.blocks(motion)])
 
     return torques
 
