@@ -64,7 +64,8 @@ class Log:
 
     def filtered(self) -> tuple[np.ndarray, ...]:
         """q, v, a and currents (n, 6) by the makers' filters."""
-        (b, c), (b_of_i, c_of_i) = (butter(5, cut)[:2] for cut in (0.15, 0.2))
+        filters: Any = [butter(5, cut) for cut in (0.15, 0.2)]
+        (b, c), (b_of_i, c_of_i) = filters
         v, a = filtfilt(b, c, self.v, axis=0), np.zeros_like(self.v)
         a[1:-1] = (v[2:] - v[:-2]) / (self.t[2:] - self.t[:-2])[:, None]
         return self.q, v, filtfilt(b, c, a, axis=0), filtfilt(b_of_i, c_of_i, self.i, axis=0)
