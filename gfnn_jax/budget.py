@@ -36,14 +36,25 @@ RATES = {
     COMPILE: 1.0,
     READING: 1.0,
 }
-# Seconds, at these rates, of a unit that tells its kind's own: of shorter ones most is overhead.
-_TELLING = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Shares of a budget, and what compiling takes."""
+
+    # Seconds, at these rates, of a unit that tells its kind's own: of shorter ones most is
+    # overhead.
+    telling: float = 0.1
+    compiling_more: float = 9.0  # seconds, of more dimensions than the table below has
+    most_reserved: float = 1 / 5  # of a budget
+
+
+_OPTIONS = _Options()
+
 # Seconds that compiling a step takes, by 2d: small eliminations are unrolled, and larger ones call
 # the library (`solve.linear`). Processor time of polynomials, jax 0.10.2; other work on the machine
 # makes them longer.
 _COMPILING = {2: 3.0, 4: 5.0, 6: 9.0, 8: 10.0}
-_COMPILING_MORE = 9.0
-_MOST_RESERVED = 1 / 5  # of a budget
 
 
 def seconds_allowed(
@@ -100,7 +111,7 @@ class Budget:
         self._done, self._last, self._closed = 0, "", False
         self._measured: dict[str, tuple[float, float]] = {}  # kind -> operations, seconds
         self._reserved: dict[str, float] = {}  # kind -> operations that follow the search
-        self.compiling = 0.0 if dim is None else _COMPILING.get(2 * dim, _COMPILING_MORE)
+        self.compiling = 0.0 if dim is None else _COMPILING.get(2 * dim, _OPTIONS.compiling_more)
 
     @property
     def seconds(self) -> float:
@@ -232,7 +243,7 @@ class Budget:
     def _set_apart(self) -> float:
         """Seconds for what follows the search."""
         assert self.max_seconds is not None
-        compiling = min(self.compiling, _MOST_RESERVED * self.max_seconds)
+        compiling = min(self.compiling, _OPTIONS.most_reserved * self.max_seconds)
         return compiling + sum(self._foretold(*each) for each in self._reserved.items())
 
     def _foretold(self, kind: str, operations: float) -> float:
@@ -247,7 +258,7 @@ class Budget:
         started, before = self._clock(), 0.0 if made is None else made()
         yield
         operations = operations if made is None else made() - before
-        if operations >= _TELLING * RATES[kind]:
+        if operations >= _OPTIONS.telling * RATES[kind]:
             done, seconds = self._measured.get(kind, (0.0, 0.0))
             self._measured[kind] = done + operations, seconds + self._clock() - started
 

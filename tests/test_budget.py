@@ -327,7 +327,7 @@ def test_a_bound_on_operations_puts_none_on_the_clock_unless_told():
 
 
 @QUIETLY
-@pytest.mark.parametrize("learn", ["map", "auto"])
+@pytest.mark.parametrize("learn", ["map", pytest.param("auto", marks=pytest.mark.slow)])
 def test_a_faster_clock_ends_at_an_earlier_unit_which_operations_reproduce(learn):
     """A clock that ticks at every look at it: so many looks fit, whatever the machine does."""
     pairs, found = kepler(), []

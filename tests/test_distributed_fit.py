@@ -272,7 +272,11 @@ def varied(of, sigma=1e-3):
     [
         pytest.param("dt", {"learn": "map", "tolerance": 1e-3}, marks=pytest.mark.slow),
         ("dt", {"learn": "hamiltonian", "terms": ("p1**2", "q1**2"), "tolerance": 5e-3}),
-        ("parameters", {"learn": "map", "chart": "type2", "tolerance": 1e-3}),
+        pytest.param(
+            "parameters",
+            {"learn": "map", "chart": "type2", "tolerance": 1e-3},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_pairs_that_differ_in_dt_or_parameters_are_all_taken(of, options, in_threads):

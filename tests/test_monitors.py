@@ -125,6 +125,7 @@ def test_latent_readings_tell_more_than_momenta_as_they_are_read(noisy):
     assert np.max(np.asarray(noisy.turn().defect(first[:, 0]))) < 1e-13
 
 
+@pytest.mark.slow
 def test_its_posterior_is_as_wide_as_its_errors(noisy):
     """A bias by noise, of which more turns take nothing, would stand out of it."""
     first, second = read(100, 2, 1)

@@ -107,7 +107,7 @@ def test_a_quartic_spring_of_five_periods_is_seen():
     assert found["x**4"] == pytest.approx(-0.2175, rel=1e-3)
 
 
-@pytest.mark.parametrize("zero", [1.3, -2.0])
+@pytest.mark.parametrize("zero", [1.3, pytest.param(-2.0, marks=pytest.mark.slow)])
 def test_an_encoder_that_was_switched_on_anywhere(zero):
     """Of a pendulum: 2 cos(theta − zero), whichever of cos and sin has the smaller phase."""
     swings = recorded(

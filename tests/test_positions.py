@@ -61,7 +61,7 @@ def wrapped():
     return gfnn.fit(recording, learn="map", tolerance=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["lifted", "wrapped"])
+@pytest.mark.parametrize("kind", ["lifted", pytest.param("wrapped", marks=pytest.mark.slow)])
 def test_the_standard_map_from_its_angle_alone(kind, request):
     learned = request.getfixturevalue(kind)
     assert learned.met

@@ -25,6 +25,8 @@ ALIKE = (
     "driven-pendulum",
     "fput",
     "henon-heiles-section",
+    "pendulum-length",
+    "driven-pendulum-phase",
 )
 
 

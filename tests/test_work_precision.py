@@ -18,7 +18,9 @@ import integrators
 import work_precision
 
 
-@pytest.mark.parametrize("name", ["two-body", "henon-heiles-regular", "pcr3bp"])
+@pytest.mark.parametrize(
+    "name", ["two-body", "henon-heiles-regular", pytest.param("pcr3bp", marks=pytest.mark.slow)]
+)
 def test_the_fields_are_those_of_the_scenes(name):
     scene = gfnn.scenes.make(name)
     z = gfnn.sample_test_states(scene, 5, jax.random.key(0))

@@ -17,10 +17,19 @@ from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.expressions import check_names
 from gfnn_jax.phase_space import TIME, Pairs, sizes
 
-_SAME = 1e-9  # of its size: a parameter, or a dt, that varies by less does not
-_PRINTED = 1e-5  # of dt: what printed times may differ by
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Times and parameters that count as one."""
+
+    same: float = 1e-9  # of its size: a parameter, or a dt, that varies by less does not
+    printed: float = 1e-5  # of dt: what printed times may differ by
+    nearly_all: float = 0.9  # of the pairs
+
+
+_OPTIONS = _Options()
+
 _OF_DT = ("auto", "polynomial")  # families of an S of dt
-_NEARLY_ALL = 0.9  # of the pairs
 
 
 def check_varied(pairs: Pairs) -> None:
@@ -71,8 +80,8 @@ def as_varied(
     pairs, messages = _without_constants(pairs)
     if np.ndim(pairs.dt) and learn != "hamiltonian":
         usual = np.median(pairs.dt)
-        rows = np.flatnonzero(np.abs(pairs.dt - usual) <= _PRINTED * usual)
-        if len(rows) >= _NEARLY_ALL * len(pairs):
+        rows = np.flatnonzero(np.abs(pairs.dt - usual) <= _OPTIONS.printed * usual)
+        if len(rows) >= _OPTIONS.nearly_all * len(pairs):
             messages.append(
                 f"{len(pairs) - len(rows)} of {len(pairs)} pairs are not dt = {usual:g} apart: "
                 "they are left out (learn='hamiltonian' uses them)"
@@ -107,9 +116,9 @@ def as_varied(
 
 def _without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
     dt = np.asarray(pairs.dt)
-    one = float(np.mean(dt)) if dt.ndim and np.ptp(dt) <= _SAME * np.mean(dt) else pairs.dt
+    one = float(np.mean(dt)) if dt.ndim and np.ptp(dt) <= _OPTIONS.same * np.mean(dt) else pairs.dt
     args = {name: np.asarray(v, np.float64) for name, v in (pairs.args or {}).items()}
-    still = [name for name, v in args.items() if np.ptp(v) <= _SAME * np.abs(v).max()]
+    still = [name for name, v in args.items() if np.ptp(v) <= _OPTIONS.same * np.abs(v).max()]
     period, own_time = pairs.period, []
     if period is not None:
         args[TIME] = np.mod(args[TIME], period)
@@ -139,13 +148,13 @@ def _without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
 def _same_phase(t0: np.ndarray, period: float) -> bool:
     """Return whether all these times of a drive are one, but for whole periods."""
     apart = np.mod(t0 - t0[0] + 0.5 * period, period) - 0.5 * period
-    return bool(np.ptp(apart) <= _SAME * period)
+    return bool(np.ptp(apart) <= _OPTIONS.same * period)
 
 
 def _one_phase(t0: float, dt: float, period: float) -> str:
     message = f"all pairs begin at the phase t = {t0:g} of the drive: the map from there is learned"
     turns = dt / period
-    if abs(turns - round(turns)) <= _SAME * max(turns, 1.0) and round(turns) > 0:
+    if abs(turns - round(turns)) <= _OPTIONS.same * max(turns, 1.0) and round(turns) > 0:
         return (
             f"{message}, that of {round(turns)} whole period{'s' * (round(turns) > 1)} of the drive"
         )

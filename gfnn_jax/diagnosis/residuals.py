@@ -74,6 +74,8 @@ class Options:
     # by so many standard errors, they are the same.
     alike: float = 3.0
     halves_apart: float = 2.0
+    pairs_of_misfit: int = 50  # pairs that a library is fitted to; as many judge it
+    quiet: float = 0.75  # of the sample, that moves least
 
 
 OPTIONS = Options()
@@ -331,10 +333,6 @@ def differs_between_sequences(z, residual, sequence) -> bool:
     return bool(across > 0.5 * np.sum(residual[places] ** 2) and across > OPTIONS.across * along)
 
 
-_PAIRS_OF_MISFIT = 50  # pairs that a library is fitted to; as many judge it
-_QUIET = 0.75  # of the sample, that moves least
-
-
 def misfit(family, data: Dataset, chart: AnyChart) -> float:
     """Part of the held-out target gradients that a family, linear in its parameters, leaves over:
     the median over pairs, of the forces or of the velocities, whichever is larger; infinite where
@@ -358,6 +356,6 @@ def misfit(family, data: Dataset, chart: AnyChart) -> float:
 
 def _quiet_pairs(data: Dataset) -> np.ndarray:
     """A sample of the training pairs without those that move most, as close passages do."""
-    rows = data.training[: 2 * _PAIRS_OF_MISFIT]
+    rows = data.training[: 2 * OPTIONS.pairs_of_misfit]
     moved = np.abs((data.y1[rows] - data.y0[rows]) / data.scale).max(axis=1)
-    return rows[moved <= np.quantile(moved, _QUIET)]
+    return rows[moved <= np.quantile(moved, OPTIONS.quiet)]

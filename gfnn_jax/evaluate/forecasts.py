@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -13,10 +14,20 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.learn.fitted import Choice, Fit
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
-_SAMPLES = 20  # that a state is estimated from
-_STARTS = 24
-_DRAWN = 16  # states about a measured one, whose motions tell how far it is trusted
-_PERIODS = (0.25, 1.0, 2.0)  # of the fastest motion, that is forecast ahead, if there are as many
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Forecasts of a part that no fit has seen."""
+
+    samples: int = 20  # that a state is estimated from
+    starts: int = 24  # of forecasts
+    drawn: int = 16  # states about a measured one, whose motions tell how far it is trusted
+    # of the fastest motion, that are forecast ahead, if there are as many
+    periods: tuple[float, ...] = (0.25, 1.0, 2.0)
+
+
+_OPTIONS = _Options()
+
 PART = 2 / 3  # of a recording, in time, that is learned from where the rest is held out
 
 
@@ -59,7 +70,7 @@ def forecasts_of(fit: Fit, held_out: Recording) -> Forecasts:
     if map_.sensors is None:
         noise = fit.noise if isinstance(fit.found, Choice) else None
         return _forecasts(partial(_of_state, map_, noise), held_out, [half / 4, half / 2, half])
-    ahead = [periods * 2 * np.pi / map_.sensors.omega for periods in _PERIODS]
+    ahead = [periods * 2 * np.pi / map_.sensors.omega for periods in _OPTIONS.periods]
     ahead = [seconds for seconds in ahead if seconds < half] or [half]
     return forecasts_along(map_, held_out, ahead)
 
@@ -81,15 +92,15 @@ def _forecasts(
     starts = [
         (run, k)
         for run, t in times.items()
-        for k in range(_SAMPLES - 1, len(t) - 1)
+        for k in range(_OPTIONS.samples - 1, len(t) - 1)
         if t[k] + ahead[-1] <= t[-1]
     ]
     if not starts:
         raise InputError(
-            f"{recording.source}: no run has {_SAMPLES} samples and {ahead[-1]:.3g} s behind them "
-            "that no fit has seen"
+            f"{recording.source}: no run has {_OPTIONS.samples} samples and {ahead[-1]:.3g} s "
+            "behind them that no fit has seen"
         )
-    chosen = np.linspace(0, len(starts) - 1, min(_STARTS, len(starts))).astype(int)
+    chosen = np.linspace(0, len(starts) - 1, min(_OPTIONS.starts, len(starts))).astype(int)
     begins = (starts[i] for i in chosen)
     each = tuple(forecast(recording, run, k, ahead[-1]) for run, k in begins)
     names = list(each[0].values)
@@ -109,7 +120,7 @@ def _ahead(map_: SymplecticMap, recording: Recording, run: str, k: int, longest:
     t = recording.times(run)
     begin = float(t[k])
     later = recording.slice(np.nextafter(begin, np.inf), begin + longest, run=run)
-    start = recording.slice(float(t[k - _SAMPLES + 1]), begin, run=run)
+    start = recording.slice(float(t[k - _OPTIONS.samples + 1]), begin, run=run)
     own = recording.slice(run=run) if recording.inputs else None
     found = map_.forecast(start, later.times(run), own)
     measured, values, std = {}, {}, {}
@@ -138,7 +149,7 @@ def _of_state(
     t, z, dt = recording.times(run), recording.array("positions", run), float(map_.dt)
     steps = int(longest / dt * (1 + 1e-9))
     sigma = np.zeros(z.shape[1]) if noise is None else noise
-    starts = z[k] + sigma * np.random.default_rng(k).normal(size=(_DRAWN, z.shape[1]))
+    starts = z[k] + sigma * np.random.default_rng(k).normal(size=(_OPTIONS.drawn, z.shape[1]))
     found = np.asarray(map_.rollout(np.concatenate([z[k : k + 1], starts]), steps)[0])[:, 1:]
     later = t[k] + dt * np.arange(1, steps + 1)
     spread = np.sqrt(np.nanmean((found[1:] - found[0]) ** 2, axis=0) + sigma**2)

@@ -46,10 +46,10 @@ class Options:
     scan: int = 16
     rest: float = 1e-12
     unrolled: int = 6
+    first: int = 4  # terms of a series before it is asked whether it ends
 
 
 OPTIONS = Options()
-_FIRST = 4  # terms of a series before it is asked whether it ends
 
 
 def _refused(name: str) -> Any:
@@ -384,7 +384,7 @@ def _written_out(rows: _Rows) -> str:
         f"const double size{i} = ROUNDING*(fabs({rows.at(s, 0)}) + {literal(graph.scale[i])});"
         for i, s in enumerate(z)
     ]
-    lines.append(f"const double square = h*h;\ndouble power = {'*'.join('h' * _FIRST)};")
+    lines.append(f"const double square = h*h;\ndouble power = {'*'.join('h' * OPTIONS.first)};")
     for k in range(OPTIONS.order):
         lines += rows.written(k)
         for i, (s, rate) in enumerate(zip(z, rows.rates, strict=True)):
@@ -393,7 +393,7 @@ def _written_out(rows: _Rows) -> str:
             place = i * rows.size + k + 1
             lines.append(f"const double {rows.at(s, k + 1)} = {later};")
             lines.append(f"T[{place}] = {rows.at(s, k + 1)};")
-        if k > _FIRST and (k - _FIRST) % 2 == 0:
+        if k > OPTIONS.first and (k - OPTIONS.first) % 2 == 0:
             lines.append("power *= square;")
             small = [
                 f"fabs({rows.at(s, n)}*{power}) <= size{i}"

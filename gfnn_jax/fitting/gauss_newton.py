@@ -70,6 +70,8 @@ class GaussNewtonOptions:
     # A step's own error, of the coordinates' sizes, that is roundoff; at dt of long arcs too.
     fine: float = 5e-16
     rounded: float = 1e-13
+    # Of the residual that the linearised problem foretells, by which that of the step may differ.
+    foretold_left_out: float = 0.01
 
 
 OPTIONS = GaussNewtonOptions()
@@ -412,10 +414,6 @@ def summarised(c, triangle: Triangle, used, iterations: int, steps: Steps) -> Fl
     return FlowFit(c, rms, errors, triangle, spectrum.condition, used, iterations, steps)
 
 
-# Of the residual that the linearised problem foretells, by which that of the step may differ.
-_FORETOLD_LEFT_OUT = 0.01
-
-
 def without_each(
     problem: Problem, family, c: np.ndarray, steps: Steps, parts: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
@@ -460,4 +458,4 @@ def _one_step(
     norm = float(np.linalg.norm(problem.residuals(family, tried, steps, rows)))
     if here.norm <= norm < 2 * here.norm and foretold > (1 - DESCENT.promised) * here.norm:
         return c  # the descent ends here too: the residual is rounding, or truncation
-    return tried if abs(norm - foretold) <= _FORETOLD_LEFT_OUT * foretold else None
+    return tried if abs(norm - foretold) <= OPTIONS.foretold_left_out * foretold else None

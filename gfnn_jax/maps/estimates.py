@@ -33,12 +33,21 @@ from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
 from gfnn_jax.solve.linear import covariance_root
 
 FEWEST = 5  # samples from which a state is estimated
-_MOST = 160  # samples of a window that are used
-_FINE = 0.16  # radians of the fastest motion in a step
-_SMALL = 2e-3  # radians of the fastest motion, over which velocities are differenced
-_FEW = 4  # steps between inputs, of which those in between are filled in
-_AT_ONCE = 4_096  # steps whose derivatives are taken together
-_DRAWS = 400  # of errors of a trajectory, whose largest multiple of a band is looked for
+
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Windows, and the steps in which their states are followed."""
+
+    most: int = 160  # samples of a window that are used
+    fine: float = 0.16  # radians of the fastest motion in a step
+    small: float = 2e-3  # radians of the fastest motion, over which velocities are differenced
+    few: int = 4  # steps between inputs, of which those in between are filled in
+    at_once: int = 4_096  # steps whose derivatives are taken together
+    draws: int = 400  # of errors of a trajectory, whose largest multiple of a band is looked for
+
+
+_OPTIONS = _Options()
 
 
 class Window(NamedTuple):
@@ -290,7 +299,7 @@ def windows_of(
 def thinned(window: Window) -> Window:
     """The window with every so many of its samples, counted from the last one: more tell no
     more."""
-    every = -(-len(window.t) // _MOST)
+    every = -(-len(window.t) // _OPTIONS.most)
     noise = None if window.noise is None else window.noise[::-every][::-1]
     return window._replace(t=window.t[::-every][::-1], y=window.y[::-every][::-1], noise=noise)
 
@@ -324,7 +333,7 @@ def _check_inputs(t: np.ndarray, begin: float, end: float, run: str) -> None:
     usual = np.median(np.diff(inside if len(inside) > 1 else t))
     ahead = np.concatenate([[begin], inside, [end]])
     steps = np.diff(ahead) / usual
-    lacks = steps > np.append(np.full(len(steps) - 1, _FEW), 1) + 0.5
+    lacks = steps > np.append(np.full(len(steps) - 1, _OPTIONS.few), 1) + 0.5
     if lacks.any():
         gap = int(np.argmax(lacks))
         raise InputError(
@@ -485,7 +494,7 @@ def _started(sensors: Sensors, window: Window) -> tuple[Window, np.ndarray]:
         start = splines([(t, own, np.ones(own.shape))]).smooth(t, own, t)
     x = np.concatenate([start.q, start.v], axis=1)
     steps = np.diff(t)
-    parts = np.ceil(steps / max(np.median(steps), _FINE / sensors.omega) - 1e-3).astype(int)
+    parts = np.ceil(steps / max(np.median(steps), _OPTIONS.fine / sensors.omega) - 1e-3).astype(int)
     measured = np.concatenate([[0], np.cumsum(parts)])
     if measured[-1] == len(parts):
         return window, x
@@ -533,8 +542,8 @@ class Orbits(NamedTuple):
         lanes, times, count, rank = self.modes.shape
         rng, found = np.random.default_rng(0), np.empty((lanes, times))
         for lane, (modes, std) in enumerate(zip(self.modes, self.std, strict=True)):
-            drawn = modes @ rng.normal(size=(rank, _DRAWS))
-            drawn += self.noise[:, None] * rng.normal(size=(times, count, _DRAWS))
+            drawn = modes @ rng.normal(size=(rank, _OPTIONS.draws))
+            drawn += self.noise[:, None] * rng.normal(size=(times, count, _OPTIONS.draws))
             largest = np.max(np.abs(drawn) / std[..., None], axis=1)
             running = np.maximum.accumulate(largest, axis=0)
             found[lane] = np.quantile(running, coverage, axis=1)
@@ -610,7 +619,7 @@ def _followed(
     friction = np.stack([law.friction for law in laws])[which] if level.size else 0 * p
     p = p + level * friction if level.size else p
     spread = np.concatenate([root, np.zeros((*x.shape, roots.shape[1]))], axis=2)
-    orbit, spreads, most = [x[:, None]], [], max(1, _AT_ONCE // len(x))
+    orbit, spreads, most = [x[:, None]], [], max(1, _OPTIONS.at_once // len(x))
     for first in range(0, h.shape[1], most):
         some = slice(first, first + most)
         step = form.follow(p, x, h[:, some], u[:, some], modes=modes)
@@ -661,7 +670,7 @@ def _channels(laws: Sequence[Law], which: np.ndarray, x: np.ndarray, u: np.ndarr
     found: list[Any] = [None] * len(x)
     for k in np.unique(which).tolist():
         own, law = np.flatnonzero(which == k), laws[k]
-        values, h = law.sensors.observation_model.values, _SMALL / law.sensors.omega
+        values, h = law.sensors.observation_model.values, _OPTIONS.small / law.sensors.omega
         shown, _ = seen.along(law.form, law.p, x[own], u[own], h, values)
         for n, *parts in zip(own.tolist(), *shown, strict=True):
             found[n] = parts
@@ -670,7 +679,7 @@ def _channels(laws: Sequence[Law], which: np.ndarray, x: np.ndarray, u: np.ndarr
 
 def substeps_of(sensors: Sensors, h: float) -> int:
     """Runge–Kutta steps that a step h is made of."""
-    return max(1, int(np.ceil(h * sensors.omega / _FINE)))
+    return max(1, int(np.ceil(h * sensors.omega / _OPTIONS.fine)))
 
 
 def _inputs(law: Law, windows: Sequence[Window], t: np.ndarray, substeps: int) -> np.ndarray:

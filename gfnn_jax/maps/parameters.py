@@ -7,6 +7,7 @@ rollout of any length keeps the drive's phase.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,10 +16,18 @@ import numpy as np
 from gfnn_jax.arrays import as_numbers, as_row, namespace, pytree
 from gfnn_jax.phase_space import TIME
 
-_EDGE = 1e-9  # tolerance at the ends of a range, relative to it, for printed numbers
-# A part of a period that no pair covers and that is longer than this, relative to the period, lies
-# outside the data. Harmonics of up to the fourth are learned, which vary over an eighth.
-_LARGEST_GAP = 1 / 8
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Ranges of parameters, and gaps in a period."""
+
+    edge: float = 1e-9  # tolerance at the ends of a range, relative to it, for printed numbers
+    # A part of a period that no pair covers and that is longer than this, relative to the period,
+    # lies outside the data. Harmonics of up to the fourth are learned, which vary over an eighth.
+    largest_gap: float = 1 / 8
+
+
+_OPTIONS = _Options()
 _HALF_DIGITS = 2.0**27 + 1  # splits a float64 in two halves, whose products are exact (Veltkamp)
 
 
@@ -39,7 +48,7 @@ class Parameters:
     @property
     def bounds(self) -> tuple[Any, Any]:
         """Lower and upper bounds (k,), with a tolerance for numbers that were printed."""
-        edge = _EDGE * (self.high - self.low)
+        edge = _OPTIONS.edge * (self.high - self.low)
         return self.low - edge, self.high + edge
 
     def contains(self, args):
@@ -97,7 +106,7 @@ def _covered(t0: np.ndarray, dt: np.ndarray, period: float) -> tuple[float, floa
     # An interval that reaches into the next period covers the first part of this one.
     gaps = np.append(begin[1:], begin[0] + period) - np.maximum(end, end[-1] - period)
     longest = int(np.argmax(gaps))
-    if gaps[longest] <= _LARGEST_GAP * period:
+    if gaps[longest] <= _OPTIONS.largest_gap * period:
         return 0.0, period
     first = begin[(longest + 1) % len(begin)]
     return float(first), float(first + period - gaps[longest])

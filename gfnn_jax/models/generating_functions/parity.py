@@ -35,10 +35,10 @@ class ParityOptions:
     rows_per_term: int = 6
     odd_degree: int = 3
     no_gain: float = 0.98
+    alike: int = 2  # degree up to which the terms that are not even are the coordinates alone
 
 
 OPTIONS = ParityOptions()
-_ALIKE = 2  # degree up to which the terms that are not even are the coordinates alone
 
 
 class _WithOdd:
@@ -73,7 +73,7 @@ def is_even(data: Dataset, degrees: Sequence[int], most_terms: int, rows_per_ter
     most = min(most_terms, w.size // rows_per_term)
     # Counting takes long where variables are many, and a higher degree has more terms.
     few = list(takewhile(lambda n: number_of_terms(inputs.is_angle, n, signs) <= most, degrees))
-    if not few or few[-1] <= _ALIKE:
+    if not few or few[-1] <= OPTIONS.alike:
         return False
     even = Products(inputs, few[-1], signs)
     odd = number_of_terms(inputs.is_angle, OPTIONS.odd_degree) - even.terms_of(OPTIONS.odd_degree)
