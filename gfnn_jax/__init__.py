@@ -28,7 +28,13 @@ if TYPE_CHECKING:
     from gfnn_jax.learn.fit import fit
     from gfnn_jax.learn.fitted import Fit
     from gfnn_jax.learn.monitors import Monitors, fit_monitors
-    from gfnn_jax.learn.options import FitOptions, GeneratingFunction, Hamiltonian, Lagrangian
+    from gfnn_jax.learn.options import (
+        FitOptions,
+        GeneratingFunction,
+        Hamiltonian,
+        Lagrangian,
+        between,
+    )
     from gfnn_jax.learn.saved import load
     from gfnn_jax.maps.saved import register
     from gfnn_jax.maps.stroboscopic import stroboscopic
@@ -69,6 +75,7 @@ _HOMES = {
     "SymplecticMap": "maps.symplectic_map",
     "TrainingData": "models.model",
     "WorkError": "errors",
+    "between": "learn.options",
     "discover": "evaluate.discover",
     "enable_compile_cache": "compiling",
     "export": "exports.export",
@@ -107,6 +114,7 @@ __all__ = [
     "SymplecticMap",
     "TrainingData",
     "WorkError",
+    "between",
     "discover",
     "enable_compile_cache",
     "export",

@@ -79,7 +79,7 @@ def test_masses_are_there_without_being_said():
         ("theta3**2", "the name 'theta3'"),
         ("omega2**2", "add a kinetic one, omega1\\*\\*2"),
         ("V: omega1**2", "has a velocity"),
-        ("R: omega1**4", "is no term"),
+        ("R: omega1**5", "is no term"),
         ("R: theta1**2", "is no term"),
         ("T: omega1**2", "expected L:, V: or R:"),
         ("omega1 +* 2", "no expression that can be read"),
@@ -126,3 +126,70 @@ def test_a_law_with_a_distance():
     past, later = recording.slice(10.0, 15.0), t[301:320]
     ahead = fit.map.forecast(past, later).values
     assert abs(ahead["x"][0] - orbit[0, 301:320]).max() < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("told", "low", "high"),
+    [
+        ("0 <= cos(theta1)", 0.0, np.inf),
+        ("cos(theta1) <= 3", -np.inf, 3.0),
+        ("-2 <= cos(theta1) <= 1e3", -2.0, 1e3),
+        ("cos(theta1) = -7.5", -7.5, -7.5),
+        ("0 <= V: cos(theta1) <= 2", -2.0, 0.0),
+    ],
+)
+def test_what_is_told_of_a_coefficient(told, low, high):
+    (one,) = read(told).told
+    assert one[1:] == (low, high, None)
+    assert one.row in read(told).terms
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        "3 <= cos(theta1) <= 2",
+        "cos(theta1) + theta2 = 3",
+        "R: omega1**2 = 1",
+        "1 = 2",
+        "cos(theta1) = theta2",
+    ],
+)
+def test_what_cannot_be_told(told):
+    with pytest.raises(InputError, match=r"terms: expected|a multiple of"):
+        read(told)
+
+
+def test_bounds_values_and_ties_of_coefficients():
+    """Of L = ½ω² + 20 cos θ − 2 cos 2θ the wrong bound is held; the tie is right."""
+    t = np.arange(0, 8, 0.05)
+    force = lambda _, z: [z[1], -20 * np.sin(z[0]) + 4 * np.sin(2 * z[0]) - 0.1 * z[1]]  # noqa: E731
+    q = solve_ivp(force, (0, 8), [1.5, 0.0], t_eval=t, rtol=1e-9).y[0]
+    swing = gfnn.Recording(
+        {"t": t, "theta": q + 1e-4 * np.random.default_rng(0).normal(size=len(t))}
+    )
+
+    def fitted(single, double):
+        terms = {"cos(theta)": single, "cos(2*theta)": double}
+        return gfnn.fit(swing, model=gfnn.Lagrangian(terms=terms, friction="linear"))
+
+    tied = fitted(single=gfnn.between(0, None), double="-0.1*cos(theta)")
+    both = {term.term: term for term in tied.lagrangian.terms}
+    (single,) = [one for name, one in both.items() if name.startswith("cos(theta")]
+    (double,) = [one for name, one in both.items() if name.startswith("cos(2*theta")]
+    assert single.coefficient == pytest.approx(20.0, rel=2e-3)
+    assert double.coefficient == pytest.approx(-0.1 * single.coefficient, rel=1e-12)
+    assert double.std == pytest.approx(0.1 * single.std, rel=1e-9)
+    assert not any("bound" in message for message in tied.messages)
+    with pytest.warns(gfnn.FitWarning, match="is held at its bound"):
+        bound = fitted(single=None, double=gfnn.between(-1.5, 5))
+    held = next(t for t in bound.lagrangian.terms if t.term.startswith("cos(2*theta"))
+    assert (held.coefficient, held.std) == (-1.5, 0.0)
+
+
+def test_a_told_coefficient_that_sets_the_scale_and_one_of_pairs_are_refused():
+    swing = {"t": 0.05 * np.arange(100), "theta": np.cos(0.2 * np.arange(100))}
+    with pytest.raises(InputError, match="sets the scale of L"):
+        gfnn.fit(gfnn.Recording(swing), terms={"omega**2": 0.7, "cos(theta)": None})
+    z = np.random.default_rng(0).normal(size=(50, 2))
+    with pytest.raises(gfnn.FitError, match="of a recording's law"):
+        gfnn.fit(gfnn.Pairs(z, z, 0.1), terms={"p1**2": 0.5})

@@ -98,8 +98,8 @@ _OPERATIONS = Kind(
     typed="a whole number of operations",
 )
 _TERMS = Kind(
-    "a sequence of texts or functions of z, () for none",
-    lambda v: not isinstance(v, str) and _are(_is_text_or_function, Sequence)(v),
+    "a sequence of texts or functions of z, () for none, or a mapping of texts to coefficients",
+    lambda v: not isinstance(v, str) and _are(_is_text_or_function, Sequence, Mapping)(v),
     _texts,
 )
 _TEXT = Kind("text", lambda v: isinstance(v, str))
@@ -128,6 +128,47 @@ class About(NamedTuple):
     metavar: str | None = None
     commands: tuple[str, ...] = RUN
     decides: bool = True
+
+
+class Between(NamedTuple):
+    """Bounds of a coefficient, as `between` makes them."""
+
+    low: float
+    high: float
+
+
+def between(low: float | None, high: float | None) -> Between:
+    """Bounds of a coefficient in ``terms``; None: no bound on that side.
+
+        model = gfnn.Lagrangian(terms={"cos(theta)": gfnn.between(0, None), "omega**2": 0.5})
+
+    Raises ValueError where no number is between them.
+    """
+    ends = (-math.inf if low is None else float(low), math.inf if high is None else float(high))
+    if not ends[0] < ends[1]:
+        raise ValueError(f"expected low < high, got between({low}, {high})")
+    return Between(*ends)
+
+
+def told(terms: Sequence[Any] | Mapping[Any, Any]) -> Sequence[Any]:
+    """Terms as texts, with what a mapping tells of their coefficients: None, a number, `between`,
+    or the text of a multiple of another term."""
+    if not isinstance(terms, Mapping):
+        return terms
+    texts = []
+    for term, value in terms.items():
+        if isinstance(value, Between):
+            texts.append(f"{value.low!r} <= {term} <= {value.high!r}")
+        elif value is None:
+            texts.append(term)
+        elif isinstance(value, (int, float, str)) and not isinstance(value, bool):
+            texts.append(f"{term} = {value}")
+        else:
+            raise FitError(
+                f"terms: expected None, a number, gfnn.between(low, high), or a multiple of "
+                f"another term as text for {term}, got {value!r}"
+            )
+    return tuple(texts)
 
 
 def _named(cls: type[T]) -> type[T]:
@@ -163,7 +204,7 @@ class Hamiltonian:
 class Lagrangian:
     """L(q, v) of a recording, with ``friction`` and inputs. Options as of `gfnn.fit`."""
 
-    terms: Sequence[str] = ()
+    terms: Sequence[str] | Mapping[str, Any] = ()
     friction: str = "auto"
     input_hold: str = "auto"
     mass: Mapping[str, float] | None = None
@@ -225,7 +266,8 @@ OPTIONS: dict[str, About] = {
     "terms": About(
         _TERMS,
         'known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"; in Python also functions of z; for a '
-        'recording those of its law: "omega**2; V: cos(theta); R: omega**2"',
+        'recording those of its law: "omega**2; V: cos(theta); R: omega**2", a coefficient by '
+        'its value "cos(theta) = 20", bounds "0 <= cos(theta)" or "cos(a) = 2*cos(b)"',
         "TEXT",
     ),
     "bracket": About(
@@ -348,7 +390,7 @@ class FitOptions:
     tolerance: float = 1e-6
     absolute_tolerance: float | None = None
     learn: str = "auto"
-    terms: Sequence[str | Callable] = ()
+    terms: Sequence[str | Callable] | Mapping[str, Any] = ()
     bracket: Any = None
     base: str | Callable | None = None
     structure: str | None = None
@@ -372,6 +414,7 @@ class FitOptions:
             value, kind = getattr(self, option.name), OPTIONS[option.name].kind
             if not (value is None and option.default is None) and not kind.holds(value):
                 raise FitError(f"expected {kind.words} as {option.name}, got {value!r}")
+        object.__setattr__(self, "terms", told(self.terms))
         self._take_from_model()
         self.refuse_others(tuple(MODELS), "one model")
         if self.ensemble > 1 and self.family != "mlp":

@@ -96,6 +96,11 @@ def check_request(
             + (float(pairs.dt) < 0) * ": where z1 come before z0 in time, exchange them"
         )
     known = () if options.base is None else (options.base,)
+    if any("=" in term for term in options.terms if isinstance(term, str)):
+        raise FitError(
+            "terms: bounds, values and ties of coefficients are of a recording's law "
+            "(gfnn.Lagrangian), got pairs: give H's terms without them"
+        )
     try:
         if structure is not None:
             _check_structured(structure, scene, options, pairs)

@@ -5,12 +5,18 @@
 
 A term is one of L unless V: (potential) or R: (friction) stands before it. A sum gives each of its
 terms, so that the formula of a fit can be given again; factors before terms say nothing, because
-the fit finds them. What is no power of a position and no first cosine or sine of whole multiples is
-the term's shape, one formula of the positions.
+the fit finds them. A coefficient may be told:
+
+    omega**2*x = 0.3;  0 <= cos(theta1);  -5 <= V: x**2 <= 0;  cos(theta2) = 2*cos(theta1)
+
+is a value, a bound, two bounds, and a multiple of another coefficient. What is no power of a
+position and no first cosine or sine of whole multiples is the term's shape, one formula of the
+positions.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -38,12 +44,26 @@ from gfnn_jax.families.lagrangian import (
 from gfnn_jax.models.lagrangians.libraries import SINE
 from gfnn_jax.models.lagrangians.structure import Loss, Row, with_powers
 
+_TURNED = {"<=": ">=", ">=": "<=", "=": "="}
+
+
+class Told(NamedTuple):
+    """A coefficient of L that is told: between two bounds, equal ones for a value; or so many times
+    that of another term."""
+
+    row: Row
+    low: float
+    high: float
+    of: Row | None = None
+
 
 class Given(NamedTuple):
-    """Terms of L, the first with v₁², and of R, None where none was given."""
+    """Terms of L, the first with v₁², and of R, None where none was given; what is told of the
+    coefficients."""
 
     terms: tuple[Row, ...]
     friction: tuple[Loss, ...] | None
+    told: tuple[Told, ...] = ()
 
 
 def given_terms(
@@ -61,16 +81,31 @@ def given_terms(
     reader = _Reader(tuple(positions), tuple(speeds), tuple(parameters))
     rows: list[Row] = []
     losses: list[Loss] = []
+    told: list[Told] = []
     kinds = set()
     for text in texts:
         if not isinstance(text, str):
             raise InputError("expected terms of a recording's law as text, got a function")
+        text, low, high, tied = _told(text)
         kind, colon, rest = text.partition(":")
         kind = kind.strip().upper() if colon else "L"
         if kind not in ("L", "V", "R"):
             raise InputError(f"terms: expected L:, V: or R: before a term, got '{text}'")
         kinds.add(kind)
-        for shown, tree in reader.summands(rest if colon else text):
+        parts = reader.summands(rest if colon else text)
+        if (low, high, tied) != (-np.inf, np.inf, None):
+            if kind == "R" or len(parts) != 1:
+                raise InputError(
+                    f"terms: expected one term of L or V whose coefficient is told, got '{text}'; "
+                    "coefficients of friction are 0 or above, and fitted"
+                )
+            row, sign = reader.row(parts[0][1], parts[0][0]), -1.0 if kind == "V" else 1.0
+            if tied is None:
+                ends = sorted((sign * low, sign * high))
+                told.append(Told(row, ends[0], ends[1]))
+            else:
+                told.append(Told(row, *reader.multiple(tied)))
+        for shown, tree in parts:
             if kind == "R":
                 losses.append(reader.loss(tree, shown))
             else:
@@ -88,7 +123,45 @@ def given_terms(
         raise InputError(f"terms: add a kinetic one, {speeds[0]}**2, which sets the scale of L")
     ordered = dict.fromkeys([first, *rows])
     moving = tuple(row for row in ordered if any(row[0]) or any(coordinates_in(row)))
-    return Given(moving, tuple(dict.fromkeys(losses)) if "R" in kinds else None)
+    tied = [one.row for one in told if one.of is not None]
+    for one in told:
+        if one.of is not None and (one.of not in moving or one.of in tied):
+            raise InputError(
+                "terms: a coefficient can be a multiple of that of another given term, which is no "
+                "multiple itself"
+            )
+    return Given(moving, tuple(dict.fromkeys(losses)) if "R" in kinds else None, tuple(told))
+
+
+def _told(text: str) -> tuple[str, float, float, str | None]:
+    """A term's text, its bounds, and the text of the term that its coefficient is a multiple of."""
+    parts = re.split(r"(<=|>=|=)", text)
+    if len(parts) == 1:
+        return text, -np.inf, np.inf, None
+    words, signs = [part.strip() for part in parts[::2]], parts[1::2]
+    numbers = [_number(word) for word in words]
+    if len(words) == 3 and signs == ["<=", "<="] and None not in (numbers[0], numbers[2]):
+        low, high, term = numbers[0], numbers[2], words[1]
+    elif len(words) == 2 and numbers[0] is not None and numbers[1] is None:
+        return _told(f"{words[1]} {_TURNED[signs[0]]} {words[0]}")
+    elif len(words) == 2 and signs == ["="] and numbers[1] is None:
+        return words[0], 1.0, 1.0, words[1]
+    elif len(words) == 2 and numbers[0] is None and numbers[1] is not None:
+        term, value = words[0], numbers[1]
+        low = -np.inf if signs == ["<="] else value
+        high = np.inf if signs == [">="] else value
+    else:
+        low = high = None
+    if low is None or high is None or not low <= high or np.isnan(low + high):
+        raise InputError(f"terms: expected low <= term <= high, or term = value, got '{text}'")
+    return term, low, high, None
+
+
+def _number(word: str) -> float | None:
+    try:
+        return float(word)
+    except ValueError:
+        return None
 
 
 class _Reader(NamedTuple):
@@ -111,6 +184,16 @@ class _Reader(NamedTuple):
             else:
                 others[base] = exponent
         return others, tuple(powers)
+
+    def multiple(self, text: str) -> tuple[float, float, Row]:
+        """The number before a term, twice, and the term."""
+        number, times, rest = text.partition("*")
+        factor = _number(number.strip()) if times and not rest.startswith("*") else None
+        parts = self.summands(text if factor is None else rest)
+        if len(parts) != 1:
+            raise InputError(f"terms: expected a multiple of one term, got '{text}'")
+        value = 1.0 if factor is None else factor
+        return value, value, self.row(parts[0][1], parts[0][0])
 
     def row(self, tree: Expression, text: str) -> Row:
         """(k, n, m, φ), with the shape and the powers of parameters where it has such."""
@@ -185,7 +268,7 @@ class _Reader(NamedTuple):
         )
 
 
-_OF_POWER = {1: DRY, 2: LINEAR, 3: QUADRATIC}  # the kind of |v| to this power in R
+_OF_POWER: dict[float, int] = {1: DRY, 2: LINEAR, 3: QUADRATIC}  # of |v| to this power in R
 
 
 def _side(tree: Expression) -> Expression | None:

@@ -209,6 +209,7 @@ def _findings(
         *left_out,
         *data.messages,
         *_without_role(recording),
+        *_held(best.fit),
         *_at_bound(options, best.choice, best.law.dim),
     )
     findings = Findings(
@@ -418,7 +419,7 @@ def _found(
         observation, d = problem.observation, problem.dim
         names = symbols((*observation.coordinates, *observation.speeds, *problem.parameters))
         given = given_terms(terms, names[:d], names[d : 2 * d], names[2 * d :])
-        find = partial(fit_given, given)
+        find = partial(fit_given, given, _scale(data, bool(given.told)))
     elif problem.parameters:
         find = search_of_systems
     found = find(problem)
@@ -444,6 +445,25 @@ def _found(
     if not found.follows:
         raise no_law(problem.scales)
     return data, found
+
+
+def _scale(data: RecordingData, told: bool) -> float:
+    """The scale of L by the mass that is given. Raises InputError where coefficients are told and
+    another mass than that of the first position."""
+    first = data.problem.observation.coordinates[0]
+    if told and {*data.mass} - {first}:
+        raise InputError(f"terms: told coefficients need the mass of {first}, if any (mass=)")
+    return float(data.mass.get(first, 1.0))
+
+
+def _held(fit: LawFit) -> list[str]:
+    """Messages about coefficients that are held at a bound."""
+    return [
+        f"{fit.problem.word(('term', one.row))} is held at its bound: the record alone would put "
+        "its coefficient beyond"
+        for one in fit.structure.held
+        if one.is_bound
+    ]
 
 
 def _with_hidden_drive(

@@ -10,12 +10,14 @@ all that is fitted.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from gfnn_jax.dataset.stretches import arcs_of
+from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians import libraries
@@ -25,7 +27,7 @@ from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, 
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.starts import best_start
-from gfnn_jax.models.lagrangians.structure import Key, Loss, Structure, is_constant
+from gfnn_jax.models.lagrangians.structure import Held, Key, Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import protected, weak_start
 from gfnn_jax.models.lagrangians.zeros import with_zeros_of_runs
 
@@ -65,13 +67,18 @@ def search_on(model: InputModel) -> SearchResult:
     return TermSearch.of(problem).along(model.fit, longer)
 
 
-def fit_given(given: Given, problem: ArcProblem) -> SearchResult:
-    """Fit exactly the terms that are given. Where systems differ in parameters, terms may be
-    multiplied by these."""
+def fit_given(given: Given, scale: float, problem: ArcProblem) -> SearchResult:
+    """Fit exactly the terms that are given, with what is told of their coefficients, those of L
+    ÷ ``scale``. Where systems differ in parameters, terms may be multiplied by these.
+
+    A coefficient that a fit puts beyond its bound is held there, and the others are fitted again.
+    """
     d, options = problem.dim, problem.options
     linear = tuple(libraries.losses(d, (LINEAR,), 0.0)[:d])
     friction = linear if given.friction is None else given.friction
     structure = Structure(d, given.terms, friction, (), problem.num_inputs, problem.sensors)
+    held, bounds = told_in(given, structure, scale)
+    structure = dataclasses.replace(structure, held=held)
     structure, known = weak_start(structure, problem, prune=False)
     plain = all(row[3] == 0 for row in given.terms)  # a sine or a phase says where zero is
     zeros = structure.with_a_zero(problem.turned) if plain else ()
@@ -84,7 +91,63 @@ def fit_given(given: Given, problem: ArcProblem) -> SearchResult:
         known = dict(zip(model.fit.structure.keys(), p.tolist(), strict=True))
         model = model._replace(fit=model.fit.again(known=known, rescale=False))
     tried = frictions_tried(d, options) if given.friction is None else None
-    return TermSearch(None, tried).along(model.fit, longer)
+    terms, fit = TermSearch(None, tried), model.fit
+    found = terms.along(fit, longer)
+    for _ in bounds:
+        beyond = passed(found.fit, bounds)
+        if not beyond:
+            break
+        held = (*held, *beyond)
+        for one in beyond:
+            word = problem.word(("term", one.row))
+            problem.on_progress(f"  {word}: held at its bound {scale * one.value:g}")
+        found = terms.along(fit.again(dataclasses.replace(fit.structure, held=held)), longer)
+    return found
+
+
+def told_in(
+    given: Given, structure: Structure, scale: float
+) -> tuple[tuple[Held, ...], dict[Row, tuple[float, float]]]:
+    """The coefficients that are held from the start, and the bounds of others, in the gauge of the
+    structure. Raises InputError for one that sets the scale of L."""
+    held, bounds = [], {}
+    for row, low, high, of in given.told:
+        if row in [structure.terms[k] for k in structure.given]:
+            if of is None and low <= 0.5 * scale <= high and is_constant(row):
+                continue
+            raise InputError(
+                "terms: the coefficient of the first term in v**2 sets the scale of L, and is ½ of "
+                "the mass: give the mass instead (mass=, --mass)"
+            )
+        if of is not None:
+            if of in [structure.terms[k] for k in structure.given]:
+                raise InputError(
+                    "terms: a multiple of v**2, whose coefficient is known: give a value"
+                )
+            held.append(Held(row, low, of))
+        elif low == high:
+            held.append(Held(row, low / scale))
+        else:
+            bounds[row] = low / scale, high / scale
+    return tuple(held), bounds
+
+
+def passed(fit: LawFit, bounds: Mapping[Row, tuple[float, float]]) -> list[Held]:
+    """The bounds at which coefficients of a fit that is beyond some of them end, by least squares
+    close to the fit."""
+    keys, p = fit.structure.keys(), fit.p
+    ends = np.array([bounds.get(k[1], (-np.inf, np.inf)) for k in keys]).reshape(-1, 2).T
+    if np.all((p >= ends[0]) & (p <= ends[1])):
+        return []
+    near = fit.linearised
+    size = np.maximum(np.linalg.norm(near.columns, axis=0), 1e-300)
+    low, high = (ends - p) * size
+    change = lsq_linear(near.columns / size, near.residual, (low, high)).active_mask
+    out = (p < ends[0]) | (p > ends[1])
+    side = np.where(change != 0, change, np.where(out, np.sign(p - ends[1]), 0))
+    return [
+        Held(keys[k][1], float(ends[int(side[k] > 0)][k]), None, True) for k in np.flatnonzero(side)
+    ]
 
 
 def to_longer_arcs(fit: LawFit, length: int) -> LawFit | None:

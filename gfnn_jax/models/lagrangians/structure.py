@@ -18,7 +18,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -68,11 +68,21 @@ def _touched(row: Row) -> list[bool]:
     return [bool(k or f) for k, f in zip(row[0], coordinates_in(row), strict=True)]
 
 
+class Held(NamedTuple):
+    """A term whose coefficient is no free one: ``value``, or that many times the one of another
+    term. is_bound: whether the value is a bound, which the data alone would pass."""
+
+    row: Row
+    value: float
+    of: Row | None = None
+    is_bound: bool = False
+
+
 @dataclasses.dataclass(frozen=True)
 class Structure:
     """Terms of L (the first is ½v₁²·2), friction, the coordinates whose zero is unknown, the number
-    of inputs, each with a gain for each coordinate, and the names of the sensors' parameters with
-    where they start."""
+    of inputs, each with a gain for each coordinate, the names of the sensors' parameters with where
+    they start, and the terms whose coefficients are ``held``."""
 
     dim: int
     terms: tuple[Row, ...]
@@ -80,6 +90,7 @@ class Structure:
     zeros: tuple[int, ...] = ()
     num_inputs: int = 0
     sensors: tuple[tuple[str, float], ...] = ()
+    held: tuple[Held, ...] = ()
 
     def keys(self) -> list[Key]:
         """A name of each free coefficient, in their order."""
@@ -137,7 +148,8 @@ class Structure:
 
     @property
     def _free(self) -> list[int]:
-        return [k for k in range(len(self.terms)) if k not in self.given]
+        fixed = {*self.given, *(self.terms.index(one.row) for one in self.held)}
+        return [k for k in range(len(self.terms)) if k not in fixed]
 
     @property
     def powers(self) -> Powers | None:
@@ -164,11 +176,18 @@ class Structure:
             values = values * functions_of(powers[: terms.count], args)
         inertia, fixed = terms.quadratic()[0], np.zeros(terms.count)
         basis = np.eye(terms.count)[:, self._free]
+        for row, value, of, _ in sorted(self.held, key=lambda one: one.of is not None):
+            k = self.terms.index(row)
+            if of is None:
+                fixed[k] = value
+            else:
+                source = self.terms.index(of)
+                fixed[k], basis[k] = value * fixed[source], value * basis[source]
         for k in self.given:
             i = self.terms[k][0].index(2)
             own = inertia[:, i, i] * values.mean(axis=0)
-            fixed[k] = 1 / own[k]
-            basis[k] = -own[self._free] / own[k]
+            fixed[k] = (1 - own @ fixed) / own[k]
+            basis[k] = -(own @ basis) / own[k]
         friction = Friction.of(self.friction, self.dim)
         return Form(terms, fixed, basis, friction, self.num_inputs, powers)
 
