@@ -101,6 +101,13 @@ def test_architecture_has_every_module_in_the_order_of_imports():
     assert rooms == [m for m in ORDER if m != "__main__"]
 
 
+def test_one_version_everywhere():
+    first = re.search(r"^## (\S+) \((.*)\)", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.M)
+    assert first
+    assert f'version = "{first[1]}"' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert f"version: {first[1]}" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
 def test_every_public_name_is_in_the_reference():
     shown = re.findall(r"::: gfnn_jax\.(\w+)\n", (ROOT / "docs/reference.md").read_text("utf-8"))
     data = {"CHARTS"}  # explained on the page of charts

@@ -5,8 +5,10 @@ import dataclasses
 import inspect
 import json
 import re
+import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from command_line import gfnn as command
@@ -172,6 +174,25 @@ def test_lanes_are_asked_for_where_states_are_given():
     map_ = discovered().map
     with pytest.raises(ValueError, match=r"map\.rollout takes these"):
         map_.advance(np.array([0.1, 0.0]), 3)
+
+
+@pytest.mark.slow
+def test_a_gradient_through_twenty_steps_of_a_law_compiles_once():
+    map_ = discovered().map
+
+    def later(z):
+        return map_.rollout(z, 20)[0][-1, 0]
+
+    z = np.array([0.3, 0.1])
+    seconds = []
+    for start in (z, z + 0.01):
+        began = time.process_time()
+        gradient = jax.grad(later)(start)
+        seconds.append(time.process_time() - began)
+    off = 1e-5 * np.eye(2)
+    expected = [(later(start + d) - later(start - d)) / 2e-5 for d in off]
+    np.testing.assert_allclose(gradient, expected, rtol=1e-6)
+    assert seconds[1] < 0.1 * seconds[0]
 
 
 def test_the_signature_of_a_fit_is_for_users():
