@@ -44,7 +44,9 @@ Rates = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
 
 class System(NamedTuple):
     """L and R, term -> coefficient, in x1, … and v1, …; where the motion begins (q, v); which
-    coordinates are angles; the period of its motion; forces in t that no column shows."""
+    coordinates are angles; the period of its motion; forces in t that no column shows, or in u1,
+    an input that is recorded where there is ``dwell``, the samples for which it keeps a value; and
+    coordinates that drive others."""
 
     lagrangian: Terms
     start: tuple[tuple[float, ...], tuple[float, ...]]
@@ -52,6 +54,8 @@ class System(NamedTuple):
     friction: Terms = MappingProxyType({})
     period: float = 2 * np.pi
     push: tuple[str, ...] = ()
+    dwell: int = 0
+    leaders: tuple[int, ...] = ()
 
 
 def _plane(rng: np.random.Generator) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -237,12 +241,36 @@ def cubic_drag(rng: np.random.Generator) -> System:
 
 
 def one_sided_friction(rng: np.random.Generator) -> System:
-    sides = rng.uniform(0.002, 0.02, 2)
+    sides = rng.uniform(0.002, 0.02, 2).tolist()
     return System(
         {"v1**2": 0.5, "x1**2": -0.5},
         ((rng.uniform(1, 2),), (0.0,)),
         friction=dict(zip(("(abs(v1) + v1)**2", "(abs(v1) - v1)**2"), sides, strict=True)),
     )
+
+
+def motor_cart(rng: np.random.Generator) -> System:
+    damping, gain = rng.uniform(3, 8), rng.uniform(5, 12)
+    return System(
+        {
+            **FREE,
+            "v1*v2*cos(x2)": rng.uniform(1.5, 4),
+            "cos(x2)": rng.uniform(15, 40),
+        },
+        ((0.0, rng.uniform(0.3, 1)), (0.0, 0.0)),
+        (1,),
+        {"v1**2": damping / 2, "v2**2": rng.uniform(0.01, 0.2)},
+        period=1.2,
+        push=(f"{gain}*u1", "0"),
+        dwell=25,
+        leaders=(0,),
+    )
+
+
+def motor_arm(rng: np.random.Generator) -> System:
+    cart = motor_cart(rng)
+    terms = {**cart.lagrangian, "v1**2*cos(2*x2)": -0.25}
+    return cart._replace(lagrangian=terms)
 
 
 SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
@@ -253,6 +281,7 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
         *(two_wells, hoop, ball_and_beam, rocking_disc, wire, central),
         *(springs_between_angles, elastic_pendulum, relativistic),
         *(drive_not_recorded, drive_of_two_phases, cubic_drag, one_sided_friction),
+        *(motor_cart, motor_arm),
     )
 }
 
@@ -260,24 +289,33 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
 # The truth, and the judgement.
 
 
-def rates(dim: int, L: str, R: str = "0", push: Sequence[str] = ()) -> Rates:
-    """q̈ at (t, q, v) of the text of L, R and forces, by SymPy; dry friction turns over a small
-    speed."""
+def rates(
+    dim: int,
+    L: str,
+    R: str = "0",
+    push: Sequence[str] = (),
+    signal: Callable[[float], float] | None = None,
+    leaders: Sequence[int] = (),
+) -> Rates:
+    """q̈ at (t, q, v) of the text of L, R and forces in t and the signal u1, by SymPy; dry friction
+    turns over a small speed. Terms with coordinates that are led act on these alone."""
     q, v = (sp.symbols([f"{s}{i + 1}" for i in range(dim)], real=True) for s in "xv")
     names = {str(s): s for s in (*q, *v)} | {"abs": sp.Abs}
     law, loss = (sp.parse_expr(text, local_dict=names) for text in (L, R))
-    left = [
-        sp.diff(law, x)
-        - sum(sp.diff(law, s, y) * w for y, w in zip(q, v, strict=True))
-        - sp.diff(loss, s)
-        for x, s in zip(q, v, strict=True)
-    ]
-    t = sp.Symbol("t", real=True)
+    led = {s for i in range(dim) if leaders and i not in leaders for s in (q[i], v[i])}
+    alone = sp.Add(*(term for term in sp.Add.make_args(law) if not led & term.free_symbols))
+    left, masses = [], []
+    for i, (x, s) in enumerate(zip(q, v, strict=True)):
+        own = alone if i in leaders else law
+        moved = sum(sp.diff(own, s, y) * w for y, w in zip(q, v, strict=True))
+        left.append(sp.diff(own, x) - moved - sp.diff(loss, s))
+        masses.append([sp.diff(own, s, w) for w in v])
+    t, u = sp.Symbol("t", real=True), sp.Function("u1")
     for i, text in enumerate(push):
-        left[i] += sp.parse_expr(text, local_dict={"t": t})
-    sign = {"sign": lambda s: np.tanh(s / _WIDTH)}
+        left[i] += sp.parse_expr(text, local_dict={"t": t, "u1": u(t)})
+    known = {"sign": lambda s: np.tanh(s / _WIDTH), "u1": signal}
     of_mass, of_force = (
-        sp.lambdify((t, *q, *v), f, [sign, "numpy"]) for f in (sp.hessian(law, v), left)
+        sp.lambdify((t, *q, *v), f, [known, "numpy"]) for f in (sp.Matrix(masses), left)
     )
     return lambda time, x, w: np.linalg.solve(
         np.array(of_mass(time, *x, *w), float), np.array(of_force(time, *x, *w), float)
@@ -332,16 +370,27 @@ def case(name: str, draw: int) -> Numbers:
     d = len(q0)
     samples, periods = np.exp([rng.uniform(*np.log(ends)) for ends in (SAMPLES, PERIODS)])
     t = system.period / samples * np.arange(int(samples * periods))
-    truth = rates(d, text_of(system.lagrangian), text_of(system.friction), system.push)
+    dwell = max(system.dwell, 1)
+    values = np.repeat(rng.uniform(-1.5, 1.5, len(t) // dwell + 1), dwell) if system.dwell else None
+
+    def signal(time: float) -> float:
+        assert values is not None
+        return float(values[min(int(time / t[1] + 1e-9), len(values) - 1)])
+
+    text = text_of(system.lagrangian)
+    truth = rates(d, text, text_of(system.friction), system.push, signal, system.leaders)
     states = integrated(truth, q0, v0, t)
     q = states[:, :d]
     spread = q.std(axis=0)
     seen = q + NOISE * spread * rng.normal(size=q.shape)
     names = [f"x{i + 1}" for i in range(d)]
+    columns = {"t": t, **dict(zip(names, seen.T, strict=True))}
+    columns |= {} if values is None else {"u1": values[: len(t)]}
     recording = gfnn.Recording(
-        {"t": t, **dict(zip(names, seen.T, strict=True))},
+        columns,
         positions=names,
         angles=[names[i] for i in system.angles],
+        inputs=[] if values is None else ["u1"],
     )
     found: Numbers = {"draw": draw, "samples": float(samples), "count": len(t)}
     refused = None
@@ -363,7 +412,8 @@ def case(name: str, draw: int) -> Numbers:
     waves = [
         " + ".join(f"({fit.gains[u][name][0]!r})*{u}" for u in fit.gains) or "0" for name in names
     ]
-    law = rates(d, fit.lagrangian.formula, fit.friction.formula or "0", waves)
+    leaders = fit.law.leaders
+    law = rates(d, fit.lagrangian.formula, fit.friction.formula or "0", waves, signal, leaders)
     ahead, errors = system.period * np.arange(_AHEAD + 1) / _AHEAD, []
     for k in np.linspace(0, len(t) - 1, _STARTS).astype(int):
         start = states[k, :d], states[k, d:]
@@ -383,6 +433,7 @@ def case(name: str, draw: int) -> Numbers:
         "z": z,
         "verdict": fit.verdict,
         "messages": list(fit.messages),
+        "leaders": list(leaders),
         "silent": fit.verdict == "identified" and not fit.messages and error >= RIGHT,
     }
 

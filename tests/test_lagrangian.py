@@ -1,5 +1,7 @@
 """A Lagrangian with forces: its closed forms against JAX's derivatives of the plain sum."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,7 @@ from gfnn_jax.families.lagrangian import (
     Lagrangian,
     Terms,
 )
+from gfnn_jax.flows.legendre import family_of
 
 ROWS = [
     ((2, 0), (0, 0), (0, 0), 0.0),
@@ -131,6 +134,33 @@ def test_dry_friction_without_a_width_has_finite_tables_at_rest():
     np.testing.assert_array_equal(slope, np.sign(speeds))
     np.testing.assert_array_equal(curvature, 0.0)
     assert value[-1] == 0.3
+
+
+@pytest.mark.parametrize("leaders", [(0,), (1,)])
+def test_terms_of_coordinates_that_are_led_act_on_these_alone(leaders):
+    """The field of the flow is that of the accelerations, and its derivative that of finite
+    differences."""
+    (q, v), model = states(), law()
+    model = dataclasses.replace(model, terms=dataclasses.replace(model.terms, leaders=leaders))
+    model, led = dataclasses.replace(model, uniform=0.0), 1 - leaders[0]
+    u, e = np.random.default_rng(1).normal(size=(5, 3)), 1e-6
+    other = model.terms.take(~model.terms.follows)
+    alone = dataclasses.replace(model, terms=other, coefficients=THETA[~model.terms.follows])
+    a = model.acceleration(q, v, u)
+    rest = model.terms.residuals(q, v, a)[..., leaders[0]] @ THETA
+    expected = other.residuals(q, v, a)[..., leaders[0]] @ alone.coefficients
+    np.testing.assert_allclose(rest, expected, atol=1e-12)
+    whole = law().terms.residuals(q, v, a)[..., led] @ THETA
+    np.testing.assert_allclose(model.terms.residuals(q, v, a)[..., led] @ THETA, whole, atol=1e-12)
+    family, params = family_of(model)
+    z = np.concatenate([q, model.momentum(q, v)], axis=1)
+    field, slope = family.gradient_and_hessian(params, z, u)
+    np.testing.assert_allclose(field[:, 2:], v, atol=1e-12)
+    ends = [model.momentum(q + s * v, v + s * a) for s in (e, -e)]
+    np.testing.assert_allclose(-field[:, :2], (ends[0] - ends[1]) / (2 * e), atol=1e-7)
+    ends = [[family.gradient(params, z + s * row, u) for s in (e, -e)] for row in np.eye(4)]
+    by = np.stack([(up - down) / (2 * e) for up, down in ends], axis=-1)
+    np.testing.assert_allclose(slope, by, atol=1e-7)
 
 
 def test_padding_moves_nothing():

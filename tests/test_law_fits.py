@@ -38,6 +38,7 @@ from gfnn_jax.maps.estimates import (
     propagate,
     propagate_each,
 )
+from gfnn_jax.maps.laws import states_of
 from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.recordings import samples_of
@@ -397,6 +398,42 @@ def test_friction_of_rare_kinds(kind):
         assert abs(term.coefficient - expected) < 4 * term.std
     given = given_terms([f"R: {fit.friction.formula}"], ["x"], ["v"]).friction
     assert given == tuple(law_of(fit.map).form.friction.rows())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [False, True])
+def test_a_cart_that_its_motor_moves_drives_a_pendulum_that_does_not_move_it(given):
+    """Found among all terms, and where the textbook's own are given; rollouts are those of the
+    equations."""
+    dt, rng = 0.03, np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-1.5, 1.5, 16), 25)
+    states = [np.array([0.0, 0.8, 0.0, 0.0])]
+
+    def rates(_, z, u):
+        a = 9 * u - 6 * z[2]
+        return [*z[2:], a, -30 * np.sin(z[1]) - 0.2 * z[3] - 3 * np.cos(z[1]) * a]
+
+    for one in u[:-1]:
+        found = solve_ivp(rates, (0, dt), states[-1], args=(one,), rtol=1e-9, atol=1e-11)
+        states.append(found.y[:, -1])
+    x = np.array(states)
+    seen = x[:, :2] + 1e-3 * rng.normal(size=(len(u), 2))
+    columns = {"t": dt * np.arange(len(u)), "z": seen[:, 0], "phi": seen[:, 1], "u": u}
+    recording = gfnn.Recording(columns, positions=["z", "phi"], angles=["phi"], inputs=["u"])
+    terms = ["z_dot**2", "phi_dot**2", "z_dot*phi_dot*cos(phi)", "cos(phi)"]
+    fit = gfnn.fit(recording, model=gfnn.Lagrangian(terms=terms if given else ()))
+    assert fit.law.leaders == (0,)
+    assert fit.verdict == "identified"
+    assert "z moves phi and is not moved by it" in fit.messages[-1]
+    coefficients = {t.term.partition("cos")[0]: t.coefficient for t in fit.lagrangian.terms}
+    assert coefficients["z_dot*phi_dot*"] == pytest.approx(3, rel=5e-3)
+    assert coefficients[""] == pytest.approx(30, rel=1e-3)
+    assert [t.term for t in fit.law.equations[0].left.terms] == ["z_ddot"]
+    z = states_of(fit.map, x[:1, :2], x[:1, 2:])
+    ahead, _ = fit.map.rollout(z, 50, inputs=u[:50, None])
+    np.testing.assert_allclose(np.asarray(ahead)[0, :, :2], x[:51, :2], atol=5e-3)
+    with pytest.raises(InputError, match="do not act back"):
+        gfnn.export(fit.map, "mjcf", "unwritten.xml")
 
 
 def undamped():

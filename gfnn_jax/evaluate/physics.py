@@ -437,6 +437,8 @@ def _energies(law: LearnedLaw) -> list[Quantity]:
     def relative(coefficient: float, std: float) -> float:
         return std / abs(coefficient) if coefficient else 0.0
 
+    if not law.energy:
+        return []
     of_losses = {t.term: relative(t.coefficient, t.std) for t in law.friction.terms}
     found = [
         Quantity(

@@ -178,7 +178,7 @@ class Equation(NamedTuple):
 
 
 def equations_of_motion(
-    lagrangian: Formula,
+    lagrangians: Sequence[Formula],
     friction: Formula,
     forces: Sequence[Sequence[Term]],
     coordinates: Sequence[str],
@@ -186,7 +186,8 @@ def equations_of_motion(
 ) -> tuple[Equation, ...]:
     """d/dt ∂L/∂v − ∂L/∂q + ∂R/∂v = forces, an equation for each coordinate.
 
-    forces: of inputs on each coordinate. Each term keeps the standard error of its coefficient.
+    lagrangians: the terms of L that act on each coordinate. forces: of inputs on it. Each term
+    keeps the standard error of its coefficient.
     """
     import sympy
 
@@ -199,7 +200,7 @@ def equations_of_motion(
     for i, own in enumerate(forces):
         left: dict[Any, list[Term]] = {}
         right: dict[Any, list[Term]] = {}
-        for term in lagrangian.terms:
+        for term in lagrangians[i].terms:
             of_term = as_sympy(term.term).xreplace(real)
             push = sympy.diff(of_term, v[i])
             inertia = sympy.Add(*(sympy.diff(push, v[k]) * a[k] for k in range(len(q))))

@@ -175,9 +175,9 @@ class Terms:
         coordinates that a term does not act on."""
         if not self.leaders:
             return values
-        leads = np.isin(np.arange(self.dim), self.leaders)
+        leads = np.isin(np.arange(self.dim), self.leaders)[None]
         acts = ~(self.follows[:, None] & leads).reshape(*self.speeds.shape, *(1,) * (axes - 1))
-        return values * acts.astype(values.dtype)
+        return values * as_row(acts.astype(values.dtype), values)
 
     def quadratic(self) -> tuple[Any, Any, Any]:
         """A (P, d, d), b (P, d), c (P,) of ∏ v_i^k_i = ½ vᵀA v + b·v + c."""

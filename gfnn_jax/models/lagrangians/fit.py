@@ -286,6 +286,8 @@ class LawFit:
         if not np.all(np.isfinite(self.p)):
             return False
         masses = law.at(self.problem.args).masses(self.problem.states[:, :d])
+        leads = np.isin(np.arange(d), self.structure.leaders)
+        masses = np.where(leads[:, None] == leads, masses, 0.0)
         return bool(np.linalg.eigvalsh(masses).min() > 0)
 
     @property

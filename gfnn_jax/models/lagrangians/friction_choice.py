@@ -17,7 +17,8 @@ which the best has odds of less than 20 the one with the fewest kinds is taken: 
 which has one coefficient and keeps a multiple of the symplectic form, before linear friction, and
 that before quadratic and dry friction. Uniform friction is tried beside linear friction only where
 both are asked for. Rare kinds, cubic and one-sided friction, come last: one of them beside the
-others, or in place of one, where that has odds of 20 against the set without it.
+others, or in place of one, where that has odds of 20 against the set without it, by held-out arcs
+and by Schwarz's criterion of all.
 
 Odds alone let chance in: a direction that is not there takes up a part of what the other
 coefficients miss on the arcs that they are not from. Where there is a choice, a set is therefore
@@ -207,7 +208,9 @@ def chosen(
     known = before.kinds if before else ()
     taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, s.plainness))
     if choose:
-        likelier = [s for s in _with_rare(table, taken) if odds(s, taken) > EVIDENCE.decided]
+        lowest = taken.criterion - 2 * np.log(EVIDENCE.decided)
+        likelier = [s for s in _with_rare(table, taken) if s.criterion < lowest]
+        likelier = [s for s in likelier if odds(s, taken) > EVIDENCE.decided]
         likeliest = min(likelier, key=lambda s: s.cost, default=taken)
         tied = [s for s in likelier if odds(likeliest, s) < EVIDENCE.decided]
         taken = min(tied, key=lambda s: (len(s.kinds), s.cost), default=taken)

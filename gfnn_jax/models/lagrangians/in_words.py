@@ -107,7 +107,11 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         delay=(inputs.delay, inputs.error) if recording.inputs else None,
         input_rules=dict(inputs.others),
         which_friction=best.choice.in_words(best.scale, law.dim, names.speeds),
-        hamiltonian=hamiltonian_of(law, lagrangian, names.coordinates, names.parameters),
+        hamiltonian=(
+            None
+            if law.terms.leaders
+            else hamiltonian_of(law, lagrangian, names.coordinates, names.parameters)
+        ),
         zeros=zeros,
         noise=dict(zip(channels, map(float, sensors.sigma / factors), strict=True)),
         residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)),
@@ -121,12 +125,13 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         sensors=parameters,
         alike=_alike(fit, lagrangian, friction),
         horizon=tuple(best.calibration.horizons),
-        energy=_energy(traces, friction, recording.inputs),
+        energy={} if law.terms.leaders else _energy(traces, friction, recording.inputs),
         messages=(
             *findings.messages,
             *(f"{flaw}: {remedy}" for flaw, remedy in flaws.items()),
             *about_parameters(recording, law.powers, fit.structure.most_functions),
             *_not_seen(gains),
+            *_leading(law.terms.leaders, recording.coordinates),
         ),
         steps=findings.steps,
         num_samples=len(recording),
@@ -276,6 +281,18 @@ def _not_seen(gains: Gains) -> list[str]:
         f"of 0. Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
         for u, forces in gains.items()
         if all(abs(gain) < OPTIONS.clear * error for gain, error in forces.values())
+    ]
+
+
+def _leading(leaders: tuple[int, ...], names: Sequence[str]) -> list[str]:
+    """A line on coordinates that drive others, which do not act back on them."""
+    if not leaders:
+        return []
+    first = ", ".join(names[i] for i in leaders)
+    others = ", ".join(name for i, name in enumerate(names) if i not in leaders)
+    return [
+        f"{first} moves {others} and is not moved by it, as where a motor holds a course: terms of "
+        f"both stand in the equations of {others} alone, and the law has no energy"
     ]
 
 

@@ -61,7 +61,7 @@ class LearnedLaw:
     delay: how much later than measured inputs act, in seconds, with its standard error (NaN where
     the record does not tell it); None without inputs. input_rules: other rules between samples of
     the inputs -> their cost of held-out arcs over that of the one taken. hamiltonian: H in words,
-    its terms as of L.
+    its terms as of L; None where some coordinates drive others, which do not act back on them.
     zeros: angle -> (where it is zero, standard error), already inside the formula. observe: column
     -> what its sensor shows, where that is not the coordinate; sensors: the parameters in it,
     fitted, with standard errors. noise: column -> σ of its samples; residual: of the fit's arcs,
@@ -85,7 +85,7 @@ class LearnedLaw:
     gains: dict[str, dict[str, tuple[float, float]]]
     delay: tuple[float, float] | None
     input_rules: dict[str, float]
-    hamiltonian: Hamiltonian
+    hamiltonian: Hamiltonian | None
     zeros: dict[str, tuple[float, float]]
     observe: dict[str, str]
     sensors: dict[str, tuple[float, float]]
@@ -120,7 +120,18 @@ class LearnedLaw:
             [Term(code, *self.gains[name][q]) for name, code in zip(self.gains, codes, strict=True)]
             for q in sensors.positions
         ]
-        return equations_of_motion(self.lagrangian, self.friction, forces, *self.symbols)
+        terms = law_of_map(self.map).terms
+        acts = terms.acting(np.ones((terms.count, terms.dim))).T
+        lagrangians = [
+            Formula(tuple(t for t, one in zip(self.lagrangian.terms, row, strict=True) if one))
+            for row in acts
+        ]
+        return equations_of_motion(lagrangians, self.friction, forces, *self.symbols)
+
+    @property
+    def leaders(self) -> tuple[int, ...]:
+        """Coordinates, by their places, that drive the others and are not moved by them."""
+        return law_of_map(self.map).terms.leaders
 
     @property
     def verdict(self) -> str:
@@ -188,12 +199,12 @@ class LearnedLaw:
             unit = self.units[name]
             lines.append(f"gain of {name}, force per {unit or 'unit'} of it: {per_coordinate}")
         lines += [self._inputs_line] if self.delay is not None else []
-        energy = self.energy
-        lines.append(
-            f"energy per second, in the unit of L: stored {energy['stored']:.3g} = supplied "
-            f"{sum(energy['supplied'].values()):.3g} - lost {sum(energy['lost'].values()):.3g} + "
-            f"unexplained {energy['closure']:.1g}"
-        )
+        if energy := self.energy:
+            lines.append(
+                f"energy per second, in the unit of L: stored {energy['stored']:.3g} = supplied "
+                f"{sum(energy['supplied'].values()):.3g} - lost {sum(energy['lost'].values()):.3g}"
+                f" + unexplained {energy['closure']:.1g}"
+            )
         wander = sensors.wander if sensors is not None else None
         if sensors is not None and sensors.level:
             lines.append(

@@ -122,6 +122,13 @@ def gyroscopic(dim: int, angles: tuple[int, ...], degree: int) -> list[Row]:
     return rows
 
 
+def couplings(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """Masses of second modes, of which a turning arm makes centrifugal forces."""
+    speeds = [unit(dim, *pair) for pair in combinations_with_replacement(range(dim), 2)]
+    none, twice = (0,) * dim, [unit(dim, i, i) for i in angles]
+    return [(k, none, m, phase) for k in speeds for m in twice for phase in (0.0, SINE)]
+
+
 def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """Modes up to |m| = 3 and their sines in V, up to 2 in T; powers of lengths up to 6 in V, 2 in
     T."""

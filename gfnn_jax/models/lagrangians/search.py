@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from gfnn_jax.dataset.stretches import arcs_of
-from gfnn_jax.errors import InputError
+from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians import libraries
@@ -26,7 +26,7 @@ from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, table_of
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, with_delay
-from gfnn_jax.models.lagrangians.starts import best_start
+from gfnn_jax.models.lagrangians.starts import OPTIONS, best_start, leading, misfit
 from gfnn_jax.models.lagrangians.structure import Held, Key, Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import protected, weak_start
 from gfnn_jax.models.lagrangians.zeros import with_zeros_of_runs
@@ -76,16 +76,27 @@ def fit_given(given: Given, scale: float, problem: ArcProblem) -> SearchResult:
     d, options = problem.dim, problem.options
     linear = tuple(libraries.losses(d, (LINEAR,), 0.0)[:d])
     friction = linear if given.friction is None else given.friction
-    structure = Structure(d, given.terms, friction, (), problem.num_inputs, problem.sensors)
-    held, bounds = told_in(given, structure, scale)
-    structure = dataclasses.replace(structure, held=held)
-    structure, known = weak_start(structure, problem, prune=False)
+    whole = Structure(d, given.terms, friction, (), problem.num_inputs, problem.sensors)
+    held, bounds = told_in(given, whole, scale)
+    whole = dataclasses.replace(whole, held=held)
     plain = all(row[3] == 0 for row in given.terms)  # a sine or a phase says where zero is
-    zeros = structure.with_a_zero(problem.turned) if plain else ()
-    structure = structure.plus([("zero", i) for i in zeros])
-    first, *longer = options.periods
-    model = choose_rule(problem, structure, known, problem.arcs(first), problem.scales.sigma)
-    problem.on_progress(f"{first:g} periods: {model.fit}")
+    zeros = whole.with_a_zero(problem.turned) if plain else ()
+    (first, *longer), models = options.periods, []
+    for leaders in ((), *leading(problem)):
+        try:
+            own, known = weak_start(dataclasses.replace(whole, leaders=leaders), problem, False)
+        except FitError:
+            if leaders:
+                continue
+            raise
+        structure = own.plus([("zero", i) for i in zeros])
+        model = choose_rule(problem, structure, known, problem.arcs(first), problem.scales.sigma)
+        problem.on_progress(f"{first:g} periods: {model.fit}")
+        models.append(model)
+        if misfit(model.fit) < OPTIONS.noise:
+            break
+    least = min(misfit(model.fit) for model in models)
+    model = next(m for m in models if misfit(m.fit) <= OPTIONS.plain * least)
     if model.fit.undetermined:
         p = model.fit.linearised.shortest()
         known = dict(zip(model.fit.structure.keys(), p.tolist(), strict=True))
@@ -299,12 +310,14 @@ class TermSearch:
         arcs gain; as it is where the residuals are rounding."""
         every = every or self.every
         assert every is not None  # terms are searched
+        every = dataclasses.replace(every, leaders=fit.structure.leaders)
         refused: set[Key] = set()
         options, problem, costs = fit.problem.options, fit.problem, None
         evidence = options.evidence
         for _ in range(0 if fit.is_exact else options.tries):
             scores = fit.scores(every)
-            scores = {k: z for k, z in scores.items() if k not in refused and z > evidence.scored}
+            open_ = (k for k in scores if k not in refused and fit.structure.may_have(k))
+            scores = {k: scores[k] for k in open_ if scores[k] > evidence.scored}
             if not scores:
                 break
             key = max(scores, key=lambda k: scores[k])
@@ -333,12 +346,13 @@ class TermSearch:
         if self.frictions is None:
             return fit, FrictionChoice(fit.structure.friction, {}, {}, gains=False)
         problem, options, begun = fit.problem, fit.problem.options, fit
+        frictions = [row for row in self.frictions if fit.structure.may_have(("loss", row))]
         third = problem.systems.a_third(problem.nodes)
         length = max(options.fewest, min(fit.arcs.t.shape[1], third))
         arcs = arcs_of(problem.nodes, length)
         if arcs.t.shape != fit.arcs.t.shape:
             fit = fit.again(arcs=arcs)
-        choice = chosen(table_of(fit, self.frictions), options.choose_friction)
+        choice = chosen(table_of(fit, frictions), options.choose_friction)
         tried = [(fit, choice)]
         for _ in range(options.choices):
             rows = [problem.word(("loss", row)) for row in choice.rows]
@@ -346,14 +360,14 @@ class TermSearch:
             if set(choice.rows) == set(fit.structure.friction):
                 break
             fit = fit.again(dataclasses.replace(fit.structure, friction=choice.rows))
-            choice = chosen(table_of(fit, self.frictions), options.choose_friction, choice)
+            choice = chosen(table_of(fit, frictions), options.choose_friction, choice)
             tried.append((fit, choice))
         else:
             if options.choose_friction:
                 fit, choice = likeliest(tried)
         rows = fit.structure.friction
         if set(choice.rows) != set(rows):
-            choice = chosen(table_of(fit, self.frictions), options.choose_friction, rows=rows)
+            choice = chosen(table_of(fit, frictions), options.choose_friction, rows=rows)
         fit = without_drives(begun.again(fit.structure, fit.values))
         return fit, choice._replace(rows=fit.structure.friction)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -73,12 +74,13 @@ class _Library(NamedTuple):
     """Terms of a start. rank: among libraries, the plainest first. apart: without friction between
     coordinates, which with masses below zero imitates a force at right angles to the motion. equal:
     with equal masses of all coordinates, for the weak form makes the equation of one as small as it
-    likes."""
+    likes. leaders: coordinates that drive the others and are not moved by them."""
 
     rows: Sequence[Row]
     rank: int = 0
     apart: bool = False
     equal: bool = False
+    leaders: tuple[int, ...] = ()
 
 
 def best_start(problem: ArcProblem) -> LawFit:
@@ -107,12 +109,33 @@ def best_start(problem: ArcProblem) -> LawFit:
     some.add_central(textbook.rows, 4, across=True)
     some.add_richer([row for row in every if sum(row[0]) < 2 or row in first], 5)
     some.add_richer(every, 6)
+    some.add_led([*first, *libraries.couplings(d, angles)], 7)
     if not some.fits or (some.one_valued and not some.followed):
         raise no_law(problem.scales)
-    most = OPTIONS.plain * min(map(some.misfit, some.fits))
+    most = OPTIONS.plain * min(map(misfit, some.fits))
     ranked = zip(some.ranks, some.fits, strict=True)
-    near = [(rank, some.misfit(fit), fit) for rank, fit in ranked if some.misfit(fit) <= most]
+    near = [(rank, misfit(fit), fit) for rank, fit in ranked if misfit(fit) <= most]
     return min(near, key=lambda one: one[:2])[2]
+
+
+def misfit(fit: LawFit) -> float:
+    """The largest residual of a channel, in units of its noise."""
+    if not (fit.follows and fit.is_definite):
+        return np.inf
+    return float(np.max(fit.rms() / fit.problem.scales.sigma))
+
+
+def leading(problem: ArcProblem) -> list[tuple[int, ...]]:
+    """Sets of coordinates that may drive the others without being moved by them: where there are
+    inputs, as of a motor."""
+    axes = range(problem.dim if problem.num_inputs else 0)
+    return [some for n in axes[1:] for some in combinations(axes, n)]
+
+
+def _is_of(fit: LawFit, structure: Structure) -> bool:
+    """Return whether a fit has the terms of a structure."""
+    own = fit.structure
+    return (own.terms, own.leaders) == (structure.terms, structure.leaders)
 
 
 class _Starts:
@@ -136,6 +159,7 @@ class _Starts:
             moved = [dataclasses.replace(n, x=n.x - about) for n in problem.nodes]
             seen = dataclasses.replace(problem, nodes=moved)
         whole = Structure(d, terms, friction, (), problem.num_inputs, problem.sensors)
+        whole = dataclasses.replace(whole, leaders=library.leaders)
         try:
             structure, known = weak_start(whole, seen, equal=library.equal)
         except FitError:
@@ -146,7 +170,7 @@ class _Starts:
         )
         if zero is not None:
             known = known | {("zero", i): float(zero[i]) for i in zeros}
-        elif any(structure.terms == other.structure.terms for other in self.fits):
+        elif any(_is_of(other, structure) for other in self.fits):
             return
         periods = problem.options.periods[0]
         rule = choose_rule(problem, structure, known, problem.arcs(periods), problem.scales.sigma)
@@ -168,6 +192,13 @@ class _Starts:
             self.add(_Library(plain, rank, apart=True, equal=True))
         if not self.are_noise:
             self.add(_Library(rows, rank, apart=True))
+
+    def add_led(self, rows: Sequence[Row], rank: int) -> None:
+        """Start from coordinates that drive others and are not moved by them, as a cart whose motor
+        holds its course moves a pendulum, where the residuals of all starts are more than noise."""
+        for leaders in leading(self.problem):
+            if not self.are_noise:
+                self.add(_Library(rows, rank, apart=True, leaders=leaders))
 
     def add_central(self, textbook: Sequence[Row], rank: int, across: bool) -> None:
         """Start from a force along or across the line to the origin by a power of the distance,
@@ -208,15 +239,15 @@ class _Starts:
             if exponent and (len(others), exponent) not in tried and not self.are_noise:
                 before = len(self.fits)
                 self.add(_Library(rows(exponent, others), rank, apart=True, equal=True))
-                misfit = min(map(self.misfit, self.fits[before:]), default=np.inf)
-                tried[len(others), exponent] = misfit
+                least = min(map(misfit, self.fits[before:]), default=np.inf)
+                tried[len(others), exponent] = least
 
         for which in range(2):
             for others, of in found:
                 attempt(of[which], others)
         for others, (a, b) in found:
             at_a, at_b = (tried.get((len(others), e), np.inf) for e in (a, b))
-            least = min(map(self.misfit, self.fits), default=0.0)
+            least = min(map(misfit, self.fits), default=0.0)
             if a == b or min(at_a, at_b) > least or not np.isfinite(max(at_a, at_b)):
                 continue
             for sign in (-1, 1):  # misfits are proportional to the distance from the exponent
@@ -226,25 +257,17 @@ class _Starts:
                     plain if abs(best - plain) < OPTIONS.rounded else float(f"{best:.4g}"), others
                 )
 
-    def misfit(self, fit: LawFit) -> float:
-        """The largest residual of a channel, in units of its noise."""
-        if not (fit.follows and fit.is_definite):
-            return np.inf
-        return float(np.max(fit.rms() / self.problem.scales.sigma))
-
     @property
     def are_noise(self) -> bool:
         """Return whether the residuals of some start are."""
-        return min(map(self.misfit, self.fits), default=np.inf) < OPTIONS.noise
+        return min(map(misfit, self.fits), default=np.inf) < OPTIONS.noise
 
     @property
     def followed(self) -> bool:
         """Return whether some start follows its arcs."""
         y = np.concatenate([n.y - n.zero for n in self.problem.nodes])
         most = OPTIONS.share * np.nanstd(y, axis=0)
-        return any(
-            self.misfit(fit) < OPTIONS.followed and np.all(fit.rms() < most) for fit in self.fits
-        )
+        return any(misfit(fit) < OPTIONS.followed and np.all(fit.rms() < most) for fit in self.fits)
 
     def far_zeros(self) -> np.ndarray:
         """Zeros (d,) of angles, by the weak form; 0 where none is far off, or none determined."""

@@ -5,7 +5,8 @@ L → c L + const moves nothing, so one coefficient has to be given: the mean of
 1. (To set the coefficient of ½v₁² alone would admit M₁₁ = 1 − 1.3 cos q + 0.3 cos 2q, which is
 nearly zero where the data are, and fits any record with nothing.) In a law whose M₁₁ is constant
 that is ½ of v₁². Coordinates that no term or friction couples with q₁ have a scale of their own, by
-which their part of L may be multiplied: there the mean of the first one's inertia is 1 too.
+which their part of L may be multiplied: there the mean of the first one's inertia is 1 too. So have
+coordinates that others drive, which do not act back on these (`leaders`).
 
 Where runs differ in parameters of the system, a row has one more entry, the whole powers of these
 that its coefficient is multiplied by; a row without it does not depend on them. Within a run
@@ -53,16 +54,6 @@ def is_constant(row: Row) -> bool:
     return not any(coordinates_in(row))
 
 
-def _moves(key: Key, part: tuple[int, ...]) -> bool:
-    """Return whether a coefficient is of a term, friction or gain of these coordinates."""
-    if key[0] == "gain":
-        return key[1] in part
-    if key[0] not in ("term", "loss"):
-        return False
-    moved = _touched(key[1]) if key[0] == "term" else key[1][0]
-    return any(moved[i] for i in part)
-
-
 def _touched(row: Row) -> list[bool]:
     """Return whether a term is one of each coordinate or of its velocity."""
     return [bool(k or f) for k, f in zip(row[0], coordinates_in(row), strict=True)]
@@ -82,7 +73,8 @@ class Held(NamedTuple):
 class Structure:
     """Terms of L (the first is ½v₁²·2), friction, the coordinates whose zero is unknown, the number
     of inputs, each with a gain for each coordinate, the names of the sensors' parameters with where
-    they start, and the terms whose coefficients are ``held``."""
+    they start, the terms whose coefficients are ``held``, and the coordinates that drive others,
+    which do not act back on them (``leaders``)."""
 
     dim: int
     terms: tuple[Row, ...]
@@ -91,6 +83,7 @@ class Structure:
     num_inputs: int = 0
     sensors: tuple[tuple[str, float], ...] = ()
     held: tuple[Held, ...] = ()
+    leaders: tuple[int, ...] = ()
 
     def keys(self) -> list[Key]:
         """A name of each free coefficient, in their order."""
@@ -122,13 +115,13 @@ class Structure:
     def uncoupled(self) -> tuple[tuple[int, ...], ...]:
         """The coordinates in parts that no term or friction couples, that of the first one first; a
         part that nothing sets in motion belongs to the first. One part where systems differ."""
-        rows = [_touched(row) for row in self.terms]
+        rows = [self._acted_on(row) for row in self.terms]
         rows += [list(map(bool, row[0])) for row in self.friction]
         part = np.arange(self.dim) if self.powers is None else np.zeros(self.dim, int)
         for row in rows:
             axes = np.flatnonzero(row)
             part[np.isin(part, part[axes])] = min(part[axes], default=0)
-        moved = [row[0].index(2) for row in self.terms if max(row[0]) == 2]
+        moved = [i for row in self.terms for i in range(self.dim) if self._is_inertia(row, i)]
         part[~np.isin(part, part[moved])] = 0
         return tuple(tuple(np.flatnonzero(part == i).tolist()) for i in np.unique(part))
 
@@ -139,12 +132,40 @@ class Structure:
         return (0, *map(self._inertia_of, self.uncoupled[1:]))
 
     def _inertia_of(self, part: tuple[int, ...]) -> int:
-        own = [k for k, row in enumerate(self.terms) if any(row[0][i] == 2 for i in part)]
+        own = [k for k, row in enumerate(self.terms) if any(self._is_inertia(row, i) for i in part)]
 
         def rank(k: int) -> tuple[int, bool]:
             return self.terms[k][0].index(2), not is_constant(self.terms[k])
 
         return min(own, key=rank)
+
+    def _acted_on(self, row: Row) -> list[bool]:
+        """Return whether a term acts on each coordinate."""
+        touched = _touched(row)
+        if any(own and i not in self.leaders for i, own in enumerate(touched)):
+            return [own and i not in self.leaders for i, own in enumerate(touched)]
+        return touched
+
+    def _is_inertia(self, row: Row, i: int) -> bool:
+        """Return whether a term is a part of the inertia of coordinate i."""
+        return row[0][i] == 2 and self._acted_on(row)[i]
+
+    def _moves(self, key: Key, part: tuple[int, ...]) -> bool:
+        """Return whether a coefficient is of a term, friction or gain of these coordinates."""
+        if key[0] == "gain":
+            return key[1] in part
+        if key[0] not in ("term", "loss"):
+            return False
+        moved = self._acted_on(key[1]) if key[0] == "term" else key[1][0]
+        return any(moved[i] for i in part)
+
+    def may_have(self, key: Key) -> bool:
+        """Return whether a coefficient may belong to it: no friction of the relative speed of
+        coordinates that drive and are driven."""
+        if key[0] != "loss" or not self.leaders:
+            return True
+        moved = np.flatnonzero(key[1][0])
+        return len({i in self.leaders for i in moved.tolist()}) == 1
 
     @property
     def _free(self) -> list[int]:
@@ -170,7 +191,7 @@ class Structure:
     def form(self, q: np.ndarray, args: np.ndarray | None = None) -> Form:
         """The law with free coefficients, in the gauge of the positions q (n, d), where systems
         have the parameters args (n, k)."""
-        terms, powers = Terms.of(self.terms, self.dim), self.powers
+        terms, powers = Terms.of(self.terms, self.dim, self.leaders), self.powers
         values = terms.potentials(q, order=0).value
         if powers is not None:
             values = values * functions_of(powers[: terms.count], args)
@@ -185,7 +206,7 @@ class Structure:
                 fixed[k], basis[k] = value * fixed[source], value * basis[source]
         for k in self.given:
             i = self.terms[k][0].index(2)
-            own = inertia[:, i, i] * values.mean(axis=0)
+            own = terms.acting(inertia, 2)[:, i, i] * values.mean(axis=0)
             fixed[k] = (1 - own @ fixed) / own[k]
             basis[k] = -(own @ basis) / own[k]
         friction = Friction.of(self.friction, self.dim)
@@ -197,7 +218,7 @@ class Structure:
         for part, place in zip(self.uncoupled[1:], self.given[1:], strict=True):
             i, own = self.terms[place][0].index(2), {}
             for key, value in known.items():
-                if key[0] == "term" and key[1][0][i] == 2:
+                if key[0] == "term" and self._is_inertia(key[1], i):
                     own[key[1]] = value
             if self.terms[place] not in own:
                 continue
@@ -205,7 +226,7 @@ class Structure:
             means = terms.potentials(q, order=0).value.mean(axis=0)
             mean = np.sum(terms.quadratic()[0][:, i, i] * means * list(own.values()))
             by = 1 / mean if mean > 0 else 1.0
-            known = {k: by * c if _moves(k, part) else c for k, c in known.items()}
+            known = {k: by * c if self._moves(k, part) else c for k, c in known.items()}
         return known
 
     def without(self, keys: set[Key]) -> Structure:

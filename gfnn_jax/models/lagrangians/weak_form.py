@@ -203,8 +203,8 @@ def weak_rows(form: Form, node: Nodes, length: float) -> tuple[np.ndarray, np.nd
         weights = functions_of(form.powers, node.stretch.args)[: len(weights)]
     f, df, _ = terms.potentials(q, order=1)
     g, dg = terms.motion(v)
-    momentum = (dg * f[..., None]).swapaxes(1, 2)  # (n, d, P)
-    force = (df * g[..., None]).swapaxes(1, 2)
+    momentum = terms.acting(dg * f[..., None]).swapaxes(1, 2)  # (n, d, P)
+    force = terms.acting(df * g[..., None]).swapaxes(1, 2)
     lost = form.friction.residuals(v).swapaxes(1, 2)
     columns, targets = [], []
     for place, phi, slope in bumps(t, length):
