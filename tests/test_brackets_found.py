@@ -136,6 +136,15 @@ def test_no_bracket_is_claimed_where_there_is_none():
     assert raised.value.verdict.startswith("no law: no bracket, nearest singular value 0.0")
 
 
+def test_uniform_friction_is_told_with_its_rate():
+    def damped(w):
+        return top(w) - 0.05 * w
+
+    with pytest.raises(FitError, match="uniform friction: the flow multiplies") as raised:
+        learned(damped, np.random.default_rng(0).normal(size=(16, 3)))
+    assert float(raised.value.verdict.rsplit(" ", 1)[1]) == pytest.approx(0.05, rel=1e-7)
+
+
 def test_too_few_runs_are_refused():
     data = runs_of(top, np.array([[1.0, 0.5, -0.3]]), 0.2, 80)
     with pytest.raises(FitError, match="2 functions of degree 2 are constant"):

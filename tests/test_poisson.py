@@ -100,6 +100,21 @@ def test_few_runs_with_noise_are_told_to_be_too_few(count):
     assert raised.value.verdict == f"no law: {count} run{'s' * (count > 1)} do not determine it"
 
 
+def test_one_noisy_orbit_of_predators_and_prey():
+    def rates(z):
+        return z * np.array([0.9 - 0.03 * z[1], 0.02 * z[0] - 0.8])
+
+    data = runs_of(rates, np.array([[31.0, 19.5]]), 0.5, 160)
+    rng, known = np.random.default_rng(0), np.array([0.8, 0.9, -0.02, -0.03])
+    z = np.concatenate([data.z0, data.z1[-1:]])
+    z *= np.exp(0.05 * rng.normal(size=z.shape))
+    about = {"run": data.run, "place": data.place, "structure": "poisson"}
+    fit = gfnn.fit(gfnn.Pairs(z[:-1], z[1:], 0.5, **about, names=("prey", "predator")))
+    assert fit.bracket.name == "log-canonical"
+    assert [t.term for t in fit.law.terms] == ["log(prey)", "log(predator)", "prey", "predator"]
+    assert np.array([t.coefficient for t in fit.law.terms]) == pytest.approx(known, rel=0.1)
+
+
 def test_a_gyroscope_on_the_command_line(tmp_path, capsys):
     data = gyroscope(tmp_path / "gyro.csv", 6)
     figure = str(tmp_path / "look.png")

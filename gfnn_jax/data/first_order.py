@@ -25,7 +25,7 @@ class _Options:
     that noise leaves of one that is constant in each.
     """
 
-    lags: tuple[int, ...] = (2, 4, 8, 16, 32)
+    lags: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
     quarter: float = 1.5
     samples: int = 4
     parts: int = 8
@@ -89,10 +89,8 @@ def _quadratic(x: np.ndarray) -> np.ndarray:
 def _explained(moved: list[np.ndarray], sums: list[np.ndarray], every: np.ndarray) -> float:
     """The least share of the changes (n_r, k) that functions (n_r, m) explain, of each part by the
     fit to the others; 0 of changes that are too few or too long."""
-    if len(moved) > 2:
-        part = [np.full(len(x), r % _OPTIONS.parts) for r, x in enumerate(moved)]
-    else:
-        part = [np.arange(len(x)) * _OPTIONS.parts // max(len(x), 1) for x in moved]
+    few = len(moved) < _OPTIONS.runs
+    part = [np.full(len(x), 0 if few else r % _OPTIONS.parts) for r, x in enumerate(moved)]
     target, rows, part = (np.concatenate(of) for of in (moved, sums, part))
     if len(rows) < _OPTIONS.samples * rows.shape[1]:
         return 0.0
@@ -104,7 +102,8 @@ def _explained(moved: list[np.ndarray], sums: list[np.ndarray], every: np.ndarra
     left = np.zeros(target.shape[1])
     for one in np.unique(part):
         own = part == one
-        c = np.linalg.lstsq(rows[~own], target[~own], rcond=_OPTIONS.told_apart)[0]
+        others = own if few else ~own
+        c = np.linalg.lstsq(rows[others], target[others], rcond=_OPTIONS.told_apart)[0]
         left += np.sum((target[own] - rows[own] @ c) ** 2, axis=0)
     return float(np.min(1 - left / np.maximum(len(target) * variance, 1e-300)))
 

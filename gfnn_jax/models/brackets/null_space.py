@@ -137,6 +137,36 @@ def null_spaces(
         yield NullSpace(tensors, vectors, values)
 
 
+def shrinking(z: np.ndarray, f: np.ndarray, slope: np.ndarray) -> float | None:
+    """λ ≠ 0 of L_f B = λB, by which uniform friction shrinks a constant or affine bracket of the
+    highest rank: the null space as an eigenvalue problem. None where there is none to roundoff.
+
+    z: (N, n) states. f, slope: the field and its derivative there.
+    """
+    scale = np.sqrt(np.mean(z**2, axis=0))
+    y, (f, slope) = z / scale, _in_units(f, slope, scale)
+    size, n = np.sqrt(np.mean(np.sum(slope**2, axis=(1, 2)))), z.shape[1]
+    for kind in (CONSTANT, LINEAR):
+        tensors = Tensors(kind, n)
+        lie, values = tensors.lie(y, f, slope), tensors.monomials(y)[0]
+        every = np.einsum("npk,pq->npqk", values, np.eye(len(tensors.places)))
+        lie, every = lie.reshape(-1, tensors.num), every.reshape(-1, tensors.num)
+        matrix = np.linalg.lstsq(every, lie, rcond=None)[0]
+        eigen = np.linalg.eig(matrix)
+        eigenvalues, vectors = np.asarray(eigen[0], complex), np.asarray(eigen[1], complex)
+        real = np.abs(np.imag(eigenvalues)) <= OPTIONS.null * size
+        rates, columns = np.real(eigenvalues[real]), np.real(vectors.T[real])
+        for found, vector in zip(rates, columns, strict=True):
+            bracket = every @ vector
+            left = np.linalg.norm(lie @ vector - found * bracket) / np.linalg.norm(bracket)
+            form = np.zeros((n, n))
+            form[tuple(np.transpose(tensors.places))] = bracket[: len(tensors.places)]
+            whole = np.linalg.matrix_rank(form - form.T, tol=1e-6 * np.abs(form).max()) == n - n % 2
+            if left <= OPTIONS.null * size < abs(found) and whole:
+                return float(found)
+    return None
+
+
 def _in_units(f, slope, scale):
     return f / scale, slope * scale / scale[:, None]
 

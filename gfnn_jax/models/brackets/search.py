@@ -29,7 +29,7 @@ from gfnn_jax.models.brackets.fields import (
     undetermined,
 )
 from gfnn_jax.models.brackets.find import Found, brackets_of, library_of, polynomials, upright
-from gfnn_jax.models.brackets.null_space import CONSTANT, LINEAR, LOG, null_spaces
+from gfnn_jax.models.brackets.null_space import CONSTANT, LINEAR, LOG, null_spaces, shrinking
 from gfnn_jax.models.brackets.poisson_field import PoissonField, hamiltonian_of
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.signals.noise import noise
@@ -127,7 +127,13 @@ def law_of(
         return _of_bracket(bracket, train, held, terms, on_progress)
     field, fit, error, notes = _free_field(train, held, names, terms, on_progress)
     if error > OPTIONS.exact and terms is None:
-        _refuse_relations_in_noise(train, names, fit)
+        sigma = _noise_of(train, fit)
+        law = _of_populations(train, held, names, sigma)
+        if law is not None:
+            return law
+        hidden = _hidden_relations(train, names, sigma)
+        if hidden:
+            raise _too_few_runs(hidden + 1, 2, len(np.unique(train.run)))
     noisy = _noise(field, fit, error, train)
     fit = fit if noisy is None else noisy.fit
     if noisy is None and error > OPTIONS.exact and terms is None:
@@ -153,6 +159,14 @@ def law_of(
             law = _through_flow(found, train, held, notes, noisy)
             if law.error <= max(OPTIONS.worse * error, OPTIONS.exact):
                 return law
+    rate = shrinking(some, f, slope)
+    if rate is not None:
+        raise FitError(
+            f"uniform friction: the flow multiplies a bracket by exp(−{rate:.8g} t), t in the unit "
+            "of dt. Laws with a bracket and friction are not learned yet; of (q, p) they are, "
+            "without structure='poisson'",
+            f"no law: uniform friction, a bracket shrinks at the rate {rate:.8g}",
+        )
     more = ". With noise more runs may show one" if noisy is not None else ""
     values = ", ".join(f"{value:.2g} ({kind})" for kind, value in nearest.items())
     raise FitError(
@@ -216,25 +230,45 @@ _SHELL = (
 )
 
 
-def _refuse_relations_in_noise(train: Data, names: tuple[str, ...], fit: FieldFit) -> None:
-    """Raise FitError where noise hides that the runs keep more than one relation of degree 2, which
-    its functions without a constant then still have."""
-    library = polynomials(names, 2)
+def _noise_of(train: Data, fit: FieldFit) -> np.ndarray:
+    """Noise (n,) of the states, at most: what local polynomials and the field leave."""
     sequences = arcs_of(train.z0, train.z1, train.run, train.place)
-    columns = np.concatenate(sequences).T
-    known = noise([np.arange(float(len(s))) for s in sequences], columns)
+    times = [np.arange(float(len(s))) for s in sequences]
+    known = [one.sigma for one in noise(times, np.concatenate(sequences).T)]
     left = np.sqrt(np.mean(fit.residual**2, axis=0) / 2)
-    sigma = np.array(
-        [s if n.sigma is None else min(n.sigma, s) for n, s in zip(known, left, strict=True)]
-    )
+    return np.array([r if s is None else min(s, r) for s, r in zip(known, left, strict=True)])
+
+
+def _hidden_relations(train: Data, names: tuple[str, ...], sigma: np.ndarray) -> int:
+    """Number of relations, beyond one, among functions of degree 2 that noise hides."""
+    library = polynomials(names, 2)
     values = library.term_values(train.z0)
     units = np.linalg.norm(values, axis=0)
     _, s, vt = np.linalg.svd(values / units, full_matrices=False)
     slopes = np.einsum("njk,mk->nmj", library.term_gradients(train.z0), vt / units)
     by_noise = np.sqrt(np.sum((slopes * sigma) ** 2, axis=(0, 2)))
-    hidden = int(np.sum(s <= OPTIONS.hidden * by_noise))
-    if hidden:
-        raise _too_few_runs(hidden + 1, 2, len(np.unique(train.run)))
+    return int(np.sum(s <= OPTIONS.hidden * by_noise))
+
+
+def _of_populations(train: Data, held: Data, names, sigma: np.ndarray) -> PoissonLaw | None:
+    """The law of one kind of predators and one of prey: {x, y} = x y, and one orbit with noise
+    determines H of x, y and their logarithms. None of other states, and where it leaves more than
+    their noise."""
+    z = np.concatenate([train.z0, train.z1])
+    if z.shape[1] != 2 or (z <= 0).any() or np.ndim(train.dt):
+        return None
+    bracket = Bracket.log([[0, 1], [-1, 0]], names)
+    field = PoissonField(bracket, library_of(LOG, names, 1, None))
+    middle, rate = 0.5 * (train.z0 + train.z1), (train.z1 - train.z0) / train.dt
+    start = hamiltonian_of(bracket, field.library, middle, rate)
+    arcs = equal_arcs(arcs_of(train.z0, train.z1, train.run, train.place))
+    own = fit_arcs(field, start.c, arcs, train.dt, sigma)
+    if (own.sigma > OPTIONS.grown * sigma).any():
+        return None
+    left = np.broadcast_to(own.sigma, train.z0.shape)
+    relative = float(np.mean(own.sigma / train.spread))
+    fit = FieldFit(own.c, left, relative, own.root, 0, own.field)
+    return PoissonLaw(own.field, fit, error_on(own.field, own.c, held), bracket.name, (), own.sigma)
 
 
 def _too_few_runs(missing: int, degree: int, runs: int) -> FitError:
