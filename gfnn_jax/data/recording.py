@@ -42,6 +42,7 @@ from gfnn_jax.data.tables import (
     rows_of,
     runs_of,
     second_times,
+    with_events,
 )
 from gfnn_jax.data.text_files import from_text
 from gfnn_jax.data.waves import wave
@@ -70,7 +71,9 @@ class ReadOptions(TypedDict, total=False):
     coordinates: what moves, where it is not the positions: ``observe`` then says how columns show
              it; by default those that its formulas name (theta, or omega, which is its velocity).
     observe: column -> text such as "x0 + R*sin(theta + tilt)", or a function of arguments with
-             these names: coordinates, velocities, and parameters to be fitted.
+             these names: coordinates, velocities, and parameters to be fitted. A column of times
+             at which the motion crosses h = 0, of a photogate, is "crossing(h)"; ``std`` is then
+             the noise of these times in s.
     guess:   where parameters of ``observe`` start.
     """
 
@@ -169,6 +172,8 @@ class Recording:
         columns, dt, time = names_of["columns"], options.get("dt"), options.get("time")
         std, observe = options.get("std") or {}, options.get("observe") or {}
         tables = [_selected(_timed(t, time), columns) for t in tables]
+        gates = [n for n, one in observe.items() if isinstance(one, str) and "crossing(" in one]
+        tables = [with_events(t, gates) for t in tables]
         tables, sigmas = with_sigmas(tables, std)
         source = ", ".join(dict.fromkeys(t.source for t in tables))
         names = list(dict.fromkeys(name for t in tables for name in t.columns))

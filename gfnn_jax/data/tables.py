@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,31 @@ def rows_of(table: Table, start: float, stop: float, every: int) -> Table:
     for name in table.times[:1]:
         keep &= ~((table.columns[name] < start) | (table.columns[name] > stop))
     return dataclasses.replace(table, columns={n: v[keep] for n, v in table.columns.items()})
+
+
+def with_events(table: Table, names: Collection[str]) -> Table:
+    """The table with a row at each time that stands in columns of events, by ``names``, where that
+    column is 0; elsewhere it is missing, and all others are there.
+
+    Raises InputError where the table has several runs.
+    """
+    events = {
+        n: table.columns[n][np.isfinite(table.columns[n])] for n in names if n in table.columns
+    }
+    if not events:
+        return table
+    if _run_column(table) is not None:
+        raise InputError(f"{table.source}: events of several runs: give a table for each run")
+    time = next(iter(table.times), "t")
+    others = {n: x for n, x in table.columns.items() if n not in events}
+    own = others.pop(time, np.zeros(0))
+    every, place = np.unique(np.concatenate([own, *events.values()]), return_inverse=True)
+    columns = {time: every} | {n: np.full(len(every), np.nan) for n in (*others, *events)}
+    for name, values in others.items():
+        columns[name][place[: len(own)]] = values
+    for name, times in events.items():
+        columns[name][np.isin(every, times)] = 0.0
+    return dataclasses.replace(table, columns=columns)
 
 
 def from_memory(table: Any) -> Table:

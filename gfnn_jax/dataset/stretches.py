@@ -233,13 +233,15 @@ def stretches(
     channels: Sequence[str] | None = None,
     coordinates_of: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
     parameters: Sequence[str] = (),
+    between: int = 0,
 ) -> list[Stretch]:
     """The stretches of all runs.
 
     channels: columns that are seen, the positions unless given. coordinates_of: (n, k) channels at
     times (n,) -> (n, d) coordinates, NaN where they are not told; None: the channels are the
     coordinates.
-    parameters: in which the systems of the runs differ.
+    parameters: in which the systems of the runs differ. between: places between two readings, of
+    events, where nothing is read.
     Raises FitError where no stretch is long enough.
     """
     names = recording.positions if channels is None else channels
@@ -247,10 +249,12 @@ def stretches(
     for run in recording.runs:
         t, u = recording.times(run), recording.array("inputs", run)
         y, noise = channels_of(recording, names, run)
+        if between:
+            t, y, u, noise = _with_places(t, y, u, noise, between)
         q = y if coordinates_of is None else coordinates_of(y, t)
         lifted = {*recording.angles} - {*names}  # angles that no column shows: columns are lifted
         turns = [i for i, n in enumerate(recording.coordinates) if n in lifted]
-        read = np.isfinite(y).any(1) & np.isfinite(u).all(1)
+        read = np.isfinite(q if between else y).any(1) & np.isfinite(u).all(1)
         t, y, u, q, noise = t[read], y[read], u[read], q[read], noise[read]
         if coordinates_of is not None and len(q):
             q = q.copy()
@@ -259,7 +263,7 @@ def stretches(
                 q[told, i] = np.unwrap(q[told, i])
         whole.append(Stretch(run, t, y, u, q, noise, args_of(recording, run, parameters)))
     even = [part for s in whole for part in s.complete().cut() if len(part.t) >= OPTIONS.shortest]
-    if even and _readings(even) >= OPTIONS.even * _readings(whole):
+    if even and not between and _readings(even) >= OPTIONS.even * _readings(whole):
         return even
     gap = GAP if recording.inputs else OPTIONS.empty
     found = [dataclasses.replace(part, even=False) for s in whole for part in s.cut(gap)]
@@ -270,6 +274,16 @@ def stretches(
             f"above {gap:g} times the median is a gap)"
         )
     return found
+
+
+def _with_places(
+    t: np.ndarray, y: np.ndarray, u: np.ndarray, noise: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Times, channels, inputs and noise with ``count`` places between two samples that are as far
+    apart as most."""
+    whole = Stretch("", t, y, u, y, noise, np.zeros(0))
+    s = whole.filled(float(np.median(np.diff(t))) / count)
+    return s.t, s.y, s.u, s.noise
 
 
 def _readings(found: Sequence[Stretch]) -> int:
@@ -308,10 +322,10 @@ def measure(found: Sequence[Stretch]) -> Scales:
     for stretch, own in zip(found, smooths, strict=True):
         systems.setdefault(tuple(stretch.args.tolist()), []).append(own)
     omega = max(_frequency(own, OPTIONS.slow * speed) for own in systems.values())
-    with np.errstate(invalid="ignore"):
-        stride = size / np.nanstd(np.concatenate([s.y for s in found]), axis=0)
+    spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
+    stride = np.divide(size, spread, out=np.full(len(size), omega * dt), where=spread > 0)
     longest = max(float(np.ptp(s.t)) for s in found)
-    return Scales(sigma, speed, omega, dt, half, float(np.nanmax(stride)), longest)
+    return Scales(sigma, speed, omega, dt, half, float(np.max(stride)), longest)
 
 
 def _inside(t: np.ndarray) -> np.ndarray:
@@ -341,7 +355,9 @@ def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
         known = [
             (s.t[have], s.y[have, k : k + 1]) for s in found for have in [~np.isnan(s.y[:, k])]
         ]
-        if all(s.even for s in found):
+        if not any(y.any() for _, y in known):  # of events
+            sigma.append(0.0)
+        elif all(s.even for s in found):
             known = [pair for pair in known if len(pair[0]) >= OPTIONS.shortest]
             if not known:
                 raise FitError(f"a column has no {OPTIONS.shortest} samples in a row: leave it out")
@@ -382,6 +398,8 @@ def _between_gaps(
     q, v, _ = curves.smooth(s.t, s.q, filled.t)
     seen = np.flatnonzero(np.isfinite(filled.y).any(1))
     longest = max(OPTIONS.gap * scales.period, 2 * scales.spacing)
+    usual = float(np.median(np.diff(filled.t[seen])))
+    longest = np.inf if usual > longest else longest  # of events
     ends = np.flatnonzero(np.diff(filled.t[seen]) > longest) + 1
     for a, b in pairwise([0, *map(int, ends), len(seen)]):
         yield filled, np.arange(seen[a], seen[b - 1] + 1), np.concatenate([q, v], axis=1)

@@ -297,11 +297,14 @@ def windows_of(
 
 
 def thinned(window: Window) -> Window:
-    """The window with every so many of its samples, counted from the last one: more tell no
-    more."""
+    """The window with every so many of its samples, counted from the last one, of each set of
+    channels that are read together: more tell no more."""
     every = -(-len(window.t) // _OPTIONS.most)
-    noise = None if window.noise is None else window.noise[::-every][::-1]
-    return window._replace(t=window.t[::-every][::-1], y=window.y[::-every][::-1], noise=noise)
+    which = np.unique(np.isfinite(window.y), axis=0, return_inverse=True)[1].ravel()
+    kept = [np.flatnonzero(which == k)[::-every] for k in range(which.max() + 1)]
+    keep = np.sort(np.concatenate(kept))
+    noise = None if window.noise is None else window.noise[keep]
+    return window._replace(t=window.t[keep], y=window.y[keep], noise=noise)
 
 
 def _with_inputs(window: Window, inputs: Recording, sensors: Sensors, run: str) -> Window:

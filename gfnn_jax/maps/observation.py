@@ -5,6 +5,7 @@
     px     =  x0 + R*sin(theta + tilt)  a camera with its pivot and its tilt
     gyro   =  omega + b                 a gyroscope alone: theta is seen by no sensor
     acc    =  l*theta_ddot + g*sin(theta)
+    gate   =  crossing(theta)           a photogate: times at which theta is zero
 
 A coordinate that no channel shows by positions alone is *unseen*: it starts as the integral of its
 velocity, zero on a line through the extremes of that, where no force acts. The slope of the line is
@@ -29,7 +30,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from gfnn_jax.data.roles import symbols
-from gfnn_jax.errors import InputError
+from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.expressions import (
     Expression,
     depends_on,
@@ -52,6 +53,9 @@ class Options:
     same: float = 1e-6  # sine of the angle between changes that are the same
     tried: int = 12  # places of an angle from which a state is looked for
     extreme: float = 0.25  # of the largest speed, that an extreme of the velocity has at least
+    few: float = 0.25  # of the samples: where fewer show positions alone, other channels do too
+    same_period: float = 0.8  # of the squares of periods: a decay that leaves more is none
+    between: int = 16  # places between two events, at which a state stands
     iterations: int = 30
 
 
@@ -72,6 +76,59 @@ class Sensor(Protocol):
         """g (...), ∂g/∂q (..., d), ∂g/∂v (..., d) and ∂g/∂c (..., m) at q, v (..., d) and c (m,)
         or (..., m). NumPy."""
         ...
+
+
+EVENTS = re.compile(r"\s*crossing\((.*)\)\s*")
+
+
+@dataclasses.dataclass(frozen=True)
+class Crossing:
+    """Events: times at which h(q; c) = 0 is crossed, the `Sensor` that reads zero there of the time
+    by which the crossing of a state is later, δt = h/ḣ, so that its noise is that of the times.
+
+    text: h in ``names`` of coordinates and in ``open`` parameters, which start at 0.
+    """
+
+    text: str
+    names: tuple[str, ...]
+    open: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, text: str, names: Sequence[str]) -> Crossing:
+        """Read h of the coordinates of these names."""
+        open_ = tuple(dict.fromkeys(n for n in names_in(text) if n not in names))
+        return cls(text, tuple(names), open_)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Names of c, with where they start."""
+        return dict.fromkeys(self.open, 0.0)
+
+    @cached_property
+    def _tree(self) -> Expression:
+        return parse_named(self.text, (*self.names, *self.open))
+
+    def __call__(self, q: np.ndarray, v: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, ...]:
+        """δt (...) and its derivatives in q, v (..., d) and c; 0 where h does not change."""
+        d, shape = q.shape[-1], q.shape[:-1]
+        w = np.concatenate([q, np.broadcast_to(c, (*shape, len(self.open)))], axis=-1)
+        (jet,) = jets([self._tree], w, 2)
+        slope, turn = np.zeros(w.shape), np.zeros((*w.shape, d))
+        for i, one in jet.slope.items():
+            slope[..., i] = one
+        for (i, j), one in jet.curvature.items():
+            for a, b in {(i, j), (j, i)}:
+                if b < d:
+                    turn[..., a, b] = one
+        rate = np.sum(slope[..., :d] * v, axis=-1)
+        over = np.divide(1.0, rate, out=np.zeros(shape), where=rate != 0)
+        late = jet.value * over
+        by_rate = (late * over)[..., None]
+        by = slope * over[..., None] - by_rate * np.sum(turn * v[..., None, :], axis=-1)
+        return late, by[..., :d], -by_rate * slope[..., :d], by[..., d:]
+
+    def __str__(self) -> str:
+        return f"crossing({self.text})"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -222,9 +279,11 @@ class Observation:
         if len(self.direct) == self.dim:
             return y[:, [self.direct[i] for i in range(self.dim)]]
         if self.unseen:
-            return self._integrated(t, y)
+            return self._integrated(t, y, angles)
         d = self.dim
         still = [k for k, name in enumerate(self.channels) if name in self.needed]
+        if np.mean(np.isfinite(y[:, still]).any(axis=1)) < OPTIONS.few:  # others, as at rest
+            still = [k for k, used in enumerate(self._used) if min(used, default=d) < d]
         q, best = np.zeros((len(y), d)), np.full(len(y), np.inf)
         scale = np.nanstd(y[:, still], axis=0) + 1e-300
         turns = np.arange(OPTIONS.tried) * 2 * np.pi / OPTIONS.tried
@@ -233,7 +292,7 @@ class Observation:
         for choice in product(*choices):
             x = np.zeros((len(y), 2 * d))
             for i, value in enumerate(choice):
-                x[:, i] = value if own[i] is None else y[:, own[i]]
+                x[:, i] = value if own[i] is None else np.nan_to_num(y[:, own[i]])
             x, left = self._followed(x, y, still, scale)
             better = left < best
             q[better], best[better] = x[better, :d], left[better]
@@ -249,8 +308,11 @@ class Observation:
                 q[:, i] = np.pi - (np.pi - q[:, i]) % (2 * np.pi)
         return q
 
-    def _integrated(self, t: np.ndarray | None, y: np.ndarray) -> np.ndarray:
-        """Coordinates of which the unseen ones are integrals of their velocities."""
+    def _integrated(
+        self, t: np.ndarray | None, y: np.ndarray, angles: Sequence[int] = ()
+    ) -> np.ndarray:
+        """Coordinates of which the unseen ones are integrals of their velocities, or swings between
+        events."""
         seen = [i for i in range(self.dim) if i not in self.unseen]
         if t is None or any(i not in self.direct for i in seen):
             names = ", ".join(self.coordinates[i] for i in self.unseen)
@@ -261,8 +323,27 @@ class Observation:
         q = np.full((len(y), self.dim), np.nan)
         q[:, seen] = y[:, [self.direct[i] for i in seen]]
         for i in self.unseen:
-            q[:, i] = _between_extremes(t, self._velocity(i, y))[0]
+            if i in self.crossed:
+                q[:, i] = _swung(t, y[:, self.crossed[i]], i in angles)
+            else:
+                q[:, i] = _between_extremes(t, self._velocity(i, y))[0]
         return q
+
+    @cached_property
+    def events(self) -> tuple[int, ...]:
+        """Channels that are times of events."""
+        return tuple(k for k, one in enumerate(self.formulas) if isinstance(one, Crossing))
+
+    @property
+    def crossed(self) -> dict[int, int]:
+        """Unseen coordinates -> the channel whose events they alone make."""
+        alone = {k: {i for i in self._used[k] if i < self.dim} for k in self.events}
+        return {min(own): k for k, own in alone.items() if len(own) == 1 and own <= {*self.unseen}}
+
+    @property
+    def between(self) -> int:
+        """Places between two events at which states stand; 0 where sensors show positions too."""
+        return OPTIONS.between if self.crossed else 0
 
     def _velocity(self, i: int, y: np.ndarray) -> np.ndarray:
         """The velocity (n,) of a coordinate by the channel that shows it alone, at ``values``."""
@@ -288,7 +369,7 @@ class Observation:
         """The observation whose parameters let unseen coordinates come back, as far as they can, in
         runs of times t (n,) and channels y (n, k), and suit all channels best."""
         found = self
-        for i in self.unseen:
+        for i in set(self.unseen) - {*self.crossed}:
             slopes = [(np.ptp(t), _between_extremes(t, found._velocity(i, y))[1]) for t, y in runs]
             weights, by = np.array(slopes).T
             back = np.zeros(2 * self.dim)
@@ -359,6 +440,8 @@ class Observation:
         by_state, unseen = self(x).by_state, list(self.unseen)
         J = by_state[..., : self.dim].copy()
         J[..., unseen] = np.hypot(J, omega * by_state[..., self.dim :])[..., unseen]
+        for i, k in self.crossed.items():  # by its speed, a time is a distance
+            J[:, k, i] = 1 / (omega * max(float(np.std(x[:, i])), 1e-300))
         J /= sigma[:, None]
         return 1 / np.sqrt(np.mean(np.sum(J**2, axis=1), axis=0))
 
@@ -445,8 +528,10 @@ def observed(
         formulas[name] = given if known else _text_of(given, starts)
         if isinstance(given, str):
             formulas[name] = re.sub(r"\b\w+_dot\b", lambda m: same.get(m[0], m[0]), given)
-        if isinstance(given, Sensor):
-            starts = {**given.parameters, **starts}
+            if event := EVENTS.fullmatch(given):
+                formulas[name] = Crossing.of(event[1], symbols(coordinates))
+        if isinstance(formulas[name], Sensor):
+            starts = {**formulas[name].parameters, **starts}
     parameters = [
         n
         for column, f in formulas.items()
@@ -539,6 +624,37 @@ def _between_extremes(t: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
         return np.where(known, q - np.mean(q), np.nan), 0.0
     line = np.polyfit(t[at], q[at], 1)
     return np.where(known, q - np.polyval(line, t), np.nan), float(line[0])
+
+
+def _swung(t: np.ndarray, seen: np.ndarray, turns: bool) -> np.ndarray:
+    """Swings (n,) that cross zero at the times t (n,) of events, where ``seen`` is no NaN; an
+    interval that is twice as long as most has a crossing that was missed. They are as large as a
+    pendulum's whose period T (1 + A²/16) dies down as these do. NaN before the first event and
+    behind the last.
+
+    Raises FitError where the periods of what ``turns`` are all the same, which any amplitude has.
+    """
+    at = t[np.isfinite(seen)]
+    if len(at) < FEWEST:
+        return np.full(len(t), np.nan)
+    steps = np.diff(at)
+    count = np.append(0.0, np.cumsum(np.maximum(np.round(steps / np.median(steps)), 1)))
+    place = np.interp(t, at, count, np.nan, np.nan)
+    period = (at[2:] - at[:-2]) / (count[2:] - count[:-2])
+    best, size, life = np.inf, 1.0, np.inf
+    for tried in count[-1] * np.geomspace(0.1, 3.0, 20):
+        rows = np.stack([np.ones(len(period)), np.exp(-count[1:-1] / tried)], axis=1)
+        (least, more), *_ = np.linalg.lstsq(rows, period, rcond=None)
+        left = np.sum((rows @ [least, more] - period) ** 2)
+        if left < best and 0 < more < least / 2:
+            best, size, life = left, np.sqrt(16 * more / least), 2 * tried
+    if turns and not best < OPTIONS.same_period * np.sum((period - np.mean(period)) ** 2):
+        raise FitError(
+            "the times between events show no change of the period, so that they do not tell how "
+            "large the swings are, nor the law: record swings that die down, or the angle too",
+            verdict="no law: times of events without a change of the period tell no amplitude",
+        )
+    return size * np.exp(-place / life) * np.sin(np.pi * place)
 
 
 def _spans(table: np.ndarray, column: np.ndarray) -> bool:

@@ -49,7 +49,7 @@ from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.damping import Damping, FunctionsOfArgs
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.inputs import Signals
-from gfnn_jax.maps.observation import Observation
+from gfnn_jax.maps.observation import Crossing, Observation
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.sensors import Sensors
@@ -99,6 +99,7 @@ _TYPES: dict[str, type] = {
         Wander,
         Observation,
         OfBodies,
+        Crossing,
         SoftL1,
         Biweight,
         Damping,

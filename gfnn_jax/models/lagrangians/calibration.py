@@ -124,7 +124,7 @@ def calibrated(
     """The law with the best window for its estimates and the misfit of its forecasts, and its
     horizons. ``spread`` (k,) of the channels."""
     starts = _starts(found, scales)
-    if not starts:
+    if not starts or not np.all(spread > 0):  # of events
         return _unknown(law, spread)
     short = (OPTIONS.short - 1) * scales.dt
     tried = np.unique(np.maximum(np.array(OPTIONS.choices) * scales.period, short))

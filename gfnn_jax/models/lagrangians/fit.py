@@ -355,12 +355,18 @@ class LawFit:
     @property
     def is_exact(self) -> bool:
         """Return whether the residuals are rounding, in which no further term is seen."""
+        return bool(np.all(self.rms() < self.problem.options.rounding * self.spread))
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Standard deviation (k,) of the channels; of times of events the period."""
         spread = np.nanstd(self.arcs.y, axis=(0, 1))
-        return bool(np.all(self.rms() < self.problem.options.rounding * spread))
+        spread[list(self.problem.observation.events)] = self.problem.scales.period
+        return spread
 
     def __str__(self) -> str:
         """A line for people; residuals in units of their channels' standard deviations."""
-        share = 100 * self.rms() / np.nanstd(self.arcs.y, axis=(0, 1))
+        share = 100 * self.rms() / self.spread
         rms = ", ".join(f"{r:.2g}" for r in share)
         return (
             f"{len(self.p)} coefficients, RMS residual {rms} % of the spread, correlated over "

@@ -105,7 +105,7 @@ def best_in_use(data: RecordingData, fit: LawFit, choice: FrictionChoice) -> Cal
     chance makes. The strength of friction may wander too: then each forecast has its own level of
     it, where these err less."""
     steady = CalibratedLaw.of(data, fit, choice)
-    wander = wander_of(fit)
+    wander = None if fit.problem.observation.crossed else wander_of(fit)
     if wander is None:
         return steady
     fit = fit.again(problem=dataclasses.replace(fit.problem, wander=wander))

@@ -71,7 +71,8 @@ class RecordingOptions:
     above_noise: times: such a rest is no noise. clearly: share by which errors of forecasts are
     smaller, which chance does not make. imitated: share of what a sensor's parameter changes that
     no coefficient of the law does, below which it is not identifiable. still: range of a position
-    over its size, at which it does not move: roundoff.
+    over its size, at which it does not move: roundoff. periods_of_events: lengths of arcs where
+    only events are read, two in a period.
     """
 
     missed: float = 0.8
@@ -81,6 +82,7 @@ class RecordingOptions:
     clearly: float = 0.2
     imitated: float = 1e-4
     still: float = 1e-14
+    periods_of_events: tuple[float, ...] = (32.0, 1e4)
 
 
 OPTIONS = RecordingOptions()
@@ -360,6 +362,15 @@ def samples_of(
             found, scales = moving.stretches, measure(moving.stretches)
     given = np.array([recording.std[name] or np.nan for name in observation.channels])
     scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
+    if not np.all(scales.sigma > 0):
+        name = observation.channels[int(np.argmin(scales.sigma))]
+        raise InputError(
+            f"{name}: the noise of its times is not known: give it in seconds, --std {name}=1e-4 "
+            f"(std={{{name!r}: 1e-4}})"
+        )
+    options = options or SearchOptions()
+    if observation.crossed:
+        options = dataclasses.replace(options, periods=OPTIONS.periods_of_events)
     nodes = nodes_of(found, scales)
     if not nodes:
         raise FitError(
@@ -373,7 +384,7 @@ def samples_of(
         observation,
         angles,
         parameters=parameters,
-        options=options or SearchOptions(),
+        options=options,
         on_progress=on_progress,
     )
     return RecordingData(recording, problem, found, messages=messages)
@@ -401,11 +412,12 @@ def _segments(
     """The segments of a recording, as the parameters of ``observation`` show its coordinates."""
     if observation.is_plain:
         return stretches(recording, parameters=parameters)
+    between = observation.between
 
     def coordinates(y: np.ndarray, t: np.ndarray) -> np.ndarray:
         return observation.coordinates_of(y, angles, t)
 
-    return stretches(recording, observation.channels, coordinates, parameters)
+    return stretches(recording, observation.channels, coordinates, parameters, between)
 
 
 def _found(
@@ -508,7 +520,7 @@ def _misses(fit: LawFit) -> bool:
     """Return whether a law leaves nearly all of the variation of every channel, or of one that is
     no noise."""
     left = fit.rms()
-    missed = left > OPTIONS.missed * np.nanstd(fit.arcs.y, axis=(0, 1))
+    missed = left > OPTIONS.missed * fit.spread
     loud = left > OPTIONS.above_noise * fit.problem.scales.sigma
     return bool(np.all(missed) or np.any(missed & loud))
 

@@ -111,12 +111,19 @@ def whiteness(
             of_inputs[u] = OfInput(both[best], best * step, significant)
         measured = np.concatenate([trace.measured[:, k] for trace in traces])
         left = measured - np.concatenate([trace.fitted[:, k] for trace in traces])
-        percent = 100 * (1 - np.sqrt(np.nanmean(left**2)) / max(np.nanstd(measured), 1e-300))
+        spread = float(np.nanstd(measured)) or _mean_interval(traces, k)
+        percent = 100 * (1 - np.sqrt(np.nanmean(left**2)) / max(spread, 1e-300))
         white = bool(np.all(np.abs(rho[1:]) < bound))
         found[name] = Whiteness(
             step * np.arange(OPTIONS.lags + 1), rho, bound, white, of_inputs, float(percent)
         )
     return found
+
+
+def _mean_interval(traces: Sequence[Trace], k: int) -> float:
+    """The mean time between readings of a channel of events."""
+    times = [trace.t[np.isfinite(trace.measured[:, k])] for trace in traces]
+    return float(np.mean(np.concatenate([np.diff(t) for t in times])))
 
 
 def _correlation(a: Sequence[np.ndarray], b: Sequence[np.ndarray], lag: int) -> float:

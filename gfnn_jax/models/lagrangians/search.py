@@ -200,7 +200,8 @@ class TermSearch:
     def of(cls, problem: ArcProblem) -> TermSearch:
         """The search among all that the coordinates of a problem may have."""
         d, shifted = problem.dim, problem.observation.shifts()
-        rows = libraries.every(d, problem.angles)
+        of = libraries.textbook if problem.observation.crossed else libraries.every
+        rows = of(d, problem.angles)
         terms, frictions = (
             libraries.without_forces(rows, shifted),
             frictions_tried(d, problem.options),

@@ -19,7 +19,7 @@ from scipy.optimize import minimize_scalar
 
 from gfnn_jax.dataset.stretches import Scales
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC
 from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
@@ -94,6 +94,8 @@ def best_start(problem: ArcProblem) -> LawFit:
     textbook, first = _Library(libraries.textbook(d, angles)), libraries.first(d, angles)
     springs, every = libraries.springs(d, problem.within_a_turn), libraries.every(d, angles)
     some.add(textbook)
+    if problem.observation.crossed and some.fits:  # times of one event tell no more
+        return some.fits[0]
     if d > 1 and len(angles) == d:
         some.add(_Library(libraries.relative(d, angles)))
     some.add_richer([*textbook.rows, *springs], 1)
@@ -143,7 +145,9 @@ class _Starts:
 
     def __init__(self, problem: ArcProblem):
         self.problem, self.fits, self.ranks = problem, [], []
-        self.linear = libraries.losses(problem.dim, (LINEAR,), 0.0)
+        kinds = (LINEAR, QUADRATIC) if problem.observation.crossed else (LINEAR,)
+        self.linear = libraries.losses(problem.dim, kinds, 0.0)
+        self.always = self.linear if problem.observation.crossed else self.linear[: problem.dim]
         q, v = np.split(problem.states, 2, axis=1)
         self.one_valued = told_by_positions(q, v, problem.angles)
 
@@ -166,7 +170,7 @@ class _Starts:
             return
         zeros = structure.with_a_zero(problem.turned)
         structure = structure.plus(
-            [("loss", row) for row in self.linear[:d]] + [("zero", i) for i in zeros]
+            [("loss", row) for row in self.always] + [("zero", i) for i in zeros]
         )
         if zero is not None:
             known = known | {("zero", i): float(zero[i]) for i in zeros}
