@@ -148,7 +148,7 @@ def fitted(fit: Callable[[], gfnn.Fit]) -> tuple[gfnn.Fit | None, Numbers]:
     return found.out, {
         "verdict": str(found.out.verdict),
         "formula": found.out.formula,
-        "friction": found.out.friction,
+        "friction": None if found.out.friction is None else str(found.out.friction),
         "processor_seconds": found.processor_seconds,
     }
 

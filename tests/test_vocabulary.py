@@ -95,6 +95,15 @@ def test_a_torsion_spring_between_pendulums_that_stay_within_a_turn():
     assert fit.map.coordinates.angles == ()
 
 
+def test_a_constant_torque_on_an_angle_that_turns_over():
+    def acceleration(q, v):
+        return 6.4 - 5.6 * np.sin(q) - 1.2 * v
+
+    fit = gfnn.fit(recorded(acceleration, [2.0, 1.0], 60, angles=["x1"]))
+    within_errors(fit.lagrangian, {"v1**2": 0.5, "x1": 6.4, "cos(x1)": 5.6})
+    within_errors(fit.friction, {"v1**2": 0.6})
+
+
 def test_an_elastic_pendulum_in_the_plane_has_a_distance():
     """V = 3 (r − 1)² + y: the coefficient of r, and of x² and y²."""
 

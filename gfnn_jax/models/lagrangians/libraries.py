@@ -169,6 +169,11 @@ def springs(dim: int, angles: Sequence[int]) -> list[Row]:
     return [(none, unit(dim, *axes), none, 0.0) for axes in pairs]
 
 
+def torques(dim: int, angles: Sequence[int]) -> list[Row]:
+    """Constant torques on angles that turn over: of a motor, on which V falls with every turn."""
+    return [((0,) * dim, unit(dim, i), (0,) * dim, 0.0) for i in angles]
+
+
 def every(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """All terms that a search may come to."""
     rows = (*first(dim, angles), *gyroscopic(dim, angles, 2), *more(dim, angles))

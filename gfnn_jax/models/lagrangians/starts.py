@@ -92,13 +92,18 @@ def best_start(problem: ArcProblem) -> LawFit:
     """
     d, angles, some = problem.dim, problem.angles, _Starts(problem)
     textbook, first = _Library(libraries.textbook(d, angles)), libraries.first(d, angles)
-    springs, every = libraries.springs(d, problem.within_a_turn), libraries.every(d, angles)
+    within = problem.within_a_turn
+    pulls = [
+        *libraries.springs(d, within),
+        *libraries.torques(d, [a for a in angles if a not in within]),
+    ]
+    every = libraries.every(d, angles)
     some.add(textbook)
     if problem.observation.crossed and some.fits:  # times of one event tell no more
         return some.fits[0]
     if d > 1 and len(angles) == d:
         some.add(_Library(libraries.relative(d, angles)))
-    some.add_richer([*textbook.rows, *springs], 1)
+    some.add_richer([*textbook.rows, *pulls], 1)
     some.add(_Library(first, 2))
     some.add_central(textbook.rows, 3, across=False)
     some.add_richer([*first, *libraries.gyroscopic(d, angles, 1)], 3)
