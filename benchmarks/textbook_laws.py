@@ -239,6 +239,16 @@ LAWS: dict[str, Law] = {
         0.1,
         CONSTANTS,
     ),
+    "springs-of-either-sign": Law(
+        {**_kinetic(2), "cosh(1.2*(q1 - q2))": 0.7}, *_box(1, 1, 1, 1), 0.2, CONSTANTS
+    ),
+    "schwarzschild-radial": Law(
+        {"p1**2": 0.5, "p1**2/q1": -1.0, "1/q1**2": 8.0, "1/(q1 - 2)": -1.0},
+        (6.0, -0.3),
+        (20.0, 0.3),
+        1.0,
+        CONSTANTS,
+    ),
     "yukawa": Law(
         {**_kinetic(2), f"exp(-0.7*{_R})/{_R}": -1.5}, *_box(2, 2, 1, 1), 0.1, CONSTANTS, _RING
     ),

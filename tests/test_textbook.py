@@ -249,6 +249,35 @@ def test_constants_inside_come_out_exactly():
     assert found == pytest.approx(expected, abs=1e-11)
 
 
+def test_exponentials_of_either_sign_are_a_hyperbolic_cosine():
+    """½(p₁² + p₂²) + e^(q₁ − q₂) + e^(q₂ − q₁)."""
+
+    def gradient(z):
+        slope = 2 * np.sinh(z[:, :1] - z[:, 1:2])
+        return np.concatenate([slope, -slope, z[:, 2:]], axis=1)
+
+    z0 = np.random.default_rng(0).uniform(-1, 1, (200, 4))
+    found = read(searched(pairs_of(gradient, z0)))
+    expected = {"p1²": 0.5, "p2²": 0.5, "cosh(q1 - q2)": 2.0}
+    assert found == pytest.approx(expected, abs=1e-10)
+
+
+def test_a_mass_that_depends_on_the_distance_is_found_beside_a_pole():
+    """Radial motion around a black hole (Schwarzschild), less a constant."""
+
+    def gradient(z):
+        (r, p), beyond = z.T, 1 / (z[:, 0] - 2)
+        return np.stack([p**2 / r**2 - 16 / r**3 + beyond**2, (1 - 2 / r) * p], axis=1)
+
+    rng = np.random.default_rng(0)
+    z0 = np.stack([rng.uniform(6, 20, 200), rng.uniform(-0.3, 0.3, 200)], axis=1)
+    pairs = pairs_of(gradient, z0, dt=1.0)
+    problem = Problem(pairs.z0, pairs.z1, pairs.dt, sizes(pairs.z0))
+    found = read(Textbook(problem, np.arange(200)).law(products=True))
+    expected = {"p1²": 0.5, "p1**2/q1": -1.0, "1/q1**2": 8.0, "1/(-2 + q1)": -1.0}
+    assert found == pytest.approx(expected, abs=1e-8)
+
+
 def test_centres_beside_the_origin_are_found_told_nothing():
     rng = np.random.default_rng(0)
     z0 = rng.uniform(-1, 1, (600, 4)) * [1.6, 1.6, 1, 1]

@@ -190,6 +190,19 @@ class Setting:
                 found.append((*squares, (*both, pole)))
         return found
 
+    def curved(self) -> list[tuple[Atom, ...]]:
+        """p_r²/r and 1/r², which motion around a heavy body has beside other functions of r: neither
+        explains much without the others."""
+        found = []
+        for place, argument in enumerate(self.arguments):
+            if argument.circular or ("power", -2.0) not in argument.kinds:
+                continue
+            for k, other in enumerate(self.arguments):
+                if argument.index >= 0 and other.index == argument.index + self.dim:
+                    square, pole = Factor(k, ("power", 2.0)), Factor(place, ("power", -1.0))
+                    found.append(((square, pole), (Factor(place, ("power", -2.0)),)))
+        return found
+
     def _of_one(self) -> _Group:
         """Shapes of one argument."""
         for place, argument in enumerate(self.arguments):

@@ -128,7 +128,7 @@ class Textbook:
         if centres and not any(argument.axes for argument in setting.arguments):
             return None
         blocks = [] if products or centres else setting.blocks()
-        tops = setting.tops() if products else []
+        tops = [*setting.tops(), *setting.curved()] if products else []
         with np.errstate(all="ignore"):
             dictionary = setting.dictionary(products=products, centres=centres)
             tried, self._tried = self._tried, len(dictionary.atoms)

@@ -34,6 +34,8 @@ def values(kind: Kind, x, theta):
             return np.sin(theta * x), theta * np.cos(theta * x)
         case "cos":
             return np.cos(theta * x), -theta * np.sin(theta * x)
+        case "cosh":
+            return np.cosh(theta * x), theta * np.sinh(theta * x)
         case "pole":
             return 1 / (theta + x), -1 / (theta + x) ** 2
         case "lorentz":
@@ -73,7 +75,14 @@ def kinds_for(x: np.ndarray, *, distance: bool = False, circular: bool = False) 
         found += [("log", 0.0), ("exp", -2.0), ("exp", -1.0)]
     if not distance:
         found += [("sin", 0.0), ("cos", 0.0)]
-    found += [("exp", 0.0), ("exp", 1.0), ("root", 1.0), ("root", -1.0), ("pole", 0.0)]
+    found += [
+        ("exp", 0.0),
+        ("exp", 1.0),
+        ("cosh", 0.0),
+        ("root", 1.0),
+        ("root", -1.0),
+        ("pole", 0.0),
+    ]
     return [*found, ("softened", 0.0), ("lorentz", 0.0), ("gauss", 0.0)]
 
 
@@ -84,6 +93,8 @@ def constants_for(kind: Kind, x: np.ndarray) -> np.ndarray:
         case "exp":
             rates = np.geomspace(0.15, 12.0, 14) / size
             return np.concatenate([-rates[::-1], rates])
+        case "cosh":
+            return np.geomspace(0.15, 12.0, 14) / size
         case "root":
             around = np.geomspace(0.02, 10.0, 14) if kind[1] > 0 else 1 + np.geomspace(0.002, 5, 14)
             return around * size**2
@@ -130,7 +141,7 @@ def text_of(kind: Kind, x: str, square: str, theta: float | None) -> str:
             return f"sqrt({t} {'+' if n > 0 else '-'} {squared})"
         case "softened":
             return f"1/sqrt({t} + {squared})"
-        case "sin" | "cos":
+        case "sin" | "cos" | "cosh":
             return f"{name}({x})" if theta == 1 else f"{name}({t}*{inner})"
         case "pole":
             return f"1/({t} + {inner})"
