@@ -191,8 +191,8 @@ class Setting:
         return found
 
     def curved(self) -> list[tuple[Atom, ...]]:
-        """p_r²/r and 1/r², which motion around a heavy body has beside other functions of r: neither
-        explains much without the others."""
+        """p_r²/r and 1/r², which motion around a heavy body has beside other functions of r:
+        neither explains much without the others."""
         found = []
         for place, argument in enumerate(self.arguments):
             if argument.circular or ("power", -2.0) not in argument.kinds:
