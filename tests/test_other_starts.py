@@ -70,6 +70,21 @@ def test_a_part_of_an_orbit_tells_the_force_by_the_distance(eccentricity, part):
     )
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("periodic", [False, True])
+def test_torsion_of_a_radian_is_no_series_of_cosines(periodic):
+    def acceleration(q, v):
+        return -(np.sin(q) + np.sin(2 * q) / 2 if periodic else 20 * q) - 0.1 * v
+
+    swing = recorded(
+        acceleration, [1.0, 0.0], ["a"], end=10.0, samples=300, noise=3e-3, angles=["a"]
+    )
+    terms = coefficients(gfnn.fit(swing).lagrangian)
+    assert ("a**2" in terms) is not periodic
+    if not periodic:
+        assert terms == pytest.approx({"a_dot**2": 0.5, "a**2": -10.0}, rel=5e-3)
+
+
 def test_two_pendulums_in_one_file_have_their_laws():
     both = recorded(
         lambda q, v: -np.array([1.0, 2.3]) * np.sin(q) - 0.01 * v,

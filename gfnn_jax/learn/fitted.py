@@ -4,6 +4,7 @@ found."""
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import io
 import warnings
 from functools import cached_property
@@ -344,7 +345,10 @@ class Fit:
                     stacklevel=2,
                 )
                 return getattr(own["map"], name)
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        known = [n for n in {*dir(type(self)), *dir(own.get("found"))} if not n.startswith("_")]
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f", did you mean {near[0]}?" if near else ""
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{hint}")
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles hold what folders hold: neither the data nor what only the search needed."""

@@ -255,6 +255,10 @@ class TermSearch:
             before, terms = fit.structure, dataclasses.replace(self.every, friction=())
             fit = self.prune(fit, friction=False)
             fit = self.prune(self.grow(fit, terms), friction=False)
+            waves = fit
+            for angle in fit.problem.within_a_turn:
+                fit = with_a_spring(fit, angle)
+            fit = fit if fit is waves else self.prune(fit, friction=False)
             if fit.structure != before:
                 fit, choice = self.with_friction(fit)
         return SearchResult(with_delay(fit), choice)
@@ -371,6 +375,30 @@ class TermSearch:
             choice = chosen(table_of(fit, frictions), options.choose_friction, rows=rows)
         fit = without_drives(begun.again(fit.structure, fit.values))
         return fit, choice._replace(rows=fit.structure.friction)
+
+
+def with_a_spring(fit: LawFit, angle: int) -> LawFit:
+    """The fit with a spring x² in place of several waves of one angle that stays within a turn,
+    where held-out arcs do not lose: a series of cosines imitates what is not periodic."""
+    d, structure = fit.problem.dim, fit.structure
+    alone = tuple(int(i == angle) for i in range(d))
+    waves = [
+        row
+        for row in structure.terms
+        if not any(row[0]) and any(row[2]) and tuple(map(bool, row[2])) == tuple(map(bool, alone))
+    ]
+    if len(waves) < 2 or any(row[1][angle] for row in structure.terms):
+        return fit
+    none = (0,) * d
+    spring = [("term", (none, tuple(n * k for k in alone), none, 0.0)) for n in (2, 1)]
+    gone = {("term", row) for row in waves} | {("zero", angle)}
+    plainer = structure.without(gone).plus(spring)
+    apart = Comparison.of(fit.cross_validate(plainer), fit.cross_validate())
+    if not apart.cost <= apart.other * (1 + fit.problem.options.evidence.gain):
+        return fit
+    word = fit.problem.word(spring[0])
+    fit.problem.on_progress(f"  {word} in place of {len(waves)} waves: held-out arcs do not lose")
+    return fit.again(plainer)
 
 
 def frictions_tried(dim: int, options: SearchOptions) -> tuple[Loss, ...]:
