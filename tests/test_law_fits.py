@@ -401,6 +401,21 @@ def test_friction_of_rare_kinds(kind):
 
 
 @pytest.mark.slow
+def test_powers_up_to_the_highest_tried_are_one_of_several_laws():
+    """A relativistic oscillator, whose motion powers imitate."""
+    t = 0.2 * np.arange(250)
+    found = solve_ivp(
+        lambda _, z: [z[1], -z[0] * (1 - z[1] ** 2) ** 1.5], (0, 50), [1.2, 0], t_eval=t, rtol=1e-9
+    )
+    x = found.y[0] + 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    recording = gfnn.Recording({"t": t, "x": x}, positions=["x"])
+    fit = gfnn.fit(recording)
+    assert fit.verdict.startswith("one of several: powers up to x**6")
+    terms = [term.term for term in fit.lagrangian.terms]
+    assert gfnn.fit(recording, model=gfnn.Lagrangian(terms=terms)).verdict == "identified"
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [False, True])
 def test_a_cart_that_its_motor_moves_drives_a_pendulum_that_does_not_move_it(given):
     """Found among all terms, and where the textbook's own are given; rollouts are those of the

@@ -23,6 +23,7 @@ KINDS = (LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED)
 FRICTIONS = ("linear", "quadratic", "dry", "uniform", "cubic", "one-sided")  # their names
 RARE = (POWER, ONE_SIDED)  # taken only where they explain a record much better than the others do
 CUBIC = 3.0  # the power of the speed that is tried
+HIGHEST = 6  # degree of potentials of lengths
 
 
 def unit(dim: int, *axes: int) -> tuple[int, ...]:
@@ -143,13 +144,20 @@ def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
             rows += [(speeds, unit(dim, *[i] * n), none, 0.0) for n in (1, 2)]
     for m in modes(dim, angles, 3):
         rows += [(none, none, m, 0.0), (none, none, m, SINE)]
-    for degree in (3, 4, 5, 6):
+    for degree in range(3, HIGHEST + 1):
         for axes in combinations_with_replacement(lengths, degree):
             rows.append((none, unit(dim, *axes), none, 0.0))
     for i in lengths:
         for m in modes(dim, angles, 1):
             rows += [(none, unit(dim, i), m, 0.0), (none, unit(dim, i), m, SINE)]
     return rows
+
+
+def last_of_series(rows: Sequence[Row]) -> Row | None:
+    """The first potential of the highest degree tried, which may be where a series of another shape
+    was cut; None where there is none."""
+    ends = (row for row in rows if not any(row[0]) and sum(row[1]) == HIGHEST)
+    return next(ends, None)
 
 
 def central(dim: int, exponent: float) -> list[Row]:

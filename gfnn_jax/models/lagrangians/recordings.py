@@ -50,7 +50,7 @@ from gfnn_jax.models.lagrangians.in_use import (
 from gfnn_jax.models.lagrangians.in_words import Findings, in_words, line_of
 from gfnn_jax.models.lagrangians.input_rules import RULES, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
-from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS
+from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, last_of_series
 from gfnn_jax.models.lagrangians.nature import Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions
 from gfnn_jax.models.lagrangians.search import SearchResult, fit_given, search, search_on
@@ -89,6 +89,13 @@ OPTIONS = RecordingOptions()
 DRIVEN = (
     "a drive that no column shows acts at {} rad/s: its waves stand among the inputs, with the "
     "phase of the times in the file. Record the drive, and name it: --inputs (inputs=)"
+)
+
+
+SERIES = (
+    "powers up to {}, the highest tried, may be a series of another shape, and hold within the "
+    "motion recorded alone. Give a shape that you expect, as exp(-x), 1/x or cos(x): --terms "
+    "(terms=)"
 )
 
 
@@ -141,6 +148,10 @@ def fit_recording(
         best, findings = _findings(recording, data, found, (*left_out, *of_drive), steps)
         findings = findings._replace(seconds=time.process_time() - started)
         law = in_words(recording, best, findings)
+        last = None if terms else last_of_series(best.fit.structure.terms)
+        if last is not None and not law.rival:
+            word = data.problem.word(("term", last))
+            law = dataclasses.replace(law, rival=SERIES.format(word))
     except (FitError, np.linalg.LinAlgError):
         if missed is not None:
             raise _with_nature(missed, data) from None
