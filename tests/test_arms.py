@@ -129,6 +129,23 @@ def test_torques_of_a_new_motion(arm):
     np.testing.assert_allclose(arm.map.mass_matrix(q), masses, rtol=0.02, atol=0.02)
 
 
+def test_mujoco_reads_the_arm(arm, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    rng, rotors = np.random.default_rng(3), np.array(list(arm.law.rotors.values()))
+    q, v = rng.normal(size=(2, 3))
+    for to, kept in (("mjcf", rotors), ("urdf", 0 * rotors)):
+        path = gfnn.export(arm, to, tmp_path / f"arm{'.xml' if to == 'mjcf' else '.urdf'}")
+        model = mujoco.MjModel.from_xml_path(str(path))
+        data, M = mujoco.MjData(model), np.zeros((3, 3))
+        data.qpos[:], data.qvel[:] = q, v
+        mujoco.mj_forward(model, data)
+        for j, unit in enumerate(np.eye(3)):
+            mujoco.mj_mulM(model, data, M[j], unit)
+        np.testing.assert_allclose(M, arm.map.mass_matrix(q) + np.diag(kept - rotors), atol=1e-9)
+        rigid = from_axes(AXES).bodies.forces(arm.law.found.x[:30], q, v, 0 * v)
+        np.testing.assert_allclose(data.qfrc_bias, rigid, atol=1e-8)
+
+
 @pytest.mark.slow  # compiles a step of three joints
 def test_map_moves_as_its_forces_say(arm, tmp_path):
     q, v = np.array([0.3, -0.2, 0.5]), np.array([0.4, -0.3, 0.2])

@@ -167,6 +167,18 @@ def test_a_fit_finds_how_a_zero_wanders(swing, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_map_takes_the_level_of_friction_from_the_samples(swing):
+    recording, fit = swing
+    warm = fit.map.with_friction_level(0.1)
+    z, covariance = warm.estimate(recording)
+    assert z.shape == (1, 2)
+    plain = fit.map.estimate(recording)[0]
+    assert np.abs(z - plain).max() < 5 * np.sqrt(np.diagonal(covariance[0]).max())
+    with pytest.raises(ValueError, match="size > 0"):
+        fit.map.with_friction_level(0.0)
+
+
+@pytest.mark.slow
 def test_forecasts_on_a_zero_that_wanders(swing):
     """Smaller errors than without it, and bands that hold them."""
     recording, fit = swing

@@ -73,7 +73,7 @@ def export(
           "c-taylor": the same of a law, by Taylor series to roundoff, with events of dry friction.
           "js": a law as JavaScript, "jax": as a plain JAX function, "casadi": as a CasADi function,
           "fmu": as an FMU of FMI 3.0, all with inputs and coefficients as arguments.
-          "mjcf", "urdf": a law that is a planar chain of links, for MuJoCo and robotics.
+          "mjcf", "urdf": an arm, or a law that is a planar chain of links, for robotics.
           "latex": the law of a fit as a formula.
           "stablehlo": step and inverse of batches of any size, for ``jax.export.deserialize``; for
           any map.

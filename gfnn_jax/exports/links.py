@@ -22,8 +22,9 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 
 from gfnn_jax.errors import InputError
+from gfnn_jax.exports import arms
 from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian
-from gfnn_jax.maps.laws import is_of_law, law_of_map
+from gfnn_jax.maps.laws import bodies_of_map, is_of_law, law_of_map
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 GRAVITY = 9.81  # m/s², by which lengths are in metres where times are in seconds
@@ -269,8 +270,11 @@ def mjcf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     ``qpos`` are the angles of the joints, as the data have them where these are relative. Viscous
     friction is damping; dry friction ``frictionloss``, by MuJoCo's soft constraints; that between
     links that share no joint acts along tendons; inputs are motors. Raises InputError where the law
-    is no chain.
+    is no chain. An arm that was learned as one is written whole (`exports.arms`).
     """
+    arm = bodies_of_map(map_)
+    if arm is not None:
+        return arms.mjcf(map_, arm, name, about)
     links = links_of(map_)
     dim, step = map_.dim, min(links.dt, OPTIONS.longest)
     body, tendons, motors = "", [], []
@@ -321,8 +325,12 @@ def urdf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     """Write the chain of links of a law as URDF: its joints turn about y, links hang along −z.
 
     Friction of joints is in ``dynamics``; what URDF cannot hold, friction between others and
-    inputs, is told in its comment. Raises InputError where the law is no chain.
+    inputs, is told in its comment. Raises InputError where the law is no chain. An arm that was
+    learned as one is written whole (`exports.arms`).
     """
+    arm = bodies_of_map(map_)
+    if arm is not None:
+        return arms.urdf(arm, name, about)
     links = links_of(map_)
     told = [
         f"friction along {row.tolist()} of the joints' velocities is left out: URDF has none"

@@ -169,12 +169,18 @@ def law_of_map(map_: SymplecticMap) -> Lagrangian:
 def dynamics_of(map_: SymplecticMap) -> Lagrangian | BodiesLaw:
     """The law of a map with its masses and forces, of bodies on joints too. Raises ValueError for
     any other map."""
+    law = bodies_of_map(map_)
+    return law_of_map(map_) if law is None else law
+
+
+def bodies_of_map(map_: SymplecticMap) -> BodiesLaw | None:
+    """The law of bodies on joints, as of an arm, whose flow the map is; None of any other map."""
     piece = map_.pieces[0]
     family = getattr(piece, "family", None)
-    if isinstance(family, Forced) and isinstance(family.family, OfBodies):
-        own, losses, gains = family.parts(np.asarray(piece.params))
-        return family.family.law(own, family.friction, losses, gains)
-    return law_of_map(map_)
+    if not isinstance(family, Forced) or not isinstance(family.family, OfBodies):
+        return None
+    own, losses, gains = family.parts(np.asarray(piece.params))
+    return family.family.law(own, family.friction, losses, gains)
 
 
 def states_of(map_: SymplecticMap, q, v, args=None):

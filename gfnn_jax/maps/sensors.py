@@ -56,6 +56,12 @@ class Sensors:
     observed: float = 0.0
     level: float = 0.0
 
+    def with_level(self, level: float) -> Sensors:
+        """The same with a level of friction, and windows of a quarter of the longest held-out
+        forecast, two periods: a level takes longer to tell than a state."""
+        window = max(self.window, 0.25 * float(np.max(self.leads)))
+        return dataclasses.replace(self, level=level, window=window)
+
     @property
     def observation_model(self) -> Observation:
         """Observation of a state by the channels."""

@@ -322,6 +322,21 @@ class SymplecticMap:
         asked = forecasts.Asked(coverage, simultaneous)
         return forecasts.forecast(self, recording, times, inputs, asked).in_units_of(recording)
 
+    def with_friction_level(self, size: float) -> SymplecticMap:
+        """The map whose estimates and forecasts find the strength of friction anew, a factor of all
+        of it, from the samples before them.
+
+        size: its standard deviation from record to record, relative, which one record does not
+        tell: 0.03 of a drive on another day. Raises ValueError for a map that was not learned from
+        a recording, and a size that is no number > 0.
+
+            warm = fit.map.with_friction_level(0.03)
+            warm.forecast(recording, times, inputs)  # two periods of samples or more
+        """
+        if self.sensors is None or not 0 < size < math.inf:
+            raise ValueError(f"expected a map of a recording and a size > 0, got {size}")
+        return dataclasses.replace(self, sensors=self.sensors.with_level(float(size)))
+
     def linearise(self, z, inputs=None, args=None, *, t0=None):
         """(A, B) of a step: ∂Z/∂z (..., 2d, 2d) and ∂Z/∂u (..., 2d, k), inputs u, (k,) or (B, k),
         that do not change during the step."""

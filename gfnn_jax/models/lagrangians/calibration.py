@@ -42,7 +42,7 @@ class CalibrationOptions:
     which a state may be estimated. first, last, leads: periods ahead, and how many times between
     these. near: leads to either side that share their errors. short: samples, at least, of the
     shortest window. widest: standard deviation of levels of friction, whose scatter is looked for.
-    alike: share by which median errors of windows differ by chance.
+    alike: share by which medians of some thirty errors differ by chance.
     fewest: errors that determine a quantile ``inside``, which are within two
     standard deviations. parts: of the record, in the jackknife of its errors. fractions: of the
     spread, that horizons are stated for.
@@ -57,7 +57,7 @@ class CalibrationOptions:
     near: int = 2
     short: int = 20
     widest: float = 0.3
-    alike: float = 0.1
+    alike: float = 0.25
     fewest: int = 20
     inside: float = 0.95
     parts: int = 8

@@ -102,8 +102,8 @@ class CalibratedLaw(NamedTuple):
 def best_in_use(data: RecordingData, fit: LawFit, choice: FrictionChoice) -> CalibratedLaw:
     """The fit as it is, or fitted anew with zeros of channels that wander: where its residuals show
     these (the likelihood's evidence) and forecasts of held-out data do not err more with them than
-    chance makes. The strength of friction may wander too: then each forecast has its own level of
-    it, where these err less."""
+    chance makes. The strength of friction may wander too: where forecasts err less by more than
+    chance makes, each has its own level of it."""
     steady = CalibratedLaw.of(data, fit, choice)
     wander = None if fit.problem.observation.crossed else wander_of(fit)
     if wander is None:
