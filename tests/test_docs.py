@@ -65,7 +65,7 @@ def test_links_lead_somewhere(page):
 
 # Pages of more than one idea still.
 LONG = {"architecture", "args", "bands", "charts-and-families", "export", "extending"}
-LONG |= {"friction-and-inputs", "laws", "mathematics", "recordings"}
+LONG |= {"friction-and-inputs", "laws", "laws-from-recordings", "mathematics", "recordings"}
 LONG |= {"scaling", "your-own-data"}
 
 
