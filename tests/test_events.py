@@ -50,6 +50,8 @@ def test_a_photogate_tells_a_pendulum_and_its_friction(friction, text):
     assert abs(term.coefficient - 22.0) < 4 * term.std
     assert [one.term for one in fit.found.friction.terms] == [text]
     assert fit.verdict == "identified"
+    with pytest.raises(gfnn.InputError, match="no state is estimated"):
+        fit.forecast(np.array([200.0]))
 
 
 def test_times_of_one_period_tell_no_law():

@@ -391,8 +391,16 @@ class _Windows:
 def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
     """(q, v, λ, b) (B, m) at the last sample of each window, and its covariance (B, m, m) in the
     law: λ (1,) the level of friction where the sensors have one, b (k,) the zeros of the channels
-    where these wander, each of length 0 where not."""
+    where these wander, each of length 0 where not.
+
+    Raises InputError where times of events alone are read, of which no state is estimated yet.
+    """
     sensors = law.sensors
+    if sensors.observation_model.crossed:
+        raise InputError(
+            "times of events alone: no state is estimated from them. The law is fit.law; start "
+            "from a state that you know, fit.predict(z0, num_steps)"
+        )
     windows, starts = zip(*(_started(sensors, w) for w in windows), strict=True)
     length = max(len(w.t) for w in windows)
     count = windows[0].y.shape[1]
