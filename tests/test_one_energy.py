@@ -31,3 +31,12 @@ def test_masses_of_one_coordinate_are_told_by_several_energies(amplitudes, kind)
     }
     fit = gfnn.fit(gfnn.Recording(table, positions=["x"]), terms=["v**2", "v**2*x**2", "x**2"])
     assert fit.verdict.split()[0] == kind
+
+
+@pytest.mark.parametrize(("noise", "kind"), [(0.3, "one"), (0.03, "identified")])
+def test_noise_of_a_large_part_of_a_radian_hides_other_laws(noise, kind):
+    """A wheel that turns freely, with θ as far as 30 turns."""
+    t, rng = np.linspace(0, 60, 400), np.random.default_rng(2)
+    table = {"t": t, "theta": 3.1 * t + noise * rng.normal(size=len(t))}
+    fit = gfnn.fit(gfnn.Recording(table), terms=["omega**2"])
+    assert fit.verdict.split()[0] == kind

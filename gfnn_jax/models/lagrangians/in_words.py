@@ -19,7 +19,7 @@ from gfnn_jax.families.text import Term
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.first_order import rival
-from gfnn_jax.models.lagrangians.fit import LawFit
+from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.in_use import CalibratedLaw, GaugedLaw
 from gfnn_jax.models.lagrangians.input_rules import InputModel
 from gfnn_jax.models.lagrangians.learned_law import (
@@ -53,7 +53,8 @@ class WarningOptions:
     there they may be a series that a library ends. complete: %, above which what is left is no
     energy that is gained. alike: correlation of two coefficients that the
     record cannot tell apart. energies: range of the energy, as a share of the largest kinetic one,
-    below which a motion of one coordinate shows M and V together only.
+    below which a motion of one coordinate shows M and V together only. hides: noise of an angle, in
+    radians, above which other laws follow the record as well.
     """
 
     clear: float = 3.0
@@ -65,6 +66,7 @@ class WarningOptions:
     complete: float = 99.999
     alike: float = 0.99
     left: float = 0.05
+    hides: float = 0.2
 
 
 OPTIONS = WarningOptions()
@@ -139,7 +141,8 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         ended="every length of arcs was fitted",
         flaws=tuple(flaws),
         symbols=(names.coordinates, names.speeds),
-        rival=rival(fit, names.coordinates),
+        rival=rival(fit, names.coordinates)
+        or _hidden(fit.problem, names.coordinates, tuple(channels)),
     )
 
 
@@ -250,6 +253,17 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
             "excites itself, as friction below zero does, which is no term of R"
         )
     return flaws | _trend(best.fit)
+
+
+def _hidden(problem: ArcProblem, coordinates: Sequence[str], channels: Sequence[str]) -> str:
+    """Reason why other laws follow the record as well, where noise is a large part of a radian."""
+    angles = [coordinates[i] for i in problem.angles if coordinates[i] in channels]
+    sigma = {name: problem.scales.sigma[channels.index(name)] for name in angles}
+    return "; ".join(
+        f"noise of {noise:.2g} rad in {name} hides what another law would leave"
+        for name, noise in sigma.items()
+        if noise > OPTIONS.hides
+    )
 
 
 def _trend(fit: LawFit) -> dict[str, str]:
