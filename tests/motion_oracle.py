@@ -21,7 +21,6 @@ from gfnn_jax.families.lagrangian import (
     Lagrangian,
     Powers,
     Terms,
-    functions_of,
 )
 from gfnn_jax.flows import motion
 from gfnn_jax.flows.dormand_prince import NODES, STAGES, WEIGHTS
@@ -46,22 +45,8 @@ def among(some, matrix, rhs):
 
 
 def inverses(matrices: np.ndarray) -> np.ndarray:
-    """The inverses (n, n, N) of matrices; NaN or infinite where one is singular. From three rows
-    on by LAPACK: cofactors would lose the condition number squared."""
-    n = len(matrices)
-    if n == 1:
-        return 1 / matrices
-    if n == 2:
-        (m11, m12), (m21, m22) = matrices
-        return np.array([[m22, -m12], [-m21, m11]]) / (m11 * m22 - m12 * m21)
-    rows = matrices.transpose(2, 0, 1)
-    try:
-        return np.linalg.inv(rows).transpose(1, 2, 0)
-    except np.linalg.LinAlgError:  # one that is singular: NumPy would invert none
-        regular = np.linalg.matrix_rank(rows) == n
-        found = np.full(rows.shape, np.nan)
-        found[regular] = np.linalg.inv(rows[regular])
-        return found.transpose(1, 2, 0)
+    """The inverses (n, n, N) of regular matrices."""
+    return np.linalg.inv(matrices.transpose(2, 0, 1)).transpose(1, 2, 0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -269,7 +254,7 @@ class Form:
     friction, and gains of the inputs. Its coefficients are (c, ρ, G row by row); that of a row of
     friction of the kind UNIFORM is γ, of the force −γ ∂L/∂v. They are p (count,), or (N, count) of
     N states that follow laws of their own; phases of the terms are then (P,) or (N, P). powers: of
-    parameters that systems differ in, by which (θ, ρ, G) are multiplied (`in_systems`).
+    parameters that systems differ in, by which (θ, ρ, G) are multiplied.
     quadratic, dissipation: made of the terms and the friction, and of those of the form that this
     one was made from where they are the same."""
 
@@ -327,19 +312,6 @@ class Form:
             of_friction = tuple(row for row, is_rate in of_friction if not is_rate)
             powers = (*powers[:first], *of_friction, *powers[last:])
         return Lagrangian(self.terms, theta, friction, losses[..., ~even], uniform, gains, powers)
-
-    def in_systems(self, p: np.ndarray, args: np.ndarray) -> tuple[Form, np.ndarray, np.ndarray]:
-        """The form whose coefficients are (θ, ρ, G) of one system, their values (A, n) in systems
-        of parameters args (A, k), and the derivatives (A, n, count) of these in p (count,)."""
-        count, own = self.terms.count, self.basis.shape[1]
-        turn = np.zeros((count + self.count - own, self.count))
-        turn[:count, :own] = self.basis
-        turn[count:, own:] = np.eye(self.count - own)
-        whole = turn @ p
-        whole[:count] += self.fixed
-        weights = functions_of(self.powers or ((),) * len(whole), args)
-        form = dataclasses.replace(self, fixed=0 * self.fixed, basis=np.eye(count), powers=None)
-        return form, weights * whole, weights[..., None] * turn
 
     def accelerate(
         self,
@@ -544,13 +516,6 @@ def step(
         for k in range(u.shape[1]):
             x, D, modes = motion.substep(x, D, modes, h / u.shape[1], u[:, k])
     return Step(x, D[..., : 2 * d], D[..., 2 * d :]), modes
-
-
-def modes_of(form: Form, p: np.ndarray, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """The modes (N, F) in which states x (N, 2d) start, with inputs u (N, inputs)."""
-    if not coulomb_rows(form.friction).any():
-        return np.zeros((len(x), 0))
-    return _Motion(form, p, 0).begin(x, u)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
