@@ -1,5 +1,5 @@
 """Maps whose generating functions are known in closed form: tests of what is done with a map need
-no fit. And pairs of Hénon and Heiles, by SciPy's integrator."""
+no fit. And motion by SciPy's integrators, pairs of Hénon and Heiles among it."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -79,3 +79,14 @@ def henon_heiles_pairs(num, seed=0, radius=0.4, dt=0.5):
     # Many orbits share the tolerance of a step: each is closer than one alone would be.
     solved = solve_ivp(field, (0, dt), z0.T.ravel(), "DOP853", rtol=2.3e-14, atol=1e-16)
     return Pairs(z0, solved.y[:, -1].reshape(4, -1).T, dt)
+
+
+def motion(acceleration, start, t, **options):
+    """Positions (d, T) at times t of q̈ = acceleration(q, v) from ``start`` (2d,), by SciPy."""
+    d = len(start) // 2
+
+    def rates(_, z):
+        return np.concatenate([z[d:], acceleration(z[:d], z[d:])])
+
+    span = (t[0], t[-1])
+    return solve_ivp(rates, span, start, t_eval=t, rtol=1e-10, atol=1e-12, **options).y[:d]

@@ -4,7 +4,7 @@ bodies in potentials of lengths, zeros of angles that are far off."""
 import numpy as np
 import pytest
 import sympy as sp
-from scipy.integrate import solve_ivp
+from analytic import motion
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
@@ -15,15 +15,9 @@ from gfnn_jax.solve.latent_arcs import Fitted
 def recorded(acceleration, start, names, end=40.0, samples=2_000, noise=1e-4, **roles):
     """Positions of q̈ = acceleration(q, v) from ``start`` (2d,), by SciPy, with noise."""
     d, t = len(start) // 2, np.linspace(0, end, samples)
-    z = solve_ivp(
-        lambda _, z: np.concatenate([z[d:], acceleration(z[:d], z[d:])]),
-        (0, end),
-        start,
-        t_eval=t,
-        rtol=1e-10,
-        atol=1e-12,
-    ).y.T
-    q = z[:, :d] + noise * np.random.default_rng(0).normal(size=(samples, d))
+    q = motion(acceleration, start, t).T + noise * np.random.default_rng(0).normal(
+        size=(samples, d)
+    )
     columns = dict(zip(names, q.T, strict=True))
     return gfnn.Recording({"t": t, **columns}, positions=names, **roles)
 

@@ -5,6 +5,7 @@ The oracle is the system that made the recording; `benchmarks/vocabulary.py` dra
 import numpy as np
 import pytest
 import sympy as sp
+from analytic import motion
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
@@ -17,15 +18,7 @@ NOISE = 1e-3
 def recorded(acceleration, start, end, samples=800, angles=()):
     """Positions x1, … of q̈ = acceleration(q, v) from ``start`` (2d,), with noise."""
     d, t = len(start) // 2, np.linspace(0, end, samples)
-    q = solve_ivp(
-        lambda _, z: np.concatenate([z[d:], acceleration(z[:d], z[d:])]),
-        (0, end),
-        start,
-        t_eval=t,
-        rtol=1e-10,
-        atol=1e-12,
-        method="DOP853",
-    ).y[:d]
+    q = motion(acceleration, start, t, method="DOP853")
     q = q + NOISE * q.std(axis=1, keepdims=True) * np.random.default_rng(0).normal(size=q.shape)
     names = [f"x{i + 1}" for i in range(d)]
     columns = dict(zip(names, q, strict=True))
