@@ -30,12 +30,23 @@ from gfnn_jax.signals.noise import Noise, noise
 # for an orbit in au and days has velocities in au/d.
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 SECONDS |= {"d": 1.0, "year": 1.0}
-_LIKE = 0.85  # likeness of a column to the derivative of another, that tells
-_MOST_COLUMNS = 12  # whose names do not tell, that are compared
-_ALONE = 1.3  # times the noise, up to which a column's spread is noise alone
-_ONE_AXIS = 0.1  # ratio of strengths of turning, below which one axis is enough
-_FIRST_ORDER = 0.6  # share of the rates' variance that functions of the columns explain of states
-_RUNS_OF_A_BODY = 3  # whose energies and |M|² determine the law of a body that turns
+
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Columns that are told apart by their values."""
+
+    like: float = 0.85  # likeness of a column to the derivative of another, that tells
+    most_columns: int = 12  # whose names do not tell, that are compared
+    alone: float = 1.3  # times the noise, up to which a column's spread is noise alone
+    one_axis: float = 0.1  # ratio of strengths of turning, below which one axis is enough
+    # share of the rates' variance that functions of the columns explain of states
+    first_order: float = 0.6
+    runs_of_a_body: int = 3  # whose energies and |M|² determine the law of a body that turns
+
+
+_OPTIONS = _Options()
+
 _STD = "_std"  # end of the name of a column that holds the σ of another
 Names = Sequence[str] | str | None
 Runs = Mapping[str, tuple[np.ndarray, dict[str, np.ndarray]]]
@@ -149,7 +160,7 @@ def _by_data(
     Raises Undecided where a column is left over that may be a position or an input.
     """
     times = [t for t, _ in runs.values()]
-    some = names[:_MOST_COLUMNS]
+    some = names[: _OPTIONS.most_columns]
     columns = {n: np.concatenate([values[n] for _, values in runs.values()]) for n in some}
     moving = [name for name, x in columns.items() if np.isfinite(x).any() and np.nanstd(x) > 0]
     if not moving:
@@ -191,7 +202,7 @@ def _by_data(
 def _is_noise(column: np.ndarray, size: Noise) -> bool:
     """Return whether a column holds a constant and noise alone."""
     spread = float(np.nanstd(column))
-    return size.white and size.sigma is not None and spread < _ALONE * size.sigma
+    return size.white and size.sigma is not None and spread < _OPTIONS.alone * size.sigma
 
 
 def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int) -> Undecided:
@@ -199,13 +210,13 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int)
     known = columns[:, np.isfinite(columns).all(axis=0)]
     strengths = np.linalg.svd(known, compute_uv=False) if known.size else np.ones(len(names))
     shown = f"{', '.join(names)} {'is a rate' if len(names) == 1 else 'are rates'} of turning"
-    if len(names) == 3 and strengths[1] > _ONE_AXIS * strengths[0]:
+    if len(names) == 3 and strengths[1] > _OPTIONS.one_axis * strengths[0]:
         states = ",".join(names)
         return Undecided(
             f"{source}: {shown} about three axes: --structure poisson --states "
             f"{shlex.quote(states)} learns the bracket of a body that turns"
-            + f", which wants runs of {_RUNS_OF_A_BODY} speeds or more"
-            * (runs < _RUNS_OF_A_BODY),
+            + f", which wants runs of {_OPTIONS.runs_of_a_body} speeds or more"
+            * (runs < _OPTIONS.runs_of_a_body),
             {"structure": "poisson", "states": tuple(names)},
         )
     main = names[int(np.argmax(known.std(axis=1)))] if known.size else names[0]
@@ -227,7 +238,7 @@ def _unclear(
     """Options for columns that nothing tells apart. explained: share of their rates that functions
     of them explain."""
     typed = shlex.quote(",".join(moving))
-    if explained > _FIRST_ORDER:
+    if explained > _OPTIONS.first_order:
         return Undecided(
             f"{source}: the names {', '.join(columns)} do not show what was measured; their rates "
             f"are functions of {', '.join(moving)} themselves, as of states without velocities, of "
@@ -256,7 +267,7 @@ def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tupl
     like = {pair: r.likeness for pair, r in related.items() if r is not None}
     found, used = [], set()
     for (a, b), likeness in sorted(like.items(), key=lambda item: -item[1]):
-        if likeness > _LIKE and not {a, b} & used:
+        if likeness > _OPTIONS.like and not {a, b} & used:
             found.append((a, b))
             used |= {a, b}
     return [(names[a], names[b]) for a, b in sorted(found)]

@@ -37,7 +37,18 @@ from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.scenes.scene import Scene
 
 STATES_MEASURED = 200  # states at which the chosen map's defect and determinant are taken
-_OF_DERIVATIVE = 3.0  # times a step's: the time that compiling its derivative takes
+
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Options of what is measured of a chosen map and of its law."""
+
+    of_derivative: float = 3.0  # times a step's: the time that compiling its derivative takes
+    # Noise in a step, of the spread, under which laws differ by less than it: `benchmarks/laws.py`
+    hides: float = 0.2
+
+
+_OPTIONS = _Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,10 +78,6 @@ class OfPositions:
             + (f". {left} undetermined combinations of terms are 0" if left else "")
             + (f". The noise of the readings is {listed}" if listed else "")
         )
-
-
-# Noise in a step, of the spread, under which laws differ by less than it (`benchmarks/laws.py`).
-_HIDES = 0.2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -158,7 +165,7 @@ class Choice:
         if law.null_terms and not isinstance(law.flow.family, Sums):
             return f"one of several: the pairs do not distinguish {', '.join(law.null_terms)}"
         relative = self.chosen.validation_relative
-        if relative > _HIDES:
+        if relative > _OPTIONS.hides:
             return (
                 f"one of several: noise of {relative:.0%} of the spread in a step hides what "
                 "another law would leave"
@@ -462,7 +469,7 @@ class Fit:
             last = self.budget.last("the posterior, and with it bands", ROWS, work)
             if within(last, lambda: posterior.root) is None:
                 map_ = dataclasses.replace(map_, posterior=None)
-        seconds = _OF_DERIVATIVE * self.budget.compiling
+        seconds = _OPTIONS.of_derivative * self.budget.compiling
         last = self.budget.last("the symplecticity defect of a step", COMPILE, seconds)
         defect = within(last, lambda: self.symplecticity_defect)
         messages = self.budget.left_out[known:]

@@ -26,9 +26,18 @@ _BESIDE = dataclasses.replace(
 )
 # A law holds outside the data and at any time step: so much dearer a step it may be.
 MAX_COST_RATIO = 4.0
-# Where none meets the tolerance, errors that the noise of held-out pairs does not tell apart.
-_AS_GOOD = 1.01
-_TURNED = 0.2  # radians backwards that are worth a word
+
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """Options of the preference for H."""
+
+    # Where none meets the tolerance, errors that the noise of held-out pairs does not tell apart.
+    as_good: float = 1.01
+    turned: float = 0.2  # radians backwards that are worth a word
+
+
+_OPTIONS = _Options()
 
 
 def law_of(problem: LawProblem, learn: str) -> LearnedHamiltonian | None:
@@ -76,7 +85,7 @@ def long_step(data: Dataset, scene: Scene | None) -> list[str]:
         return []
     _, _, jacobian = tangent(data.y0, data.y1, data.scale)
     angle = backwards(turns(jacobian, data.scale)[0])
-    if angle < _TURNED:
+    if angle < _OPTIONS.turned:
         return []
     return [
         f"a step of {data.dt:g} turns the states around their centre by {angle:.2g} radians "
@@ -109,7 +118,7 @@ def preferred(law: Candidate, chosen: Candidate, tolerance: Tolerance) -> bool:
         )
     if chosen.validation_bound <= tolerance.bound or not np.isfinite(law.validation_relative):
         return False
-    as_good = _AS_GOOD
+    as_good = _OPTIONS.as_good
     if law.num_parameters <= chosen.num_parameters:
         size = law.validation_relative if tolerance.relative else law.validation_rms
         chance = law.validation_bound / size if size > 0 else 1.0
