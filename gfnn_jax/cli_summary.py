@@ -33,6 +33,8 @@ def law_line(report: dict[str, Any]) -> str:
 
 def error_line(fit: dict[str, Any]) -> str:
     """Line about the one-step error, its bound, and the tolerance that this bound is held to."""
+    if fit["validation_rms"] is None:
+        return "one-step error not known, for the step fails at some of the held-out states"
     unit = "of the spread" if fit["tolerance_is_relative"] else "in the data's units"
     return (
         f"one-step error {fit['validation_rms']:.2e} in the data's units, "
