@@ -192,7 +192,7 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
             "alike": list(fit.alike),
             "next_motions": [motion._asdict() for motion in fit.next_motions],
         },
-        "hamiltonian": _law(fit.hamiltonian),
+        "hamiltonian": None if fit.hamiltonian is None else _law(fit.hamiltonian),
         "lagrangian": {**_law(fit.lagrangian), "text": str(fit.lagrangian)},
         "friction": {
             **_law(fit.friction),
