@@ -36,10 +36,12 @@ def error_line(fit: dict[str, Any]) -> str:
     if fit["validation_rms"] is None:
         return "one-step error not known, for the step fails at some of the held-out states"
     unit = "of the spread" if fit["tolerance_is_relative"] else "in the data's units"
+    bound = fit["validation_bound"]
+    shown = "not known" if bound is None else f"{bound:.2e}"  # of few pairs it is infinite
     return (
         f"one-step error {fit['validation_rms']:.2e} in the data's units, "
         f"{fit['validation_relative']:.2e} of the spread; 95 % bound "
-        f"{fit['validation_bound']:.2e}, tolerance {fit['tolerance']:g} {unit}: "
+        f"{shown}, tolerance {fit['tolerance']:g} {unit}: "
         f"{'met' if fit['tolerance_met'] else 'not met'}"
     )
 
