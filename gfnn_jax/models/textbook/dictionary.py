@@ -21,7 +21,7 @@ from gfnn_jax.models.textbook.atoms import (
     powers_of,
     value_of,
 )
-from gfnn_jax.models.textbook.shapes import Kind, constants_for, has_constant, values
+from gfnn_jax.models.textbook.shapes import COSH, Kind, constants_for, has_constant, values
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,8 +157,8 @@ class Setting:
         return Dictionary(atoms, columns[:, independent] / size[independent])
 
     def blocks(self) -> list[tuple[Atom, ...]]:
-        """Atoms that laws have together: the first inverse powers of an argument, all products of
-        coordinates up to a degree."""
+        """Atoms that laws have together: the first inverse powers of an argument, exponentials of
+        either sign, all products of coordinates up to a degree."""
         found: list[tuple[Atom, ...]] = []
         for place, argument in enumerate(self.arguments):
             kinds = [] if argument.circular else argument.kinds
@@ -166,6 +166,11 @@ class Setting:
                 if ("power", -float(last)) in kinds:
                     powers = range(1, last + 1)
                     found.append(tuple((Factor(place, ("power", -float(n))),) for n in powers))
+            if not argument.circular and not argument.square:
+                # Not among the functions of one argument: beside exponentials a greedy search that
+                # takes it early finds fewer laws.
+                for theta in constants_for(COSH, argument.value):
+                    found.append(((Factor(place, COSH, float(theta)),),))
         for highest in range(3, self.degree + 1):
             block = tuple(self._monomials(highest, alone=True))
             if block and len(block) <= OPTIONS.most_monomials:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 Kind = tuple[str, float]  # name and exponent n
+COSH: Kind = ("cosh", 0.0)
 
 
 def values(kind: Kind, x, theta):
@@ -75,14 +76,7 @@ def kinds_for(x: np.ndarray, *, distance: bool = False, circular: bool = False) 
         found += [("log", 0.0), ("exp", -2.0), ("exp", -1.0)]
     if not distance:
         found += [("sin", 0.0), ("cos", 0.0)]
-    found += [
-        ("exp", 0.0),
-        ("exp", 1.0),
-        ("cosh", 0.0),
-        ("root", 1.0),
-        ("root", -1.0),
-        ("pole", 0.0),
-    ]
+    found += [("exp", 0.0), ("exp", 1.0), ("root", 1.0), ("root", -1.0), ("pole", 0.0)]
     return [*found, ("softened", 0.0), ("lorentz", 0.0), ("gauss", 0.0)]
 
 
@@ -94,7 +88,7 @@ def constants_for(kind: Kind, x: np.ndarray) -> np.ndarray:
             rates = np.geomspace(0.15, 12.0, 14) / size
             return np.concatenate([-rates[::-1], rates])
         case "cosh":
-            return np.geomspace(0.15, 12.0, 14) / size
+            return np.geomspace(0.5, 8.0, 4) / size
         case "root":
             around = np.geomspace(0.02, 10.0, 14) if kind[1] > 0 else 1 + np.geomspace(0.002, 5, 14)
             return around * size**2
