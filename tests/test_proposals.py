@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
 from gfnn_jax.cli_parser import column_options, parser
+from gfnn_jax.data.first_order import first_order
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.errors import InputError
 
@@ -284,3 +285,11 @@ def test_populations_are_states_of_first_order():
     carts = {"t": T, "one": np.cos(T) + np.cos(1.7 * T), "two": np.cos(T) - np.cos(1.7 * T)}
     with pytest.raises(InputError, match="or some of them and --inputs"):
         gfnn.Recording(carts)
+
+
+def test_random_walks_are_no_states():
+    """Of one run, each part is judged by the others: six functions fit a short walk by chance."""
+    rng = np.random.default_rng(5)
+    for length in (40, 80, 160):
+        t, walk = np.arange(length) * 0.1, np.cumsum(rng.normal(size=(length, 2)), axis=0)
+        assert first_order([t], [walk]).explained < 0.3

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +20,8 @@ class _Options:
     proposals).
 
     lags: samples over which changes are taken. quarter: of the columns' variance that a change may
-    have. samples: changes for each function, at least. parts: into which a run is cut, every other
-    one judged by the fit to those between. invariant: part of a function's variance within runs,
+    have. samples: changes for each function, at least. parts: into which the runs are cut, each
+    judged by the fit to the others. invariant: part of a function's variance within runs,
     that noise leaves of one that is constant in each.
     """
 
@@ -72,7 +72,9 @@ def first_order(times: Sequence[np.ndarray], runs: Sequence[np.ndarray]) -> Firs
         cumulative_simpson(p, x=t, axis=0, initial=0) for t, p in zip(times, tables, strict=True)
     ]
     shares = [
-        _explained([x[lag:] - x[:-lag] for x in runs], [s[lag:] - s[:-lag] for s in sums], every)
+        _explained(
+            [x[lag:] - x[:-lag] for x in runs], [s[lag:] - s[:-lag] for s in sums], lag, every
+        )
         for lag in _OPTIONS.lags
     ]
     return FirstOrder(max(shares), _constants(runs, tables))
@@ -86,26 +88,41 @@ def _quadratic(x: np.ndarray) -> np.ndarray:
     return np.stack([np.ones(len(x)), *x.T, *products], axis=1)
 
 
-def _explained(moved: list[np.ndarray], sums: list[np.ndarray], every: np.ndarray) -> float:
-    """The least share of the changes (n_r, k) that functions (n_r, m) explain, of each part by the
-    fit to the others; 0 of changes that are too few or too long."""
-    few = len(moved) < _OPTIONS.runs
-    part = [np.full(len(x), 0 if few else r % _OPTIONS.parts) for r, x in enumerate(moved)]
-    target, rows, part = (np.concatenate(of) for of in (moved, sums, part))
-    if len(rows) < _OPTIONS.samples * rows.shape[1]:
+def _explained(moved: list[np.ndarray], sums: list[np.ndarray], lag: int, every) -> float:
+    """The least share of the changes (n_r, k) over ``lag`` that functions (n_r, m) explain, of each
+    part by the fit to the others; 0 of changes that are too few or too long."""
+    target, rows = np.concatenate(moved), np.concatenate(sums)
+    if not len(target):
         return 0.0
-    every = every[:: 1 + len(every) // _OPTIONS.most]
-    target, rows, part = (of[:: 1 + len(of) // _OPTIONS.most] for of in (target, rows, part))
     variance = np.var(target, axis=0)
     if np.any(variance > _OPTIONS.quarter * np.var(every, axis=0)):
         return 0.0
-    left = np.zeros(target.shape[1])
-    for one in np.unique(part):
-        own = part == one
-        others = own if few else ~own
+    thin, left, judged = 1 + len(target) // _OPTIONS.most, np.zeros(target.shape[1]), 0
+    for own, others in _parts([len(x) for x in moved], lag):
+        own, others = own[::thin], others[::thin]
+        if len(others) < _OPTIONS.samples * rows.shape[1]:
+            return 0.0
         c = np.linalg.lstsq(rows[others], target[others], rcond=_OPTIONS.told_apart)[0]
         left += np.sum((target[own] - rows[own] @ c) ** 2, axis=0)
-    return float(np.min(1 - left / np.maximum(len(target) * variance, 1e-300)))
+        judged += len(own)
+    return float(np.min(1 - left / np.maximum(judged * variance, 1e-300)))
+
+
+def _parts(lengths: list[int], lag: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(changes of a part, those of the others that share no time with them): of many runs a part is
+    every eighth run, of few an eighth of each run."""
+    run = np.repeat(np.arange(len(lengths)), lengths)
+    place = np.concatenate([np.arange(n) for n in lengths])
+    for k in range(_OPTIONS.parts):
+        if len(lengths) >= _OPTIONS.runs:
+            own = run % _OPTIONS.parts == k
+            others = ~own
+        else:
+            edges = np.array([(n * k, n * (k + 1)) for n in lengths])[run] // _OPTIONS.parts
+            own = (edges[:, 0] <= place) & (place < edges[:, 1])
+            others = (place <= edges[:, 0] - lag) | (place >= edges[:, 1] - 1 + lag)
+        if own.any():
+            yield np.flatnonzero(own), np.flatnonzero(others)
 
 
 def _constants(runs: list[np.ndarray], tables: list[np.ndarray]) -> int:
