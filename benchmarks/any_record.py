@@ -33,6 +33,7 @@ FIRST = 100  # draw; nothing was tuned to these
 NOISE, RIGHT = 1e-3, 0.01  # of the spread
 COUNT, RUNS = 1_500, 200
 MISSING = 0.3
+OFF = 0.05  # of a force, up to which a law of one orbit is right
 DUFFING = "spring"
 MECHANICAL = ("pendulum", "double pendulum", DUFFING, "carts")
 _STARTS, _AHEAD = 11, 10
@@ -362,15 +363,16 @@ def rosette(rng: np.random.Generator) -> Motion:
     return Motion(rates, [1.0, 0.0, 0.0, rng.uniform(0.4, 1.2)], 5.5)
 
 
+POWERS = "one of several: the power of the distance"
 ORBITS = {
     "membrane": (membrane, ("first order",)),
     "prey and predators": (prey, ("first order",)),
     "reaction": (brusselator, ("first order",)),
     "Van der Pol in Liénard's plane": (two_columns_of_van_der_pol, ("first order",)),
     "two linear equations": (decay, ("first order",)),
-    "ellipse about a sun": (planet, ("identified",)),
+    "ellipse about a sun": (planet, ("identified", POWERS)),
     "ellipse about its middle": (equal_springs, ("identified", "first order or mechanical")),
-    "rosette": (rosette, ("identified",)),
+    "rosette": (rosette, ("identified", POWERS)),
 }
 EACH_ORBIT = 5
 
@@ -385,15 +387,30 @@ def orbit_case(name: str, draw: int) -> Numbers:
     x = solve_ivp(motion.rates, (0, t[-1]), motion.start, **options).y.T[:, :2]
     x = x + NOISE * x.std(axis=0) * rng.normal(size=x.shape)
     table = {"t": t, "x1": x[:, 0], "x2": x[:, 1]}
-    _, said = _fitted(gfnn.Recording(table, positions=["x1", "x2"], angles=[]))
+    fit, said = _fitted(gfnn.Recording(table, positions=["x1", "x2"], angles=[]))
     verdict = said["verdict"] or f"refused: {said.get('refused')}"
+    wrong = verdict.startswith("identified") and not _is_right(fit, motion, x)
     return said | {
         "draw": draw,
         "class": name,
         "verdict": verdict,
         "identified": verdict.startswith("identified"),
-        "named": any(word in verdict for word in words),
+        "wrong": wrong,
+        "named": any(word in verdict for word in words) and not wrong,
     }
+
+
+def _is_right(fit: Any, motion: Motion, x: np.ndarray) -> bool:
+    """Return whether a law has the forces of the truth, also a third off the orbit x (n, 2)."""
+    if len(motion.start) == 2:
+        return False  # of first order
+    r, law = np.linalg.norm(x, axis=1), law_of(fit, 1e-3)
+    turns = np.exp(1j * np.arange(12))
+    at = np.linspace(0.7 * r.min(), 1.3 * r.max(), 12) * turns
+    q = np.stack([at.real, at.imag], axis=1)
+    true = np.array([motion.rates(0.0, [*one, 0.0, 0.0])[2:] for one in q])
+    miss = np.array([law(one, np.zeros(2)) for one in q]) - true
+    return bool(np.all(np.linalg.norm(miss, axis=1) < OFF * np.linalg.norm(true, axis=1)))
 
 
 def drawn(one: Callable[[str, int], Numbers], name: str, count: int, quick: bool) -> Numbers:
@@ -466,10 +483,14 @@ def tables() -> None:
         rows = []
         for name in names:
             own = cases.get(_slug(f"{kind} {name}"), [])
-            named, identified = (sum(c[k] for c in own) for k in ("named", "identified"))
+            named, identified, wrong = (
+                sum(c.get(k, False) for c in own) for k in ("named", "identified", "wrong")
+            )
+            wrong = identified if kind == "outside" else wrong
             if own:
-                rows.append([name, f"{named} of {len(own)}", str(identified)])
-        text += "\n\n" + markdown((head, "named for what it is", "*identified*"), rows)
+                rows.append([name, f"{named} of {len(own)}", str(identified), str(wrong)])
+        heads = (head, "named for what it is", "*identified*", "wrong and *identified*")
+        text += "\n\n" + markdown(heads, rows)
     between_markers(TABLES, "any-record", f"{text}\n\n{provenance(found)}")
 
 

@@ -400,6 +400,20 @@ def test_friction_of_rare_kinds(kind):
     assert given == tuple(law_of(fit.map).form.friction.rows())
 
 
+def test_a_power_of_the_distance_that_others_imitate_is_one_of_several():
+    """A hardening spring in the plane, V = ½ r² + 0.2 r⁴, along an orbit of few distances."""
+    t = 0.1 * np.arange(250)
+
+    def rates(_, z):
+        return [z[2], z[3], *(-(1 + 0.8 * (z[0] ** 2 + z[1] ** 2)) * z[:2])]
+
+    x = solve_ivp(rates, (0, 25), [1, 0, 0, 0.9], t_eval=t, rtol=1e-9).y[:2].T
+    x = x + 1e-3 * np.random.default_rng(0).normal(size=x.shape)
+    fit = gfnn.fit(gfnn.Recording({"t": t, "x": x[:, 0], "y": x[:, 1]}, positions=["x", "y"]))
+    assert "sqrt(x**2 + y**2)**4" in str(fit.formula)
+    assert re.match(r"one of several: .* may be .*r\*\*3.5 .* in place of r\*\*4\.", fit.verdict)
+
+
 @pytest.mark.slow
 def test_powers_up_to_the_highest_tried_are_one_of_several_laws():
     """A relativistic oscillator, whose motion powers imitate."""
@@ -766,6 +780,13 @@ def test_the_gain_of_a_band_limited_input_has_no_bias():
     fit = gfnn.fit(recording, terms=["V: x**2", "R: v**2"], input_hold="band")
     gain, std = fit.gains["u"]["x"]
     assert abs(gain - 3) < 3 * std < 3e-5
+    assert fit.verdict == "identified"
+    table["u"] = (waves @ np.exp(-0.03j * rates)).imag  # written down 0.03 s late
+    recording = gfnn.Recording(table, positions=["x"], inputs=["u"])
+    with pytest.warns(gfnn.FitWarning, match="inputs act .* they answer the motion"):
+        fit = gfnn.fit(recording, terms=["V: x**2", "R: v**2"], input_hold="band")
+    assert fit.delay[0] == pytest.approx(-0.03, abs=4 * fit.delay[1])
+    assert fit.verdict.startswith("partly: inputs act 0.0")
 
 
 @pytest.mark.slow

@@ -34,6 +34,7 @@ from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.lagrangians.central_powers import other_powers
 from gfnn_jax.models.lagrangians.dependence import search_of_systems
 from gfnn_jax.models.lagrangians.drives import hidden_frequency, with_frequency
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
@@ -72,7 +73,8 @@ class RecordingOptions:
     smaller, which chance does not make. imitated: share of what a sensor's parameter changes that
     no coefficient of the law does, below which it is not identifiable. still: range of a position
     over its size, at which it does not move: roundoff. periods_of_events: lengths of arcs where
-    only events are read, two in a period.
+    only events are read, two in a period. early: of a sample, that inputs may act before they were
+    measured: rounding.
     """
 
     missed: float = 0.8
@@ -83,6 +85,7 @@ class RecordingOptions:
     imitated: float = 1e-4
     still: float = 1e-14
     periods_of_events: tuple[float, ...] = (32.0, 1e4)
+    early: float = 0.01
 
 
 OPTIONS = RecordingOptions()
@@ -91,7 +94,10 @@ DRIVEN = (
     "phase of the times in the file. Record the drive, and name it: --inputs (inputs=)"
 )
 
-
+EARLY = (
+    "their times are late, as of a filter or of a second clock: shift the column. Or they answer "
+    "the motion, as a controller does, and do not drive it: name what drives it (--inputs, inputs=)"
+)
 SERIES = (
     "powers up to {}, the highest tried, may be a series of another shape, and hold within the "
     "motion recorded alone. Give a shape that you expect, as exp(-x), 1/x or cos(x): --terms "
@@ -148,10 +154,8 @@ def fit_recording(
         best, findings = _findings(recording, data, found, (*left_out, *of_drive), steps)
         findings = findings._replace(seconds=time.process_time() - started)
         law = in_words(recording, best, findings)
-        last = None if terms else last_of_series(best.fit.structure.terms)
-        if last is not None and not law.rival:
-            word = data.problem.word(("term", last))
-            law = dataclasses.replace(law, rival=SERIES.format(word))
+        if not terms and not law.rival:
+            law = dataclasses.replace(law, rival=_other_shapes(best.fit))
     except (FitError, np.linalg.LinAlgError):
         if missed is not None:
             raise _with_nature(missed, data) from None
@@ -161,12 +165,31 @@ def fit_recording(
     if missed is None and law.flaws:
         what = _nature(data)
         if what.partly:
-            return dataclasses.replace(law, nature=what.reason)
-        missed = no_law(data.problem.scales)
+            law = dataclasses.replace(law, nature=what.reason)
+        else:
+            missed = no_law(data.problem.scales)
     if missed is not None:
         missed.fit = law
         raise _with_nature(missed, data)
-    return law
+    return _with_early_inputs(law, data.problem.scales.dt)
+
+
+def _with_early_inputs(law: LearnedLaw, dt: float) -> LearnedLaw:
+    """The law, with a flaw where its inputs act before they were measured."""
+    delay, error = law.delay or (0.0, 0.0)
+    if not -delay > max(error, OPTIONS.early * dt):
+        return law
+    flaw = f"inputs act {measured(-delay, error)} s before they were measured"
+    messages = (*law.messages, f"{flaw}: {EARLY}")
+    return dataclasses.replace(law, flaws=(flaw, *law.flaws), messages=messages)
+
+
+def _other_shapes(fit: LawFit) -> str:
+    """A line on terms of other shapes that follow a record as the law does, "" where none do."""
+    last = last_of_series(fit.structure.terms)
+    if last is not None:
+        return SERIES.format(fit.problem.word(("term", last)))
+    return other_powers(fit, symbols(fit.problem.observation.coordinates))
 
 
 def _is_no_law(law: LearnedLaw) -> bool:

@@ -21,6 +21,7 @@ from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.central_powers import with_likeliest_power
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, table_of
@@ -253,7 +254,7 @@ class TermSearch:
         others tried; with the delay of its inputs."""
         if self.every is not None:
             before, terms = fit.structure, dataclasses.replace(self.every, friction=())
-            fit = self.prune(fit, friction=False)
+            fit = self.prune(with_likeliest_power(fit), friction=False)
             fit = self.prune(self.grow(fit, terms), friction=False)
             waves = fit
             for angle in fit.problem.within_a_turn:
