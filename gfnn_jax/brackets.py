@@ -148,7 +148,7 @@ class Bracket:
         raise NotImplementedError
 
     def matrix(self, z):
-        """B(z) (..., n, n) at states z (..., n), NumPy or JAX."""
+        """B(z) (..., n, n) at states z (..., n), NumPy, JAX or lists."""
         raise NotImplementedError
 
     def apply(self, z, g):
@@ -216,6 +216,7 @@ class Constant(Bracket):
 
     def matrix(self, z):
         """B (..., n, n), the same at every state z."""
+        z = _as_states(z)
         return namespace(z).broadcast_to(self.form, (*z.shape[:-1], *self.form.shape))
 
     @cached_property
@@ -248,6 +249,7 @@ class Log(Bracket):
 
     def matrix(self, z):
         """B_ij z_i z_j (..., n, n)."""
+        z = _as_states(z)
         return as_row(self.form, z[..., None]) * (z[..., :, None] * z[..., None, :])
 
     def outside(self, z):
@@ -291,7 +293,7 @@ class LieAlgebra(Bracket):
 
     def matrix(self, z):
         """Σ_k c_ijk z_k (..., n, n)."""
-        n = self.size
+        z, n = _as_states(z), self.size
         return matmul(z, self.constants.reshape(n * n, n).T).reshape(*z.shape[:-1], n, n)
 
     def outside(self, z):
@@ -393,6 +395,7 @@ class Magnetic(Bracket):
 
     def matrix(self, z):
         """B (..., 2d, 2d)."""
+        z = _as_states(z)
         xp, d = namespace(z), self.size // 2
         inverse = xp.linalg.inv(self.mass)
         curl = matmul(inverse, matmul(self.curl(z[..., :d]), inverse))
@@ -428,8 +431,8 @@ class Casimir:
     labels: tuple[str, ...]
 
     def __call__(self, z):
-        """Value (...) at states z (..., n), NumPy or JAX."""
-        z = z if hasattr(z, "shape") else np.asarray(z, float)
+        """Value (...) at states z (..., n), NumPy, JAX or lists."""
+        z = _as_states(z)
         y = namespace(z).log(z) if self.logs else z
         value = matmul(y, self.linear)
         if self.quadratic is not None:
@@ -438,6 +441,7 @@ class Casimir:
 
     def gradient(self, z):
         """Gradient (..., n)."""
+        z = _as_states(z)
         if self.logs:
             return as_row(self.linear, z) / z
         slope = matmul(z, self.quadratic) if self.quadratic is not None else 0.0
@@ -457,6 +461,11 @@ class Casimir:
 
     def __str__(self) -> str:
         return self.formula
+
+
+def _as_states(z):
+    """States as they are where they are an array, traced or not; else as a NumPy array."""
+    return z if hasattr(z, "shape") else np.asarray(z, float)
 
 
 def standard_constants(blocks: Sequence[str]) -> np.ndarray:

@@ -383,7 +383,7 @@ def _hold_to(strict: bool, model: Path) -> None:
 
 # Options of `gfnn run` for files; of `gfnn fit` that no law of a recording has; of `gfnn predict`
 # for steps of a map, and for the forecast of a recording.
-_OF_FILES = ("despite", *ROLES, *OF_COLUMNS, "std", "observe", "guess", "mass")
+_OF_FILES = ("despite", *ROLES, *OF_COLUMNS, "std", "observe", "event", "guess", "mass")
 _OF_MAPS = (
     "tolerance",
     "absolute_tolerance",

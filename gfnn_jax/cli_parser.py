@@ -475,6 +475,8 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
     names("--scale", "columns whose scale is fitted with the law")
     shows = "what a sensor shows, as 'px = x0 + R*sin(theta + tilt)': its parameters are fitted"
     pairs("--observe", shows, _formula, "COLUMN=TEXT")
+    events = "times at which an expression is zero, as 'gate=theta' of a photogate"
+    pairs("--event", events, _formula, "COLUMN=TEXT")
     pairs("--guess", "start values of the parameters of --observe", _guesses, "NAME=X")
     moving = "names of coordinates that --observe is written in, where no column measures them"
     names("--coordinates", moving)
@@ -486,8 +488,8 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
 def column_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """The options that were given, as keywords of `gfnn_jax.read`; ``mass`` is none of them."""
     given = {name: getattr(arguments, name) for name in (*ROLES, *OF_COLUMNS)}
-    for name in ("std", "observe", "guess"):
-        given[name] = dict(pair for pairs in getattr(arguments, name) or () for pair in pairs)
+    for name, option in (*((n, n) for n in ("std", "observe", "guess")), ("events", "event")):
+        given[name] = dict(pair for pairs in getattr(arguments, option) or () for pair in pairs)
     return {name: value for name, value in given.items() if value not in (None, {})}
 
 
@@ -499,7 +501,7 @@ def masses(arguments: argparse.Namespace) -> dict[str, float]:
 def names_roles(options: dict[str, Any]) -> bool:
     """Return whether keywords of `column_options` say what columns are, which makes a file a
     recording."""
-    return bool({*ROLES, "columns", "coordinates", "observe", "time"} & set(options))
+    return bool({*ROLES, "columns", "coordinates", "observe", "events", "time"} & set(options))
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -31,6 +31,7 @@ def test_jacobi_and_casimirs(name):
     z = RNG.uniform(0.5, 1.5, bracket.size)
     b = bracket.matrix(z)
     np.testing.assert_allclose(b, -b.T, atol=1e-14)
+    np.testing.assert_array_equal(b, bracket.matrix(z.tolist()))
     slope = np.asarray(jax.jacfwd(bracket.matrix)(z))  # ∂_l B_ij
     cycle = np.einsum("il,jkl->ijk", b, slope)
     total = cycle + cycle.transpose(1, 2, 0) + cycle.transpose(2, 0, 1)

@@ -31,7 +31,7 @@ def gate(friction, noise=1e-4, start=0.9):
 
 def fitted(times):
     record = gfnn.Recording(
-        {"gate": times}, observe={"gate": "crossing(theta)"}, angles=["theta"], std={"gate": 1e-4}
+        {"gate": times}, events={"gate": "theta"}, angles=["theta"], std={"gate": 1e-4}
     )
     return gfnn.fit(record)
 
@@ -77,7 +77,7 @@ def test_events_stand_between_samples():
     record = gfnn.Recording(
         {"t": t, "x": t**2, "gate": [0.5, 2.0, np.nan, np.nan, np.nan]},
         positions=["x"],
-        observe={"gate": "crossing(x - 2*a)"},
+        events={"gate": "x - 2*a"},
     )
     np.testing.assert_array_equal(record.times("0"), [0, 0.5, 1, 2, 3, 4])
     np.testing.assert_array_equal(

@@ -159,6 +159,24 @@ def test_javascript_is_the_flow(kind, tmp_path):
         assert family.num_parameters == len(params)
 
 
+@needs_node
+def test_a_body_without_a_force_and_one_that_falls_in_javascript(tmp_path):
+    none = (0, 0)
+    rows = [((2, 0), none, none, 0.0), ((0, 2), none, none, 0.0), (none, (0, 1), none, 0.0)]
+    friction = lagrangian.Friction.of([], 2)
+    coefficients = np.array([0.5, 0.5, -9.8])
+    own = lagrangian.Lagrangian(
+        lagrangian.Terms.of(rows, 2), coefficients, friction, np.zeros(0), 0.0, np.zeros((2, 0))
+    )
+    z = np.random.default_rng(0).uniform(-1, 1, (20, 4))
+    path = gfnn.export(map_of_law(own, z, 0.02, tolerance=1e-9), "js", tmp_path / "own.js")
+    q, p = z[:, :2], z[:, 2:]
+    fall = 0.1 * np.array([0.0, -9.8])
+    wanted = np.concatenate([q + 0.1 * p + 0.05 * fall, p + fall], axis=1)
+    found = by_javascript(path, [[state, 0.1] for state in z.tolist()])
+    np.testing.assert_allclose(found, wanted, atol=1e-14)
+
+
 @needs_cc
 def test_bodies_stick_in_c_as_in_a_rollout(tmp_path):
     map_, z = sticking()

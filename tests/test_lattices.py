@@ -471,6 +471,7 @@ def test_kicked_sites_of_plain_coordinates():
     ("options", "said"),
     [
         ({"structure": "torus"}, "expected a structure among"),
+        ({"structure": "poisson,chain"}, r"\(one alone\).*, got 'poisson,chain'"),
         ({"structure": "ring:0"}, "expected a structure among"),
         ({"structure": "ring:3"}, "expected 3 q of every site; got 20"),
         ({"structure": "chain:10"}, "at least 5 sites, got 2"),

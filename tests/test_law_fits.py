@@ -566,6 +566,11 @@ def test_a_band_of_whole_trajectories_holds_them(swing):
     assert 2.0 < np.median(wider) < 6.0
     more = fit.map.forecast(past, times, coverage=0.99, simultaneous=True)
     assert np.all(more.band["theta"] > found.band["theta"])
+    np.testing.assert_allclose(found.upper["theta"] - found.lower["theta"], 2 * found.band["theta"])
+    np.testing.assert_allclose(
+        found.upper["theta"] + found.lower["theta"], 2 * found.values["theta"]
+    )
+    assert fit.map.forecast(past, times).lower is None
     of_each = fit.map.forecast(past, times, coverage=0.95)
     np.testing.assert_allclose(of_each.band["theta"], 2 * of_each.std["theta"])
     with pytest.raises(gfnn.InputError, match="between 0 and 1"):

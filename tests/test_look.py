@@ -169,6 +169,24 @@ def test_look_as_json(tmp_path, capsys):
     assert said["command"] == f"gfnn fit {path} --std theta=0.002 --mass theta=2 --out model"
 
 
+def test_look_names_what_sensors_show(tmp_path, capsys):
+    t = 0.05 * np.arange(200)
+    gate = np.where(t < 3, 0.3 + t * 10, np.nan)
+    columns = np.stack([t, np.cos(2 * t), -4 * np.cos(2 * t), np.sin(3 * t), gate], axis=1)
+    path = tmp_path / "r.csv"
+    np.savetxt(path, columns, "%.6g", ",", header="t,x,a,u,gate", comments="")
+    given = ["--positions", "x", "--inputs", "u", "--observe", "a=x_ddot", "--event", "gate=x"]
+    assert main(["look", str(path), "--json", *given, "--std", "gate=1e-3"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    roles = {name: column["role"] for name, column in said["columns"].items()}
+    assert roles == {"x": "positions", "u": "inputs", "a": "accelerations", "gate": "events"}
+    assert "--event 'gate = x'" in said["command"]
+    recording = gfnn.read(path, positions="x", events={"gate": "x"})
+    assert recording.observe == {"gate": "crossing(x)"}
+    with pytest.raises(InputError, match="not in both"):
+        gfnn.read(path, observe={"gate": "crossing(x)"}, events={"gate": "x"})
+
+
 def test_strict_look_fails_where_something_is_wrong(tmp_path, capsys):
     path = a_swing(tmp_path / "r.csv", omega=lambda t, x: np.cos(17 * t))
     assert main(["look", str(path), "--json"]) == 0

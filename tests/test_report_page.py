@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import re
 import shutil
 import subprocess
@@ -37,7 +38,7 @@ def swing(seconds=24.0, dt=0.04, sigma=1e-3):
 def discovered():
     t, x = swing()
     table = {"t": t, "x": x}
-    return gfnn.discover(table, report=None, positions=["x"])
+    return gfnn.discover(table, positions=["x"])
 
 
 def test_quantities_are_those_of_the_oscillator():
@@ -118,13 +119,19 @@ def test_the_page_is_whole_small_and_needs_no_network():
     assert discovered().verdict.partition(":")[0] in text
 
 
-def test_a_refusal_has_its_page(tmp_path):
+def test_a_refusal_has_its_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     t = np.arange(0.0, 20.0, 0.05)
     x = np.ones(len(t))  # which moves nowhere
     with pytest.raises((gfnn.FitError, gfnn.InputError)) as refused:
-        gfnn.discover({"t": t, "x": x}, tmp_path / "report.html", positions=["x"])
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+        gfnn.discover({"t": t, "x": x}, tmp_path / "o", positions=["x"])
+    text = (tmp_path / "o" / "report.html").read_text(encoding="utf-8")
     assert str(refused.value)[:40] in text
+    with pytest.raises((gfnn.FitError, gfnn.InputError)):
+        gfnn.discover({"t": t, "x": x}, positions=["x"])
+    assert [path.name for path in tmp_path.iterdir()] == ["o"]  # nothing without out
+    told = json.loads((tmp_path / "o" / "report.json").read_text(encoding="utf-8"))
+    assert (told["verdict"], told["error"]) == ("not fitted", str(refused.value))
 
 
 def test_one_command_writes_the_report(tmp_path, monkeypatch, capsys):

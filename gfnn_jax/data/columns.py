@@ -428,3 +428,22 @@ def typical(
         elif name in std:
             found[name] = float(std[name]) * factors[name]
     return found
+
+
+def with_crossings(observe: Mapping[str, Any], events: Mapping[str, str]) -> dict[str, Any]:
+    """Join what sensors show with columns of ``events``, whose expression h is the formula
+    "crossing(h)". Raises InputError where h is no text, or a column stands in both."""
+    for name, expression in events.items():
+        if not (isinstance(expression, str) and expression.strip()):
+            raise InputError(
+                f"events: {name}: expected an expression of coordinates as text, as "
+                f"{{'{name}': 'theta'}}, got {expression!r}"
+            )
+        if name in observe:
+            raise InputError(f"{name}: expected it in observe or in events, not in both")
+    return {**observe, **{name: f"crossing({one})" for name, one in events.items()}}
+
+
+def crossings_in(observe: Mapping[str, Any]) -> tuple[str, ...]:
+    """The columns of which ``observe`` says that they hold times of crossings."""
+    return tuple(n for n, one in observe.items() if isinstance(one, str) and "crossing(" in one)

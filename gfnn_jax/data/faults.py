@@ -478,8 +478,8 @@ def _time_units(traits: Traits) -> Iterator[Fault]:
 def _drifting(traits: Traits) -> Iterator[Fault]:
     drifts = {run: drift(t) for run, t in zip(traits.recording.runs, traits.times, strict=True)}
     run = max(drifts, key=lambda name: abs(drifts[name]))
-    events = any("crossing(" in str(one) for one in traits.recording.observe.values())
-    if abs(drifts[run]) > _OPTIONS.drift and not events:  # whose times are what is measured
+    events = traits.recording.events  # whose times are what is measured
+    if abs(drifts[run]) > _OPTIONS.drift and not events:
         found = f"the time step drifts by {100 * drifts[run]:.2g} % along run {run}"
         remedy = "If the samples are even and the clock drifts, give even steps: --dt"
         yield Fault("drifting clock", found, f"{remedy} {traits.step:g}")

@@ -24,12 +24,14 @@ from gfnn_jax.data.columns import (
     check_known,
     check_sigmas,
     clock_of,
+    crossings_in,
     factors_of,
     listed,
     resolved,
     roles_of,
     time_unit_of,
     typical,
+    with_crossings,
     with_sigmas,
 )
 from gfnn_jax.data.roles import ROLES, coordinates_in, is_run, unit_in
@@ -71,10 +73,11 @@ class ReadOptions(TypedDict, total=False):
     coordinates: what moves, where it is not the positions: ``observe`` then says how columns show
              it; by default those that its formulas name (theta, or omega, which is its velocity).
     observe: column -> text such as "x0 + R*sin(theta + tilt)", or a function of arguments with
-             these names: coordinates, velocities, and parameters to be fitted. A column of times
-             at which the motion crosses h = 0, of a photogate, is "crossing(h)"; ``std`` is then
-             the noise of these times in s.
-    guess:   where parameters of ``observe`` start.
+             these names: coordinates, velocities, and parameters to be fitted.
+    events:  column -> expression h, as {"gate": "theta"} of a photogate: the column holds the times
+             at which the motion crosses h = 0, and ``std`` is the noise of these times in s. It is
+             short for ``observe={"gate": "crossing(theta)"}``.
+    guess:   where parameters of ``observe`` and ``events`` start.
     """
 
     positions: Names
@@ -94,6 +97,7 @@ class ReadOptions(TypedDict, total=False):
     scale: Names
     coordinates: Names
     observe: Mapping[str, Any] | None
+    events: Mapping[str, str] | None
     guess: Mapping[str, float] | None
 
 
@@ -170,10 +174,10 @@ class Recording:
         given = {role: names_of[role] for role in ROLES}
         angles = None if options.get("angles") is None else names_of["angles"]
         columns, dt, time = names_of["columns"], options.get("dt"), options.get("time")
-        std, observe = options.get("std") or {}, options.get("observe") or {}
+        std = options.get("std") or {}
+        observe = with_crossings(options.get("observe") or {}, options.get("events") or {})
         tables = [_selected(_timed(t, time), columns) for t in tables]
-        gates = [n for n, one in observe.items() if isinstance(one, str) and "crossing(" in one]
-        tables = [with_events(t, gates) for t in tables]
+        tables = [with_events(t, crossings_in(observe)) for t in tables]
         tables, sigmas = with_sigmas(tables, std)
         source = ", ".join(dict.fromkeys(t.source for t in tables))
         names = list(dict.fromkeys(name for t in tables for name in t.columns))
@@ -182,11 +186,11 @@ class Recording:
         of_times = list(dict.fromkeys(name for t in tables for name in t.times))
         columned = [name for name in names if not is_run(name) and name not in of_times]
         numbers = [name for name in columned if name not in sigmas.values()]
+        check_known(source, "observe", observe, numbers)
         told = time_unit_of(source, of_times[:1], units, options.get("time_unit"))
         unit = told or "s"
         runs = runs_of(tables, columned, SECONDS[unit], dt)
         coordinate_names = listed(options.get("coordinates"))
-        check_known(source, "observe", observe, numbers)
         if not coordinate_names and not given["positions"]:
             implied = coordinates_in(observe.values())
             coordinate_names = () if {*implied} & {*numbers} else implied
@@ -254,6 +258,16 @@ class Recording:
         for run in self.runs:
             for array in (self._times[run], *self._values[run].values()):
                 array.flags.writeable = False
+
+    @property
+    def events(self) -> tuple[str, ...]:
+        """Columns of times at which the motion crosses a zero, as ``observe`` says."""
+        return crossings_in(self.observe)
+
+    @property
+    def accelerations(self) -> tuple[str, ...]:
+        """Columns whose formula in ``observe`` has an acceleration, as x_ddot."""
+        return tuple(name for name, one in self.observe.items() if "_ddot" in str(one))
 
     def __len__(self) -> int:
         """The number of samples of all runs."""

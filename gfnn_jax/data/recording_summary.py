@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 _VALUE = r"(?!(?:and|or|with|if|goes|learns|has)\b)('[^']*'|[^\s()]+?)(?=[.,;:)]*(?:\s|$))"
 _TYPED = re.compile(rf"--([a-z][a-z-]+)(?: {_VALUE})?(?: \(\w+=\))?")
 _LISTS = (*ROLES, "angles", "degrees", "columns", "coordinates", "offset", "scale", "states")
-_IN_PYTHON = {"from": "start", "to": "stop"}
+_IN_PYTHON = {"from": "start", "to": "stop", "event": "events"}
+_FORMULAS = {"observe": "observe", "events": "event"}  # keyword: option, one for each column
+_SEEN = ("events", "accelerations")  # what a sensor shows, more exactly than its role
 _OF_FITS = ("structure", "states", "mass")
 _NOTEBOOK = '<pre style="line-height:normal;white-space:pre">{code}</pre>'
 
@@ -57,10 +59,11 @@ _SHOWN = _Shown()
 class Column:
     """One column, in the file's unit.
 
-    role: positions, velocities, momenta, inputs, parameters, or ignored. sigma: of the noise, with
-    ``white`` whether neighbouring samples have independent noise; None where it is not told.
-    resolution: the smallest step between values. derivative_of: the column whose derivative it is,
-    times ``factor``, ``lag`` seconds late. frequencies: in Hz, the strongest first.
+    role: positions, velocities, accelerations, momenta, inputs, events, parameters, sensors or
+    ignored. sigma: of the noise, ``white`` whether neighbouring samples have independent noise;
+    None where it is not told. resolution: the smallest step between values. derivative_of: the
+    column whose derivative it is, times ``factor``, ``lag`` seconds late. frequencies: in Hz, the
+    strongest first.
     """
 
     name: str
@@ -283,7 +286,7 @@ def _coarsest(known: Traits) -> float | None:
 def _column(known: Traits, name: str, doubted: frozenset[str]) -> Column:
     recording, values = known.recording, known.columns[name]
     factor = recording.factors[name]
-    role = next((r for r in ROLES if name in getattr(recording, r)), "ignored")
+    role = next((r for r in (*_SEEN, *ROLES) if name in getattr(recording, r)), "ignored")
     noise = known.noise.get(name)
     of, relation = _derivative_of(known, name)
     resolution = known.resolution[name]
@@ -366,7 +369,7 @@ def in_python(text: str) -> str:
         if value is None:
             return f"{name}="
         value = shlex.split(value)[0]
-        if name == "observe":
+        if name in ("observe", "events"):
             value = dict([value.split(" = ", 1)])
         elif name in _LISTS:
             value = [] if value == "none" else value.split(",")
@@ -385,8 +388,9 @@ def as_typed(options: Mapping[str, Any]) -> str:
     words = {"start": "from", "stop": "to", "time_unit": "time-unit"}
     parts = []
     for option, value in options.items():
-        if option == "observe":
-            parts += [f" --observe {shlex.quote(f'{c} = {f}')}" for c, f in value.items()]
+        if option in _FORMULAS:
+            name = _FORMULAS[option]
+            parts += [f" --{name} {shlex.quote(f'{c} = {f}')}" for c, f in value.items()]
             continue
         if isinstance(value, Mapping):
             value = ",".join(f"{name}={_short(number)}" for name, number in value.items())

@@ -13,7 +13,7 @@ STRUCTURES = (
     "chain:FIELDS",
     "bodies:N:SPECIES",
 )
-EXPECTED = f"a structure among {', '.join(STRUCTURES)}"
+EXPECTED = f"a structure among {', '.join(STRUCTURES)} (one alone)"
 _SITES, _BODIES = r"(ring|chain)(:[1-9][0-9]?)?", r"bodies:0*([2-9]|[1-9][0-9]+)(:[A-Za-z]+)?"
 
 

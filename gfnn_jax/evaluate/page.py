@@ -25,7 +25,7 @@ from gfnn_jax.evaluate.figures import Figure
 from gfnn_jax.evaluate.figures_style import as_svg
 from gfnn_jax.evaluate.forecasts import Forecasts, forecasts_of
 from gfnn_jax.evaluate.physics import Physics, physics
-from gfnn_jax.evaluate.report import device
+from gfnn_jax.evaluate.report import PAGE, REPORT, device, to_json
 from gfnn_jax.evaluate.simulation import simulation
 from gfnn_jax.exports.symbolic import as_mathml, defines
 from gfnn_jax.families.text import in_letters, measured
@@ -125,15 +125,27 @@ def write_page(fit: Fit, path: str | os.PathLike[str], **options: Any) -> None:
     _write(page(fit, **options), Path(path))
 
 
+def write_reports(fit: Fit, folder: Path, about: About) -> None:
+    """Write the report as page and as JSON into a folder, which is made where there is none."""
+    write_page(fit, folder / PAGE, about=about)
+    _write(to_json(fit.report()), folder / REPORT)
+
+
 def write_refusal(
     recording: Recording,
     error: Exception,
-    path: str | os.PathLike[str],
+    folder: Path,
     about: About = About(),  # noqa: B008
 ) -> None:
-    """Write the page of a recording that gave no law: why, what it holds, what to do."""
+    """Write the page of a recording that gave no law into a folder: why, what it holds, what to do;
+    and as JSON the verdict, ``error``, and the report of the law that was refused, where there is
+    one."""
     cause = error if isinstance(error, FitError) else error.__cause__
-    verdict = cause.verdict if isinstance(cause, FitError) and cause.verdict else "not fitted"
+    of_fit = cause if isinstance(cause, FitError) else None
+    verdict = of_fit.verdict if of_fit and of_fit.verdict else "not fitted"
+    refused = of_fit.fit.report() if of_fit and of_fit.fit is not None else {"data": {}}
+    result = {**refused, "verdict": verdict, "error": str(error)}
+    result["data"] = {**refused["data"], "source": recording.source}
     summary = recording.summary()
     drawn = _svg(figures.recording_figure(recording, summary), "The recording.")
     sections = [
@@ -146,13 +158,14 @@ def write_refusal(
         Section("To do next", lines=[summary.command]),
         _made(float("nan"), about.command),
     ]
-    _write(_rendered(_title(recording), verdict, sections), Path(path))
+    _write(_rendered(_title(recording), verdict, sections), folder / PAGE)
+    _write(to_json(result), folder / REPORT)
 
 
 def _write(text: str, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(
-        "w", encoding="utf-8", dir=path.parent, suffix=".html", delete=False
+        "w", encoding="utf-8", dir=path.parent, suffix=path.suffix, delete=False
     ) as file:
         file.write(text)
     Path(file.name).chmod(0o644)

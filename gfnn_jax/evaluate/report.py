@@ -18,6 +18,7 @@ from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.maps.saved import versions
 from gfnn_jax.solve.status import STATUS_NAMES
 
+REPORT, PAGE = "report.json", "report.html"
 STEPS_REPORTED = (1, 10, 100, 1000)
 _LABELS = ("learns", "family", "label", "chart", "num_parameters")
 _ERRORS = ("validation_rms", "validation_relative", "validation_bound", "outside")

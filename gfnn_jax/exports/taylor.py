@@ -98,6 +98,12 @@ _FUNCTIONS = {
 }
 
 
+def _has_row(rate: Any) -> bool:
+    """Return whether a rate has a row in T: no number has one, as of a body without a force, and
+    no coefficient."""
+    return isinstance(rate, Symbol) and (rate.operation != "input" or rate.operands[0][0] in "zu")
+
+
 class _Rows:
     """The rows of a table T, a series each: z, the forces that hold bodies, then all operations.
 
@@ -117,7 +123,8 @@ class _Rows:
         rates, speeds, limits = np.split(
             np.array([*found, None], dtype=object)[:-1], [self.width, self.width + self.count]
         )
-        self.rates, self.speeds, self.limits = rates.tolist(), speeds.tolist(), limits.tolist()
+        self.rates = [rate if _has_row(rate) else tape.made("+", rate, 0.0) for rate in rates]
+        self.speeds, self.limits = speeds.tolist(), limits.tolist()
         self.tape, self.size = tape, OPTIONS.order + 1
         self.made = self._used()
         self.varies: set[int] = set()

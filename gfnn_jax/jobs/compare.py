@@ -19,7 +19,7 @@ from gfnn_jax.evaluate import figures, metrics, report
 from gfnn_jax.jobs.figures import BINS, divergences, figures_of_comparison
 from gfnn_jax.jobs.measure import Rollouts, measure, without_runaways
 from gfnn_jax.jobs.methods import OURS, PAPER_GFNN, TITLES, learn_and_roll
-from gfnn_jax.jobs.output import REPORT, Output, pairs_digest
+from gfnn_jax.jobs.output import Output, pairs_digest
 from gfnn_jax.jobs.search import scene_named
 from gfnn_jax.jobs.shared_data import SharedData, separable
 from gfnn_jax.maps.saved import versions
@@ -133,7 +133,7 @@ def compare(
         with atomic_folder(output.out) as folder:
             for file, figure in figures_of_comparison(scene, measured, data.reference).items():
                 figures.save(figure, folder / f"{file}.png")
-            (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
+            (folder / report.REPORT).write_text(report.to_json(result), encoding="utf-8")
     return Compared(output.out, json.loads(report.to_json(result)))
 
 
@@ -177,7 +177,7 @@ def _curve(error) -> dict[str, Any]:
 def _already_done(out: Path, job: dict[str, Any], chosen: Sequence[str]) -> bool:
     """Return whether a resumed comparison had already finished."""
     try:
-        found = json.loads((out / REPORT).read_text(encoding="utf-8"))
+        found = json.loads((out / report.REPORT).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
     return found.get("job") == job and set(found.get("methods", ())) == set(chosen)

@@ -19,8 +19,9 @@ from gfnn_jax.errors import FitError, InputError, OutOfTime, WorkError
 from gfnn_jax.evaluate.figures_of_recordings import law_figure
 from gfnn_jax.evaluate.figures_style import save
 from gfnn_jax.evaluate.page import About, write_page
+from gfnn_jax.evaluate.report import PAGE
 from gfnn_jax.fitting import row_blocks
-from gfnn_jax.jobs.output import PAGE, Output, Ran, publish, units_of, write
+from gfnn_jax.jobs.output import Output, Ran, publish, units_of, write
 from gfnn_jax.jobs.search import (
     BEST,
     failures_of_arithmetic,

@@ -23,7 +23,7 @@ from gfnn_jax.phase_space import Pairs
 from gfnn_jax.storage.outputs import atomic_folder
 from gfnn_jax.storage.partial import unfinished
 
-REPORT, PAGE, MODEL = "report.json", "report.html", "model"
+MODEL = "model"
 _ANGLES = ("deg", "°", "rad")  # begins of the units that `gfnn_jax.read` turns into radians
 
 
@@ -63,7 +63,7 @@ class Ran(NamedTuple):
 def write(folder: Path, model: Path, fit: Fit, result: dict[str, Any], job: dict[str, Any]) -> None:
     """Write the fit into the folder ``model``, and its report into ``folder``."""
     save(fit, model, record={"job": job, **report.finite(result)})
-    (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
+    (folder / report.REPORT).write_text(report.to_json(result), encoding="utf-8")
 
 
 def publish(best: Path, model: Path) -> str:

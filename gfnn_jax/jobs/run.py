@@ -11,6 +11,7 @@ import numpy as np
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import figures
 from gfnn_jax.evaluate.page import About, write_page
+from gfnn_jax.evaluate.report import PAGE
 from gfnn_jax.jobs.figures import Beside, figures_of_run
 from gfnn_jax.jobs.measure import (
     NUM_STEPS,
@@ -19,7 +20,7 @@ from gfnn_jax.jobs.measure import (
     map_rollouts,
     measure,
 )
-from gfnn_jax.jobs.output import MODEL, PAGE, Output, Ran, pairs_digest, write
+from gfnn_jax.jobs.output import MODEL, Output, Ran, pairs_digest, write
 from gfnn_jax.jobs.search import refusals, scene_named, search
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps.bands import bands

@@ -18,7 +18,7 @@ from gfnn_jax.evaluate.figures_style import save
 from gfnn_jax.evaluate.forecasts import Forecasts, end_of_part, forecasts_of
 from gfnn_jax.evaluate.page import About, write_page, write_refusal
 from gfnn_jax.jobs.fit import fit_recording, fit_states
-from gfnn_jax.jobs.output import PAGE, REPORT, Output
+from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.output import Ran as Learned
 from gfnn_jax.phase_space import POISSON
 from gfnn_jax.storage.outputs import atomic_folder
@@ -69,12 +69,12 @@ def run_record(
             )
         except (InputError, WorkError) as error:
             refused: InputError | WorkError | None = error
-            write_refusal(whole, error, folder / PAGE, about)
+            write_refusal(whole, error, folder, about)
         else:
             refused = None
             ran = _report(learned, whole, end, folder, output, about)
     if refused is not None:
-        raise type(refused)(f"{refused} (report: {output.out / PAGE})")
+        raise type(refused)(f"{refused} (report: {output.out / report.PAGE})")
     return ran
 
 
@@ -100,7 +100,7 @@ def _report(
             "median": {name: list(of) for name, of in found.median.items()},
             "within_two_deviations": found.within,
         }
-    (folder / REPORT).write_text(report.to_json(result), encoding="utf-8")
+    (folder / report.REPORT).write_text(report.to_json(result), encoding="utf-8")
     output.progress.line("writing the report")
-    write_page(fit, folder / PAGE, about=about, forecasts=found)
+    write_page(fit, folder / report.PAGE, about=about, forecasts=found)
     return Ran(learned._replace(fit=fit), found, held_out)

@@ -22,7 +22,8 @@ class Forecast(NamedTuple):
     (runs, n), and their standard deviations. times: in seconds. units: of the values, "" where it
     is not known. outside: lines about runs whose parameters, or whose motion, lie beyond those that
     the law was learned from, which the standard deviations leave out. band: half widths
-    (runs, n) of the band that was asked for, None where none was."""
+    (runs, n) of the band that was asked for, None where none was; ``lower`` and ``upper`` are its
+    edges."""
 
     times: np.ndarray
     values: dict[str, np.ndarray]
@@ -30,6 +31,21 @@ class Forecast(NamedTuple):
     units: dict[str, str]
     outside: tuple[str, ...] = ()
     band: dict[str, np.ndarray] | None = None
+
+    @property
+    def lower(self) -> dict[str, np.ndarray] | None:
+        """Lower edge (runs, n) of the band by name, None where no band was asked for."""
+        return self._edge(-1.0)
+
+    @property
+    def upper(self) -> dict[str, np.ndarray] | None:
+        """Upper edge (runs, n) of the band by name, None where no band was asked for."""
+        return self._edge(1.0)
+
+    def _edge(self, side: float) -> dict[str, np.ndarray] | None:
+        if self.band is None:
+            return None
+        return {name: self.values[name] + side * half for name, half in self.band.items()}
 
     def in_units_of(self, recording: Recording) -> Forecast:
         """Convert values and standard deviations to the units of a recording's file."""

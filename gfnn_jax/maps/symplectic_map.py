@@ -311,9 +311,10 @@ class SymplecticMap:
     def forecast(self, recording, times, inputs=None, *, coverage=None, simultaneous=False):
         """`maps.forecasts.Forecast` at ``times`` (n,), the recording's clock, in its units, from
         the state at each run's end; ``inputs`` are a recording of those ahead, matched by run where
-        it has several. ``coverage`` asks for the half widths ``band`` that hold a reading with this
-        probability, or with ``simultaneous`` all readings of a run at these times (0.95 where no
-        coverage is given), by the largest errors of forecasts of held-out data.
+        it has several. ``coverage`` asks for a band, ``lower`` to ``upper``, with half widths
+        ``band``, that holds a reading with this probability, or with ``simultaneous`` all readings
+        of a run at these times (0.95 where no coverage is given), by the largest errors of
+        forecasts of held-out data.
         Raises InputError as `estimate` does, for times before a run's end, a coverage outside
         (0, 1), and of a map of positions alone for times between its steps and simultaneous
         bands."""
