@@ -115,6 +115,21 @@ def test_one_noisy_orbit_of_predators_and_prey():
     assert np.array([t.coefficient for t in fit.law.terms]) == pytest.approx(known, rel=0.1)
 
 
+@pytest.mark.parametrize("own", [0.002, 0.01])
+def test_prey_that_crowd_are_no_law_with_a_bracket(own):
+    """A wound-in orbit fits arc by arc, but H drifts from arc to arc."""
+
+    def rates(z):
+        return z * np.array([0.9 - 0.03 * z[1] - own * z[0], 0.02 * z[0] - 0.8])
+
+    data = runs_of(rates, np.array([[31.0, 19.5]]), 0.3, 120)
+    z = np.concatenate([data.z0, data.z1[-1:]])
+    z *= np.exp(0.03 * np.random.default_rng(0).normal(size=z.shape))
+    about = {"run": data.run, "place": data.place, "structure": "poisson"}
+    with pytest.raises(FitError, match=r"no H of it leaves noise|fewer orbits"):
+        gfnn.fit(gfnn.Pairs(z[:-1], z[1:], 0.3, **about))
+
+
 def test_a_gyroscope_on_the_command_line(tmp_path, capsys):
     data = gyroscope(tmp_path / "gyro.csv", 6)
     figure = str(tmp_path / "look.png")

@@ -54,6 +54,9 @@ class Options:
     long: float = 0.6
     fewest: int = 8
     grown: float = 1.6
+    # of states with noise: parts of a run, and χ² per degree of freedom of H in these, at most
+    parts: int = 8
+    uneven: float = 4.0
     hidden: float = 2.0  # times what noise makes of a relation: one that noise may hide
     standard: int = 1  # brackets of which H is looked for among shapes
     # times the error of the free field, that a Poisson field may leave
@@ -148,6 +151,7 @@ def law_of(
     off = [np.mean((one[0] / sizes(f)) ** 2) for one in draws]
     unsure = float(np.sqrt(np.mean(off)))
     nearest: dict[str, float] = {}
+    missed: list[str] = []  # brackets whose laws do not leave noise alone
     for null in null_spaces(some, f, slope, draws):
         kind = null.tensors.kind
         nearest[kind] = null.nearest
@@ -156,9 +160,21 @@ def law_of(
             continue
         library = library_of(kind, names, _degree(field), terms)
         for found in brackets_of(null, some, f, library, OPTIONS.errors * unsure):
-            law = _through_flow(found, train, held, notes, noisy)
-            if law.error <= max(OPTIONS.worse * error, OPTIONS.exact):
+            missed.append(found.name)
+            try:
+                law = _through_flow(found, train, held, notes, noisy)
+            except FitError:
+                continue
+            close = law.error <= max(OPTIONS.worse * error, OPTIONS.exact)
+            if close and (noisy is None or _leaves_noise(law, noisy.sigma, train, held)):
                 return law
+    if missed:
+        raise FitError(
+            f"no law: within its errors the field has a bracket ({', '.join(dict.fromkeys(missed))}"
+            "), but no H of it leaves noise alone and is constant along the runs. Other forces may "
+            "act, or more runs are needed",
+            "no law: no H of a bracket leaves noise alone",
+        )
     rate = shrinking(some, f, slope)
     if rate is not None:
         raise FitError(
@@ -253,7 +269,7 @@ def _hidden_relations(train: Data, names: tuple[str, ...], sigma: np.ndarray) ->
 def _of_populations(train: Data, held: Data, names, sigma: np.ndarray) -> PoissonLaw | None:
     """The law of one kind of predators and one of prey: {x, y} = x y, and one orbit with noise
     determines H of x, y and their logarithms. None of other states, and where it leaves more than
-    their noise."""
+    their noise, or H is not the same in all parts of a run."""
     z = np.concatenate([train.z0, train.z1])
     if z.shape[1] != 2 or (z <= 0).any() or np.ndim(train.dt):
         return None
@@ -263,12 +279,34 @@ def _of_populations(train: Data, held: Data, names, sigma: np.ndarray) -> Poisso
     start = hamiltonian_of(bracket, field.library, middle, rate)
     arcs = equal_arcs(arcs_of(train.z0, train.z1, train.run, train.place))
     own = fit_arcs(field, start.c, arcs, train.dt, sigma)
-    if (own.sigma > OPTIONS.grown * sigma).any():
-        return None
     left = np.broadcast_to(own.sigma, train.z0.shape)
     relative = float(np.mean(own.sigma / train.spread))
     fit = FieldFit(own.c, left, relative, own.root, 0, own.field)
-    return PoissonLaw(own.field, fit, error_on(own.field, own.c, held), bracket.name, (), own.sigma)
+    error = error_on(own.field, own.c, held)
+    law = PoissonLaw(own.field, fit, error, bracket.name, (), own.sigma)
+    return law if _leaves_noise(law, sigma, train, held) else None
+
+
+def _leaves_noise(law: PoissonLaw, sigma: np.ndarray, train: Data, held: Data) -> bool:
+    """Return whether a law leaves no more than the noise (n,) of the states, and has the same H in
+    all parts of a run. Arcs tell no drift of H, as by friction: each has an H of its own."""
+    if law.sigma is None or (law.sigma > OPTIONS.grown * sigma).any():
+        return False
+    z, run, place = (
+        np.concatenate([getattr(data, key) for data in (train, held)])
+        for key in ("z0", "run", "place")
+    )
+    library, c, total, count = law.field.library, law.fit.c, 0.0, 0
+    for own in (run == r for r in np.unique(run)):
+        states = z[own][np.argsort(place[own])]
+        h = library.value(c, states)
+        errors = np.linalg.norm(library.gradient(c, states) * law.sigma, axis=1)
+        parts = np.array_split(np.arange(len(h)), min(OPTIONS.parts, len(h)))
+        weight = np.array([np.sum(errors[part] ** -2.0) for part in parts])
+        mean = np.array([np.average(h[part], weights=errors[part] ** -2.0) for part in parts])
+        total += np.sum(weight * (mean - np.average(mean, weights=weight)) ** 2)
+        count += len(parts) - 1
+    return total <= OPTIONS.uneven * max(count, 1)
 
 
 def _too_few_runs(missing: int, degree: int, runs: int) -> FitError:
@@ -317,8 +355,10 @@ def _through_flow(
     found: Found, train: Data, held: Data, notes: tuple[str, ...], noisy: _Noisy | None
 ) -> PoissonLaw:
     """The law with the coefficients of H fitted through the flow of B∇H; with noise along arcs, the
-    constants of the bracket too."""
+    constants of the bracket too. Raises FitError where no fit is found."""
     kept = np.flatnonzero(found.hamiltonian.c).tolist()
+    if not kept:
+        raise FitError(f"no H of the {found.name} bracket is told from none")
     field, sigma = PoissonField(found.bracket, found.library.take(kept)), None
     pairs = train[:3] if noisy is None else noisy.long
     fit = fit_field(field, *pairs, found.hamiltonian.c[kept])
