@@ -42,7 +42,9 @@ from gfnn_jax.maps.laws import states_of
 from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.recordings import samples_of
+from gfnn_jax.models.lagrangians.rivals import one_sided
 from gfnn_jax.models.lagrangians.search import search, search_on
+from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.text import speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
 from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
@@ -412,6 +414,26 @@ def test_a_power_of_the_distance_that_others_imitate_is_one_of_several():
     fit = gfnn.fit(gfnn.Recording({"t": t, "x": x[:, 0], "y": x[:, 1]}, positions=["x", "y"]))
     assert "sqrt(x**2 + y**2)**4" in str(fit.formula)
     assert re.match(r"one of several: .* may be .*r\*\*3.5 .* in place of r\*\*4\.", fit.verdict)
+
+
+@pytest.mark.parametrize("pushed", [False, True])
+def test_a_constant_force_that_one_sided_friction_imitates_is_named(pushed):
+    """ẍ = −x − 0.04 ẋ, stronger one way by a tenth, or pushed by 0.3."""
+    t = 0.25 * np.arange(240)
+
+    def rates(_, z):
+        friction = 0.04 * z[1] + (0.3 if pushed else -0.004 * abs(z[1]))
+        return [z[1], -z[0] - friction]
+
+    x = solve_ivp(rates, (0, 60), [1.5, 0], t_eval=t, rtol=1e-9).y[0]
+    x = x + 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    problem = samples_of(gfnn.Recording({"t": t, "x": x}, positions=["x"])).problem
+    rows = ((2,), (0,)), ((0,), (1,)), ((0,), (2,))
+    terms = tuple((*row, (0,), 0.0) for row in rows)
+    structure = Structure(1, terms, (((1,), LINEAR, 0.0),))
+    known = dict(zip(structure.keys(), (0.0, -0.5, 0.04), strict=True))
+    fit = problem.fit(structure, known, problem.arcs(4.0), problem.scales.sigma)
+    assert ("friction of x that is stronger one way" in one_sided(fit, ["x"])) is not pushed
 
 
 @pytest.mark.slow

@@ -34,7 +34,6 @@ from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.lagrangians.central_powers import other_powers
 from gfnn_jax.models.lagrangians.dependence import search_of_systems
 from gfnn_jax.models.lagrangians.drives import hidden_frequency, with_frequency
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
@@ -54,6 +53,7 @@ from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, last_of_series
 from gfnn_jax.models.lagrangians.nature import Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions
+from gfnn_jax.models.lagrangians.rivals import one_sided, other_powers
 from gfnn_jax.models.lagrangians.search import SearchResult, fit_given, search, search_on
 from gfnn_jax.models.lagrangians.starts import no_law
 from gfnn_jax.models.lagrangians.text import speed_names
@@ -189,7 +189,8 @@ def _other_shapes(fit: LawFit) -> str:
     last = last_of_series(fit.structure.terms)
     if last is not None:
         return SERIES.format(fit.problem.word(("term", last)))
-    return other_powers(fit, symbols(fit.problem.observation.coordinates))
+    names = symbols(fit.problem.observation.coordinates)
+    return other_powers(fit, names) or one_sided(fit, names)
 
 
 def _is_no_law(law: LearnedLaw) -> bool:

@@ -21,12 +21,12 @@ from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians import libraries
-from gfnn_jax.models.lagrangians.central_powers import with_likeliest_power
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, table_of
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, with_delay
+from gfnn_jax.models.lagrangians.rivals import with_likeliest_power
 from gfnn_jax.models.lagrangians.starts import OPTIONS, best_start, leading, misfit
 from gfnn_jax.models.lagrangians.structure import Held, Key, Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import protected, weak_start

@@ -1,9 +1,10 @@
-"""Powers of the distance in a central force: which of the neighbouring ones are as likely?
+"""Terms of other shapes that may follow a record as well as those of its law.
 
-Beside springs r^3.5 imitates r^4 along an orbit whose distance changes little. So a law with a
-power of the distance is fitted again with the next halves of whole numbers, as far as they follow
-its arcs as well: laws with as many coefficients have odds by the sums of their squares
-(`fitting.evidence`).
+Beside springs r^3.5 imitates r^4 along an orbit whose distance changes little, so that a law with a
+power of the distance is fitted again with the next halves of whole numbers. A small constant force
+pushes as friction does that is stronger one way, so that a law with both it and linear friction is
+fitted again with friction of either side. Laws with as many coefficients have odds by the sums of
+their squares (`fitting.evidence`).
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from gfnn_jax.families.expressions import factors_of, parse
-from gfnn_jax.families.lagrangian import shape_of
+from gfnn_jax.families.lagrangian import LINEAR, ONE_SIDED, shape_of
 from gfnn_jax.models.lagrangians.fit import LawFit
-from gfnn_jax.models.lagrangians.libraries import central
+from gfnn_jax.models.lagrangians.libraries import central, losses, torques
 from gfnn_jax.models.lagrangians.structure import Row, Structure
 
 MOST = 4  # neighbours that are tried to either side
@@ -49,6 +50,37 @@ def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
     )
 
 
+def one_sided(fit: LawFit, coordinates: Sequence[str]) -> str:
+    """A line on the coordinate whose friction may be stronger one way in place of a constant force
+    beside it; "" where there is none, or where that has no odds against it that decide."""
+    structure, evidence = fit.structure, fit.problem.options.evidence
+    d, values = structure.dim, fit.values
+    sides = losses(d, (ONE_SIDED,), 0.0)
+    if not fit.problem.options.choose_friction:
+        return ""
+    for i, force in enumerate(torques(d, range(d))):
+        rubs = losses(d, (LINEAR,), 0.0)[i]
+        own = sides[2 * i : 2 * i + 2]
+        if force not in structure.terms or rubs not in structure.friction:
+            continue
+        known = values | dict.fromkeys((("loss", side) for side in own), values["loss", rubs])
+        other = structure.without({("term", force), ("loss", rubs)})
+        again = fit.again(other.plus([("loss", side) for side in own]), known, rescale=False)
+        odds = evidence.odds(fit.fitted.cost, again.fitted.cost, _independent(fit))
+        if again.follows and odds < evidence.decided:
+            return (
+                f"friction of {coordinates[i]} that is stronger one way follows the record as the "
+                "constant force on it does. A record that ends at rest would decide: the force "
+                "shifts where it rests"
+            )
+    return ""
+
+
+def _independent(fit: LawFit) -> float:
+    """The number of residuals that are independent."""
+    return np.count_nonzero(np.isfinite(fit.arcs.y)) / fit.correlation
+
+
 def _power(fit: LawFit) -> float | None:
     """The power of the distance that a law has; None of a law without."""
     d = fit.structure.dim
@@ -64,13 +96,12 @@ def _as_likely(fit: LawFit) -> dict[float, LawFit]:
     if own is None or not fit.follows:
         return {}
     springs = any(max(row[1]) == 2 and not any(row[0]) for row in fit.structure.terms)
-    count = np.count_nonzero(np.isfinite(fit.arcs.y)) / fit.correlation
     found = {own: fit}
 
     def odds(fit: LawFit) -> float:
         """Odds of the best so far over a fit."""
         least = min(other.fitted.cost for other in found.values())
-        return evidence.odds(least, fit.fitted.cost, count)
+        return evidence.odds(least, fit.fitted.cost, _independent(fit))
 
     for step in (-0.5, 0.5):
         first = np.ceil(2 * own) / 2 if step < 0 else np.floor(2 * own) / 2
