@@ -592,6 +592,8 @@ def test_a_band_of_whole_trajectories_holds_them(swing):
     np.testing.assert_allclose(
         found.upper["theta"] + found.lower["theta"], 2 * found.values["theta"]
     )
+    again = fit.forecast(times, after=past, coverage=0.9, simultaneous=True)
+    np.testing.assert_array_equal(again.upper["theta"], found.upper["theta"])
     assert fit.map.forecast(past, times).lower is None
     of_each = fit.map.forecast(past, times, coverage=0.95)
     np.testing.assert_allclose(of_each.band["theta"], 2 * of_each.std["theta"])

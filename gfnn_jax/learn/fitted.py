@@ -407,19 +407,27 @@ class Fit:
         return report.finite(assemble(self, **about))
 
     def forecast(
-        self, times: Any, *, after: Recording | None = None, inputs: Any = None
+        self,
+        times: Any,
+        *,
+        after: Recording | None = None,
+        inputs: Any = None,
+        coverage: float | None = None,
+        simultaneous: bool = False,
     ) -> Forecast:
         """Forecast at ``times`` (n,), in s on the clock of the recording, with standard deviations,
         in the units of its file: `maps.forecasts.Forecast`.
 
         after: the recording from whose end it starts; None: the one that was learned from.
-        inputs: a recording of the inputs ahead. Raises ValueError where the fit has no data and no
-        ``after``, InputError as `SymplecticMap.forecast` does.
+        inputs: a recording of the inputs ahead. coverage, simultaneous: of a band, ``lower`` to
+        ``upper``, as in `SymplecticMap.forecast`. Raises ValueError where the fit has no data and
+        no ``after``, InputError as `SymplecticMap.forecast` does.
 
             ahead = fit.forecast(np.arange(10.1, 12.0, 0.1))
             ahead.values["theta"], ahead.std["theta"]  # (runs, times)
         """
-        return self.map.forecast(self.seen if after is None else after, times, inputs)
+        start = self.seen if after is None else after
+        return self.map.forecast(start, times, inputs, coverage=coverage, simultaneous=simultaneous)
 
     def predict(self, z0: Any, num_steps: int, **options: Any) -> np.ndarray:
         """States (B, num_steps + 1, 2d), or (num_steps + 1, 2d), that follow z0 (B, 2d) or (2d,):
