@@ -73,6 +73,7 @@ def test_law_without_a_lift(tmp_path):
     np.testing.assert_allclose(total, total[:, :1] + 0 * total, rtol=1e-15)
     np.testing.assert_allclose(map_.hamiltonian(z), family.value(params, z), rtol=1e-14)
     np.testing.assert_allclose(map_.step(z, dt=0.05)[0], map_.over(0.05).step(z)[0])
+    assert gfnn.export(map_, "stablehlo", tmp_path / "toda.zip").exists()
     map_.save(tmp_path / "model")
     np.testing.assert_array_equal(gfnn.load(tmp_path / "model").map.step(z)[0], after)
 

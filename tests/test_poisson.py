@@ -10,7 +10,7 @@ from test_brackets_found import heavy, lorenz, populations, runs_of, top
 import gfnn_jax as gfnn
 from gfnn_jax import cli
 from gfnn_jax.data.text_files import to_text
-from gfnn_jax.errors import FitError
+from gfnn_jax.errors import FitError, InputError
 
 
 def pairs_of(data, **more):
@@ -49,6 +49,11 @@ def test_a_saved_law_is_the_same(heavy_top, tmp_path):
     assert again.verdict == fit.verdict
     one, other = (np.asarray(f.map.step(starts)[0]) for f in (fit, again))
     assert np.array_equal(one, other)
+    for to, suffix in (("c", "c"), ("c-taylor", "c"), ("js", "js")):
+        told = rf"bracket of its own, se\(3\), of which --to {to} .*--to stablehlo.*--to latex"
+        with pytest.raises(InputError, match=told):
+            gfnn.export(fit, to, tmp_path / f"top.{suffix}")
+    assert gfnn.export(fit, "latex", tmp_path / "top.tex").read_text().startswith("H = ")
 
 
 def test_a_given_bracket():

@@ -22,6 +22,8 @@ from gfnn_jax.exports.fmu import fmu
 from gfnn_jax.exports.javascript import javascript
 from gfnn_jax.exports.jax_source import jax_source
 from gfnn_jax.exports.links import mjcf, urdf
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.lie import LieFlow
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import require_x64
@@ -100,6 +102,13 @@ def export(
         return out
     map_ = map_ if isinstance(map_, SymplecticMap) else saved.load(map_)
     about = _about(folder)
+    if to in _PRINTERS and map_.bracket is not None:
+        raise InputError(
+            f"this map has a bracket of its own, {map_.bracket.name}, of which --to {to} makes no "
+            "step: use --to stablehlo"
+            + " or, for the formula of its law, --to latex"
+            * isinstance(map_.pieces[0], (Flow, LieFlow))
+        )
     if to in _PRINTERS:
         atomic_write(out, _PRINTERS[to](map_, _identifier(out), about))
     else:

@@ -111,8 +111,6 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
         raise InputError(
             "this map has no law, whose rates would be exported: use --to c or --to stablehlo"
         )
-    if map_.bracket is not None:
-        raise InputError("this law has a bracket of its own: use --to stablehlo")
     if map_.coordinates.forward is not CARTESIAN.forward:
         raise InputError(
             f"this law is one in {map_.coordinates.name} coordinates: use --to c or --to stablehlo"

@@ -149,11 +149,11 @@ class LieGenerated:
 
     def _moved(self, z, args, unrolled: bool | int):
         """(Z − z, Info)."""
-        shape = (len(z), 1)
+        shape = (z.shape[0], 1)
         h = jnp.broadcast_to(self.dt[:, None] if jnp.ndim(self.dt) else self.dt, shape)
         args = at_time(self.family, args, 0.5 * self.dt)
         if args is not None:  # open lanes are taken out of the batch, with their own
-            args = jnp.broadcast_to(args, (len(z), args.shape[-1]))
+            args = jnp.broadcast_to(args, (z.shape[0], args.shape[-1]))
         shared = (self.family, self.params, self.bracket, self.scale)
         guess = jax.lax.stop_gradient(z)
         if unrolled:
