@@ -186,10 +186,7 @@ def test_bounds_values_and_ties_of_coefficients():
     assert (held.coefficient, held.std) == (-1.5, 0.0)
 
 
-def test_a_told_coefficient_that_sets_the_scale_and_one_of_pairs_are_refused():
+def test_a_told_coefficient_that_sets_the_scale_is_refused():
     swing = {"t": 0.05 * np.arange(100), "theta": np.cos(0.2 * np.arange(100))}
     with pytest.raises(InputError, match="sets the scale of L"):
         gfnn.fit(gfnn.Recording(swing), terms={"omega**2": 0.7, "cos(theta)": None})
-    z = np.random.default_rng(0).normal(size=(50, 2))
-    with pytest.raises(gfnn.FitError, match="of a recording's law"):
-        gfnn.fit(gfnn.Pairs(z, z, 0.1), terms={"p1**2": 0.5})

@@ -201,6 +201,8 @@ def fitted_gradients(family, z, gradient, scale, args=None) -> np.ndarray:
     the unit of what it changes."""
     dim = z.shape[1] // 2
     weight = 1.0 / np.roll(scale, dim)
+    if (offset := getattr(family, "offset", None)) is not None:
+        gradient = gradient - offset(z, args)
     terms = family.term_gradients(z, args) * weight[:, None]
     rows = terms.reshape(-1, terms.shape[-1])
     size = np.linalg.norm(rows, axis=0)

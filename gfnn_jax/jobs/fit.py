@@ -20,6 +20,7 @@ from gfnn_jax.evaluate.figures_of_recordings import law_figure
 from gfnn_jax.evaluate.figures_style import save
 from gfnn_jax.evaluate.page import About, write_page
 from gfnn_jax.evaluate.report import PAGE
+from gfnn_jax.families.told import anything_told
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.jobs.output import Output, Ran, publish, units_of, write
 from gfnn_jax.jobs.search import (
@@ -122,7 +123,8 @@ def fit(
                 spent=reading,
                 kept=(kept_in, job),
             )
-            if large and can_be_refitted(fitted.map):
+            told = fitted.chosen.learns == "hamiltonian" and anything_told(asked.terms)
+            if large and not told and can_be_refitted(fitted.map):
                 assert trajectories.sampled is not None
                 seconds = work_of_refit(fitted, trajectories.sampled, reading)
                 try:
@@ -142,7 +144,8 @@ def fit(
                     fitted = not_refitted(fitted, f"no time, it would take about {seconds:.2g} s")
             else:
                 group.broadcast({})
-                fitted = not_refitted(fitted, why_not(fitted.map)) if large else fitted
+                why = "a refit keeps nothing that is told of coefficients" if told else None
+                fitted = not_refitted(fitted, why or why_not(fitted.map)) if large else fitted
             progress.status("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
             result = fitted.report(

@@ -140,7 +140,7 @@ class Between(NamedTuple):
 def between(low: float | None, high: float | None) -> Between:
     """Bounds of a coefficient in ``terms``; None: no bound on that side.
 
-        model = gfnn.Lagrangian(terms={"cos(theta)": gfnn.between(0, None), "omega**2": 0.5})
+        model = gfnn.Hamiltonian(terms={"q1**4": gfnn.between(0, None), "p1**2": 0.5})
 
     Raises ValueError where no number is between them.
     """
@@ -157,6 +157,8 @@ def told(terms: Sequence[Any] | Mapping[Any, Any]) -> Sequence[Any]:
         return terms
     texts = []
     for term, value in terms.items():
+        if value is not None and not isinstance(term, str):
+            raise FitError("terms: expected text as a term of whose coefficient something is told")
         if isinstance(value, Between):
             texts.append(f"{value.low!r} <= {term} <= {value.high!r}")
         elif value is None:
@@ -192,7 +194,7 @@ class Hamiltonian:
     (family "mlp"); with a ``bracket`` (`gfnn.Bracket`) of states that are no (q, p). Options as of
     `gfnn.fit`."""
 
-    terms: Sequence[str | Callable] = ()
+    terms: Sequence[str | Callable] | Mapping[str, Any] = ()
     bracket: Any = None
     structure: str | None = None
     family: str = "auto"
@@ -266,7 +268,7 @@ OPTIONS: dict[str, About] = {
     "terms": About(
         _TERMS,
         'known terms of H: "p1**2; 1/sqrt(q1**2 + q2**2)"; in Python also functions of z; for a '
-        'recording those of its law: "omega**2; V: cos(theta); R: omega**2", a coefficient by '
+        'recording those of its law: "omega**2; V: cos(theta); R: omega**2"; a coefficient by '
         'its value "cos(theta) = 20", bounds "0 <= cos(theta)" or "cos(a) = 2*cos(b)"',
         "TEXT",
     ),

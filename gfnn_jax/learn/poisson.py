@@ -21,6 +21,7 @@ from gfnn_jax.dataset.split import split_rows
 from gfnn_jax.errors import FitError, FitWarning, InputError
 from gfnn_jax.families.expressions import parse_named, to_named_text
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.families.told import anything_told
 from gfnn_jax.flows.lie import chart_of, law_flow
 from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit
 from gfnn_jax.learn.options import FitOptions, Watch
@@ -177,6 +178,11 @@ def _given(terms, names: tuple[str, ...]) -> Terms | None:
     that is no expression in these names."""
     if not terms:
         return None
+    if anything_told(terms):
+        raise InputError(
+            "terms: values, bounds and ties of coefficients are of H of plain pairs, got states "
+            "with a bracket: give the terms without them"
+        )
     texts = tuple(dict.fromkeys(to_named_text(parse_named(t, names), names) for t in terms))
     eye = np.eye(len(texts), dtype=int)
     return Terms(0, texts, tuple(map(tuple, eye.tolist())), (), names)

@@ -27,8 +27,10 @@ from gfnn_jax.diagnosis.local_jacobians import check_number
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.sums import site_terms
 from gfnn_jax.families.terms import given_terms
+from gfnn_jax.families.told import Constrained, anything_told, untold
 from gfnn_jax.learn.options import FitOptions, Watch
 from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
+from gfnn_jax.models.hamiltonians.told_terms import told_terms
 from gfnn_jax.models.maps_of_laws.law_maps import factored_out, flow_of
 from gfnn_jax.phase_space import Pairs, sizes, split
 from gfnn_jax.scenes.draws import sample_states
@@ -96,15 +98,13 @@ def check_request(
             + (float(pairs.dt) < 0) * ": where z1 come before z0 in time, exchange them"
         )
     known = () if options.base is None else (options.base,)
-    if any("=" in term for term in options.terms if isinstance(term, str)):
-        raise FitError(
-            "terms: bounds, values and ties of coefficients are of a recording's law "
-            "(gfnn.Lagrangian), got pairs: give H's terms without them"
-        )
     try:
+        if anything_told(options.terms):
+            _check_told(structure, options, pairs)
         if structure is not None:
             _check_structured(structure, scene, options, pairs)
-        given_terms(pairs.dim, () if structure else options.terms, tuple(pairs.args or ()))
+        own = () if structure else untold(options.terms)
+        given_terms(pairs.dim, own, tuple(pairs.args or ()))
         given_terms(pairs.dim, known)
     except (InputError, jax.errors.ConcretizationTypeError) as error:
         raise FitError(str(error)) from error
@@ -121,6 +121,23 @@ def check_request(
         check_number(pairs)
     elif len(pairs) < FEWEST:
         raise FitError(f"expected at least {FEWEST} pairs, got {len(pairs)}")
+
+
+def _check_told(structure: str | None, options: FitOptions, pairs: Pairs) -> None:
+    """Raises FitError and InputError for what cannot be told of coefficients."""
+    refused = {
+        f"structure {structure}": structure is not None,
+        "a network": options.family == "mlp",
+        "args or a drive": bool(pairs.args) or pairs.period is not None,
+    }
+    for what, given in refused.items():
+        if given:
+            raise FitError(
+                "terms: values, bounds and ties of coefficients are of H of plain pairs, got "
+                f"{what}: give the terms without them"
+            )
+    terms = given_terms(pairs.dim, untold(options.terms))
+    Constrained.of(terms, told_terms(pairs.dim, options.terms))
 
 
 def check_moves(pairs: Pairs) -> None:

@@ -18,6 +18,7 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms, multiplied
+from gfnn_jax.families.told import Constrained
 from gfnn_jax.fitting import least_squares, uncertainty
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.significance import null_terms
@@ -49,6 +50,7 @@ def covariance_root(law: FittedLaw, flows: Problem, data: Dataset, steps: Steps)
     slopes = images.by_coefficient / unit[..., None]
     left, scores, noise = residual / unit, None, None
     family = without_forces(law.family)
+    family = family.family if isinstance(family, Constrained) else family
     if isinstance(family, Terms):  # of many coordinates both would take too much
         states = None
         if goes_on.any():

@@ -13,8 +13,10 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
+from gfnn_jax.families.told import Constrained, anything_told, untold
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.hamiltonians.told_terms import constrained
 from gfnn_jax.models.parameters import angles_and_others
 
 # Pairs, from which on the midpoints of a sample tell libraries apart, and times what another one
@@ -23,9 +25,12 @@ _TELLING, _WORSE = 60, 3.0
 
 
 def modes_of(problem: LawProblem) -> Modes | None:
-    """The basis that grows, where an angle enters H by itself, beside a user's terms; else None."""
+    """The basis that grows, where an angle enters H by itself, beside a user's terms; else None,
+    and where something is told of their coefficients."""
     data, scene, terms = problem.data, problem.scene, problem.terms
     if data.args is not None or (scene is not None and scene.features is not None):
+        return None
+    if anything_told(terms):
         return None
     angles, plain = angles_and_others(data)
     if not angles:
@@ -38,7 +43,7 @@ def modes_of(problem: LawProblem) -> Modes | None:
 def own_terms(problem: LawProblem) -> Terms | None:
     """The user's own terms, None where there are none."""
     given, data = problem.terms, problem.data
-    return given_terms(data.dim, given, data.parameters) if given else None
+    return given_terms(data.dim, untold(given), data.parameters) if given else None
 
 
 def check_finite(given: Terms, data: Dataset, rows) -> None:
@@ -54,7 +59,7 @@ def check_finite(given: Terms, data: Dataset, rows) -> None:
             )
 
 
-def libraries_of(problem: LawProblem) -> Iterator[Terms | Sums]:
+def libraries_of(problem: LawProblem) -> Iterator[Terms | Sums | Constrained]:
     """Families by rising size, of as many terms as the training rows tell apart."""
     data, scene, options = problem.data, problem.scene, problem.options
     if data.structure is not None:
@@ -68,7 +73,7 @@ def libraries_of(problem: LawProblem) -> Iterator[Terms | Sums]:
     for degree in degrees if own is None else options.given_degrees:
         if degree == 0:
             assert own is not None
-            yield own
+            yield constrained(problem, own)
             continue
         family = polynomial_terms(
             data.dim,
@@ -83,7 +88,7 @@ def libraries_of(problem: LawProblem) -> Iterator[Terms | Sums]:
         for library in tried:
             if library.num_parameters > most:
                 return
-            yield library
+            yield library if own is None else constrained(problem, library)
 
 
 def promising(libraries: list[Any], data: Dataset) -> list[Any]:

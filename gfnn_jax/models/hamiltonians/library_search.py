@@ -20,6 +20,7 @@ from gfnn_jax.dataset.structures import Bodies
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.sums import matrix_free
+from gfnn_jax.families.told import anything_told
 from gfnn_jax.fitting.growth import grow
 from gfnn_jax.fitting.linear_starts import forward_start, log_start, midpoint_start
 from gfnn_jax.fitting.significance import ABOVE_NOISE, null_terms, significant
@@ -41,7 +42,8 @@ NONE: Mapping[int, FittedLaw] = MappingProxyType({})
 def of_libraries(
     problem: LawProblem, basis: Modes | None, early: Mapping[int, FittedLaw]
 ) -> FittedLaw:
-    """The best library of terms of H, without friction or with it.
+    """The best library of terms of H, without friction or with it; without, where something is told
+    of coefficients.
 
     basis: of the library that grows, where one does. early: the first libraries without friction,
     where these are fitted already.
@@ -50,6 +52,8 @@ def of_libraries(
     def search(forces: Forces | None = None, data=problem.data) -> FittedLaw:
         return _searched(problem.on(data), forces, early if forces is None else NONE)
 
+    if anything_told(problem.terms):
+        return search()
     if problem.data.args is not None:
         found = _walked(problem)
     elif basis is not None:

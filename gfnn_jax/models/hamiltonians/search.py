@@ -22,6 +22,7 @@ from gfnn_jax.dataset.split import outermost
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.families.told import Constrained
 from gfnn_jax.fitting.significance import ABOVE_NOISE, significant_terms, terms_above_noise
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.models.hamiltonians.covariance import covariance_root
@@ -39,6 +40,13 @@ from gfnn_jax.models.hamiltonians.options import OPTIONS
 from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.sequences import arcs_of, fitted_to_sequences
 from gfnn_jax.models.hamiltonians.symmetries import imposed
+from gfnn_jax.models.hamiltonians.told_terms import (
+    breaks_bounds,
+    held_at_bounds,
+    root_of_all,
+    unbound,
+    within_bounds,
+)
 
 
 def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
@@ -78,18 +86,27 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
     _check_resolved(inner, best)
     best, outside = _simplified(inner, everywhere, everywhere.training[outer], best)
     ended, of_arcs = problem.work.ended, None
+    problem.flows.allowance = UNBOUNDED
+    best = within_bounds(problem, best)
     if arcs is not None:
-        problem.flows.allowance = UNBOUNDED
         of_arcs = partial(covariance_root, best, problem.flows, everywhere, best.fit.steps)
         problem = problem.beginning(data)
         best = best._replace(error=problem.error_of(best.family, best.fit))
     problem.flows.allowance = UNBOUNDED
     if best.noisy or arcs is not None:
-        best = _along_sequences(problem, best)
-    best = _with_symmetries(best, data)
+        of_steps, best = best, _along_sequences(problem, best)
+        best = of_steps if breaks_bounds(problem, best) else best
+    best, told = _with_symmetries(best, data), best.family
+    if isinstance(told, Constrained):
+        root = of_arcs or partial(covariance_root, best, problem.flows, data, best.fit.steps)
+        best, of_arcs = unbound(best), lambda: root_of_all(told, root())
     learned = learned_from(problem, best, started, of_arcs)
-    candidate = dataclasses.replace(learned.candidate, outside=outside)
-    return dataclasses.replace(learned, candidate=candidate, ended=ended or problem.work.ended)
+    return dataclasses.replace(
+        learned,
+        candidate=dataclasses.replace(learned.candidate, outside=outside),
+        messages=(*learned.messages, *held_at_bounds(problem, best)),
+        ended=ended or problem.work.ended,
+    )
 
 
 def _best_law(problem: LawProblem, basis: Modes | None) -> FittedLaw:

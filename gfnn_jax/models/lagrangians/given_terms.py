@@ -16,7 +16,6 @@ positions.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -41,10 +40,9 @@ from gfnn_jax.families.lagrangian import (
     QUADRATIC,
     coordinates_in,
 )
+from gfnn_jax.families.told import told_of
 from gfnn_jax.models.lagrangians.libraries import SINE
 from gfnn_jax.models.lagrangians.structure import Loss, Row, with_powers
-
-_TURNED = {"<=": ">=", ">=": "<=", "=": "="}
 
 
 class Told(NamedTuple):
@@ -86,14 +84,14 @@ def given_terms(
     for text in texts:
         if not isinstance(text, str):
             raise InputError("expected terms of a recording's law as text, got a function")
-        text, low, high, tied = _told(text)
+        text, low, high, times, tied = one = told_of(text)
         kind, colon, rest = text.partition(":")
         kind = kind.strip().upper() if colon else "L"
         if kind not in ("L", "V", "R"):
             raise InputError(f"terms: expected L:, V: or R: before a term, got '{text}'")
         kinds.add(kind)
         parts = reader.summands(rest if colon else text)
-        if (low, high, tied) != (-np.inf, np.inf, None):
+        if one.says:
             if kind == "R" or len(parts) != 1:
                 raise InputError(
                     f"terms: expected one term of L or V whose coefficient is told, got '{text}'; "
@@ -104,7 +102,10 @@ def given_terms(
                 ends = sorted((sign * low, sign * high))
                 told.append(Told(row, ends[0], ends[1]))
             else:
-                told.append(Told(row, *reader.multiple(tied)))
+                of = reader.summands(tied)
+                if len(of) != 1:
+                    raise InputError(f"terms: expected a multiple of one term, got '{tied}'")
+                told.append(Told(row, times, times, reader.row(of[0][1], of[0][0])))
         for shown, tree in parts:
             if kind == "R":
                 losses.append(reader.loss(tree, shown))
@@ -133,37 +134,6 @@ def given_terms(
     return Given(moving, tuple(dict.fromkeys(losses)) if "R" in kinds else None, tuple(told))
 
 
-def _told(text: str) -> tuple[str, float, float, str | None]:
-    """A term's text, its bounds, and the text of the term that its coefficient is a multiple of."""
-    parts = re.split(r"(<=|>=|=)", text)
-    if len(parts) == 1:
-        return text, -np.inf, np.inf, None
-    words, signs = [part.strip() for part in parts[::2]], parts[1::2]
-    numbers = [_number(word) for word in words]
-    if len(words) == 3 and signs == ["<=", "<="] and None not in (numbers[0], numbers[2]):
-        low, high, term = numbers[0], numbers[2], words[1]
-    elif len(words) == 2 and numbers[0] is not None and numbers[1] is None:
-        return _told(f"{words[1]} {_TURNED[signs[0]]} {words[0]}")
-    elif len(words) == 2 and signs == ["="] and numbers[1] is None:
-        return words[0], 1.0, 1.0, words[1]
-    elif len(words) == 2 and numbers[0] is None and numbers[1] is not None:
-        term, value = words[0], numbers[1]
-        low = -np.inf if signs == ["<="] else value
-        high = np.inf if signs == [">="] else value
-    else:
-        low = high = None
-    if low is None or high is None or not low <= high or np.isnan(low + high):
-        raise InputError(f"terms: expected low <= term <= high, or term = value, got '{text}'")
-    return term, low, high, None
-
-
-def _number(word: str) -> float | None:
-    try:
-        return float(word)
-    except ValueError:
-        return None
-
-
 class _Reader(NamedTuple):
     """Reads terms in these names, which are the coordinates of trees in this order."""
 
@@ -184,16 +154,6 @@ class _Reader(NamedTuple):
             else:
                 others[base] = exponent
         return others, tuple(powers)
-
-    def multiple(self, text: str) -> tuple[float, float, Row]:
-        """The number before a term, twice, and the term."""
-        number, times, rest = text.partition("*")
-        factor = _number(number.strip()) if times and not rest.startswith("*") else None
-        parts = self.summands(text if factor is None else rest)
-        if len(parts) != 1:
-            raise InputError(f"terms: expected a multiple of one term, got '{text}'")
-        value = 1.0 if factor is None else factor
-        return value, value, self.row(parts[0][1], parts[0][0])
 
     def row(self, tree: Expression, text: str) -> Row:
         """(k, n, m, φ), with the shape and the powers of parameters where it has such."""
