@@ -5,30 +5,38 @@
 
 A map without a law is S in the chart of a known bracket, up to degree 8 (heavy top 4), fitted to
 80 % of 1,000 to 1,300 pairs; its error is that of the executed step on 200 further ones, RMS ÷
-spread. ``beside``: a free top from the same 400 pairs by the law with its bracket, and by a field
-of all terms of degree 2, fitted to finite differences and through a Runge–Kutta step of order 4,
-which then steps both; orbits are compared with the flow of the true law.
+spread. ``beside``: a free top from the same 400 pairs by the law with its bracket, and by fields
+of degree 2: PySINDy's (``pip install gfnn_jax[peers]``), one of finite differences, and one fitted
+through the Runge–Kutta step of order 4 that steps all fields. |M| and orbits of five fresh starts
+are compared with the flow of the true law. M² is a Casimir of the true bracket; the law's may have
+another of a top's family, with M² as its H.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
-from harness import TABLES, Numbers, between_markers, markdown, number, provenance, results
+from harness import FIGURES, TABLES, Numbers, between_markers, markdown, number, provenance, results
 from harness import main as run_pieces
 from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import gfnn_jax as gfnn
+from gfnn_jax.evaluate.figures_style import save, style
 from gfnn_jax.flows.lie import law_flow
 from gfnn_jax.models.brackets.lie_maps import fit_lie_map
 
 INVERSE = np.linalg.inv([[1.0, 0.2, 0.1], [0.2, 1.7, 0.3], [0.1, 0.3, 2.5]])
+# Steps that are saved: of a rollout all up to the seventh, then every 200th.
+SAVED = (1, 2, 5, 10, 20, 50, 100, 200, 600, 1_000, 2_000, 6_000, 10_000, 20_000, 60_000, 100_000)
 SPIN, TOP = gfnn.Bracket.so3(), gfnn.Bracket.se3()
 CHAIN = gfnn.Bracket.constant(
     [[0, 1.3, 0.3, -1], [-1.3, 0, 1, 0.3], [-0.3, -1, 0, 1.3], [1, -0.3, -1.3, 0]]
@@ -139,31 +147,70 @@ def beside(quick: bool) -> Numbers:
     truth = law_flow(energy, INVERSE, SPIN, dt, np.asarray(fresh))
 
     def rolled(step):
-        def more(z, _):
-            return jax.lax.scan(lambda y, _: (step(y), None), z, length=steps // 100)[0], None
-
-        states = [fresh]
-        run = jax.jit(lambda z: more(z, None)[0])
-        for _ in range(100):
-            states.append(run(states[-1]))
+        run = jax.jit(lambda z, n: jax.lax.fori_loop(0, n, lambda _, y: step(y), z))
+        saved, states = [n for n in SAVED if n <= steps], [fresh]
+        for count in np.diff([0, *saved]):
+            states.append(run(states[-1], count))
         return np.asarray(states)
 
+    by_steps: dict[str, Callable] = {
+        "field through Runge–Kutta 4": partial(runge_kutta, through),
+        "field by finite differences, Runge–Kutta 4": partial(runge_kutta, middle),
+    }
+    sindy = by_sindy(orbits, dt)
+    if sindy is not None:
+        by_steps["PySINDy's field, Runge–Kutta 4"] = partial(runge_kutta, sindy)
     reference = rolled(lambda z: truth.step(z)[0])
-    found = {}
-    for name, states in {
-        "law with its bracket": np.asarray(
-            fit.map.rollout(fresh, steps, save_every=steps // 100)[0]
-        ).swapaxes(0, 1),
-        "field by finite differences, Runge–Kutta 4": rolled(partial(runge_kutta, middle)),
-        "field through Runge–Kutta 4": rolled(partial(runge_kutta, through)),
-    }.items():
-        length = np.linalg.norm(states, axis=-1)
-        found[name] = {
-            "casimir": float(np.nanmax(np.abs(length / length[0] - 1)[-1])),
-            "orbit": float(np.nanmedian(np.abs(states - reference).max(axis=2)[-1])),
-            "finite": bool(np.isfinite(states).all()),
-        }
+    short = np.asarray(fit.map.rollout(fresh, 100)[0])[:, [0, *SAVED[:7]]]
+    long = np.asarray(fit.map.rollout(fresh, steps, save_every=200)[0])
+    own = [n for n in SAVED[7:] if n <= steps]
+    states = np.concatenate([short, long[:, np.array(own) // 200]], axis=1).swapaxes(0, 1)
+    found = {"law with its bracket": compared(states, reference)}
+    found |= {name: compared(rolled(step), reference) for name, step in by_steps.items()}
+    if sindy is None:
+        found["PySINDy's field, Runge–Kutta 4"] = {"absent": "not installed"}
     return found
+
+
+def by_sindy(orbits: np.ndarray, dt: float) -> np.ndarray | None:
+    """PySINDy's coefficients (9, 3) of the features of `beside`; None where it is not installed."""
+    if importlib.util.find_spec("pysindy") is None:
+        return None
+    pysindy = importlib.import_module("pysindy")
+    library = pysindy.PolynomialLibrary(degree=2, include_bias=False)
+    model = pysindy.SINDy(
+        optimizer=pysindy.STLSQ(threshold=0.02),
+        feature_library=library,
+        differentiation_method=pysindy.FiniteDifference(order=4),
+    )
+    model.fit(list(orbits), t=dt)
+    return model.coefficients().T
+
+
+def compared(states: np.ndarray, reference: np.ndarray) -> Numbers:
+    """Largest relative change of |M|, and median error of the orbits, at each saved step, of
+    states (S, B, 3)."""
+    length = np.linalg.norm(states, axis=-1)
+    casimir = np.abs(length / length[0] - 1).max(axis=1)
+    orbit = np.median(np.abs(states - reference).max(axis=2), axis=1)
+    series = {"steps": [*SAVED][: len(states) - 1]}
+    series |= {"casimirs": casimir[1:].tolist(), "orbits": orbit[1:].tolist()}
+    return {"casimir": float(casimir[-1]), "orbit": float(orbit[-1]), **series}
+
+
+def draw(found: Numbers) -> None:
+    """Draw changes of |M| and errors of orbits over the steps."""
+    with style():
+        figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
+    for name, m in found.items():
+        if "absent" not in m:
+            for ax, key in zip(axes, ("casimirs", "orbits"), strict=True):
+                ax.loglog(m["steps"], np.maximum(m[key], 1e-17), label=name)
+    for ax, what in zip(axes, ("|M|, relative change", "error of the orbit"), strict=True):
+        ax.set_xlabel("step")
+        ax.set_ylabel(what)
+    axes[0].legend(fontsize="x-small")
+    save(figure, FIGURES / "bracket_peers.png", dpi=130)
 
 
 NAMES = ("kicked top", "free top", "heavy top", "four populations in logs")
@@ -183,12 +230,15 @@ def tables() -> None:
     heads = ("map without a law", "terms of S", "one step", "Casimirs, 10³ steps", "fit, CPU s")
     text = markdown(heads, rows)
     if "beside" in found:
+        peers = found["beside"]["measured"]
+        draw(peers)
         rows = [
-            [name, number(m["casimir"]), number(m["orbit"])]
-            for name, m in found["beside"]["measured"].items()
+            [name, m.get("absent") or number(m["casimir"]), number(m.get("orbit"))]
+            for name, m in peers.items()
         ]
-        heads = ("free top, 400 pairs; after 10⁵ steps", "Casimir", "orbit")
+        heads = ("free top, 400 pairs; after 10⁵ steps", "change of M", "orbit")
         text += "\n\n" + markdown(heads, rows)
+        text += "\n\n![Changes of M and errors of orbits over 10⁵ steps](figures/bracket_peers.png)"
     between_markers(TABLES, "bracket_maps", f"{text}\n\n{provenance(found)}")
 
 
