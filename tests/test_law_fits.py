@@ -352,9 +352,12 @@ def test_a_driven_mass_has_a_law_of_one_term():
 def test_a_law_that_does_not_follow_its_record_is_said_to():
     """As where the sensor moved half way, for good."""
     t, x = pendulum(end=20.0)
-    x[len(t) // 2 :] += 0.7
-    with pytest.warns(gfnn.FitWarning, match="the law follows only .* of the variation of x"):
-        gfnn.fit(gfnn.Recording({"t": t, "x": x}, positions=["x"]))
+    late = np.arange(len(t)) >= len(t) // 2
+    fit = gfnn.fit(gfnn.Recording({"t": t, "x": x + 0.1 * late}, positions=["x"]))
+    assert fit.verdict.startswith("partly") and "as at 10 s" in fit.verdict
+    with pytest.raises(gfnn.FitError) as refused:
+        gfnn.fit(gfnn.Recording({"t": t, "x": x + 0.7 * late}, positions=["x"]))
+    assert refused.value.verdict.startswith("no law") and "as at 10 s" in refused.value.verdict
 
 
 @pytest.mark.slow

@@ -60,7 +60,7 @@ def test_any_form_of_the_same_data(kind, law, tmp_path):
 
 def test_several_positions():
     both = np.stack([X, X[::-1]], axis=1)
-    recording = as_pairs_or_recording(T, both)
+    recording, _ = as_pairs_or_recording(T, both)
     assert recording.positions == ("x1", "x2")
 
 

@@ -77,7 +77,8 @@ def test_the_equation_of_motion():
     lagrangian = Formula((Term("v1**2", 0.5, 0.0), Term("v1*v2*cos(x1 - x2)", 2.0, 0.1)))
     friction = Formula((Term("abs(v2)**3", 0.1, 0.01), Term("(v2 - v1)**2", 0.2, 0.02)))
     forces = [[Term("u", 3.0, 0.5)], []]
-    first, second = equations_of_motion(lagrangian, friction, forces, ["x1", "x2"], ["v1", "v2"])
+    both = [lagrangian, lagrangian]
+    first, second = equations_of_motion(both, friction, forces, ["x1", "x2"], ["v1", "v2"])
     assert str(first.left) == "x₁_ddot + 2.0(1) x₂_ddot cos(x₁−x₂)"
     assert str(first.right) == "-2.0(1) v₂² sin(x₁−x₂) - 0.40(4) (v₁−v₂) + 3.0(5) u"
     assert "- 0.30(3) v₂ |v₂|" in str(second.right)

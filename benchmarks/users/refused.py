@@ -58,7 +58,7 @@ def mixed_lengths() -> Any:
 
 
 REFUSED: dict[str, Callable[[], Refused]] = {
-    "terms-none": lambda: Refused(fitted(terms=None), "for none as terms, got None"),
+    "terms-none": lambda: Refused(fitted(terms=None), "as terms, got None"),
     "terms-as-text": lambda: Refused(fitted(terms="p1**2"), "as terms, got 'p1**2'"),
     "unknown-name": lambda: Refused(fitted(terms=["p1**2 + x**2"]), "the name 'x'"),
     "dt-backwards": lambda: Refused(
