@@ -370,12 +370,15 @@ def _of_law(found: Searched) -> _Refits:
         data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
     )
     steps = Steps(flow.stages, flow.over(np.max(data.each_dt)).substeps)
-    coefficients = np.asarray(flow.params)
+    family, coefficients = flow.family, np.asarray(flow.params)
+    if law.constrained is not None:  # what is told of coefficients holds in each fit
+        family = law.constrained
+        coefficients = coefficients[list(family.free)]
 
     def predicts(parts: list[np.ndarray]) -> list[np.ndarray]:
-        without = without_each(problem, flow.family, coefficients, steps, parts)
+        without = without_each(problem, family, coefficients, steps, parts)
         images = (
-            problem.images(flow.family, c, part, steps).states
+            problem.images(family, c, part, steps).states
             for c, part in zip(without, parts, strict=True)
         )
         return [to_user(data.coordinates, states) for states in images]

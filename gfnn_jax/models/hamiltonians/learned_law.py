@@ -20,6 +20,7 @@ from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.exports.symbolic import as_latex, as_sympy
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.families.told import Constrained
 from gfnn_jax.flows.collective import Collective
 from gfnn_jax.flows.collocation import truncation
 from gfnn_jax.flows.flow import Flow
@@ -72,7 +73,8 @@ class LearnedHamiltonian:
     went in the end. friction: γ where that is uniform, else the terms of Rayleigh's R; of a system
     without, (). constants: numbers inside terms that noisy sequences told, each with its term and
     its standard error. symmetries: that H has to roundoff. proposals: simple fractions near its
-    numbers, which noisy sequences allow. rivals: the next two laws that they allow. misfit: whether
+    numbers, which noisy sequences allow. constrained: H in the coefficients that were fitted, where
+    others are told. rivals: the next two laws that they allow. misfit: whether
     these sequences are certain that H lacks something.
     """
 
@@ -100,6 +102,7 @@ class LearnedHamiltonian:
     widths: tuple[float, ...] = ()
     turns: bool = False
     kinds: Callable[[], WhichFriction | None] | WhichFriction | None = None
+    constrained: Constrained | None = None
 
     @cached_property
     def which_friction(self) -> WhichFriction | None:

@@ -87,7 +87,8 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
     best, outside = _simplified(inner, everywhere, everywhere.training[outer], best)
     ended, of_arcs = problem.work.ended, None
     problem.flows.allowance = UNBOUNDED
-    best = within_bounds(problem, best)
+    before, best = best, within_bounds(problem, best)
+    outside = outside if best is before else None
     if arcs is not None:
         of_arcs = partial(covariance_root, best, problem.flows, everywhere, best.fit.steps)
         problem = problem.beginning(data)
@@ -105,6 +106,7 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
         learned,
         candidate=dataclasses.replace(learned.candidate, outside=outside),
         messages=(*learned.messages, *held_at_bounds(problem, best)),
+        constrained=told if isinstance(told, Constrained) else None,
         ended=ended or problem.work.ended,
     )
 
