@@ -41,8 +41,9 @@ from gfnn_jax.maps.estimates import (
 from gfnn_jax.maps.laws import states_of
 from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.input_rules import choose_again
+from gfnn_jax.models.lagrangians.libraries import central, textbook
 from gfnn_jax.models.lagrangians.recordings import samples_of
-from gfnn_jax.models.lagrangians.rivals import one_sided
+from gfnn_jax.models.lagrangians.rivals import one_sided, other_powers, with_likeliest_power
 from gfnn_jax.models.lagrangians.search import search, search_on
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.text import speed_names, terms_of
@@ -416,9 +417,15 @@ def test_a_power_of_the_distance_that_others_imitate_is_one_of_several():
 
     x = solve_ivp(rates, (0, 25), [1, 0, 0, 0.9], t_eval=t, rtol=1e-9).y[:2].T
     x = x + 1e-3 * np.random.default_rng(0).normal(size=x.shape)
-    fit = gfnn.fit(gfnn.Recording({"t": t, "x": x[:, 0], "y": x[:, 1]}, positions=["x", "y"]))
-    assert "sqrt(x**2 + y**2)**4" in str(fit.formula)
-    assert re.match(r"one of several: .* may be .*r\*\*3.5 .* in place of r\*\*4\.", fit.verdict)
+    recording = gfnn.Recording({"t": t, "x": x[:, 0], "y": x[:, 1]}, positions=["x", "y"])
+    problem = samples_of(recording).problem
+    half = Structure(2, (*textbook(2, ()), central(2, 3.5)[0]))
+    known = {("term", row): -0.5 for row in half.terms if 2 in row[1]}
+    known |= {("term", half.terms[-1]): -0.2, ("term", ((0, 2), (0, 0), (0, 0), 0.0)): 0.5}
+    fit = problem.fit(half, known, problem.arcs(4.0), problem.scales.sigma)
+    found = with_likeliest_power(fit)
+    assert found.structure.terms[-1] == central(2, 4.0)[0]
+    assert re.search(r"r\*\*3.5 .* in place of r\*\*4\.", other_powers(found, ["x", "y"]))
 
 
 @pytest.mark.parametrize("pushed", [False, True])
