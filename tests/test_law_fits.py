@@ -44,7 +44,7 @@ from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.libraries import central, textbook
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.rivals import one_sided, other_powers, with_likeliest_power
-from gfnn_jax.models.lagrangians.search import search, search_on
+from gfnn_jax.models.lagrangians.search import search, search_on, with_fewer_waves
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.text import speed_names, terms_of
 from gfnn_jax.signals.local_cubics import choose_half, smooth
@@ -497,6 +497,20 @@ def test_a_cart_that_its_motor_moves_drives_a_pendulum_that_does_not_move_it(giv
     np.testing.assert_allclose(np.asarray(ahead)[0, :, :2], x[:51, :2], atol=5e-3)
     with pytest.raises(InputError, match="do not act back"):
         gfnn.export(fit.map, "mjcf", "unwritten.xml")
+    if given:
+        return
+    problem, none = samples_of(recording).problem, (0, 0)
+    waves = [((1, 1), none, (0, n), 0.0) for n in (0, 2, 1)]
+    rows = ((2, 0), none, none, 0.0), ((0, 2), none, none, 0.0), (none, none, (0, 1), 0.0)
+    friction = ((1, 0), LINEAR, 0.0), ((0, 1), LINEAR, 0.0)
+    structure = Structure(2, (*rows, *waves[:2]), friction, (), 1, leaders=(0,))
+    known = dict(
+        zip([("term", row) for row in structure.terms], (0.5, 0.5, 30, 2.2, 0.8), strict=True)
+    )
+    known |= {("loss", friction[0]): 6, ("loss", friction[1]): 0.2, ("gain", 0, 0): 9}
+    imitated = problem.fit(structure, known, problem.arcs(1.0), problem.scales.sigma)
+    fewer = with_fewer_waves(imitated, waves).structure.terms
+    assert [row for row in fewer if row[0] == (1, 1)] == waves[2:]
 
 
 def undamped():
