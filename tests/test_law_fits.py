@@ -356,7 +356,7 @@ def test_a_law_that_does_not_follow_its_record_is_said_to():
     late = np.arange(len(t)) >= len(t) // 2
     fit = gfnn.fit(gfnn.Recording({"t": t, "x": x + 0.1 * late}, positions=["x"]))
     assert fit.verdict.startswith("partly")
-    assert "as at 10 s" in fit.verdict
+    assert "as at 10 s" in str(fit.verdict)
     with pytest.raises(gfnn.FitError) as refused:
         gfnn.fit(gfnn.Recording({"t": t, "x": x + 0.7 * late}, positions=["x"]))
     assert refused.value.verdict.startswith("no law")
