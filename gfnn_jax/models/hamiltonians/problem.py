@@ -164,7 +164,7 @@ class LawProblem:
     tolerance: Tolerance
     budget: Budget = dataclasses.field(default_factory=Budget)
     scene: Any = None
-    terms: Sequence[Any] = ()
+    terms: Any = ()  # of a sequence, or a mapping of text to what is known of its coefficient
     options: LawOptions = OPTIONS
     dearest: float = np.inf
     on_progress: Callable[[str], Any] = lambda message: None
