@@ -209,7 +209,8 @@ def draw(found: Numbers) -> None:
     for ax, what in zip(axes, ("|M|, relative change", "error of the orbit"), strict=True):
         ax.set_xlabel("step")
         ax.set_ylabel(what)
-    axes[0].legend(fontsize="x-small")
+    lines, labels = axes[0].get_legend_handles_labels()
+    figure.legend(lines, labels, loc="outside upper center", ncols=2, fontsize="x-small")
     save(figure, FIGURES / "bracket_peers.png", dpi=130)
 
 

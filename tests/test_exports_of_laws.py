@@ -231,7 +231,10 @@ def one_step(to, path, map_):
     own.exitInitializationMode()
     numbers = {v.name: v.valueReference for v in about.modelVariables}
     dim, dt = map_.dim, float(map_.dt)
-    z_at = [numbers[f"{letter}{i + 1}"] for letter in "qp" for i in range(dim)]
+    names = [f"{letter}{i + 1}" for letter in "qp" for i in range(dim)]
+    if map_.sensors is not None:
+        names[:dim] = map_.sensors.positions
+    z_at = [numbers[own] for own in names]
     u_at = [numbers[name] for name in ("l", "F") if name in numbers]
 
     def by_fmu(z, u):

@@ -21,6 +21,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from gfnn_jax.errors import WorkError
 from gfnn_jax.exports import c_parts
 from gfnn_jax.exports.graph import LawGraph, graph_of
 from gfnn_jax.exports.jax_source import FUNCTIONS, rates_of
@@ -42,10 +43,10 @@ _TYPES = "Float32 Int8 UInt8 Int16 UInt16 Int32 UInt32 Int64 UInt64 Boolean Stri
 def fmu(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> bytes:
     """Make the FMU of the law of a map, a zip archive.
 
-    Its states are z = (q, p), which start at 0; inputs and parameters of the system those of the
-    map, coefficients tunable parameters ``c1``, `c2``, …; the time of a drive is that of the
-    simulation. Inputs are held during a step. Raises InputError for a map without a law, or with
-    one that is no formula.
+    Its states are z = (q, p), which start at 0, the q named as their columns; inputs and parameters
+    of the system those of the map, coefficients tunable parameters ``c1``, ``c2``, …; the time of a
+    drive is that of the simulation. Inputs are held during a step. Raises InputError for a map
+    without a law, or with one that is no formula, WorkError without a C compiler.
     """
     graph = graph_of(map_)
     starts = _starts(graph, map_)
@@ -57,17 +58,14 @@ def fmu(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> bytes:
         archive.writestr("modelDescription.xml", _description(graph, map_, name, token, about))
         archive.writestr(f"sources/{name}.c", text)
         archive.writestr("sources/buildDescription.xml", _build(name))
-        binary = _compiled(text, name)
-        if binary is not None:
-            place, content = binary
-            archive.writestr(place, content)
+        archive.writestr(*_compiled(text, name))
     return packed.getvalue()
 
 
-def _compiled(text: str, name: str) -> tuple[str, bytes] | None:
-    """The binary's path and content; None without a compiler."""
+def _compiled(text: str, name: str) -> tuple[str, bytes]:
+    """The binary's path and content. Raises WorkError without a compiler."""
     if shutil.which("cc") is None:
-        return None
+        raise WorkError("an FMU needs the C compiler cc, which is not installed; --to c needs none")
     machine = {"arm64": "aarch64", "AMD64": "x86_64"}.get(platform.machine(), platform.machine())
     system = platform.system().lower()
     suffix = {"darwin": ".dylib", "windows": ".dll"}.get(system, ".so")
@@ -276,11 +274,15 @@ def _description(
     width, dim, sensors = len(graph.rates), graph.dim, map_.sensors
     shown = sensors.positions if sensors is not None else graph.names[:dim]
     told = [*shown, *(f"momentum of {q}" for q in shown)]
+    names = [*shown, *graph.names[dim:]]  # as the columns, where these are free
+    others = {"time", *graph.arguments, *(f"c{k + 1}" for k in range(len(graph.terms)))}
+    if len({*names} - others) < width:
+        names = graph.names
     rows = [_variable("time", 0, causality="independent", variability="continuous")]
-    for i, (own, text) in enumerate(zip(graph.names, told, strict=True)):
+    for i, (own, text) in enumerate(zip(names, told, strict=True)):
         exact = {"initial": "exact", "start": 0.0, "nominal": f"{graph.scale[i]:.3g}"}
         rows.append(_variable(own, 1 + i, causality="output", description=text, **exact))
-    for i, own in enumerate(graph.names):
+    for i, own in enumerate(names):
         outside = "output" if i < dim else "local"
         rows.append(_variable(f"der({own})", 1 + width + i, causality=outside, derivative=1 + i))
     first = 1 + 2 * width

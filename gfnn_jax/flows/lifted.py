@@ -372,7 +372,8 @@ def roll(law, w, slopes, out, substeps):
                         slopes[i, s] = value
                 if not abs(total) < np.inf:
                     return n, most
-                ahead = change * min(change / before, 1.0)  # of the next iteration
+                # Change of the next iteration; the first one does not show how fast they shrink.
+                ahead = change * min(change / before, 1.0) if iterations > 1 else change
                 if change <= _SETTLED and (ahead <= _FLOOR or change > 0.5 * before):
                     break
                 before = change
