@@ -22,6 +22,7 @@ Where it is not white, a *whitening* (`solve.noise`) mixes residuals along an ar
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import cached_property, partial
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -38,6 +39,35 @@ class Defects(NamedTuple):
     closing: np.ndarray
     by_state: np.ndarray
     by_coefficients: np.ndarray
+
+
+def flow_defects(
+    rates: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    x: np.ndarray,
+    h: np.ndarray,
+    parameters: int,
+    substeps: int,
+) -> Defects:
+    """Ends of Runge–Kutta steps of order 4 of ż = f(z; p) from all nodes x (A, L, n) but the last,
+    less the next nodes.
+
+    h: (A (L − 1), 1), times between nodes. parameters: of p. rates: (ż (N, n), its derivatives) of
+    z (N, n) and the derivatives (N, n, n + P) of z in the node it began at and in p.
+    """
+    arcs, length, n = x.shape
+    z, h = x[:, :-1].reshape(-1, n), h / substeps
+    slope = np.zeros((len(z), n, n + parameters))
+    slope[:, range(n), range(n)] = 1.0
+    for _ in range(substeps):
+        total, change, at = np.zeros_like(z), np.zeros_like(slope), (z, slope)
+        for part, weight in zip((0.5, 0.5, 1.0, 0.0), (1, 2, 2, 1), strict=True):
+            rate, moving = rates(*at)
+            total, change = total + weight * rate / 6, change + weight * moving / 6
+            at = z + part * h * rate, slope + part * h[..., None] * moving
+        z, slope = z + h * total, slope + h[..., None] * change
+    ends = z.reshape(arcs, length - 1, n)
+    slope = slope.reshape(arcs, length - 1, n, -1)
+    return Defects(ends - x[:, 1:], slope[..., :n], slope[..., n:])
 
 
 class Observed(NamedTuple):

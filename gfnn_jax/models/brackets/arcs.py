@@ -12,7 +12,14 @@ from gfnn_jax.brackets import Bracket, standard_constants
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.models.brackets.algebra import changed
 from gfnn_jax.models.brackets.poisson_field import PoissonField
-from gfnn_jax.solve.latent_arcs import Defects, Fitted, Observed, Readings, observed_whole
+from gfnn_jax.solve.latent_arcs import (
+    Defects,
+    Fitted,
+    Observed,
+    Readings,
+    flow_defects,
+    observed_whole,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,14 +122,11 @@ class PoissonArcs:
     def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         """Ends of the steps from all nodes but the last, less the next nodes."""
         arcs, length, m = x.shape
-        z = x[:, :-1].reshape(-1, m)
-        h = np.reshape(np.broadcast_to(self.dt, (arcs, length - 1)), (-1, 1)) / self.substeps
+        h = np.reshape(np.broadcast_to(self.dt, (arcs, length - 1)), (-1, 1))
         count = self.library.num_parameters
         bracket = self.free.moved(p[count:])
         field, free = PoissonField(bracket, self.library), FreeBracket(bracket, self.free.places)
         c = p[:count]
-        slope = np.zeros((len(z), m, m + len(p)))
-        slope[:, range(m), range(m)] = 1.0
 
         def rates(z, slope):
             gradient = self.library.gradient(c, z)
@@ -131,16 +135,7 @@ class PoissonArcs:
             moving[..., m + count :] += free.columns(z, gradient)
             return np.einsum("nij,nj->ni", bracket.matrix(z), gradient), moving
 
-        for _ in range(self.substeps):
-            total, change, at = np.zeros_like(z), np.zeros_like(slope), (z, slope)
-            for part, weight in zip((0.5, 0.5, 1.0, 0.0), (1, 2, 2, 1), strict=True):
-                rate, moving = rates(*at)
-                total, change = total + weight * rate / 6, change + weight * moving / 6
-                at = z + part * h * rate, slope + part * h[..., None] * moving
-            z, slope = z + h * total, slope + h[..., None] * change
-        ends = z.reshape(arcs, length - 1, m)
-        slope = slope.reshape(arcs, length - 1, m, -1)
-        return Defects(ends - x[:, 1:], slope[..., :m], slope[..., m:])
+        return flow_defects(rates, x, h, len(p), self.substeps)
 
 
 class ArcsFit(NamedTuple):

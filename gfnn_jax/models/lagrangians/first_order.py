@@ -22,7 +22,7 @@ from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.nature import told_by_positions
-from gfnn_jax.solve.latent_arcs import Defects, Fitted, Readings, observed_whole
+from gfnn_jax.solve.latent_arcs import Defects, Fitted, Readings, flow_defects, observed_whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,11 +120,7 @@ class FieldOnArcs:
         return c
 
     def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
-        arcs, length, d = x.shape
-        z, c = x[:, :-1].reshape(-1, d), self.matrix(p)
-        h = self.h.reshape(-1, 1) / self.substeps
-        slope = np.zeros((len(z), d, d + len(p)))
-        slope[:, range(d), range(d)] = 1.0
+        d, c, h = x.shape[-1], self.matrix(p), self.h.reshape(-1, 1)
         i, j = self.places.T
         own = np.arange(len(p))
 
@@ -134,16 +130,7 @@ class FieldOnArcs:
             moving[:, i, d + own] += values[:, j]
             return values @ c.T, moving
 
-        for _ in range(self.substeps):
-            total, change, at = np.zeros_like(z), np.zeros_like(slope), (z, slope)
-            for part, weight in zip((0.5, 0.5, 1.0, 0.0), (1, 2, 2, 1), strict=True):
-                rate, moving = rates(*at)
-                total, change = total + weight * rate / 6, change + weight * moving / 6
-                at = z + part * h * rate, slope + part * h[..., None] * moving
-            z, slope = z + h * total, slope + h[..., None] * change
-        ends = z.reshape(arcs, length - 1, d)
-        slope = slope.reshape(arcs, length - 1, d, -1)
-        return Defects(ends - x[:, 1:], slope[..., :d], slope[..., d:])
+        return flow_defects(rates, x, h, len(p), self.substeps)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
