@@ -3,7 +3,7 @@
     python benchmarks/scaling.py             all of it (about six minutes on two cores), tables
     python benchmarks/scaling.py --quick     few steps, into runs/scaling
     python benchmarks/scaling.py --only fit-map,fit-law,reading
-    python benchmarks/scaling.py --only accelerator     on a machine that has one
+    benchmarks/gpu.sh                        the rows of a GPU, on a machine that has one
 
 Every number of devices has a process of its own, with so many virtual CPU devices; the digest of
 all states says whether the bits are the same. More devices than cores gain nothing: the table says
@@ -15,8 +15,7 @@ maps are apart. Reading: a file of half a gigabyte, and what memory a process ne
 
 Fits on devices: the factor of a least-squares problem, one Gauss–Newton problem of a law and some
 iterations of an ensemble, by a fit that was told no devices and by 1, 2, 4 and 8 of them, processor
-seconds beside. Accelerator: the first of these and rollouts, in float64, on the accelerator that
-JAX finds and on this machine's processor; where there is none it says so.
+seconds beside.
 """
 
 from __future__ import annotations
@@ -198,32 +197,6 @@ def measure_fits_on_devices(quick: bool) -> Numbers:
     }
 
 
-def measure_accelerator(quick: bool) -> Numbers:
-    """Rows of a fit and a rollout, float64, on the accelerator and on the processor."""
-    devices = {"accelerator": jax.local_devices()[0], "processor": jax.devices("cpu")[0]}
-    if devices["accelerator"].platform == "cpu":
-        print("  no accelerator")
-        return {"accelerator": None}
-    work, (map_, z0) = problem("rows", quick), learned("map")
-    z0 = np.resize(z0, (sharded._ON_ACCELERATORS, 4))
-    found: Numbers = {"accelerator": devices["accelerator"].device_kind, "lanes": len(z0)}
-    factors, states = {}, {}
-    for name, device in devices.items():
-        with row_blocks.on_devices([device]):
-            factored = timed(work, repeats=3)
-        roll = sharded.Sharded(map_, (device,)).rollout
-        rolled = timed(lambda roll=roll: roll(z0, STEPS, save_every=STEPS)[0], repeats=3)
-        factors[name], states[name] = factored.out, rolled.out
-        found[f"on_{name}"] = {
-            "fit_seconds": factored.seconds,
-            "microseconds": 1e6 * rolled.seconds / (STEPS * len(z0)),
-        }
-    squares = [np.triu(factor).T @ np.triu(factor) for factor in factors.values()]
-    found["normal_matrices_apart"] = float(np.abs(np.subtract(*squares)).max() / squares[1].max())
-    found["states_apart"] = float(np.abs(np.subtract(*states.values())).max())
-    return found
-
-
 # Fits of several processes.
 
 PROCESSES, SAMPLE, CHUNK = (1, 2, 4), 3_000, 50_000
@@ -337,8 +310,7 @@ GROUPS = {
     "reading": partial(measure_group, task="reading"),
 }
 ON_DEVICES = {"fit-devices": measure_fits_on_devices}
-ACCELERATOR = {"accelerator": measure_accelerator}
-PIECES = ROLLOUTS | ON_DEVICES | ACCELERATOR | GROUPS
+PIECES = ROLLOUTS | ON_DEVICES | GROUPS
 
 
 def tables() -> None:
@@ -395,35 +367,6 @@ def tables() -> None:
     if found:
         text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
         between_markers(TABLES, "scaling-fit-devices", text)
-    heads = (
-        "accelerator",
-        "fit there, s",
-        "fit on the processor, s",
-        "step of a state there, µs",
-        "on the processor, µs",
-        "states apart by",
-    )
-    rows, found = [], results(ACCELERATOR, "scaling")
-    for result in found.values():
-        m = result["measured"]
-        there, here = m["accelerator"], m.get("on_processor")
-        if there is None:
-            rows.append(["no accelerator", *["–"] * 5])
-            continue
-        on = m["on_accelerator"]
-        rows.append(
-            [
-                there,
-                number(on["fit_seconds"]),
-                number(here["fit_seconds"]),
-                number(on["microseconds"]),
-                number(here["microseconds"]),
-                f"{m['states_apart']:.1e}",
-            ]
-        )
-    if found:
-        text = f"{markdown(heads, rows)}\n\n{provenance(found)}"
-        between_markers(TABLES, "scaling-accelerator", text)
     heads = (
         "all rows",
         "pairs",
