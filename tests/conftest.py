@@ -66,7 +66,7 @@ def pytest_configure(config):
         jax.config.update(name, value)
     # Each operation that is traced keeps where it was called from: a twentieth of the time.
     with contextlib.suppress(ImportError, AttributeError):  # no part of JAX's interface
-        from jax._src.lib import _jax  # pyright: ignore[reportPrivateImportUsage]
+        from jax._src.lib import _jax
 
         _jax.set_tracebacks_enabled(False)
     # Tracing makes millions of small objects that live on: looking through them so often as Python

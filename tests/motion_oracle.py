@@ -264,8 +264,8 @@ class Form:
     friction: Friction
     num_inputs: int = 0
     powers: Powers | None = None
-    quadratic: Quadratic = None  # pyright: ignore[reportAssignmentType]
-    dissipation: Dissipation = None  # pyright: ignore[reportAssignmentType]
+    quadratic: Quadratic = None
+    dissipation: Dissipation = None
 
     def __post_init__(self):
         if self.quadratic is None or not self.quadratic.is_of(self.terms):

@@ -10,7 +10,7 @@ def calibration(errors: np.ndarray) -> Calibration:
     """Of errors (8, n) of forecasts from the parts of a record."""
     parts = np.stack([np.median(np.delete(errors, k, axis=0), axis=0) for k in range(8)])
     none: list = []
-    return Calibration(None, none, np.median(errors, axis=0)[:, None], parts[..., None])  # pyright: ignore
+    return Calibration(None, none, np.median(errors, axis=0)[:, None], parts[..., None])
 
 
 def errs_more(one: Calibration, other: Calibration) -> bool:

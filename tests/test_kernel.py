@@ -95,7 +95,7 @@ def test_steps_are_those_of_numpy(d, powers, dry, own):
         if dry and d < 5:  # of five bodies some speed may be 0 but for roundoff
             np.testing.assert_array_equal(found.modes[:, form.friction.jumps], modes)
     assert found.by_coefficients.shape == (num, 2 * d, form.count)
-    assert len(kernel.follow.signatures) == 1  # pyright: ignore[reportAttributeAccessIssue]
+    assert len(kernel.follow.signatures) == 1
 
 
 SHAPES = """

@@ -91,7 +91,7 @@ def test_what_a_family_affords_rises_with_its_cost(rising):
 class Costing(PolynomialModel):
     """A model, or a family, of which only the operations count."""
 
-    operations = None  # pyright: ignore[reportAssignmentType]
+    operations = None
 
     def __init__(self, operations):
         object.__setattr__(self, "operations", operations)

@@ -32,7 +32,7 @@ def example():
     fewer = code.replace("num_steps=100_000, save_every=100", "num_steps=1_000, save_every=1")
     assert fewer != code
     names: dict = {}
-    strict = jax.config.jax_numpy_dtype_promotion  # pyright: ignore[reportAttributeAccessIssue]
+    strict = jax.config.jax_numpy_dtype_promotion
     # As in a user's session, where nothing is strict.
     jax.config.update("jax_numpy_rank_promotion", "allow")
     jax.config.update("jax_numpy_dtype_promotion", "standard")
