@@ -90,7 +90,8 @@ CASES = {
     ),
     # No mechanical law: populations, of first order. 10 % of noise leaves coefficients open.
     "predator_prey.csv": Case(
-        dict.fromkeys(("log(Prey)", "log(Predator)", "Prey", "Predator"), math.nan)
+        dict.fromkeys(("log(Prey)", "log(Predator)", "Prey", "Predator"), math.nan),
+        says=("states without velocities, of populations",),
     ),
     "predator_prey_qp.csv": Case(
         {"q1": 0.8, "exp(q1)": -0.02, "p1": 0.9, "exp(p1)": -0.03}, tolerance=0.2

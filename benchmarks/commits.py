@@ -1,10 +1,12 @@
-"""Which results are older than their code: told, or measured again, oldest first.
+"""Which results are old: told, or measured again, oldest first.
 
-A result notes the commit that it was measured at, whether files differed from it (`dirty`), and the
-files of the package and of this folder that its process had loaded (`code`). It is old where one of
-these differs from today's in more than comments, docstrings and layout. A result that was measured
-with files that differed, or that notes no commit of this repository, counts as of the commit that
-it came with. What draws figures changes no number.
+A result is old in two cases. Its study changed: a script of this folder that its process had loaded
+(`code`) differs from today's in more than comments, docstrings and layout; the harness measures
+nothing and does not count. Or the package did: it was measured with a version more than one minor
+version behind today's. Between two versions `freeze.py` guards the package, by the bits of thirty
+fits; a commit that moves numbers on purpose measures the studies that it names again. A result
+that was measured with scripts that differed, or that notes no commit of this repository, counts as
+of the commit that it came with.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -22,7 +25,8 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 PACKAGE = "gfnn_jax"
-_NO_NUMBERS = (f"{PACKAGE}/evaluate/figures", f"{HERE.name}/commits.py")
+_NO_NUMBERS = tuple(f"{HERE.name}/{name}.py" for name in ("commits", "harness", "summary"))
+_BEHIND = 1  # minor versions that a result may be
 _WITH_DOCSTRING = (ast.Module, ast.ClassDef, ast.FunctionDef)
 _TOLD = 4  # files of which it is told that they changed
 
@@ -37,13 +41,9 @@ def git(*words: str) -> str:
 
 
 def code() -> dict[str, Any]:
-    """The commit, whether files differ from it, and the files that this process has loaded. A study
-    that starts another Python counts as having loaded the whole package."""
+    """The commit, whether files differ from it, and the files that this process has loaded."""
     loaded = (Path(getattr(module, "__file__", None) or "/") for module in [*sys.modules.values()])
     own = {path.resolve() for path in loaded if path.suffix == ".py"}
-    studies = [path for path in own if path.is_relative_to(HERE) and path != Path(__file__)]
-    if any("sys.executable" in path.read_text(encoding="utf-8") for path in studies):
-        own |= set((HERE.parent / PACKAGE).rglob("*.py"))
     names = (path.relative_to(HERE.parent) for path in own if path.is_relative_to(HERE.parent))
     files = sorted(str(name) for name in names if name.parts[0] in (PACKAGE, HERE.name))
     return {
@@ -54,8 +54,8 @@ def code() -> dict[str, Any]:
 
 
 def changed(noted: Any, result: str) -> Iterator[str]:
-    """The files that mean something else today, of those that a result's `code` notes, or why they
-    are not known. result: name of its file."""
+    """The scripts that mean something else today, of those that a result's `code` notes, or why
+    they are not known. result: name of its file."""
     noted = noted or {}  # {file or folder: digest} in results until 0.3
     loaded = noted["files"].split() if "commit" in noted else list(noted)
     base = noted.get("commit")
@@ -65,9 +65,21 @@ def changed(noted: Any, result: str) -> Iterator[str]:
         yield "its code is not recorded"
         return
     for name in _differ(base):
-        counts = name.startswith(tuple(loaded)) and not name.startswith(_NO_NUMBERS)
+        counts = name.startswith(tuple(loaded)) and name not in _NO_NUMBERS
         if counts and _meaning(base, name) != _meaning("", name):
             yield name
+
+
+def behind(version: str) -> str:
+    """Why a result of this version of the package is old, "" where it is not."""
+    minor = int(version.split(".")[1])
+    return f"of version {version}" if _minor_today() > minor + _BEHIND else ""
+
+
+@functools.cache
+def _minor_today() -> int:
+    about = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))
+    return int(about["project"]["version"].split(".")[1])
 
 
 @functools.cache
@@ -84,7 +96,7 @@ def _came_with() -> dict[str, str]:
 
 @functools.cache
 def _differ(base: str) -> list[str]:
-    return git("diff", "--name-only", "--no-renames", base, "--", "*.py").splitlines()
+    return git("diff", "--name-only", "--no-renames", base, "--", f"{HERE.name}/*.py").splitlines()
 
 
 @functools.cache
@@ -129,10 +141,12 @@ def check(studies: Sequence[str], only: Sequence[str], folder: Path, *, tell: bo
     old = []
     for piece, path, study in asked:
         found = json.loads(path.read_text(encoding="utf-8"))
-        if why := list(islice(changed(found.get("code"), path.name), _TOLD)):
+        why = list(islice(changed(found.get("code"), path.name), _TOLD))
+        why += filter(None, [behind(found.get("versions", {}).get("gfnn_jax", "0.0.0"))])
+        if why:
             took = f"{found['seconds']:.0f} s" if "seconds" in found else "time not known"
             old.append((found.get("date", ""), path, study, piece, f"{', '.join(why)}; {took}"))
-    print(f"{len(asked) - len(old)} of {len(asked)} results are of current code")
+    print(f"{len(asked) - len(old)} of {len(asked)} results are of current studies")
     paths = os.pathsep.join(filter(None, [str(HERE.parent), os.environ.get("PYTHONPATH")]))
     failed = 0
     for date, path, study, piece, why in sorted(old):

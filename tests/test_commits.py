@@ -30,7 +30,7 @@ main(__doc__, {}, "a-try")
 
 @pytest.fixture
 def repository(tmp_path, monkeypatch):
-    """A repository of a package of two modules and a study that loaded one; (root, commit)."""
+    """A repository of a package and of a study that loads two scripts; (root, commit)."""
 
     def commit() -> str:
         for words in (["add", "-A"], ["commit", "-qm", "one", "--allow-empty"]):
@@ -45,8 +45,9 @@ def repository(tmp_path, monkeypatch):
     subprocess.run(["git", "init", "-q"], check=True)
     for folder in ("gfnn_jax", "benchmarks/results"):
         Path(folder).mkdir(parents=True)
-    Path("gfnn_jax/used.py").write_text('"""Doc."""\ndef f(x):\n    return x\n')
-    Path("gfnn_jax/idle.py").write_text("Y = 1\n")
+    Path("benchmarks/used.py").write_text('"""Doc."""\ndef f(x):\n    return x\n')
+    Path("gfnn_jax/room.py").write_text("Y = 1\n")
+    Path("pyproject.toml").write_text('[project]\nversion = "0.4.0"\n')
     Path("benchmarks/a_try.py").write_text(STUDY)
     source = Path(__file__).parent.parent / "benchmarks/commits.py"
     Path("benchmarks/commits.py").write_bytes(source.read_bytes())
@@ -56,7 +57,7 @@ def repository(tmp_path, monkeypatch):
 
 
 def forget():
-    for cached in (commits._came_with, commits._differ, commits._meaning):
+    for cached in (commits._came_with, commits._differ, commits._meaning, commits._minor_today):
         cached.cache_clear()
 
 
@@ -65,27 +66,32 @@ def is_old(code, name="a-try-one.json"):
     return list(commits.changed(code, name))
 
 
-def test_a_result_is_old_where_a_file_changed_that_it_loaded(repository):
+def test_a_result_is_old_where_a_script_changed_that_it_loaded(repository):
     root, commit = repository
     first = commit()
-    code = {"commit": first, "dirty": False, "files": "benchmarks/a_try.py gfnn_jax/used.py"}
+    code = {
+        "commit": first,
+        "dirty": False,
+        "files": "benchmarks/a_try.py benchmarks/used.py gfnn_jax/room.py",
+    }
     assert is_old(code) == []
-    used = root / "gfnn_jax/used.py"
+    used = root / "benchmarks/used.py"
     used.write_text("def f(x):  # the same\n    '''Other words.'''\n    return (x)\n")
-    (root / "gfnn_jax/idle.py").write_text("Y = 2\n")
+    (root / "gfnn_jax/room.py").write_text("Y = 2\n")
     assert is_old(code) == []
     used.write_text("def f(x):\n    return 2 * x\n")
-    assert is_old(code) == ["gfnn_jax/used.py"]
+    assert is_old(code) == ["benchmarks/used.py"]
     # One that was measured beside this change is of the commit that it came with, as one of 0.3.
-    for other in (code | {"dirty": True}, {"gfnn_jax/used.py": "ab1 cd2"}, {"gfnn_jax": "ab1"}):
+    for other in (code | {"dirty": True}, {"benchmarks/used.py": "ab1 cd2"}, {"benchmarks": "ab1"}):
         (root / "benchmarks/results/a-try-one.json").write_text(json.dumps({"code": other}))
         commit()
         assert is_old(other) == []
         used.write_text(used.read_text() + "Z = 1\n")
-        assert is_old(other) == ["gfnn_jax/used.py"]
+        assert is_old(other) == ["benchmarks/used.py"]
     used.unlink()
-    assert is_old(code) == ["gfnn_jax/used.py"]
+    assert is_old(code) == ["benchmarks/used.py"]
     assert len(is_old(None)) == len(is_old(code, "")) == 1
+    assert [commits.behind(f"0.{minor}.1") for minor in (2, 3, 4)] == ["of version 0.2.1", "", ""]
 
 
 def test_what_is_old_is_measured_again(repository, capsys):
@@ -93,8 +99,9 @@ def test_what_is_old_is_measured_again(repository, capsys):
     results = root / "benchmarks/results"
     commit()
     for name in ("one", "broken", "other"):
-        code = None if name != "other" else {"gfnn_jax/used.py": ""}
-        (results / f"a-try-{name}.json").write_text(json.dumps({"code": code}))
+        code = None if name != "other" else {"benchmarks/used.py": ""}
+        found = {"code": code, "versions": {"gfnn_jax": "0.4.0"}}
+        (results / f"a-try-{name}.json").write_text(json.dumps(found))
     (results / "nobody.json").write_text("{}")
     commit()
     forget()

@@ -94,6 +94,22 @@ def test_a_record_is_named_for_what_it_is(make, verdict):
     assert nature(found, measure(found), ()).verdict.startswith(verdict)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_a_small_unrecorded_force_leaves_the_gain_of_an_input(seed):
+    """Where nothing brings a body back, the force moves it far; accelerations tell."""
+    rng = np.random.default_rng(seed)
+    t, gain = np.arange(200) * 0.1, rng.uniform(2, 8)
+    u = np.repeat(rng.normal(size=40), 5)
+    force = 0.2 * gain * np.sin(rng.uniform(0.2, 0.4) * t + rng.uniform(0, 6))
+    x = np.cumsum(np.cumsum(gain * u + force)) * 0.01
+    with pytest.warns(gfnn.FitWarning):
+        fit = gfnn.fit(gfnn.Recording({"t": t, "y": x, "u": u}, positions=["y"], inputs=["u"]))
+    assert not fit.verdict.startswith("identified")
+    found, std = fit.law.gains["u"]["y"]
+    assert abs(found - gain) < max(0.2 * gain, 4 * std)
+
+
 @pytest.mark.parametrize("noise", [1e-5, 1e-3, 0.03])
 def test_a_pendulum_is_none_of_these(noise):
     x = orbit(lambda _, z: [z[1], -9 * np.sin(z[0]) - 0.05 * z[1]], [1.2, 0.0])[:, 0]

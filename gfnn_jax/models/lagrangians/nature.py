@@ -45,6 +45,7 @@ class NatureOptions:
     lags: int = 40
     first: float = 0.95
     second: float = 0.97
+    mostly: float = 0.9
     real: float = 0.5
     few: float = 0.05
     most: float = 0.7
@@ -61,11 +62,13 @@ OPTIONS = NatureOptions()
 
 class Nature(NamedTuple):
     """Nature of a record: kind of the verdict, and the reason; whether a law of the terms tried may
-    follow part of it all the same."""
+    follow part of it all the same; and whether what was recorded tells most of the accelerations,
+    but not all."""
 
     kind: str
     reason: str
     partly: bool = True
+    mostly: bool = False
 
     @property
     def verdict(self) -> str:
@@ -139,6 +142,7 @@ def nature(
         "no law",
         f"unrecorded: positions and velocities tell only {100 * second:.0f} % of the "
         "accelerations. An input is missing (--inputs), or a coordinate",
+        mostly=second > OPTIONS.mostly,
     )
 
 

@@ -160,11 +160,12 @@ def fit_recording(
         if missed is not None:
             raise _with_nature(missed, data) from None
         raise
+    lost = _loses_a_channel(law)
     if _is_no_law(law):
         missed = missed or no_law(data.problem.scales)
-    if missed is None and law.flaws:
+    if missed is None and (law.flaws or lost):
         what = _nature(data)
-        if what.partly:
+        if what.mostly if lost else what.partly:
             law = dataclasses.replace(law, nature=what.reason)
         else:
             missed = no_law(data.problem.scales)
@@ -194,15 +195,18 @@ def _other_shapes(fit: LawFit) -> str:
 
 
 def _is_no_law(law: LearnedLaw) -> bool:
-    """Return whether a law leaves nearly all of every channel, or much of one that is no noise."""
-    left = law.whiteness.items()
-    if all(one.fit_percent < 100 * (1 - OPTIONS.missed) for _, one in left):
-        return True
+    """Return whether a law leaves nearly all of every channel."""
+    least = 100 * (1 - OPTIONS.missed)
+    return all(one.fit_percent < least for one in law.whiteness.values())
+
+
+def _loses_a_channel(law: LearnedLaw) -> bool:
+    """Return whether a law leaves much of a channel that is no noise."""
     return any(
         one.fit_percent < OPTIONS.followed
         and not one.white
         and law.residual[name] > OPTIONS.above_noise * law.noise[name]
-        for name, one in left
+        for name, one in law.whiteness.items()
     )
 
 
