@@ -19,9 +19,9 @@ from gfnn_jax.maps.lanes import Lanes, RolloutInfo
 from gfnn_jax.maps.samples import Samples
 
 # Lanes of a block. On a CPU 64 and 1,024 are no faster for a generated map, 64 perhaps for a law
-# (benchmarks/scaling.py, on a busy machine). An accelerator needs many; the best number was not
-# measured.
-_ON_CPU, _ON_ACCELERATORS = 256, 16_384
+# (benchmarks/scaling.py, on a busy machine). On an H100 a generated map gains nothing beyond 16,384
+# lanes, a law and a network are 1.8 and 3.4 times as fast with 131,072 (benchmarks/gpu.sh).
+_ON_CPU, _ON_ACCELERATORS = 256, 131_072
 
 
 def local_devices(devices: int | str = "all") -> tuple[Any, ...]:
