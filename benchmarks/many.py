@@ -33,7 +33,7 @@ from harness import (
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
-from gfnn_jax.evaluate import growth
+from gfnn_jax.evaluate import metrics
 from gfnn_jax.families.sums import Part, Sums, Windows, body_terms
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.collocation import Steps, images
@@ -289,7 +289,7 @@ def energy(quick: bool) -> Numbers:
     (states, _), seconds, _ = once(lambda: map_.rollout(z[40:], steps, save_every=every))
     states = np.asarray(states)
     values = np.asarray(map_.hamiltonian(states.reshape(-1, 2_000))).reshape(states.shape[:2])
-    off = growth.energy_error(values)
+    off = metrics.energy_error(values)
     lags = np.unique(np.geomspace(1, off.shape[1] // 4, 20).astype(int))
     rms = [float(np.sqrt(np.mean((off[:, n:] - off[:, :-n]) ** 2))) for n in lags]
     return {
@@ -300,7 +300,7 @@ def energy(quick: bool) -> Numbers:
         "lags": (every * lags).tolist(),
         "rms": rms,
         "exponent": float(np.polyfit(np.log(lags), np.log(rms), 1)[0]),
-        "drift_per_step": growth.energy_drift(every * np.arange(off.shape[1]), off).value,
+        "drift_per_step": metrics.energy_drift(every * np.arange(off.shape[1]), off).value,
         "largest": float(np.abs(off).max()),
     }
 

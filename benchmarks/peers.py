@@ -46,7 +46,7 @@ from scipy.optimize import least_squares
 
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import stretches
-from gfnn_jax.signals.local_cubics import choose_half, smooth
+from gfnn_jax.signals.local_polynomials import choose_half, smooth
 
 Acceleration = Callable[[Any, jax.Array, jax.Array], jax.Array]  # (params, q, v) -> q̈, (d,) each
 LENGTH = 24  # samples of an arc that a peer is fitted to

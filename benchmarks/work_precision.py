@@ -46,7 +46,7 @@ from integrators import runners
 
 import gfnn_jax as gfnn
 from gfnn_jax.evaluate import figures, metrics
-from gfnn_jax.jobs.shared_data import separable
+from gfnn_jax.jobs.methods import separable
 from gfnn_jax.scenes import Scene
 from gfnn_jax.solve.status import LEFT_DOMAIN
 

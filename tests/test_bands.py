@@ -15,7 +15,7 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.predict import Steps, predict
-from gfnn_jax.maps.bands import bands, horizon
+from gfnn_jax.maps.posterior import bands, horizon
 from gfnn_jax.models.generating_functions.map_of_terms import SumOfTerms
 from gfnn_jax.models.generating_functions.sweeps import Linear, LinearSweep
 from gfnn_jax.scenes import henon_heiles

@@ -19,7 +19,7 @@ from gfnn_jax.models.generating_functions import sweeps
 from gfnn_jax.models.generating_functions.parity import is_even
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.search.search import Search
-from gfnn_jax.storage.factors import KeptFactors
+from gfnn_jax.storage.checkpoints import KeptFactors
 
 
 def test_a_relative_error_is_that_of_each_coordinate_in_its_own_spread():

@@ -15,7 +15,7 @@ from gfnn_jax.dataset.measured_error import Tolerance, bound_of_mean
 from gfnn_jax.dataset.runs import identified, next_of, sampled, steps_between
 from gfnn_jax.dataset.split import correlation_time, split_rows
 from gfnn_jax.learn.choose import of_few
-from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.piece import Affine
 from gfnn_jax.processes import Group
 
 # Runs

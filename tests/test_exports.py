@@ -33,11 +33,10 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE1, TYPE2, TYPE3
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import fit_predictors
-from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping, FunctionsOfArgs
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import map_of_law
 from gfnn_jax.maps.parameters import sampled
+from gfnn_jax.maps.piece import Affine, Damping, FunctionsOfArgs
 from gfnn_jax.phase_space import symplectic_form
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK
 

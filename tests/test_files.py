@@ -16,8 +16,7 @@ from hypothesis.extra import numpy as hnp
 
 from gfnn_jax.data import files
 from gfnn_jax.data.blocks import LARGEST
-from gfnn_jax.data.files import DataWarning
-from gfnn_jax.data.summary import summary
+from gfnn_jax.data.files import DataWarning, summary
 from gfnn_jax.errors import InputError
 
 RNG = np.random.default_rng(0)

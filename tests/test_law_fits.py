@@ -47,7 +47,7 @@ from gfnn_jax.models.lagrangians.rivals import one_sided, other_powers, with_lik
 from gfnn_jax.models.lagrangians.search import search, search_on, with_fewer_waves
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.text import speed_names, terms_of
-from gfnn_jax.signals.local_cubics import choose_half, smooth
+from gfnn_jax.signals.local_polynomials import choose_half, smooth
 from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
 
 

@@ -16,7 +16,7 @@ from recordings.generated import MISTAKES, sheet
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
 from gfnn_jax.data.recording_summary import refuse_mistakes, summarise
-from gfnn_jax.data.wrong_values import without_wrong_values
+from gfnn_jax.data.traits import without_wrong_values
 from gfnn_jax.errors import InputError
 
 

@@ -14,7 +14,7 @@ from gfnn_jax.coordinates import Coordinates, polar, to_user
 from gfnn_jax.families import from_function
 from gfnn_jax.generating import generated as generated_module
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
-from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.piece import Affine
 from gfnn_jax.phase_space import symplectic_form, symplecticity_defect
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK
 

@@ -13,7 +13,7 @@ from gfnn_jax.families import from_function
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.charts import MIDPOINT, TYPE1, TYPE2, TYPE3
-from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.piece import Affine
 from gfnn_jax.phase_space import apply_j, symplectic_form
 
 DATA = np.random.default_rng(0).uniform(-1, 1, (400, 2))

@@ -8,7 +8,7 @@ from analytic import exact_oscillator, generated, map_of, oscillator, rotated
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.noise import of_differences
+from gfnn_jax.dataset.rows import of_differences
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.diagnosis.residuals import noise_of_sites, state_noise
 from gfnn_jax.families.terms import given_terms

@@ -22,7 +22,7 @@ from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn import noisy_sweeps
 from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
-from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.piece import Affine
 from gfnn_jax.models.generating_functions.map_arcs import NearestArcs
 from gfnn_jax.models.generating_functions.sweeps import Linear, LinearSweep, Size
 

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
 from gfnn_jax.cli_parser import column_options, parser
-from gfnn_jax.data.first_order import first_order
+from gfnn_jax.data.columns import first_order
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.errors import InputError
 

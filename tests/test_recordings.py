@@ -8,8 +8,8 @@ import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli_parser import add_column_options, column_options, masses, names_roles
-from gfnn_jax.data.channels import parameters_of
 from gfnn_jax.data.files import are_recordings
+from gfnn_jax.data.recording import parameters_of
 from gfnn_jax.data.recording_summary import as_typed
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.errors import InputError

@@ -18,8 +18,8 @@ from gfnn_jax.generating.charts import CHARTS, MIDPOINT, TYPE2, AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import PolynomialModel, Predictor
 from gfnn_jax.maps import saved as models
-from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.piece import Affine
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.scenes import DrawnFrom, Scene, pcr3bp, two_body
 from gfnn_jax.storage.checkpoints import load_model, save_model

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax.budget import Budget
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Candidate
 from gfnn_jax.search.search import Search
 
 WORK = 1_000  # operations that a made-up size takes, and its steps

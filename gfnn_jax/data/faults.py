@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 from scipy import signal
 
-from gfnn_jax.data.accelerations import (
+from gfnn_jax.data.columns import SECONDS
+from gfnn_jax.data.traits import (
+    Traits,
     accelerations,
     fitted,
     functions,
     held_out,
+    in_words,
     missed,
     scaled,
 )
-from gfnn_jax.data.columns import SECONDS
-from gfnn_jax.data.traits import Traits
-from gfnn_jax.data.wrong_values import in_words
 from gfnn_jax.signals.derivatives import Relation, difference
 from gfnn_jax.signals.steps import drift
 from gfnn_jax.signals.wrong_values import TURN

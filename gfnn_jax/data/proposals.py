@@ -13,11 +13,10 @@ from collections.abc import Iterator
 import numpy as np
 from scipy import optimize, signal
 
-from gfnn_jax.data.accelerations import Accelerations, accelerations
+from gfnn_jax.data.columns import TOLD, first_order
 from gfnn_jax.data.faults import Fault, faults
-from gfnn_jax.data.first_order import TOLD, first_order
 from gfnn_jax.data.roles import is_rate_of_turning
-from gfnn_jax.data.traits import Traits
+from gfnn_jax.data.traits import Accelerations, Traits, accelerations
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,8 +18,7 @@ from rich.text import Text
 from gfnn_jax.data.faults import WRONG, Fault
 from gfnn_jax.data.proposals import findings, mistakes
 from gfnn_jax.data.roles import ROLES
-from gfnn_jax.data.traits import Traits, of_rows, traits
-from gfnn_jax.data.wrong_values import WrongValues
+from gfnn_jax.data.traits import Traits, WrongValues, of_rows, traits
 from gfnn_jax.errors import InputError
 from gfnn_jax.signals import energy
 from gfnn_jax.signals.steps import dominant_frequencies, gaps

@@ -7,6 +7,8 @@ import re
 import unicodedata
 from collections.abc import Iterable
 
+import numpy as np
+
 ROLES = ("positions", "velocities", "momenta", "inputs", "parameters", "sensors")
 # Words that name a time, first in a name or alone in it; times by the calendar with their unit.
 TIMES = (
@@ -222,3 +224,27 @@ def _mate(positions: list[str], name: str) -> str | None:
 def _index(name: str) -> str:
     found = _INDEXED.fullmatch(_bare(name))
     return (found[2] or "") if found else ""
+
+
+_WAVE = re.compile(r"(cos|sin)\((\d[\d.]*(?:e[-+]?\d+)?)\*t\)")
+_OF = {"cos": np.cos, "sin": np.sin}
+
+
+def wave_names(omega: float) -> tuple[str, str]:
+    """The names of the two waves of an angular frequency, in rad/s."""
+    return f"cos({omega:.10g}*t)", f"sin({omega:.10g}*t)"
+
+
+def wave(name: str, t: np.ndarray) -> np.ndarray | None:
+    """The wave (n,) of this name at times t (n,) in seconds; None for the name of a column.
+
+    >>> wave("cos(2*t)", np.zeros(2))
+    array([1., 1.])
+    """
+    found = _WAVE.fullmatch(name)
+    return None if found is None else _OF[found[1]](float(found[2]) * t)
+
+
+def is_wave(name: str) -> bool:
+    """Return whether a name is one of a wave."""
+    return _WAVE.fullmatch(name) is not None

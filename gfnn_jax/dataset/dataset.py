@@ -19,9 +19,8 @@ from gfnn_jax.dataset.structures import Structure
 from gfnn_jax.errors import FitError
 from gfnn_jax.flows.collocation import of_lanes
 from gfnn_jax.flows.flow import Flow
-from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping
 from gfnn_jax.maps.domain import Domain, Ranges, covering
+from gfnn_jax.maps.piece import Affine, Damping
 from gfnn_jax.phase_space import Pairs, sizes
 
 Factored = Affine | Damping | Flow  # pieces that can be factored out of pairs

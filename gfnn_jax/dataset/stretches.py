@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.data.channels import args_of, channels_of
-from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.recording import Recording, args_of, channels_of
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.signals.local_cubics import Smooth, choose_half, smooth
+from gfnn_jax.signals.local_polynomials import Smooth, choose_half, smooth
 from gfnn_jax.signals.splines import FEWEST, Splines, splines
 
 GAP = 3.5  # median steps: a longer one ends a stretch, where sampling is even or inputs act

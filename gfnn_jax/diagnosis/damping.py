@@ -29,8 +29,7 @@ from gfnn_jax.families.products import Products
 from gfnn_jax.fitting.least_squares import ROWS_PER_TERM
 from gfnn_jax.fitting.significance import CERTAIN
 from gfnn_jax.generating.charts import AnyChart
-from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping, FunctionsOfArgs
+from gfnn_jax.maps.piece import Affine, Damping, FunctionsOfArgs
 from gfnn_jax.phase_space import split, symplectic_form
 
 

@@ -16,7 +16,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError
 from gfnn_jax.fitting.linear_starts import fit_half_map
 from gfnn_jax.generating.charts import CHARTS, TYPE1, AnyChart
-from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.piece import Affine
 from gfnn_jax.phase_space import Pairs, symplecticity_defect
 
 

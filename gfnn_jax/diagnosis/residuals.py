@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.noise import of_halves, of_pairs
+from gfnn_jax.dataset.rows import of_halves, of_pairs
 from gfnn_jax.dataset.runs import next_of
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.inputs import box_inputs

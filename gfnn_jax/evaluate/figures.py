@@ -19,8 +19,6 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from gfnn_jax.coordinates import nearest_image
-from gfnn_jax.evaluate.chaos import kl_divergence
-from gfnn_jax.evaluate.errors import error_statistics
 from gfnn_jax.evaluate.figures_of_recordings import begin_of as begin_of
 from gfnn_jax.evaluate.figures_of_recordings import coming_figure as coming_figure
 from gfnn_jax.evaluate.figures_of_recordings import forecasts_figure as forecasts_figure
@@ -39,6 +37,7 @@ from gfnn_jax.evaluate.figures_style import (
     style,
 )
 from gfnn_jax.evaluate.figures_style import save as save
+from gfnn_jax.evaluate.metrics import error_statistics, kl_divergence
 from gfnn_jax.phase_space import split
 
 _HALO = [withStroke(linewidth=2, foreground="white")]  # keeps text legible on lines

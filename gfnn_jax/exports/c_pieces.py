@@ -29,8 +29,7 @@ from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.systems import OfSystems
 from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform, without_forces
 from gfnn_jax.generating.generated import Generated, ImplicitStep
-from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping
+from gfnn_jax.maps.piece import Affine, Damping
 from gfnn_jax.solve.linear import COFACTORS_UP_TO, by_cofactors
 
 _EXPLICIT = (Affine, Damping)  # pieces whose image is a formula

@@ -152,3 +152,49 @@ def amplitude_of(w, target_gradient) -> float:
     w, target = np.asarray(w, np.float64), np.asarray(target_gradient, np.float64)
     size = np.max(w.std(axis=0) * np.sqrt(np.mean(target**2, axis=0)))
     return float(size) if size > 0 else 1.0
+
+
+@pytree()
+class Ensemble(DifferentiatedByJax):
+    """Ensemble of E networks of one shape; the params of the family are their weights (E,).
+
+    network: the common shape. members: their params, every leaf with a leading axis E.
+    """
+
+    network: Mlp
+    members: Any
+
+    name = "mlp"
+
+    @property
+    def inputs(self):
+        return self.network.inputs
+
+    @property
+    def size(self) -> int:
+        """Number E of members."""
+        return jax.tree.leaves(self.members)[0].shape[0]
+
+    @property
+    def label(self) -> str:
+        return f"{self.size} × {self.network.label}"
+
+    @property
+    def num_parameters(self) -> int:
+        """Number of parameters of all members; the weights are not learned."""
+        return self.size * self.network.num_parameters
+
+    @property
+    def operations(self) -> tuple[int, int]:
+        """Floating-point operations of ∇S, and of ∇S with its Hessian, for all members."""
+        gradient, with_hessian = self.network.operations
+        return self.size * gradient, self.size * with_hessian
+
+    def unflatten(self, coefficients):
+        """Return the weights (..., E) themselves."""
+        return coefficients
+
+    def value(self, params, w, args=None):
+        """S(params, w), shape (...): params (E,), w (..., 2d)."""
+        each = jax.vmap(lambda member: self.network.value(member, w))(self.members)
+        return jnp.tensordot(params, each, 1)

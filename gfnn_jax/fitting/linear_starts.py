@@ -24,7 +24,7 @@ import numpy as np
 import scipy.linalg
 
 from gfnn_jax.families.family import at_time
-from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.piece import Affine
 from gfnn_jax.phase_space import apply_j, symplectic_form
 
 

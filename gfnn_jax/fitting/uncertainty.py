@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import gammainc
 
-from gfnn_jax.dataset.noise import of_pairs
+from gfnn_jax.dataset.rows import of_pairs
 from gfnn_jax.fitting.triangle import Triangle
 
 # A row is never taken for one that the coefficients reproduce whatever it says.

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.budget import READING
-from gfnn_jax.data.files import iterate_pairs, read_trajectories
+from gfnn_jax.data.files import iterate_pairs, read_trajectories, summary
 from gfnn_jax.data.recording import Recording, read
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.data.sample import read_sample
-from gfnn_jax.data.summary import summary
 from gfnn_jax.errors import FitError, InputError, OutOfTime, WorkError
 from gfnn_jax.evaluate.figures_of_recordings import law_figure
 from gfnn_jax.evaluate.figures_style import save

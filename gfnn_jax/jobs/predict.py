@@ -27,8 +27,8 @@ from gfnn_jax.data.predictions import (
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.jobs.output import Output, read_in_units, refuse_other_units
 from gfnn_jax.maps import saved
-from gfnn_jax.maps.bands import bands, horizon
 from gfnn_jax.maps.lanes import Lanes
+from gfnn_jax.maps.posterior import bands, horizon
 from gfnn_jax.maps.samples import Samples
 from gfnn_jax.maps.sharded import Sharded
 from gfnn_jax.maps.symplectic_map import SymplecticMap

@@ -23,7 +23,7 @@ from gfnn_jax.jobs.measure import (
 from gfnn_jax.jobs.output import MODEL, Output, Ran, pairs_digest, write
 from gfnn_jax.jobs.search import refusals, scene_named, search
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.maps.bands import bands
+from gfnn_jax.maps.posterior import bands
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from gfnn_jax import scenes
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Candidate
 from gfnn_jax.errors import FitError, InputError, WorkError
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.learn.fit import fit
@@ -22,8 +22,7 @@ from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
-from gfnn_jax.storage.checkpoints import TrainingCheckpoints
-from gfnn_jax.storage.factors import KeptFactors
+from gfnn_jax.storage.checkpoints import KeptFactors, TrainingCheckpoints
 
 BEST = "best"
 

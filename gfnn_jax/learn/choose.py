@@ -19,8 +19,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.budget import FLOW, ROWS, Budget, within
-from gfnn_jax.candidates.assemble import measured, stepped
-from gfnn_jax.candidates.candidate import Candidate, with_error
+from gfnn_jax.candidates.assemble import Candidate, measured, stepped, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import (

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.budget import SOLVE, Budget, within
-from gfnn_jax.candidates.assemble import stepped
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Candidate, stepped
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance

@@ -16,8 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax.candidates.assemble import block_of
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Candidate, block_of
 from gfnn_jax.data.files import are_recordings, read_trajectories
 from gfnn_jax.data.proposed import Proposed, as_proposed
 from gfnn_jax.data.recording import ReadOptions, Recording
@@ -35,8 +34,7 @@ from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, Watch, with_options
-from gfnn_jax.learn.other_bracket import other_bracket
-from gfnn_jax.learn.poisson import learn_poisson
+from gfnn_jax.learn.poisson import learn_poisson, other_bracket
 from gfnn_jax.learn.positions import learn_positions
 from gfnn_jax.learn.propose import structures_to_try
 from gfnn_jax.learn.request import checked, diagnose_request, paid_for, wrapped

@@ -14,8 +14,7 @@ import numpy as np
 
 from gfnn_jax.brackets import Bracket, Casimir
 from gfnn_jax.budget import COMPILE, ROWS, Budget, within
-from gfnn_jax.candidates.assemble import stepped
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Candidate, stepped
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.damping import LearnedDamping

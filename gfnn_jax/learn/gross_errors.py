@@ -20,8 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.budget import FLOW
-from gfnn_jax.candidates.assemble import stepped
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Candidate, stepped
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import error_of_each
 from gfnn_jax.errors import OutOfTime

@@ -26,8 +26,8 @@ from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.fit import fit
 from gfnn_jax.learn.fitted import Fit
-from gfnn_jax.maps.affine import Affine
 from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.piece import Affine
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.generating_functions.latent_monitors import Linear, latent_readings

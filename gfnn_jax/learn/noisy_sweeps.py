@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.budget import ROWS, Budget
-from gfnn_jax.candidates.candidate import Candidate, validated
+from gfnn_jax.candidates.assemble import Candidate, validated
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import arcs_of_pairs, onward

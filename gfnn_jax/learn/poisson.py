@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.brackets import Bracket, Log
-from gfnn_jax.candidates.assemble import block_of, stepped
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.brackets import Bracket, Log, Magnetic
+from gfnn_jax.candidates.assemble import Candidate, block_of, stepped
 from gfnn_jax.coordinates import CARTESIAN, LOG
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
@@ -256,3 +255,33 @@ def _learned(law, map_, candidate, messages) -> LearnedHamiltonian:
         messages=tuple(messages),
         covariance=lambda: law.fit.root,
     )
+
+
+MOST_COLUMNS = 8  # of states that are looked at
+EXACT = 1e-9  # of the spread: a law of these that misses nothing
+
+
+def other_bracket(pairs: Pairs) -> list[str]:
+    """A line about the bracket of pairs: of velocities in place of momenta, of columns in another
+    order, of states of another kind. None where no bracket is found, or the pairs have noise,
+    parameters or a drive."""
+    if pairs.args is not None or pairs.z0.shape[1] > MOST_COLUMNS:
+        return []
+    pairs = identified(pairs).pairs
+    split = split_rows(pairs, 0)
+    z0, z1, run, place = (np.asarray(a) for a in (pairs.z0, pairs.z1, pairs.run, pairs.place))
+    every = Data(z0, z1, pairs.dt, run, place, sizes(z0))
+    names = tuple(f"z{i + 1}" for i in range(z0.shape[1]))
+    try:
+        law = law_of(every.take(np.sort(split.training)), every.take(split.validation), names)
+    except FitError:
+        return []
+    if law.error > EXACT:
+        return []
+    what = "states with another bracket"
+    if law.bracket.name == "constant":
+        what = "(q, p) in another order or scale"
+    elif isinstance(law.bracket, Magnetic):
+        what = "positions and velocities in a magnetic field"
+    learn = 'gfnn.Pairs(…, structure="poisson")'
+    return [f"the columns are {what}: {law.bracket}. Learn them with {learn}"]

@@ -16,11 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.budget import ROWS, Budget, within
-from gfnn_jax.candidates.assemble import block_of, stepped
-from gfnn_jax.candidates.candidate import Candidate, with_error
+from gfnn_jax.candidates.assemble import Candidate, block_of, stepped, with_error
 from gfnn_jax.coordinates import Coordinates, nearest_image
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.data.wrong_values import without_wrong_values
+from gfnn_jax.data.traits import without_wrong_values
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, one_step_error
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.dataset.split import Split, split_rows

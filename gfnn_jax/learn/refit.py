@@ -19,8 +19,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.budget import FLOW, RATES, ROWS
-from gfnn_jax.candidates.assemble import stepped
-from gfnn_jax.candidates.candidate import Candidate, with_error
+from gfnn_jax.candidates.assemble import Candidate, stepped, with_error
 from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_inner, whole_turns
 from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
 from gfnn_jax.dataset.rows import of_rows, residual_weight

@@ -30,7 +30,7 @@ from gfnn_jax.families.terms import given_terms
 from gfnn_jax.families.told import Constrained, anything_told, untold
 from gfnn_jax.learn.options import FitOptions, Watch
 from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
-from gfnn_jax.models.hamiltonians.told_terms import told_terms
+from gfnn_jax.models.hamiltonians.libraries import told_terms
 from gfnn_jax.models.maps_of_laws.law_maps import factored_out, flow_of
 from gfnn_jax.phase_space import Pairs, sizes, split
 from gfnn_jax.scenes.draws import sample_states

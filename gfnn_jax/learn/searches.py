@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.budget import Budget
-from gfnn_jax.candidates.assemble import composed
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Candidate, composed
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.structures import Sites

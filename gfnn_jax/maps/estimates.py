@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gfnn_jax.data.channels import args_of, channels_of
-from gfnn_jax.data.recording import Recording
-from gfnn_jax.data.waves import is_wave, wave
+from gfnn_jax.data.recording import Recording, args_of, channels_of
+from gfnn_jax.data.roles import is_wave, wave
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import DRY, UNIFORM, Friction, Lagrangian, functions_of
 from gfnn_jax.flows.motion import Form
@@ -27,7 +26,7 @@ from gfnn_jax.flows.schedules import TAPS, at_stages
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.sensors import TUBE, Sensors
-from gfnn_jax.signals.local_cubics import smooth
+from gfnn_jax.signals.local_polynomials import smooth
 from gfnn_jax.signals.splines import splines
 from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
 from gfnn_jax.solve.linear import covariance_root

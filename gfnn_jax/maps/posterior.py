@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from gfnn_jax.coordinates import nearest_image
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
@@ -47,3 +50,51 @@ class Posterior:
     def of_piece(self, piece: int) -> Posterior:
         """Make the posterior of a piece that has another index."""
         return Posterior(piece, self.root if self.known else lambda: self.root)
+
+
+QUANTILES = (0.05, 0.5, 0.95)
+
+
+class Bands(NamedTuple):
+    """Bands of a prediction: std (B, S, 2d) and quantiles (3, B, S, 2d) at 5, 50 and 95 %.
+
+    std is the root mean square about the map's own prediction. Both are over the samples that have
+    not failed, and NaN where all have.
+    """
+
+    std: np.ndarray
+    quantiles: np.ndarray
+
+    @property
+    def median(self) -> np.ndarray:
+        """Median (B, S, 2d) of the samples."""
+        return self.quantiles[1]
+
+
+def bands(drawn, states, angles: tuple[int, ...] = ()) -> Bands:
+    """Compute the bands of the samples' states (n, B, S, 2d) about the prediction (B, S, 2d).
+
+    angles: indices of coordinates that are compared modulo 2π.
+    """
+    states = np.asarray(states)
+    off = np.asarray(drawn) - states
+    if angles:
+        off = nearest_image(off.reshape(-1, off.shape[-1]), angles).reshape(off.shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # for lanes in which all samples failed
+        std = np.sqrt(np.nanmean(off**2, axis=0))
+        quantiles = states + np.nanquantile(off, QUANTILES, axis=0)
+    return Bands(std, quantiles)
+
+
+def horizon(std, steps, size: float) -> np.ndarray:
+    """First step (B,) of ``steps`` (S,) at which two standard deviations of the position exceed
+    ``size``.
+
+    The standard deviation is the Euclidean norm of std (B, S, 2d) over q; one that is not known
+    counts as too large. −1 where no step exceeds it.
+    """
+    dim = std.shape[-1] // 2
+    beyond = ~(2 * np.linalg.norm(std[..., :dim], axis=-1) <= size)
+    first = np.asarray(steps)[np.argmax(beyond, axis=1)]
+    return np.where(beyond.any(axis=1), first, -1)

@@ -23,10 +23,9 @@ from gfnn_jax.coordinates import CARTESIAN, LOG, Coordinates
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import lagrangian
 from gfnn_jax.families.displacements import OfDisplacement
-from gfnn_jax.families.ensemble import Ensemble
 from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.lagrangian import Friction
-from gfnn_jax.families.mlp import Mlp
+from gfnn_jax.families.mlp import Ensemble, Mlp
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.rigid_bodies import Bodies
 from gfnn_jax.families.sines import Sines
@@ -45,12 +44,11 @@ from gfnn_jax.flows.uniform import Uniform
 from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import PolynomialModel, Predictor
-from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping, FunctionsOfArgs
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.observation import Crossing, Observation
 from gfnn_jax.maps.parameters import Parameters
+from gfnn_jax.maps.piece import Affine, Damping, FunctionsOfArgs
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.stroboscopic import OverPhases

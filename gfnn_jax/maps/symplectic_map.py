@@ -30,7 +30,6 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.lie import LieFlow
 from gfnn_jax.generating.charts import TYPE1
 from gfnn_jax.maps import energy, programs
-from gfnn_jax.maps.bands import Bands, bands
 from gfnn_jax.maps.domain import Domain, Ranges
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.lanes import (
@@ -45,7 +44,7 @@ from gfnn_jax.maps.lanes import (
 from gfnn_jax.maps.modified_hamiltonian import ModifiedHamiltonian
 from gfnn_jax.maps.parameters import Parameters, as_args
 from gfnn_jax.maps.piece import PieceWithAction, serves_any_dt
-from gfnn_jax.maps.posterior import Posterior
+from gfnn_jax.maps.posterior import Bands, Posterior, bands
 from gfnn_jax.maps.samples import sampled
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.sharded import Sharded, local_devices

@@ -20,8 +20,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from gfnn_jax.budget import ROWS, SOLVE, Budget
-from gfnn_jax.candidates.assemble import composed
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Candidate, composed
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.maps.symplectic_map import SymplecticMap

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.signals.local_cubics import Smooth
+from gfnn_jax.signals.local_polynomials import Smooth
 
 
 @dataclasses.dataclass(frozen=True)

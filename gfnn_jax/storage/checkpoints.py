@@ -18,6 +18,7 @@ import json
 import re
 import shutil
 import warnings
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ import numpy as np
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.storage.outputs import (
+    atomic_file,
     atomic_folder,
     failures_as_work_errors,
     restore_interrupted,
@@ -353,3 +355,29 @@ def _as_like(folder: Path, like: Any, entries: list[dict[str, Any]], leaves: lis
     if len(expected) != len(entries):
         raise InputError(f"{folder}: expected {len(expected)} leaves, found {len(entries)}")
     return jax.tree.unflatten(structure, leaves)
+
+
+FACTORS = "factors"
+
+
+class KeptFactors:
+    """Store of pairs of factors by name, in ``folder/factors``. A damaged one counts as missing."""
+
+    def __init__(self, folder):
+        self.folder = Path(folder) / FACTORS
+
+    def load(self, name: str) -> dict[str, np.ndarray] | None:
+        """Load the arrays that were saved under this name; None where there are none."""
+        try:
+            with np.load(self._path(name), allow_pickle=False) as stored:
+                return dict(stored)
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+            return None
+
+    def save(self, name: str, **arrays) -> None:
+        """Save these arrays under this name. Raises WorkError."""
+        with atomic_file(self._path(name)) as stream:
+            np.savez(stream, **arrays)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name.replace(' ', '-')}.npz"

@@ -7,15 +7,14 @@ import dataclasses
 import numpy as np
 import scipy.linalg
 
-from gfnn_jax.candidates.assemble import composed
-from gfnn_jax.candidates.candidate import Candidate, with_error
+from gfnn_jax.candidates.assemble import Candidate, composed, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, measured_error
 from gfnn_jax.dataset.rows import residual_weight
 from gfnn_jax.fitting.linear_starts import fit_half_map
 from gfnn_jax.generating.charts import MIDPOINT
-from gfnn_jax.maps.affine import Affine
+from gfnn_jax.maps.piece import Affine
 from gfnn_jax.phase_space import symplectic_form
 
 _PAIRS = 20_000  # that a regression takes, at most

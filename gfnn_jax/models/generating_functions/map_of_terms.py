@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.budget import ROWS, Budget, within
-from gfnn_jax.candidates.assemble import Assembled, composed, measured
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Assembled, Candidate, composed, measured
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error

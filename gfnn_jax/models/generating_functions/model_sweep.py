@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.budget import Budget
-from gfnn_jax.candidates.assemble import composed, stepped
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Candidate, composed, stepped
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, measured_error

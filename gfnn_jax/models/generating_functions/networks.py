@@ -21,12 +21,11 @@ import jax
 import numpy as np
 
 from gfnn_jax.budget import NETWORK, Budget
-from gfnn_jax.candidates.candidate import Candidate, validated
+from gfnn_jax.candidates.assemble import Candidate, validated
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
 from gfnn_jax.dataset.rows import inputs_of, rows_of
-from gfnn_jax.families.ensemble import Ensemble
-from gfnn_jax.families.mlp import Mlp, amplitude_of
+from gfnn_jax.families.mlp import Ensemble, Mlp, amplitude_of
 from gfnn_jax.fitting.levenberg_marquardt import (
     GradientFit,
     Limits,

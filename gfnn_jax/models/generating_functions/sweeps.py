@@ -22,13 +22,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.budget import Budget
-from gfnn_jax.candidates.assemble import with_predictor
-from gfnn_jax.candidates.candidate import Candidate, refined_images, validated
+from gfnn_jax.candidates.assemble import Candidate, refined_images, validated, with_predictor
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
-from gfnn_jax.dataset.noise import of_pairs
-from gfnn_jax.dataset.rows import inputs_of, of_rows, rows_of, weighted_rows_of
+from gfnn_jax.dataset.rows import inputs_of, of_pairs, of_rows, rows_of, weighted_rows_of
 from gfnn_jax.dataset.runs import looked_at
 from gfnn_jax.dataset.split import outermost
 from gfnn_jax.families.family import own_families
@@ -41,8 +39,7 @@ from gfnn_jax.fitting.least_squares import ROWS_PER_TERM
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.maps.affine import Affine
-from gfnn_jax.maps.damping import Damping
+from gfnn_jax.maps.piece import Affine, Damping
 from gfnn_jax.models.generating_functions.parity import is_even
 
 # Operations of singular values, ÷ terms³; and of a step in NumPy, in units that take as long.

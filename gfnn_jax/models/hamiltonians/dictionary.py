@@ -21,7 +21,7 @@ import numpy as np
 
 from gfnn_jax.budget import FLOW, MATCHING
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.noise import of_differences
+from gfnn_jax.dataset.rows import of_differences
 from gfnn_jax.dataset.runs import next_of
 from gfnn_jax.errors import InputError, OutOfTime
 from gfnn_jax.fitting.evidence import EVIDENCE

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.budget import Budget
-from gfnn_jax.candidates.assemble import Assembled, composed, measured
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Assembled, Candidate, composed, measured
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.exports.symbolic import as_latex, as_sympy

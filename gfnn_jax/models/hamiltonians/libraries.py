@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.diagnosis.residuals import misfit
 from gfnn_jax.errors import FitError
+from gfnn_jax.families.expressions import parse, to_text
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms, given_terms, joined, multiplied, polynomial_terms
-from gfnn_jax.families.told import Constrained, anything_told, untold
+from gfnn_jax.families.told import Constrained, Told, anything_told, told_of, untold
+from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.generating.charts import MIDPOINT
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.problem import LawProblem
-from gfnn_jax.models.hamiltonians.told_terms import constrained
 from gfnn_jax.models.parameters import angles_and_others
 
 # Pairs, from which on the midpoints of a sample tell libraries apart, and times what another one
@@ -99,3 +102,124 @@ def promising(libraries: list[Any], data: Dataset) -> list[Any]:
     left = [misfit(family, data, MIDPOINT) for family in libraries]
     most = _WORSE * min(left, default=np.inf)
     return [f for f, part in zip(libraries, left, strict=True) if part <= most]
+
+
+_ROUNDS = 10  # of holding and fitting, at most
+
+
+def told_terms(dim: int, terms: Iterable[Any]) -> tuple[Told, ...]:
+    """Everything that is told of coefficients, by the terms' names as families have them.
+
+    Raises InputError for text that cannot be read.
+    """
+
+    def named(text: str) -> str:
+        return to_text(parse(text, dim), dim)
+
+    told = [one for one in map(told_of, (t for t in terms if isinstance(t, str))) if one.says]
+    return tuple(
+        one._replace(term=named(one.term), of=None if one.of is None else named(one.of))
+        for one in told
+    )
+
+
+def constrained(problem: LawProblem, library: Terms) -> Terms | Constrained:
+    """The library with what is told. Its terms are taken apart first: one that is the same function
+    as a bound one would make it free."""
+    told, data = told_terms(problem.data.dim, problem.terms), problem.data
+    if not told:
+        return library
+    rows = data.training[: max(200, 4 * library.num_parameters)]
+    return Constrained.of(library.take(null_terms(library, data.y0[rows])[0]), told)
+
+
+def within_bounds(problem: LawProblem, law: FittedLaw) -> FittedLaw:
+    """The law whose coefficients are within the bounds that are told, fitted to the rows of its
+    fit. Raises FitError where every coefficient is held."""
+    bounds = {one.term: (one.low, one.high) for one in _bounds(problem)}
+    if not bounds:
+        return law
+    family, c = _with_bounded(problem, law)
+    ends = np.array([bounds.get(name, (-np.inf, np.inf)) for name in family.term_names])
+    held: dict[int, float] = {}
+    fit = law.fit
+    rows = np.setdiff1d(problem.data.training, np.setdiff1d(law.rows, fit.used))
+    for _ in range(_ROUNDS):
+        found = problem.flows.linearised(family, c, fit.steps, rows).rebased(c)
+        columns, target = found.factor[:, :-1], found.factor[:, -1]
+        size = np.linalg.norm(columns, axis=0)
+        best = lsq_linear(columns / size, target, (ends * size[:, None]).T, method="bvls")
+        sides = dict(enumerate(best.active_mask))
+        binding = {j: float(ends[j, int(side > 0)]) for j, side in sides.items() if side}
+        if binding == held and (held or family is law.family):
+            break
+        if len(binding) == len(c):
+            raise FitError("terms: every coefficient would be held at its bound: widen the bounds")
+        start = np.delete(best.x / size, list(binding))
+        law = law.with_fit(problem.fitted(family.held(binding), start, rows, rounds=False))
+        fit, rows, held = law.fit, law.fit.used, binding
+        c = family.params_of(law.family, fit.coefficients)
+        if not held:
+            break
+    return law
+
+
+def breaks_bounds(problem: LawProblem, law: FittedLaw) -> bool:
+    """Return whether a coefficient is outside the bounds that are told."""
+    known = unbound(law).values
+    return not all(one.low <= known.get(one.term, 0.0) <= one.high for one in _bounds(problem))
+
+
+def held_at_bounds(problem: LawProblem, law: FittedLaw) -> list[str]:
+    """Messages about the coefficients of an unbound law that are held at a bound."""
+    return [
+        f"{one.term} is held at its bound: the pairs alone would put its coefficient beyond"
+        for one in _bounds(problem)
+        if law.values.get(one.term, 0.0) in (one.low, one.high)
+    ]
+
+
+def unbound(law: FittedLaw) -> FittedLaw:
+    """The law with a coefficient and an error of every term, those that are held included."""
+    family = law.family
+    if not isinstance(family, Constrained):
+        return law
+    fit, whole = law.fit, law.whole
+    if whole is not None:
+        whole = whole._replace(root=root_of_all(family, whole.root))
+    fit = fit._replace(
+        coefficients=family.coefficients(fit.coefficients),
+        standard_errors=np.abs(family.basis) @ fit.standard_errors,
+    )
+    return law._replace(family=family.family, fit=fit, whole=whole)
+
+
+def root_of_all(family: Constrained, root: np.ndarray) -> np.ndarray:
+    """(N, N): the root of the covariance of all coefficients from that of the free ones (m, m)."""
+    square = np.zeros((len(family.fixed), len(family.fixed)))
+    square[: len(root)] = root @ family.basis.T
+    return square
+
+
+def _bounds(problem: LawProblem) -> list[Told]:
+    told = told_terms(problem.data.dim, problem.terms)
+    return [one for one in told if one.of is None and one.low < one.high]
+
+
+def _with_bounded(problem: LawProblem, law: FittedLaw) -> tuple[Constrained, np.ndarray]:
+    """The family and its params, with terms that were dropped though 0 is outside their bounds."""
+    family, c = law.family, law.fit.coefficients
+    names = family.family.term_names
+    gone = [o for o in _bounds(problem) if o.term not in names and not o.low <= 0 <= o.high]
+    if not gone:
+        return family, c
+    given = given_terms(problem.data.dim, untold(problem.terms))
+    more = given.take([given.term_names.index(one.term) for one in gone])
+    both, count = joined(family.family, more), len(gone)
+    basis = np.zeros((len(family.fixed) + count, len(c) + count))
+    basis[:-count, :-count], basis[-count:, -count:] = family.basis, np.eye(count)
+    free = (*family.free, *range(len(family.fixed), len(family.fixed) + count))
+    return (
+        Constrained(both, np.append(family.fixed, np.zeros(count)), basis, free),
+        np.append(c, np.zeros(count)),
+    )

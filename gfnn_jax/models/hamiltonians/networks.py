@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.budget import NETWORK
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Candidate
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.measured_error import measured_error
 from gfnn_jax.dataset.rows import residual_weight

@@ -31,22 +31,20 @@ from gfnn_jax.models.hamiltonians.fitted_law import Dropped, FittedLaw
 from gfnn_jax.models.hamiltonians.friction import is_smooth, mechanical, without_turns
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian, learned_from
 from gfnn_jax.models.hamiltonians.libraries import (
+    breaks_bounds,
     check_finite,
+    held_at_bounds,
     modes_of,
     own_terms,
+    root_of_all,
+    unbound,
+    within_bounds,
 )
 from gfnn_jax.models.hamiltonians.library_search import is_exact, of_libraries, small_polynomials
 from gfnn_jax.models.hamiltonians.options import OPTIONS
 from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.sequences import arcs_of, fitted_to_sequences
 from gfnn_jax.models.hamiltonians.symmetries import imposed
-from gfnn_jax.models.hamiltonians.told_terms import (
-    breaks_bounds,
-    held_at_bounds,
-    root_of_all,
-    unbound,
-    within_bounds,
-)
 
 
 def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:

@@ -19,7 +19,7 @@ import numpy as np
 from gfnn_jax.budget import UNBOUNDED, Allowance
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.dataset.noise import of_differences
+from gfnn_jax.dataset.rows import of_differences
 from gfnn_jax.dataset.runs import Arcs, arcs_of_pairs, onward, steps_between
 from gfnn_jax.dataset.split import Split
 from gfnn_jax.errors import InputError

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.data.channels import args_of, parameters_of
-from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.recording import Recording, args_of, parameters_of
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.errors import FitError
 from gfnn_jax.exports.symbolic import Formula

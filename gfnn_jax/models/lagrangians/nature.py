@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Scales, Stretch
-from gfnn_jax.signals.local_cubics import smooth
+from gfnn_jax.signals.local_polynomials import smooth
 from gfnn_jax.signals.splines import Splines
 
 

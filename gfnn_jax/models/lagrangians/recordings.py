@@ -15,11 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.data.channels import channels_of, parameters_of
-from gfnn_jax.data.recording import Recording
-from gfnn_jax.data.roles import by_name, symbols
-from gfnn_jax.data.waves import wave_names
-from gfnn_jax.data.wrong_values import without_wrong_values
+from gfnn_jax.data.recording import Recording, channels_of, parameters_of
+from gfnn_jax.data.roles import by_name, symbols, wave_names
+from gfnn_jax.data.traits import without_wrong_values
 from gfnn_jax.dataset.stretches import (
     Moving,
     Stretch,

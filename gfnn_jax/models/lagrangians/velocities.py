@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.data.channels import channels_of
-from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.recording import Recording, channels_of
 from gfnn_jax.dataset.stretches import Arcs, Nodes, Stretch
 from gfnn_jax.fitting.evidence import correlation_time
 from gfnn_jax.fitting.linearised import Linearised

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.budget import FLOW
-from gfnn_jax.candidates.candidate import Candidate
+from gfnn_jax.candidates.assemble import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed
 from gfnn_jax.diagnosis.local_jacobians import Charts
