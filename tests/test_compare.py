@@ -11,6 +11,7 @@ from gfnn_jax.baselines import Budget
 from gfnn_jax.baselines.paper_gfnn import paper_gfnn
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs import compare as comparison
+from gfnn_jax.jobs import methods
 from gfnn_jax.jobs.figures import divergences
 from gfnn_jax.jobs.measure import Rollouts, without_runaways
 from gfnn_jax.jobs.methods import SharedData, separable
