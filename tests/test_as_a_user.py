@@ -15,7 +15,6 @@ SHORT = {
     "twenty-pairs",
     "friction",
     "degrees",
-    "wrapped-angle",
     "copies",
     *benchmark.REFUSED,
 }

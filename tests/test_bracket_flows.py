@@ -77,7 +77,9 @@ def wide(casimirs, number, lanes):
 
 
 @pytest.mark.parametrize("steps", [1_000, pytest.param(10_000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "spins" else n for n in SYSTEMS]
+)
 def test_step(name, steps, tmp_path):
     """The step is the flow of B∇H, exactly Poisson by the derivative of what ran; Casimirs stay;
     it is undone by its inverse and saved."""

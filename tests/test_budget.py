@@ -274,15 +274,15 @@ KEPLER_TERMS = ["p1**2 + p2**2", "1/sqrt(q1**2 + q2**2)"]
 PENDULUM_TERMS = ["p1**2/l**2", "l*cos(q1)"]
 QUICK = {
     "S or H": (kepler, {"tolerance": 1e-4}),
-    "S": (kepler, {"learn": "map", "tolerance": 1e-4}),
-    "H": (kepler, {"learn": "hamiltonian", "terms": KEPLER_TERMS, "tolerance": 1e-4}),
     "S of several dt": (partial(oscillators, dt=SEVERAL), {"learn": "map"}),
-    "H of several dt": (partial(oscillators, dt=SEVERAL), {"learn": "hamiltonian"}),
     "H of a ring": (ring, {"learn": "hamiltonian", "structure": "ring"}),
     "H of a parameter": (pendulums, {"learn": "hamiltonian", "terms": PENDULUM_TERMS}),
     "S of noisy sequences": (sequences, {"learn": "map"}),
 }
-SLOW = {
+SLOW = {  # much like those
+    "S": (kepler, {"learn": "map", "tolerance": 1e-4}),
+    "H": (kepler, {"learn": "hamiltonian", "terms": KEPLER_TERMS, "tolerance": 1e-4}),
+    "H of several dt": (partial(oscillators, dt=SEVERAL), {"learn": "hamiltonian"}),
     "S of noisy pairs": (partial(oscillators, noise=1e-3), {"learn": "map"}),
     "H of noisy sequences": (sequences, {"learn": "hamiltonian"}),
     "S beside a base": (oscillators, {"learn": "map", "base": "p1**2/2"}),

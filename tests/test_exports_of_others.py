@@ -107,7 +107,7 @@ def test_names_with_commas_go_through_every_option():
         (None, (T, SWING), ["--columns", "t,x"]),
         ("x", (SWING,), ["--dt", "0.02"]),
         ("lap,x", (T, SWING), ["--time", "lap"]),
-        ("t,#,x", (T, T, SWING), ["--columns", "t,x"]),
+        pytest.param("t,#,x", (T, T, SWING), ["--columns", "t,x"], marks=pytest.mark.slow),
     ],
 )
 def test_predict_reads_a_file_as_fit_did(tmp_path, capsys, head, columns, options):

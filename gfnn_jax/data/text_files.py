@@ -428,6 +428,8 @@ def from_text(
         return rows_of(_stacked(text, columns), start, stop, every)
     wanted = [n for n in text.names if n in (columns or text.names) or n in text.times or is_run(n)]
     wanted = [name for name in wanted if name not in text.text or name in text.times[:1]]
+    if not wanted:
+        raise InputError(f"{path}: no column of numbers: {', '.join(text.names)} hold words")
     runs = [name for name in wanted if is_run(name)]
     kept: list[dict[str, np.ndarray]] = []
     numbers: list[np.ndarray] = []  # of the rows that are kept, in the file
