@@ -54,7 +54,8 @@ def test_the_command_line_reads_what_python_takes():
 def test_a_job_is_identified_by_what_decides_its_model():
     options = gfnn.FitOptions(terms=("p1**2",), angles=(0,), max_seconds=3.0, devices=2)
     assert json.loads(json.dumps(options.deciding)) == options.deciding
-    others = {"max_seconds", "max_operations", "devices", "bracket"}  # canonical pairs have none
+    unasked = {"bracket", "hidden"}  # canonical pairs and plain recordings have none
+    others = {"max_seconds", "max_operations", "devices", *unasked}
     assert set(FIELDS) - set(options.deciding) == others
 
 

@@ -66,10 +66,10 @@ def fit(
                order. Of different dt, S is a function of dt too, in the midpoint chart. With
                parameters (args) H is learned, or an S of state and parameters, which
                family="polynomial" or learn="map" ask for. Or a `Recording`, of which ``learn``
-               ("auto" or "lagrangian"), ``terms``, ``friction``, ``input_hold``, ``mass`` and
-               ``loss`` apply (`models.lagrangians.recordings`); with learn="map" the map of its
-               positions is learned (`learn.positions`). Or a table (of pandas, polars, xarray, or
-               arrays by name) or a file, of either kind: read as `gfnn look` proposes, with a
+               ("auto" or "lagrangian"), ``terms``, ``friction``, ``input_hold``, ``mass``, ``loss``
+               and ``hidden`` apply (`models.lagrangians.recordings`); with learn="map" the map of
+               its positions is learned (`learn.positions`). Or a table (of pandas, polars, xarray,
+               or arrays by name) or a file, of either kind: read as `gfnn look` proposes, with a
                warning that says how. Or times (n,), with positions x1 … xd, (n,) or (n, d), behind
                them: ``fit(t, x)``.
     scene:     lends its coordinates, features and reversor; None: plain coordinates.
@@ -122,6 +122,7 @@ def fit(
                     mass=options.mass,
                     terms=tuple(options.terms),
                     loss=options.loss,
+                    hidden=options.hidden,
                     on_progress=watch.on_progress,
                 )
             except FitError as error:

@@ -211,6 +211,7 @@ class Lagrangian:
     input_hold: str = "auto"
     mass: Mapping[str, float] | None = None
     loss: Any = None
+    hidden: int = 0
 
 
 @_named
@@ -368,6 +369,11 @@ OPTIONS: dict[str, About] = {
         "one's own",
         commands=(),
     ),
+    "hidden": About(
+        _whole(0, 2),
+        "for a recording of one position: the number of coordinates beside it that no column shows",
+        "N",
+    ),
     "devices": About(
         DEVICES,
         "number of devices that share the rows, and the networks of an ensemble; on a CPU these "
@@ -409,6 +415,7 @@ class FitOptions:
     input_hold: str = "auto"
     mass: Mapping[str, float] | None = None
     loss: Any = None
+    hidden: int = 0
     devices: int | str | None = None
 
     def __post_init__(self):
@@ -463,6 +470,8 @@ class FitOptions:
         values = {name: getattr(self, name) for name, about in OPTIONS.items() if about.decides}
         if self.bracket is None:
             del values["bracket"]  # jobs of canonical data are what they were
+        if not self.hidden:
+            del values["hidden"]
         return {n: list(v) if isinstance(v, (tuple, list)) else v for n, v in values.items()}
 
     def budget(self, watch: Watch, dim: int | None) -> Budget:

@@ -41,6 +41,7 @@ from gfnn_jax.families.expressions import (
 from gfnn_jax.families.jets import jets
 from gfnn_jax.families.traced import traced
 from gfnn_jax.flows.motion import Form, Rates
+from gfnn_jax.maps.hidden import Hidden
 from gfnn_jax.signals.splines import FEWEST, splines
 from gfnn_jax.solve.latent_arcs import SOFT_L1, Observed
 from gfnn_jax.solve.noise import Loss
@@ -261,8 +262,20 @@ class Observation:
         return g, by
 
     @cached_property
+    def hidden(self) -> Hidden | None:
+        """The one channel where it shows coordinates that no other does; else None."""
+        return next((one for one in self.formulas if isinstance(one, Hidden)), None)
+
+    @property
+    def shortest(self) -> float:
+        """Seconds of readings, below which they tell no state."""
+        return 0.0 if self.hidden is None else self.hidden.oscillations.seconds
+
+    @cached_property
     def unseen(self) -> tuple[int, ...]:
         """Coordinates that no channel shows by positions alone."""
+        if self.hidden is not None:
+            return ()
         still = {*range(self.dim)}
         seen = set().union(*(used for used in self._used if used <= still))
         return tuple(i for i in range(self.dim) if i not in seen)
@@ -278,6 +291,8 @@ class Observation:
         """
         if len(self.direct) == self.dim:
             return y[:, [self.direct[i] for i in range(self.dim)]]
+        if self.hidden is not None and t is not None:
+            return self.hidden.states(t, y[:, 0], float(self.values[0]))[0]
         if self.unseen:
             return self._integrated(t, y, angles)
         d = self.dim
@@ -437,6 +452,8 @@ class Observation:
     def state_sigma(self, x: np.ndarray, sigma: np.ndarray, omega: float) -> np.ndarray:
         """σ (d,) of the coordinates, of that of the channels (k,), at states x (n, 2d); of unseen
         ones that of their velocities over the frequency ω."""
+        if self.hidden is not None:
+            return np.full(self.dim, sigma[0])
         by_state, unseen = self(x).by_state, list(self.unseen)
         J = by_state[..., : self.dim].copy()
         J[..., unseen] = np.hypot(J, omega * by_state[..., self.dim :])[..., unseen]

@@ -45,6 +45,7 @@ from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import PolynomialModel, Predictor
 from gfnn_jax.maps.domain import Domain, Ranges
+from gfnn_jax.maps.hidden import Hidden
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.observation import Crossing, Observation
 from gfnn_jax.maps.parameters import Parameters
@@ -98,6 +99,7 @@ _TYPES: dict[str, type] = {
         Observation,
         OfBodies,
         Crossing,
+        Hidden,
         SoftL1,
         Biweight,
         Damping,

@@ -126,8 +126,10 @@ def calibrated(
     starts = _starts(found, scales)
     if not starts or not np.all(spread > 0):  # of events
         return _unknown(law, spread)
-    short = (OPTIONS.short - 1) * scales.dt
-    tried = np.unique(np.maximum(np.array(OPTIONS.choices) * scales.period, short))
+    shortest = law.sensors.observation_model.shortest
+    short = max((OPTIONS.short - 1) * scales.dt, shortest)
+    period = max(scales.period, shortest)
+    tried = np.unique(np.maximum(np.array(OPTIONS.choices) * period, short))
     some = starts[:: -(-len(starts) // OPTIONS.tried)]
     longest = max(s.t[-1] - s.t[0] for s in found)
     reach = scales.period if scales.period < longest else longest / 2

@@ -142,6 +142,8 @@ def _in_gauge(data: RecordingData, fit: LawFit) -> tuple[Lagrangian, np.ndarray,
         scale = value / float(np.mean(law.at(fit.problem.args).masses(q)[:, i, i]))
         law, covariance = scaled(law, covariance, scale)
         gauge = f"the mean inertia of {name} over the data is {value:g}, as given"
+    if (sensor := fit.problem.observation.hidden) is not None:
+        gauge += f"; {sensor.gauge}"
     for i in fit.problem.observation.unseen:
         gauge += f"; no sensor shows {names[i]}: it is zero where V is even, or has no slope"
     parts = fit.structure.uncoupled[1:]

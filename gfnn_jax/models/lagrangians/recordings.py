@@ -39,6 +39,7 @@ from gfnn_jax.models.lagrangians.first_order import plain_field
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_terms import given_terms
+from gfnn_jax.models.lagrangians.hidden import no_hidden_law, search_hidden, with_hidden
 from gfnn_jax.models.lagrangians.in_use import (
     CalibratedLaw,
     GaugedLaw,
@@ -111,6 +112,7 @@ def fit_recording(
     mass: Mapping[str, float] | None = None,
     terms: Sequence[Any] = (),
     loss: Loss | None = None,
+    hidden: int = 0,
     on_progress: Callable[[str], Any] = lambda message: None,
 ) -> LearnedLaw:
     """The law of a recording, from its positions and inputs.
@@ -119,7 +121,8 @@ def fit_recording(
     "auto", or the inputs between samples: "hold", "linear" or "band". mass: the known mass (or
     moment of inertia) of one position, which fixes the scale of L. terms: those of L, V and R, as
     text in the names of columns (`models.lagrangians.given_terms`), which are then all that is
-    fitted. loss: of residuals in units of their noise; None: the soft L1 of `solve.noise`.
+    fitted. loss: of residuals in units of their noise; None: the soft L1 of `solve.noise`. hidden:
+    coordinates beside the one position that no column shows (`models.lagrangians.hidden`).
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found; its ``fit`` is then the `LearnedLaw` that misses most of the motion, where there is one.
     """
@@ -136,6 +139,7 @@ def fit_recording(
     recording, left_out = without_wrong_values(recording)
     for line in left_out:
         note(line)
+    recording = with_hidden(recording, hidden) if hidden else recording
 
     def searched(recording: Recording, *rules: str) -> tuple[RecordingData, SearchResult]:
         data = samples_of(recording, loss, options=options, on_progress=note)
@@ -152,7 +156,7 @@ def fit_recording(
         best, findings = _findings(recording, data, found, (*left_out, *of_drive), steps)
         findings = findings._replace(seconds=time.process_time() - started)
         law = in_words(recording, best, findings)
-        if not terms and not law.rival:
+        if not terms and not law.rival and not hidden:
             law = dataclasses.replace(law, rival=_other_shapes(best.fit))
     except (FitError, np.linalg.LinAlgError):
         if missed is not None:
@@ -161,7 +165,7 @@ def fit_recording(
     lost = _loses_a_channel(law)
     if _is_no_law(law):
         missed = missed or no_law(data.problem.scales)
-    if missed is None and (law.flaws or lost):
+    if missed is None and (law.flaws or lost) and not hidden:
         what = _nature(data)
         if what.mostly if lost else what.partly:
             law = dataclasses.replace(law, nature=what.reason)
@@ -218,6 +222,9 @@ def _nature(data: RecordingData) -> Nature:
 
 def _with_nature(error: FitError, data: RecordingData) -> FitError:
     """The error where no law was found, with what the record is."""
+    sensor = data.problem.observation.hidden
+    if sensor is not None:  # whose states tell nothing of the record then
+        return no_hidden_law(len(sensor.names) - 1, error.fit)
     if not error.verdict:
         return error
     what = _nature(data)
@@ -464,7 +471,9 @@ def _found(
     between samples of the inputs; of one system where nothing depends on the parameters."""
     problem = dataclasses.replace(data.problem, rules=rules, inputs=None)
     find: Callable[[ArcProblem], SearchResult | None] = search
-    if terms:
+    if problem.observation.hidden is not None:
+        find = search_hidden
+    elif terms:
         observation, d = problem.observation, problem.dim
         names = symbols((*observation.coordinates, *observation.speeds, *problem.parameters))
         given = given_terms(terms, names[:d], names[d : 2 * d], names[2 * d :])
@@ -532,7 +541,8 @@ def _with_hidden_drive(
         problem, loud = data.problem, _loudest(found.fit)
     except FitError as error:
         missed, problem, loud = error, samples_of(recording).problem, np.inf
-    searches = loud > OPTIONS.above_noise and not recording.inputs
+    seen = not recording.inputs and problem.observation.hidden is None
+    searches = loud > OPTIONS.above_noise and seen
     omega = hidden_frequency(problem) if searches else None
     if omega is not None:
         problem.on_progress(f"a drive that nobody recorded: {omega:.5g} rad/s")

@@ -1,0 +1,255 @@
+"""Laws of one reading that shows several coordinates: the others are hidden.
+
+Any choice of hidden coordinates follows one reading x alike, so that they have a *gauge*. Of a
+length they are the modes of small swings, x = x_1 + x_2 + x_rest, each with its own frequency and
+friction: the linear part is then unique. How their masses compare, only powers of degree 3 and 4
+tell. Of an angle they are those of a chain of pendulums, cos x and cos x_hidden.
+
+A fit starts from the oscillations that follow the reading window by window: of a length these are
+the modes; of an angle they leave the coupling of the pendulums and the size of the hidden swings
+open, of which several are tried along short arcs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from itertools import combinations_with_replacement
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.roles import symbols
+from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.maps.hidden import Hidden
+from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
+from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
+from gfnn_jax.models.lagrangians.input_rules import InputModel
+from gfnn_jax.models.lagrangians.search import SearchResult, TermSearch, to_longer_arcs
+from gfnn_jax.models.lagrangians.starts import OPTIONS as STARTS
+from gfnn_jax.models.lagrangians.starts import misfit
+from gfnn_jax.models.lagrangians.structure import Key, Row, Structure
+from gfnn_jax.signals.oscillations import Oscillations, oscillations
+
+
+@dataclasses.dataclass(frozen=True)
+class HiddenOptions:
+    """Starts of laws with hidden coordinates (`benchmarks/any_record.py`, hidden).
+
+    periods: lengths of arcs, in periods of the slowest oscillation. degrees: of the powers of
+    modes. couplings: squares of c in ½v² + c v w + ½w², of two pendulums, and sizes: of the hidden
+    swings, times those that are seen, that are tried. sets: of oscillations that pendulums start
+    from, and finished: starts that are followed on. damped: of the critical friction, at the start.
+    """
+
+    periods: tuple[float, ...] = (0.75, 1.5, 3.0, 6.0, 12.0)
+    degrees: tuple[int, ...] = (3, 4)
+    couplings: tuple[float, ...] = (0.1, 0.3, 0.6, 0.85)
+    sizes: tuple[float, ...] = (0.5, 1.0, 2.0)
+    sets: int = 3
+    finished: int = 3
+    damped: float = 0.003
+
+
+OPTIONS = HiddenOptions()
+
+
+def with_hidden(recording: Recording, count: int) -> Recording:
+    """The recording with so many coordinates beside its one position that no column shows.
+
+    Raises InputError where it has more than one position, or sensors or inputs, FitError where its
+    spectrum does not show as many oscillations.
+    """
+    if len(recording.positions) != 1 or recording.observe or recording.inputs or count > 2:
+        raise InputError(
+            "hidden: expected a recording of one position, without inputs and formulas of sensors, "
+            "and one or two hidden coordinates"
+        )
+    (name,) = recording.positions
+    if name in recording.angles and count > 1:
+        raise InputError("hidden: of an angle one hidden coordinate at the most")
+    longest = max(recording.runs, key=lambda run: len(recording.times(run)))
+    y = recording.unwrapped(name, longest)
+    sets = oscillations(recording.times(longest), y, 1 + count)
+    if not sets:
+        raise no_hidden_law(count)
+    sensor = _sensor(recording, name, sets[0], float(np.nanmean(y)))
+    names = [n for n in (*recording.velocities, *recording.momenta) if n in recording.columns]
+    return recording._with(
+        positions=(),
+        velocities=(),
+        momenta=(),
+        ignored=(*recording.ignored, *names),
+        sensors=(name,),
+        coordinates=sensor.names,
+        angles=sensor.names if name in recording.angles else recording.angles,
+        observe={name: sensor},
+    )
+
+
+def no_hidden_law(count: int, law: Any = None) -> FitError:
+    """Error where no law with so many hidden coordinates follows, but ``law`` in part."""
+    return FitError(
+        f"no law with {count} of its coordinates hidden follows the column: ask for fewer, "
+        f"hidden={count - 1}, or record another column",
+        f"no law: none with {count} hidden coordinates follows the recording",
+        law,
+    )
+
+
+def _sensor(recording: Recording, name: str, found: Oscillations, mean: float) -> Hidden:
+    """Sensor of the modes of a length, or of an angle, whose hidden one starts as its first."""
+    count, code = len(found.omega), symbols((name,))[0]
+    rest = f"{code}_rest"
+    omega = tuple(map(float, found.omega))
+    if name in recording.angles:
+        names = (f"{code}_seen", f"{code}_hidden")
+        return Hidden(names, (1.0, 0.0), omega, ((1.0, 1.0), (1.0, 0.0)), rest, mean)
+    names = tuple(f"{code}_{k + 1}" for k in range(count))
+    eye = tuple(map(tuple, np.eye(count).tolist()))
+    return Hidden(names, (1.0,) * count, omega, eye, rest, mean)
+
+
+def search_hidden(problem: ArcProblem) -> SearchResult:
+    """The law of a problem whose channel shows several coordinates, from the first set of
+    oscillations that leads to one which leaves noise alone, else from the best.
+
+    Raises FitError where no start follows short arcs.
+    """
+    longest = max(problem.nodes, key=lambda n: len(n.t))
+    found: list[LawFit] = []
+    sets = oscillations(longest.t, longest.y[:, 0], problem.dim)
+    for one in sets[: OPTIONS.sets] if problem.angles else sets:
+        found += _followed(_from(problem, one))
+        if found and min(map(misfit, found)) < STARTS.noise:
+            break
+    if not found:
+        raise no_hidden_law(problem.dim - 1)
+    fit = min(found, key=misfit)
+    fit = TermSearch(fit.structure, None).prune(fit)
+    return SearchResult(InputModel(fit), FrictionChoice(fit.structure.friction, {}, {}, False))
+
+
+def _from(problem: ArcProblem, found: Oscillations) -> ArcProblem:
+    """The problem whose states start from these oscillations, with arcs of their periods."""
+    sensor = dataclasses.replace(_sensor_of(problem), omega=tuple(map(float, found.omega)))
+    observation = dataclasses.replace(problem.observation, formulas=(sensor,))
+    slow = 2 * np.pi / (min(sensor.omega) * problem.scales.period)
+    periods = tuple(slow * n for n in OPTIONS.periods)
+    options = dataclasses.replace(problem.options, periods=periods)
+    return dataclasses.replace(problem, observation=observation, options=options)
+
+
+def _sensor_of(problem: ArcProblem) -> Hidden:
+    sensor = problem.observation.hidden
+    assert sensor is not None
+    return sensor
+
+
+def _followed(problem: ArcProblem) -> list[LawFit]:
+    """The best starts along longer and longer arcs, those that are laws."""
+    found: list[LawFit] = []
+    fits = _of_pendulums(problem) if problem.angles else _of_modes(problem)
+    for fit in sorted(fits, key=misfit)[: OPTIONS.finished]:
+        fit = fit.again()
+        for size in problem.options.periods[1:]:
+            longer = to_longer_arcs(fit, problem.length(size))
+            if longer is None:
+                break
+            fit = longer
+        problem.on_progress(f"from oscillations: {fit}")
+        if fit.follows and fit.is_definite:
+            found.append(fit)
+            if misfit(fit) < STARTS.noise:
+                break
+    return found
+
+
+class _Shape(NamedTuple):
+    """A start: coefficients that are known, and coordinates (d, d) of each oscillation."""
+
+    known: dict[Key, float]
+    shapes: np.ndarray
+
+
+def _started(problem: ArcProblem, shapes: np.ndarray) -> ArcProblem:
+    """The problem with the states that a shape makes of the oscillations."""
+    sensor = dataclasses.replace(_sensor_of(problem), shapes=tuple(map(tuple, shapes.tolist())))
+    nodes = [
+        dataclasses.replace(n, x=np.concatenate(sensor.states(n.t, n.y[:, 0]), axis=1))
+        for n in problem.nodes
+    ]
+    return dataclasses.replace(problem, nodes=nodes)
+
+
+def _of_modes(problem: ArcProblem) -> list[LawFit]:
+    """Short arcs fitted by modes of small swings, and then with powers that couple them."""
+    sensor, d = _sensor_of(problem), problem.dim
+    none, omega = (0,) * d, sensor.omega
+    masses = [(libraries.unit(d, i, i), none, none, 0.0) for i in range(d)]
+    springs = [(none, libraries.unit(d, i, i), none, 0.0) for i in range(d)]
+    powers: list[Row] = [
+        (none, libraries.unit(d, *axes), none, 0.0)
+        for degree in OPTIONS.degrees
+        for axes in combinations_with_replacement(range(d), degree)
+    ]
+    friction = tuple(libraries.losses(d, (LINEAR,), 0.0))
+    linear = Structure(d, (*masses, *springs), friction[:d], (), 0, problem.sensors)
+    known: dict[Key, float] = {
+        ("term", row): -0.5 * w**2 for row, w in zip(springs, omega, strict=True)
+    }
+    known |= {("loss", row): OPTIONS.damped * w for row, w in zip(friction[:d], omega, strict=True)}
+    problem = _started(problem, np.eye(d))
+    arcs, sigma = problem.arcs(problem.options.periods[0]), problem.scales.sigma
+    plain = problem.fit(linear, known, arcs, sigma)
+    whole = dataclasses.replace(linear, terms=(*linear.terms, *powers), friction=friction)
+    values = {**plain.values, **{("term", row): 0.5 for row in masses}}
+    rich = plain.again(whole, values)
+    return [fit for fit in (rich, plain) if fit.follows][:1]
+
+
+def _of_pendulums(problem: ArcProblem) -> list[LawFit]:
+    """Short arcs fitted by two pendulums from several couplings and sizes of the hidden swings."""
+    terms = libraries.textbook(2, (0, 1))
+    friction = tuple(libraries.losses(2, (LINEAR,), 0.0))
+    structure = Structure(2, tuple(terms), friction, (), 0, problem.sensors)
+    found = []
+    for known, shapes in _pendulums(problem, terms):
+        known |= {("loss", row): OPTIONS.damped * problem.scales.omega for row in friction[:2]}
+        some = _started(problem, shapes)
+        arcs = some.arcs(problem.options.periods[0])
+        found.append(some.fit(structure, known, arcs, problem.scales.sigma, rescale=False))
+    return [fit for fit in found if fit.follows and fit.is_definite]
+
+
+def _pendulums(problem: ArcProblem, terms: list[Row]) -> Iterator[_Shape]:
+    """Pendulums ½v² + c v w + ½w² − ½a x² − ½b y² of the two frequencies, and their modes, with y
+    in other units."""
+    sensor = _sensor_of(problem)
+    squares = np.array(sensor.omega) ** 2
+    size = np.concatenate(
+        [sensor.oscillations.parts(n.t, n.y[:, 0] - sensor.start)[0] for n in problem.nodes]
+    )
+    for coupling in OPTIONS.couplings:
+        total, product = (1 - coupling) * squares.sum(), (1 - coupling) * squares.prod()
+        if total**2 < 4 * product:
+            continue
+        c, root = np.sqrt(coupling), np.sqrt(total**2 - 4 * product)
+        for a in ((total + root) / 2, (total - root) / 2):
+            ratio = (a - squares) / (c * squares)
+            scale = np.std(size.sum(axis=1)) / np.std(size @ ratio)
+            for times in OPTIONS.sizes:
+                by = times * scale
+                values = {
+                    ((0, 2), (0, 0)): 0.5 / by**2,
+                    ((1, 1), (1, -1)): c / by,
+                    ((0, 0), (1, 0)): a,
+                    ((0, 0), (0, 1)): (total - a) / by**2,
+                }
+                known: dict[Key, float] = {
+                    ("term", row): float(values[row[0], row[2]]) for row in terms[1:]
+                }
+                yield _Shape(known, np.stack([np.ones(2), by * ratio], axis=1))

@@ -1,0 +1,97 @@
+"""Laws of one column that shows several coordinates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.signals.oscillations import Oscillations, oscillations
+
+STEP = 0.025
+
+
+def followed(rates, start, seconds):
+    """Positions of a motion, with noise of 1e-3 of their spread, and without."""
+    t = STEP * np.arange(round(seconds / STEP))
+    options = {"t_eval": t, "rtol": 1e-10, "atol": 1e-12}
+    q = solve_ivp(rates, (0, t[-1]), start, **options).y[: len(start) // 2]
+    return t, q + 1e-3 * q.std() * np.random.default_rng(0).normal(size=q.shape), q
+
+
+def test_oscillations_are_the_parts_of_a_sum():
+    t = np.sort(np.random.default_rng(0).uniform(0, 30, 600))
+    slow, fast = np.cos(1.7 * t + 0.3), 0.4 * np.sin(4.1 * t)
+    (found, *_) = oscillations(t, slow + fast, 2)
+    np.testing.assert_allclose(found.omega, [1.7, 4.1], rtol=1e-3)
+    parts, rates = Oscillations(np.array([1.7, 4.1])).parts(t, slow + fast)
+    np.testing.assert_allclose(parts, np.stack([slow, fast], 1), atol=1e-6)
+    np.testing.assert_allclose(rates[:, 1], 4.1 * 0.4 * np.cos(4.1 * t), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "hidden", "message"),
+    [
+        ({"positions": ["x", "y"]}, 1, "one position"),
+        ({"positions": ["x"], "inputs": ["y"]}, 1, "without inputs"),
+        ({"positions": ["x"], "angles": ["x"]}, 2, "of an angle one hidden coordinate"),
+    ],
+)
+def test_hidden_coordinates_that_cannot_be_are_refused(options, hidden, message):
+    t = STEP * np.arange(400)
+    recording = gfnn.Recording({"t": t, "x": np.cos(2 * t), "y": np.sin(t)}, **options)
+    with pytest.raises(InputError, match=message):
+        gfnn.fit(recording, model=gfnn.Lagrangian(hidden=hidden))
+
+
+@pytest.mark.slow
+def test_what_has_no_second_oscillation_has_no_hidden_coordinate():
+    t = STEP * np.arange(400)
+    recording = gfnn.Recording({"t": t, "x": np.cos(2 * t)}, positions=["x"], angles=[])
+    with pytest.raises(FitError, match="hidden=0"):
+        gfnn.fit(recording, model=gfnn.Lagrangian(hidden=1))
+
+
+@pytest.mark.slow
+def test_a_pendulum_on_a_pendulum_is_told_by_the_first(tmp_path):
+    g, c, m = 9.8, 0.4, 0.35  # L = ½v² + c v w cos(q − p) + ½m w² + g cos q + g c cos p
+
+    def rates(_, s):
+        q, p, v, w = s
+        turn, k = c * np.sin(q - p), c * np.cos(q - p)
+        forces = [-turn * w * w - g * np.sin(q) - 0.01 * v, turn * v * v - g * c * np.sin(p)]
+        return [v, w, *np.linalg.solve([[1, k], [k, m]], forces)]
+
+    t, q, true = followed(rates, [0.8, -0.5, 0.0, 0.0], 40)
+    seen = t < 30
+    recording = gfnn.Recording({"t": t[seen], "theta": q[0, seen]})
+    fit = gfnn.fit(recording, model=gfnn.Lagrangian(hidden=1))
+    assert fit.verdict == "identified"
+    values = {term.term: term.coefficient for term in fit.law.lagrangian.terms}
+    for name, value in (("cos(theta_seen)", g), ("cos(theta_hidden)", g * c)):
+        assert values[name] == pytest.approx(value, rel=0.02)
+    assert "theta_hidden is a pendulum on theta_seen" in fit.law.gauge
+    fit.save(tmp_path / "law")
+    ahead = gfnn.load(tmp_path / "law").map.forecast(recording, t[~seen])
+    off = ahead.values["theta"][0] - true[0, ~seen]
+    assert np.sqrt(np.mean(off**2)) < 1e-3 * true[0].std()
+    assert np.mean(np.abs(off) < 2 * ahead.std["theta"][0]) > 0.9
+
+
+@pytest.mark.slow
+def test_a_cart_tells_another_on_a_cubic_spring():
+    def rates(_, s):
+        x, y, v, w = s
+        pull = 5 * (y - x) + 3 * (y - x) ** 3
+        return [v, w, -6 * x + pull - 0.02 * v, (-4 * y - pull - 0.03 * w) / 1.5]
+
+    t, x, true = followed(rates, [1.0, -0.4, 0.0, 0.0], 40)
+    seen = t < 30
+    recording = gfnn.Recording({"t": t[seen], "x": 0.3 + x[0, seen]}, positions=["x"], angles=[])
+    fit = gfnn.fit(recording, model=gfnn.Lagrangian(hidden=1))
+    assert fit.verdict == "identified"
+    assert fit.law.sensors["x_rest"][0] == pytest.approx(0.3, abs=1e-3)
+    off = fit.map.forecast(recording, t[~seen]).values["x"][0] - 0.3 - true[0, ~seen]
+    assert np.sqrt(np.mean(off**2)) < 2e-3 * true[0].std()
