@@ -163,7 +163,7 @@ def fit_recording(
             raise _with_nature(missed, data) from None
         raise
     lost = _loses_a_channel(law)
-    if _is_no_law(law):
+    if _is_no_law(law) or (hidden and lost):
         missed = missed or no_law(data.problem.scales)
     if missed is None and (law.flaws or lost) and not hidden:
         what = _nature(data)
