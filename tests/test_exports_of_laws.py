@@ -332,6 +332,35 @@ def test_mujoco_moves_a_chain_of_links_as_its_law_does(relative, to, tmp_path):
     np.testing.assert_allclose(model.body_pos[-1], [0, 0, -0.5], atol=1e-12)  # the length is told
 
 
+@pytest.mark.slow
+def test_friction_holds_a_link_in_mujoco_as_in_the_law(tmp_path):
+    mujoco = pytest.importorskip("mujoco", reason="MuJoCo is an extra")
+    rows = [((2,), (0,), (0,), 0.0), ((0,), (0,), (1,), 0.0)]
+    friction = lagrangian.Friction.of([((1,), lagrangian.DRY, 1e-4)], 1)
+    own = lagrangian.Lagrangian(
+        lagrangian.Terms.of(rows, 1),
+        np.array([0.5, 9.0]),
+        friction,
+        np.array([6.0]),
+        0.0,
+        np.zeros((1, 0)),
+    )
+    z = np.array([[0.4, 2.0]])
+    map_ = map_of_law(own, np.random.default_rng(0).uniform(-2, 2, (300, 2)), 0.01, tolerance=1e-9)
+    none, one = np.zeros((1, 1)), np.ones(1)
+    sensors = Sensors(("a",), (), (), 1e-3 * one, 10.0, 0.6, "hold", 0.0, one, none, creep=1e-4)
+    map_ = dataclasses.replace(map_, sensors=sensors)
+    path = gfnn.export(map_, "mjcf", tmp_path / "own.xml")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = z[0, :1], z[0, 1:]
+    for _ in range(1_000):
+        mujoco.mj_step(model, data)
+    states, _ = map_.rollout(z[0], 100)
+    assert abs(states[-1, 1]) < 1e-12  # it is held, off its rest
+    np.testing.assert_allclose(data.qpos, states[-1, :1], atol=1e-3)  # its own friction: 0.005
+
+
 def test_forces_of_a_motion_make_it():
     map_, z = chain(relative=True)
     law = law_of_map(map_)

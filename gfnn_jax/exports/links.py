@@ -311,6 +311,7 @@ def mjcf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
         f"<mujoco model={quoteattr(name)}>",
         _comment(links, about),
         '<compiler angle="radian" inertiafromgeom="false" boundmass="0" boundinertia="0"/>',
+        arms.stiff_friction(step),
         f'<option timestep="{_text(step)}" gravity="0 0 {_text(-links.gravity)}" '
         f'integrator="{"implicitfast" if links.dry else "RK4"}"/>',
         f"<worldbody>\n{body}</worldbody>",
