@@ -467,6 +467,26 @@ def test_powers_up_to_the_highest_tried_are_one_of_several_laws():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("draw", [0, 1, 2])
+def test_powers_that_are_the_series_of_a_shape_give_way_to_it(draw):
+    """Morse's potential, of numbers drawn at random, told nothing."""
+    rng = np.random.default_rng([7, draw])
+    a, depth, t = rng.uniform(0.6, 1.4), rng.uniform(0.5, 1.5), 0.2 * np.arange(300)
+    depth /= a**2
+
+    def rates(_, z):
+        return [z[1], -2 * a * depth * (np.exp(-a * z[0]) - np.exp(-2 * a * z[0]))]
+
+    x = solve_ivp(rates, (0, 60), [1.1 / a, 0], t_eval=t, rtol=1e-10).y[0]
+    x = x + 1e-3 * np.std(x) * rng.normal(size=len(t))
+    law = gfnn.fit(gfnn.Recording({"t": t, "x": x}, positions=["x"])).lagrangian
+    shapes = [term for term in law.terms if "exp" in term.term]
+    assert len(law.terms) == 3 and len(shapes) == 2
+    sizes = sorted(term.coefficient for term in shapes)
+    assert np.allclose(sizes, [-depth, 2 * depth], rtol=0.01)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [False, True])
 def test_a_cart_that_its_motor_moves_drives_a_pendulum_that_does_not_move_it(given):
     """Found among all terms, and where the textbook's own are given; rollouts are those of the

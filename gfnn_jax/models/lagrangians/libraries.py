@@ -24,6 +24,13 @@ FRICTIONS = ("linear", "quadratic", "dry", "uniform", "cubic", "one-sided")  # t
 RARE = (POWER, ONE_SIDED)  # taken only where they explain a record much better than the others do
 CUBIC = 3.0  # the power of the speed that is tried
 HIGHEST = 6  # degree of potentials of lengths
+SHAPES = (  # of a length q, of which powers may be the series
+    "exp(A*q) + exp(2*A*q)",  # of Morse
+    "exp(A*q) + q",  # of Toda
+    "exp(A*q) + exp(-A*q)",
+    "cos(A*q) + sin(A*q)",
+    "sqrt(1+(A*q)**2) + q",
+)
 
 
 def unit(dim: int, *axes: int) -> tuple[int, ...]:
@@ -168,6 +175,13 @@ def central(dim: int, exponent: float) -> list[Row]:
     across = permutations(range(dim), 2)
     fields = [(unit(dim, j), unit(dim, i), none, 0.0, shape) for i, j in across]
     return [(none, none, none, 0.0, shape), *fields]
+
+
+def shaped(shape: str, constant: float) -> list[Row]:
+    """The potentials of the one coordinate that a sum of `SHAPES` is of, with this constant A."""
+    tree = [parse(text.replace("A", f"({constant:.8g})"), 1) for text in shape.split(" + ")]
+    shapes: list[Row] = [((0,), (0,), (0,), 0.0, to_text(one, 1)) for one in tree]
+    return [((0,), (1,), (0,), 0.0) if row[4] == "q1" else row for row in shapes]
 
 
 def springs(dim: int, angles: Sequence[int]) -> list[Row]:

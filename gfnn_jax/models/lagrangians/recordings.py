@@ -27,6 +27,7 @@ from gfnn_jax.dataset.stretches import (
     without_rests,
 )
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.lagrangian import shape_of
 from gfnn_jax.families.text import measured
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law, smoothed
@@ -156,8 +157,10 @@ def fit_recording(
         best, findings = _findings(recording, data, found, (*left_out, *of_drive), steps)
         findings = findings._replace(seconds=time.process_time() - started)
         law = in_words(recording, best, findings)
-        if not terms and not law.rival and not hidden:
-            law = dataclasses.replace(law, rival=_other_shapes(best.fit))
+        if not terms and not hidden:
+            messages = (*law.messages, *_with_constants(best.fit))
+            rival = law.rival or _other_shapes(best.fit)
+            law = dataclasses.replace(law, rival=rival, messages=messages)
     except (FitError, np.linalg.LinAlgError):
         if missed is not None:
             raise _with_nature(missed, data) from None
@@ -281,6 +284,17 @@ def _options(friction: str) -> SearchOptions:
             f"{friction!r}"
         )
     return SearchOptions(frictions=kinds, choose_friction=False)
+
+
+def _with_constants(fit: LawFit) -> list[str]:
+    """A message where a search has found numbers inside of shapes of the one coordinate."""
+    shapes = [row for row in fit.structure.terms if fit.structure.dim == 1 and shape_of(row)]
+    if not shapes:
+        return []
+    return [
+        f"the number inside {fit.problem.word(('term', shapes[0]))} is fitted too: standard errors "
+        "of the other coefficients are with it as it is"
+    ]
 
 
 def _without_role(recording: Recording) -> list[str]:

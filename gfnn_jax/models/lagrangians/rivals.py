@@ -3,8 +3,9 @@
 Beside springs r^3.5 imitates r^4 along an orbit whose distance changes little, so that a law with a
 power of the distance is fitted again with the next halves of whole numbers. A small constant force
 pushes as friction does that is stronger one way, so that a law with both it and linear friction is
-fitted again with friction of either side. Laws with as many coefficients have odds by the sums of
-their squares (`fitting.evidence`).
+fitted again with friction of either side. Powers of a length may be a series of another shape: the
+weak form tells the constant inside it, and fits beside that correct it. Laws with as many
+coefficients have odds by the sums of their squares (`fitting.evidence`).
 """
 
 from __future__ import annotations
@@ -13,14 +14,34 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from gfnn_jax.families.expressions import factors_of, parse
 from gfnn_jax.families.lagrangian import LINEAR, ONE_SIDED, shape_of
+from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.models.lagrangians.fit import LawFit
-from gfnn_jax.models.lagrangians.libraries import central, losses, torques
-from gfnn_jax.models.lagrangians.structure import Row, Structure
+from gfnn_jax.models.lagrangians.libraries import SHAPES, central, losses, shaped, torques
+from gfnn_jax.models.lagrangians.structure import Row, Structure, is_constant
+from gfnn_jax.models.lagrangians.weak_form import weak_share
 
-MOST = 4  # neighbours that are tried to either side
+
+@dataclasses.dataclass(frozen=True)
+class RivalOptions:
+    """Limits of what is tried (`benchmarks/any_record.py`, `vocabulary.py`).
+
+    most: powers of the distance to either side. series: potentials, from which on they may be the
+    series of a shape. constants: inside a shape, times the range of the motion, where it begins;
+    apart: relative, of fits that correct it; corrections: of it.
+    """
+
+    most: int = 4
+    series: int = 3
+    constants: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
+    apart: float = 0.01
+    corrections: int = 2
+
+
+OPTIONS = RivalOptions()
 
 
 def with_likeliest_power(fit: LawFit) -> LawFit:
@@ -34,6 +55,48 @@ def with_likeliest_power(fit: LawFit) -> LawFit:
         return fit
     fit.problem.on_progress(f"  r**{best:g} in place of r**{_power(fit):g}: it is as likely")
     return whole[best].again()
+
+
+def with_a_shape(fit: LawFit) -> LawFit:
+    """The fit of one length with a shape (`libraries.SHAPES`) in place of its powers, where that is
+    likelier than these, and than any other shape, by odds that decide."""
+    structure, count = fit.structure, _independent(fit)
+    powers = [row for row in structure.terms if not any(row[0])]
+    if structure.dim > 1 or fit.problem.angles or len(powers) < OPTIONS.series or not fit.follows:
+        return fit
+    units = np.array(OPTIONS.constants) / np.ptp(fit.problem.states[:, 0])
+    masses = tuple(row for row in structure.terms if any(row[0]) and is_constant(row))
+    found = [(criterion(fit.fitted.cost, count, len(fit.p)), "", fit)]
+    for name in SHAPES:
+
+        def of(a: float, name: str = name) -> Structure:
+            return dataclasses.replace(structure, terms=(*masses, *shaped(name, a)))
+
+        def share(a: float, of=of) -> float:
+            return weak_share(of(a), fit.problem)
+
+        begun = min((units * side for side in (1, -1)), key=lambda row: min(map(share, row)))
+        near = min(begun, key=share)
+        ends = sorted((near / 2, near * 2))
+        a = float(minimize_scalar(share, bounds=ends, method="bounded").x)
+        other = fit.again(of(a), rescale=False)
+        for _ in range(OPTIONS.corrections):
+            steps = a * (1 + OPTIONS.apart * np.array([-1, 0, 1]))
+            costs = [fit.again(of(b), other.values, rescale=False).fitted.cost for b in steps]
+            bend, slope, _ = np.polyfit([-1, 0, 1], costs, 2)
+            if not (np.isfinite(bend) and bend > 0):
+                break
+            a *= float(1 - OPTIONS.apart * slope / (2 * bend))
+        other = fit.again(of(a), other.values, rescale=False)
+        if other.follows and other.is_definite:
+            size = criterion(other.fitted.cost, count, len(other.p) + 1)
+            found.append((size, f"{name}, A = {a:.5g},", other))
+    (least, name, best), *others = sorted(found, key=lambda one: one[0])
+    decide = 2 * np.log(fit.problem.options.evidence.decided)
+    if best is fit or min(one[0] for one in others) < least + decide:
+        return fit
+    fit.problem.on_progress(f"  {name} in place of {len(powers)} powers")
+    return best.again()
 
 
 def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
@@ -105,7 +168,7 @@ def _as_likely(fit: LawFit) -> dict[float, LawFit]:
 
     for step in (-0.5, 0.5):
         first = np.ceil(2 * own) / 2 if step < 0 else np.floor(2 * own) / 2
-        for a in (first + step * np.arange(1, MOST + 1)).tolist():
+        for a in (first + step * np.arange(1, OPTIONS.most + 1)).tolist():
             if a == 0 or (a == 2 and springs):
                 continue  # which the other terms are
             other = fit.again(_with_power(fit, own, a), rescale=False)

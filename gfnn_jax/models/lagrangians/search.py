@@ -26,7 +26,7 @@ from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, table_of
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, with_delay
-from gfnn_jax.models.lagrangians.rivals import with_likeliest_power
+from gfnn_jax.models.lagrangians.rivals import with_a_shape, with_likeliest_power
 from gfnn_jax.models.lagrangians.starts import OPTIONS, best_start, leading, misfit
 from gfnn_jax.models.lagrangians.structure import Held, Key, Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import protected, weak_start
@@ -257,6 +257,7 @@ class TermSearch:
             fit = self.prune(with_likeliest_power(fit), friction=False)
             fit = self.prune(self.grow(fit, terms), friction=False)
             waves = fit
+            fit = with_a_shape(fit)
             for angle in fit.problem.within_a_turn:
                 fit = with_a_spring(fit, angle)
             if fit.structure.leaders:
