@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -78,7 +79,8 @@ def with_a_shape(fit: LawFit) -> LawFit:
         begun = min((units * side for side in (1, -1)), key=lambda row: min(map(share, row)))
         near = min(begun, key=share)
         ends = sorted((near / 2, near * 2))
-        a = float(minimize_scalar(share, bounds=ends, method="bounded").x)
+        least_at: Any = minimize_scalar(share, bounds=ends, method="bounded")
+        a = float(least_at.x)
         other = fit.again(of(a), rescale=False)
         for _ in range(OPTIONS.corrections):
             steps = a * (1 + OPTIONS.apart * np.array([-1, 0, 1]))
