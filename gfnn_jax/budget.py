@@ -114,6 +114,15 @@ class Budget:
         self.compiling = 0.0 if dim is None else _COMPILING.get(2 * dim, _OPTIONS.compiling_more)
 
     @property
+    def compilation(self) -> str:
+        """The time that compiling the step takes, as progress shows it."""
+        return _about(self.compiling)
+
+    def about(self, kind: str, operations: float) -> str:
+        """The time that so many operations take, as progress shows it."""
+        return _about(self._foretold(kind, operations))
+
+    @property
     def seconds(self) -> float:
         """Since its making, with those spent before it."""
         return self._clock() - self._started
@@ -283,6 +292,10 @@ class Allowance:
 
 
 UNBOUNDED = Allowance()
+
+
+def _about(seconds: float) -> str:
+    return f" (about {seconds:.0f} s)" if seconds >= 1 else ""
 
 
 def within(unit: contextlib.AbstractContextManager[Any], make: Callable[[], T]) -> T | None:

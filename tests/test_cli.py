@@ -24,6 +24,7 @@ from command_line import (
 )
 
 from gfnn_jax import cli, cli_process, cli_summary, scenes
+from gfnn_jax.budget import Budget
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, FitWarning
@@ -462,6 +463,9 @@ def test_parts_tell_the_time_left():
     assert left.of("bands (2 of 4)", 16.0) == ", about 18 s left"
     assert left.of("another step", 17.0) == ""
     assert left.of("folds (1 of 2)", 20.0) == ""
+    assert progress._so_far("compiling (about 9 s)", 4.0).endswith("4 s so far, about 5 s left")
+    assert progress._so_far("compiling (about 9 s)", 9.0).endswith("9 s so far")
+    assert Budget(dim=1).compilation == " (about 3 s)"
 
 
 def test_failing_arithmetic_is_one_line(tmp_path, capsys, monkeypatch):

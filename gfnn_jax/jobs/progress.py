@@ -50,6 +50,7 @@ def on_stderr() -> Iterator[Progress]:
 
 
 _PART = re.compile(r"(.*) \((\d+) of (\d+)\)$")  # a message about the k-th of n equal parts
+_ABOUT = re.compile(r"\(about (\d+) s\)$")  # one that foretells how long its work takes
 
 
 class _Left:
@@ -69,6 +70,13 @@ class _Left:
         done = part - self._first
         left = (now - self._began) / done * (count - part + 1) if done else 0.0
         return f", about {left:.0f} s left" if left >= 1 else ""
+
+
+def _so_far(message: str, seconds: float) -> str:
+    """A message shown again after so many seconds, with those left where it foretells them."""
+    found = _ABOUT.search(message)
+    left = int(found[1]) - seconds if found else 0.0
+    return f"{message} … {seconds:.0f} s so far" + (f", about {left:.0f} s left" * (left >= 1))
 
 
 class _Lines:
@@ -112,7 +120,7 @@ class _Lines:
             with self._lock:
                 now = time.perf_counter()
                 if now >= self._last + 0.8 * LONGEST_SILENCE:
-                    self._print(f"{self._message} … {now - self._since:.0f} s so far")
+                    self._print(_so_far(self._message, now - self._since))
 
     def _print(self, message: str) -> None:
         self._last = time.perf_counter()

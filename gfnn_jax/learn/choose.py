@@ -103,7 +103,9 @@ def choose(searched: Searched, request: Request) -> Chosen:
     best = ranking[0].candidate if ranking else None
     if law is None or not (best is None or preferred(law.candidate, best, request.tolerance)):
         return _of_ranking(ranking, request)
-    request.watch.on_progress(f"compiling the flow of {law.candidate.label}")
+    request.watch.on_progress(
+        f"compiling the flow of {law.candidate.label}{request.budget.compilation}"
+    )
     candidate, seconds, *_ = flow_assembled(law, *given)
     expected = max(bound, OPTIONS.confirmed * law.candidate.validation_bound)
     if best is not None and not candidate.validation_bound <= expected:
@@ -127,7 +129,8 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     )
     smaller = _smaller(tried, budget, on_progress)
     for entry in itertools.chain([first], larger, ranking[1:], smaller):
-        on_progress(f"compiling the step of {entry.candidate.chart} {entry.candidate.label}")
+        step = f"{entry.candidate.chart} {entry.candidate.label}"
+        on_progress(f"compiling the step of {step}{budget.compilation}")
         data = entry.sweep.data
         assembled = measured(entry.candidate, entry.map, data, request.tolerance, budget)
         compile_seconds += assembled.compile_seconds
@@ -208,7 +211,9 @@ def work_of_posterior(num_parameters: int) -> float:
     return OPTIONS.of_root * float(num_parameters) ** 3
 
 
-def stated(chosen: Chosen, found: Searched, budget: Budget) -> Chosen:
+def stated(
+    chosen: Chosen, found: Searched, budget: Budget, on_progress: Callable[[str], Any]
+) -> Chosen:
     """The choice with its error on the test rows, or by cross-validation over runs where
     these are of few runs, or over blocks of time where all pairs are."""
     data = found.data
@@ -218,7 +223,7 @@ def stated(chosen: Chosen, found: Searched, budget: Budget) -> Chosen:
     by_runs = count_of_runs(data, everyone) >= FEWEST_RUNS
     if by_runs or not len(data.test):
         cluster = data.run if by_runs else data.split.stretch
-        known = _by_folds(chosen, found, everyone, cluster, budget)
+        known = _by_folds(chosen, found, everyone, cluster, budget, on_progress)
         # A fit without some runs may have no image of them; that says nothing of the whole one.
         if known and (np.isfinite(known.candidate.validation_bound) or not len(data.test)):
             return known
@@ -293,7 +298,7 @@ def of_few(errors: np.ndarray, tolerance: Tolerance) -> str:
 
 
 def _by_folds(
-    chosen: Chosen, found: Searched, rows, cluster: np.ndarray, budget: Budget
+    chosen: Chosen, found: Searched, rows, cluster: np.ndarray, budget: Budget, on_progress
 ) -> Chosen | None:
     """The error of rows that are each predicted by a fit without their fold of clusters (N,); None
     where such fits are not known how to make, or do not fit into the budget."""
@@ -303,7 +308,10 @@ def _by_folds(
     folds = np.array_split(np.unique(cluster[rows]), OPTIONS.folds)
     out = [rows[np.isin(cluster[rows], fold)] for fold in folds if len(fold)]
     try:
-        last = budget.last(_WHAT, model.kind, len(out) * model.work)
+        work = len(out) * model.work
+        took = budget.about(model.kind, work)
+        on_progress(f"computing the error to state by {len(out)} more fits{took}")
+        last = budget.last(_WHAT, model.kind, work)
         images = within(last, lambda: np.concatenate(model.predicts(out)))
     except (FitError, np.linalg.LinAlgError) as error:
         budget.leave_out(_WHAT, str(error))

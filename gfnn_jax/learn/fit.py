@@ -178,7 +178,7 @@ def fit(
         data = found.data
         chosen = with_posterior(choose(found, request), found)
         watch.on_progress("computing the error to state, by pairs that chose nothing")
-        chosen = with_test_rows(stated(chosen, found, budget), found, budget)
+        chosen = with_test_rows(stated(chosen, found, budget, watch.on_progress), found, budget)
         conclusion = conclude(chosen, found, request)
         warn([*conclusion.messages, *filter(None, [chosen.few])])
         symmetries = symmetries_of_pairs(found.data)
