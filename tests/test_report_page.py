@@ -243,7 +243,8 @@ def test_the_page_in_a_browser(tmp_path):
         slider.dispatchEvent(new Event("input"));
         const after = curve.getAttribute("d");
         document.getElementById("reset").click();
-        document.title = `${before !== after} ${before === curve.getAttribute("d")}`;
+        const dots = document.querySelectorAll("#simulation circle").length;
+        document.title = `${before !== after} ${before === curve.getAttribute("d")} ${dots > 9}`;
     </script></body>"""
     path = tmp_path / "report.html"
     path.write_text(page(discovered()).replace("</body>", moved), encoding="utf-8")
@@ -255,6 +256,6 @@ def test_the_page_in_a_browser(tmp_path):
 
     shown = chromium("--virtual-time-budget=3000", "--dump-dom")
     assert not re.findall(r"CONSOLE.*", shown.stderr)
-    assert "<title>true true</title>" in shown.stdout
+    assert "<title>true true true</title>" in shown.stdout
     chromium(f"--print-to-pdf={tmp_path / 'report.pdf'}")
     assert (tmp_path / "report.pdf").stat().st_size > 20_000

@@ -81,13 +81,13 @@ const panels = shown.channels.map((channel) => {
     for (const at of ticks(low, high))
         made("text", {x: x(at), y: HEIGHT - 12, "text-anchor": "middle"}, svg).textContent =
             String(Number(at.toPrecision(6)));
-    made("text", {x: WIDTH - RIGHT, y: HEIGHT - 1, "text-anchor": "end"}, svg).textContent = "t [s]";
+    made("text", {x: WIDTH - RIGHT, y: HEIGHT - 4, "text-anchor": "end"}, svg).textContent = "t [s]";
     made("text", {x: 12, y: HEIGHT / 2, "text-anchor": "middle",
         transform: `rotate(-90 12 ${HEIGHT / 2})`}, svg).textContent = channel.label;
     const inside = made("g", {"clip-path": `url(#clip-${channel.name})`}, svg);
-    const dots = channel.y.map((value, k) => value === null ? "" :
-        `M${x(shown.t[k]).toFixed(1)} ${y(value).toFixed(1)}h0`).join("");
-    made("path", {d: dots, stroke: "#888", "stroke-width": 3, "stroke-linecap": "round"}, inside);
+    channel.y.forEach((value, k) => {  // circles: Chromium draws no dots of paths without a length
+        if (value !== null) made("circle", {cx: x(shown.t[k]), cy: y(value), r: 1.5, fill: "#888"}, inside);
+    });
     const curve = made("path", {fill: "none", stroke: "#0072B2", "stroke-width": 1.8}, inside);
     return {channel, y, curve};
 });

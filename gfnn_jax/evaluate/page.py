@@ -61,7 +61,7 @@ class Section(NamedTuple):
 
     @property
     def empty(self) -> bool:
-        return not any(self[1:])
+        return not any(self._replace(title="", heads=()))
 
 
 class About(NamedTuple):
