@@ -8,7 +8,7 @@ Pairs are of 20 to 75 runs of 20 steps, right to the last digit, with no more to
 field, relative; of a step and of the last one, largest coordinate, in the median over 3 orbits of
 1,000 steps, of chaotic systems of 100. Casimirs are followed over 10⁶ steps of one orbit, those of
 Toda's chain until its bodies are so far apart that a is 0. Fields without a bracket are ten of
-which none may get one.
+which none may get one; three have uniform friction, which multiplies their bracket.
 """
 
 from __future__ import annotations
@@ -355,13 +355,51 @@ def noisy(quick: bool) -> Numbers:
     return found
 
 
+def resisted(field: Field, rates: list[float]) -> Field:
+    """A field with friction beside it."""
+    return lambda z: field(z) - np.array(rates) * z
+
+
+DAMPED = {  # λ is 0.05
+    "free top": (resisted(euler, [0.05] * 3), *SYSTEMS["free top, full inertia"][1:4]),
+    "heavy top, Π damped": (
+        resisted(SYSTEMS["heavy top"][0], [0.05] * 3 + [0] * 3),
+        *SYSTEMS["heavy top"][1:4],
+    ),
+    "Toda's chain": (resisted(toda, [0] * 3 + [0.05] * 4), chain, 0.2, 75),
+}
+
+
+def damped(quick: bool) -> Numbers:
+    """Uniform friction: its rate, and errors on fresh states."""
+    found = {}
+    for name, (field, draw, dt, count) in list(DAMPED.items())[: 1 if quick else None]:
+        rng = np.random.default_rng(0)
+        fit, seconds = learned(
+            pairs_of([orbit(field, draw(rng), dt, 20) for _ in range(count)], dt)
+        )
+        assert fit.bracket is not None
+        fresh = np.array([draw(rng) for _ in range(3)])
+        reference = np.array([orbit(field, z, dt, 100) for z in fresh])
+        off = np.abs(np.asarray(fit.map.rollout(fresh, 100)[0]) - reference).max(axis=2)
+        found[name] = {
+            "found": fit.bracket.name,
+            "rate": -float(np.log(float(fit.map.multiplier() or 1.0))) / dt,
+            "one_step": float(np.median(off[:, 1])),
+            "last": float(np.median(off[:, -1])),
+            "defect": fit.symplecticity_defect,
+            "cpu_seconds": seconds,
+        }
+    return found
+
+
 def piece_of(name: str) -> str:
     """Name of a system's piece: letters, digits and hyphens."""
     return re.sub("[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
 PIECES = {piece_of(name): partial(of_system, name) for name in SYSTEMS}
-PIECES |= {"without": without, "noisy": noisy}
+PIECES |= {"without": without, "damped": damped, "noisy": noisy}
 
 
 def tables() -> None:
@@ -403,6 +441,22 @@ def tables() -> None:
     if "without" in found:
         said = [[name, verdict] for name, verdict in found["without"]["measured"].items()]
         text += "\n\n" + markdown(("field without a bracket", "what is said"), said)
+    if "damped" in found:
+        keys = ("one_step", "last", "defect", "cpu_seconds")
+        said = [
+            [name, m["found"], f"{m['rate'] - 0.05:.0e}", *(number(m[key]) for key in keys)]
+            for name, m in found["damped"]["measured"].items()
+        ]
+        heads = (
+            "uniform friction, λ = 0.05",
+            "bracket",
+            "λ off by",
+            "one step",
+            "step 100",
+            "defect",
+            "fit, CPU s",
+        )
+        text += "\n\n" + markdown(heads, said)
     if "noisy" in found:
         said = [
             [

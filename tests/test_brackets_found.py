@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+import gfnn_jax as gfnn
 from gfnn_jax.brackets import Bracket
 from gfnn_jax.errors import FitError
 from gfnn_jax.models.brackets.algebra import analysed, changed
@@ -136,13 +137,32 @@ def test_no_bracket_is_claimed_where_there_is_none():
     assert raised.value.verdict.startswith("no law: no bracket, nearest singular value 0.0")
 
 
-def test_uniform_friction_is_told_with_its_rate():
-    def damped(w):
-        return top(w) - 0.05 * w
+def damped_top(w):
+    return top(w) - 0.05 * w
 
-    with pytest.raises(FitError, match="uniform friction: the flow multiplies") as raised:
-        learned(damped, np.random.default_rng(0).normal(size=(16, 3)))
-    assert float(raised.value.verdict.rsplit(" ", 1)[1]) == pytest.approx(0.05, rel=1e-7)
+
+def damped_heavy(z):
+    return heavy(z) - 0.05 * np.append(z[:3], np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("field", "width"), [(damped_top, 3), pytest.param(damped_heavy, 6, marks=pytest.mark.slow)]
+)
+def test_uniform_friction(field, width, tmp_path):
+    """The rate and the motion to roundoff; the bracket is multiplied by e^(−λ dt); saved."""
+    data = runs_of(field, np.random.default_rng(0).normal(size=(8 * width - 8, width)), 0.2, 20)
+    given = {"run": data.run, "place": data.place, "structure": "poisson"}
+    fit = gfnn.fit(gfnn.Pairs(data.z0, data.z1, 0.2, **given), max_seconds=None)
+    assert np.log(fit.map.multiplier()) == pytest.approx(-0.05 * 0.2, rel=1e-8)
+    assert fit.verdict == "identified"
+    assert fit.symplecticity_defect < 1e-13
+    assert "multiplies the bracket by exp(−0.05 t)" in " ".join(fit.messages)
+    images, _ = fit.map.step(data.z0)
+    np.testing.assert_allclose(images, data.z1, atol=1e-13)
+    np.testing.assert_allclose(fit.map.inverse(images)[0], data.z0, atol=1e-13)
+    fit.map.save(tmp_path / "model")
+    again = gfnn.load(tmp_path / "model").map
+    np.testing.assert_array_equal(again.step(data.z0)[0], images)
 
 
 def test_too_few_runs_are_refused():

@@ -22,6 +22,7 @@ from gfnn_jax.exports.fmu import fmu
 from gfnn_jax.exports.javascript import javascript
 from gfnn_jax.exports.jax_source import jax_source
 from gfnn_jax.exports.links import mjcf, urdf
+from gfnn_jax.flows.damped import DampedFlow
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.lie import LieFlow
 from gfnn_jax.maps import saved
@@ -107,7 +108,7 @@ def export(
             f"this map has a bracket of its own, {map_.bracket.name}, of which --to {to} makes no "
             "step: use --to stablehlo"
             + " or, for the formula of its law, --to latex"
-            * isinstance(map_.pieces[0], (Flow, LieFlow))
+            * isinstance(map_.pieces[0], (Flow, LieFlow, DampedFlow))
         )
     if to in _PRINTERS:
         atomic_write(out, _PRINTERS[to](map_, _identifier(out), about))

@@ -27,6 +27,7 @@ from gfnn_jax.families.family import (
     symmetric_gradient_and_hessian,
 )
 from gfnn_jax.flows.collective import Casimirs, casimirs_of, collective
+from gfnn_jax.flows.damped import DampedFlow, Dilations, InRestingFrame
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.solve import newton
@@ -192,14 +193,19 @@ def lie_generated(family, params, bracket: Bracket, dt, scale) -> LieGenerated:
     return LieGenerated(as_family(family), params, bracket, dt, scale, casimirs_of(bracket))
 
 
-def law_flow(family, params, bracket: Bracket, dt: float, z) -> Flow | LieFlow:
+def law_flow(
+    family, params, bracket: Bracket, dt: float, z, friction: Dilations | None = None
+) -> Flow | LieFlow | DampedFlow:
     """The piece that H makes with a bracket: on its lift where it has one, else `LieFlow`.
 
         piece = law_flow(H, params, gfnn.Bracket.se3(), 0.1, z)
 
     z: states (N, n) of the flow (log z of a log-canonical bracket), at which the substeps are
-    halved until the step changes no more.
+    halved until the step changes no more. friction: uniform, its coefficients behind those of H.
     """
+    if friction is not None:
+        frame = InRestingFrame(as_family(family), friction)
+        return DampedFlow(law_flow(frame, params, bracket, dt, z), frame)
     z, scale = np.asarray(z, float), sizes(z)
     z = z[:: -(-len(z) // _PROBES)]
     lifted = not isinstance(bracket, LieAlgebra) or bool(bracket.blocks)
@@ -207,10 +213,11 @@ def law_flow(family, params, bracket: Bracket, dt: float, z) -> Flow | LieFlow:
         piece = Flow(collective(family, bracket), params, dt, scale, _STAGES)
     else:
         piece = LieFlow(lie_generated(family, params, bracket, dt, scale))
-    image, before = piece.image(z), np.inf
+    args = np.zeros((len(z), 1)) if isinstance(family, InRestingFrame) else None
+    image, before = piece.image(z, args), np.inf
     while piece.substeps < _MOST_SUBSTEPS:
         finer = dataclasses.replace(piece, substeps=2 * piece.substeps)
-        closer = finer.image(z)
+        closer = finer.image(z, args)
         change = np.nanmax(np.abs(closer - image) / scale, initial=0.0)
         if np.isfinite(image).all() and (change <= _RESOLVED or change > 0.5 * before):
             break  # to roundoff, or no better by more

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.brackets import Bracket, Log, Magnetic
+from gfnn_jax.brackets import Bracket, Log, Magnetic, added
 from gfnn_jax.candidates.assemble import Candidate, block_of, stepped
 from gfnn_jax.coordinates import CARTESIAN, LOG
 from gfnn_jax.data.recording import Recording
@@ -203,7 +203,8 @@ class _Learned(NamedTuple):
 def _of_law(law: PoissonLaw, z: np.ndarray, dt: float) -> _Learned:
     """The flow of a law over dt."""
     family = law.field.library
-    piece = law_flow(family, law.fit.c, law.bracket, dt, _inner(z, law.bracket))
+    inner = _inner(z, law.bracket)
+    piece = law_flow(family, law.fit.c, law.bracket, dt, inner, law.field.friction)
     map_ = _map(piece, law.bracket, z, dt, Posterior(0, law.fit.root))
     label = f"H of {family.num_parameters} terms"
     return _Learned(map_, law.bracket, label, family, law.fit.relative, law, law.notes, law.sigma)
@@ -244,8 +245,10 @@ def _learned(law, map_, candidate, messages) -> LearnedHamiltonian:
     """The law as fits have it."""
     std = np.sqrt(np.sum(law.fit.root**2, axis=0))
     std = np.where(std > 1e-12 * np.abs(law.fit.c), std, 0.0)
-    named = zip(law.field.library.term_names, law.fit.c, std, strict=True)
-    terms = tuple(Term(name, float(c), float(s)) for name, c, s in named)
+    names = (*law.field.library.term_names, *_resistances(law))
+    named = zip(names, law.fit.c, std, strict=True)
+    every = [Term(name, float(c), float(s)) for name, c, s in named]
+    terms = tuple(every[: law.field.library.num_parameters])
     return LearnedHamiltonian(
         candidate,
         map_.pieces[0],
@@ -254,7 +257,19 @@ def _learned(law, map_, candidate, messages) -> LearnedHamiltonian:
         float("nan"),
         messages=tuple(messages),
         covariance=lambda: law.fit.root,
+        friction=tuple(every[len(terms) :]),
     )
+
+
+def _resistances(law: PoissonLaw) -> list[str]:
+    """R of each part of uniform friction, with −∂R/∂z its force; "friction" where it has no R."""
+    found, names = [], law.bracket.labels
+    for e in () if law.field.friction is None else law.field.friction.matrices:
+        e = np.where(np.abs(e) > 1e-12 * np.abs(e).max(), e, 0.0)
+        squares = [(0.5 * value, f"{a}**2") for value, a in zip(np.diag(e), names, strict=True)]
+        diagonal = np.count_nonzero(e) == np.count_nonzero(np.diag(e))
+        found.append(f"({added(squares, '*')})" if diagonal else "friction")
+    return found
 
 
 MOST_COLUMNS = 8  # of states that are looked at
@@ -276,7 +291,7 @@ def other_bracket(pairs: Pairs) -> list[str]:
         law = law_of(every.take(np.sort(split.training)), every.take(split.validation), names)
     except FitError:
         return []
-    if law.error > EXACT:
+    if law.error > EXACT or law.field.friction is not None:
         return []
     what = "states with another bracket"
     if law.bracket.name == "constant":

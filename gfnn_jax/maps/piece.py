@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.arrays import as_row, matmul, namespace, pytree
+from gfnn_jax.flows.damped import DampedFlow
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.lie import LieFlow
 from gfnn_jax.generating.generated import Generated
@@ -60,9 +61,17 @@ class PieceWithAction(Piece, Protocol):
         ...
 
 
+def with_params(piece: Any, params: Any) -> Any:
+    """The piece with other coefficients: its own, or those of the piece that it is made of."""
+    inside = next((n for n in ("flow", "short") if n in vars(piece)), None)
+    if inside is None:
+        return dataclasses.replace(piece, params=params)
+    return dataclasses.replace(piece, **{inside: with_params(getattr(piece, inside), params)})
+
+
 def serves_any_dt(piece: Any) -> bool:
     """Return whether a piece can be stepped over any dt."""
-    return isinstance(piece, (Flow, LieFlow)) or (
+    return isinstance(piece, (Flow, LieFlow, DampedFlow)) or (
         isinstance(piece, Generated) and piece.serves_any_dt
     )
 

@@ -24,6 +24,7 @@ from gfnn_jax.maps.lanes import (
     predicted,
     require_no_inputs_backwards,
 )
+from gfnn_jax.maps.piece import with_params
 
 # Fewest lanes that are stepped together. More samples at once gain nothing on a CPU: a batched
 # program takes both sides of every branch (100 samples, Hénon–Heiles, µs per step: 1,000 states
@@ -51,7 +52,7 @@ class Samples:
     def one(self, params) -> Any:
         """Make the map with these params of its piece."""
         pieces = list(self.map.pieces)
-        pieces[self.piece] = dataclasses.replace(pieces[self.piece], params=params)
+        pieces[self.piece] = with_params(pieces[self.piece], params)
         return dataclasses.replace(self.map, pieces=tuple(pieces), posterior=None)
 
     def start(self, z0, *, params=None, t0=None, stop_outside: bool = False) -> Lanes:

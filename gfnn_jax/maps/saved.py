@@ -35,6 +35,7 @@ from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.flows import lifts
 from gfnn_jax.flows.bodies import OfBodies
 from gfnn_jax.flows.collective import Casimirs, Collective
+from gfnn_jax.flows.damped import DampedFlow, Dilations, InRestingFrame
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.legendre import Legendre
@@ -113,6 +114,9 @@ _TYPES: dict[str, type] = {
         Casimirs,
         LieGenerated,
         LieFlow,
+        DampedFlow,
+        Dilations,
+        InRestingFrame,
         lifts.Itself,
         lifts.Logarithms,
         lifts.Quadratic,

@@ -26,6 +26,7 @@ from gfnn_jax.arrays import pytree
 from gfnn_jax.brackets import Bracket
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.families.displacements import OfDisplacement
+from gfnn_jax.flows.damped import DampedFlow
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.lie import LieFlow
 from gfnn_jax.generating.charts import TYPE1
@@ -288,7 +289,7 @@ class SymplecticMap:
         It is the learned one where the map is the flow of a Hamiltonian. For any other map it is
         the modified Hamiltonian, whose error ``modified_hamiltonian`` gives.
         """
-        if len(self.pieces) != 1 or not isinstance(self.pieces[0], (Flow, LieFlow)):
+        if len(self.pieces) != 1 or not isinstance(self.pieces[0], (Flow, LieFlow, DampedFlow)):
             return self.modified_hamiltonian(z, args).value
         z = self._states(z)
         return programs.hamiltonian(self, z, self._args(args, z, t0))

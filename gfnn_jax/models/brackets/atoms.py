@@ -67,7 +67,7 @@ class ShapedField(PoissonField):
         texts = tuple(text(atom, base.names) for atom in atoms)
         own = tuple(map(tuple, np.eye(len(texts), dtype=int).tolist()))
         library = joined(base, Terms(0, texts, own, (), base.names)) if atoms else base
-        return cls(bracket, library, atoms)
+        return cls(bracket, library, atoms=atoms)
 
     @property
     def base(self) -> Terms:
@@ -103,7 +103,7 @@ def with_shapes(
     z0, z1, dt = pairs
     middle, rate = 0.5 * (z0 + z1), (z1 - z0) / np.reshape(dt, (-1, 1))
     field = ShapedField.of(bracket, base, ())
-    best = fit_field(field, *pairs, hamiltonian_of(bracket, base, middle, rate).c)
+    best = fit_field(field, *pairs, hamiltonian_of(field, middle, rate).c)
     for _ in range(OPTIONS.atoms):
         if best.relative <= OPTIONS.exact:
             break

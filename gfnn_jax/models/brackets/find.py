@@ -19,9 +19,16 @@ from scipy.optimize import least_squares, minimize
 from gfnn_jax.brackets import Bracket, jacobi_failure
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms, exponents
+from gfnn_jax.flows.damped import Dilations
 from gfnn_jax.models.brackets.algebra import Algebra, analysed
 from gfnn_jax.models.brackets.null_space import CONSTANT, LINEAR, LOG, NullSpace
-from gfnn_jax.models.brackets.poisson_field import OfField, hamiltonian_of, sparse, term_sizes
+from gfnn_jax.models.brackets.poisson_field import (
+    OfField,
+    PoissonField,
+    hamiltonian_of,
+    sparse,
+    term_sizes,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,9 +53,8 @@ class Found(NamedTuple):
     """A bracket that a field allows. hamiltonian: H over ``library``. several: number m of
     independent bivectors that the flow conserves. name: of its kind. rule: why it was taken."""
 
-    bracket: Bracket
+    field: PoissonField
     name: str
-    library: Terms
     hamiltonian: OfField
     several: int
     rule: str
@@ -56,7 +62,7 @@ class Found(NamedTuple):
     @property
     def rank(self) -> tuple:
         """Order of preference, least first."""
-        blocks = getattr(self.bracket, "blocks", None)
+        blocks = getattr(self.field.bracket, "blocks", None)
         return (
             self.hamiltonian.misfit > OPTIONS.misfit,
             blocks == (),
@@ -66,8 +72,9 @@ class Found(NamedTuple):
     @property
     def several_terms(self) -> int:
         """Number of constants of the bracket."""
-        probe = np.random.default_rng(OPTIONS.seed).uniform(0.5, 1.5, self.bracket.size)
-        return len(self.bracket.relations()) + int(np.count_nonzero(self.bracket.matrix(probe)))
+        bracket = self.field.bracket
+        probe = np.random.default_rng(OPTIONS.seed).uniform(0.5, 1.5, bracket.size)
+        return len(bracket.relations()) + int(np.count_nonzero(bracket.matrix(probe)))
 
 
 def polynomials(names: tuple[str, ...], degree: int, *, constant: bool = False) -> Terms:
@@ -93,21 +100,22 @@ def library_of(kind: str, names: tuple[str, ...], degree: int, given: Terms | No
 def brackets_of(
     null: NullSpace, z: np.ndarray, f: np.ndarray, library: Terms, noise: float = 0.0
 ) -> list[Found]:
-    """Brackets among the null vectors with an H whose B∇H is the field, best first.
+    """Brackets among the null vectors with an H whose B∇H is the field, best first; of those that
+    shrink with the uniform friction that the field then has.
 
     z, f: (N, n) states and the field there. noise: of f, relative.
     """
     found = []
     for vector, rule in _combinations(null, z, noise):
         made = [
-            (name, *_with_energy(bracket, library, z, f, noise))
+            (name, *_with_energy(bracket, library, z, f, noise, bool(null.rate)))
             for bracket, name in _made(null, vector, library.names, noise, z)
         ]
         least = min((own.misfit for *_, own in made), default=0.0)
         limit = min(max(OPTIONS.misfit, 3 * noise), OPTIONS.rounded * least + OPTIONS.misfit)
-        for name, bracket, own in made:
+        for name, field, own in made:
             if own.misfit <= limit:
-                found.append(Found(bracket, name, library, own, len(null.vectors), rule))
+                found.append(Found(field, name, own, len(null.vectors), rule))
     return sorted(found, key=lambda one: one.rank)
 
 
@@ -288,11 +296,13 @@ def _magnetic(form, c, names, zero: float) -> Bracket | None:
     return Bracket.magnetic(field[kept], powers[kept], _rounded(mass, zero), names)
 
 
-def _with_energy(bracket, library, z, f, noise) -> tuple[Bracket, OfField]:
-    """The bracket with H, convex where it can be."""
-    own = hamiltonian_of(bracket, library, z, f, noise)
-    bracket, c = upright(bracket, library, own.c, z)
-    return bracket, own._replace(c=c)
+def _with_energy(bracket, library, z, f, noise, damped: bool) -> tuple[PoissonField, OfField]:
+    """The field with H, convex where it can be."""
+    field = PoissonField(bracket, library, Dilations.of(bracket) if damped else None)
+    own = hamiltonian_of(field, z, f, noise)
+    bracket, c = upright(bracket, library, field.of_h(own.c), z)
+    c = np.concatenate([c, own.c[len(c) :]])
+    return dataclasses.replace(field, bracket=bracket), own._replace(c=c)
 
 
 def upright(bracket: Any, library: Terms, c: np.ndarray, z: np.ndarray) -> tuple[Any, np.ndarray]:

@@ -38,6 +38,7 @@ class Options:
     held: int = 5  # one pair of so many is held out: it says which degree is best
     worse: float = 2.0  # held-out error beyond that of the best degree: higher ones are not tried
     rows_per_term: float = 1.5  # at least
+    most_terms: int = 1000  # of S: more take longer than 12 s (benchmarks/bracket_maps.py)
 
 
 OPTIONS = Options()
@@ -51,7 +52,7 @@ class LieMap(NamedTuple):
     error: float
 
 
-def fit_lie_map(z0, z1, bracket: Constant | LieAlgebra, dt: float, degree: int = 8) -> LieMap:
+def fit_lie_map(z0, z1, bracket: Constant | LieAlgebra, dt: float, degree: int = 10) -> LieMap:
     """Fit S up to a total ``degree`` to pairs z0, z1 (N, n) of a Lie algebra or constant bracket;
     the degree with the least held-out error is taken."""
     scale = sizes(np.concatenate([z0, z1]))
@@ -61,7 +62,8 @@ def fit_lie_map(z0, z1, bracket: Constant | LieAlgebra, dt: float, degree: int =
     best, c, family = None, None, None
     for d in range(2, degree + 1):
         terms = number_of_terms(inputs.is_angle, d)
-        if terms * OPTIONS.rows_per_term > z0[~held].size:
+        most = min(OPTIONS.most_terms, z0[~held].size / OPTIONS.rows_per_term)
+        if terms > most:
             break
         larger = Products(inputs, d)
         c = np.zeros(terms) if family is None else _carried(family, c, larger)

@@ -67,6 +67,11 @@ class Tensors:
         slopes = np.concatenate([np.zeros((1, self.width)), eye])
         return values, np.broadcast_to(slopes, (*count, *slopes.shape))
 
+    def values(self, z: np.ndarray) -> np.ndarray:
+        """All of the basis, its entries above the diagonal, at z (N, n): (N P, J)."""
+        own = np.einsum("npk,pq->npqk", self.monomials(z)[0], np.eye(len(self.places)))
+        return own.reshape(-1, self.num)
+
     def lie(self, z: np.ndarray, f: np.ndarray, slope: np.ndarray) -> np.ndarray:
         """L_f of all of the basis, its entries above the diagonal (N, P, J), from f (N, n) and
         f' (N, n, n)."""
@@ -88,12 +93,13 @@ class NullSpace(NamedTuple):
     """Bivectors with L_f B = 0 of one kind, in the units of the coordinates.
 
     tensors: the basis. vectors: (m, J) coefficients in it. values: all singular values, rising, ÷
-    the size of f' over the states: 1 where nothing cancels.
+    the size of f' over the states: 1 where nothing cancels. rate: λ of L_f B = λB.
     """
 
     tensors: Tensors
     vectors: np.ndarray
     values: np.ndarray
+    rate: float = 0.0
 
     @property
     def nearest(self) -> float:
@@ -106,11 +112,12 @@ def null_spaces(
     f: np.ndarray,
     slope: np.ndarray,
     draws: list[tuple[np.ndarray, np.ndarray]],
+    rate: float = 0.0,
 ) -> Iterator[NullSpace]:
-    """The null spaces of L_f over constant, affine and logarithmic B in turn.
+    """The null spaces of L_f − λ over constant, affine and logarithmic B in turn.
 
     z: (N, n) states. f, slope: the field and its derivative there. draws: the same of fields
-    drawn from the field's covariance, less the field.
+    drawn from the field's covariance, less the field. rate: λ.
     """
     scale = np.sqrt(np.mean(z**2, axis=0))
     y, (f, slope) = z / scale, _in_units(f, slope, scale)
@@ -122,6 +129,7 @@ def null_spaces(
         stride = max(1, int(len(z) // max(needed, 30)))
         own = slice(None, None, stride)
         lie = tensors.lie(y[own], f[own], slope[own]).reshape(-1, tensors.num)
+        lie = lie - rate * tensors.values(y[own])
         size = np.sqrt(len(lie) / len(tensors.places) * np.mean(np.sum(slope[own] ** 2, (1, 2))))
         _, values, vt = np.linalg.svd(lie, full_matrices=False)
         values, vt = values[::-1] / size, vt[::-1]
@@ -134,37 +142,34 @@ def null_spaces(
         allowed = np.maximum(OPTIONS.errors * limit, OPTIONS.null)
         count = int(np.cumprod(values[: len(allowed)] <= allowed).sum())
         vectors = vt[:count] * _back(tensors, scale)
-        yield NullSpace(tensors, vectors, values)
+        yield NullSpace(tensors, vectors, values, rate)
 
 
-def shrinking(z: np.ndarray, f: np.ndarray, slope: np.ndarray) -> float | None:
-    """λ ≠ 0 of L_f B = λB, by which uniform friction shrinks a constant or affine bracket of the
-    highest rank: the null space as an eigenvalue problem. None where there is none to roundoff.
+def shrinking(z: np.ndarray, f: np.ndarray, slope: np.ndarray) -> list[float]:
+    """All λ ≠ 0 of L_f B = λB to roundoff, by which uniform friction shrinks a constant or affine
+    bracket, those of a higher rank first: the null space as an eigenvalue problem.
 
     z: (N, n) states. f, slope: the field and its derivative there.
     """
     scale = np.sqrt(np.mean(z**2, axis=0))
     y, (f, slope) = z / scale, _in_units(f, slope, scale)
     size, n = np.sqrt(np.mean(np.sum(slope**2, axis=(1, 2)))), z.shape[1]
+    known: list[tuple[int, float]] = []
     for kind in (CONSTANT, LINEAR):
         tensors = Tensors(kind, n)
-        lie, values = tensors.lie(y, f, slope), tensors.monomials(y)[0]
-        every = np.einsum("npk,pq->npqk", values, np.eye(len(tensors.places)))
-        lie, every = lie.reshape(-1, tensors.num), every.reshape(-1, tensors.num)
-        matrix = np.linalg.lstsq(every, lie, rcond=None)[0]
-        eigen = np.linalg.eig(matrix)
-        eigenvalues, vectors = np.asarray(eigen[0], complex), np.asarray(eigen[1], complex)
-        real = np.abs(np.imag(eigenvalues)) <= OPTIONS.null * size
-        rates, columns = np.real(eigenvalues[real]), np.real(vectors.T[real])
-        for found, vector in zip(rates, columns, strict=True):
-            bracket = every @ vector
-            left = np.linalg.norm(lie @ vector - found * bracket) / np.linalg.norm(bracket)
-            form = np.zeros((n, n))
-            form[tuple(np.transpose(tensors.places))] = bracket[: len(tensors.places)]
-            whole = np.linalg.matrix_rank(form - form.T, tol=1e-6 * np.abs(form).max()) == n - n % 2
-            if left <= OPTIONS.null * size < abs(found) and whole:
-                return float(found)
-    return None
+        lie, every = tensors.lie(y, f, slope).reshape(-1, tensors.num), tensors.values(y)
+        eigen = np.linalg.eig(np.linalg.lstsq(every, lie, rcond=None)[0])
+        for rate, vector in zip(eigen[0], np.transpose(eigen[1]), strict=True):
+            found, bracket = float(np.real(rate)), every @ np.real(vector)
+            left = np.linalg.norm(lie @ np.real(vector) - found * bracket)
+            own = left <= OPTIONS.null * size * np.linalg.norm(bracket)
+            seen = any(abs(found - other) <= OPTIONS.null * size for _, other in known)
+            if own and not seen and abs(found) > OPTIONS.null * size:
+                form = np.zeros((n, n))
+                form[tuple(np.transpose(tensors.places))] = bracket[: len(tensors.places)]
+                rank = np.linalg.matrix_rank(form - form.T, tol=1e-6 * np.abs(form).max())
+                known.append((-int(rank), found))
+    return [rate for _, rate in sorted(known)]
 
 
 def _in_units(f, slope, scale):

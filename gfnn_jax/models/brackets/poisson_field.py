@@ -4,6 +4,7 @@ whose bracket is known. NumPy."""
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.optimize import linprog
 
 from gfnn_jax.brackets import Bracket
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.flows.damped import Dilations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,24 +29,48 @@ OPTIONS = Options()
 
 @dataclasses.dataclass(frozen=True)
 class PoissonField:
-    """f = Σ_j c_j B ∇φ_j, φ the terms of H."""
+    """f = Σ_j c_j B ∇φ_j − Σ_k c_k E_k z, φ the terms of H, E_k those of uniform friction."""
 
     bracket: Bracket
     library: Terms
+    friction: Dilations | None = None
 
     @property
     def num(self) -> int:
-        """Number of terms."""
-        return self.library.num_parameters
+        """Number of coefficients."""
+        return self.library.num_parameters + len(self._matrices)
+
+    @cached_property
+    def _matrices(self) -> np.ndarray:
+        n = self.bracket.size
+        return np.zeros((0, n, n)) if self.friction is None else self.friction.matrices
+
+    def take(self, rows: list[int]) -> PoissonField:
+        """The field of these coefficients alone."""
+        count = self.library.num_parameters
+        library = self.library.take([row for row in rows if row < count])
+        kept = [row - count for row in rows if row >= count]
+        friction = self.friction.take(kept) if self.friction is not None and kept else None
+        return PoissonField(self.bracket, library, friction)
+
+    def of_h(self, c) -> np.ndarray:
+        """Those of the coefficients c that are of H."""
+        return c[: self.library.num_parameters]
+
+    def damping(self, c) -> np.ndarray:
+        """E (n, n)."""
+        return np.tensordot(c[self.library.num_parameters :], self._matrices, 1)
 
     def rate(self, c, z):
         """f (N, n)."""
-        return np.einsum("nij,nj->ni", self.bracket.matrix(z), self.library.gradient(c, z))
+        gradient = self.library.gradient(self.of_h(c), z)
+        found = np.einsum("nij,nj->ni", self.bracket.matrix(z), gradient)
+        return found if self.friction is None else found - z @ self.damping(c).T
 
     def jacobian(self, c, z):
         """∂f/∂z (N, n, n); that of B by complex steps, which are exact of polynomials."""
-        gradient, hessian = self.library.gradient_and_hessian(c, z)
-        found = self.bracket.matrix(z) @ hessian
+        gradient, hessian = self.library.gradient_and_hessian(self.of_h(c), z)
+        found = self.bracket.matrix(z) @ hessian - self.damping(c)
         for k, h in enumerate(np.maximum(np.abs(z).max(axis=0), 1e-300) * 1e-20):
             moved = z.astype(complex)
             moved[:, k] += 1j * h
@@ -52,8 +78,10 @@ class PoissonField:
         return found
 
     def columns(self, z):
-        """B ∇φ_j (N, n, J)."""
-        return self.bracket.matrix(z) @ self.library.term_gradients(z)
+        """B ∇φ_j and −E_k z (N, n, J)."""
+        own = self.bracket.matrix(z) @ self.library.term_gradients(z)
+        drags = -np.einsum("kij,nj->nik", self._matrices, z)
+        return np.concatenate([own, drags], axis=2) if drags.size else own
 
 
 class OfField(NamedTuple):
@@ -66,16 +94,18 @@ class OfField(NamedTuple):
 
 
 def hamiltonian_of(
-    bracket: Bracket, library: Terms, z: np.ndarray, f: np.ndarray, noise: float = 0.0
+    field: PoissonField, z: np.ndarray, f: np.ndarray, noise: float = 0.0
 ) -> OfField:
-    """H with B∇H = f at states z (N, n), f (N, n), by linear least squares; of all that differ by
-    Casimirs the one with the smallest sum of its coefficients' sizes, in units of the terms.
+    """H with B∇H = f, or with friction B∇H − Ez = f, at states z (N, n), f (N, n), by linear least
+    squares; of all that differ by Casimirs the one with the smallest sum of its coefficients'
+    sizes, in units of the terms.
 
     noise: of f, relative: what of singular values is none.
     """
-    units, scale = term_sizes(library, z), np.sqrt(np.mean(f**2, axis=0)) + 1e-300
-    columns = PoissonField(bracket, library).columns(z) / units / scale[:, None]
-    matrix, right = columns.reshape(-1, library.num_parameters), (f / scale).ravel()
+    units, scale = term_sizes(field.library, z), np.sqrt(np.mean(f**2, axis=0)) + 1e-300
+    units = np.append(units, np.ones(field.num - len(units)))
+    columns = field.columns(z) / units / scale[:, None]
+    matrix, right = columns.reshape(-1, field.num), (f / scale).ravel()
     u, s, vt = np.linalg.svd(matrix, full_matrices=False)
     known = s > max(OPTIONS.casimir, noise) * s[0]
     c = vt[known].T @ ((u.T @ right)[known] / s[known])

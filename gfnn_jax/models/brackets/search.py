@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +29,14 @@ from gfnn_jax.models.brackets.fields import (
     undetermined,
 )
 from gfnn_jax.models.brackets.find import Found, brackets_of, library_of, polynomials, upright
-from gfnn_jax.models.brackets.null_space import CONSTANT, LINEAR, LOG, null_spaces, shrinking
+from gfnn_jax.models.brackets.null_space import (
+    CONSTANT,
+    LINEAR,
+    LOG,
+    NullSpace,
+    null_spaces,
+    shrinking,
+)
 from gfnn_jax.models.brackets.poisson_field import PoissonField, hamiltonian_of
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.signals.noise import noise
@@ -152,11 +159,15 @@ def law_of(
     unsure = float(np.sqrt(np.mean(off)))
     nearest: dict[str, float] = {}
     missed: list[str] = []  # brackets whose laws do not leave noise alone
-    for null in null_spaces(some, f, slope, draws):
+    shrunk: list[str] = []
+    for null in _nulls(some, f, slope, draws, noisy is None):
         kind = null.tensors.kind
-        nearest[kind] = null.nearest
+        if null.rate:
+            shrunk.append(f"{null.rate:.8g}")
+        else:
+            nearest[kind] = null.nearest
         on_progress(f"{kind} brackets: {len(null.vectors)}, the nearest at {null.nearest:.1e}")
-        if not len(null.vectors):
+        if not len(null.vectors) or (null.rate and kind == LOG):
             continue
         library = library_of(kind, names, _degree(field), terms)
         for found in brackets_of(null, some, f, library, OPTIONS.errors * unsure):
@@ -175,15 +186,12 @@ def law_of(
             "act, or more runs are needed",
             "no law: no H of a bracket leaves noise alone",
         )
-    rate = shrinking(some, f, slope)
-    if rate is not None:
-        raise FitError(
-            f"uniform friction: the flow multiplies a bracket by exp(−{rate:.8g} t), t in the unit "
-            "of dt. Laws with a bracket and friction are not learned yet; of (q, p) they are, "
-            "without structure='poisson'",
-            f"no law: uniform friction, a bracket shrinks at the rate {rate:.8g}",
-        )
     more = ". With noise more runs may show one" if noisy is not None else ""
+    if shrunk:
+        more = (
+            f". Bivectors shrink at the rates {', '.join(dict.fromkeys(shrunk))}, as by uniform "
+            "friction, but no H of this library goes with them: name its terms (terms=)"
+        )
     values = ", ".join(f"{value:.2g} ({kind})" for kind, value in nearest.items())
     raise FitError(
         f"no bracket: L_f B = 0 has no solution among these, the nearest singular value being "
@@ -191,6 +199,13 @@ def law_of(
         f"of the spread{more}",
         f"no law: no bracket, nearest singular value {min(nearest.values()):.2g}",
     )
+
+
+def _nulls(z, f, slope, draws, clean: bool) -> Iterator[NullSpace]:
+    """Null spaces of L_f, and of pairs without noise those of uniform friction."""
+    yield from null_spaces(z, f, slope, draws)
+    for rate in shrinking(z, f, slope) if clean else ():
+        yield from null_spaces(z, f, slope, draws, rate)
 
 
 def _degree(field: FreeField) -> int:
@@ -276,7 +291,7 @@ def _of_populations(train: Data, held: Data, names, sigma: np.ndarray) -> Poisso
     bracket = Bracket.log([[0, 1], [-1, 0]], names)
     field = PoissonField(bracket, library_of(LOG, names, 1, None))
     middle, rate = 0.5 * (train.z0 + train.z1), (train.z1 - train.z0) / train.dt
-    start = hamiltonian_of(bracket, field.library, middle, rate)
+    start = hamiltonian_of(field, middle, rate)
     arcs = equal_arcs(arcs_of(train.z0, train.z1, train.run, train.place))
     own = fit_arcs(field, start.c, arcs, train.dt, sigma)
     left = np.broadcast_to(own.sigma, train.z0.shape)
@@ -357,9 +372,9 @@ def _through_flow(
     """The law with the coefficients of H fitted through the flow of B∇H; with noise along arcs, the
     constants of the bracket too. Raises FitError where no fit is found."""
     kept = np.flatnonzero(found.hamiltonian.c).tolist()
-    if not kept:
+    field, sigma = found.field.take(kept), None
+    if not field.library.num_parameters:
         raise FitError(f"no H of the {found.name} bracket is told from none")
-    field, sigma = PoissonField(found.bracket, found.library.take(kept)), None
     pairs = train[:3] if noisy is None else noisy.long
     fit = fit_field(field, *pairs, found.hamiltonian.c[kept])
     if noisy is not None:
@@ -375,6 +390,13 @@ def _through_flow(
             *notes,
             f"one of a family of {found.several} brackets, each of which makes the same motion "
             f"with an H of its own: {found.rule} was taken",
+        )
+    if field.friction is not None:
+        shrinks = float(fit.c[field.library.num_parameters :] @ field.friction.rates)
+        notes = (
+            *notes,
+            f"uniform friction: the flow multiplies the bracket by exp(−{shrinks:.8g} t), t in the "
+            "unit of dt; Casimirs, which friction alone moves, change too",
         )
     return PoissonLaw(field, fit, error_on(field, fit.c, held), found.name, notes, sigma)
 
@@ -413,18 +435,19 @@ def _of_bracket(bracket, train, held, terms, on_progress) -> PoissonLaw:
 def _of_library(bracket: Bracket, library: Terms, train: Data, held: Data) -> PoissonLaw:
     """H of these terms, through the flow, without those that Casimirs make superfluous."""
     middle, h = 0.5 * (train.z0 + train.z1), np.reshape(train.dt, (-1, 1))
-    start = hamiltonian_of(bracket, library, middle, (train.z1 - train.z0) / h)
-    fit = fit_field(PoissonField(bracket, library), *train[:3], start.c)
+    field = PoissonField(bracket, library)
+    start = hamiltonian_of(field, middle, (train.z1 - train.z0) / h)
+    fit = fit_field(field, *train[:3], start.c)
     return _lean(bracket, library, fit.c, train, held)
 
 
 def _lean(bracket, library, c, train: Data, held: Data) -> PoissonLaw:
     """The law of coefficients c, of all that differ by Casimirs the one of fewest terms."""
     some = train.z0[:: max(1, len(train.z0) // OPTIONS.states)]
-    f = PoissonField(bracket, library).rate(c, some)
-    own = hamiltonian_of(bracket, library, some, f)
+    field = PoissonField(bracket, library)
+    own = hamiltonian_of(field, some, field.rate(c, some))
     kept = np.flatnonzero(own.c).tolist()
-    field = PoissonField(bracket, library.take(kept))
+    field = field.take(kept)
     fit = fit_field(field, *train[:3], own.c[kept])
     return PoissonLaw(field, fit, error_on(field, fit.c, held), bracket.name, ())
 
