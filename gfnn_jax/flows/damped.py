@@ -35,7 +35,7 @@ class Dilations:
 
     @classmethod
     def of(cls, bracket: Bracket) -> Dilations:
-        """All that are diagonal where L z has the bracket's standard constants; none of a bracket
+        """Find all that are diagonal where L z has the bracket's standard constants; none of a bracket
         that is neither constant nor a Lie algebra."""
         n, rows = bracket.size, []
         basis = getattr(bracket, "basis", None)
@@ -58,7 +58,7 @@ class Dilations:
         return self.inverse @ (self.patterns[:, :, None] * self.basis)
 
     def take(self, rows) -> Dilations:
-        """These of the motions alone."""
+        """Keep these of the motions alone."""
         return dataclasses.replace(self, patterns=self.patterns[rows], rates=self.rates[rows])
 
     def grown(self, c, z, time):

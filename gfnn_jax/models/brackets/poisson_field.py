@@ -54,7 +54,7 @@ class PoissonField:
         return PoissonField(self.bracket, library, friction)
 
     def of_h(self, c) -> np.ndarray:
-        """Those of the coefficients c that are of H."""
+        """Select the coefficients of H."""
         return c[: self.library.num_parameters]
 
     def damping(self, c) -> np.ndarray:
