@@ -35,8 +35,8 @@ class Dilations:
 
     @classmethod
     def of(cls, bracket: Bracket) -> Dilations:
-        """Find all that are diagonal where L z has the bracket's standard constants; none of a bracket
-        that is neither constant nor a Lie algebra."""
+        """Find all that are diagonal where L z has the bracket's standard constants; none of a
+        bracket that is neither constant nor a Lie algebra."""
         n, rows = bracket.size, []
         basis = getattr(bracket, "basis", None)
         basis = np.eye(n) if basis is None else np.asarray(basis)
