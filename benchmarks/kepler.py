@@ -1,6 +1,6 @@
-"""A million steps of two bodies: the figure of docs/results.md.
+"""A million steps of two bodies: a panel of the figure of docs/results.md (`long_time.py`).
 
-    python benchmarks/kepler.py           measure, then figure and caption
+    python benchmarks/kepler.py           measure, then the figure and its caption
     python benchmarks/kepler.py --quick   small sizes, into runs/kepler, no figure
     python benchmarks/kepler.py --tables  only the figure and its caption again
 
@@ -12,12 +12,11 @@ benchmarks/results.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable
-from typing import Any
 
 # Sets float64, so it comes before all of JAX.
-from harness import FIGURES, PAGE, SEED, Numbers, between_markers, main, number, results, timed
+from harness import SEED, Numbers, main, timed
+from long_time import INTEGRATOR, LEARNED, NETWORK, draw
 
 # isort: split
 import jax
@@ -26,14 +25,12 @@ import numpy as np
 
 import gfnn_jax as gfnn
 from gfnn_jax.baselines import METHODS, Budget, Sequences
-from gfnn_jax.evaluate import figures, metrics
+from gfnn_jax.evaluate import metrics
 from gfnn_jax.maps.rollout import rollout
 
-FIGURE = FIGURES / "kepler.png"
 NUM_PAIRS, NUM_NETWORK_PAIRS, TRAINING_SECONDS = 4_000, 100_000, 60.0
 NUM_ORBITS, NUM_STEPS, NUM_NETWORK_STEPS, EARLY = 8, 1_000_000, 10_000, 1_000
 SUBSTEPS = 10
-LEARNED, NETWORK, INTEGRATOR = "learned map", "learned vector field", "integrator, H known"
 
 
 def yoshida(dt: float) -> Callable:
@@ -118,41 +115,8 @@ def measure(quick: bool) -> Numbers:
     return {"num_orbits": NUM_ORBITS, "methods": methods}
 
 
-def draw(result: Numbers) -> None:
-    """The figure, and its caption in docs/results.md."""
-    methods = result["measured"]["methods"]
-    curves = {
-        name: (np.array(m["curve"]["steps"]), np.array(m["curve"]["error"], float))
-        for name, m in methods.items()
-    }
-    axes: Any = figures.error_growth(curves)
-    figures.save(axes.figure, FIGURE)
-    learned, network, integrator = (methods[name] for name in (LEARNED, NETWORK, INTEGRATOR))
-    caption = (
-        f"*Two bodies, {learned['num_steps']:,} steps of 0.1, about 16,000 revolutions: mean "
-        f"position error of {result['measured']['num_orbits']} orbits that no fit has seen, and a "
-        "band of one standard deviation. "
-        f"Learned map: {learned['pairs']:,} pairs, {learned['num_parameters']:,} parameters, "
-        f"{number(learned['error_end'])} at the end, the semi-major axis within "
-        f"{number(learned['axis_end'])}. "
-        f"Learned vector field (VFNN): {network['pairs']:,} pairs, "
-        f"{network['num_parameters']:,} parameters, {network['num_steps']:,} steps. "
-        "Integrator that is told H: symplectic, of "
-        f"order 4, ten substeps to a step, {number(integrator['error_end'])} at the end, "
-        f"{number(integrator['microseconds_per_step'])} µs a step; the learned map takes "
-        f"{number(learned['microseconds_per_step'])} µs. "
-        "Drawn by `benchmarks/kepler.py`.*"
-    )
-    between_markers(PAGE, "kepler", textwrap.fill(caption, 100, break_long_words=False))
-
-
-def tables() -> None:
-    for result in results(PIECES, "kepler").values():
-        draw(result)
-
-
 PIECES = {"million-steps": measure}
 
 
 if __name__ == "__main__":
-    main(__doc__ or "", PIECES, "kepler", tables, None)
+    main(__doc__ or "", PIECES, "kepler", draw, None)

@@ -35,6 +35,7 @@ def long(quick: bool) -> Numbers:
         "drift_exponent": exponent,
         "change_at_the_end": float(size[-count // 10 :].mean()),
         "oscillation": float(np.median(action.std(axis=1) / action.mean(axis=1))),
+        "curve": {"turns": step.tolist(), "change": size.tolist()},
     }
 
 
