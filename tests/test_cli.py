@@ -23,14 +23,14 @@ from command_line import (
     predict,
 )
 
-from gfnn_jax import cli, cli_process, cli_summary, scenes
+from gfnn_jax import cli, cli_summary, scenes
 from gfnn_jax.budget import Budget
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.jobs import fit as jobs_fit
-from gfnn_jax.jobs import progress, search
+from gfnn_jax.jobs import output, progress
 from gfnn_jax.learn import fit as learn_fit
 from gfnn_jax.learn.options import MODELS, OPTIONS
 from gfnn_jax.maps import saved as models
@@ -394,7 +394,7 @@ def test_fit_of_csv(tmp_path):
 
 def test_a_model_is_kept_and_known_again(fitted, tmp_path, capsys, monkeypatch):
     """An existing model is refused, replaced on demand, and the very job known again."""
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
+    monkeypatch.setattr(output, "fit", lambda *args, **kwargs: fitted)
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
     assert gfnn(*fit) == 0
     before = files(tmp_path)
@@ -409,7 +409,7 @@ def test_a_model_is_kept_and_known_again(fitted, tmp_path, capsys, monkeypatch):
 
 
 def test_data_inside_the_output_are_not_deleted(fitted, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
+    monkeypatch.setattr(output, "fit", lambda *args, **kwargs: fitted)
     model = tmp_path / "m"
     assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", model) == 0
     inside = pairs_file(model / "d.npz")
@@ -422,7 +422,7 @@ def test_data_inside_the_output_are_not_deleted(fitted, tmp_path, capsys, monkey
 def test_strict(fitted, tmp_path, capsys, monkeypatch):
     """A missed tolerance: the map is written, and the exit status says so where asked for."""
     missed = fitted.replaced(asked=Tolerance(1e-300))
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: missed)
+    monkeypatch.setattr(output, "fit", lambda *args, **kwargs: missed)
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
     assert gfnn(*fit, "--strict") == 1
     assert "misses the tolerance" in capsys.readouterr().err.splitlines()[-1]
@@ -437,7 +437,7 @@ def test_the_former_name_of_an_option(fitted, tmp_path, monkeypatch):
         asked.append(options.family)
         return fitted
 
-    monkeypatch.setattr(search, "fit", remember)
+    monkeypatch.setattr(output, "fit", remember)
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--overwrite")
     for more in ((), ("--scalar", "sines"), ("--family", "polynomial")):
         assert gfnn(*fit, *more) == 0
@@ -472,7 +472,7 @@ def test_failing_arithmetic_is_one_line(tmp_path, capsys, monkeypatch):
     def fail(*args, **kwargs):
         raise np.linalg.LinAlgError("SVD did not converge")
 
-    monkeypatch.setattr(search, "fit", fail)
+    monkeypatch.setattr(output, "fit", fail)
     assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 1
     assert capsys.readouterr().err.strip().endswith("the fit failed: SVD did not converge")
 
@@ -515,7 +515,7 @@ def test_warnings_are_one_line(fitted, tmp_path, capsys, monkeypatch):
         warnings.warn("nothing meets the tolerance", FitWarning, stacklevel=2)
         return fitted
 
-    monkeypatch.setattr(search, "fit", warn)
+    monkeypatch.setattr(output, "fit", warn)
     assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 0
     assert "gfnn: warning: nothing meets the tolerance" in capsys.readouterr().err.splitlines()
 
@@ -610,7 +610,7 @@ def test_compiled_programs_are_kept_in_the_users_cache(tmp_path, monkeypatch):
     of_the_tests = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
     try:
-        cli_process.set_up_jax()
+        cli.set_up_jax()
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "gfnn_jax")
     finally:
         jax.config.update("jax_compilation_cache_dir", of_the_tests)

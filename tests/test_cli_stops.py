@@ -24,8 +24,8 @@ from command_line import (
 )
 
 from gfnn_jax.jobs import fit as jobs_fit
+from gfnn_jax.jobs import output, progress
 from gfnn_jax.jobs import predict as predict_job
-from gfnn_jax.jobs import progress, search
 from gfnn_jax.maps import saved as models
 from gfnn_jax.storage import checkpoints
 
@@ -52,7 +52,7 @@ def test_a_training_that_was_stopped(fitted, tmp_path, capsys, monkeypatch):
             raise KeyboardInterrupt
         return fitted
 
-    monkeypatch.setattr(search, "fit", training)
+    monkeypatch.setattr(output, "fit", training)
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
     assert gfnn(*fit) == 130
     last = capsys.readouterr().err.splitlines()[-1]
@@ -75,10 +75,10 @@ def test_resuming_another_job_discards_no_training(fitted, tmp_path, capsys, mon
         raise KeyboardInterrupt
 
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
-    monkeypatch.setattr(search, "fit", training)
+    monkeypatch.setattr(output, "fit", training)
     assert gfnn(*fit, "--family", "mlp") == 130
     before = files(tmp_path)
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
+    monkeypatch.setattr(output, "fit", lambda *args, **kwargs: fitted)
     assert gfnn(*fit, "--resume") == 2
     assert "m.partial: belongs to another fit: family differ" in capsys.readouterr().err
     assert files(tmp_path) == before
@@ -88,7 +88,7 @@ def test_nothing_is_left_where_nothing_was_kept(tmp_path, capsys, monkeypatch):
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(search, "fit", stop)
+    monkeypatch.setattr(output, "fit", stop)
     assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 130
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "gfnn: stopped; nothing of the fit was kept"
@@ -128,11 +128,11 @@ def test_an_interrupted_fit_publishes_the_best_of_all_its_runs(
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--resume")
     for error, best in ((1e-2, 1e-2), (1e-3, 1e-3), (1e-1, 1e-3)):
         candidate = dataclasses.replace(fitted.chosen, validation_relative=error)
-        monkeypatch.setattr(search, "fit", stopped_with([(fitted.map, candidate)]))
+        monkeypatch.setattr(output, "fit", stopped_with([(fitted.map, candidate)]))
         assert gfnn(*fit) == 130
         assert "m and can be used" in capsys.readouterr().err
         assert models.record(tmp_path / "m")["validation_relative"] == best
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
+    monkeypatch.setattr(output, "fit", lambda *args, **kwargs: fitted)
     assert gfnn(*fit) == 0
     assert "unfinished" not in models.record(tmp_path / "m")
 
@@ -173,10 +173,10 @@ def test_a_fit_survives_two_of_each_signal(family, tmp_path, monkeypatch):
 
 def test_an_interrupted_fit_leaves_an_older_model_as_it_is(fitted, tmp_path, capsys, monkeypatch):
     fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--overwrite")
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
+    monkeypatch.setattr(output, "fit", lambda *args, **kwargs: fitted)
     assert gfnn(*fit) == 0
     before = files(tmp_path / "m")
-    monkeypatch.setattr(search, "fit", stopped_with([(fitted.map, fitted.chosen)]))
+    monkeypatch.setattr(output, "fit", stopped_with([(fitted.map, fitted.chosen)]))
     capsys.readouterr()
     assert gfnn(*fit) == 130
     assert files(tmp_path / "m") == before
@@ -185,7 +185,7 @@ def test_an_interrupted_fit_leaves_an_older_model_as_it_is(fitted, tmp_path, cap
 
 
 def test_a_killed_fit_that_kept_nothing_is_in_nobodys_way(fitted, tmp_path, monkeypatch):
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
+    monkeypatch.setattr(output, "fit", lambda *args, **kwargs: fitted)
     (tmp_path / "m.partial").mkdir()
     (tmp_path / "m.partial" / "job.json").write_text("{}")
     assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 0
@@ -264,7 +264,7 @@ def test_a_prediction_resumes_to_the_same_bits(stop, status, model, tmp_path, ca
 
 
 def test_a_full_disk(model, fitted, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(search, "fit", lambda *args, **kwargs: fitted)
+    monkeypatch.setattr(output, "fit", lambda *args, **kwargs: fitted)
     assert predict(model, tmp_path / "p.npz") == 0
     before = files(tmp_path)
     with monkeypatch.context() as patch:

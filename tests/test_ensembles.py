@@ -14,10 +14,9 @@ from gfnn_jax.fitting.levenberg_marquardt import (
     Limits,
     LMState,
 )
-from gfnn_jax.jobs.output import Output
+from gfnn_jax.jobs.output import Output, search
 from gfnn_jax.jobs.predict import Steps, predict
 from gfnn_jax.jobs.progress import Progress
-from gfnn_jax.jobs.search import search
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.models.generating_functions import networks
 

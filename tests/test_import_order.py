@@ -54,7 +54,6 @@ ORDER = (
     "evaluate",
     "jobs",
     "cli_parser",
-    "cli_process",
     "cli_summary",
     "cli",
     "__main__",

@@ -21,7 +21,7 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.rates import rates
 from gfnn_jax.generating.charts import CHARTS
 from gfnn_jax.generating.generated import Generated
-from gfnn_jax.learn.propose import proposed
+from gfnn_jax.learn.request import proposed
 from gfnn_jax.models.hamiltonians.libraries import promising
 from gfnn_jax.phase_space import apply_j, defect_of_pairs
 from gfnn_jax.solve import krylov

@@ -20,7 +20,7 @@ from gfnn_jax.learn import searches
 from gfnn_jax.models.hamiltonians import choose_law
 from gfnn_jax.models.hamiltonians.choose_law import preferred
 from gfnn_jax.models.hamiltonians.fitted_law import formula
-from gfnn_jax.models.maps_of_laws.draw import Drawing, drawn
+from gfnn_jax.models.maps_of_laws.law_maps import Drawing, drawn
 
 FORMULA = "0.5 q1² + 0.5 q2² + 0.5 p1² + 0.5 p2² + q1² q2 - 0.333333333333 q2³"
 

@@ -46,8 +46,6 @@ def test_added_coefficients_are_those_of_larger_fits():
         expected = np.sqrt((before - rest) / (rest / before))
         assert found.scores(1.0, 0.0, 1e-12)[i] == pytest.approx(expected)
     assert found.rest**2 == pytest.approx(before)
-    both = solved(rows, [0, 2, 1, 4])[1]
-    assert one.joint_score([0, 2], [1, 4]) == pytest.approx(before - both)
     assert one.among([3, 1]).step() == pytest.approx(solved(rows, [3, 1])[0])
     left = one.without([0, 2])
     assert left.step() == pytest.approx(solved(rows, range(5))[0][[1, 3, 4]])

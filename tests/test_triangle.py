@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from gfnn_jax.fitting.triangle import Triangle, eliminated, folded
+from gfnn_jax.fitting.triangle import Triangle, folded
 
 RNG = np.random.default_rng(0)
 SCALES = 10.0 ** np.linspace(-3, 3, 7)  # of the columns, which the solution does not see
@@ -114,22 +114,6 @@ def test_a_step_becomes_a_solution():
     step = Triangle.of(np.column_stack([A, A @ start - B]))
     np.testing.assert_allclose(start - plain(step), lstsq(A, B), rtol=1e-9)
     np.testing.assert_allclose(plain(step.rebased(start)), lstsq(A, B), rtol=1e-9)
-
-
-def test_own_unknowns_of_blocks_are_eliminated():
-    """Six blocks of 15 rows with two unknowns each beside seven that all have."""
-    own = RNG.normal(size=(6, 15, 2))
-    every = np.zeros((6, 15, 6, 2))
-    every[np.arange(6), :, np.arange(6)] = own
-    both = lstsq(np.column_stack([every.reshape(90, 12), A]), B)
-    t, inside, rest = eliminated(np.concatenate([own, ROWS.reshape(6, 15, 8)], axis=-1), 2)
-    triangle = Triangle.of(rest.reshape(-1, 8))
-    c = plain(triangle)
-    np.testing.assert_allclose(c, both[12:], rtol=1e-9)
-    x = np.linalg.solve(t, -(inside @ np.append(c, -1.0))[..., None])[..., 0]
-    np.testing.assert_allclose(x.ravel(), both[:12], rtol=1e-8)
-    left = np.linalg.norm(np.column_stack([every.reshape(90, 12), A]) @ both - B)
-    assert triangle.residual_norm(7) == pytest.approx(left, rel=1e-10)
 
 
 def test_a_row_that_failed_outweighs_all():

@@ -241,15 +241,6 @@ class Linearised:
             np.sqrt(np.maximum(square - along**2, 0.0)),
         )
 
-    def joint_score(self, fitted: Sequence[int], omitted: Sequence[int]) -> float:
-        """sᵀF⁻¹s of all ``omitted`` coefficients at once, in units of the variance: of χ² with as
-        many degrees of freedom where none of them is there."""
-        rest = self.among([*fitted, *omitted]).without(range(len(fitted)))
-        if not len(rest.p):
-            return 0.0
-        spectrum = rest.spectrum
-        return float(np.sum(spectrum.along[spectrum.known] ** 2)) / self.variance
-
     def unimitated(self, k: int) -> float:
         """Share of what a coefficient changes that no combination of the others does: below some
         1e-4 it is not identifiable."""

@@ -235,18 +235,6 @@ class Spectrum:
         return np.where(self.known, 1.0 / square, 0.0)
 
 
-def eliminated(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(T, S, rest) of rows of [X Y b] (..., N, k + n + 1), X those of k = ``count`` unknowns x that
-    no other rows have, for any number of blocks at once. By the QR of each block,
-
-        min over x  is  ‖rest (c, −1)‖,        T x = −S (c, −1):
-
-    rest (..., M, n + 1) are the rows of c alone, and x follows from c. N is at least k.
-    """
-    r = np.asarray(np.linalg.qr(rows, mode="r"))
-    return r[..., :count, :count], r[..., :count, count:], r[..., count:, count:]
-
-
 def folded(factor: np.ndarray, rows: np.ndarray, *, triangular: bool = False) -> np.ndarray:
     """R of the stacked [factor; rows], (n, n) and (m, n), by LAPACK's ``dtpqrt`` in place: both are
     overwritten. 2 m n² operations; a third of that where the rows are ``triangular`` too.

@@ -19,8 +19,7 @@ from gfnn_jax.evaluate import figures, metrics, report
 from gfnn_jax.jobs.figures import BINS, divergences, figures_of_comparison
 from gfnn_jax.jobs.measure import Rollouts, measure, without_runaways
 from gfnn_jax.jobs.methods import OURS, PAPER_GFNN, TITLES, SharedData, learn_and_roll, separable
-from gfnn_jax.jobs.output import Output, pairs_digest
-from gfnn_jax.jobs.search import scene_named
+from gfnn_jax.jobs.output import Output, pairs_digest, scene_named
 from gfnn_jax.maps.saved import versions
 from gfnn_jax.scenes import Scene
 from gfnn_jax.storage.outputs import atomic_folder, atomic_write, failures_as_work_errors

@@ -21,14 +21,18 @@ from gfnn_jax.evaluate.page import About, write_page
 from gfnn_jax.evaluate.report import PAGE
 from gfnn_jax.families.told import anything_told
 from gfnn_jax.fitting import row_blocks
-from gfnn_jax.jobs.output import Output, Ran, publish, units_of, write
-from gfnn_jax.jobs.search import (
+from gfnn_jax.jobs.output import (
     BEST,
+    Output,
+    Ran,
     failures_of_arithmetic,
     line,
+    publish,
     refusals,
     scene_named,
     search,
+    units_of,
+    write,
 )
 from gfnn_jax.learn.fit import fit as learn_fit
 from gfnn_jax.learn.options import FitOptions

@@ -24,9 +24,9 @@ from gfnn_jax.jobs.measure import (
     map_rollouts,
     step_rollouts,
 )
+from gfnn_jax.jobs.output import search
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.jobs.run import QUICK, WHOLE
-from gfnn_jax.jobs.search import search
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, sizes, symplecticity_defect

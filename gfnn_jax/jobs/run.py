@@ -20,8 +20,16 @@ from gfnn_jax.jobs.measure import (
     map_rollouts,
     measure,
 )
-from gfnn_jax.jobs.output import MODEL, Output, Ran, pairs_digest, write
-from gfnn_jax.jobs.search import refusals, scene_named, search
+from gfnn_jax.jobs.output import (
+    MODEL,
+    Output,
+    Ran,
+    pairs_digest,
+    refusals,
+    scene_named,
+    search,
+    write,
+)
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps.posterior import bands
 from gfnn_jax.maps.symplectic_map import SymplecticMap

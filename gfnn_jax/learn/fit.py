@@ -36,13 +36,12 @@ from gfnn_jax.learn.noisy_sweeps import without_bias
 from gfnn_jax.learn.options import FitOptions, Watch, with_options
 from gfnn_jax.learn.poisson import learn_poisson, other_bracket
 from gfnn_jax.learn.positions import learn_positions
-from gfnn_jax.learn.propose import structures_to_try
-from gfnn_jax.learn.request import checked, diagnose_request, paid_for, wrapped
+from gfnn_jax.learn.request import checked, diagnose_request, paid_for, structures_to_try, wrapped
 from gfnn_jax.learn.searches import Searched, searched
 from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.models.lagrangians.recordings import fit_recording
-from gfnn_jax.models.maps_of_laws.draw import Drawing, drawn
+from gfnn_jax.models.maps_of_laws.law_maps import Drawing, drawn
 from gfnn_jax.phase_space import POISSON, Pairs, require_x64
 from gfnn_jax.threads import one_thread
 

@@ -31,7 +31,7 @@ from gfnn_jax.models.arms.learned_arm import LearnedArm
 from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
-from gfnn_jax.models.maps_of_laws.draw import NUM_PAIRS
+from gfnn_jax.models.maps_of_laws.law_maps import NUM_PAIRS
 from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.scenes.scene import Scene
 

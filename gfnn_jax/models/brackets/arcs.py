@@ -29,7 +29,6 @@ class Options:
     rate: float = 0.2  # largest h‖f'‖ of a Runge–Kutta step
     most_substeps: int = 16
     nodes: int = 64  # of an arc, at most
-    fewest_nodes: int = 4
     # standard errors of a coefficient that stays
     significant: float = 4.0
     # distance of a constant of the bracket from a whole number that it may be, and the rise of

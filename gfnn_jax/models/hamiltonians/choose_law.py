@@ -12,8 +12,7 @@ from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.fitting.linear_starts import backwards, tangent, turns
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
-from gfnn_jax.models.hamiltonians.options import OPTIONS
-from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.hamiltonians.problem import OPTIONS, LawProblem
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.scenes.scene import Scene
 

@@ -26,7 +26,7 @@ from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
-from gfnn_jax.models.hamiltonians.options import OPTIONS
+from gfnn_jax.models.hamiltonians.problem import OPTIONS
 from gfnn_jax.models.parameters import states_and_functions
 from gfnn_jax.phase_space import apply_j, symplectic_form
 

@@ -41,8 +41,7 @@ from gfnn_jax.models.hamiltonians.libraries import (
     within_bounds,
 )
 from gfnn_jax.models.hamiltonians.library_search import is_exact, of_libraries, small_polynomials
-from gfnn_jax.models.hamiltonians.options import OPTIONS
-from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.hamiltonians.problem import OPTIONS, LawProblem
 from gfnn_jax.models.hamiltonians.sequences import arcs_of, fitted_to_sequences
 from gfnn_jax.models.hamiltonians.symmetries import imposed
 
