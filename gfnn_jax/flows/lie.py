@@ -40,7 +40,7 @@ _TERMS = 32
 # States, largest number of substeps, and the change in units of the coordinates' sizes by which
 # they are judged: roundoff of the largest of a few hundred numbers.
 _PROBES, _MOST_SUBSTEPS, _RESOLVED = 64, 64, 4e-15
-_STAGES = 8  # of a law's step, of order 16, as compiled rollouts have them (`flows.lifted`)
+_STAGES = 8  # of a law's step, of order 16, as compiled rollouts have them (`flows.compiled_steps`)
 # The symmetric composition of 17 steps and order 8 of W. Kahan & R.-C. Li, Math. Comp. 66 (1997),
 # 1089: the first nine of its weights.
 _WEIGHTS = (

@@ -482,7 +482,9 @@ class SymplecticMap:
         saving = Saving(num_steps // save_every, save_every, stop_outside)
         followed = map_._followed(z0, args)
         if followed is None:
-            compiled = map_._on_lift(z0, args, saving)
+            from gfnn_jax.maps import compiled_rollouts  # stands after this module
+
+            compiled = compiled_rollouts.roll_out(map_, z0, args, saving)
             states, info = roll_out(map_, z0, args, saving) if compiled is None else compiled
         else:
             states, info = followed.roll_out(z0, args, saving)
@@ -503,14 +505,6 @@ class SymplecticMap:
     def angles_of_z(self) -> tuple[int, ...]:
         """Indices of the user's coordinates that are angles."""
         return self.coordinates.angles if self.coordinates.forward is CARTESIAN.forward else ()
-
-    def _on_lift(self, z0, args, saving: Saving):
-        """A rollout of a law with a bracket by compiled steps, or None: then steps are JAX's."""
-        if self.bracket is None:
-            return None
-        from gfnn_jax.maps import lifted_rollouts  # stands after this module
-
-        return lifted_rollouts.roll_out(self, z0, args, saving)
 
     def _followed(self, *given):
         """The law of a recording as it is followed with its dry friction on the numbers ``given``,

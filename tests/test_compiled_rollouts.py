@@ -1,0 +1,71 @@
+"""Rollouts of laws by compiled steps, against the same steps by JAX."""
+
+import jax
+import numpy as np
+import pytest
+
+from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC, Friction, Lagrangian, Terms
+from gfnn_jax.flows.compiled_steps import Stepper
+from gfnn_jax.maps import lanes
+from gfnn_jax.maps.inputs import Signals
+from gfnn_jax.maps.laws import map_of_law
+
+ARMS = [
+    ((2, 0), (0, 0), (0, 0), 0.0),
+    ((1, 1), (0, 0), (1, -1), 0.0),
+    ((0, 2), (0, 0), (0, 0), 0.0),
+    ((0, 0), (0, 0), (1, 0), 0.0),
+    ((0, 0), (0, 0), (0, 1), 0.0),
+]
+KINDS = {"alone": ([], 0.0), "friction": ([((1, 0), LINEAR, 0.0), ((-1, 1), QUADRATIC, 0.0)], 0.0)}
+KINDS["uniform"] = ([], 0.2)
+
+
+def arms(kind, driven=False):
+    """The map of a double pendulum, and states, some of which turn over."""
+    rows, uniform = KINDS[kind]
+    friction, theta = Friction.of(rows, 2), np.array([0.5, 0.4, 0.25, 20.0, 8.0])
+    gains = np.ones((2, int(driven)))
+    law = Lagrangian(Terms.of(ARMS, 2), theta, friction, np.full(len(rows), 0.3), uniform, gains)
+    q, v = np.split(np.random.default_rng(0).normal(size=(200, 4)), 2, axis=1)
+    z = np.concatenate([q, law.momentum(q, 3 * v)], axis=1)
+    signals = Signals(("u",), "linear") if driven else None
+    return map_of_law(law, z, 0.02, angles=(0, 1), signals=signals), z[:12]
+
+
+@pytest.mark.parametrize(
+    ("kind", "driven"),
+    [
+        ("friction", True),
+        pytest.param("alone", False, marks=pytest.mark.slow),
+        pytest.param("uniform", False, marks=pytest.mark.slow),
+    ],
+)
+def test_steps_are_those_of_jax(kind, driven):
+    map_, z = arms(kind, driven)
+    inputs = np.sin(np.arange(901) / 30)[:, None] if driven else None
+    states, info = map_.rollout(z, 900, save_every=3, inputs=inputs)
+    args = map_._schedule(None, z, None, inputs, 900)
+    expected, other = lanes.roll_out(map_, z, args, lanes.Saving(300, 3))
+    assert Stepper.of(map_.pieces[0], 2 * driven) is not None
+    np.testing.assert_allclose(states[:, :34], expected[:, :34], rtol=1e-11, atol=1e-11)
+    np.testing.assert_array_equal(info.left_at, other.left_at)
+    np.testing.assert_array_equal(info.status, other.status)
+
+
+@pytest.mark.slow
+def test_energy_stays_and_many_turns_cost_no_digit():
+    """A pendulum that turns over, 1e5 steps: the orbit of the step is closed to roundoff."""
+    rows = [((2,), (0,), (0,), 0.0), ((0,), (0,), (1,), 0.0)]
+    none = np.zeros(0)
+    law = Lagrangian(
+        Terms.of(rows, 1), np.array([0.5, 1.0]), Friction.of([], 1), none, 0.0, none.reshape(1, 0)
+    )
+    z = np.random.default_rng(0).normal(size=(50, 2)) + np.array([0.0, 2.0])
+    map_ = map_of_law(law, z, 0.1, angles=(0,), tolerance=1e-15)
+    states, _ = map_.rollout(np.array([0.0, 2.5]), 100_000, save_every=100)
+    assert states[-1, 0] > 1e4
+    energy = 0.5 * states[:, 1] ** 2 - np.cos(np.asarray(states[:, 0]))
+    assert np.max(abs(np.asarray(energy) / energy[0] - 1)) < 1e-11  # cos of 2e4 loses 4 digits
+    steps = jax.jit(lambda z: map_.rollout(z, 10)[0])(np.array([0.0, 2.5]))
+    assert steps.shape == (11, 2)
