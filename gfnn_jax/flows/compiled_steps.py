@@ -445,9 +445,7 @@ def roll(law, task, substeps, inputs, moving):
                     if not abs(total) < np.inf:
                         goes = False
                         break
-                    # Change of the next iteration; the first does not show how fast they shrink.
-                    ahead = change * min(change / before, 1.0) if iterations > 1 else change
-                    if change <= _SETTLED and (ahead <= _FLOOR or change > 0.5 * before):
+                    if change <= _FLOOR or (change <= _SETTLED and change > 0.5 * before):
                         break
                     before = change
                 most = max(most, iterations)
