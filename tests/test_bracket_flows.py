@@ -12,8 +12,8 @@ import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN, LOG
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collective import collective
-from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.compiled_steps import STAGES, Stepper
+from gfnn_jax.flows.flow import Flow
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.solve.status import NON_FINITE, OK
 
