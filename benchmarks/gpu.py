@@ -59,6 +59,7 @@ BATCHES = (200, 20_000)  # the paper's, and one that fills a GPU
 STEPS, ITERATIONS, MEMBERS, SAMPLES = 50, 1_000, 8, 64
 PAIRS, SAMPLED_LANES, COMPARED = 100_000, 4_096, 64
 
+Rows = tuple[np.ndarray, np.ndarray]
 Row = tuple[str, str, Numbers]  # kind, name, what was measured
 
 
@@ -79,10 +80,10 @@ class Problem:
         family = Mlp(box_inputs(self.w), hidden, "silu", amplitude_of(self.w, self.target))
         return family, family.init(jax.random.key(key), dtype)
 
-    def rows(self) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    def rows(self) -> tuple[Rows, Rows]:
         """Those that train, and those that validate."""
-        both = self.w, self.target
-        return tuple(a[self.held :] for a in both), tuple(a[: self.held] for a in both)
+        w, target, held = self.w, self.target, self.held
+        return (w[held:], target[held:]), (w[:held], target[:held])
 
 
 def training(problem: Problem, device) -> Iterator[Row]:
@@ -107,7 +108,7 @@ def training(problem: Problem, device) -> Iterator[Row]:
 def ensemble(problem: Problem, device) -> Iterator[Row]:
     train, validation = problem.rows()
     count = 1_000 if problem.quick else 8_000
-    train = tuple(a[:count] for a in train)
+    train = train[0][:count], train[1][:count]
     family = problem.network((32, 32, 32), np.float64, 0)[0]
     starts = [problem.network((32, 32, 32), np.float64, key)[1] for key in range(MEMBERS)]
     seconds: list[float] = []
