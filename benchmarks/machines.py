@@ -319,10 +319,11 @@ def robot(quick: bool, path: Path) -> Numbers:
     table = pd.read_csv(path)
     table["theta2"] += table["theta1"]
     table = table[["run", "t", "theta1", "theta2", "tau1", "tau2"]]
-    roles = {"positions": JOINTS, "angles": JOINTS, "inputs": TORQUES}
+    roles: dict[str, Any] = {"positions": JOINTS, "angles": JOINTS, "inputs": TORQUES}
     training = table[table["run"] < (1 if quick else TRAINED)]
     fit = gfnn.fit(gfnn.Recording(training, **roles), terms=TERMS)
-    map_, last = fit.map, table[table["run"] == table["run"].max()]
+    map_ = fit.map
+    last: Any = table[table["run"] == table["run"].max()]
     dt, t, torques = float(map_.dt), last["t"].to_numpy(), last[TORQUES].to_numpy()
     count, starts, states, inputs = round(AHEAD / dt), np.arange(2.0, 9.0, 0.35), [], []
     for start in starts:
@@ -334,7 +335,7 @@ def robot(quick: bool, path: Path) -> Numbers:
     ends = np.asarray(map_.rollout(z, count, inputs=np.array(inputs))[0])[:, -1]
     with tempfile.TemporaryDirectory() as folder:
         for to in ("mjcf", "urdf"):
-            gfnn.export(fit, to, Path(folder) / f"arm{SUFFIXES[to]}")
+            gfnn.export(map_, to, Path(folder) / f"arm{SUFFIXES[to]}")
         model = mujoco.MjModel.from_xml_path(str(Path(folder) / f"arm{SUFFIXES['mjcf']}"))
     step, joints, off = model.opt.timestep, np.tril(np.ones((2, 2))), []
     for start, begun, v, end in zip(starts, z, velocities_of(map_, z), ends, strict=True):
