@@ -196,7 +196,7 @@ def hidden_case(name: str, draw: int) -> Numbers:
             off = fit.map.forecast(recording, ahead).values["x1"][0] - q[~seen, 0][: len(ahead)]
             said["error"] = float(np.sqrt(np.mean(off**2)) / spread[0])
         found |= said if len(columns) == 1 else {"of_both": said.get("error")}
-    right = found.get("error", np.inf) < 3 * max(found["of_both"] or 0.0, NOISE)
+    right = found.get("error", np.inf) < 3 * (found["of_both"] or 0.0)
     return found | {"right": bool(right), "named": bool(right), "verdict": found.get("verdict", "")}
 
 

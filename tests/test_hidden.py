@@ -91,7 +91,7 @@ def test_a_cart_tells_another_on_a_cubic_spring():
     seen = t < 30
     recording = gfnn.Recording({"t": t[seen], "x": 0.3 + x[0, seen]}, positions=["x"], angles=[])
     fit = gfnn.fit(recording, model=gfnn.Lagrangian(hidden=1))
-    assert fit.verdict == "identified"
+    assert fit.verdict.startswith("one of several: x_1, x_2 are the modes")
     assert fit.law.sensors["x_rest"][0] == pytest.approx(0.3, abs=1e-3)
     off = fit.map.forecast(recording, t[~seen]).values["x"][0] - 0.3 - true[0, ~seen]
     assert np.sqrt(np.mean(off**2)) < 2e-3 * true[0].std()

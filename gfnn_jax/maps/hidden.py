@@ -48,6 +48,12 @@ class Hidden:
             return f"{names} are the modes of small swings, of which the column shows the sum"
         return f"{self.names[1]} is a pendulum on {self.names[0]}, in a unit of its own"
 
+    @property
+    def rivals(self) -> str:
+        """Why other laws follow the column alike; "" of a pendulum on an angle, whose law has a form
+        of its own. Powers of modes have not: of those that couple them some imitate others."""
+        return self.gauge + ", and other powers of them may couple them" if all(self.weights) else ""
+
     def states(
         self, t: np.ndarray, y: np.ndarray, rest: float | None = None
     ) -> tuple[np.ndarray, np.ndarray]:

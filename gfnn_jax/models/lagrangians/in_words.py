@@ -255,7 +255,10 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
 
 
 def _hidden(problem: ArcProblem, coordinates: Sequence[str], channels: Sequence[str]) -> str:
-    """Reason why other laws follow the record as well, where noise is a large part of a radian."""
+    """Reason why other laws follow the record as well: hidden coordinates that are modes, or noise
+    that is a large part of a radian."""
+    if problem.observation.hidden is not None:
+        return problem.observation.hidden.rivals
     angles = [coordinates[i] for i in problem.angles if coordinates[i] in channels]
     sigma = {name: problem.scales.sigma[channels.index(name)] for name in angles}
     return "; ".join(
