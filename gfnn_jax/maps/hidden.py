@@ -50,9 +50,11 @@ class Hidden:
 
     @property
     def rivals(self) -> str:
-        """Why other laws follow the column alike; "" of a pendulum on an angle, whose law has a form
-        of its own. Powers of modes have not: of those that couple them some imitate others."""
-        return self.gauge + ", and other powers of them may couple them" if all(self.weights) else ""
+        """Why other laws follow the column alike; "" of a pendulum on an angle, whose law has its
+        own form. Powers of modes have none: of those that couple them some imitate others."""
+        if not all(self.weights):
+            return ""
+        return f"{self.gauge}, and other powers of them may couple them"
 
     def states(
         self, t: np.ndarray, y: np.ndarray, rest: float | None = None
