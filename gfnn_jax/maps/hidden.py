@@ -50,8 +50,8 @@ class Hidden:
 
     @property
     def rivals(self) -> str:
-        """Reason why other laws follow the column alike; "" of a pendulum on an angle, whose
-        law has its own form. Powers of modes have none: of those that couple them some imitate others."""
+        """Reason why other laws follow the column alike; "" of a pendulum on an angle, whose law
+        has its own form. Powers of modes have none: some that couple them imitate others."""
         if not all(self.weights):
             return ""
         return f"{self.gauge}, and other powers of them may couple them"
