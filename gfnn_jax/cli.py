@@ -37,7 +37,7 @@ from gfnn_jax.cli_summary import (
 from gfnn_jax.compiling import enable_compile_cache
 from gfnn_jax.data.files import are_recordings
 from gfnn_jax.data.roles import ROLES
-from gfnn_jax.errors import InputError, WorkError
+from gfnn_jax.errors import InputError, WorkError, read_in_a_shell
 from gfnn_jax.jobs import progress
 from gfnn_jax.storage.outputs import ensure_new, signals_handled
 from gfnn_jax.storage.partial import unfinished_note
@@ -53,7 +53,12 @@ def process() -> int:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (without the program's name) and return the exit status."""
-    arguments, argv = argparse.Namespace(), sys.argv[1:] if argv is None else argv
+    with read_in_a_shell():
+        return _status_of(sys.argv[1:] if argv is None else argv)
+
+
+def _status_of(argv: Sequence[str]) -> int:
+    arguments = argparse.Namespace()
     try:
         if not argv:
             raise InputError(f"expected a command, got none: {_TO_BEGIN}")

@@ -296,7 +296,7 @@ def test_what_is_no_noise_of_initial_states_is_refused(noisy, tmp_path):
         with pytest.raises(InputError, match="z0_std"):
             read_initial_noise(path, (2, 4))
     noisy[1].map.save(tmp_path / "model")
-    with pytest.raises(InputError, match="--horizon needs --samples"):
+    with pytest.raises(InputError, match="horizon= needs samples="):
         predict(tmp_path / "model", path, Output(tmp_path / "o.npz"), Steps(2, horizon=1.0))
 
 

@@ -511,7 +511,7 @@ def test_what_has_no_c_is_refused(tmp_path):
     map_, _ = map_in(MIDPOINT, 1, 3)
     single = jax.tree.map(lambda a: np.asarray(a, np.float32), map_)
     for bad, why in ((network, "one of a function"), (single, "not of float64")):
-        with pytest.raises(gfnn.InputError, match=rf"{why}.*use --to stablehlo"):
+        with pytest.raises(gfnn.InputError, match=rf"{why}.*use to=.stablehlo"):
             gfnn.export(bad, "c", tmp_path / "a.c")
     for to, out, why in (
         ("c", "a.txt", "is written as .c"),

@@ -206,7 +206,7 @@ def test_fit_refuses_what_look_calls_wrong(tmp_path, capsys):
         assert "--positions theta" in line
         assert "--despite 'no derivative'" in line
     assert not (tmp_path / "model").exists()
-    with pytest.raises(InputError, match=r"--despite: expected some of constant, .* got 'sgin'"):
+    with pytest.raises(InputError, match=r"despite=: expected some of constant, .* got 'sgin'"):
         refuse_mistakes(gfnn.read(path), ["sgin"])
     assert "wrong (no derivative): omega" in str(gfnn.read(path).summary())
     refuse_mistakes(gfnn.read(path), ["no derivative"])

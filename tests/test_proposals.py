@@ -86,7 +86,7 @@ def test_points_on_a_circle_are_an_angle_and_the_command_has_it(seed):
     again = gfnn.Recording({"t": T, **table}, **read)
     assert again.coordinates == again.angles == ("theta",)
     assert kinds(again.summary()) == []
-    with pytest.raises(InputError, match="--coordinates theta --observe"):
+    with pytest.raises(InputError, match=r"coordinates=\[.theta.\] observe="):
         refuse_mistakes(gfnn.Recording({"t": T, **table}))
     refuse_mistakes(gfnn.Recording({"t": T, **table}), ["circle"])
 
@@ -280,10 +280,10 @@ def test_populations_are_states_of_first_order():
     t = np.arange(1900.0, 1960)
     found = solve_ivp(rates, (t[0], t[-1]), (31, 19.5), t_eval=t, rtol=1e-9)
     table = {"Year": t, "Prey": found.y[0], "Predator": 10 * found.y[1]}
-    with pytest.raises(InputError, match="--structure poisson --states Prey,Predator"):
+    with pytest.raises(InputError, match=r"structure=.poisson. states=\[.Prey., .Predator.\]"):
         gfnn.Recording(table)
     carts = {"t": T, "one": np.cos(T) + np.cos(1.7 * T), "two": np.cos(T) - np.cos(1.7 * T)}
-    with pytest.raises(InputError, match="or some of them and --inputs"):
+    with pytest.raises(InputError, match="or some of them and inputs="):
         gfnn.Recording(carts)
 
 

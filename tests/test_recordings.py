@@ -367,5 +367,5 @@ def test_options_of_the_command_line_are_keywords_of_read():
 def test_names_with_blanks_are_one_word_of_the_command_that_is_told():
     t = np.arange(40) * 0.1
     table = {"t": t, "frame": np.sin(7.3 * t), "pendulum angle": np.cos(t) + 0.1 * np.sin(9 * t)}
-    with pytest.raises(InputError, match="--positions 'frame,pendulum angle', or some"):
+    with pytest.raises(InputError, match=r"positions=\['frame', 'pendulum angle'\], or some"):
         gfnn.Recording(table)

@@ -313,7 +313,7 @@ def test_samples_of_any_number_of_processes(sampled_folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(job, "wait_for_all", lambda: None)
         predicted("parts.npz", share=Share(1, 2))
-        with pytest.raises(InputError, match="--resume goes on with them"):
+        with pytest.raises(InputError, match="resume=True goes on with them"):
             predicted("parts.npz", share=Share(0, 1))
         there = predicted("parts.npz", share=Share(0, 1), resume=True)
     assert there.read_bytes() == whole.read_bytes()

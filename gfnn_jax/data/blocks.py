@@ -107,13 +107,13 @@ class Request:
         if self.initial:
             return np.nan
         if given is None and found is None:
-            raise InputError(f"{self.path}: holds no time step. Give it: --dt (dt=)")
+            raise InputError(f"{self.path}: holds no time step. Give it: --dt")
         if given is None or found is None:
             return given if found is None else found  # pyright: ignore[reportReturnType]
         if not abs(given - found) <= TIME_TOLERANCE * found:
             own = "times that are uneven" if np.isnan(found) else f"the file's dt = {found}"
             raise InputError(
-                f"{self.path}: the given dt = {given} disagrees with {own}. Leave out --dt (dt=)"
+                f"{self.path}: the given dt = {given} disagrees with {own}. Leave out --dt"
             )
         return given
 

@@ -349,7 +349,7 @@ def time_unit_of(
         if told is not None and given is not None and clock_of(told) != clock_of(given):
             raise InputError(
                 f"{source}: {name} is in {told} by its header, got the time unit {given} "
-                "(--time-unit, time_unit=)"
+                "(--time-unit)"
             )
         if told is not None:
             return told

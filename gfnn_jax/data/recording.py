@@ -521,7 +521,7 @@ def parameters_of(recording: Recording) -> tuple[str, ...]:
             if not (np.isfinite(column).all() and np.ptp(column) == 0):
                 raise InputError(
                     f"{recording.source}: parameter {name} is not one number in run {run}. Name "
-                    "what changes within a run an input: --inputs (inputs=)"
+                    "what changes within a run an input: --inputs"
                 )
         if len({float(column[0]) for column in columns}) > 1:
             found.append(name)

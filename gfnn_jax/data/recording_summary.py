@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import html
 import io
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -19,18 +18,13 @@ from gfnn_jax.data.faults import WRONG, Fault
 from gfnn_jax.data.proposals import findings, mistakes
 from gfnn_jax.data.roles import ROLES
 from gfnn_jax.data.traits import Traits, WrongValues, of_rows, traits
-from gfnn_jax.errors import InputError
+from gfnn_jax.errors import InputError, said
 from gfnn_jax.signals import energy
 from gfnn_jax.signals.steps import dominant_frequencies, gaps
 
 if TYPE_CHECKING:
     from gfnn_jax.data.recording import Recording
 
-# An option with its value, up to the punctuation of a sentence, and the keyword beside it.
-_VALUE = r"(?!(?:and|or|with|if|goes|learns|has)\b)('[^']*'|[^\s()]+?)(?=[.,;:)]*(?:\s|$))"
-_TYPED = re.compile(rf"--([a-z][a-z-]+)(?: {_VALUE})?(?: \(\w+=\))?")
-_LISTS = (*ROLES, "angles", "degrees", "columns", "coordinates", "offset", "scale", "states")
-_IN_PYTHON = {"from": "start", "to": "stop", "event": "events"}
 _FORMULAS = {"observe": "observe", "events": "event"}  # keyword: option, one for each column
 _SEEN = ("events", "accelerations")  # what a sensor shows, more exactly than its role
 _OF_FITS = ("structure", "states", "mass")
@@ -171,7 +165,7 @@ class RecordingSummary:
     def _printed(self) -> Console:
         # A notebook would take it for its own display.
         console = Console(file=io.StringIO(), width=_SHOWN.width, record=True, force_jupyter=False)
-        console.print(_screen(self, python=True))
+        console.print(self)
         return console
 
     def __str__(self) -> str:
@@ -358,30 +352,6 @@ def _as_code(value: Any) -> str:
     return repr(list(value) if isinstance(value, tuple) else value)
 
 
-def in_python(text: str) -> str:
-    """Text with options of the command line as keywords: ``--degrees angle`` is
-    ``degrees=['angle']``."""
-
-    def keyword(found: re.Match[str]) -> str:
-        name, value = found[1].replace("-", "_"), found[2]
-        name = _IN_PYTHON.get(name, name)
-        if value is None:
-            return f"{name}="
-        value = shlex.split(value)[0]
-        if name in ("observe", "events"):
-            value = dict([value.split(" = ", 1)])
-        elif name in _LISTS:
-            value = [] if value == "none" else value.split(",")
-        elif name == "guess":
-            pairs = (pair.split("=", 1) for pair in value.split(","))
-            value = {of: float(number) for of, number in pairs}
-        elif name in ("start", "stop", "dt"):
-            value = float(value)
-        return f"{name}={value!r}"
-
-    return _TYPED.sub(keyword, text)
-
-
 def as_typed(options: Mapping[str, Any]) -> str:
     """Keywords of `gfnn_jax.read` as options of the command line, with a blank before each."""
     words = {"start": "from", "stop": "to", "time_unit": "time-unit"}
@@ -402,11 +372,11 @@ def as_typed(options: Mapping[str, Any]) -> str:
 # The screen.
 
 
-def _screen(summary: RecordingSummary, python: bool = False) -> Group:
-    """Screen that `gfnn look` prints; with the words of ``python`` that a notebook shows."""
+def _screen(summary: RecordingSummary) -> Group:
+    """Screen that `gfnn look` prints."""
     told = filter(None, (_samples(summary), _times(summary), _moving(summary)))
-    lines = [Text(in_python(line) if python else line) for line in told]
-    found = [_fault(fault, python) for fault in summary.faults[: _SHOWN.most]]
+    lines = [Text(said(line)) for line in told]
+    found = [_fault(fault) for fault in summary.faults[: _SHOWN.most]]
     more = len(summary.faults) - _SHOWN.most
     found += [Text(f"and {more} more")] if more > 0 else []
     return Group(*lines, _columns(summary), *found)
@@ -508,9 +478,9 @@ def _remarks(column: Column) -> str:
     return ", ".join(parts)
 
 
-def _fault(fault: Fault, python: bool) -> Text:
+def _fault(fault: Fault) -> Text:
     text = Text(
         f"wrong ({fault.kind}): " if fault.wrong else "note: ",
         style="bold red" if fault.wrong else "yellow",
     )
-    return text.append(in_python(str(fault)) if python else str(fault), style="not bold default")
+    return text.append(said(str(fault)), style="not bold default")

@@ -226,7 +226,7 @@ def _parts(
         named = f"--time {shlex.quote(rising[0])} if that is it, or " if rising else ""
         raise InputError(
             f"{table.source}: expected a column t or time, found {', '.join(table.columns)}; give "
-            f"{named}the time between rows: --dt (dt=)"
+            f"{named}the time between rows: --dt"
         )
     if column is not None:
         labels, first, inverse = np.unique(

@@ -74,7 +74,7 @@ class Dataset:
             raise FitError(
                 f"{int((~known).sum())} pairs have no {coordinates.name} coordinates of the scene, "
                 f"the first is number {int(np.argmin(known))}, from 0. Leave them out, or fit "
-                "without --scene (scene=)"
+                "without --scene"
             )
         lifted = lift if structure is None or not structure.angles else lift_sites
         y0, y1, centres, covered = lifted(before, after, coordinates)

@@ -305,9 +305,7 @@ def measure(found: Sequence[Stretch]) -> Scales:
     speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
     if not np.all(speed > 0):
         still = ", ".join(str(i + 1) for i in np.flatnonzero(~(speed > 0)))
-        raise InputError(
-            f"position {still} does not move: leave it out of --positions (positions=)"
-        )
+        raise InputError(f"position {still} does not move: leave it out of --positions")
     if not all(np.array_equal(s.y, s.q, equal_nan=True) for s in found):
         sigma = _noise_of_channels(found)
     steps = [

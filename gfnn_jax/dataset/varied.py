@@ -84,7 +84,7 @@ def as_varied(
         if len(rows) >= _OPTIONS.nearly_all * len(pairs):
             messages.append(
                 f"{len(pairs) - len(rows)} of {len(pairs)} pairs are not dt = {usual:g} apart: "
-                "they are left out (learn='hamiltonian' uses them)"
+                "they are left out (--learn hamiltonian uses them)"
             )
             pairs = pairs.take(rows)
             pairs = dataclasses.replace(pairs, dt=float(np.mean(pairs.dt)))

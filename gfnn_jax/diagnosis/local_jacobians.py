@@ -297,13 +297,13 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
     raise FitError(
         f"no chart covers these data, with or without a base map: each has a determinant near 0 "
         f"({lows}), and no generating function exists there. Take pairs of a smaller dt or of a "
-        "smaller region, or learn H, which needs no chart: --learn hamiltonian (learn=)"
+        "smaller region, or learn H, which needs no chart: --learn hamiltonian"
     )
 
 
 def _about(name, determinant: ChartDeterminant, what, valid) -> str:
     instead = [n for n in ("midpoint", "type2", "type3") if n in valid and n != name]
-    advice = f". Use --chart {instead[0]} (chart=)" if instead else ". Take a smaller dt"
+    advice = f". Use --chart {instead[0]}" if instead else ". Take a smaller dt"
     return (
         f"chart {name} {what}: its determinant, of ∂w/∂z, falls to {determinant.low:.2g} and is "
         f"negative for {100 * determinant.negative:.0f} % of the states{advice}"

@@ -70,7 +70,7 @@ def forecast_recording(model: Path, initial: Path, output: Output, asked: Ahead)
     if out.suffix not in (".csv", ".npz"):
         raise InputError(f"{out}: a forecast is written as .csv or .npz")
     if num_steps is not None and num_steps < 0:
-        raise InputError("expected --num-steps above 0: a forecast begins where a recording ends")
+        raise InputError("expected --num-steps, above 0: a forecast begins where a recording ends")
     if num_steps is None and asked.compare is None:
         raise InputError("expected --num-steps, or --compare, whose times the forecast is for")
     known = _Model(model, asked.columns)
@@ -99,7 +99,7 @@ def forecast_recording(model: Path, initial: Path, output: Output, asked: Ahead)
             if not len(times):
                 raise InputError(
                     f"{asked.compare}: holds no sample of run {run} after the end of {initial}, "
-                    f"{last:g} s. To forecast a part of one file: --to T ends --initial there"
+                    f"{last:g} s. To forecast a part of one file, end it by --to"
                 )
         found[run] = forecast(known.map, part, times, ahead)
     compared = None if measured is None else _compared(known, found, measured)

@@ -71,7 +71,7 @@ class Steps:
         """Raises InputError where the options contradict each other."""
         if self.save_every > abs(self.num_steps):
             raise InputError(
-                f"expected --save-every of at most --num-steps = {abs(self.num_steps)}, got "
+                f"expected --save-every of at most {abs(self.num_steps)} (--num-steps), got "
                 f"{self.save_every}"
             )
         if self.horizon is not None and self.samples is None:

@@ -146,7 +146,7 @@ def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
     return [
         f"phase-space volumes change by {change:.2g} ± {error:.1g} (relative) in a step, as by "
         "friction. The map keeps volumes: it meets the tolerance of one step, and long rollouts "
-        "miss the decay. With a smaller --tolerance (tolerance=) a fit looks for friction"
+        "miss the decay. With a smaller --tolerance a fit looks for friction"
     ]
 
 
@@ -257,7 +257,7 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     if np.isfinite(error) or _noise_by_neighbours(sample) is False:
         message = (
             "the residuals are no noise: neighbouring pairs have similar ones. Either the terms "
-            "tried cannot represent the motion (give known ones: --terms, terms=), or it is not "
+            "tried cannot represent the motion (give known ones: --terms), or it is not "
             "symplectic (friction, a missing coordinate)"
         )
         return _LeftOver(None, [message], "the residuals are a function of the states")
@@ -356,7 +356,7 @@ def _beside_known(found: np.ndarray, known: np.ndarray) -> _LeftOver:
     message = (
         f"larger models are no more accurate, and the residuals are up to {ratio:.2g} times the "
         f"noise that was given ({name}): std is too small, or the terms tried cannot represent "
-        "the motion (give known ones: --terms, terms=)"
+        "the motion (give known ones: --terms)"
     )
     return _LeftOver(known, [message])
 
@@ -372,7 +372,7 @@ def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOv
     message = (
         "other terms of the structure are no more accurate: the residuals are noise of about "
         f"{noise[0]:.1e} on positions and {noise[-1]:.1e} on momenta, or terms that were not tried "
-        "(give known ones: --terms, terms=)"
+        "(give known ones: --terms)"
     )
     return _LeftOver(noise, [message])
 

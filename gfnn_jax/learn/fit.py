@@ -20,12 +20,11 @@ from gfnn_jax.candidates.assemble import Candidate, block_of
 from gfnn_jax.data.files import are_recordings, read_trajectories
 from gfnn_jax.data.proposed import Proposed, as_proposed
 from gfnn_jax.data.recording import ReadOptions, Recording
-from gfnn_jax.data.recording_summary import in_python
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.diagnosis.diagnosis import NOT_SYMPLECTIC
 from gfnn_jax.diagnosis.outliers import clean, looked_for_errors
 from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
-from gfnn_jax.errors import FitError, FitWarning, InputError
+from gfnn_jax.errors import FitError, FitWarning, InputError, said
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.choose import Chosen, choose, stated, with_posterior, with_test_rows
@@ -270,7 +269,7 @@ def said_of(proposed: Proposed) -> tuple[str, ...]:
     """Lines on the options that were proposed and taken."""
     if not proposed.new:
         return ()
-    return (f"read as proposed: {proposed.summary.read_as}", *map(in_python, proposed.why))
+    return (f"read as proposed: {proposed.summary.read_as}", *map(said, proposed.why))
 
 
 def _of_arrays(t: Any, x: Any) -> Recording:

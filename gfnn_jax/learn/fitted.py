@@ -20,7 +20,7 @@ from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.damping import LearnedDamping
 from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
-from gfnn_jax.errors import FitWarning
+from gfnn_jax.errors import FitWarning, said
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.fitting.evidence import EVIDENCE
@@ -288,17 +288,18 @@ class Fit:
         """Verdict of the data, ``KIND`` or ``KIND: reason``. KIND is identified, one of several,
         partly, or map, of a generated map without a law; no law and not mechanical are those of a
         `FitError`. None where a folder holds none."""
-        return self.stored.get("verdict", None if self.found is None else self.found.verdict)
+        verdict = self.stored.get("verdict", None if self.found is None else self.found.verdict)
+        return None if verdict is None else said(verdict)
 
     @property
     def messages(self) -> tuple[str, ...]:
         """The warnings, and the friction that the map has."""
-        return () if self.found is None else self.found.messages
+        return () if self.found is None else tuple(map(said, self.found.messages))
 
     @property
     def table(self) -> str:
         """Every candidate, the chosen one marked; or the law, its errors and its horizon."""
-        return "" if self.found is None else self.found.table
+        return "" if self.found is None else said(self.found.table)
 
     @property
     def formula(self) -> str | None:
@@ -342,7 +343,8 @@ class Fit:
         own = self.__dict__
         if not name.startswith("__") and "map" in own:
             if hasattr(own.get("found"), name):
-                return getattr(own["found"], name)
+                found = getattr(own["found"], name)
+                return said(found) if isinstance(found, str) else found
             if hasattr(own["map"], name):
                 warnings.warn(
                     f"fit.{name} is fit.map.{name}: a fit is no map, and will not stand for it in "

@@ -100,7 +100,7 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
     elif not met:
         messages.append(
             f"one-step error {candidate.validation_bound:.1e} misses the tolerance "
-            f"{tolerance.bound:g}: pairs with noise, or an H that the library lacks (terms=)"
+            f"{tolerance.bound:g}: pairs with noise, or an H that the library lacks (--terms)"
         )
         warnings.warn(messages[-1], FitWarning, stacklevel=4)
     tested = pairs.take(test[: min(STATES_MEASURED, block_of(n))])
@@ -136,7 +136,9 @@ def pairs_of_states(recording: Recording) -> Pairs:
     with a missing value is none. Raises InputError where there are fewer than two columns."""
     names, parts = recording.positions, []
     if len(names) < 2:
-        raise InputError(f"expected two or more columns of states, got {len(names)}: --states A,B")
+        raise InputError(
+            f"expected two or more columns of states, got {len(names)}: --positions A,B"
+        )
     for number, run in enumerate(recording.runs):
         z, t = np.asarray(recording.array("positions", run)), recording.times(run)
         known = np.asarray(np.isfinite(z).all(axis=1))

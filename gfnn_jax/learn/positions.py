@@ -126,7 +126,7 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
     if best is None:
         raise FitError(
             f"{len(triples)} triples of positions gave no S(q, Q) whose step can be solved. Add "
-            "positions, or raise --max-seconds (max_seconds=)"
+            "positions, or raise --max-seconds"
         )
     fit = sweep.learned(sweep.without_noise(best), left_out, options.seed)
     for message in fit.messages:

@@ -165,15 +165,15 @@ def _check_structured(
         "it has its own terms: expected no family or base": (options.family, options.base)
         != ("auto", None),
         "expected another chart than type1": chart == "type1",
-        "only H is learned, expected no learn='map' or chart": bodies
+        "only H is learned, expected no --learn map or chart": bodies
         and (learn == "map" or chart != "auto"),
         "expected no angles": bodies and angles,
         "expected plain q and p, no coordinates of a scene, parameters or drive": own
         or pairs.args
         or pairs.period is not None,
-        "with angles only S is learned (learn='map'), expected no terms, which are of H": angles
+        "with angles only S is learned (--learn map), expected no terms, which are of H": angles
         and (learn == "hamiltonian" or terms),
-        "learn='map' expects pairs of one dt, got several": learn == "map" and np.ndim(pairs.dt),
+        "--learn map expects pairs of one dt, got several": learn == "map" and np.ndim(pairs.dt),
         "expected no terms, it has powers of distances": terms and bodies,
         "expected terms as text in q1, p1 of a site and q2, p2, … of the next ones": not all(
             isinstance(term, str) for term in terms
@@ -235,7 +235,7 @@ def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
     return [
         f"coordinate {a} of z, given as an angle, ranges over {range_[a]:.3g} and moves by up to "
         f"{move[a]:.3g} in a step. Angles are in radians: are these degrees? Convert them, or take "
-        f"{a} out of --angles (angles=)"
+        f"{a} out of --angles"
         for a in coordinates.angles
         if range_[a] > 2 * TWO_PI and move[a] > np.pi
     ]
@@ -270,7 +270,7 @@ def unnamed_angles(pairs: Pairs, coordinates: Coordinates) -> list[str]:
     named = "coordinate " + indices if len(found) == 1 else f"coordinates {indices}"
     return [
         f"{named} of z: jumps of 2π in {count} of {len(pairs)} pairs, as of an angle that is "
-        f"wrapped; name it: --angles {indices}, angles=({indices},)"
+        f"wrapped; name it: --angles {indices}"
     ]
 
 
@@ -422,8 +422,8 @@ def proposed(data: Dataset) -> list[str]:
         return []
     return [
         f"the structure {best} explains these pairs: a sample of them leaves relative residuals of "
-        f"{left:.1g} in forces and velocities, to second order in dt. Fit again with --structure "
-        f"{best} (structure='{best}')"
+        f"{left:.1g} in forces and velocities, to second order in dt. Fit again with "
+        f"--structure {best}"
     ]
 
 

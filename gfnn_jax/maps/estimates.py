@@ -177,7 +177,7 @@ def forecast(
     elif sensors.inputs and inputs is None:
         raise InputError(
             f"the law has inputs ({', '.join(sensors.inputs)}): give them for the times of the "
-            "forecast, --inputs FILE (inputs=)"
+            "forecast, --inputs FILE"
         )
     if inputs is not None and sensors.inputs:
         windows = [
@@ -340,7 +340,7 @@ def _check_inputs(t: np.ndarray, begin: float, end: float, run: str) -> None:
         gap = int(np.argmax(lacks))
         raise InputError(
             f"run {run}: the forecast needs inputs from {begin:g} to {end:g} s, and there are none "
-            f"from {ahead[gap]:g} to {ahead[gap + 1]:g} s: --inputs FILE (inputs=)"
+            f"from {ahead[gap]:g} to {ahead[gap + 1]:g} s: --inputs FILE"
         )
 
 

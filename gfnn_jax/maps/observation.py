@@ -620,8 +620,7 @@ def _started(g: Observation) -> np.ndarray:
     missing = [g.parameters[i] for i in open_ if not determined[i] or not np.isfinite(values[i])]
     if missing and not g.unseen:  # else what is integrated tells them
         raise InputError(
-            f"observe: {', '.join(missing)}: expected a first guess, guess={{{missing[0]!r}: …}} "
-            f"(--guess {missing[0]}=…)"
+            f"--observe: {', '.join(missing)}: expected a first guess, --guess {missing[0]}=…"
         )
     return np.where(np.abs(values) < 1e-12, 0.0, values)
 

@@ -172,8 +172,8 @@ class SymplecticMap:
                 )
         if len(self.pieces) != 1 or not serves_any_dt(self.pieces[0]):
             raise ValueError(
-                f"this is a map of dt = {float(np.asarray(self.dt)):g} only. Fit a law (--learn "
-                "hamiltonian, learn='hamiltonian'), or S to pairs of several dt"
+                f"this is a map of dt = {float(np.asarray(self.dt)):g} only. Fit a law "
+                "(learn='hamiltonian'), or S to pairs of several dt"
             )
         if dt.shape not in ((), lanes):
             raise ValueError(

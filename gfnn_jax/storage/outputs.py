@@ -41,9 +41,7 @@ def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
             )
         if path.exists() and not (folder and not any(path.iterdir())):
             if not overwrite:
-                raise InputError(
-                    f"{path}: exists already (--overwrite, in Python overwrite=True, replaces it)"
-                )
+                raise InputError(f"{path}: exists already (--overwrite replaces it)")
             if folder and not any((path / mark).is_file() for mark in FOLDER_MARKS):
                 raise InputError(
                     f"{path}: is a folder without {' or '.join(FOLDER_MARKS)}; not overwritten"

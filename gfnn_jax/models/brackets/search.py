@@ -190,7 +190,7 @@ def law_of(
     if shrunk:
         more = (
             f". Bivectors shrink at the rates {', '.join(dict.fromkeys(shrunk))}, as by uniform "
-            "friction, but no H of this library goes with them: name its terms (terms=)"
+            "friction, but no H of this library goes with them: name its terms (--terms)"
         )
     values = ", ".join(f"{value:.2g} ({kind})" for kind, value in nearest.items())
     raise FitError(

@@ -100,7 +100,7 @@ def unfit_for_law(data: Dataset, scene: Scene | None) -> str | None:
     if scene is not None and scene.period is not None and data.period is None:
         return f"the Hamiltonian of the scene {scene.name} depends on time"
     if any(a >= data.dim for a in data.coordinates.angles):
-        return "--angles (angles=) names a momentum"
+        return "--angles names a momentum"
     return None
 
 

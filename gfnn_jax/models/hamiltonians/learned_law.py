@@ -285,7 +285,7 @@ def _unmet(tolerance: Tolerance, found: FittedLaw, law: LearnedHamiltonian) -> s
     """State why the tolerance is missed; "" where it is met."""
     if tolerance.met_by(law.candidate):
         return ""
-    why = "If you know terms of H, give them: --terms (terms=)"
+    why = "If you know terms of H, give them: --terms"
     if law.fast:
         why = (
             f"The motion turns by ωh = {law.omega_h:.2g} radians in a step; beyond π pairs of one "

@@ -268,7 +268,7 @@ def _grown(problem: LawProblem, basis: Modes) -> FittedLaw:
     if grown is None or not np.isfinite(grown.rms):
         raise FitError(
             f"expected more pairs: {len(data.y0)} determine no H of Fourier modes. If they are of "
-            "a map without a flow, use --learn map (learn='map')"
+            "a map without a flow, use --learn map"
         )
     work.capped((1 - options.growth_part) * options.mode_operations)
     count = int(np.ceil(options.rows_compared * len(grown.coefficients) / (2 * data.dim)))

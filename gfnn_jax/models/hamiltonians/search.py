@@ -139,7 +139,7 @@ def _check_resolved(problem: LawProblem, best: FittedLaw) -> None:
     if found >= MOST_SUBSTEPS:
         raise FitError(
             f"the H found is too fast: one dt needs {MOST_SUBSTEPS} substeps or more. Use a "
-            "smaller dt; if the pairs are of a map without a flow, use --learn map (learn='map')"
+            "smaller dt; if the pairs are of a map without a flow, use --learn map"
         )
 
 

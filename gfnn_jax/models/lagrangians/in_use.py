@@ -135,7 +135,7 @@ def _in_gauge(data: RecordingData, fit: LawFit) -> tuple[Lagrangian, np.ndarray,
     names, scale = data.recording.coordinates, 1.0
     gauge = (
         f"the mean inertia M11 (of {names[0]}) over the data is 1, the unit of L, R, gains and "
-        f"energies; --mass {names[0]}=VALUE (mass=) gives them theirs"
+        f"energies; --mass {names[0]}=VALUE gives them theirs"
     )
     for name, value in data.mass.items():
         q, i = fit.problem.states[:, : fit.form.dim], names.index(name)

@@ -248,7 +248,7 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
         flaws["the record gains energy that no input explains"] = (
             "a force is missing beside the inputs that are named"
             if best.law.num_inputs
-            else "if the system is driven, name its drive: --inputs NAME (inputs=); if not, it "
+            else "if the system is driven, name its drive: --inputs NAME; if not, it "
             "excites itself, as friction below zero does, which is no term of R"
         )
     return flaws | _trend(best.fit)
@@ -294,7 +294,7 @@ def _not_seen(gains: Gains) -> list[str]:
     """Warnings about inputs without a force."""
     return [
         f"no force of the input {u} is seen: its gain is within {OPTIONS.clear:g} standard errors "
-        f"of 0. Record a stronger or more varied {u}, or leave it out of --inputs (inputs=)"
+        f"of 0. Record a stronger or more varied {u}, or leave it out of --inputs"
         for u, forces in gains.items()
         if all(abs(gain) < OPTIONS.clear * error for gain, error in forces.values())
     ]

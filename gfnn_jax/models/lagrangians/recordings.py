@@ -91,17 +91,16 @@ class RecordingOptions:
 OPTIONS = RecordingOptions()
 DRIVEN = (
     "a drive that no column shows acts at {} rad/s: its waves stand among the inputs, with the "
-    "phase of the times in the file. Record the drive, and name it: --inputs (inputs=)"
+    "phase of the times in the file. Record the drive, and name it: --inputs"
 )
 
 EARLY = (
     "their times are late, as of a filter or of a second clock: shift the column. Or they answer "
-    "the motion, as a controller does, and do not drive it: name what drives it (--inputs, inputs=)"
+    "the motion, as a controller does, and do not drive it: name what drives it (--inputs)"
 )
 SERIES = (
     "powers up to {}, the highest tried, may be a series of another shape, and hold within the "
-    "motion recorded alone. Give a shape that you expect, as exp(-x), 1/x or cos(x): --terms "
-    "(terms=)"
+    "motion recorded alone. Give a shape that you expect, as exp(-x), 1/x or cos(x): --terms"
 )
 
 
@@ -301,7 +300,7 @@ def _without_role(recording: Recording) -> list[str]:
     """A message of columns that are inputs by their names, and that no role was given."""
     numbers = [name for name in recording.ignored if name in recording.factors]
     return [
-        f"column {name} is not used: if it drives the motion, name it: --inputs (inputs=)"
+        f"column {name} is not used: if it drives the motion, name it: --inputs"
         for name in by_name(numbers)["inputs"]
     ]
 
@@ -324,7 +323,7 @@ def _at_bound(options: SearchOptions, choice: FrictionChoice, dim: int) -> list[
 
 def _check(recording: Recording, input_hold: str, mass: Mapping[str, float] | None) -> None:
     if not recording.coordinates:
-        raise InputError(f"{recording.source}: no positions. Name them: --positions (positions=)")
+        raise InputError(f"{recording.source}: no positions. Name them: --positions")
     if input_hold not in ("auto", *HOLDS):
         raise InputError(f"expected input_hold auto, {', '.join(HOLDS)}, got {input_hold!r}")
     for name, value in (mass or {}).items():
@@ -423,8 +422,7 @@ def samples_of(
     if not np.all(scales.sigma > 0):
         name = observation.channels[int(np.argmin(scales.sigma))]
         raise InputError(
-            f"{name}: the noise of its times is not known: give it in seconds, --std {name}=1e-4 "
-            f"(std={{{name!r}: 1e-4}})"
+            f"{name}: the noise of its times is not known: give it in seconds, --std {name}=1e-4"
         )
     options = options or SearchOptions()
     if observation.crossed:
@@ -524,7 +522,7 @@ def _scale(data: RecordingData, told: bool) -> float:
     another mass than that of the first position."""
     first = data.problem.observation.coordinates[0]
     if told and {*data.mass} - {first}:
-        raise InputError(f"terms: told coefficients need the mass of {first}, if any (mass=)")
+        raise InputError(f"terms: told coefficients need the mass of {first}, if any (--mass)")
     return float(data.mass.get(first, 1.0))
 
 
@@ -629,7 +627,7 @@ def _check_identifiable(fit: LawFit) -> None:
         if not fit.linearised.unimitated(k) > OPTIONS.imitated:
             raise FitError(
                 f"{name}: not identifiable from this record, for coefficients of the law act as it "
-                "does. Write its value into --observe (observe=), or leave it out"
+                "does. Write its value into --observe, or leave it out"
             )
 
 

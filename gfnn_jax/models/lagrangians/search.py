@@ -129,7 +129,7 @@ def told_in(
                 continue
             raise InputError(
                 "terms: the coefficient of the first term in v**2 sets the scale of L, and is ½ of "
-                "the mass: give the mass instead (mass=, --mass)"
+                "the mass: give the mass instead (--mass)"
             )
         if of is not None:
             if of in [structure.terms[k] for k in structure.given]:

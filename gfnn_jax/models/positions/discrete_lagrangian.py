@@ -132,7 +132,7 @@ def triples_of(recording: Recording, *, sites: bool = False) -> Triples:
     if off > OPTIONS.even * dt:
         raise FitError(
             f"{recording.source}: a map needs positions at even times; the step is {dt:g} s, and "
-            f"some are off by {off:.2g} s. A law takes uneven times: --learn lagrangian (learn=)"
+            f"some are off by {off:.2g} s. A law takes uneven times: --learn lagrangian"
         )
     whole = np.concatenate([recording.array("positions", run) for run in recording.runs])
     wrapped = bool(angles) and bool(np.nanmax(np.ptp(whole[:, angles], axis=0)) <= _ONE_TURN)
