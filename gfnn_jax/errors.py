@@ -20,9 +20,20 @@ _WORDS = (
 )
 _VALUE = rf"(?!(?:{_WORDS})\b)('[^']*'|[^\s()]+?)(?=[.,;:)]*(?:\s|$))"
 _TYPED = re.compile(rf"--([a-z][a-z-]+)(?: {_VALUE})?")
-_IN_PYTHON = {"from": "start", "event": "events"}
+_IN_PYTHON = {"from": "start", "event": "events", "states": "positions"}
 _FLAGS = ("overwrite", "resume", "keep", "strict", "quick")
-_TEXTS = ("learn", "structure", "chart", "family", "time", "friction", "to", "scene", "base")
+_TEXTS = (
+    "learn",
+    "structure",
+    "chart",
+    "family",
+    "time",
+    "time_unit",
+    "friction",
+    "to",
+    "scene",
+    "base",
+)
 _PAIRS = ("guess", "mass", "std")
 _PLACES = (None, "FILE", "NAME", "A,B")  # for a value that the reader knows
 _readers = ["python"]  # of the messages; the innermost last

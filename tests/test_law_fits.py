@@ -759,7 +759,7 @@ def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
     assert "--num-steps" in capsys.readouterr().err
     of_all = ["predict", model, "--initial", everything, "--out", str(out), "--overwrite"]
     assert main([*of_all, "--compare", everything]) == 2
-    assert "--to T" in capsys.readouterr().err
+    assert "end it by --to" in capsys.readouterr().err
     assert main([*of_all, "--compare", everything, "--to", "15"]) == 0  # the rest of one file
     assert " rad; " in capsys.readouterr().out
     assert np.genfromtxt(out, delimiter=",", names=True)["t"][0] == pytest.approx(15.05)

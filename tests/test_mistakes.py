@@ -157,7 +157,7 @@ def test_an_angle_that_is_wrapped_is_named():
         ]
         (said,) = unnamed_angles(gfnn.Pairs(*ends, 0.2), cartesian)
         assert "coordinate 1 of z: jumps of 2π in" in said
-        assert "--angles 1, angles=(1,)" in said
+        assert "name it: --angles 1" in said
         assert unnamed_angles(gfnn.Pairs(*ends, 0.2), Coordinates("cartesian", angles=(1,))) == []
     assert unnamed_angles(PAIRS, cartesian) == []
     kicked = gfnn.Pairs(Z0, rng.uniform(-3, 3, Z0.shape), 1.0)

@@ -50,7 +50,7 @@ def test_a_saved_law_is_the_same(heavy_top, tmp_path):
     one, other = (np.asarray(f.map.step(starts)[0]) for f in (fit, again))
     assert np.array_equal(one, other)
     for to, suffix in (("c", "c"), ("c-taylor", "c"), ("js", "js")):
-        told = rf"bracket of its own, se\(3\), of which --to {to} .*--to stablehlo.*--to latex"
+        told = rf"bracket of its own, se\(3\), of which to=.{to}. .*to=.stablehlo.*to=.latex"
         with pytest.raises(InputError, match=told):
             gfnn.export(fit, to, tmp_path / f"top.{suffix}")
     assert gfnn.export(fit, "latex", tmp_path / "top.tex").read_text().startswith("H = ")

@@ -283,15 +283,15 @@ REFUSED = {
     "t,x,v\n0,1,2\n1,2\n2,3,4\n": "line 3: 3 columns expected",
     "t,x,v\n0,1,2\n1,2,3,4\n2,3,4\n": "line 3: 3 columns expected",
     "t,x,x\n0,1,2\n1,2,3\n": " x ",
-    "0,1\n1,2\n": "--columns t,x",
+    "0,1\n1,2\n": r"columns=\['t', 'x'\]",
     "t,x\n": "expected rows of numbers",
     "t,x\n,1\n1,2\n": "line 2: t",
     "t,x\n0,inf\n1,2\n": "line 2, x",
     "t,x\n0,00,1,5\n0,10,1,6\n": "decimal commas",
-    "t [fortnight],x\n0,1\n1,2\n": "--time-unit",
+    "t [fortnight],x\n0,1\n1,2\n": "time_unit=",
     "t,x,v1,v2\n0,1,2,3\n1,2,3,4\n": "v1, v2 .* x",
     "": "expected rows of numbers",
-    "x\n1\n": "--dt",
+    "x\n1\n": "dt=",
 }
 
 

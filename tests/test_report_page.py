@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -16,11 +15,10 @@ from command_line import gfnn as command
 
 import gfnn_jax as gfnn
 from gfnn_jax.evaluate.page import page
-from gfnn_jax.evaluate.physics import physics
+from gfnn_jax.evaluate.physics import _count, _of_swings, _System, physics
 from gfnn_jax.exports.symbolic import Formula, as_latex, as_mathml, equations_of_motion
+from gfnn_jax.families.lagrangian import QUADRATIC, Friction
 from gfnn_jax.families.text import Term
-from gfnn_jax.jobs import run_record
-from gfnn_jax.jobs.output import Output
 
 OMEGA, DAMPING, REST = 3.0, 0.06, 0.2  # 1/s, 1/s, m
 
@@ -55,6 +53,18 @@ def test_quantities_are_those_of_the_oscillator():
         assert abs(found.value - value) < 4 * found.std, (name, found)
         assert found.std < 0.02 * abs(value)
     assert by_name["small swings: frequency"].unit == "Hz"
+
+
+def test_quadratic_friction_alone_has_no_damping_ratio():
+    system = _System.of(discovered().law)
+    drag = Friction(np.array([[1]]), np.array([QUADRATIC]), np.zeros(1))
+    law = dataclasses.replace(system.law, friction=drag, losses=np.array([0.1]), uniform=0.0)
+    system = system._replace(law=law, root=np.zeros((0, _count(law))))
+    rest = system.rests()[0][0]
+    names = [one.name for one in system.at_rest(rest, True, False)]
+    assert names == ["rest position, x", "small swings: frequency"]
+    quality = _of_swings(system.swings(rest), system)[1]
+    assert "depends on the amplitude" in quality.about
 
 
 def test_a_pendulum_slows_down_as_elliptic_integrals_say():
@@ -214,21 +224,6 @@ def test_options_of_columns_serve_the_one_command(tmp_path, monkeypatch, capsys)
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
-
-
-@pytest.mark.slow
-def test_what_look_proposes_is_taken_and_said(tmp_path, monkeypatch):
-    """Angles and a first time that `gfnn look` proposes, as though they had been typed."""
-    t, x = swing(12.0)
-    path = tmp_path / "swing.csv"
-    np.savetxt(path, np.stack([t, x], axis=1), "%.4f", ",", header="t,x")
-    proposed = SimpleNamespace(options={"angles": ("x",), "start": 2.0}, faults=())
-    monkeypatch.setattr(run_record, "look", lambda paths, columns: proposed)
-    ran = run_record.run_record(path, Output(tmp_path / "out"), columns={}, despite=("degrees",))
-    assert ran.learned.fit.data.angles == ("x",)
-    assert ran.learned.fit.data.times("0")[0] == pytest.approx(2.0)
-    text = (tmp_path / "out/report.html").read_text(encoding="utf-8")
-    assert "taken as gfnn look proposes: --angles x --from 2.0" in text
 
 
 @pytest.mark.slow

@@ -343,8 +343,8 @@ def time_unit_of(
         told = _time_unit(name, units)
         if told is None and given is None and _unit(units, name):
             raise InputError(
-                f"{source}: {name}: unit {units[name]!r} is not known: give --time-unit "
-                f"{'|'.join(SECONDS)}"
+                f"{source}: {name}: unit {units[name]!r} is not known; give it, one of "
+                f"{', '.join(SECONDS)}: --time-unit"
             )
         if told is not None and given is not None and clock_of(told) != clock_of(given):
             raise InputError(

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from gfnn_jax.coordinates import nearest_image
-from gfnn_jax.families.lagrangian import DRY, Lagrangian
+from gfnn_jax.families.lagrangian import DRY, LINEAR, ONE_SIDED, UNIFORM, Lagrangian
 from gfnn_jax.families.text import in_letters, measured
 from gfnn_jax.maps.laws import is_of_law, law_of_map
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
@@ -240,15 +240,16 @@ class _System(NamedTuple):
         found = self.rest_from(q)
         return q if found is None else found
 
-    def _smooth(self) -> Lagrangian:
-        """The law without dry friction, which has no linear part."""
-        kept = np.flatnonzero(self.law.friction.kinds != DRY)
+    def _viscous(self) -> Lagrangian:
+        """The law with the friction that has a part linear in the speed: other kinds make a decay
+        that depends on the amplitude, and no damping ratio."""
+        kept = np.flatnonzero(np.isin(self.law.friction.kinds, (LINEAR, UNIFORM, ONE_SIDED)))
         friction, losses = self.law.friction.take(kept), np.asarray(self.law.losses)[kept]
         return dataclasses.replace(self.law, friction=friction, losses=losses)
 
     def _linear(self, q: np.ndarray) -> np.ndarray:
         """The matrix (2d, 2d) of small motion (q, v) about rest."""
-        law, d = self._smooth(), self.law.dim
+        law, d = self._viscous(), self.law.dim
         speed = self.size * max(np.sqrt(np.max(np.abs(self._curvature(q)))), 1e-12)
         steps = OPTIONS.step * np.concatenate([self.size, speed])
         moved = np.concatenate([np.diag(steps), -np.diag(steps)])
@@ -425,6 +426,8 @@ def _of_swings(swings: Swings, system: _System) -> list[Quantity]:
     ]
     if np.isfinite(swings.quality[-1]):
         about = "2π × energy ÷ energy lost in a period, by all friction"
+        if system.law.friction.count > system._viscous().friction.count:
+            about += "; it depends on the amplitude, for not all friction is viscous"
         quality, error = float(swings.quality[-1]), float(swings.quality_std[-1])
         found.append(Quantity(f"{at}: quality factor Q", quality, error, "", about))
     return found
