@@ -5,11 +5,7 @@ stands where it has to. Of a ratio near one its distance from one is halved and 
 the RMS of one step on fresh states ÷ spread, cost the operations of a step of the chosen map; both
 relative to those of the constants as they are.
 
-The parity of S in three degrees of freedom and more (`generating_functions/parity.py`) is a guess
-from held-out residuals, made where terms are scarce: the second piece has it tested, always assumed
-and never assumed, on even and other laws.
-
-    python benchmarks/constants.py [--only halved-and-doubled,parity]
+    python benchmarks/constants.py
 """
 
 from __future__ import annotations
@@ -39,20 +35,6 @@ class System(NamedTuple):
     box: tuple[float, ...]
 
 
-def chained(q):
-    """−∇V of three oscillators with quartic couplings: V is even."""
-    left = q - np.roll(q, 1, axis=1)
-    right = np.roll(q, -1, axis=1) - q
-    return -q + 0.5 * (right**3 - left**3)
-
-
-def cubic(q):
-    """The same with cubic couplings: V is not even."""
-    left = q - np.roll(q, 1, axis=1)
-    right = np.roll(q, -1, axis=1) - q
-    return -q + 0.25 * (right**2 - left**2)
-
-
 def henon_heiles(q):
     x, y = q.T
     return -np.stack([x + 2 * x * y, y + x**2 - y**2], axis=1)
@@ -60,8 +42,6 @@ def henon_heiles(q):
 
 PENDULUM = System(lambda q: -np.sin(q), (1.5, 1.0))
 HENON_HEILES = System(henon_heiles, (0.3,) * 4)
-EVEN, ODD = System(chained, (0.5,) * 6), System(cubic, (0.5,) * 6)
-WEAKLY_ODD = System(lambda q: chained(q) + 0.1 * (cubic(q) + q), (0.5,) * 6)
 
 
 def moved(system: System, z: np.ndarray, dt: float = DT) -> np.ndarray:
@@ -311,32 +291,7 @@ def shown(row: dict[str, Any]) -> str:
     return "; ".join(moves) or "nothing changes"
 
 
-def parity(quick: bool) -> harness.Numbers:
-    """System and number of pairs -> the error with S tested for evenness, always even, never."""
-    found: dict[str, Any] = {}
-    counts = (320,) if quick else (320, 1_000)
-    for name, system in (("even", EVEN), ("weakly odd", WEAKLY_ODD), ("odd", ODD)):
-        for count in counts:
-            row = {}
-            # with_odd ≥ gain × without: of 0 it always holds, of infinity never.
-            for rule, gain in (("tested", None), ("always", 0.0), ("never", np.inf)):
-                value = value_of(f"{S}.parity", "OPTIONS.no_gain") if gain is None else gain
-                with set_to(f"{S}.parity", "OPTIONS.no_gain", value):
-                    out = learned(
-                        system,
-                        pairs_of(system, count),
-                        learn="map",
-                        family="polynomial",
-                        tolerance=1e-7,
-                    )
-                row[rule] = out._asdict()
-            found[f"{name}, {count} pairs"] = row
-            told = ", ".join(f"{r} {o['error']:.1e} ({o['label']})" for r, o in row.items())
-            print(f"{name}, {count} pairs: {told}", flush=True)
-    return found
-
-
-PIECES: harness.Pieces = {"halved-and-doubled": halved_and_doubled, "parity": parity}
+PIECES: harness.Pieces = {"halved-and-doubled": halved_and_doubled}
 
 
 def tables() -> None:
@@ -351,14 +306,6 @@ def tables() -> None:
             for name, row in rows.items()
         ]
         text.append(harness.markdown(heads, cells))
-    if "parity" in found:
-        rows = found["parity"]["measured"]
-        rules = ("tested", "always", "never")
-        cells = [
-            [name, *(f"{row[r]['error']:.1e} ({row[r]['label']})" for r in rules)]
-            for name, row in rows.items()
-        ]
-        text.append(harness.markdown(("parity of S, d = 3", *rules), cells))
     if text:
         text.append(harness.provenance(found))
         harness.between_markers(harness.TABLES, "constants", "\n\n".join(text))
@@ -367,4 +314,4 @@ def tables() -> None:
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
     enable_compile_cache(tempfile.mkdtemp())
-    harness.main(__doc__ or "", PIECES, "constants", tables, None, ("parity",))
+    harness.main(__doc__ or "", PIECES, "constants", tables, None)

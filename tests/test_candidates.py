@@ -14,9 +14,8 @@ from gfnn_jax.dataset.runs import identified
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
-from gfnn_jax.generating.charts import MIDPOINT, TYPE2
+from gfnn_jax.generating.charts import TYPE2
 from gfnn_jax.models.generating_functions import sweeps
-from gfnn_jax.models.generating_functions.parity import is_even
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.search.search import Search
 from gfnn_jax.storage.checkpoints import KeptFactors
@@ -158,23 +157,3 @@ def test_a_fit_that_goes_on_takes_the_factors_that_were_kept(monkeypatch, tmp_pa
     damaged = next((tmp_path / "factors").iterdir())
     damaged.write_bytes(damaged.read_bytes()[:100])
     assert again().ranking[0].candidate.label == "polynomial 4"
-
-
-@pytest.mark.parametrize(("odd", "even"), [(0.0, True), (1e-4, False), (1e-1, False)])
-def test_an_even_generating_function_is_known_by_its_pairs(odd, even, monkeypatch):
-    """A kick by the force −q − q³/2 − odd q² of each of three coordinates, and a drift."""
-    options = dataclasses.replace(sweeps.OPTIONS, most_terms=300)
-    monkeypatch.setattr(sweeps, "OPTIONS", options)  # degree 4
-    z = np.random.default_rng(0).uniform(-0.5, 0.5, (900, 6))
-    q, p = z[:, :3], z[:, 3:]
-    p = p - 0.1 * (q + q**3 / 2 + odd * q**2)
-    pairs = Pairs(z, np.concatenate([q + 0.1 * p, p], axis=1), 0.1)
-    data = Dataset.of(identified(pairs).pairs, Coordinates("cartesian")).divided(0)
-    assert is_even(data, (2, 4, 6), 300, 3) == even
-    assert not is_even(data, (2,), 300, 3)  # saves no more than six terms
-    (found,) = sweeps.sweeps_for("polynomial", [MIDPOINT], data, Tolerance(1e-6), None)
-    assert [size.family.degree for size in found.sizes] == ([2, 4] if even else [2, 3, 4])
-    if even:
-        judged = found.estimate(found.sizes[-1], Budget(), lambda message: None)
-        assert judged.label == "even polynomial 4"
-        assert judged.num_parameters == 21 + 126

@@ -1,6 +1,4 @@
-"""Symmetries of a law, and simple fractions near its numbers."""
-
-from fractions import Fraction
+"""Symmetries of a law."""
 
 import diffrax
 import jax.numpy as jnp
@@ -10,7 +8,6 @@ from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.families.terms import given_terms
-from gfnn_jax.models.hamiltonians.fitted_law import Term, fraction_near, proposals
 from gfnn_jax.models.hamiltonians.symmetries import LawNumbers, restricted, symmetries_of
 
 R = "sqrt(q1**2 + q2**2)"
@@ -80,29 +77,6 @@ def test_numbers_that_their_errors_tell_apart_are_left_so():
     found = restricted(family, LawNumbers(p, covariance, 3_000), states(2), ())
     assert not any("rotation" in text for text in found.symmetries)
     np.testing.assert_array_equal(found.numbers, p)
-
-
-def test_fractions_are_proposed_where_errors_allow():
-    assert fraction_near(0.49998, 4e-5) == Fraction(1, 2)
-    assert fraction_near(-0.333331, 2e-6) == Fraction(-1, 3)
-    assert fraction_near(0.49998, 4e-6) is None  # five standard errors away
-    assert fraction_near(0.51, 0.02) is None  # an error that allows too many
-    assert fraction_near(0.70710678, 1e-8) is None
-
-
-def test_a_random_number_is_seldom_near_a_fraction():
-    numbers = np.random.default_rng(0).uniform(0, 1, 300)
-    assert sum(fraction_near(x, 1e-5) is not None for x in numbers) < 0.02 * len(numbers)
-
-
-def test_ratios_are_proposed_with_the_error_of_a_ratio():
-    """Both numbers are known to 1 %, what they have in common is not in their ratio."""
-    own = 1e-2 * np.array([1.613, -0.8066])
-    covariance = np.outer(own, own) + np.diag([1e-5, 1e-5]) ** 2
-    terms = [Term("exp(q1)", 1.613, 1.6e-2), Term("exp(2*q1)", -0.80652, 8e-3)]
-    (found,) = proposals(terms, covariance, 0)
-    assert found.fraction == Fraction(-1, 2)
-    assert str(found).startswith("exp(2*q1) ÷ exp(q1): -0.5000")
 
 
 def test_diffrax_takes_the_vector_field_of_a_law():

@@ -142,7 +142,6 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
         "which_friction": which and {**_kinds(which), "text": str(which)},
         "constants": [term._asdict() for term in law.constants],
         "symmetries": list(law.symmetries),
-        "fractions": [str(p) for p in law.proposals],
         "rivals": [rival._asdict() for rival in law.rivals],
         "notes": list(law.notes),
         "dropped": law.dropped._asdict() if law.dropped is not None else None,

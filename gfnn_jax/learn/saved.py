@@ -22,7 +22,7 @@ from gfnn_jax.maps import saved as maps
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.arms.identify import BaseParameters, Columns, Identified, Prior
 from gfnn_jax.models.arms.learned_arm import LearnedArm
-from gfnn_jax.models.hamiltonians.fitted_law import Dropped, PartialLaw, Proposal, Rival
+from gfnn_jax.models.hamiltonians.fitted_law import Dropped, PartialLaw, Rival
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.calibration import Horizon
 from gfnn_jax.models.lagrangians.friction_choice import WhichFriction
@@ -60,7 +60,6 @@ for _kind in (
     NextMotion,
     OfInput,
     OfPositions,
-    Proposal,
     SymmetryOfPairs,
     Tolerance,
     Velocity,
@@ -147,7 +146,6 @@ def _portable(found: Choice | LearnedLaw | LearnedArm | None) -> Any:
             candidate=dataclasses.replace(law.candidate, map=None),
             covariance=None,
             kinds=law.which_friction,
-            proposals=tuple(p._replace(fraction=str(p.fraction)) for p in law.proposals),
         )
         law = law if maps.can_be_saved(law) else None  # a user's functions of z cannot
     without = dict.fromkeys(("pairs", "validation_pairs", "test_pairs", "scene", "budget"))

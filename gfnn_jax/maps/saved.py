@@ -124,6 +124,8 @@ _TYPES: dict[str, type] = {
     )
 } | {"LagrangianTerms": lagrangian.Terms}
 _NAMES = {kind: name for name, kind in _TYPES.items()}
+# What stands beside the items of a dict; and a field of laws that 0.4.0 saved.
+_ASIDE = {("dict", "keys"), ("LearnedHamiltonian", "proposals")}
 _TYPES["DampingOfArgs"] = Damping  # in maps that 0.3 saved
 
 
@@ -379,7 +381,7 @@ def _decode(text: Any, arrays: Any, scene: Scene | None) -> Any:
     items = {}
     for name in {**text, **(arrays or {})}:
         numbers = (arrays or {}).get(name)
-        if name == "type" or (kind, name) == ("dict", "keys"):
+        if name == "type" or (kind, name) in _ASIDE:
             continue
         if name == "features" and text[name] == _OF_SCENE:
             if scene is None or scene.features is None:

@@ -40,7 +40,6 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, AnyChart
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.piece import Affine, Damping
-from gfnn_jax.models.generating_functions.parity import is_even
 
 # Operations of singular values, ÷ terms³; and of a step in NumPy, in units that take as long.
 OF_SOLVE, OF_STEPS = 22.0, 20.0
@@ -151,9 +150,6 @@ def part_of_noise(
     return noise / (noise + uncertainty.misfit(explained, further, each) / rows)
 
 
-_EVEN_DEGREES = tuple((degree,) for degree in (2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 24, 28, 32))
-
-
 def sweeps_for(
     request: Any,
     charts: Sequence[AnyChart],
@@ -175,16 +171,11 @@ def sweeps_for(
         return
     features = scene.features if scene is not None else None
     polynomials = request in ("auto", "polynomial")
-    free = polynomials and (scene is None or scene.reversor is None)
-    degrees = [degree for (degree,) in _EVEN_DEGREES]
-    even = free and is_even(data, degrees, OPTIONS.most_terms, ROWS_PER_TERM)
     for chart in charts:
-        # Only the midpoint S inherits the parity.
+        # Only the midpoint S inherits the reversor.
         reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
         if polynomials:
-            yield LinearSweep(
-                data, tolerance, chart, Linear("polynomial", None, reversor, even), factors
-            )
+            yield LinearSweep(data, tolerance, chart, Linear("polynomial", None, reversor), factors)
         if request in ("auto", "features") and features is not None:
             yield LinearSweep(
                 data, tolerance, chart, Linear("features", features, reversor), factors
@@ -201,14 +192,12 @@ def sweep_of_dt(data: Dataset, tolerance: Tolerance, scene, factors=None) -> Lin
 
 @dataclasses.dataclass(frozen=True)
 class Linear:
-    """A kind of linear families. features, reversor: a scene's, as `box_inputs` takes them. even:
-    whether S(−w) = S(w), and has even terms only. own: a user's families, of the inputs, by rising
-    number of terms."""
+    """A kind of linear families. features, reversor: a scene's, as `box_inputs` takes them. own: a
+    user's families, of the inputs, by rising number of terms."""
 
     kind: str
     features: Any = None
     reversor: Any = None
-    even: bool = False
     own: Callable[[Inputs], Iterable[Any]] | None = None
 
 
@@ -228,9 +217,8 @@ class LinearSweep(Generates):
         of: Linear,
         factors: Any = None,
     ):
-        kind, even, own = of.kind, of.even, of.own
-        reversor = (-1,) * 2 * data.dim if even else of.reversor
-        self._kept, self._prefix = factors, "even " if even else ""
+        kind, reversor, own = of.kind, of.reversor, of.own
+        self._kept = factors
         self.data, self.tolerance, self.chart, self.kind = data, tolerance, chart, kind
         self._train, self._weight = weighted_rows_of(data, chart, data.training)
         self._held, _ = weighted_rows_of(data, chart, data.validation)
@@ -240,7 +228,6 @@ class LinearSweep(Generates):
         if data.own_dt is not None:
             made, args = _of_time_step, data.own_dt[data.training, None] ** 2
         inputs = inputs_of(data, w, features=of.features, reversor=reversor, args=args)
-        degrees = _EVEN_DEGREES if even else OPTIONS.degrees
         signs = None
         if kind != "sines" and own is None and reversor is not None:
             signs = variable_signs(inputs, reversor, w)
@@ -250,9 +237,10 @@ class LinearSweep(Generates):
                 return ([family] for family in own(inputs))
             if kind == "sines":
                 return ([Sines(inputs, count)] for count in OPTIONS.sines)
-            return ((made(inputs, degree, signs) for degree in g) for g in degrees)
+            return ((made(inputs, degree, signs) for degree in g) for g in OPTIONS.degrees)
 
-        known = len(OPTIONS.sines) if kind == "sines" or own is not None else sum(map(len, degrees))
+        counted = kind == "sines" or own is not None
+        known = len(OPTIONS.sines) if counted else sum(map(len, OPTIONS.degrees))
         # Test rows determine a size too: once they have stated its error, it is fitted to them.
         rows = self._train[1].size + len(data.test) * self._width
         self._groups, self._determining = groups, rows
@@ -268,7 +256,7 @@ class LinearSweep(Generates):
 
     def named(self, size: Size) -> str:
         """Name of the unit that estimates the size."""
-        return f"{self.chart.name} {self._prefix}{size.family.label}"
+        return f"{self.chart.name} {size.family.label}"
 
     def work(self, size: Size) -> float:
         """Operations that estimating the size takes: its group's factor, if it is not there yet."""
@@ -329,7 +317,7 @@ class LinearSweep(Generates):
             label = f"{family.name} {(terms := round(2**order))}"
         else:
             degree = round(order)
-            label = f"{self._prefix}{family.name} {degree}"
+            label = f"{family.name} {degree}"
             terms = family.terms_of(degree)
         fitted = len(self._train[0]) + len(self.data.test)
         share = fitted / (fitted + len(self.data.validation))
@@ -640,7 +628,7 @@ class LinearSweep(Generates):
         error = estimated_error(self.data, self.tolerance, held_rms)
         return Candidate.of(
             error,
-            label=f"{self._prefix}{size.family.label}",
+            label=f"{size.family.label}",
             family=self.kind,
             chart=self.chart.name,
             num_parameters=size.family.num_parameters,

@@ -27,7 +27,7 @@ from gfnn_jax.errors import InputError, OutOfTime
 from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_with_constants
 from gfnn_jax.flows.collocation import Steps, operations
-from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw, PartialLaw, Rival, Term, proposals
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw, PartialLaw, Rival, Term
 from gfnn_jax.models.hamiltonians.fitted_law import formula as formula_of
 from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.sequences import OPTIONS as ARCS
@@ -339,8 +339,6 @@ def _law(problem: LawProblem, formula: Formula, fitted: Fitted) -> FittedLaw:
     inside = [j for j, places in enumerate(formula.numbers) for _ in places]
     names = [family.term_names[j] for j in inside]
     inner = tuple(map(Term, names, constants, deviations[terms:].tolist()))
-    coefficients = map(Term, family.term_names, c.tolist(), deviations.tolist())
-    near = proposals([*coefficients, *inner], covariance, len(inner))
     fit = problem.flows.fit(family, c, data.training, rounds=False)
     fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
     return FittedLaw(
@@ -353,7 +351,6 @@ def _law(problem: LawProblem, formula: Formula, fitted: Fitted) -> FittedLaw:
         whole=summary_of(fitted, _covariance_root_of_coefficients(covariance, terms)),
         constants=inner,
         symmetries=known.symmetries,
-        proposals=near,
     )
 
 

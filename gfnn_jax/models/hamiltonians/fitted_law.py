@@ -1,14 +1,9 @@
-"""A law as fitted, and H as text: its terms with coefficients, as people and as programs read it.
-
-Simple fractions near the numbers of a law are proposed where their errors allow, and never taken.
-"""
+"""A law as fitted, and H as text: its terms with coefficients, as people and as programs read it."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from fractions import Fraction
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,10 +13,6 @@ from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.families.text import Term, added, digits, plain
 from gfnn_jax.fitting.gauss_newton import FlowFit
-
-# Fractions: the largest denominator that is tried, the distance from the number in standard errors,
-# and the chance that some fraction as simple is as near (benchmarks/textbook_noise.py).
-_DENOMINATORS, _NEAR, _CHANCE = 12, 2.0, 0.02
 
 
 class Rival(NamedTuple):
@@ -82,61 +73,6 @@ def _is_sum(term: str) -> bool:
     return any(depth[i] == 0 and term[i : i + 3] in (" + ", " - ") for i in range(len(term)))
 
 
-class Proposal(NamedTuple):
-    """A number of a law, or the ratio of two, and the fraction that it may be."""
-
-    name: str
-    value: float
-    std: float
-    fraction: Fraction
-
-    def __str__(self) -> str:
-        """The number with its error: "p1²: 0.49998 ± 2e-05 → 1/2"."""
-        digits = int(np.clip(np.ceil(-np.log10(self.std)) + 1, 2, 15)) if self.std > 0 else 15
-        return f"{self.name}: {self.value:.{digits}f} ± {self.std:.0e} → {self.fraction}"
-
-
-def fraction_near(value: float, std: float) -> Fraction | None:
-    """The simplest fraction within two standard errors, where it is unlikely to be there by chance.
-
-    Of fractions with denominators up to b there are Σ φ(k), k ≤ b, in every unit.
-    """
-    among = 0
-    for b in range(1, _DENOMINATORS + 1):
-        among += sum(np.gcd(k, b) == 1 for k in range(1, b + 1))
-        found = Fraction(round(value * b), b)
-        if found and abs(value - found) <= _NEAR * std:
-            return found if 2 * _NEAR * std * among <= _CHANCE else None
-    return None
-
-
-def proposals(
-    terms: Sequence[Term], covariance: np.ndarray, constants: int
-) -> tuple[Proposal, ...]:
-    """Fractions near numbers with this covariance, the last so many of them constants inside terms;
-    of those that are near none, fractions near their ratios, coefficients and constants apart."""
-    found, rest = [], []
-    for k, term in enumerate(terms):
-        near = fraction_near(term.coefficient, term.std)
-        inside = k >= len(terms) - constants
-        name = f"the constant in {term.term}" if inside else term.term
-        if near is None:
-            rest.append((k, name, inside))
-        else:
-            found.append(Proposal(name, term.coefficient, term.std, near))
-    for (i, first, a), (j, second, b) in combinations(rest, 2):
-        if a != b:
-            continue
-        x, y = terms[i].coefficient, terms[j].coefficient
-        slope = np.array([-y / x**2, 1 / x])
-        own = np.ix_([i, j], [i, j])
-        std = float(np.sqrt(slope @ covariance[own] @ slope))
-        near = fraction_near(y / x, std)
-        if near is not None:
-            found.append(Proposal(f"{second} ÷ {first}", y / x, std, near))
-    return tuple(found)
-
-
 class Dropped(NamedTuple):
     """Terms that went because the pairs do not ask for them, and what that cost: the held-out error
     ÷ spread with them and without."""
@@ -170,7 +106,7 @@ class FittedLaw(NamedTuple):
     of those. thresholds: standard errors below which its terms go, in turn; None: as of the
     options. dropped: terms that went in the end. whole:
     what whole sequences tell, where they were fitted. constants: numbers inside terms that were
-    fitted with them. symmetries, proposals, rivals: as of `LearnedHamiltonian`. odds: of the kinds
+    fitted with them. symmetries, rivals: as of `LearnedHamiltonian`. odds: of the kinds
     of its friction against others, where these competed."""
 
     family: Any  # of terms of H, or of L, with friction or without
@@ -188,7 +124,6 @@ class FittedLaw(NamedTuple):
     whole: SequenceFit | None = None
     constants: tuple[Term, ...] = ()
     symmetries: tuple[str, ...] = ()
-    proposals: tuple[Proposal, ...] = ()
     rivals: tuple[Rival, ...] = ()
     odds: dict[tuple[int, ...], float] | None = None
 

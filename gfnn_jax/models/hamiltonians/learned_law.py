@@ -30,7 +30,6 @@ from gfnn_jax.models.hamiltonians.covariance import covariance_root
 from gfnn_jax.models.hamiltonians.fitted_law import (
     Dropped,
     FittedLaw,
-    Proposal,
     Rival,
     Term,
     as_code,
@@ -71,9 +70,8 @@ class LearnedHamiltonian:
     it is met. ended: what cut the search for it short, "" where nothing did. dropped: terms that
     went in the end. friction: γ where that is uniform, else the terms of Rayleigh's R; of a system
     without, (). constants: numbers inside terms that noisy sequences told, each with its term and
-    its standard error. symmetries: that H has to roundoff. proposals: simple fractions near its
-    numbers, which noisy sequences allow. constrained: H in the coefficients that were fitted, where
-    others are told. rivals: the next two laws that they allow. misfit: whether
+    its standard error. symmetries: that H has to roundoff. constrained: H in the coefficients that
+    were fitted, where others are told. rivals: the next two laws that they allow. misfit: whether
     these sequences are certain that H lacks something.
     """
 
@@ -95,7 +93,6 @@ class LearnedHamiltonian:
     friction: tuple[Term, ...] = ()
     constants: tuple[Term, ...] = ()
     symmetries: tuple[str, ...] = ()
-    proposals: tuple[Proposal, ...] = ()
     rivals: tuple[Rival, ...] = ()
     misfit: bool = False
     widths: tuple[float, ...] = ()
@@ -156,16 +153,13 @@ class LearnedHamiltonian:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Lines about H beside its formula: constants inside, symmetries, fractions, rivals."""
+        """Lines about H beside its formula: constants inside, symmetries, rivals."""
         found = []
         if self.constants:
             text = ", ".join(f"{c.coefficient:g} ± {c.std:.0e} in {c.term}" for c in self.constants)
             found.append(f"constants inside: {text}")
         if self.symmetries:
             found.append(f"symmetries: {'; '.join(self.symmetries)}")
-        if self.proposals:
-            text = ", ".join(map(str, self.proposals))
-            found.append(f"near simple fractions, which are not taken: {text}")
         if self.rivals:
             text = "; ".join(f"{odds_text(r.odds)} against {r.formula}" for r in self.rivals)
             found.append(f"odds by description length: {text}")
@@ -263,7 +257,6 @@ def learned_from(
         friction=friction,
         constants=found.constants,
         symmetries=symmetries,
-        proposals=found.proposals,
         rivals=found.rivals,
         widths=widths,
         turns=turns and problem.met_by(found) and error.bound > problem.tolerance.bound,
