@@ -1,4 +1,4 @@
-"""A law as fitted, and H as text: its terms with coefficients, as people and as programs read it."""
+"""A law as fitted, and H as text: its terms with coefficients, for people and for programs."""
 
 from __future__ import annotations
 
