@@ -21,7 +21,7 @@ from gfnn_jax.exports.casadi_function import casadi_function
 from gfnn_jax.exports.fmu import fmu
 from gfnn_jax.exports.javascript import javascript
 from gfnn_jax.exports.jax_source import jax_source
-from gfnn_jax.exports.links import mjcf, urdf
+from gfnn_jax.exports.robots import mjcf, urdf
 from gfnn_jax.flows.damped import DampedFlow
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.lie import LieFlow

@@ -1,4 +1,4 @@
-"""A law that is a planar chain of links, as MJCF (MuJoCo) and URDF.
+"""Bodies on joints, of a law: an arm that was learned as one, or a planar chain of links.
 
 With absolute angles θ_i from where links hang, a chain has
 
@@ -14,16 +14,16 @@ choices move alike.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from itertools import permutations
-from typing import Any
-from xml.sax.saxutils import escape, quoteattr
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.exports import arms
 from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian
+from gfnn_jax.families.rigid_bodies import PER_LINK
+from gfnn_jax.flows.bodies import BodiesLaw
 from gfnn_jax.maps.laws import bodies_of_map, is_of_law, law_of_map
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
@@ -36,48 +36,59 @@ class Options:
 
     states: random ones at which the law is compared with a chain. most: difference of masses and
     forces of a chain, relative to those of the law, beyond which it is none. still: part of the
-    masses × (rates of the data)², below which gravity is none. longest: a step of MuJoCo, seconds.
+    masses × (rates of the data)², below which gravity is none.
     """
 
     states: int = 200
     most: float = 0.05
     still: float = 1e-9
-    longest: float = 1e-3
 
 
 OPTIONS = Options()
 
 
-@dataclasses.dataclass(frozen=True)
-class Links:
-    """The links of a chain, from its base, and what acts on its joints.
+class Link(NamedTuple):
+    """A link: its joint's name, the number of the link that it is on, whether it slides; its mass,
+    centre (3,) and inertia (3, 3) about that; rotation and origin of the joint's frame, its axis
+    (3,), the inertia of its rotor, and how long it is drawn."""
 
-    masses, lengths, centres, inertias: (d,). zeros: (d,) the coordinate of each joint where the
-    links hang in line. joints: (d, d), the measured coordinates of those of the joints. damping,
-    dry: rows (direction (d,) in the joints' velocities, coefficient). inputs: name -> (d,) torques
-    of the joints for a unit. gravity: 0 where there is none. off: by how much the law differs from
-    this chain. notes: what a file cannot hold, and what was chosen.
+    name: str
+    parent: int
+    slides: bool
+    mass: float
+    centre: np.ndarray
+    inertia: np.ndarray
+    rotation: Any
+    origin: np.ndarray
+    axis: np.ndarray
+    rotor: float = 0.0
+    length: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Robot:
+    """Links on joints, and what acts on them.
+
+    damping, dry: rows (direction (n,) in the joints' velocities, coefficient). inputs: name -> (n,)
+    forces of the joints for a unit. gravity: (3,). notes: what a file cannot hold, and what was
+    chosen. dt: of the map.
     """
 
-    masses: np.ndarray
-    lengths: np.ndarray
-    centres: np.ndarray
-    inertias: np.ndarray
-    zeros: np.ndarray
-    joints: np.ndarray
+    links: list[Link]
     damping: list[tuple[np.ndarray, float]]
     dry: list[tuple[np.ndarray, float]]
     inputs: dict[str, np.ndarray]
-    gravity: float
-    off: float
+    gravity: np.ndarray
     notes: list[str]
-    names: tuple[str, ...]
     dt: float
 
 
-def links_of(map_: SymplecticMap) -> Links:
-    """The links of the law of a map. Raises InputError where it is no planar chain, or no link of
-    positive inertia explains it."""
+def robot_of(map_: SymplecticMap) -> Robot:
+    """The links of the law of a map. Raises InputError where it is neither an arm nor a planar
+    chain, or no link of positive inertia explains it."""
+    arm = bodies_of_map(map_)
+    if arm is not None:
+        return _of_arm(map_, arm)
     if not is_of_law(map_):
         raise InputError("expected a law of a recording: only a Lagrangian has links; use --to c")
     law, dim = law_of_map(map_), map_.dim
@@ -102,7 +113,7 @@ def links_of(map_: SymplecticMap) -> Links:
             f"this law is no planar chain of links, from which it differs by {best.off:.0%}: use "
             "--to fmu or --to c"
         )
-    return _with_forces(map_, law, best)
+    return _of_chain(map_, law, best)
 
 
 def _conventions(dim: int) -> Iterator[np.ndarray]:
@@ -196,28 +207,41 @@ def _masses(chain: _Chain, lengths: np.ndarray, beta: np.ndarray) -> tuple[np.nd
     )
 
 
-def _with_forces(map_: SymplecticMap, law: Lagrangian, chain: _Chain) -> Links:
-    """The links, and friction and inputs in the coordinates of the joints."""
+def _of_rows(
+    friction: Any, losses: Any, turn: np.ndarray
+) -> tuple[list[tuple[np.ndarray, float]], list[tuple[np.ndarray, float]], list[str]]:
+    """Rows of damping and of dry friction, directions times ``turn``, and a note on others."""
+    rows: dict[int, list[tuple[np.ndarray, float]]] = {LINEAR: [], DRY: []}
+    notes: list[str] = []
+    for row, kind, size in zip(
+        friction.directions, friction.kinds.tolist(), np.asarray(losses), strict=True
+    ):
+        if kind in rows:
+            rows[kind].append((row @ turn, float(size)))
+        else:
+            notes = ["friction that is not linear or dry is left out: these formats have none"]
+    return rows[LINEAR], rows[DRY], notes
+
+
+def _of_chain(map_: SymplecticMap, law: Lagrangian, chain: _Chain) -> Robot:
+    """The links, and friction and inputs in the coordinates of the joints, which turn about y."""
+    from scipy.spatial.transform import Rotation  # loaded when first used
+
     lengths, beta, gravity, notes = _lengths(chain)
     masses, centres, inertias = _masses(chain, lengths, beta)
     dim = map_.dim
     joints = np.linalg.inv(chain.turn) @ np.tril(np.ones((dim, dim)))  # q = joints φ + …
     zeros = np.diff(chain.zeros, prepend=0.0)
     zeros = np.where(np.abs(zeros) > 1e-12, zeros, 0.0)
-    sensors, damping, dry = map_.sensors, [], []
-    for row, kind, size in zip(
-        law.friction.directions, law.friction.kinds, np.asarray(law.losses), strict=True
-    ):
-        if kind in (LINEAR, DRY):
-            (damping if kind == LINEAR else dry).append((row @ joints, float(size)))
-        else:
-            notes.append("friction that is not linear or dry is left out: these formats have none")
+    damping, dry, left_out = _of_rows(law.friction, law.losses, joints)
+    notes = [f"the law differs from this chain by {chain.off:.1e} of itself", *notes, *left_out]
     if law.uniform and dim == 1:
         damping.append((np.ones(1), float(law.uniform) * float(chain.a[0])))
     elif law.uniform:
         notes.append("friction in proportion to the momenta is left out: these formats have none")
     named = map_.signals.names if map_.signals is not None else ()
     gains = joints.T @ np.asarray(law.gains).reshape(dim, len(named))
+    sensors = map_.sensors
     names = sensors.positions if sensors is not None else tuple(f"q{i + 1}" for i in range(dim))
     notes.append("L is known up to a factor where no mass is: masses, inertias and torques have it")
     notes.append("each link has the mass of a uniform rod, or less: L does not determine it")
@@ -225,143 +249,55 @@ def _with_forces(map_: SymplecticMap, law: Lagrangian, chain: _Chain) -> Links:
         rows = [" + ".join(f"joint{j + 1}" for j in range(dim) if row[j]) for row in joints.round()]
         told = (f"{n} = {row}" for n, row in zip(names, rows, strict=True))
         notes.append(f"the columns of the data: {', '.join(told)}")
-    return Links(
-        masses,
-        lengths,
-        centres,
-        inertias,
-        zeros,
-        joints,
-        damping,
-        dry,
-        dict(zip(named, gains.T, strict=True)),
-        gravity,
-        chain.off,
-        notes,
-        names,
-        float(map_.dt),
-    )
-
-
-def _text(value: float) -> str:
-    return f"{float(value) + 0.0:.17g}"  # no -0
-
-
-def _comment(links: Links, about: Mapping[str, Any]) -> str:
-    lines = [f"{key}: {value}" for key, value in about.items()]
-    lines += [f"the law differs from this chain by {links.off:.1e} of itself", *links.notes]
-    listed = "\n".join(f"  {line}" for line in lines).replace("--", "- -")
-    return f"<!--\n{escape(listed)}\n-->"
-
-
-def _of_joint(row: np.ndarray) -> int | None:
-    """The joint whose velocity alone a row has, by ±1; None of others."""
-    at = np.flatnonzero(np.abs(row) > 1e-12)
-    return int(at[0]) if len(at) == 1 and abs(abs(row[at[0]]) - 1) < 1e-12 else None
-
-
-def _own(rows: list[tuple[np.ndarray, float]], joint: int) -> float:
-    return sum(size for row, size in rows if _of_joint(row) == joint)
-
-
-def mjcf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
-    """Write the chain of links of a law as MJCF, which MuJoCo reads.
-
-    ``qpos`` are the angles of the joints, as the data have them where these are relative. Viscous
-    friction is damping; dry friction ``frictionloss``, by MuJoCo's soft constraints; that between
-    links that share no joint acts along tendons; inputs are motors. Raises InputError where the law
-    is no chain. An arm that was learned as one is written whole (`exports.arms`).
-    """
-    arm = bodies_of_map(map_)
-    if arm is not None:
-        return arms.mjcf(map_, arm, name, about)
-    links = links_of(map_)
-    dim, step = map_.dim, min(links.dt, OPTIONS.longest)
-    body, tendons, motors = "", [], []
-    for j in reversed(range(dim)):
-        above = links.lengths[j - 1] if j else 0.0
-        inertia = links.inertias[j]
-        long = links.lengths[j] or 2 * links.centres[j] or 1.0
-        inside = f"""\
-<body name="link{j + 1}" pos="0 0 {_text(-above)}">
-  <joint name="joint{j + 1}" type="hinge" axis="0 1 0" ref="{_text(links.zeros[j])}"
-    damping="{_text(_own(links.damping, j))}" frictionloss="{_text(_own(links.dry, j))}"/>
-  <inertial pos="0 0 {_text(-links.centres[j])}" mass="{_text(links.masses[j])}"
-    diaginertia="{_text(inertia)} {_text(inertia)} {_text(1e-3 * inertia)}"/>
-  <geom type="capsule" size="{_text(0.02 * abs(long))}" fromto="0 0 0 0 0 {_text(-long)}"
-    contype="0" conaffinity="0"/>
-{body}</body>"""
-        body = "\n".join(f"  {line}" for line in inside.splitlines()) + "\n"
-
-    def along(row: np.ndarray, **attributes: float) -> str:
-        own = "".join(
-            f'<joint joint="joint{j + 1}" coef="{_text(c)}"/>' for j, c in enumerate(row) if c
+    down = np.array([0.0, 0.0, -1.0])
+    links = [
+        Link(
+            f"joint{j + 1}",
+            j - 1,
+            False,
+            masses[j],
+            centres[j] * down,
+            inertias[j] * np.diag([1.0, 1.0, 1e-3]),
+            Rotation.from_euler("y", -zeros[j]),
+            (lengths[j - 1] if j else 0.0) * down,
+            np.array([0.0, 1.0, 0.0]),
+            length=lengths[j] or 2 * centres[j] or 1.0,
         )
-        listed = "".join(f' {key}="{_text(value)}"' for key, value in attributes.items())
-        tendons.append(f'  <fixed name="along{len(tendons) + 1}"{listed}>{own}</fixed>')
-        return f"along{len(tendons)}"
-
-    for key, rows in (("damping", links.damping), ("frictionloss", links.dry)):
-        for row, size in rows:
-            if _of_joint(row) is None:
-                along(row, **{key: size})
-    for own, row in links.inputs.items():
-        motors.append(f'  <motor name={quoteattr(own)} tendon="{along(row)}"/>')
-    parts = [
-        f"<mujoco model={quoteattr(name)}>",
-        _comment(links, about),
-        '<compiler angle="radian" inertiafromgeom="false" boundmass="0" boundinertia="0"/>',
-        arms.stiff_friction(step),
-        f'<option timestep="{_text(step)}" gravity="0 0 {_text(-links.gravity)}" '
-        f'integrator="{"implicitfast" if links.dry else "RK4"}"/>',
-        f"<worldbody>\n{body}</worldbody>",
-        *(["<tendon>", *tendons, "</tendon>"] if tendons else []),
-        *(["<actuator>", *motors, "</actuator>"] if motors else []),
-        "</mujoco>\n",
+        for j in range(dim)
     ]
-    return "\n".join(parts)
+    inputs = dict(zip(named, gains.T, strict=True))
+    return Robot(links, damping, dry, inputs, gravity * down, notes, float(map_.dt))
 
 
-def urdf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
-    """Write the chain of links of a law as URDF: its joints turn about y, links hang along −z.
+def _of_arm(map_: SymplecticMap, law: BodiesLaw) -> Robot:
+    """The links of an arm: masses, centres and inertias as learned, all possible."""
+    from scipy.spatial.transform import Rotation
 
-    Friction of joints is in ``dynamics``; what URDF cannot hold, friction between others and
-    inputs, is told in its comment. Raises InputError where the law is no chain. An arm that was
-    learned as one is written whole (`exports.arms`).
-    """
-    arm = bodies_of_map(map_)
-    if arm is not None:
-        return arms.urdf(arm, name, about)
-    links = links_of(map_)
-    told = [
-        f"friction along {row.tolist()} of the joints' velocities is left out: URDF has none"
-        for row, _ in (*links.damping, *links.dry)
-        if _of_joint(row) is None
-    ]
-    told += [
-        f"torques of the joints for a unit of {own}: {row.tolist()}"
-        for own, row in links.inputs.items()
-    ]
-    links = dataclasses.replace(links, notes=[*links.notes, *told])
-    parts = ['<?xml version="1.0"?>', f"<robot name={quoteattr(name)}>", _comment(links, about)]
-    parts.append('<link name="base"/>')
-    for j in range(map_.dim):
-        above = links.lengths[j - 1] if j else 0.0
-        inertia = _text(links.inertias[j])
-        parts.append(f"""\
-<joint name="joint{j + 1}" type="continuous">
-  <parent link="{f"link{j}" if j else "base"}"/>
-  <child link="link{j + 1}"/>
-  <origin xyz="0 0 {_text(-above)}" rpy="0 {_text(-links.zeros[j])} 0"/>
-  <axis xyz="0 1 0"/>
-  <dynamics damping="{_text(_own(links.damping, j))}" friction="{_text(_own(links.dry, j))}"/>
-</joint>
-<link name="link{j + 1}">
-  <inertial>
-    <origin xyz="0 0 {_text(-links.centres[j])}"/>
-    <mass value="{_text(links.masses[j])}"/>
-    <inertia ixx="{inertia}" iyy="{inertia}" izz="{_text(1e-3 * links.inertias[j])}"
-      ixy="0" ixz="0" iyz="0"/>
-  </inertial>
-</link>""")
-    return "\n".join([*parts, "</robot>\n"])
+    bodies, links = law.bodies, []
+    for i, name in enumerate(bodies.names):
+        m, *rest = np.asarray(law.parameters)[PER_LINK * i : PER_LINK * (i + 1)]
+        centre, about = np.array(rest[:3]) / m, np.zeros((3, 3))
+        about[np.triu_indices(3)] = rest[3:]
+        about = about + np.triu(about, 1).T
+        about = about - m * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+        links.append(
+            Link(
+                name,
+                bodies.parents[i],
+                bodies.sliding[i],
+                float(m),
+                centre,
+                about,
+                Rotation.from_matrix(np.asarray(bodies.rotations[i])),
+                np.asarray(bodies.origins[i]),
+                np.asarray(bodies.axes[i]),
+                float(law.rotors[i]),
+            )
+        )
+    damping, dry, left_out = _of_rows(law.friction, law.losses, np.eye(len(links)))
+    offsets = ", ".join(f"{n} {c:.6g}" for n, c in zip(bodies.names, law.offsets, strict=True))
+    notes = [f"constant forces that the joints hold against, left out: {offsets}", *left_out]
+    named = map_.signals.names if map_.signals is not None else ()
+    inputs = dict(zip(named, np.asarray(law.gains).T, strict=True))
+    gravity = np.asarray(bodies.gravity, float)
+    return Robot(links, damping, dry, inputs, gravity, notes, float(map_.dt))

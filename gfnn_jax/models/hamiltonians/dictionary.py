@@ -23,7 +23,7 @@ from gfnn_jax.budget import FLOW, MATCHING
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.rows import of_differences
 from gfnn_jax.dataset.runs import next_of
-from gfnn_jax.errors import InputError, OutOfTime
+from gfnn_jax.errors import InputError
 from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_with_constants
 from gfnn_jax.flows.collocation import Steps, operations
@@ -107,13 +107,10 @@ def law_of_physics(problem: LawProblem) -> FittedLaw | None:
     for name, contents, allowed in OPTIONS.dictionaries:
         if law is not None or not allowed[data.dim - 1]:
             continue
-        try:
-            with work.budget.unit(name, MATCHING, allowed[data.dim - 1]):
-                law = search.law(**dict.fromkeys(contents, True))
-        except OutOfTime:
-            work.budget.leave_out(name, work.ended)
-            return None
-        except np.linalg.LinAlgError:
+        searched = False
+        with work.optional(name), work.budget.unit(name, MATCHING, allowed[data.dim - 1]):
+            law, searched = search.law(**dict.fromkeys(contents, True)), True
+        if not searched:
             return None
     if law is None:
         for partial in search.partial:
@@ -123,16 +120,13 @@ def law_of_physics(problem: LawProblem) -> FittedLaw | None:
             problem.partly(PartialLaw(shown, partial.left, "of the spread"))
         return None
     family, start = _without_nothing(law, data.y0[rows], data.scale)
-    try:
-        # Whatever it took to fit the libraries before, this law is close to its optimum.
-        with work.again(f"H of {family.num_parameters} terms", family, len(rows)):
-            found = problem.fitted(family, start, rows, rounds=False)
-    except OutOfTime:
-        work.budget.leave_out("the law of physics that was found", work.ended)
-        return None
-    if not (problem.met_by(found) and found.error.relative <= OPTIONS.exact):
-        return None
-    return found._replace(null=search.null, undetermined=search.null)
+    # Whatever it took to fit the libraries before, this law is close to its optimum.
+    again = work.again(f"H of {family.num_parameters} terms", family, len(rows))
+    with work.optional("the law of physics that was found"), again:
+        found = problem.fitted(family, start, rows, rounds=False)
+        if problem.met_by(found) and found.error.relative <= OPTIONS.exact:
+            return found._replace(null=search.null, undetermined=search.null)
+    return None
 
 
 def _without_nothing(law: Law, z: np.ndarray, scale: np.ndarray):
@@ -167,7 +161,7 @@ def law_of_sequences(problem: LawProblem) -> FittedLaw | None:
     cyclic = data.coordinates.cyclic
     search = NoisyTextbook(weak, angles=angles, cyclic=cyclic, on_progress=problem.on_progress)
     name = "laws of physics behind noise"
-    try:
+    with problem.work.optional(name), contextlib.suppress(InputError):  # constants have run away
         with budget.unit(name, MATCHING, OPTIONS.operations[data.dim - 1]):
             formulas = _worth(search.formulas())
         family = formulas[0].family(formulas[0].constants)
@@ -175,10 +169,6 @@ def law_of_sequences(problem: LawProblem) -> FittedLaw | None:
         one = operations(family, 2 * data.dim, _STEPS, family)
         with budget.unit(name, FLOW, OPTIONS.evaluations * states * one):
             return _chosen(problem, formulas, noise)
-    except OutOfTime:
-        budget.leave_out(name, problem.work.ended)
-    except (np.linalg.LinAlgError, InputError):
-        pass
     return None
 
 

@@ -18,6 +18,7 @@ can follow, or as the tolerance asks (`followed`).
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -26,7 +27,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.errors import FitError, OutOfTime
+from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting.gauss_newton import Problem
@@ -92,13 +93,10 @@ def beside_friction(problem: LawProblem, alone: FittedLaw, search: Search) -> Fi
     if not problem.simple or problem.met_by(alone):
         return alone
     problem.work.capped(problem.options.max_operations)
-    try:
-        what = "whether friction explains anything"
-        with problem.work.again(what, alone.family, len(rows)):
-            if not _explains(problem.flows, alone, rows):
-                return alone
-    except OutOfTime:
-        problem.budget.leave_out("H with friction", problem.work.ended)
+    explains, what = False, "whether friction explains anything"
+    with problem.work.optional(what), problem.work.again(what, alone.family, len(rows)):
+        explains = _explains(problem.flows, alone, rows)
+    if not explains:
         return alone
     for forces in (Uniform, linear_in_velocities)[: 1 if data.dim == 1 else 2]:
         law = _found(problem, "H with friction", lambda own=forces: search(own, data))
@@ -120,14 +118,8 @@ def _found(
     problem: LawProblem, what: str, search: Callable[[], FittedLaw | None]
 ) -> FittedLaw | None:
     """Law that a search finds; None where no such friction is in the pairs, or no time is left."""
-    try:
+    with problem.work.optional(what), contextlib.suppress(FitError):
         return search()
-    except OutOfTime:
-        problem.budget.leave_out(what, problem.work.ended)
-    except FitError:
-        pass
-    except np.linalg.LinAlgError as error:
-        problem.budget.leave_out(what, f"the arithmetic failed ({error})")
     return None
 
 
@@ -162,13 +154,9 @@ def _of_kinds(
 def mechanical(problem: LawProblem) -> FittedLaw | None:
     """The law of a Lagrangian, without friction or with it, as `beside_friction` would have it;
     None where the pairs are of no such system."""
-    try:
+    alone = None
+    with problem.work.optional("the Lagrangian"):
         alone = lagrangian_of(problem)
-    except OutOfTime:
-        problem.budget.leave_out("the Lagrangian", problem.work.ended)
-        return None
-    except np.linalg.LinAlgError:
-        return None
     if alone is None:
         return None
 

@@ -13,6 +13,7 @@ from gfnn_jax.budget import FLOW, Allowance, Budget, Counted
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
+from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting.gauss_newton import FlowFit, Problem
 from gfnn_jax.flows.collocation import Steps, images, operations, truncation
@@ -204,6 +205,17 @@ class LawWork:
         )
         with self._without_clock(over), unit:
             yield
+
+    @contextlib.contextmanager
+    def optional(self, what: str) -> Iterator[None]:
+        """What the search can do without: it is left out, and told, where the time is over within,
+        or where its linear algebra fails."""
+        try:
+            yield
+        except OutOfTime:
+            self.budget.leave_out(what, self.ended)
+        except np.linalg.LinAlgError as error:
+            self.budget.leave_out(what, f"its linear algebra failed: {error}")
 
     def round(self, name: str, expected: float):
         """A unit of so many operations."""

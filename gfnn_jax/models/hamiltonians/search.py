@@ -183,20 +183,14 @@ def _along_sequences(problem: LawProblem, best: FittedLaw) -> FittedLaw:
     are not where sequences turn), and held-out steps bear it out."""
     if not is_smooth(best.family) or problem.met_by(best):
         return best
-    what, budget, rows = "the fit of H to whole sequences", problem.budget, problem.data.training
+    what, work, rows = "the fit of H to whole sequences", problem.work, problem.data.training
     problem.on_progress("H: fitting whole sequences")
-    try:
-        with problem.work.again(what, best.family, len(rows)):
-            if best.error.relative <= problem.options.roundoff:
-                return best
-            found = fitted_to_sequences(problem, best)
-            rise = problem.options.rise
-            better = found is not None and found.error.relative <= rise * best.error.relative
-            return found if found is not None and better else best
-    except OutOfTime:
-        budget.leave_out(what, budget.ended)
-    except np.linalg.LinAlgError as error:
-        budget.leave_out(what, f"its linear algebra failed: {error}")
+    with work.optional(what), work.again(what, best.family, len(rows)):
+        if best.error.relative <= problem.options.roundoff:
+            return best
+        found, rise = fitted_to_sequences(problem, best), problem.options.rise
+        better = found is not None and found.error.relative <= rise * best.error.relative
+        return found if found is not None and better else best
     return best
 
 
