@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from other_python import run_python
 
 from gfnn_jax.families.family import DifferentiatedByJax
 from gfnn_jax.fitting.adam import DEFAULT, PAPER, PAPER_STANDARD_MAP, QUICK, Recipe, Training
@@ -129,22 +128,11 @@ def test_every_pair_is_used_once_per_epoch():
 
 
 def test_an_epochs_length_may_be_given():
-    """Longer than a pass: 20 batches of 50 from 330 pairs; Adam has then counted 40 iterations."""
-    states = []
-    recipe = dataclasses.replace(SHORT, epochs=2, epoch_length=20)
-    fit(recipe, checkpoint=lambda _, state: states.append(state))
-    counts = [leaf for leaf in states[-1]["carry"] if leaf.shape == ()]
-    assert counts
-    assert all(count == 40 for count in counts)
-
-
-def test_learns():
-    result = fit(dataclasses.replace(SHORT, epochs=30))
-    assert result.stopped_because == "epochs"
-    assert result.epochs == 30
-    assert result.train_rms < 0.2 * numpy_rms(start(), *TRAIN)
-    assert result.validation_rms < 0.2 * numpy_rms(start(), *VALIDATION)
-    assert result.validation_rms == pytest.approx(numpy_rms(result.params, *VALIDATION), rel=1e-12)
+    """Longer than a pass: an epoch of 12 batches of all pairs is as good as 12 epochs of one."""
+    still = dataclasses.replace(SHORT, epochs=1, batch_size=330, schedule="staircase")
+    one = fit(dataclasses.replace(still, epoch_length=12))
+    many = fit(dataclasses.replace(still, epochs=12))
+    np.testing.assert_allclose(one.params["outer"], many.params["outer"], rtol=1e-9)
 
 
 @pytest.mark.parametrize("recipe", [PAPER, PAPER_STANDARD_MAP])
@@ -181,31 +169,6 @@ def test_the_same_key_gives_the_same_bits_and_another_key_others():
     assert bits(first.params) == bits(again.params)
     assert bits(first.history) == bits(again.history)
     assert bits(first.params) != bits(other.params)
-
-
-@pytest.mark.parametrize("stopped_after", [1, 4])
-def test_resumes_bit_for_bit(stopped_after):
-    """Interrupted between two epochs, and gone on from the last state that was saved."""
-    saved = {}
-
-    def stop(epoch, *_):
-        if epoch == stopped_after:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fit(checkpoint=saved.__setitem__, on_epoch=stop)
-    assert list(saved) == list(range(1, stopped_after + 1))
-    reported = []
-    rest = fit(
-        params=start(seed=99),
-        resume=saved[stopped_after],
-        on_epoch=lambda epoch, *_: reported.append(epoch),
-    )
-    assert reported == list(range(stopped_after + 1, 7))
-    assert bits(rest.params) == bits(whole().params)
-    assert bits(rest.history) == bits(whole().history)
-    assert rest.epochs == whole().epochs
-    assert (rest.train_rms, rest.validation_rms) == (whole().train_rms, whole().validation_rms)
 
 
 def test_the_best_epoch_is_kept():
@@ -296,51 +259,3 @@ def test_a_cap_ends_the_training_and_its_rate():
 def test_a_batch_is_never_more_than_the_pairs():
     result = fit(dataclasses.replace(SHORT, batch_size=10_000, epochs=2))
     assert result.epochs == 2
-
-
-ON_DEVICES = """
-import sys
-import jax
-jax.config.update("jax_enable_x64", True)
-import numpy as np
-from test_adam import NETWORK, WEIGHT, gradient_data, start
-from gfnn_jax.fitting.adam import Recipe, Training
-from gfnn_jax.storage.checkpoints import TrainingCheckpoints
-
-train, held = gradient_data(230, 0), gradient_data(50, 1)
-recipe = Recipe(batch_size=40, epochs=4, rate=0.01, schedule="cosine", dtype="float64")
-
-def trained(count, **more):
-    devices = jax.devices()[:count] if count else ()
-    training = Training(recipe, jax.random.key(0), devices=devices, **more)
-    return training.of_gradients(NETWORK, start(), train, held, WEIGHT)
-
-def close(one, other):
-    for a, b in zip(jax.tree.leaves(one.params), jax.tree.leaves(other.params), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(one.validation_rms, other.validation_rms, rtol=1e-12)
-
-kept = TrainingCheckpoints(sys.argv[1], {})
-
-def keep(epoch, state):
-    if epoch == 2:
-        kept.save(epoch, state)
-
-alone = trained(0)
-for count in (1, 2, 4):
-    close(trained(count, checkpoint=keep if count == 4 else None), alone)
-for count in (0, 2):
-    close(trained(count, resume=kept.latest()[1]), alone)
-try:
-    trained(3)
-except ValueError as error:
-    assert "divides the 40 rows" in str(error)
-else:
-    raise SystemExit("a batch of 40 on 3 devices")
-"""
-
-
-@pytest.mark.slow
-def test_batches_shared_out_among_devices(tmp_path):
-    """Also gone on with, out of a checkpoint, on another number of devices."""
-    run_python(ON_DEVICES, tmp_path / "kept", devices=4)

@@ -9,8 +9,7 @@ with a weight for the size of each coordinate:
 independent of the units of q and p. `Training.of_loss` takes any loss of a batch.
 
 An epoch is one compiled scan. Its order of the pairs is a function of the key and the epoch's
-number alone, so that nothing but the state below is needed to go on, and the same key gives the
-same bits.
+number alone: the same key gives the same bits.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -97,9 +96,8 @@ class AdamFit(NamedTuple):
 
     train_rms, validation_rms: of that epoch, per component of the loss; the first is a mean over
     its batches, while parameters moved. history: both of every epoch, (epochs,) each.
-    seconds: without compilation; with those of the run that was resumed. operations: counted, of an
-    epoch. stopped_because: "epochs", or words that say that the cap was reached, or where numbers
-    ceased to be finite.
+    seconds: without compilation. operations: counted, of an epoch. stopped_because: "epochs", or
+    words that say that the cap was reached, or where numbers ceased to be finite.
     """
 
     params: Any
@@ -119,28 +117,17 @@ class Training:
 
     key:        a ``jax.random.key``; decides the order of the rows.
     on_epoch:   called with (epochs done, train_rms, validation_rms) after each epoch.
-    checkpoint: called with (epochs done, state) after each epoch, to save the state: dicts and
-                lists of NumPy arrays and numbers (and the containers of the params). Given back as
-                ``resume`` the fit goes on as though it had never stopped, bit for bit on one
-                device; the params then only lend their structure.
     cap:        operations of the training, counted: the epochs are as many as it allows, one or
                 more, and the rate goes through its whole schedule in them.
-    devices:    JAX's, of this process, among which the rows of each batch are shared out; their
-                number divides that of the rows. Batches are the same, so that the results differ by
-                rounding from those of one device, and a state may be gone on with on another
-                number. Every device holds all rows of train.
 
-    An interrupt (Ctrl-C) passes through; the last state given to ``checkpoint`` is whole. What is
+    What is
     compiled serves the next training with the same loss, or family, and data of the same shapes.
     """
 
     recipe: Recipe
     key: Any
     on_epoch: Callable[[int, float, float], Any] | None = None
-    checkpoint: Callable[[int, dict[str, Any]], Any] | None = None
-    resume: dict[str, Any] | None = None
     cap: float | None = None
-    devices: Sequence[Any] = ()
 
     def of_gradients(
         self,
@@ -182,26 +169,13 @@ class Training:
     def _minimised(self, loss: Callable, given: Any, data: tuple, components: int) -> AdamFit:
         """Minimise ``loss(given, params, *batch)``; what is given, a pytree, may change without
         another compilation. data: (params, train, validation)."""
-        recipe, cap, devices = self.recipe, self.cap, self.devices
+        recipe, cap = self.recipe, self.cap
         if recipe.dtype == "float64":
             require_x64("training in float64")
         params, train, validation = jax.tree.map(
             lambda a: jnp.asarray(np.asarray(a, recipe.dtype)), data
         )
         num_rows, batch_size = len(train[0]), min(recipe.batch_size, len(train[0]))
-        everywhere, among = None, None
-        if devices:
-            if batch_size % len(devices):
-                raise ValueError(
-                    "expected a number of devices that divides the rows of a batch, "
-                    f"{batch_size}, got {len(devices)}"
-                )
-            mesh = jax.sharding.Mesh(np.array(devices), ("rows",))
-            everywhere = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
-            among = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(None, "rows"))
-            params, train, validation, given = jax.device_put(
-                (params, train, validation, given), everywhere
-            )
         length = recipe.epoch_length or num_rows // batch_size
 
         def rates(epoch):
@@ -219,8 +193,7 @@ class Training:
                 random.permutation(num_rows)[: in_pass * batch_size].reshape(in_pass, batch_size)
                 for _ in range(-(-length // in_pass))
             ]
-            batches = np.concatenate(passes)[:length].astype(np.int32)
-            return jax.device_put(batches, among) if devices else batches
+            return np.concatenate(passes)[:length].astype(np.int32)
 
         started = time.perf_counter()
         carry, epochs = _first_carry(params), recipe.epochs
@@ -235,28 +208,17 @@ class Training:
         def rms(value):
             return math.sqrt(float(value) / components)
 
-        if self.resume is None:
-            start = rms(_validate(params, given, validation, loss=loss))
-            if not math.isfinite(start):
-                raise ValueError("the loss is not finite on the validation rows at the start")
-            epoch, seconds = 0, 0.0
-            best = {"params": _copied(params), "train_rms": math.nan, "validation_rms": start}
-            history: dict[str, list[float]] = {"train_rms": [], "validation_rms": []}
-        else:
-            epoch, seconds, best = (self.resume[name] for name in ("epoch", "seconds", "best"))
-            history = {
-                name: np.asarray(column).tolist() for name, column in self.resume["history"].items()
-            }
-            structure = jax.tree.structure(carry)
-            carry = structure.unflatten([jnp.array(leaf) for leaf in self.resume["carry"]])
-            carry = jax.device_put(carry, everywhere) if devices else carry
-
+        start = rms(_validate(params, given, validation, loss=loss))
+        if not math.isfinite(start):
+            raise ValueError("the loss is not finite on the validation rows at the start")
+        epoch, seconds = 0, 0.0
+        best = {"params": _copied(params), "train_rms": math.nan, "validation_rms": start}
+        history: dict[str, list[float]] = {"train_rms": [], "validation_rms": []}
         capped = epochs < recipe.epochs
         stopped_because = f"the cap of {cap:.3g} operations" if capped else "epochs"
         while epoch < epochs:
             started = time.perf_counter()
-            batches, now_rates = order(epoch), rates(epoch)
-            carry, value = _run_epoch(carry, given, batches, now_rates, train, loss=loss)
+            carry, value = _run_epoch(carry, given, order(epoch), rates(epoch), train, loss=loss)
             epoch += 1
             held = _validate(carry[0], given, validation, loss=loss)
             now = {"train_rms": rms(value), "validation_rms": rms(held)}
@@ -268,14 +230,8 @@ class Training:
                 break
             if now["validation_rms"] < best["validation_rms"]:
                 best = {"params": _copied(carry[0]), **now}
-            if self.checkpoint is not None:
-                leaves = _copied(jax.tree.leaves(carry))
-                columns = {name: np.array(column) for name, column in history.items()}
-                state = {"epoch": epoch, "seconds": seconds, "carry": leaves}
-                self.checkpoint(epoch, {**state, "best": best, "history": columns})
             if self.on_epoch is not None:
                 self.on_epoch(epoch, now["train_rms"], now["validation_rms"])
-
         return AdamFit(
             params=jax.tree.map(jnp.asarray, best["params"]),
             train_rms=best["train_rms"],
