@@ -56,6 +56,12 @@ def load_model(folder) -> tuple[dict[str, Any], dict[str, Any]]:
     where the arrays are float64 while JAX's x64 mode is off, which would round them.
     """
     tree, record = _read(Path(folder))
+    wide = [leaf.dtype for leaf in jax.tree.leaves(tree) if _would_be_rounded(leaf)]
+    if wide:
+        raise InputError(
+            f"{folder}: holds {wide[0]} arrays: switch on JAX's float64 first "
+            '(jax.config.update("jax_enable_x64", True))'
+        )
     return tree, record["description"]
 
 
@@ -87,8 +93,7 @@ class TrainingCheckpoints:
         """Load the newest undamaged checkpoint as (step, tree), or None.
 
         Leaves come back bit for bit as they were saved, arrays as NumPy's. A damaged checkpoint is
-        passed over with a warning. Raises InputError where the checkpoint is of another training,
-        or is float64 while JAX's x64 mode is off.
+        passed over with a warning. Raises InputError where the checkpoint is of another training.
         """
         for step in reversed(self._steps()):
             path = self._path(step)
@@ -171,18 +176,11 @@ def _read(folder: Path) -> tuple[Any, dict[str, Any]]:
     try:
         stored = _stored(folder / _ARRAYS[version]) if _any_stored(record) else {}
         leaves = [_restored(folder, entry, stored) for entry in record["leaves"]]
-        tree = _rebuild(record["structure"], leaves)
+        return _rebuild(record["structure"], leaves), record
     except InputError:
         raise
     except Exception as error:
         raise Damaged(f"{folder}: cannot be restored ({str(error)[:200]})") from error
-    wide = [leaf.dtype for leaf in leaves if _would_be_rounded(leaf)]
-    if wide:
-        raise InputError(
-            f"{folder}: holds {wide[0]} arrays: switch on JAX's float64 first "
-            '(jax.config.update("jax_enable_x64", True))'
-        )
-    return tree, record
 
 
 def _any_stored(record: dict[str, Any]) -> bool:
