@@ -208,8 +208,8 @@ class LawWork:
 
     @contextlib.contextmanager
     def optional(self, what: str) -> Iterator[None]:
-        """What the search can do without: it is left out, and told, where the time is over within,
-        or where its linear algebra fails."""
+        """A part that the search can do without: it is left out, and told, where the time is over
+        within, or where its linear algebra fails."""
         try:
             yield
         except OutOfTime:
