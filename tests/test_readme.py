@@ -124,3 +124,23 @@ def test_it_is_short_and_its_first_screen_has_a_command_and_a_picture():
     first = "\n".join(lines[:35])
     assert "gfnn double_pendulum" in first
     assert "![" in first
+
+
+@pytest.mark.slow
+def test_the_first_command_ends_in_the_law_that_is_printed_below_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    typed = blocks("sh")[0].strip().rpartition("/gfnn ")[2]
+    assert cli.main(shlex.split(typed.replace(" --open", ""))) == 0
+    told = capsys.readouterr()
+    printed = blocks("text")[0].splitlines()
+    assert [line for line in told.out.splitlines() if line.startswith(("L = ", "R = "))] == printed
+    assert "not met" not in told.out + told.err
+    assert list(tmp_path.glob("runs/*/report.html"))
+
+
+@pytest.mark.slow
+def test_the_first_command_of_the_help_meets_its_tolerance(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["run", "two-body", "--quick", "--strict"]) == 0
+    told = capsys.readouterr()
+    assert "not met" not in told.out + told.err

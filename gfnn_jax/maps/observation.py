@@ -299,19 +299,20 @@ class Observation:
         still = [k for k, name in enumerate(self.channels) if name in self.needed]
         if np.mean(np.isfinite(y[:, still]).any(axis=1)) < OPTIONS.few:  # others, as at rest
             still = [k for k, used in enumerate(self._used) if min(used, default=d) < d]
-        q, best = np.zeros((len(y), d)), np.full(len(y), np.inf)
         scale = np.nanstd(y[:, still], axis=0) + 1e-300
         turns = np.arange(OPTIONS.tried) * 2 * np.pi / OPTIONS.tried
         own = [self.channels.index(n) if n in self.channels else None for n in self.coordinates]
         choices = [turns if i in angles and own[i] is None else np.zeros(1) for i in range(d)]
-        for choice in product(*choices):
-            x = np.zeros((len(y), 2 * d))
-            for i, value in enumerate(choice):
-                x[:, i] = value if own[i] is None else np.nan_to_num(y[:, own[i]])
-            x, left = self._followed(x, y, still, scale)
-            better = left < best
-            q[better], best[better] = x[better, :d], left[better]
-        told = np.isfinite(best)
+        starts = np.array(list(product(*choices)))
+        x = np.zeros((len(starts), len(y), 2 * d))
+        for i in range(d):
+            x[..., i] = starts[:, [i]] if own[i] is None else np.nan_to_num(y[:, own[i]])
+        each = np.broadcast_to(y, (len(starts), *y.shape)).reshape(-1, y.shape[1])
+        found, left = self._followed(x.reshape(-1, 2 * d), each, still, scale)
+        left = left.reshape(len(starts), -1)
+        best, samples = np.argmin(left, axis=0), np.arange(len(y))
+        q = found.reshape(x.shape)[best, samples, :d]
+        told = np.isfinite(left[best, samples])
         if not told.any():
             raise InputError(
                 f"observe: {', '.join(self.channels)} do not determine "
@@ -417,16 +418,18 @@ class Observation:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Gauss–Newton of each sample from x (n, 2d): states, and what they leave of y, squared;
         infinite where a coordinate moves no channel."""
-        d, sizes = self.dim, np.full(len(x), np.inf)
+        d, x, sizes = self.dim, x.copy(), np.full(len(x), np.inf)
+        J, moving = np.zeros((len(x), len(still), d)), np.arange(len(x))
         for _ in range(OPTIONS.iterations):
-            shown = self(x)
-            r = (y[:, still] - shown.values[:, still]) / scale
-            J = shown.by_state[:, still, :d] / scale[:, None]
-            sizes = np.sum(np.nan_to_num(r) ** 2, axis=1)
-            J = np.where(np.isfinite(r)[..., None], J, 0.0)
-            step = (np.linalg.pinv(J, rcond=1e-8) @ np.nan_to_num(r)[..., None])[..., 0]
-            x = np.concatenate([x[:, :d] + np.clip(step, -1e3, 1e3), x[:, d:]], axis=1)
-            if np.max(np.abs(step), initial=0.0) < 1e-10:
+            shown = self(x[moving])
+            r = (y[moving][:, still] - shown.values[:, still]) / scale
+            known, r = np.isfinite(r), np.nan_to_num(r)
+            sizes[moving] = np.sum(r**2, axis=1)
+            J[moving] = shown.by_state[:, still, :d] / scale[:, None] * known[..., None]
+            step = (np.linalg.pinv(J[moving], rcond=1e-8) @ r[..., None])[..., 0]
+            x[moving, :d] += np.clip(step, -1e3, 1e3)
+            moving = moving[np.abs(step).max(axis=1, initial=0.0) >= 1e-10]
+            if not len(moving):
                 break
         rank = np.linalg.matrix_rank(J, tol=1e-8)
         return x, np.where((rank == d) & np.isfinite(sizes), sizes, np.inf)
