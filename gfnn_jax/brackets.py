@@ -164,9 +164,9 @@ class Bracket:
         rows = np.flatnonzero(self.outside(np.asarray(z, float)))
         if rows.size:
             some = ", ".join(map(str, rows[:5])) + (", …" if rows.size > 5 else "")
-            raise FitError(f"{self._undefined} in {rows.size} of {len(z)} states, rows {some}")
+            raise FitError(f"{self.undefined} in {rows.size} of {len(z)} states, rows {some}")
 
-    _undefined = "a value is missing"
+    undefined = "a value is missing"
 
     @cached_property
     def casimirs(self) -> tuple[Casimir, ...]:
@@ -236,7 +236,7 @@ class Log(Bracket):
     names: tuple[str, ...] = ()
     note: str = ""
 
-    _undefined = "a coordinate is not above 0"
+    undefined = "a coordinate is not above 0"
 
     @property
     def name(self) -> str:
@@ -276,7 +276,7 @@ class LieAlgebra(Bracket):
     names: tuple[str, ...] = ()
     note: str = ""
 
-    _undefined = "Γ = 0 in se(3), a ≤ 0 in aff(1), or a value is missing,"
+    undefined = "Γ = 0 in se(3), a ≤ 0 in aff(1), or a value is missing,"
 
     @property
     def size(self) -> int:

@@ -2,13 +2,14 @@
 
 import re
 import shlex
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from test_brackets_found import heavy, lorenz, populations, runs_of, top
 
 import gfnn_jax as gfnn
-from gfnn_jax import cli
+from gfnn_jax import cli, cli_parser
 from gfnn_jax.data.text_files import to_text
 from gfnn_jax.errors import FitError, InputError
 
@@ -65,8 +66,13 @@ def test_a_given_bracket():
     assert fit.bracket.name == "log-canonical"
     beside = np.array(fit.map.step(data.z0[:50])[0])
     assert np.abs(beside - data.z1[:50]).max() < 1e-12
-    with pytest.raises(FitError, match="not above 0"):
-        gfnn.fit(gfnn.Pairs(data.z0 - 1, data.z1 - 1, 0.2), bracket=known)
+    z0 = np.where(np.arange(len(data.z0))[:, None] % 97 == 3, -data.z0, data.z0)
+    pairs = gfnn.Pairs(z0, data.z1, 0.2, run=data.run, structure="poisson")
+    with pytest.raises(FitError, match=r"not above 0 in 5 of 400 pairs, rows \[3, 100, ") as raised:
+        gfnn.fit(pairs, bracket=known)
+    call = str(raised.value).partition("Without them: ")[2]
+    told = SimpleNamespace(fit=lambda pairs, bracket: len(pairs))
+    assert eval(call, {"gfnn": told, "pairs": pairs, "bracket": known}) == 395
     with pytest.raises(FitError, match="one of 3 coordinates, the states have 4"):
         gfnn.fit(pairs_of(data), bracket=gfnn.Bracket.so3())
 
@@ -133,6 +139,39 @@ def test_prey_that_crowd_are_no_law_with_a_bracket(own):
     about = {"run": data.run, "place": data.place, "structure": "poisson"}
     with pytest.raises(FitError, match=r"no H of it leaves noise|fewer orbits"):
         gfnn.fit(gfnn.Pairs(z[:-1], z[1:], 0.3, **about))
+
+
+def swings(amplitudes, sigma, rate=np.sin):
+    """Noisy runs of a swing, one of each amplitude."""
+    starts = np.array([[a, 0.0] for a in amplitudes])
+    law = lambda z: np.array([z[1], -rate(z[0])])  # noqa: E731
+    return pairs_of(runs_of(law, starts, 0.1, 300, noise=sigma))
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.1])
+def test_a_sinusoid_of_one_amplitude_is_of_several_laws(sigma):
+    fit = gfnn.fit(swings([1.0, 1.0, 1.0], sigma, rate=lambda x: 1.69 * x))
+    assert [t.term for t in fit.law.terms] == ["z1²", "z2²"]
+    assert fit.verdict.startswith("one of several: H has one value along all runs")
+
+
+def test_noisy_swings_are_not_taken_for_harmonic_ones():
+    fit = gfnn.fit(swings([0.4, 1.0, 1.5], 0.1))
+    assert [t.term for t in fit.law.terms] == ["z1²", "z2²", "z1⁴"]
+    assert fit.law.terms[2].coefficient == pytest.approx(-1 / 24, rel=0.2)
+    assert fit.verdict.startswith("one of several: its terms of degree 3 or more may be the series")
+
+
+def test_states_without_a_bracket_are_told_what_to_type(tmp_path, capsys):
+    starts = np.random.default_rng(0).normal(size=(20, 2))
+    data = runs_of(lambda z: np.array([z[1], (1 - z[0] ** 2) * z[1] - z[0]]), starts, 0.2, 20)
+    path, columns = tmp_path / "two words.csv", {"x": data.z0[:, 0], "y": data.z0[:, 1]}
+    path.write_text(to_text({"run": data.run, "t": 0.2 * data.place, **columns}))
+    fit = ["fit", str(path), "--structure", "poisson", "--states", "x,y", "--out", f"{tmp_path}/m"]
+    assert cli.main(fit) == 1
+    said = capsys.readouterr().err.partition("If these are positions: gfnn ")[2]
+    asked = cli_parser.parser().parse_args(shlex.split(said))
+    assert (asked.data, asked.positions) == ([path], ("x", "y"))
 
 
 def test_a_gyroscope_on_the_command_line(tmp_path, capsys):

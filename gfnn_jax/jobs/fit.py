@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -199,9 +200,18 @@ def fit_states(
     with refusals():
         asked = FitOptions(**{**options, "structure": "poisson"})
     recording = read(list(data), **columns)
-    with refusals(), failures_of_arithmetic():
-        fitted = learn_fit(recording, options=asked, on_progress=progress.line)
     names = list(recording.positions)
+    with refusals(), failures_of_arithmetic():
+        try:
+            fitted = learn_fit(recording, options=asked, on_progress=progress.line)
+        except FitError as error:
+            if not error.verdict.startswith("no law: no "):
+                raise
+            typed = ["gfnn", "fit", *data, "--positions", ",".join(names), "--out", output.out]
+            for name in ("time", "dt"):
+                typed += [f"--{name}", columns[name]] if name in columns else []
+            command = shlex.join(map(str, typed))
+            raise FitError(f"{error}. If these are positions: {command}", error.verdict) from error
     result = fitted.report(seed=asked.seed, data={"source": recording.source, "states": names})
     job = {**_job(recording, columns, asked), "states": names}
     with atomic_folder(output.out) as folder:

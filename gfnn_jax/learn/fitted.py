@@ -103,7 +103,8 @@ class Choice:
     too few for these. operations: of the search, as counted; as ``max_operations`` they give this
     map again, whatever the clock. budget: what is left of it. defect_known: whether there is
     time in it to compile the derivative of a step. white: whether H leaves no more than white
-    noise, so that the pairs do not contradict it. seed: of what was drawn.
+    noise, so that the pairs do not contradict it. seed: of what was drawn. several: why other laws
+    may have made the pairs too, else "".
     """
 
     candidates: tuple[Candidate, ...]
@@ -135,6 +136,7 @@ class Choice:
     defect_known: bool = True
     white: bool = False
     seed: int = 0
+    several: str = ""
 
     @property
     def law(self) -> LearnedHamiltonian | None:
@@ -163,6 +165,8 @@ class Choice:
         # Sums over sites have terms that vanish or add up to nothing, whatever the data.
         if law.null_terms and not isinstance(law.flow.family, Sums):
             return f"one of several: the pairs do not distinguish {', '.join(law.null_terms)}"
+        if self.several:
+            return f"one of several: {self.several}"
         relative = self.chosen.validation_relative
         if relative > _OPTIONS.hides:
             return (

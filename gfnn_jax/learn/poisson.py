@@ -35,6 +35,7 @@ from gfnn_jax.phase_space import POISSON, Pairs, require_x64, sizes
 from gfnn_jax.search.search import MET
 
 EVEN = 1e-3  # of a sampling interval: what printed times may be off by
+FEW = 0.1  # of the pairs: those that may be wrong readings of positive states
 NOISE = 1.15  # times the noise, that the errors of a law may be which misses nothing else
 
 
@@ -66,7 +67,10 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         learned = _generated(train, bracket)
     else:
         terms, report = _given(options.terms, names), watch.on_progress
-        law = law_of(train, held, names, bracket=bracket, terms=terms, on_progress=report)
+        try:
+            law = law_of(train, held, names, bracket=bracket, terms=terms, on_progress=report)
+        except FitError as error:
+            raise FitError(f"{error}{_next(data, error.verdict)}", error.verdict) from error
         learned = _of_law(law, every.z0, float(np.median(dt)))
     seconds, map_, sigma = time.perf_counter() - started, learned.map_, learned.sigma
     watch.on_progress(f"compiling the step of {learned.label}")
@@ -127,8 +131,27 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         budget=budget,
         white=white,
         seed=options.seed,
+        several=learned.law.several if learned.law else "",
     )
     return Fit(map_, choice)
+
+
+def _next(data: Pairs | Recording, verdict: str) -> str:
+    """What to type after pairs had no bracket: without states that logarithms have not, or, of an
+    even number of columns, as (q, p)."""
+    if isinstance(data, Recording) or not verdict.startswith("no law: no "):
+        return ""
+    below = np.mean((np.minimum(data.z0, data.z1) <= 0).any(axis=1))
+    if 0 < below <= FEW:
+        kept = "(pairs.z0 > 0).all(axis=1) & (pairs.z1 > 0).all(axis=1)"
+        return (
+            f". Logarithms were not tried, for {below:.2g} of the pairs have a coordinate that is "
+            f"not above 0. Without them: gfnn.fit(pairs.take({kept}))"
+        )
+    if data.z0.shape[1] % 2:
+        return ""
+    call = "gfnn.fit(gfnn.Pairs(pairs.z0, pairs.z1, pairs.dt, run=pairs.run))"
+    return f". As positions and momenta, with friction of any kind: {call}"
 
 
 def pairs_of_states(recording: Recording) -> Pairs:
@@ -170,7 +193,14 @@ def _checked(pairs: Any, bracket: Bracket | None) -> tuple[np.ndarray, np.ndarra
                 f"the bracket is one of {bracket.size} coordinates, the states have "
                 f"{states[0].shape[1]}"
             )
-        bracket.require_inside(states[0])
+        outside = np.flatnonzero(bracket.outside(states[0]) | bracket.outside(states[1]))
+        if len(outside):
+            rows = f"[{', '.join(map(str, outside[:5]))}{', …' * (len(outside) > 5)}]"
+            raise FitError(
+                f"{bracket.undefined} in {len(outside)} of {len(states[0])} pairs, rows {rows}. "
+                "Without them: gfnn.fit(pairs.take(~(bracket.outside(pairs.z0) | "
+                "bracket.outside(pairs.z1))), bracket=bracket)"
+            )
     return states[0], states[1]
 
 

@@ -35,7 +35,7 @@ class Options:
     # χ² for each that is made one
     near: float = 0.02
     whole: float = 4.0
-    rounds: int = 5  # of dropping terms
+    rounds: int = 12  # of dropping terms, the weaker half of those that may go in each
     states: int = 400  # at which the field's rates are taken
     # of the noise: residuals that are none
     least: float = 1e-3
@@ -151,8 +151,8 @@ def fit_arcs(
     field: PoissonField, c: np.ndarray, y: np.ndarray, dt: float, sigma: np.ndarray
 ) -> ArcsFit:
     """Fit H and the bracket's constants to arcs y (A, L, n), dt between nodes. Terms below four
-    standard errors are dropped, and constants that may be whole numbers are. sigma: (n,) noise to
-    start from."""
+    standard errors are dropped, the weaker half of them at a time, for terms that are alike hide
+    one another; constants that may be whole numbers are. sigma: (n,) noise to start from."""
     some = y.reshape(-1, y.shape[2])[:: max(1, y[..., 0].size // OPTIONS.states)]
     rate = np.quantile(np.abs(field.jacobian(c, some)).sum(axis=2).max(axis=1), 0.99)
     substeps = int(np.clip(np.ceil(rate * dt / OPTIONS.rate), 1, OPTIONS.most_substeps))
@@ -166,7 +166,9 @@ def fit_arcs(
     for _ in range(OPTIONS.rounds):
         count = library.num_parameters
         errors = np.sqrt(np.sum(_root(fitted)[:, :count] ** 2, axis=0))
-        kept = np.flatnonzero(np.abs(fitted.p[:count]) > OPTIONS.significant * errors)
+        strength = np.abs(fitted.p[:count]) / np.maximum(errors, 1e-300)
+        weak = np.sum(strength <= OPTIONS.significant)
+        kept = np.sort(np.argsort(strength)[(weak + 1) // 2 :])
         if len(kept) in (0, count):
             break
         library = library.take(kept.tolist())

@@ -63,7 +63,10 @@ class Options:
     grown: float = 1.6
     # of states with noise: parts of a run, and χ² per degree of freedom of H in these, at most
     parts: int = 8
+    # of the square of what H changes by across the states: a variance of H that is none
+    level: float = 1e-4
     uneven: float = 4.0
+    most_terms: int = 40  # of a richer H, that arcs with noise are asked about
     hidden: float = 2.0  # times what noise makes of a relation: one that noise may hide
     standard: int = 1  # brackets of which H is looked for among shapes
     # times the error of the free field, that a Poisson field may leave
@@ -95,7 +98,8 @@ class Data(NamedTuple):
 class PoissonLaw(NamedTuple):
     """ż = B∇H. field: with the terms of H that count. fit: of their coefficients. error: RMS on
     held-out pairs ÷ spread. name: of the bracket's kind. notes: lines about what was found. sigma:
-    (n,) noise of the states, where sequences were fitted."""
+    (n,) noise of the states, where sequences were fitted. several: why other laws may have made the
+    pairs too, else ""."""
 
     field: PoissonField
     fit: FieldFit
@@ -103,6 +107,7 @@ class PoissonLaw(NamedTuple):
     name: str
     notes: tuple[str, ...]
     sigma: np.ndarray | None = None
+    several: str = ""
 
     @property
     def bracket(self) -> Bracket:
@@ -135,6 +140,37 @@ def law_of(
     """
     if bracket is not None:
         return _of_bracket(bracket, train, held, terms, on_progress)
+    law = _of_field(train, held, names, terms, on_progress)
+    if law.field.friction is None and _one_level(law, train.z0):
+        several = (
+            "H has one value along all runs, and every function of H with the same slope there "
+            "moves them so: add runs that start at other values of H"
+        )
+        law = law._replace(several=several)
+    return law
+
+
+def _one_level(law: PoissonLaw, z: np.ndarray) -> bool:
+    """Return whether H has the same value at all states z (N, n), to their noise."""
+    h, by_noise = _energies(law, z)
+    slopes = law.field.library.gradient(law.fit.c, z)
+    size = np.mean(np.sum((slopes * sizes(z)) ** 2, axis=-1))  # of H along a coordinate's spread
+    return bool(np.var(h) - np.mean(by_noise**2) <= OPTIONS.level * size)
+
+
+def _energies(law: PoissonLaw, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """H (N,) at states z (N, n), and what their noise makes of it, to second order: near an
+    equilibrium H has no slope."""
+    library, c = law.field.library, law.fit.c
+    sigma = np.zeros(z.shape[1]) if law.sigma is None else law.sigma
+    slopes, bends = library.gradient_and_hessian(c, z)
+    first = np.sum((slopes * sigma) ** 2, axis=-1)
+    second = 0.5 * np.sum((bends * sigma[:, None] * sigma) ** 2, axis=(-2, -1))
+    return library.value(c, z), np.sqrt(first + second)
+
+
+def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) -> PoissonLaw:
+    """The law of a field whose bracket is found."""
     field, fit, error, notes = _free_field(train, held, names, terms, on_progress)
     if error > OPTIONS.exact and terms is None:
         sigma = _noise_of(train, fit)
@@ -176,6 +212,7 @@ def law_of(
                 law = _through_flow(found, train, held, notes, noisy)
             except FitError:
                 continue
+            law = law if noisy is None else _richer(law, noisy, train, held)
             close = law.error <= max(OPTIONS.worse * error, OPTIONS.exact)
             if close and (noisy is None or _leaves_noise(law, noisy.sigma, train, held)):
                 return law
@@ -311,11 +348,9 @@ def _leaves_noise(law: PoissonLaw, sigma: np.ndarray, train: Data, held: Data) -
         np.concatenate([getattr(data, key) for data in (train, held)])
         for key in ("z0", "run", "place")
     )
-    library, c, total, count = law.field.library, law.fit.c, 0.0, 0
+    total, count = 0.0, 0
     for own in (run == r for r in np.unique(run)):
-        states = z[own][np.argsort(place[own])]
-        h = library.value(c, states)
-        errors = np.linalg.norm(library.gradient(c, states) * law.sigma, axis=1)
+        h, errors = _energies(law, z[own][np.argsort(place[own])])
         parts = np.array_split(np.arange(len(h)), min(OPTIONS.parts, len(h)))
         weight = np.array([np.sum(errors[part] ** -2.0) for part in parts])
         mean = np.array([np.average(h[part], weights=errors[part] ** -2.0) for part in parts])
@@ -364,6 +399,32 @@ def _noise(field: FreeField, fit: FieldFit, error: float, train: Data) -> _Noisy
         return None
     sigma = np.sqrt(np.mean(fit.residual**2, axis=0) / 2)
     return _Noisy(sequences, long, again, sigma)
+
+
+def _richer(law: PoissonLaw, noisy: _Noisy, train: Data, held: Data) -> PoissonLaw:
+    """The law with terms of two more degrees, where whole arcs show them: the noise of a step, by
+    which the field's degree was chosen, hides a period that changes with the energy. Of brackets
+    without Casimirs, which would hide such terms, and of few terms."""
+    bracket, own = law.bracket, law.field.library
+    degree = max(map(sum, own.powers))
+    library = library_of(_kind_of(bracket), bracket.labels, degree + 1, None)
+    if bracket.casimirs or library.num_parameters > OPTIONS.most_terms or law.field.friction:
+        return law
+    places = dict(zip(library.term_names, range(library.num_parameters), strict=True))
+    if not set(own.term_names) <= set(places):
+        return law
+    c = np.zeros(library.num_parameters)
+    c[[places[name] for name in own.term_names]] = law.fit.c
+    arcs = equal_arcs(noisy.sequences)
+    rich = fit_arcs(PoissonField(bracket, library), c, arcs, train.dt, noisy.sigma)
+    more = rich.field.num - own.num_parameters
+    gain = arcs.shape[0] * arcs.shape[1] * np.sum(np.log(law.sigma / rich.sigma))
+    if gain <= 0.5 * max(more, 1) * np.log(arcs.size) + np.log(len(c)):
+        return law
+    fit = law.fit._replace(c=rich.c, root=rich.root)
+    error = error_on(rich.field, rich.c, held)
+    several = f"its terms of degree {degree + 1} or more may be the series of another function"
+    return PoissonLaw(rich.field, fit, error, law.name, law.notes, rich.sigma, several)
 
 
 def _through_flow(
