@@ -71,7 +71,7 @@ def test_a_given_bracket():
     with pytest.raises(FitError, match=r"not above 0 in 5 of 400 pairs, rows \[3, 100, ") as raised:
         gfnn.fit(pairs, bracket=known)
     call = str(raised.value).partition("Without them: ")[2]
-    told = SimpleNamespace(fit=lambda pairs, bracket: len(pairs))
+    told = SimpleNamespace(fit=lambda pairs, bracket: len(pairs.z0))
     assert eval(call, {"gfnn": told, "pairs": pairs, "bracket": known}) == 395
     with pytest.raises(FitError, match="one of 3 coordinates, the states have 4"):
         gfnn.fit(pairs_of(data), bracket=gfnn.Bracket.so3())
