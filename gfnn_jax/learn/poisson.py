@@ -137,7 +137,7 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
 
 
 def _next(data: Pairs | Recording, verdict: str) -> str:
-    """What to type after pairs had no bracket: without states that logarithms have not, or, of an
+    """Say what to type after pairs had no bracket: without states that logarithms have not, or, of an
     even number of columns, as (q, p)."""
     if isinstance(data, Recording) or not verdict.startswith("no law: no "):
         return ""
