@@ -137,8 +137,8 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
 
 
 def _next(data: Pairs | Recording, verdict: str) -> str:
-    """Say what to type after pairs had no bracket: without states that logarithms have not, or, of an
-    even number of columns, as (q, p)."""
+    """Say what to type after pairs had no bracket: without states that logarithms have not, or as
+    (q, p) where the number of columns is even."""
     if isinstance(data, Recording) or not verdict.startswith("no law: no "):
         return ""
     below = np.mean((np.minimum(data.z0, data.z1) <= 0).any(axis=1))
