@@ -146,6 +146,60 @@ def sampled(sampling: str, name: str, quick: bool) -> Numbers:
     return {"cases": cases}
 
 
+# Sensors that show no position
+
+PHONE = {
+    "gyro": "omega + b",
+    "radial": "A*omega**2 + G*cos(theta)",
+    "tangential": "A*theta_ddot + G*sin(theta)",
+}
+WORN = {  # what a pendulum carries
+    "gyroscope": ("gyro",),
+    "accelerometer": ("radial", "tangential"),
+    "accelerometer, axis along the rod": ("radial",),
+    "both": tuple(PHONE),
+}
+
+
+def worn_case(name: str, draw: int) -> Numbers:
+    """A pendulum that carries a gyroscope with a bias (noise 5e-3 rad/s), an accelerometer of
+    unknown scale κ on its bob (0.03 m/s²), or both, at 50 Hz over 24 s. A law is right whose ω₀²
+    is within 0.1 % and whose friction is linear and within 5 %; its sensors' parameters, the bias,
+    κl and κg, within four standard errors."""
+    rng = np.random.default_rng([88, draw])
+    squared, rubs, size, scale = rng.uniform((5, 0.05, 0.25, 0.8), (40, 0.15, 1.2, 1.25))
+    t, length, b = 0.02 * np.arange(1_200), 9.81 / squared, rng.uniform(-0.1, 0.1)
+
+    def pull(theta, omega):
+        return -squared * np.sin(theta) - rubs * omega
+
+    options = {"t_eval": t, "rtol": 1e-10, "atol": 1e-12}
+    theta, omega = solve_ivp(lambda _, s: [s[1], pull(*s)], (0, t[-1]), [size, 0.0], **options).y
+    read = {
+        "gyro": omega + b,
+        "radial": scale * (length * omega**2 + 9.81 * np.cos(theta)),
+        "tangential": scale * (length * pull(theta, omega) + 9.81 * np.sin(theta)),
+    }
+    noise = {"gyro": 5e-3, "radial": 0.03, "tangential": 0.03}
+    table = {"t": t} | {n: read[n] + noise[n] * rng.normal(size=len(t)) for n in WORN[name]}
+    shown = {n: PHONE[n] for n in WORN[name]}
+    fit, said = _fitted(gfnn.Recording(table, coordinates="theta", observe=shown))
+    found: Numbers = {"draw": draw, "swing": size, "named": False} | said
+    if fit is None:
+        return found
+    terms = {term.term: term for term in fit.lagrangian.terms}
+    lost = {term.term: term for term in fit.friction.terms}
+    truth = {"b": b, "A": scale * length, "G": scale * 9.81}
+    off = {n: (v - truth[n]) / std for n, (v, std) in fit.sensors.items()}
+    found["sensors_off"] = max(map(abs, off.values()))
+    if set(lost) == {"omega**2"} and set(terms) == {"omega**2", "cos(theta)"}:
+        found["squared_off"] = abs(terms["cos(theta)"].coefficient / squared - 1)
+        found["friction_off"] = abs(2 * lost["omega**2"].coefficient / rubs - 1)
+        right = found["squared_off"] < 1e-3 and found["friction_off"] < 0.05
+        found["right"] = found["named"] = bool(right and found["sensors_off"] < 4)
+    return found
+
+
 # Coordinates that no column shows
 
 
@@ -474,7 +528,8 @@ def drawn(one: Callable[[str, int], Numbers], name: str, count: int, quick: bool
         c = one(name, int(draw))
         cases.append(c)
         named = "named" if c["named"] else "NOT"
-        print(f"  {name} {draw}: {named}: {c['verdict'][:150]}", flush=True)
+        what = c.get("formula", "") + " " + c["verdict"]
+        print(f"  {name} {draw}: {named}: {what[:150]}", flush=True)
     return {"cases": cases}
 
 
@@ -494,6 +549,7 @@ PIECES |= {
     _slug(f"outside {n}"): partial(drawn, outside_case, n, k)
     for n, k in zip(OUTSIDE, EACH, strict=True)
 }
+PIECES |= {_slug(f"worn {n}"): partial(drawn, worn_case, n, DRAWS) for n in WORN}
 HIDDEN = ("carts", "double pendulum")
 PIECES |= {_slug(f"hidden {n}"): partial(drawn, hidden_case, n, DRAWS) for n in HIDDEN}
 PIECES |= {_slug(f"orbit {n}"): partial(drawn, orbit_case, n, EACH_ORBIT) for n in ORBITS}
@@ -532,6 +588,22 @@ def tables() -> None:
         "CPU s",
     )
     text = markdown(heads, rows)
+    rows = []
+    for name in WORN:
+        own = cases.get(_slug(f"worn {name}"), [])
+        heads = ("squared_off", "friction_off", "sensors_off")
+        errors = [[c[k] for c in own if k in c] for k in heads]
+        largest = [number(max(e)) if e else "–" for e in errors]
+        if own:
+            rows.append([name, f"{sum(c['named'] for c in own)} of {len(own)}", *largest])
+    heads = (
+        "carried by a pendulum",
+        "right",
+        "largest relative error of ω₀²",
+        "of friction",
+        "of bias, κl, κg, in standard errors",
+    )
+    text += "\n\n" + markdown(heads, rows)
     rows = []
     for name in HIDDEN:
         own = cases.get(_slug(f"hidden {name}"), [])

@@ -133,6 +133,35 @@ def test_a_gyroscope_alone(gyroscope):
     )
 
 
+PHONE = {"y": "A*omega**2 + G*cos(theta)", "x": "A*theta_ddot + G*sin(theta)"}
+
+
+def test_an_accelerometer_alone(tmp_path):
+    """Of unknown scale on the bob, where the axis across the rod shows friction alone."""
+    rng, t = np.random.default_rng(6), np.arange(0, 16, 0.02)
+    theta, omega = swing(t, (0.8, 0.0)).T
+    turning, A, G = -9 * np.sin(theta) - 0.05 * omega, 1.1 * 9.81 / 9, 1.1 * 9.81
+    y, x = A * omega**2 + G * np.cos(theta), A * turning + G * np.sin(theta)
+    table = {"t": t, **{n: c + 0.03 * rng.normal(size=len(t)) for n, c in (("y", y), ("x", x))}}
+    fit = gfnn.fit(gfnn.Recording(table, observe=PHONE))
+    law_is_right(fit)
+    for name, true in (("A", A), ("G", G)):
+        value, std = fit.sensors[name]
+        assert abs(value - true) < 4 * std < 0.005 * true
+    fit.save(tmp_path / "model")
+    part = gfnn.Recording({n: c[:700] for n, c in table.items()}, observe=PHONE)
+    ahead = gfnn.load(tmp_path / "model").map.forecast(part, t[[710, 760]])
+    np.testing.assert_allclose(ahead.values["y"][0], y[[710, 760]], atol=0.1)
+
+
+def test_what_an_accelerometer_does_not_tell_is_named():
+    t = np.arange(0, 10, 0.02)
+    shown = {"y": "kappa*(l*omega**2 + g*cos(theta))"}
+    recording = gfnn.Recording({"t": t, "y": np.cos(6 * t) + 9.8}, observe=shown)
+    with pytest.raises(InputError, match=r"kappa\*l, kappa\*g, l/g are.*1\*\(l\*omega"):
+        gfnn.fit(recording)
+
+
 @pytest.mark.slow
 def test_a_gyroscope_from_the_command_line(gyroscope, tmp_path, capsys):
     path, model = tmp_path / "phone.csv", tmp_path / "model"

@@ -9,7 +9,8 @@
 
 A coordinate that no channel shows by positions alone is *unseen*: it starts as the integral of its
 velocity, zero on a line through the extremes of that, where no force acts. The slope of the line is
-what the sensor shows of a body at rest.
+what the sensor shows of a body at rest. Where no channel shows the velocity alone, it starts as the
+swing, in step with the channel that oscillates most clearly, that all channels suit best.
 
 A channel is text in the names of the coordinates, their velocities (omega of theta, v of x, or with
 _dot), their accelerations (with _ddot) and parameters, or a function
@@ -24,13 +25,13 @@ import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from itertools import product
+from itertools import combinations, product
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from gfnn_jax.data.roles import symbols
-from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.errors import InputError
 from gfnn_jax.families.expressions import (
     Expression,
     depends_on,
@@ -42,7 +43,9 @@ from gfnn_jax.families.jets import jets
 from gfnn_jax.families.traced import traced
 from gfnn_jax.flows.motion import Form, Rates
 from gfnn_jax.maps.hidden import Hidden
-from gfnn_jax.signals.splines import FEWEST, splines
+from gfnn_jax.maps.unseen import Swing, between_extremes, swung
+from gfnn_jax.signals.splines import splines
+from gfnn_jax.signals.steps import dominant_frequencies
 from gfnn_jax.solve.latent_arcs import SOFT_L1, Observed
 from gfnn_jax.solve.noise import Loss
 
@@ -53,9 +56,10 @@ class Options:
 
     same: float = 1e-6  # sine of the angle between changes that are the same
     tried: int = 12  # places of an angle from which a state is looked for
-    extreme: float = 0.25  # of the largest speed, that an extreme of the velocity has at least
+    # of an angle, or of the channel's size over the squared frequency: largest swings at the start
+    sizes: tuple[float, ...] = tuple(np.geomspace(0.1, 2.5, 15))
+    clean: float = 1e-3  # of a channel's size: more weight has no channel at the start
     few: float = 0.25  # of the samples: where fewer show positions alone, other channels do too
-    same_period: float = 0.8  # of the squares of periods: a decay that leaves more is none
     between: int = 16  # places between two events, at which a state stands
     iterations: int = 30
 
@@ -139,6 +143,7 @@ class Observation:
     channels: names of columns. formulas: of each, in the `symbols` of ``coordinates`` and
     ``speeds`` and in ``parameters``, or a `Sensor`. values: (m,) of the parameters, those to start
     from or those that were fitted. loss: of what is left of a channel in units of its noise.
+    swing: where the one coordinate starts of which no channel shows position or velocity alone.
     """
 
     channels: tuple[str, ...]
@@ -148,6 +153,7 @@ class Observation:
     parameters: tuple[str, ...]
     values: Any
     loss: Loss = SOFT_L1
+    swing: Swing | None = None
 
     @staticmethod
     def plain(names: Sequence[str], speeds: Sequence[str] | None = None) -> Observation:
@@ -269,7 +275,8 @@ class Observation:
     @property
     def shortest(self) -> float:
         """Seconds of readings, below which they tell no state."""
-        return 0.0 if self.hidden is None else self.hidden.oscillations.seconds
+        own = self.swing if self.hidden is None else self.hidden.oscillations
+        return 0.0 if own is None else own.seconds
 
     @cached_property
     def unseen(self) -> tuple[int, ...]:
@@ -336,13 +343,15 @@ class Observation:
                 f"observe: {names}: no column shows it. Where only velocities are shown of one "
                 "coordinate, columns have to show the others as they are"
             )
+        if self.swing is not None:
+            return self._swinging(t, y)[:, None]
         q = np.full((len(y), self.dim), np.nan)
         q[:, seen] = y[:, [self.direct[i] for i in seen]]
         for i in self.unseen:
             if i in self.crossed:
-                q[:, i] = _swung(t, y[:, self.crossed[i]], i in angles)
+                q[:, i] = swung(t, y[:, self.crossed[i]], i in angles)
             else:
-                q[:, i] = _between_extremes(t, self._velocity(i, y))[0]
+                q[:, i] = between_extremes(t, self._velocity(i, y))[0]
         return q
 
     @cached_property
@@ -381,12 +390,16 @@ class Observation:
         found = splines([(t, q, np.ones(q.shape))]).smooth(t, q, t)
         return np.concatenate(found[:2], axis=1), found.a
 
-    def balanced(self, runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Observation:
+    def balanced(
+        self, runs: Sequence[tuple[np.ndarray, np.ndarray]], angles: Sequence[int] = ()
+    ) -> Observation:
         """The observation whose parameters let unseen coordinates come back, as far as they can, in
         runs of times t (n,) and channels y (n, k), and suit all channels best."""
         found = self
+        if self.dim == 1 and not self.crossed and not any(used == {1} for used in self._used):
+            return self._with_a_swing(runs, angles)
         for i in set(self.unseen) - {*self.crossed}:
-            slopes = [(np.ptp(t), _between_extremes(t, found._velocity(i, y))[1]) for t, y in runs]
+            slopes = [(np.ptp(t), between_extremes(t, found._velocity(i, y))[1]) for t, y in runs]
             weights, by = np.array(slopes).T
             back = np.zeros(2 * self.dim)
             back[self.dim + i] = -np.average(by, weights=weights**3)
@@ -400,18 +413,51 @@ class Observation:
             return found
         states = [found._states(t, y) for t, y in runs]
         x, a = (np.concatenate(of) for of in zip(*states, strict=True))
-        y = np.concatenate([y for _, y in runs])
-        values, scale = found.values, np.nanstd(y, axis=0)
+        return found._suited(x, a, np.concatenate([y for _, y in runs]))[0]
+
+    def _suited(self, x: np.ndarray, a: np.ndarray, y: np.ndarray) -> tuple[Observation, float]:
+        """The observation whose parameters suit channels y (n, k) of states x (n, 2d) and
+        accelerations a (n, d) best, and the mean square that it leaves, of that of y."""
+        values, scale, cost = self.values, _roughness(y), np.inf
         for _ in range(OPTIONS.iterations):
-            shown = found(x, values, a)
+            shown = self(x, values, a)
             left = ((y - shown.values) / scale).ravel()
             rows = (shown.by_coefficients / scale[:, None]).reshape(len(left), -1)
             told = np.isfinite(left) & np.isfinite(rows).all(1)
+            cost = float(np.mean(left[told] ** 2))
             change = np.linalg.lstsq(rows[told], left[told], rcond=1e-9)[0]
             values = values + change
-            if np.max(np.abs(change)) < 1e-9 * np.max(np.abs(values)):
+            if np.max(np.abs(change), initial=0.0) <= 1e-9 * np.max(np.abs(values), initial=0.0):
                 break
-        return dataclasses.replace(found, values=values)
+        return dataclasses.replace(self, values=values), cost
+
+    def _with_a_swing(
+        self, runs: Sequence[tuple[np.ndarray, np.ndarray]], angles: Sequence[int]
+    ) -> Observation:
+        """The observation with the swing, and the parameters, that suit the channels best."""
+        t, y = max(runs, key=lambda run: np.ptp(run[0]))
+        found = []
+        for k, even, turned in product(range(len(self.channels)), (False, True), (False, True)):
+            own = np.isfinite(y[:, k])
+            (line,) = dominant_frequencies([t[own]], y[own, k], 1)
+            one = Swing(k, 2 * np.pi * line, even, turned, bool(angles))
+            z = one.along(t, y)
+            unit = 1.0 if angles else np.nanstd(y[:, k]) / one.own_omega**2
+            for size in OPTIONS.sizes:
+                for sign in (1, -1):
+                    swing = dataclasses.replace(one, size=sign * size * unit / np.max(np.abs(z)))
+                    suited, cost = self._suited(*swing.states(z), y)
+                    found.append((cost, dataclasses.replace(suited, swing=swing)))
+        return min(found, key=lambda one: one[0])[1]
+
+    def _swinging(self, t: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """The swing (n,) with the sign that suits channels y (n, k) better."""
+        assert self.swing is not None
+        x, a = self.swing.states(self.swing.along(t, y))
+        left = [
+            np.nansum(((y - self(s * x, a=s * a).values) / _roughness(y)) ** 2) for s in (1, -1)
+        ]
+        return (1 - 2 * (self.swing.even and left[1] < left[0])) * x[:, 0]
 
     def _followed(
         self, x: np.ndarray, y: np.ndarray, still: list[int], scale: np.ndarray
@@ -493,6 +539,24 @@ class Observation:
         return tuple(
             n for n, a in zip(self.parameters, along, strict=True) if abs(a) > OPTIONS.same
         )
+
+    def alike(self) -> tuple[list[str], list[str]]:
+        """Parameters that no motion tells apart through the channels, whatever its law, and the
+        products and ratios of two of these that it tells, as A*l and A*g of A*(l*a + g*sin(q))."""
+        rng, names, d = np.random.default_rng(0), self.parameters, self.dim
+        c = rng.uniform(0.5, 1.5, len(names))
+        by = self._shown(rng.normal(size=(40, 2 * d)), c, rng.normal(size=(40, d)))[1]
+        rows = by[..., 3 * d :] * c
+        _, sizes, turns = np.linalg.svd(np.tensordot(rows, rows, ((0, 1), (0, 1))))
+        open_ = turns[np.sqrt(sizes) <= OPTIONS.same * np.sqrt(sizes.max(initial=0.0))]
+        own = [i for i in range(len(c)) if np.abs(open_[:, i]).max(initial=0.0) > OPTIONS.same]
+        told = [
+            f"{names[i]}{sign}{names[j]}"
+            for i, j in combinations(own, 2)
+            for sign, both in (("*", open_[:, i] + open_[:, j]), ("/", open_[:, i] - open_[:, j]))
+            if np.abs(both).max() < OPTIONS.same
+        ]
+        return [names[i] for i in own], told
 
     def _anywhere(self, scaled: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of all channels at some states, in what shifts each coordinate (or scales it
@@ -628,52 +692,10 @@ def _started(g: Observation) -> np.ndarray:
     return np.where(np.abs(values) < 1e-12, 0.0, values)
 
 
-def _between_extremes(t: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
-    """The integral (n,) of a velocity v (n,), NaN where it was not read, less a straight line
-    through its values at the extremes of v, and the slope of that line."""
-    known = np.isfinite(v)
-    if known.sum() < FEWEST:
-        return np.full(len(t), np.nan), 0.0
-    column, ones = v[:, None], np.ones((len(v), 1))
-    curve = splines([(t, column, ones)]).curve(t, v)
-    q = curve.antiderivative()(t)
-    speed, rate = np.abs(curve(t)), curve(t, nu=1)
-    at = np.flatnonzero((rate[1:] * rate[:-1] < 0) & (speed[1:] > OPTIONS.extreme * speed.max()))
-    if len(at) < 3:
-        return np.where(known, q - np.mean(q), np.nan), 0.0
-    line = np.polyfit(t[at], q[at], 1)
-    return np.where(known, q - np.polyval(line, t), np.nan), float(line[0])
-
-
-def _swung(t: np.ndarray, seen: np.ndarray, turns: bool) -> np.ndarray:
-    """Swings (n,) that cross zero at the times t (n,) of events, where ``seen`` is no NaN; an
-    interval that is twice as long as most has a crossing that was missed. They are as large as a
-    pendulum's whose period T (1 + A²/16) dies down as these do. NaN before the first event and
-    behind the last.
-
-    Raises FitError where the periods of what ``turns`` are all the same, which any amplitude has.
-    """
-    at = t[np.isfinite(seen)]
-    if len(at) < FEWEST:
-        return np.full(len(t), np.nan)
-    steps = np.diff(at)
-    count = np.append(0.0, np.cumsum(np.maximum(np.round(steps / np.median(steps)), 1)))
-    place = np.interp(t, at, count, np.nan, np.nan)
-    period = (at[2:] - at[:-2]) / (count[2:] - count[:-2])
-    best, size, life = np.inf, 1.0, np.inf
-    for tried in count[-1] * np.geomspace(0.1, 3.0, 20):
-        rows = np.stack([np.ones(len(period)), np.exp(-count[1:-1] / tried)], axis=1)
-        (least, more), *_ = np.linalg.lstsq(rows, period, rcond=None)
-        left = np.sum((rows @ [least, more] - period) ** 2)
-        if left < best and 0 < more < least / 2:
-            best, size, life = left, np.sqrt(16 * more / least), 2 * tried
-    if turns and not best < OPTIONS.same_period * np.sum((period - np.mean(period)) ** 2):
-        raise FitError(
-            "the times between events show no change of the period, so that they do not tell how "
-            "large the swings are, nor the law: record swings that die down, or the angle too",
-            verdict="no law: times of events without a change of the period tell no amplitude",
-        )
-    return size * np.exp(-place / life) * np.sin(np.pi * place)
+def _roughness(y: np.ndarray) -> np.ndarray:
+    """About the noise (k,) of channels y (n, k), by their second differences."""
+    rough = np.nanstd(np.diff(y, 2, axis=0), axis=0) / np.sqrt(6)
+    return np.fmax(rough, OPTIONS.clean * np.nanstd(y, axis=0))
 
 
 def _spans(table: np.ndarray, column: np.ndarray) -> bool:

@@ -55,6 +55,7 @@ from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.maps.stroboscopic import OverPhases
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.maps.unseen import Swing
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.scene import Scene
 from gfnn_jax.solve.noise import Biweight, SoftL1, Wander
@@ -101,6 +102,7 @@ _TYPES: dict[str, type] = {
         OfBodies,
         Crossing,
         Hidden,
+        Swing,
         SoftL1,
         Biweight,
         Damping,

@@ -39,7 +39,7 @@ class Oscillations(NamedTuple):
     @property
     def seconds(self) -> float:
         """Length of a window."""
-        return _OPTIONS.periods * 2 * np.pi / float(np.min(self.omega))
+        return _OPTIONS.periods * 2 * np.pi / float(np.min(self.omega[self.omega > 0]))
 
     @property
     def are_apart(self) -> bool:

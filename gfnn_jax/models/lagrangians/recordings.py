@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import re
+import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -373,6 +375,16 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
         scales=recording.scales,
         columns=recording.columns,
     )
+    alike, told = observation.alike()
+    if alike:
+        one = re.compile(rf"\b{alike[0]}\b")
+        texts = {n: one.sub("1", f) for n, f in recording.observe.items() if isinstance(f, str)}
+        typed = " ".join(f"--observe {shlex.quote(f'{n} = {f}')}" for n, f in texts.items())
+        raise InputError(
+            f"observe: {', '.join(alike)} are not identifiable one by one"
+            + f", but {', '.join(told)} are" * bool(told)
+            + f". Write a number for {alike[0]}: {typed}"
+        )
     lengths = [i for i in range(len(names)) if i not in angles]
     open_ = observation.undetermined(lengths)
     if open_:
@@ -400,7 +412,7 @@ def samples_of(
     if observation.unseen:
         names = observation.channels
         own = [(recording.times(r), channels_of(recording, names, r)[0]) for r in recording.runs]
-        observation = observation.balanced(own)
+        observation = observation.balanced(own, angles)
     found = _segments(recording, observation, angles, parameters)
     offset = [i for i in observation.shifts() if i not in angles]
     if offset and not recording.guess:  # an offset starts at the middle of its coordinate

@@ -99,6 +99,13 @@ def best_start(problem: ArcProblem) -> LawFit:
     ]
     every = libraries.every(d, angles)
     some.add(textbook)
+    if problem.observation.swing is not None:  # whose sign a sensor may have wrong
+        problem = dataclasses.replace(
+            problem, nodes=[dataclasses.replace(n, x=-n.x) for n in problem.nodes]
+        )
+        other = _Starts(problem)
+        other.add(textbook)
+        some = min(some, other, key=lambda one: min(map(misfit, one.fits), default=np.inf))
     if problem.observation.crossed and some.fits:  # times of one event tell no more
         return some.fits[0]
     if d > 1 and len(angles) == d:
