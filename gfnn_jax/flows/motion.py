@@ -158,16 +158,12 @@ class Form:
 
         width, frictions = 2 * self.dim, self.friction.count
         columns = (0, width, width + self.count)[order]
-        c, losses, gains = self.split(p)
+        own, turns = self.basis.shape[1], np.atleast_2d(self.terms.phases)
         with np.errstate(all="ignore"):  # of lanes without a law, which become NaN
-            theta = self.fixed + c @ self.basis.T
-            turns = np.atleast_2d(self.terms.phases)
+            theta = self.fixed + p[..., :own] @ self.basis.T
             turns = np.concatenate([np.cos(turns), np.sin(turns)], axis=1)
-        flat = gains.reshape(*p.shape[:-1], self.dim * self.num_inputs)
-        laws = (
-            _owned(np.atleast_2d(np.concatenate([theta, losses, flat], axis=-1))),
-            _owned(turns),
-        )
+        whole = np.concatenate([theta, p[..., own:]], axis=-1)
+        laws = _owned(np.atleast_2d(whole)), _owned(turns)
         begun = np.full((len(x), frictions), np.nan) if modes is None else modes
         lanes = (x.shape, begun.shape, u.shape[:2], u.shape[4:])
         asked = ((len(h), width), (len(h), frictions), h.shape, (self.num_inputs,))

@@ -130,7 +130,7 @@ def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> La
 
 
 def law_of(map_: Any) -> Law:
-    """Law of a map that was learned from a recording."""
+    """Law of a map that was learned from a recording; a map keeps it as `law_in_use`."""
     law = jax.tree.map(np.asarray, law_of_map(map_))
     root = None if map_.posterior is None else map_.posterior.root
     return law_in_use(law, root, map_.sensors)
@@ -138,7 +138,7 @@ def law_of(map_: Any) -> Law:
 
 def estimate(map_: Any, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Implement `maps.forecasts.estimate` for the map of a law."""
-    law = law_of(map_)
+    law = map_.law_in_use
     windows = windows_of(law.sensors, recording, map_.parameters)
     d = law.form.dim
     x, covariance = estimates_of([law], np.zeros(len(windows), int), windows)
@@ -163,7 +163,7 @@ def forecast(
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...], np.ndarray]:
     """Implement `maps.forecasts.forecast` for the map of a law: values, std, outside, and how many
     standard deviations (runs,) hold whole trajectories with the probability ``whole``."""
-    law = law_of(map_)
+    law = map_.law_in_use
     sensors = law.sensors
     windows = windows_of(sensors, recording, map_.parameters)
     last = np.array([np.max(w.t) for w in windows])
@@ -636,9 +636,10 @@ def _followed(
         orbit.append(step.states)
         x, modes = step.states[:, -1], step.modes[:, -1]
         further = step.by_coefficients[..., :count] @ roots[:, None].swapaxes(2, 3)
-        for k in range(further.shape[1]):
-            spread = step.by_state[:, k] @ spread
-            spread[..., size:] += further[:, k]
+        of_steps = (part.swapaxes(0, 1) for part in (step.by_state, further))
+        for k, (by_state, pushed) in enumerate(zip(*of_steps, strict=True)):
+            spread = by_state @ spread
+            spread[..., size:] += pushed
             if level.size:
                 push = step.by_coefficients[:, k, :, :count] @ friction[..., None]
                 spread[..., :size] += push @ of_level
@@ -650,9 +651,10 @@ def _followed(
 def _side_by_side(laws: Sequence[Law], which: np.ndarray) -> tuple[Form, np.ndarray, np.ndarray]:
     """A form with the phases of each lane, coefficients (B, n) and roots (B, m, n) of lanes of
     which each follows one of the laws."""
-    terms = laws[0].form.terms
-    phases = np.stack([law.form.terms.phases for law in laws])[which]
-    form = dataclasses.replace(laws[0].form, terms=dataclasses.replace(terms, phases=phases))
+    form, terms = laws[0].form, laws[0].form.terms
+    if len(laws) > 1:
+        phases = np.stack([law.form.terms.phases for law in laws])[which]
+        form = dataclasses.replace(form, terms=dataclasses.replace(terms, phases=phases))
     most = max(len(law.root) for law in laws)
     roots = np.stack([np.pad(law.root, ((0, most - len(law.root)), (0, 0))) for law in laws])
     return form, np.stack([law.p for law in laws])[which], roots[which]
@@ -662,11 +664,12 @@ def _in_steps(sensors: Sensors, times: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Times (B, n) with those between them that Runge–Kutta steps need, and the places of all but
     the first."""
     steps = np.diff(times, axis=1)
-    parts = [substeps_of(sensors, np.max(h, initial=0.0)) for h in steps.T]
-    between = [
-        times[:, k, None] + steps[:, k, None] * np.arange(n) / n for k, n in enumerate(parts)
-    ]
-    return np.concatenate([*between, times[:, -1:]], axis=1), np.cumsum(parts)
+    parts = substeps_of(sensors, np.max(steps, axis=0, initial=0.0))
+    ends = np.cumsum(parts)
+    begun = np.repeat(np.arange(len(parts)), parts)
+    within = np.arange(len(begun)) - (ends - parts)[begun]
+    between = times[:, begun] + steps[:, begun] * within / parts[begun]
+    return np.concatenate([between, times[:, -1:]], axis=1), ends
 
 
 def _channels(laws: Sequence[Law], which: np.ndarray, x: np.ndarray, u: np.ndarray) -> Observed:
@@ -687,9 +690,9 @@ def _channels(laws: Sequence[Law], which: np.ndarray, x: np.ndarray, u: np.ndarr
     return Observed(*map(np.stack, zip(*found, strict=True)))
 
 
-def substeps_of(sensors: Sensors, h: float) -> int:
-    """Runge–Kutta steps that a step h is made of."""
-    return max(1, int(np.ceil(h * sensors.omega / _OPTIONS.fine)))
+def substeps_of(sensors: Sensors, h: Any) -> Any:
+    """Runge–Kutta steps that a step h (...) is made of."""
+    return np.maximum(1, np.ceil(h * sensors.omega / _OPTIONS.fine).astype(int))
 
 
 def _inputs(law: Law, windows: Sequence[Window], t: np.ndarray, substeps: int) -> np.ndarray:

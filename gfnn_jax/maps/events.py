@@ -20,7 +20,7 @@ from gfnn_jax.families.lagrangian import DRY, functions_of
 from gfnn_jax.flows.dormand_prince import NODES
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.schedules import of_polynomials
-from gfnn_jax.maps.estimates import Law, law_of, substeps_of
+from gfnn_jax.maps.estimates import Law, substeps_of
 from gfnn_jax.maps.inner import contains, parts_of_two_pi
 from gfnn_jax.maps.inputs import Scheduled
 from gfnn_jax.maps.lanes import Lanes, RolloutInfo, Saving, start_lanes
@@ -163,7 +163,7 @@ def followed(map_: Any, *given: Any) -> Followed | None:
     bare = jax.tree.map(np.asarray, map_)
     if np.any(bare.dt <= 0):
         return None
-    return Followed(bare, law_of(map_), substeps_of(map_.sensors, float(np.max(bare.dt))))
+    return Followed(bare, map_.law_in_use, substeps_of(map_.sensors, float(np.max(bare.dt))))
 
 
 def _modes(v: np.ndarray, directions: np.ndarray) -> np.ndarray:

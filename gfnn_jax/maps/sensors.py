@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -62,7 +63,7 @@ class Sensors:
         window = max(self.window, 0.25 * float(np.max(self.leads)))
         return dataclasses.replace(self, level=level, window=window)
 
-    @property
+    @cached_property
     def observation_model(self) -> Observation:
         """Observation of a state by the channels."""
         return self.observation or Observation.plain(self.positions)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from functools import cached_property
 from numbers import Integral
 from typing import Any
 
@@ -298,6 +299,14 @@ class SymplecticMap:
         """Energy per unit of time at z: ``lost`` (..., F) by each friction and ``supplied``
         (..., k) by each input: `maps.energy`. Raises ValueError for a map that is no flow."""
         return energy.power_of(self, z, args, inputs)
+
+    @cached_property
+    def law_in_use(self):
+        """Law of a map that was learned from a recording, with its sensors: `maps.estimates.Law`,
+        made once."""
+        from gfnn_jax.maps import estimates  # stands after this module: loaded when first used
+
+        return estimates.law_of(self)
 
     def estimate(self, recording) -> tuple[np.ndarray, np.ndarray]:
         """States z = (q, p) (runs, 2d) at each run's last time and their covariance (runs, 2d, 2d),

@@ -434,7 +434,8 @@ class _Units(NamedTuple):
         """Rows (a, L, k, ...) of a block of arcs, mixed along each arc into white ones."""
         if self.whitening is None:
             return rows
-        return np.einsum("akij,ajk...->aik...", self.whitening[block], rows, optimize=True)
+        by_channel = rows.reshape(*rows.shape[:3], -1).swapaxes(1, 2)
+        return (self.whitening[block] @ by_channel).swapaxes(1, 2).reshape(rows.shape)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -483,7 +484,7 @@ class _Iterate:
         gap = self.gap / OPTIONS.defect
         return self.cost + gap * gap  # infinite where it overflows, which a power of 2 refuses
 
-    @property
+    @cached_property
     def merits(self) -> np.ndarray:
         """Merit (A,) of each arc."""
         with np.errstate(all="ignore"):
@@ -496,7 +497,7 @@ class _Iterate:
         most = OPTIONS.closed**2 * self.x[0].size
         return np.where(self.gaps <= most, 0.0, self.gaps / OPTIONS.defect**2)
 
-    @property
+    @cached_property
     def gaps(self) -> np.ndarray:
         """Sum of squares (A,) of each arc's defects, in units of the states'."""
         with np.errstate(all="ignore"):
@@ -572,10 +573,11 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     S = np.zeros((num_arcs, length, m, m + n + 1))
     S[:, 0, range(m), range(m)] = 1.0
     with np.errstate(all="ignore"):  # along an arc that is no orbit they may overflow
-        for i in range(length - 1):
-            S[:, i + 1] = defects.by_state[:, i] @ S[:, i]
-            S[:, i + 1, :, m : m + n] += defects.by_coefficients[:, i]
-            S[:, i + 1, :, -1] += defects.closing[:, i]
+        S[:, 1:, :, m : m + n], S[:, 1:, :, -1] = defects.by_coefficients, defects.closing
+        nodes = S.swapaxes(0, 1)
+        by_state = defects.by_state.swapaxes(0, 1)
+        for by, here, there in zip(by_state, nodes[:-1], nodes[1:], strict=True):
+            there += by @ here
         J = observed.by_state @ S
     J[..., m:-1] += observed.by_coefficients
     J /= sigma[..., None]
@@ -603,10 +605,14 @@ def _solve(rows: _Rows, defects: Defects, damping: float) -> tuple[np.ndarray, n
     pivots = np.abs(np.diagonal(own, axis1=1, axis2=2)) / units
     loose = pivots.min(axis=1) <= OPTIONS.loose * pivots.max(axis=1)
     moved[~loose] = np.linalg.solve(own[~loose], right[~loose])
-    inverse = np.linalg.pinv(own[loose] / units, rcond=OPTIONS.loose)
-    moved[loose] = inverse @ right[loose] / units[:, None]
-    dx = [moved[..., 0]]
-    for i in range(defects.closing.shape[1]):
-        carried = (defects.by_state[:, i] @ dx[-1][..., None])[..., 0]
-        dx.append(carried + defects.by_coefficients[:, i] @ dp + defects.closing[:, i])
-    return dp, np.stack(dx, axis=1)
+    if loose.any():
+        inverse = np.linalg.pinv(own[loose] / units, rcond=OPTIONS.loose)
+        moved[loose] = inverse @ right[loose] / units[:, None]
+    pushed = (defects.by_coefficients @ dp)[..., None]
+    dx = np.concatenate([moved[:, None], pushed], axis=1)
+    nodes, parts = dx.swapaxes(0, 1), (defects.by_state, defects.closing[..., None])
+    steps = zip(*(part.swapaxes(0, 1) for part in parts), nodes[:-1], nodes[1:], strict=True)
+    for by, closing, here, there in steps:
+        there += by @ here
+        there += closing
+    return dp, dx[..., 0]
