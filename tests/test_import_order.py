@@ -63,6 +63,7 @@ SHORTHANDS = {
     ("maps.symplectic_map", f"maps.{name}")
     for name in (
         "saved",
+        "estimates",
         "forecasts",
         "events",
         "laws",
