@@ -38,7 +38,7 @@ class StartOptions:
     period, below which more of them are the remedy. plain: times the residual of the larger
     library, that a plainer one's may have. noise: residual, times the noise, that is no more.
     exponents: of the distance, where a power of it begins; beside: up to which it is then found;
-    rounded: up to which it is a half, or whole.
+    rounded: up to which it is a half, or whole, or none.
     """
 
     followed: float = 10.0
@@ -219,7 +219,8 @@ class _Starts:
     def add_central(self, textbook: Sequence[Row], rank: int, across: bool) -> None:
         """Start from a force along or across the line to the origin by a power of the distance,
         with equal masses, alone or beside the textbook's, where the residuals of all starts are
-        more than noise: the likeliest, by Schwarz's criterion."""
+        more than noise: the likeliest, by Schwarz's criterion. Across, the power 0 is a uniform
+        field."""
         problem, d = self.problem, self.problem.dim
         if d == 1 or problem.angles or self.are_noise:
             return
@@ -228,6 +229,8 @@ class _Starts:
         def rows(exponent: float, others: Sequence[Row]) -> list[Row]:
             if exponent == 2:
                 return list(textbook)  # springs
+            if abs(exponent) < OPTIONS.rounded:
+                return [*others, *(libraries.gyroscopic(d, (), 1) if across else [])]
             along, *fields = libraries.central(d, exponent)
             return [*others, *(fields if across else [along])]
 
@@ -252,7 +255,9 @@ class _Starts:
         tried: dict[tuple[int, float], float] = {}
 
         def attempt(exponent: float, others: Sequence[Row]) -> None:
-            if exponent and (len(others), exponent) not in tried and not self.are_noise:
+            exponent = 0.0 if abs(exponent) < OPTIONS.rounded else exponent
+            new = (exponent or across) and (len(others), exponent) not in tried
+            if new and not self.are_noise:
                 before = len(self.fits)
                 self.add(_Library(rows(exponent, others), rank, apart=True, equal=True))
                 least = min(map(misfit, self.fits[before:]), default=np.inf)
@@ -267,7 +272,9 @@ class _Starts:
             if a == b or min(at_a, at_b) > least or not np.isfinite(max(at_a, at_b)):
                 continue
             for sign in (-1, 1):  # misfits are proportional to the distance from the exponent
-                best = (a * at_b + sign * b * at_a) / (at_b + sign * at_a)
+                best = (a * at_b + sign * b * at_a) / max(at_b + sign * at_a, 1e-300, key=abs)
+                if abs(best - b) > OPTIONS.beside:
+                    continue
                 plain = float(np.round(2 * best) / 2)
                 attempt(
                     plain if abs(best - plain) < OPTIONS.rounded else float(f"{best:.4g}"), others
