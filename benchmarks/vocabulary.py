@@ -267,6 +267,28 @@ def motor_cart(rng: np.random.Generator) -> System:
     )
 
 
+def magnet_on_a_spring(rng: np.random.Generator) -> System:
+    """A force i² ÷ (a + y)² beside a spring, by a current that is recorded."""
+    gap, pull = rng.uniform(1.5, 3), rng.uniform(0.3, 1)
+    return System(
+        {"v1**2": 0.5, "x1**2": -0.5, f"u1**2/({gap} + x1)": pull * gap},
+        ((rng.uniform(-0.3, 0.3),), (0.0,)),
+        friction={"v1**2": rng.uniform(0.02, 0.1)},
+        dwell=20,
+    )
+
+
+def parametric_drive(rng: np.random.Generator) -> System:
+    """A pendulum whose pivot is shaken, which no column shows."""
+    omega, phase = rng.uniform(1.3, 2.6), rng.uniform(0, 2 * np.pi)
+    return System(
+        {"v1**2": 0.5, "cos(x1)": 1.0, f"cos(x1)*cos({omega}*t + {phase})": rng.uniform(0.1, 0.4)},
+        ((rng.uniform(0.5, 1.5),), (0.0,)),
+        (0,),
+        {"v1**2": rng.uniform(0.01, 0.04)},
+    )
+
+
 def motor_arm(rng: np.random.Generator) -> System:
     cart = motor_cart(rng)
     terms = {**cart.lagrangian, "v1**2*cos(2*x2)": -0.25}
@@ -281,7 +303,7 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
         *(two_wells, hoop, ball_and_beam, rocking_disc, wire, central),
         *(springs_between_angles, elastic_pendulum, relativistic),
         *(drive_not_recorded, drive_of_two_phases, cubic_drag, one_sided_friction),
-        *(motor_cart, motor_arm),
+        *(motor_cart, motor_arm, magnet_on_a_spring, parametric_drive),
     )
 }
 
@@ -300,7 +322,8 @@ def rates(
     """q̈ at (t, q, v) of the text of L, R and forces in t and the signal u1, by SymPy; dry friction
     turns over a small speed. Terms with coordinates that are led act on these alone."""
     q, v = (sp.symbols([f"{s}{i + 1}" for i in range(dim)], real=True) for s in "xv")
-    names = {str(s): s for s in (*q, *v)} | {"abs": sp.Abs}
+    t, u = sp.Symbol("t", real=True), sp.Function("u1")
+    names = {str(s): s for s in (*q, *v)} | {"abs": sp.Abs, "t": t, "u1": u(t)}
     law, loss = (sp.parse_expr(text, local_dict=names) for text in (L, R))
     led = {s for i in range(dim) if leaders and i not in leaders for s in (q[i], v[i])}
     alone = sp.Add(*(term for term in sp.Add.make_args(law) if not led & term.free_symbols))
@@ -310,7 +333,6 @@ def rates(
         moved = sum(sp.diff(own, s, y) * w for y, w in zip(q, v, strict=True))
         left.append(sp.diff(own, x) - moved - sp.diff(loss, s))
         masses.append([sp.diff(own, s, w) for w in v])
-    t, u = sp.Symbol("t", real=True), sp.Function("u1")
     for i, text in enumerate(push):
         left[i] += sp.parse_expr(text, local_dict={"t": t, "u1": u(t)})
     known = {"sign": lambda s: np.tanh(s / _WIDTH), "u1": signal}

@@ -2,6 +2,8 @@
 
 The oracle is the system that made the recording; `benchmarks/vocabulary.py` draws many."""
 
+import re
+
 import numpy as np
 import pytest
 import sympy as sp
@@ -9,8 +11,11 @@ from analytic import motion
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
-from gfnn_jax.errors import FitError
+from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.lagrangian import Friction, Terms
+from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.given_terms import given_terms
 
 NOISE = 1e-3
 
@@ -145,3 +150,62 @@ def test_a_drive_that_nobody_recorded_is_found_named_and_forecast(tmp_path):
     fit.save(tmp_path / "fit")
     ahead = gfnn.load(tmp_path / "fit").map.forecast(recording, whole[until:])
     assert np.abs(ahead.values["x"][0] - x[until:]).max() < 0.01
+
+
+def test_terms_with_inputs_move_by_the_compiled_law_as_by_the_lagrangian():
+    """A support that moves and a magnet: ½v² − ½(x − u)² + i²/(0.4 + x); the oracle is SciPy."""
+    given = given_terms(["V: (x - u)**2", "V: i**2/(0.4 + x)"], ["x"], ["v"], (), ["u", "i"])
+    terms = Terms.of(given.terms, 1)
+    assert terms.texts(["x"], ["v"], ["u", "i"])[1:] == ("(x - u)**2", "i**2/(0.4 + x)")
+    form = Form(terms, np.array([0.5, -0.5, 1.0]), np.zeros((3, 0)), Friction.of([], 1), 2)
+    p, u, x = np.zeros(2), np.array([0.3, 0.5]), np.array([0.7, -0.2])
+    step = form.step(p, x[None], np.array([0.2]), np.tile(u, (1, 8, 6, 1)))
+
+    def force(x):
+        return -(x - u[0]) - u[1] ** 2 / (0.4 + x) ** 2
+
+    exact = solve_ivp(lambda t, z: [z[1], force(z[0])], (0, 0.2), x, rtol=1e-12, atol=1e-13)
+    assert step.states[0] == pytest.approx(exact.y[:, -1], abs=1e-10)
+    law = form.lagrangian(p)
+    assert law.acceleration(x[:1], x[1:], u) == pytest.approx(force(x[0]))
+    assert law.energy(x[:1], x[1:]) == pytest.approx(0.5 * x[1] ** 2)  # without inputs
+    with pytest.raises(InputError, match="without inputs"):
+        given_terms(["v**2*u"], ["x"], ["v"], (), ["u"])
+
+
+def a_magnet():
+    """Positions of a body on a spring, and the current of the magnet that pulls it, held."""
+    rng, dt, x, seen = np.random.default_rng(1), 0.2, np.array([0.2, 0.0]), []
+    current = np.repeat(rng.uniform(-1.5, 1.5, 40), 20)
+    for i in current:
+        seen.append(x[0])
+        force = lambda z, i=i: -z[0] - 0.08 * z[1] - 1.2 * i**2 / (2 + z[0]) ** 2  # noqa: E731
+        x = solve_ivp(lambda t, z, f=force: [z[1], f(z)], (0, dt), x, rtol=1e-9, atol=1e-11).y[
+            :, -1
+        ]
+    noise = NOISE * np.std(seen) * rng.normal(size=len(seen))
+    columns = {"t": dt * np.arange(len(seen)), "x": seen + noise, "i": current}
+    return gfnn.Recording(columns, positions=["x"], inputs=["i"])
+
+
+@pytest.mark.slow
+def test_a_magnet_pulls_by_its_current_squared_and_its_gap():
+    fit = gfnn.fit(a_magnet())
+    (shape,) = [term.term for term in fit.lagrangian.terms if "i" in term.term]
+    gap = 1 / float(re.fullmatch(r"i\*\*2/\(1 \+ ([\d.]+)\*x\)", shape)[1])
+    assert gap == pytest.approx(2, rel=0.02)
+    assert any("inside i**2" in message for message in fit.messages)
+
+
+@pytest.mark.slow
+def test_a_pivot_that_is_shaken_unseen_is_a_drive_of_the_stiffness():
+    omega, t = 2.1, np.linspace(0, 100, 900)
+    of = lambda t, z: [z[1], -(1 + 0.3 * np.cos(omega * t)) * np.sin(z[0]) - 0.03 * z[1]]  # noqa: E731
+    x = solve_ivp(of, (0, 100), [1.2, 0], t_eval=t, rtol=1e-9, atol=1e-11).y[0]
+    x = x + NOISE * x.std() * np.random.default_rng(0).normal(size=len(x))
+    fit = gfnn.fit(gfnn.Recording({"t": t, "x": x}, positions=["x"], angles=["x"]))
+    found = float(re.search(r"acts at ([\d.]+)", " ".join(fit.messages))[1])
+    assert found == pytest.approx(omega, rel=1e-4)
+    gains = {term.term[:14]: term.coefficient for term in fit.lagrangian.terms}
+    assert gains["cos(x)*cos(2.1"] == pytest.approx(0.3, abs=1e-3)
+    assert fit.verdict == "identified"

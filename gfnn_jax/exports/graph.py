@@ -201,7 +201,8 @@ def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
         law = law.at(args[..., : len(law.powers[0])])
     gains = np.asarray(law.gains, dtype=object).reshape(dim, law.num_inputs)
     losses = np.asarray(law.losses, dtype=object).ravel()
-    gradient = Legendre(law.terms).gradient(law.coefficients, z)[0]
+    u = args[..., -law.num_inputs :] if law.num_inputs else None
+    gradient = Legendre(law.terms).gradient(law.coefficients, z, u)[0]
     v = gradient[dim:]
     forces = -gradient[:dim] - z[0, dim:] * law.uniform
     if own.count:

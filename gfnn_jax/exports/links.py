@@ -97,10 +97,10 @@ def robot_of(map_: SymplecticMap) -> Robot:
             "this law is one of systems that differ in parameters, and MJCF and URDF hold one: use "
             "--to fmu"
         )
-    if law.terms.leaders:
+    if law.terms.leaders or law.terms.driven:
         raise InputError(
-            "in this law some coordinates move others that do not act back on them, which no chain "
-            "of links does: use --to fmu"
+            "in this law some coordinates move others that do not act back on them, or terms have "
+            "inputs, which no chain of links does: use --to fmu"
         )
     rng = np.random.default_rng(0)
     q, none = rng.uniform(-np.pi, np.pi, (OPTIONS.states, dim)), np.zeros((OPTIONS.states, dim))

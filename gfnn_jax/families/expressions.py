@@ -195,13 +195,16 @@ def parse_named(text: str, names: Sequence[str]) -> Expression:
     return _read(text, lambda tree: _parsed(tree, known, text, 0))
 
 
-def summands(text: str, names: Sequence[str]) -> list[tuple[str, Expression]]:
-    """The terms of a sum in variables of these names, as `parse_named` reads each, without the
-    number before it, and its text.
+def summands(
+    text: str, names: Sequence[str], parameters: Sequence[str] = ()
+) -> list[tuple[str, Expression]]:
+    """The terms of a sum in variables and parameters of these names, as `parse_named` reads each,
+    without the number before it, and its text.
 
     Raises InputError as `parse` does.
     """
     known = {name: coordinate(i) for i, name in enumerate(names)}
+    known |= {name: parameter(i) for i, name in enumerate(parameters)}
 
     def parts(tree: ast.expr) -> list[tuple[str, Expression]]:
         found, open_ = [], [tree]
@@ -328,10 +331,15 @@ def to_text(tree: Expression, dim: int, parameters: tuple[str, ...] = ()) -> str
     return _text(tree, (*coordinate_names(dim), *parameters), 2 * dim)[0]
 
 
-def to_named_text(tree: Expression, names: Sequence[str], as_factor: bool = False) -> str:
-    """Write a tree of coordinates of these names as text that `parse_named` reads back; a sum in
-    brackets where other factors will stand before it."""
-    text, binds = _text(tree, tuple(names), len(names))
+def to_named_text(
+    tree: Expression,
+    names: Sequence[str],
+    parameters: Sequence[str] = (),
+    as_factor: bool = False,
+) -> str:
+    """Write a tree of coordinates and parameters of these names as text that `parse_named` reads
+    back; a sum in brackets where other factors will stand before it."""
+    text, binds = _text(tree, (*names, *parameters), len(names))
     return f"({text})" if as_factor and binds < _PRODUCT else text
 
 
@@ -371,6 +379,25 @@ def depends_on(tree: Expression) -> set[int]:
     if tree.operation == "coordinate":
         return {tree.operands[0]}
     return set().union(*(depends_on(o) for o in tree.operands if isinstance(o, Expression)))
+
+
+def along_parameters(tree: Expression, count: int, step: float) -> Expression:
+    """The derivative of an expression along the first ``count`` parameters, times the ``count``
+    that follow, by the difference over two steps."""
+
+    def moved(tree: Expression, by: float) -> Expression:
+        if tree.operation == "parameter":
+            return tree + by * parameter(tree.operands[0] + count)
+        inner = (moved(o, by) if isinstance(o, Expression) else o for o in tree.operands)
+        return Expression(tree.operation, tuple(inner))
+
+    return (moved(tree, step) - moved(tree, -step)) * (0.5 / step)
+
+
+def has_parameters(tree: Expression) -> bool:
+    """Return whether a parameter is in the expression."""
+    inner = (o for o in tree.operands if isinstance(o, Expression))
+    return tree.operation == "parameter" or any(map(has_parameters, inner))
 
 
 def whole_multiples(tree: Expression) -> tuple[dict[int, int], float] | None:

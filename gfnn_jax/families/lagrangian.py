@@ -6,12 +6,12 @@
 
 k, n and m are whole numbers, and a term has at most two factors v: kinetic, gyroscopic and
 potential terms. g, where a term has one, is any other formula: its *shape*, 1/√(q1² + q2²) or
-exp(−q1). With s = c·v, the speed of one coordinate or the relative speed of two, friction is
-linear, r = ½s²; quadratic, r = ⅓|s|³; dry, r = √(s² + ε²) − ε; a power a of the speed, r = |s|^(a +
-1)/(a + 1); or one-sided, r = ½ max(s, 0)², which beside linear friction makes it depend on the
-direction. Everything is batch first, in closed form, and runs in NumPy or JAX. A term is a row of
-arrays, none of which is static, so that another library of as many terms (`Terms.padded`) compiles
-nothing.
+exp(−q1); of a term without v it may have inputs too, u1²/(0.3 + q1). With s = c·v, the speed of one
+coordinate or the relative speed of two, friction is linear, r = ½s²; quadratic, r = ⅓|s|³; dry, r =
+√(s² + ε²) − ε; a power a of the speed, r = |s|^(a + 1)/(a + 1); or one-sided, r = ½ max(s, 0)²,
+which beside linear friction makes it depend on the direction. Everything is batch first, in closed
+form, and runs in NumPy or JAX. A term is a row of arrays, none of which is static, so that another
+library of as many terms (`Terms.padded`) compiles nothing.
 
 Of systems that differ in parameters μ, a length or a mass, each coefficient is multiplied by a
 product of whole powers of these: L = Σ θ_j ∏ μ_i^a_ji ℓ_j(q, v), and R and G alike. The law of one
@@ -22,16 +22,24 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gfnn_jax.arrays import as_row, matmul, namespace, pytree
-from gfnn_jax.families.expressions import Expression, depends_on, parse, to_named_text
+from gfnn_jax.families.expressions import (
+    Expression,
+    depends_on,
+    has_parameters,
+    number,
+    parse,
+    to_named_text,
+)
 from gfnn_jax.families.jets import jets
 from gfnn_jax.families.text import added, barred, combination, power, shown
 
+INPUTS = tuple(f"u{j + 1}" for j in range(64))  # their names in shapes
 MAX_POWER = 8  # of one coordinate in one term; powers come from a table of this length
 Powers = tuple[tuple[int, ...], ...]  # of the parameters, (m, k), for each coefficient
 # Kinds of friction. UNIFORM stands in a fit's `flows.motion.Form` alone.
@@ -61,8 +69,20 @@ class Derivatives(NamedTuple):
 
 
 def shape_of(row: Sequence[Any]) -> str:
-    """The shape of a row (k, n, m, φ, shape), as text in q1, …, qd; "" where it has none."""
+    """The shape of a row (k, n, m, φ, shape), as text in q1, …, qd and inputs u1, …; "" where it
+    has none."""
     return row[4] if len(row) > 4 and isinstance(row[4], str) else ""
+
+
+@cache
+def tree_of(shape: str, dim: int) -> Expression:
+    """The tree of a shape, whose parameters are the inputs; of "" that of 1."""
+    return parse(shape or "1", dim, INPUTS)
+
+
+def has_inputs(row: Sequence[Any]) -> bool:
+    """Return whether a row has inputs in its shape."""
+    return has_parameters(tree_of(shape_of(row), len(row[0])))
 
 
 def coordinates_in(row: Sequence[Any], phased: bool = True) -> tuple[bool, ...]:
@@ -70,7 +90,7 @@ def coordinates_in(row: Sequence[Any], phased: bool = True) -> tuple[bool, ...]:
     its powers and its shape alone."""
     powers, wave = row[1:3]
     found = [bool(n or (m and phased)) for n, m in zip(powers, wave, strict=True)]
-    for i in depends_on(parse(shape_of(row) or "1", len(powers))):
+    for i in depends_on(tree_of(shape_of(row), len(powers))):
         found[i] = True
     return tuple(found)
 
@@ -78,7 +98,7 @@ def coordinates_in(row: Sequence[Any], phased: bool = True) -> tuple[bool, ...]:
 @pytree("shapes", "leaders")
 class Terms:
     """The terms ℓ_j of a Lagrangian: whole numbers k, n and m, each (P, d), phases (P,), and their
-    shapes as text in q1, …, qd, "" of a term without, () where none has one.
+    shapes as text in q1, …, qd and inputs u1, …, "" of a term without, () where none has one.
 
     A phase is 0 for a cosine and −π/2 for a sine. leaders: coordinates that move others and are not
     moved by them, as a cart whose motor holds its course: a term with one of the others acts on the
@@ -125,11 +145,18 @@ class Terms:
     @cached_property
     def trees(self) -> dict[int, Expression]:
         """The shapes of the terms that have one."""
-        return {j: parse(text, self.dim) for j, text in enumerate(self.shapes) if text}
+        return {j: tree_of(text, self.dim) for j, text in enumerate(self.shapes) if text}
 
-    def texts(self, names: Sequence[str], speeds: Sequence[str]) -> tuple[str, ...]:
-        """Each term as code in the names of the coordinates and of their velocities; a phase other
-        than that of a cosine or a sine stays in the argument."""
+    @cached_property
+    def driven(self) -> bool:
+        """Return whether some term has inputs in its shape."""
+        return any(map(has_parameters, self.trees.values()))
+
+    def texts(
+        self, names: Sequence[str], speeds: Sequence[str], inputs: Sequence[str] = INPUTS
+    ) -> tuple[str, ...]:
+        """Each term as code in the names of the coordinates, their velocities and the inputs; a
+        phase other than that of a cosine or a sine stays in the argument."""
         listed = []
         for j, (k, n, m, phase, *_) in enumerate(self.rows()):
             factors = [power(x, e) for x, e in zip((*speeds, *names), (*k, *n), strict=True) if e]
@@ -141,7 +168,7 @@ class Terms:
                 factors.append(f"{'sin' if sine else 'cos'}({inside})")
             text = "*".join(factors)
             if j in self.trees:
-                shape = to_named_text(self.trees[j], names, as_factor=True)
+                shape = to_named_text(self.trees[j], names, inputs, as_factor=True)
                 below = text and shape.startswith("1/")
                 text = text + shape[1:] if below else "*".join([*factors, shape])
             listed.append(text or "1")
@@ -196,11 +223,16 @@ class Terms:
         own = as_row(xp.eye(self.dim, dtype=k.dtype), outer) * k[:, None, :]
         return (outer - own) * twice[:, None, None], k * once[:, None], never
 
-    def potentials(self, q: Any, order: int = 2) -> Potentials:
+    def potentials(self, q: Any, order: int = 2, u: Any = None) -> Potentials:
         """∏ q_i^n_i cos(m·q + φ) g(q) at q (..., d), with its derivatives up to ``order`` 0, 1 or
-        2."""
+        2; u (..., inputs), None for none: terms that have inputs are 0 there."""
         found = self._waves(q, order)
-        return _shaped(found, self.trees, q, order) if self.shapes else found
+        if not self.shapes:
+            return found
+        trees = self.trees
+        if u is None and self.driven:
+            trees = {j: number(0.0) if has_parameters(g) else g for j, g in trees.items()}
+        return _shaped(found, trees, q, order, u if self.driven else None)
 
     def _waves(self, q: Any, order: int) -> Potentials:
         """The same without shapes."""
@@ -401,9 +433,9 @@ class Lagrangian:
             powers=None,
         )
 
-    def derivatives(self, q: Any, v: Any) -> Derivatives:
-        """L and its first and second derivatives at q, v (..., d)."""
-        f, df, ddf = self.terms.potentials(q)
+    def derivatives(self, q: Any, v: Any, u: Any = None) -> Derivatives:
+        """L and its first and second derivatives at q, v (..., d); u as in `Terms.potentials`."""
+        f, df, ddf = self.terms.potentials(q, u=u)
         g, dg = self.terms.motion(v)
         A, _, _ = self.terms.quadratic()
         theta, acting = as_row(self.coefficients, f), self.terms.acting
@@ -464,7 +496,7 @@ class Lagrangian:
     def balance(self, q: Any, v: Any, u: Any = None) -> tuple[Any, Any]:
         """M (..., d, d) and the force (..., d) of M a = ∂L/∂q − (∂²L/∂v∂q) v − ∂R/∂v − γ ∂L/∂v +
         G u, at q, v (..., d)."""
-        f, df, _ = self.terms.potentials(q, order=1)
+        f, df, _ = self.terms.potentials(q, 1, u)
         g, dg = self.terms.motion(v)
         theta = as_row(self.coefficients, f)
         along = (df * v[..., None, :]).sum(-1)
@@ -546,11 +578,13 @@ def _monomials(x: Any, n: Any, order: int) -> tuple[Any, Any, Any]:
     return value, slope, curvature
 
 
-def _shaped(f: Potentials, trees: dict[int, Expression], q: Any, order: int) -> Potentials:
+def _shaped(
+    f: Potentials, trees: dict[int, Expression], q: Any, order: int, u: Any = None
+) -> Potentials:
     """Factors f of terms multiplied by the shapes that some of them have."""
     xp, d, places = namespace(q), q.shape[-1], np.array(list(trees))
     with np.errstate(all="ignore"):  # a shape may have a boundary: NaN beyond it
-        found, zero = jets(tuple(trees.values()), q, order), 0 * q[..., 0]
+        found, zero = jets(tuple(trees.values()), q, order, u), 0 * q[..., 0]
 
         def rows(entries: list[Any], *shape: int) -> Any:
             whole = xp.stack([zero + entry for entry in entries], axis=-1)

@@ -184,9 +184,11 @@ class Forced(WithForces):
         return params[..., :own], params[..., own : own + count], gains
 
     def _inner(self, args):
-        """Args of H."""
+        """Args of H: inputs, where its terms have such."""
         if args is None:
             return None
+        if getattr(getattr(self.family, "terms", None), "driven", False):
+            return self._inputs(args)
         others = args.shape[-1] - (self.degree + 1) * self.num_inputs
         return args[..., :others] if others else None
 

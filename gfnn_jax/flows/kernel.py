@@ -62,12 +62,12 @@ VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN, RAISED_SPEED, ONE_SIDED = range(7)
 SIZES, DEGREE, FIRST_V, LAST_V, WAVE, COUNT, POWERED, LEVEL, LEVELS = range(9)
 WAVES, BEGINS, COLUMNS, KINDS, PROGRAMS, CODE, COORDINATES = range(9, 16)
 
-# Operations: variables, constants and values of the stack are put on it. Of two numbers that are
-# taken from it sum, product, the larger one, whether the first is greater; of three one, by the
-# first; of x, f, f' and f'' f(x).
-VARIABLE, CONSTANT, COPY, PLUS, TIMES, LARGER, GREATER, SELECT, COMPOSE = range(9)
-SQUARE, INVERSE_OF, ROOT, RAISED, SIN, COS, TAN, EXP, LOG = range(9, 18)
-SINH, COSH, TANH, ARCTAN, ABS = range(18, 23)
+# Operations: variables, constants, values of the stack and inputs are put on it. Of two numbers
+# that are taken from it sum, product, the larger one, whether the first is greater; of three one,
+# by the first; of x, f, f' and f'' f(x).
+VARIABLE, CONSTANT, COPY, INPUT, PLUS, TIMES, LARGER, GREATER, SELECT, COMPOSE = range(10)
+SQUARE, INVERSE_OF, ROOT, RAISED, SIN, COS, TAN, EXP, LOG = range(10, 19)
+SINH, COSH, TANH, ARCTAN, ABS = range(19, 24)
 
 # In the row of sizes: numbers of coordinates, terms, waves, frictions, dry ones without a width,
 # inputs, free coefficients of terms, coordinates in an f at the most; then where blocks of rows of
@@ -215,18 +215,20 @@ def _solve(f, matrix, rhs, size, width):
 
 
 @_function
-def _shape(n, f, j):
-    """The shape of a term at X, with its derivatives in the term's coordinates, into the first
-    column of the stack."""
+def _shape(n, f, j, u):
+    """The shape of a term at X with inputs in the row u, with its derivatives in the term's
+    coordinates, into the first column of the stack."""
     count, most, jet, top = n[COUNT, j], n[SIZES, MOST], n[SIZES, JET], -1
     bent = jet + 1 + most
     for e in range(n[PROGRAMS, j], n[PROGRAMS, j + 1]):
         operation, operand = n[CODE, e], f[OPERANDS, e]
-        if operation <= COPY:
+        if operation <= INPUT:
             top += 1
             for i in range(1 + most + most * most):
                 f[jet + i, top] = 0.0
             f[jet, top] = f[jet, int(operand)] if operation == COPY else operand
+            if operation == INPUT:
+                f[jet, top] = f[u, int(operand)]
             if operation == VARIABLE:
                 own = int(operand)
                 f[jet, top] = f[X, n[COORDINATES + own, j]]
@@ -314,11 +316,11 @@ def _shape(n, f, j):
 
 
 @_function
-def _with_shape(n, f, j, value):
+def _with_shape(n, f, j, u, value):
     """Multiply the factor ``value`` of a term and its derivatives by the shape; return f."""
     count, most, jet = n[COUNT, j], n[SIZES, MOST], n[SIZES, JET]
     slope, curvature, bent = n[SIZES, SLOPE], n[SIZES, CURVATURE], jet + 1 + most
-    _shape(n, f, j)
+    _shape(n, f, j, u)
     g = f[jet, 0]
     for i in range(count):
         for k in range(count):
@@ -331,9 +333,9 @@ def _with_shape(n, f, j, value):
 
 
 @_function
-def _terms(n, f, gamma, order):
+def _terms(n, f, gamma, u, order):
     """The terms' factors f = ∏ q_i^n_i cos(m·q + φ) at X with their derivatives, and the masses,
-    forces and momenta that the terms make."""
+    forces and momenta that the terms make, with inputs in the row u."""
     d, masses, most = n[SIZES, DIM], n[SIZES, MASSES], n[SIZES, MOST]
     slope, curvature = n[SIZES, SLOPE], n[SIZES, CURVATURE]
     powers, modes = COORDINATES + most, COORDINATES + 2 * most
@@ -381,7 +383,7 @@ def _terms(n, f, gamma, order):
                     bent += both * c - s * (mode * of_k + n[modes + k, j] * of_i)
                 f[curvature + i * most + k, j] = bent
         if n[PROGRAMS, j] < n[PROGRAMS, j + 1]:
-            value = _with_shape(n, f, j, value)
+            value = _with_shape(n, f, j, u, value)
         for i in range(count):
             along += f[slope + i, j] * f[X, d + n[COORDINATES + i, j]]
         f[FACTOR, j] = value
@@ -588,7 +590,7 @@ def _rates(n, f, u, order):
     for k in range(n[SIZES, FRICTIONS]):
         if n[KINDS, k] == EVEN:
             gamma += f[LOSSES, k]
-    _terms(n, f, gamma, order)
+    _terms(n, f, gamma, u, order)
     _friction(n, f, order)
     for i in range(d):
         for m in range(n[SIZES, INPUTS]):

@@ -26,7 +26,8 @@ from gfnn_jax.solve.linear import small_solve
 
 @pytree()
 class Legendre:
-    """H of L = Σ θ_j ℓ_j; params are θ (P,), ``terms`` the ℓ_j. H is not linear in θ."""
+    """H of L = Σ θ_j ℓ_j; params are θ (P,), ``terms`` the ℓ_j. H is not linear in θ. Where terms
+    have inputs these are the args (..., inputs), as `flows.forces.Forced` gives them."""
 
     terms: Terms
 
@@ -85,7 +86,7 @@ class Legendre:
     def gradient(self, params, w, args=None):
         """(−∂L/∂q, v), shape (..., 2d)."""
         v = self.velocity(params, w)
-        by_q = self._law(params).derivatives(split(w)[0], v).by_q
+        by_q = self._law(params).derivatives(split(w)[0], v, args).by_q
         return namespace(w).concatenate([-by_q, v], axis=-1)
 
     def gradient_and_hessian(self, params, w, args=None):
@@ -93,7 +94,7 @@ class Legendre:
 
         H_pp = M⁻¹,  H_pq = ∂v/∂q = −M⁻¹ L_vq,  H_qq = −L_qq + L_qv M⁻¹ L_vq.
         """
-        v, found = self._derivatives(params, w)
+        v, found = self._derivatives(params, w, args)
         xp, turn = namespace(w), partial(namespace(w).swapaxes, axis1=-1, axis2=-2)
         unit = xp.broadcast_to(np.eye(self.dim, dtype=w.dtype), found.by_vv.shape)
         inverse = turn(_solved(found.by_vv, unit))
@@ -115,18 +116,18 @@ class Legendre:
         if along is not None and not isinstance(along, Legendre):
             return along.term_gradients(w, args)
         q = split(w)[0]
-        v, found = self._derivatives(params, w)
+        v, found = self._derivatives(params, w, args)
         terms = self.terms if along is None else along.terms
-        value, slope, _ = terms.potentials(q, order=1)
+        value, slope, _ = terms.potentials(q, 1, args)
         motion, by_motion = terms.motion(v)
         by_v = -_solved(found.by_vv, value[..., None] * terms.acting(by_motion))  # (..., P, d)
         by_q = terms.acting(-slope * motion[..., None]) - by_v @ np.swapaxes(found.by_qv, -1, -2)
         return np.swapaxes(np.concatenate([by_q, by_v], axis=-1), -1, -2)
 
-    def _derivatives(self, params, w) -> tuple[Any, Derivatives]:
+    def _derivatives(self, params, w, u=None) -> tuple[Any, Derivatives]:
         """v and the derivatives of L there."""
         v = self.velocity(params, w)
-        return v, self._law(params).derivatives(split(w)[0], v)
+        return v, self._law(params).derivatives(split(w)[0], v, u)
 
     def _law(self, params) -> Lagrangian:
         none = np.zeros(0)

@@ -33,7 +33,7 @@ _KINDS = {
 }
 _BINARY = {"+": row.PLUS, "*": row.TIMES, "max": row.LARGER, ">": row.GREATER}
 _TAKEN = dict.fromkeys(_BINARY.values(), 1) | {row.SELECT: 2, row.COMPOSE: 3}  # from the stack
-_PUSHED = (row.VARIABLE, row.CONSTANT, row.COPY)
+_PUSHED = (row.VARIABLE, row.CONSTANT, row.COPY, row.INPUT)
 _POWERS = {2.0: row.SQUARE, -1.0: row.INVERSE_OF, 0.5: row.ROOT}
 _FUNCTIONS = {
     "sin": row.SIN,
@@ -158,7 +158,7 @@ Operation = tuple[int, float]
 
 def operations(tree: Expression, slots: list[int], at: int = 0) -> list[Operation]:
     """The operations of a shape in the order in which a stack that holds ``at`` numbers computes
-    them; coordinates by their places among ``slots``.
+    them; coordinates by their places among ``slots``, inputs by their own.
 
     Raises InputError for a function of a user's own that is no formula.
     """
@@ -167,6 +167,8 @@ def operations(tree: Expression, slots: list[int], at: int = 0) -> list[Operatio
         return [(row.CONSTANT, operands[0])]
     if kind == "coordinate":
         return [(row.VARIABLE, float(slots.index(operands[0])))]
+    if kind == "parameter":
+        return [(row.INPUT, float(operands[0]))]
     if CHEBYSHEV.fullmatch(kind):
         return operations(_chebyshev(int(kind[1:]), operands[0]), slots, at)
     if kind == "/":

@@ -1,4 +1,5 @@
-"""A drive that nobody recorded: a sinusoidal force of one frequency on each coordinate.
+"""A drive that nobody recorded: a sinusoidal force of one frequency on each coordinate, or such a
+stiffness, as of a pendulum whose pivot is shaken.
 
 In weak form the terms of a library and the two waves of a frequency ω are linear, so that of each
 ω one least-squares problem tells what is left; the ω that leaves least is a drive where it is a
@@ -59,10 +60,10 @@ class DriveOptions:
 OPTIONS = DriveOptions()
 
 
-def hidden_frequency(problem: ArcProblem) -> float | None:
-    """The angular frequency of a drive that the record shows beside a library of terms, in rad/s;
-    None where it shows none."""
-    left, count = _left_of(problem)
+def hidden_frequency(problem: ArcProblem, stiff: bool) -> float | None:
+    """The angular frequency of a drive that the record shows beside a library of terms, in rad/s:
+    of a force, and of a stiffness where it may be ``stiff``; None where it shows none."""
+    left, count, waves = _left_of(problem, stiff)
     if not count > OPTIONS.windows:
         return None
     turn = 2 * np.pi / _duration(problem)
@@ -78,7 +79,7 @@ def hidden_frequency(problem: ArcProblem) -> float | None:
     gain, others = (
         -np.log(max(float(share), 1e-300)) for share in (found.fun, min(beside, default=1.0))
     )
-    chance = np.log(len(tried)) + problem.dim * np.log(max(count, 1.0))
+    chance = np.log(len(tried)) + 0.5 * waves * np.log(max(count, 1.0))
     is_line = gain > OPTIONS.stands_out * others
     is_seen = is_line and 0.5 * count * gain > EVIDENCE.logarithm + chance
     return float(found.x) if is_seen and not _repeats(problem, float(found.x)) else None
@@ -135,9 +136,10 @@ def _driven(problem: ArcProblem, omega: float) -> ArcProblem:
     return dataclasses.replace(problem, nodes=nodes, inputs=inputs)
 
 
-def _left_of(problem: ArcProblem) -> tuple[Callable[[float], float], float]:
-    """Share of the squares of a library's weak residuals that a drive of a frequency leaves, and
-    the number of residuals that are independent."""
+def _left_of(problem: ArcProblem, stiff: bool) -> tuple[Callable[[float], float], float, int]:
+    """Share of the squares of a library's weak residuals that a drive of a frequency leaves, the
+    number of residuals that are independent, and of coefficients of the drive; where it is
+    ``stiff`` its force is in proportion to the position, or to the angle's sine and cosine, too."""
     d, angles = problem.dim, problem.angles
     rows = libraries.first(d, angles)
     if d == 1:
@@ -154,17 +156,25 @@ def _left_of(problem: ArcProblem) -> tuple[Callable[[float], float], float]:
     Q = U[:, s > OPTIONS.rank * np.max(s, initial=0.0)]
     y = y - Q @ (Q.T @ y)
     windows = [
-        (n.t[place], phi)
+        (n.t[place], phi * _factors(n.x[place, :d], angles, stiff))
         for n in problem.nodes
         for length in lengths
         for place, phi, _ in bumps(n.t, length)
     ]
+    many = 2 * len(windows[0][1]) if windows else 0
 
     def left(omega: float) -> float:
-        both = np.array([(phi @ np.cos(omega * t), phi @ np.sin(omega * t)) for t, phi in windows])
-        A = (both[:, None, None, :] * np.eye(d)[:, :, None]).reshape(len(y), 2 * d)
+        waves = [(phi, np.cos(omega * t), np.sin(omega * t)) for t, phi in windows]
+        both = np.array([np.concatenate([phi @ c, phi @ s]) for phi, c, s in waves])
+        A = (both[:, None, None, :] * np.eye(d)[:, :, None]).reshape(len(y), many * d)
         A = A - Q @ (Q.T @ A)
         c = np.linalg.lstsq(A, y, rcond=OPTIONS.rank)[0]
         return float(np.sum((y - A @ c) ** 2) / max(np.sum(y**2), 1e-300))
 
-    return left, len(y) / WEAK.overlap
+    return left, len(y) / WEAK.overlap, many * d
+
+
+def _factors(q: np.ndarray, angles: tuple[int, ...], stiff: bool) -> np.ndarray:
+    """What (m, n) the waves of a drive are multiplied by at positions q (n, d)."""
+    own = [(np.sin(x), np.cos(x)) if i in angles else (x,) for i, x in enumerate(q.T)]
+    return np.array([np.ones(len(q)), *(f for some in own[: stiff * len(own)] for f in some)])

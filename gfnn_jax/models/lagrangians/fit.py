@@ -19,7 +19,7 @@ from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.arcs import LawOnArcs
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.structure import Key, Structure
-from gfnn_jax.models.lagrangians.text import word_of
+from gfnn_jax.models.lagrangians.text import Names, word_of
 from gfnn_jax.solve.latent_arcs import Fitted, Readings
 from gfnn_jax.solve.noise import Wander
 
@@ -165,6 +165,12 @@ class ArcProblem:
         return tuple(i for i in self.angles if i in shown)
 
     @property
+    def squares(self) -> bool:
+        """Return whether squares of the inputs are no constants together, as of two waves."""
+        u = np.concatenate([n.stretch.u for n in self.nodes])[:, -2:]
+        return bool(np.ptp(np.sum(u**2, axis=1)) > 1e-6 * np.sum(u**2, axis=1).max(initial=0.0))
+
+    @property
     def within_a_turn(self) -> tuple[int, ...]:
         """Angles that stay within a turn in each run, of which a law may have powers."""
         ranges = [np.ptp(n.x[:, : self.dim], axis=0) for n in self.nodes]
@@ -188,7 +194,7 @@ class ArcProblem:
     def word(self, key: Key) -> str:
         """A coefficient by the names of columns."""
         seen = self.observation
-        return word_of(key, seen.coordinates, seen.speeds, self.parameters)
+        return word_of(key, Names(seen.coordinates, seen.speeds, self.parameters))
 
     def law(self, structure: Structure, arcs: Arcs, p: np.ndarray, free: bool = True) -> LawOnArcs:
         """The law of coefficients p on arcs, all of them free or none."""
@@ -457,6 +463,22 @@ class LawFit:
         added = self.problem.linearised(larger, self).added(*places(larger, self.structure, new))
         scores = added.scores(self.correlation, options.imitated, options.least_left)
         return dict(zip(new, scores.tolist(), strict=True))
+
+    def along(
+        self, changes: Mapping[Key, float], larger: Structure, problem: ArcProblem | None = None
+    ) -> tuple[float, float]:
+        """The number whose change moves further coefficients (of a ``larger`` structure) by these
+        ``changes`` that fits best, to first order, and its standard error; 0 and NaN where the
+        fitted ones imitate it."""
+        own, others = places(larger, self.structure, list(changes))
+        turn = np.zeros((len(larger.keys()), len(own) + 1))
+        turn[own, range(len(own))] = 1.0
+        turn[others, -1] = list(changes.values())
+        whole = (problem or self.problem).linearised(larger, self).combined(turn)
+        found = whole.added(range(len(own)), [len(own)])
+        if not found.share[0] > self.problem.options.imitated:
+            return 0.0, np.nan
+        return float(found.value[0]), float(np.sqrt(self.correlation) / found.size[0])
 
 
 class FoldFit(NamedTuple):

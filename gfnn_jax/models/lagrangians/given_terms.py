@@ -11,7 +11,8 @@ the fit finds them. A coefficient may be told:
 
 is a value, a bound, two bounds, and a multiple of another coefficient. What is no power of a
 position and no first cosine or sine of whole multiples is the term's shape, one formula of the
-positions.
+positions and, in V, of the inputs: the current of a magnet, V: i**2/(0.01 + y), or a support that
+moves, V: (y - s)**2.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from gfnn_jax.families.expressions import (
     Expression,
     depends_on,
     factors_of,
+    has_parameters,
     product_of,
     summands,
     to_text,
@@ -33,6 +35,7 @@ from gfnn_jax.families.expressions import (
 )
 from gfnn_jax.families.lagrangian import (
     DRY,
+    INPUTS,
     LINEAR,
     MAX_POWER,
     ONE_SIDED,
@@ -69,6 +72,7 @@ def given_terms(
     positions: Sequence[str],
     speeds: Sequence[str],
     parameters: Sequence[str] = (),
+    inputs: Sequence[str] = (),
 ) -> Given:
     """The terms that these texts name. ``parameters`` are those in which the systems of the
     runs differ.
@@ -76,7 +80,7 @@ def given_terms(
     Without a kinetic term each coordinate has its ½v². Raises InputError, a line with the text, for
     what is no term of such a law.
     """
-    reader = _Reader(tuple(positions), tuple(speeds), tuple(parameters))
+    reader = _Reader(tuple(positions), tuple(speeds), tuple(parameters), tuple(inputs))
     rows: list[Row] = []
     losses: list[Loss] = []
     told: list[Told] = []
@@ -140,10 +144,11 @@ class _Reader(NamedTuple):
     positions: tuple[str, ...]
     speeds: tuple[str, ...]
     parameters: tuple[str, ...]
+    inputs: tuple[str, ...]
 
     def summands(self, text: str) -> list[tuple[str, Expression]]:
         """The terms of a sum, with their texts."""
-        return summands(text, (*self.positions, *self.speeds, *self.parameters))
+        return summands(text, (*self.positions, *self.speeds, *self.parameters), self.inputs)
 
     def apart(self, tree: Expression) -> tuple[dict[Expression, float], tuple[int, ...]]:
         """The factors of a product that are no parameters, and the powers of these."""
@@ -172,10 +177,11 @@ class _Reader(NamedTuple):
                 shape[base] = exponent
             else:
                 raise self.refused(text)
-        if sum(k) > 2:
+        if sum(k) > 2 or (any(k) and any(map(has_parameters, shape))):
             raise self.refused(text)
         row = (tuple(k), tuple(n), *(wave or ((0,) * d, 0.0)))
-        return with_powers((*row, to_text(product_of(shape), d)) if shape else row, of_system)
+        shown = to_text(product_of(shape), d, INPUTS)
+        return with_powers((*row, shown) if shape else row, of_system)
 
     def wave(self, tree: Expression) -> tuple[tuple[int, ...], float] | None:
         """(m, φ) of the cosine or the sine of whole multiples of positions; None of another
@@ -223,8 +229,8 @@ class _Reader(NamedTuple):
         of = f", times whole powers of {', '.join(self.parameters)}" if self.parameters else ""
         return InputError(
             f"terms: '{text}' is no term of a law. A term of L or V is a formula of "
-            f"{', '.join(self.positions)}, in L times up to two of {', '.join(self.speeds)}; one "
-            f"of R is v**2, abs(v)**a, abs(v) or (abs(v) + v)**2{of}"
+            f"{', '.join((*self.positions, *self.inputs))}, in L without inputs times up to two of "
+            f"{', '.join(self.speeds)}; one of R is v**2, abs(v)**a, abs(v) or (abs(v) + v)**2{of}"
         )
 
 

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.data.recording import Recording, args_of, parameters_of
-from gfnn_jax.data.roles import symbols
 from gfnn_jax.errors import FitError
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.lagrangian import Powers
@@ -31,9 +30,9 @@ from gfnn_jax.models.lagrangians.next_motion import Motion
 from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness, whiteness
 from gfnn_jax.models.lagrangians.structure import Structure, is_constant
 from gfnn_jax.models.lagrangians.text import (
+    Names,
     friction_of,
     of_systems,
-    speed_names,
     terms_of,
     word_of,
 )
@@ -89,7 +88,7 @@ class Findings(NamedTuple):
 
 def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> LearnedLaw:
     """The law, its sensors and what its fit showed, by names of columns and in the file's units."""
-    names, traces, inputs = _names(recording), findings.traces, findings.inputs
+    names, traces, inputs = Names.of(recording), findings.traces, findings.inputs
     fit, law = best.fit, best.law
     sensors = findings.map.sensors
     assert sensors is not None  # of every map of a recording
@@ -108,11 +107,7 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         delay=(inputs.delay, inputs.error) if recording.inputs else None,
         input_rules=dict(inputs.others),
         which_friction=best.choice.in_words(best.scale, law.dim, names.speeds),
-        hamiltonian=(
-            None
-            if law.terms.leaders
-            else hamiltonian_of(law, lagrangian, names.coordinates, names.parameters)
-        ),
+        hamiltonian=(None if law.terms.leaders else hamiltonian_of(law, lagrangian, names)),
         zeros=zeros,
         noise=dict(zip(channels, map(float, sensors.sigma / factors), strict=True)),
         residual=dict(zip(channels, map(float, fit.rms() / factors), strict=True)),
@@ -126,12 +121,16 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         sensors=parameters,
         alike=_alike(fit, lagrangian, friction),
         horizon=tuple(best.calibration.horizons),
-        energy={} if law.terms.leaders else _energy(traces, friction, recording.inputs),
+        energy=(
+            {}
+            if law.terms.leaders or law.terms.driven
+            else _energy(traces, friction, recording.inputs)
+        ),
         messages=(
             *findings.messages,
             *(f"{flaw}: {remedy}" for flaw, remedy in flaws.items()),
             *about_parameters(recording, law.powers, fit.structure.most_functions),
-            *_not_seen(gains),
+            *(() if law.terms.driven else _not_seen(gains)),
             *_leading(law.terms.leaders, recording.coordinates),
         ),
         steps=findings.steps,
@@ -147,23 +146,8 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
 
 def line_of(recording: Recording, found: GaugedLaw) -> str:
     """L and R of a law, before its bands are known."""
-    lagrangian, friction = _expressions(found, _names(recording))
+    lagrangian, friction = _expressions(found, Names.of(recording))
     return f"L = {lagrangian}; R = {friction}"
-
-
-class _Names(NamedTuple):
-    """Symbols of coordinates, of their speeds, and of parameters, as formulas write them."""
-
-    coordinates: tuple[str, ...]
-    speeds: tuple[str, ...]
-    parameters: tuple[str, ...] = ()
-
-
-def _names(recording: Recording) -> _Names:
-    names, d = recording.coordinates, len(recording.coordinates)
-    speeds = speed_names(names, recording.velocities)
-    listed = symbols((*names, *speeds, *parameters_of(recording)))
-    return _Names(listed[:d], listed[d : 2 * d], listed[2 * d :])
 
 
 def _standard_errors(
@@ -178,11 +162,11 @@ def _standard_errors(
     return of_terms, of_losses, rest[: law.gains.size].reshape(law.gains.shape), float(std[-1])
 
 
-def _expressions(best: CalibratedLaw | GaugedLaw, names: _Names) -> tuple[Formula, Formula]:
+def _expressions(best: CalibratedLaw | GaugedLaw, names: Names) -> tuple[Formula, Formula]:
     """L and Rayleigh's R; uniform friction enters R as γ T."""
     law = best.law
     of_terms, of_losses, _, of_rate = _standard_errors(best)
-    lagrangian = terms_of(law.terms, law.coefficients, of_terms, names.coordinates, names.speeds)
+    lagrangian = terms_of(law.terms, law.coefficients, of_terms, names)
     friction = friction_of(law.friction, law.losses, of_losses, names.speeds)
     if law.powers is not None:
         lagrangian = of_systems(lagrangian, law.powers[: law.terms.count], names.parameters)
@@ -338,7 +322,7 @@ def about_parameters(
 
 
 def _next_motions(
-    motions: Sequence[Motion], recording: Recording, names: _Names
+    motions: Sequence[Motion], recording: Recording, names: Names
 ) -> tuple[NextMotion, ...]:
     """Motions to record, in the file's units where a column shows the coordinate."""
     named = []
@@ -348,7 +332,7 @@ def _next_motions(
             for name, q in zip(recording.coordinates, motion.start, strict=True)
         }
         units = {name: recording.unit(name) for name in start}
-        gains = {word_of(k, *names): g for k, g in motion.gains.items()}
+        gains = {word_of(k, names): g for k, g in motion.gains.items()}
         named.append(NextMotion(start, gains, units))
     return tuple(named)
 

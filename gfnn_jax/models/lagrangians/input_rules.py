@@ -5,12 +5,13 @@ A fit's residuals are linear in a small delay τ as they are in the coefficients
 
     r(p, τ + δ) = r(p, τ) + Σ_ij G_ij ∂r/∂G'_ij δ,
 
-with G' the gains of further inputs ∂u(t − τ)/∂τ. So one evaluation of the arcs gives the delay that
-fits best, with its standard error, and how far the coefficients imitate it. It is taken where it is
-significant and held-out arcs gain by it. The rule between samples is that of which held-out arcs
-cost least, each with its own delay: chosen with the first law, whose misfit may hide the choice,
-and again with the last. Inputs that are held act as those in between do half a sample later, but
-for little: of rules whose costs differ by no more than chance the one without a delay is taken.
+with G' the gains of further inputs ∂u(t − τ)/∂τ, and terms that have inputs alike. So one
+evaluation of the arcs gives the delay that fits best, with its standard error, and how far the
+coefficients imitate it. It is taken where it is significant and held-out arcs gain by it. The rule
+between samples is that of which held-out arcs cost least, each with its own delay: chosen with the
+first law, whose misfit may hide the choice, and again with the last. Inputs that are held act as
+those in between do half a sample later, but for little: of rules whose costs differ by no more than
+chance the one without a delay is taken.
 """
 
 from __future__ import annotations
@@ -23,9 +24,11 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs, arcs_of
+from gfnn_jax.families.expressions import along_parameters, to_text
+from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
 from gfnn_jax.fitting.evidence import Comparison
-from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, places
-from gfnn_jax.models.lagrangians.structure import Key, Structure
+from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
+from gfnn_jax.models.lagrangians.structure import Key, Row, Structure
 
 RULES = {
     "hold": "held from sample to sample",
@@ -39,15 +42,15 @@ class DelayOptions:
     """Options of the search for a delay (`benchmarks/measured.py`).
 
     apart: of a sample, by which inputs are differentiated. settled: standard errors, within which a
-    delay is found. most: corrections. furthest: samples, of a correction. imitated: share of what a
-    delay changes that no coefficient does, below which it is not identifiable.
+    delay is found. most: corrections. furthest: samples, of a correction. step: of inputs, over
+    which shapes that have them are differentiated.
     """
 
     apart: float = 0.05
     settled: float = 0.1
     most: int = 4
     furthest: float = 1.0
-    imitated: float = 0.03
+    step: float = 1e-4
 
 
 OPTIONS = DelayOptions()
@@ -148,15 +151,21 @@ def correction(fit: LawFit, slope: np.ndarray) -> tuple[float, float]:
     arcs of a fit, and its standard error; 0 and NaN where the coefficients imitate it."""
     count = fit.structure.num_inputs
     both = np.concatenate([fit.problem.inputs(fit.arcs), slope], axis=-1)
+    driven = {_along_inputs(row, count): row for row in fit.structure.terms if has_inputs(row)}
+    changes: dict[Key, float] = {
+        ("gain", i, count + j): fit.values["gain", i, j]
+        for i in range(fit.form.dim)
+        for j in range(count)
+    }
+    changes |= {("term", slope): fit.values["term", row] for slope, row in driven.items()}
     structure = dataclasses.replace(fit.structure, num_inputs=2 * count)
+    structure = structure.plus([("term", slope) for slope in driven])
     problem = dataclasses.replace(fit.problem, inputs=lambda arcs: both)
-    further = [("gain", i, count + j) for i in range(fit.form.dim) for j in range(count)]
-    own, others = places(structure, fit.structure, further)
-    turn = np.zeros((len(structure.keys()), len(own) + 1))
-    turn[own, range(len(own))] = 1.0
-    turn[others, -1] = [fit.values["gain", i, j - count] for _, i, j in further]
-    whole = problem.linearised(structure, fit).combined(turn)
-    found = whole.added(range(len(own)), [len(own)])
-    if not found.share[0] > OPTIONS.imitated:
-        return 0.0, np.nan
-    return float(found.value[0]), float(np.sqrt(fit.correlation) / found.size[0])
+    return fit.along(changes, structure, problem)
+
+
+def _along_inputs(row: Row, count: int) -> Row:
+    """The derivative of a term along its inputs, times the ``count`` inputs that follow."""
+    d = len(row[0])
+    tree = along_parameters(tree_of(shape_of(row), d), count, OPTIONS.step)
+    return (*row[:4], to_text(tree, d, INPUTS), *row[5:])

@@ -20,7 +20,7 @@ from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.friction_choice import WhichFriction
 from gfnn_jax.models.lagrangians.input_rules import RULES
 from gfnn_jax.models.lagrangians.residuals import Trace, Whiteness
-from gfnn_jax.models.lagrangians.text import of_systems, terms_of
+from gfnn_jax.models.lagrangians.text import Names, of_systems, terms_of
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
 ONLY_TOGETHER = "only together"  # end of a line about coefficients that are identified as a sum
@@ -315,18 +315,16 @@ class Hamiltonian:
         return Formula(tuple(t for t in self.terms if ": " not in t.term))
 
 
-def hamiltonian_of(
-    law: Lagrangian, lagrangian: Formula, names: tuple[str, ...], parameters: tuple[str, ...]
-) -> Hamiltonian:
+def hamiltonian_of(law: Lagrangian, lagrangian: Formula, names: Names) -> Hamiltonian:
     """The entries of M and a, those of L with two factors v and with one, and V = −(the terms of L
     without v)."""
     terms = law.terms
     coefficients = np.array([t.coefficient for t in lagrangian.terms])
     std = np.array([t.std for t in lagrangian.terms])
     still = dataclasses.replace(terms, speeds=np.zeros_like(terms.speeds))
-    found = terms_of(still, coefficients, std, names, names)
+    found = terms_of(still, coefficients, std, names)
     if law.powers is not None:
-        found = of_systems(found, law.powers[: terms.count], parameters)
+        found = of_systems(found, law.powers[: terms.count], names.parameters)
     factors, listed = found.terms, []
     for row, (factor, c, error) in zip(terms.rows(), factors, strict=True):
         axes = [i for i, k in enumerate(row[0]) for _ in range(k)]

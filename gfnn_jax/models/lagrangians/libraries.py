@@ -15,7 +15,16 @@ from itertools import combinations, combinations_with_replacement, permutations
 import numpy as np
 
 from gfnn_jax.families.expressions import parse, product_of, to_text
-from gfnn_jax.families.lagrangian import DRY, LINEAR, ONE_SIDED, POWER, QUADRATIC, UNIFORM
+from gfnn_jax.families.lagrangian import (
+    DRY,
+    INPUTS,
+    LINEAR,
+    ONE_SIDED,
+    POWER,
+    QUADRATIC,
+    UNIFORM,
+    tree_of,
+)
 from gfnn_jax.models.lagrangians.structure import Loss, Row
 
 SINE = -np.pi / 2
@@ -31,6 +40,7 @@ SHAPES = (  # of a length q, of which powers may be the series
     "cos(A*q) + sin(A*q)",
     "sqrt(1+(A*q)**2) + q",
 )
+GAINS = ("1/(1+A*q)", "1/(1+A*q)**2", "exp(A*q)")  # by which a force of inputs depends on q
 
 
 def unit(dim: int, *axes: int) -> tuple[int, ...]:
@@ -177,10 +187,12 @@ def central(dim: int, exponent: float) -> list[Row]:
     return [(none, none, none, 0.0, shape), *fields]
 
 
-def shaped(shape: str, constant: float) -> list[Row]:
-    """The potentials of the one coordinate that a sum of `SHAPES` is of, with this constant A."""
-    tree = [parse(text.replace("A", f"({constant:.8g})"), 1) for text in shape.split(" + ")]
-    shapes: list[Row] = [((0,), (0,), (0,), 0.0, to_text(one, 1)) for one in tree]
+def shaped(shape: str, constant: float, times: str = "1") -> list[Row]:
+    """The potentials of the one coordinate that a sum of `SHAPES` is of, with this constant A,
+    ``times`` a function of inputs."""
+    texts = [text.replace("A", f"({constant:.8g})") for text in shape.split(" + ")]
+    trees = [tree_of(times, 1) * tree_of(text, 1) for text in texts]
+    shapes: list[Row] = [((0,), (0,), (0,), 0.0, to_text(one, 1, INPUTS)) for one in trees]
     return [((0,), (1,), (0,), 0.0) if row[4] == "q1" else row for row in shapes]
 
 
@@ -194,6 +206,21 @@ def springs(dim: int, angles: Sequence[int]) -> list[Row]:
 def torques(dim: int, angles: Sequence[int]) -> list[Row]:
     """Constant torques on angles that turn over: of a motor, on which V falls with every turn."""
     return [((0,) * dim, unit(dim, i), (0,) * dim, 0.0) for i in angles]
+
+
+def driven(dim: int, angles: Sequence[int], inputs: int, squares: bool) -> list[Row]:
+    """Potentials times an input, or its square: forces whose gain depends on the position, as of a
+    magnet by its current, or a stiffness that is driven."""
+    none, rows = (0,) * dim, []
+    for j, power in ((j, power) for power in range(1, 2 + squares) for j in range(inputs)):
+        shape = f"u{j + 1}" if power == 1 else f"u{j + 1}**{power}"
+        for i in range(dim):
+            if i in angles:
+                rows += [(none, none, unit(dim, i), phase, shape) for phase in (0.0, SINE)]
+            else:  # a force in proportion to an input is its gain
+                degrees = range(2 if power == 1 else 1, 4)
+                rows += [(none, unit(dim, *[i] * n), none, 0.0, shape) for n in degrees]
+    return rows
 
 
 def every(dim: int, angles: tuple[int, ...]) -> list[Row]:

@@ -29,7 +29,7 @@ from gfnn_jax.dataset.stretches import (
     without_rests,
 )
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import shape_of
+from gfnn_jax.families.lagrangian import INPUTS, shape_of
 from gfnn_jax.families.text import measured
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law, smoothed
@@ -55,10 +55,10 @@ from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, last_of_series
 from gfnn_jax.models.lagrangians.nature import Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions
-from gfnn_jax.models.lagrangians.rivals import one_sided, other_powers
+from gfnn_jax.models.lagrangians.rivals import constant_of, one_sided, other_powers
 from gfnn_jax.models.lagrangians.search import SearchResult, fit_given, search, search_on
 from gfnn_jax.models.lagrangians.starts import no_law
-from gfnn_jax.models.lagrangians.text import speed_names
+from gfnn_jax.models.lagrangians.text import Names, speed_names
 from gfnn_jax.models.lagrangians.traces import traces_of
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
 from gfnn_jax.solve.noise import Loss
@@ -289,12 +289,15 @@ def _options(friction: str) -> SearchOptions:
 
 def _with_constants(fit: LawFit) -> list[str]:
     """A message where a search has found numbers inside of shapes of the one coordinate."""
-    shapes = [row for row in fit.structure.terms if fit.structure.dim == 1 and shape_of(row)]
+    some = fit.structure.terms if fit.structure.dim == 1 else ()
+    shapes = [row for row in some if shape_of(row) not in ("", *INPUTS)]
     if not shapes:
         return []
+    constant, _, error = constant_of(fit)
     return [
-        f"the number inside {fit.problem.word(('term', shapes[0]))} is fitted too: standard errors "
-        "of the other coefficients are with it as it is"
+        f"the number {measured(constant, abs(constant) * error)} inside "
+        f"{fit.problem.word(('term', shapes[0]))} is fitted too: standard errors of the other "
+        "coefficients are with it as it is"
     ]
 
 
@@ -498,9 +501,7 @@ def _found(
     if problem.observation.hidden is not None:
         find = search_hidden
     elif terms:
-        observation, d = problem.observation, problem.dim
-        names = symbols((*observation.coordinates, *observation.speeds, *problem.parameters))
-        given = given_terms(terms, names[:d], names[d : 2 * d], names[2 * d :])
+        given = given_terms(terms, *Names.of(data.recording))
         find = partial(fit_given, given, _scale(data, bool(given.told)))
     elif problem.parameters:
         find = search_of_systems
@@ -567,8 +568,9 @@ def _with_hidden_drive(
         missed, problem, loud = error, samples_of(recording).problem, np.inf
     seen = not recording.inputs and problem.observation.hidden is None
     searches = loud > OPTIONS.above_noise and seen
-    omega = hidden_frequency(problem) if searches else None
-    if omega is not None:
+    for stiff in (False, True) if searches else ():
+        if (omega := hidden_frequency(problem, stiff)) is None:
+            continue
         problem.on_progress(f"a drive that nobody recorded: {omega:.5g} rad/s")
         with contextlib.suppress(FitError):
             _, law = searched(recording.driven_by(wave_names(omega)), "band")

@@ -11,17 +11,33 @@ coefficients have odds by the sums of their squares (`fitting.evidence`).
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from gfnn_jax.families.expressions import factors_of, parse
-from gfnn_jax.families.lagrangian import LINEAR, ONE_SIDED, shape_of
+from gfnn_jax.families.expressions import Expression, factors_of, number, to_text
+from gfnn_jax.families.lagrangian import (
+    INPUTS,
+    LINEAR,
+    ONE_SIDED,
+    has_inputs,
+    shape_of,
+    tree_of,
+)
 from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.models.lagrangians.fit import LawFit
-from gfnn_jax.models.lagrangians.libraries import SHAPES, central, losses, shaped, torques
+from gfnn_jax.models.lagrangians.libraries import (
+    GAINS,
+    SHAPES,
+    central,
+    losses,
+    shaped,
+    springs,
+    torques,
+)
 from gfnn_jax.models.lagrangians.structure import Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import weak_share
 
@@ -32,14 +48,17 @@ class RivalOptions:
 
     most: powers of the distance to either side. series: potentials, from which on they may be the
     series of a shape. constants: inside a shape, times the range of the motion, where it begins;
-    apart: relative, of fits that correct it; corrections: of it.
+    apart: relative, over which it is differentiated; corrections: of it; furthest: relative, of
+    each; settled: standard errors, within which it is found.
     """
 
     most: int = 4
     series: int = 3
     constants: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)
-    apart: float = 0.01
-    corrections: int = 2
+    apart: float = 1e-4
+    corrections: int = 6
+    furthest: float = 0.3
+    settled: float = 0.1
 
 
 OPTIONS = RivalOptions()
@@ -59,19 +78,24 @@ def with_likeliest_power(fit: LawFit) -> LawFit:
 
 
 def with_a_shape(fit: LawFit) -> LawFit:
-    """The fit of one length with a shape (`libraries.SHAPES`) in place of its powers, where that is
-    likelier than these, and than any other shape, by odds that decide."""
+    """The fit of one length with a shape (`libraries.SHAPES`) in place of its powers, or beside
+    springs in place of the powers that inputs are multiplied by, where that is likelier than these,
+    and than any other shape, by odds that decide."""
     structure, count = fit.structure, _independent(fit)
-    powers = [row for row in structure.terms if not any(row[0])]
-    if structure.dim > 1 or fit.problem.angles or len(powers) < OPTIONS.series or not fit.follows:
+    potentials = [row for row in structure.terms if not any(row[0])]
+    driven = Counter(shape_of(row) for row in potentials if has_inputs(row))
+    of_inputs, many = driven.most_common(1)[0] if driven else ("1", len(potentials))
+    fewest = 2 if driven else OPTIONS.series
+    if structure.dim > 1 or fit.problem.angles or many < fewest or not fit.follows:
         return fit
     units = np.array(OPTIONS.constants) / np.ptp(fit.problem.states[:, 0])
-    masses = tuple(row for row in structure.terms if any(row[0]) and is_constant(row))
+    kept = tuple(row for row in structure.terms if any(row[0]) and is_constant(row))
+    kept += (*torques(1, [0]), *springs(1, [0])) if driven else ()
     found = [(criterion(fit.fitted.cost, count, len(fit.p)), "", fit)]
-    for name in SHAPES:
+    for name in GAINS if driven else SHAPES:
 
         def of(a: float, name: str = name) -> Structure:
-            return dataclasses.replace(structure, terms=(*masses, *shaped(name, a)))
+            return dataclasses.replace(structure, terms=(*kept, *shaped(name, a, of_inputs)))
 
         def share(a: float, of=of) -> float:
             return weak_share(of(a), fit.problem)
@@ -80,25 +104,70 @@ def with_a_shape(fit: LawFit) -> LawFit:
         near = min(begun, key=share)
         ends = sorted((near / 2, near * 2))
         least_at: Any = minimize_scalar(share, bounds=ends, method="bounded")
-        a = float(least_at.x)
-        other = fit.again(of(a), rescale=False)
-        for _ in range(OPTIONS.corrections):
-            steps = a * (1 + OPTIONS.apart * np.array([-1, 0, 1]))
-            costs = [fit.again(of(b), other.values, rescale=False).fitted.cost for b in steps]
-            bend, slope, _ = np.polyfit([-1, 0, 1], costs, 2)
-            if not (np.isfinite(bend) and bend > 0):
-                break
-            a *= float(1 - OPTIONS.apart * slope / (2 * bend))
-        other = fit.again(of(a), other.values, rescale=False)
+        other = with_constant(fit.again(of(float(least_at.x)), rescale=False), False)
         if other.follows and other.is_definite:
             size = criterion(other.fitted.cost, count, len(other.p) + 1)
-            found.append((size, f"{name}, A = {a:.5g},", other))
+            found.append((size, name, other))
     (least, name, best), *others = sorted(found, key=lambda one: one[0])
     decide = 2 * np.log(fit.problem.options.evidence.decided)
     if best is fit or min(one[0] for one in others) < least + decide:
         return fit
-    fit.problem.on_progress(f"  {name} in place of {len(powers)} powers")
+    fit.problem.on_progress(f"  {name} in place of {many} powers")
     return best.again()
+
+
+def with_constant(fit: LawFit, rescale: bool = True) -> LawFit:
+    """The fit with the number inside its shapes corrected, as long as that is more than a tenth of
+    its standard error."""
+    for _ in range(OPTIONS.corrections):
+        change, error = constant_of(fit)[1:]
+        if not fit.follows or not abs(change) > OPTIONS.settled * error:
+            break
+        by = 1 + float(np.clip(change, -OPTIONS.furthest, OPTIONS.furthest))
+        turned = {row: _scaled(row, by) for row in fit.structure.terms}
+        structure = dataclasses.replace(fit.structure, terms=tuple(turned.values()))
+        known = {("term", turned[k[1]]) if k[0] == "term" else k: c for k, c in fit.values.items()}
+        fit = fit.again(structure, known, rescale=rescale)
+    return fit
+
+
+def constant_of(fit: LawFit) -> tuple[float, float, float]:
+    """The number inside the shapes of a law, 0 where there is none, its relative change that fits
+    best, and the standard error of that; NaN where the coefficients imitate it."""
+    step, changes, numbers = OPTIONS.apart, {}, [0.0]
+    for row in fit.structure.terms:
+        if numbers_in := _numbers(tree_of(shape_of(row), fit.structure.dim)):
+            numbers = [*numbers_in, *numbers]
+            ends = (
+                tree_of(shape_of(_scaled(row, 1 + by)), fit.structure.dim) for by in (step, -step)
+            )
+            slope = to_text((next(ends) - next(ends)) * (0.5 / step), fit.structure.dim, INPUTS)
+            changes["term", (*row[:4], slope, *row[5:])] = fit.values["term", row]
+    if not changes or not fit.follows:
+        return numbers[0], 0.0, np.nan
+    return numbers[0], *fit.along(changes, fit.structure.plus(list(changes)))
+
+
+def _numbers(tree: Expression) -> list[float]:
+    """The numbers in a shape that are not whole."""
+    if tree.value is not None:
+        return [] if tree.value.is_integer() else [tree.value]
+    return [x for o in tree.operands if isinstance(o, Expression) for x in _numbers(o)]
+
+
+def _scaled(row: Row, by: float) -> Row:
+    """A row with the numbers in its shape that are not whole times a factor."""
+
+    def turned(tree: Expression) -> Expression:
+        if tree.value is not None:
+            return tree if tree.value.is_integer() else number(float(f"{tree.value * by:.8g}"))
+        inner = (turned(o) if isinstance(o, Expression) else o for o in tree.operands)
+        return Expression(tree.operation, tuple(inner))
+
+    if not shape_of(row):
+        return row
+    dim = len(row[0])
+    return (*row[:4], to_text(turned(tree_of(shape_of(row), dim)), dim, INPUTS), *row[5:])
 
 
 def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
@@ -149,8 +218,8 @@ def _independent(fit: LawFit) -> float:
 def _power(fit: LawFit) -> float | None:
     """The power of the distance that a law has; None of a law without."""
     d = fit.structure.dim
-    distance = parse(shape_of(central(d, 1.0)[0]), d)
-    found = (factors_of(parse(shape_of(row) or "1", d)) for row in fit.structure.terms)
+    distance = tree_of(shape_of(central(d, 1.0)[0]), d)
+    found = (factors_of(tree_of(shape_of(row), d)) for row in fit.structure.terms)
     return next((one[distance] for one in found if set(one) == {distance}), None)
 
 

@@ -18,7 +18,7 @@ from scipy.optimize import lsq_linear
 
 from gfnn_jax.dataset.stretches import arcs_of
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
+from gfnn_jax.families.lagrangian import LINEAR, UNIFORM, has_inputs
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
@@ -26,7 +26,7 @@ from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, table_of
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, with_delay
-from gfnn_jax.models.lagrangians.rivals import with_a_shape, with_likeliest_power
+from gfnn_jax.models.lagrangians.rivals import with_a_shape, with_constant, with_likeliest_power
 from gfnn_jax.models.lagrangians.starts import OPTIONS, best_start, leading, misfit
 from gfnn_jax.models.lagrangians.structure import Held, Key, Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import protected, weak_start
@@ -262,9 +262,10 @@ class TermSearch:
                 fit = with_a_spring(fit, angle)
             if fit.structure.leaders:
                 fit = with_fewer_waves(fit, self.every.terms)
-            fit = fit if fit is waves else self.prune(fit, friction=False)
+            fit = fit if fit is waves else with_constant(self.prune(fit, friction=False))
             if fit.structure != before:
                 fit, choice = self.with_friction(fit)
+                fit = with_constant(fit)
         return SearchResult(with_delay(fit), choice)
 
     def telling_more(self, fit: LawFit) -> LawFit | None:
@@ -320,6 +321,10 @@ class TermSearch:
         every = every or self.every
         assert every is not None  # terms are searched
         every = dataclasses.replace(every, leaders=fit.structure.leaders)
+        if any(map(has_inputs, fit.structure.terms)):
+            problem, d = fit.problem, every.dim
+            more = libraries.driven(d, problem.angles, problem.num_inputs, problem.squares)
+            every = every.plus([("term", row) for row in more])
         refused: set[Key] = set()
         options, problem, costs = fit.problem.options, fit.problem, None
         evidence = options.evidence

@@ -112,6 +112,9 @@ def best_start(problem: ArcProblem) -> LawFit:
         some.add(_Library(libraries.relative(d, angles)))
     some.add_richer([*textbook.rows, *pulls], 1)
     some.add(_Library(first, 2))
+    if inputs := problem.num_inputs:
+        driven = libraries.driven(d, angles, inputs, problem.squares)
+        some.add_richer([*textbook.rows, *driven], 3)
     some.add_central(textbook.rows, 3, across=False)
     some.add_richer([*first, *libraries.gyroscopic(d, angles, 1)], 3)
     if not some.followed and (zero := some.far_zeros()).any():

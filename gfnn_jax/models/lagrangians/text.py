@@ -4,25 +4,42 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.data.recording import Recording, parameters_of
+from gfnn_jax.data.roles import is_wave, symbols
 from gfnn_jax.exports.symbolic import Formula
-from gfnn_jax.families.lagrangian import Friction, Powers, Terms
+from gfnn_jax.families.lagrangian import INPUTS, Friction, Powers, Terms
 from gfnn_jax.families.text import Term, power
 from gfnn_jax.models.lagrangians.structure import powers_of
 
 
-def terms_of(
-    terms: Terms,
-    coefficients: np.ndarray,
-    std: np.ndarray,
-    names: Sequence[str],
-    speeds: Sequence[str],
-) -> Formula:
+class Names(NamedTuple):
+    """Symbols of coordinates, of their speeds, of parameters and of inputs, as formulas write
+    them."""
+
+    coordinates: tuple[str, ...]
+    speeds: tuple[str, ...]
+    parameters: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = INPUTS
+
+    @classmethod
+    def of(cls, recording: Recording) -> Names:
+        """Make those of a recording; a wave that nobody recorded stands as it is."""
+        names, of_systems = recording.coordinates, parameters_of(recording)
+        speeds, inputs = speed_names(names, recording.velocities), recording.inputs
+        shown = symbols((*names, *speeds, *of_systems, *inputs))
+        a, b = 2 * len(names), len(shown) - len(inputs)
+        pushes = (n if is_wave(n) else s for n, s in zip(inputs, shown[b:], strict=True))
+        return cls(shown[: a // 2], shown[a // 2 : a], shown[a:b], tuple(pushes))
+
+
+def terms_of(terms: Terms, coefficients: np.ndarray, std: np.ndarray, names: Names) -> Formula:
     """Terms of Σ θ_j ℓ_j."""
-    listed = zip(terms.texts(names, speeds), coefficients, std, strict=True)
+    texts = terms.texts(names.coordinates, names.speeds, names.inputs)
+    listed = zip(texts, coefficients, std, strict=True)
     return Formula(tuple(Term(text, float(c), float(s)) for text, c, s in listed))
 
 
@@ -53,25 +70,20 @@ def _with_powers(term: str, powers: Sequence[int], parameters: Sequence[str]) ->
     return term
 
 
-def word_of(
-    key: tuple[Any, ...],
-    names: Sequence[str],
-    speeds: Sequence[str],
-    parameters: Sequence[str] = (),
-) -> str:
+def word_of(key: tuple[Any, ...], names: Names) -> str:
     """A coefficient of a structure, by its term."""
     kind, *rest = key
-    one, none = np.ones(1), np.zeros(1)
+    one, none, dim = np.ones(1), np.zeros(1), len(names.coordinates)
     if kind in ("term", "loss"):
         found = (
-            terms_of(Terms.of(rest, len(names)), one, none, names, speeds)
+            terms_of(Terms.of(rest, dim), one, none, names)
             if kind == "term"
-            else friction_of(Friction.of(rest, len(names)), one, none, speeds)
+            else friction_of(Friction.of(rest, dim), one, none, names.speeds)
         )
-        powers = (powers_of(rest[0], len(parameters)),)
-        (term,) = of_systems(found, powers, parameters).terms
+        powers = (powers_of(rest[0], len(names.parameters)),)
+        (term,) = of_systems(found, powers, names.parameters).terms
         return term.term if kind == "term" else f"R: {term.term}"
-    return f"{'gain' if kind == 'gain' else 'zero'} of {names[rest[0]]}"
+    return f"{'gain' if kind == 'gain' else 'zero'} of {names.coordinates[rest[0]]}"
 
 
 def speed_names(positions: Sequence[str], velocities: Sequence[str]) -> tuple[str, ...]:

@@ -201,7 +201,7 @@ def weak_rows(form: Form, node: Nodes, length: float) -> tuple[np.ndarray, np.nd
     weights = np.ones(terms.count + form.friction.count)
     if form.powers is not None:
         weights = functions_of(form.powers, node.stretch.args)[: len(weights)]
-    f, df, _ = terms.potentials(q, order=1)
+    f, df, _ = terms.potentials(q, 1, u)
     g, dg = terms.motion(v)
     momentum = terms.acting(dg * f[..., None]).swapaxes(1, 2)  # (n, d, P)
     force = terms.acting(df * g[..., None]).swapaxes(1, 2)
