@@ -18,7 +18,7 @@ from scipy.optimize import lsq_linear
 
 from gfnn_jax.dataset.stretches import arcs_of
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import LINEAR, UNIFORM, has_inputs
+from gfnn_jax.families.lagrangian import LINEAR, UNIFORM, has_inputs, shape_of
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
@@ -394,7 +394,7 @@ def with_a_spring(fit: LawFit, angle: int) -> LawFit:
     waves = [
         row
         for row in structure.terms
-        if not any(row[0]) and any(row[2]) and tuple(map(bool, row[2])) == tuple(map(bool, alone))
+        if not any(row[0] + row[1]) and not shape_of(row) and tuple(map(bool, row[2])) == alone
     ]
     if len(waves) < 2 or any(row[1][angle] for row in structure.terms):
         return fit
