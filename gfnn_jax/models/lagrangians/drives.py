@@ -175,6 +175,6 @@ def _left_of(problem: ArcProblem, stiff: bool) -> tuple[Callable[[float], float]
 
 
 def _factors(q: np.ndarray, angles: tuple[int, ...], stiff: bool) -> np.ndarray:
-    """What (m, n) the waves of a drive are multiplied by at positions q (n, d)."""
+    """Factors (m, n) of the waves of a drive at positions q (n, d)."""
     own = [(np.sin(x), np.cos(x)) if i in angles else (x,) for i, x in enumerate(q.T)]
     return np.array([np.ones(len(q)), *(f for some in own[: stiff * len(own)] for f in some)])
