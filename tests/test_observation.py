@@ -162,7 +162,10 @@ def test_what_a_law_has_anyway_is_refused():
         ({"observe": {"theta": "b + theta"}, "guess": {"c": 1.0}}, "no parameter c among b"),
         ({"observe": {"theta": np.sin}}, "function of named arguments"),
         ({"observe": {"theta": lambda theta: np.sin(theta)}}, "JAX's operations, as jnp.sin"),
-        ({"observe": {"u": "phi + phi_dot"}, "coordinates": "phi"}, "nor its velocity alone"),
+        (
+            {"observe": {"u": "phi + phi_dot"}, "coordinates": ["theta", "phi"]},
+            "nor its velocity alone",
+        ),
     ],
 )
 def test_observations_that_cannot_be_are_refused(options, message):

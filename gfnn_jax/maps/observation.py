@@ -503,9 +503,11 @@ class Observation:
         ones that of their velocities over the frequency ω."""
         if self.hidden is not None:
             return np.full(self.dim, sigma[0])
-        by_state, unseen = self(x).by_state, list(self.unseen)
-        J = by_state[..., : self.dim].copy()
-        J[..., unseen] = np.hypot(J, omega * by_state[..., self.dim :])[..., unseen]
+        d, unseen = self.dim, list(self.unseen)
+        by = self._shown(x, self.values, None)[1][..., : 3 * d].reshape(*x.shape[:1], -1, 3, d)
+        J = by[..., 0, :].copy()
+        by_rates = np.linalg.norm(by * omega ** np.arange(3)[:, None], axis=-2)
+        J[..., unseen] = by_rates[..., unseen]
         for i, k in self.crossed.items():  # by its speed, a time is a distance
             J[:, k, i] = 1 / (omega * max(float(np.std(x[:, i])), 1e-300))
         J /= sigma[:, None]
