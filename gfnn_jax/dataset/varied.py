@@ -77,7 +77,7 @@ def as_varied(
     the midpoint chart; of pairs that differ in dt and in parameters, or of sites, H alone. Raises
     FitError where anything else is asked for.
     """
-    pairs, messages = _without_constants(pairs)
+    pairs, messages = without_constants(pairs)
     if np.ndim(pairs.dt) and learn != "hamiltonian":
         usual = np.median(pairs.dt)
         rows = np.flatnonzero(np.abs(pairs.dt - usual) <= _OPTIONS.printed * usual)
@@ -114,7 +114,9 @@ def as_varied(
     return pairs, "hamiltonian", messages
 
 
-def _without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
+def without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
+    """The pairs without a dt, parameters or a phase of a drive that are the same in all, and
+    messages."""
     dt = np.asarray(pairs.dt)
     one = float(np.mean(dt)) if dt.ndim and np.ptp(dt) <= _OPTIONS.same * np.mean(dt) else pairs.dt
     args = {name: np.asarray(v, np.float64) for name, v in (pairs.args or {}).items()}
@@ -132,16 +134,7 @@ def _without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
         "is not known"
         for name in still
     ]
-    varied = Pairs(
-        pairs.z0,
-        pairs.z1,
-        one,
-        kept or None,
-        period=period,
-        run=pairs.run,
-        place=pairs.place,
-        std=pairs.std,
-    )
+    varied = dataclasses.replace(pairs, dt=one, args=kept or None, t0=None, period=period)
     return varied, own_time + messages
 
 

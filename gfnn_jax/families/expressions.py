@@ -186,12 +186,14 @@ def window_terms(text: str) -> list[str]:
     return _read(text, lambda tree: [ast.unparse(part) for part in of_a_window(tree)])
 
 
-def parse_named(text: str, names: Sequence[str]) -> Expression:
-    """Parse an expression in variables of any names, which become coordinates in their order.
+def parse_named(text: str, names: Sequence[str], parameters: Sequence[str] = ()) -> Expression:
+    """Parse an expression in variables of any names, which become coordinates in their order, and
+    in parameters.
 
     Raises InputError as `parse` does.
     """
     known = {name: coordinate(i) for i, name in enumerate(names)}
+    known |= {name: parameter(i) for i, name in enumerate(parameters)}
     return _read(text, lambda tree: _parsed(tree, known, text, 0))
 
 

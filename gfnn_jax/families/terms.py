@@ -149,7 +149,7 @@ class Terms(OfCoefficients):
     def trees(self) -> list[Expression]:
         """Expressions of the variables."""
         if self.names:
-            return [parse_named(text, self.names) for text in self.variables]
+            return [parse_named(text, self.names, self.parameters) for text in self.variables]
         return [parse(text, self.dim, self.parameters) for text in self.variables]
 
     @property

@@ -200,20 +200,25 @@ def law_flow(
 
         piece = law_flow(H, params, gfnn.Bracket.se3(), 0.1, z)
 
-    z: states (N, n) of the flow (log z of a log-canonical bracket), at which the substeps are
-    halved until the step changes no more. friction: uniform, its coefficients behind those of H.
+    z: states of the flow (log z of a log-canonical bracket) and the args of H behind them (N, n +
+    k), at which the substeps are halved until the step changes no more. friction: uniform, its
+    coefficients behind those of H.
     """
     if friction is not None:
         frame = InRestingFrame(as_family(family), friction)
-        return DampedFlow(law_flow(frame, params, bracket, dt, z), frame)
-    z, scale = np.asarray(z, float), sizes(z)
-    z = z[:: -(-len(z) // _PROBES)]
+        since = np.zeros((len(z), 1))
+        return DampedFlow(
+            law_flow(frame, params, bracket, dt, np.concatenate([z, since], axis=1)), frame
+        )
+    z = np.asarray(z, float)
+    z, args = np.split(z, [bracket.size], axis=1)
+    scale, some = sizes(z), slice(None, None, -(-len(z) // _PROBES))
+    z, args = z[some], args[some] if args.size else None
     lifted = not isinstance(bracket, LieAlgebra) or bool(bracket.blocks)
     if lifted:
         piece = Flow(collective(family, bracket), params, dt, scale, _STAGES)
     else:
         piece = LieFlow(lie_generated(family, params, bracket, dt, scale))
-    args = np.zeros((len(z), 1)) if isinstance(family, InRestingFrame) else None
     image, before = piece.image(z, args), np.inf
     while piece.substeps < _MOST_SUBSTEPS:
         finer = dataclasses.replace(piece, substeps=2 * piece.substeps)

@@ -3,6 +3,7 @@ bracket given or found, and its map."""
 
 from __future__ import annotations
 
+import dataclasses
 import time
 import warnings
 from typing import Any, NamedTuple
@@ -12,11 +13,12 @@ import numpy as np
 from gfnn_jax.brackets import Bracket, Log, Magnetic, added
 from gfnn_jax.candidates.assemble import Candidate, block_of, stepped
 from gfnn_jax.coordinates import CARTESIAN, LOG
-from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.recording import Recording, args_of, parameters_of
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.dataset.split import split_rows
+from gfnn_jax.dataset.varied import check_varied, without_constants
 from gfnn_jax.errors import FitError, FitWarning, InputError
 from gfnn_jax.families.expressions import parse_named, to_named_text
 from gfnn_jax.families.terms import Terms
@@ -25,8 +27,10 @@ from gfnn_jax.flows.lie import chart_of, law_flow
 from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit
 from gfnn_jax.learn.options import FitOptions, Watch
 from gfnn_jax.maps.domain import covering
+from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.brackets.beside import Beside
 from gfnn_jax.models.brackets.lie_maps import fit_lie_map
 from gfnn_jax.models.brackets.search import Data, PoissonLaw, law_of
 from gfnn_jax.models.hamiltonians.fitted_law import Term, formula
@@ -45,40 +49,41 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
     without a law is fitted instead, in the chart of a given bracket.
 
     The pairs are split as others are: the degree of the field is chosen, and the error is stated,
-    by pairs that were not fitted to. Raises FitError where values are missing or depend on
-    parameters or a time, states are none of the bracket's, or there is no law (with a verdict).
+    by pairs that were not fitted to. H may depend on parameters and on the time of a drive. Raises
+    FitError where values are missing, states are none of the bracket's, or there is no law (with a
+    verdict).
     """
     require_x64("a fit")
     bracket, tolerance = options.bracket, Tolerance.of(options)
     budget = options.budget(watch, None)
     options.refuse_others(("hamiltonian", "map"), "states with a bracket of their own")
     pairs = pairs_of_states(data) if isinstance(data, Recording) else data
-    z0, z1 = _checked(pairs, bracket)
-    n = z0.shape[1]
+    check_varied(pairs)
+    n = _checked(pairs, bracket)
     names = pairs.names or (bracket.labels if bracket else tuple(f"z{i + 1}" for i in range(n)))
-    pairs = identified(pairs).pairs
-    split = split_rows(pairs, options.seed)
+    pairs, left_out = without_constants(identified(pairs).pairs)
+    split, every = split_rows(pairs, options.seed), _data_of(pairs)
     dt: Any = np.asarray(pairs.dt) if np.ndim(pairs.dt) else float(pairs.dt)
-    z0, z1, run, place = (np.asarray(a) for a in (pairs.z0, pairs.z1, pairs.run, pairs.place))
-    every = Data(z0, z1, dt, run, place, sizes(z0))
     train, held = every.take(np.sort(split.training)), every.take(split.validation)
     bracket, started = bracket and bracket.named(names), time.perf_counter()
     if options.learn == "map":
         learned = _generated(train, bracket)
     else:
-        terms, report = _given(options.terms, names), watch.on_progress
+        terms, report = _given(options.terms, (*names, *every.beside.names)), watch.on_progress
         try:
             law = law_of(train, held, names, bracket=bracket, terms=terms, on_progress=report)
         except FitError as error:
             raise FitError(f"{error}{_next(data, error.verdict)}", error.verdict) from error
-        learned = _of_law(law, every.z0, float(np.median(dt)))
+        learned = _of_law(law, every, float(np.median(dt)))
     seconds, map_, sigma = time.perf_counter() - started, learned.map_, learned.sigma
     watch.on_progress(f"compiling the step of {learned.label}")
     test = split.test if len(split.test) else split.validation
-    steps = stepped(map_, every.z0[test], dt[test] if np.ndim(dt) else None)
+    tested = pairs.take(test)
+    own_dt = tested.dt if np.ndim(dt) else None
+    steps = stepped(map_, np.asarray(tested.z0), own_dt, tested.args)
     images = np.where(steps.failed[:, None], np.nan, steps.images)
-    off = images - every.z1[test]
-    error = one_step_error(off, every.spread, tolerance, split.stretch[test])
+    off = images - np.asarray(tested.z1)
+    error = one_step_error(off, every.spread[:n], tolerance, split.stretch[test])
     # both states of a pair have the noise that its sequence tells
     white = sigma is not None and bool(np.sqrt(np.mean((off / sigma) ** 2)) <= NOISE * np.sqrt(2))
     candidate = Candidate.of(
@@ -97,7 +102,7 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         microseconds_per_step=steps.microseconds_per_step,
     )
     watch.on_candidate(candidate)
-    met, messages = candidate.validation_bound <= tolerance.bound, list(learned.notes)
+    met, messages = candidate.validation_bound <= tolerance.bound, [*left_out, *learned.notes]
     if white and not met and sigma is not None:
         noise = ", ".join(f"{s:.2g}" for s in sigma)
         messages.append(f"the law leaves no more than the noise of the states, {noise}")
@@ -107,7 +112,7 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
             f"{tolerance.bound:g}: pairs with noise, or an H that the library lacks (--terms)"
         )
         warnings.warn(messages[-1], FitWarning, stacklevel=4)
-    tested = pairs.take(test[: min(STATES_MEASURED, block_of(n))])
+    tested = tested.take(slice(min(STATES_MEASURED, block_of(n))))
     choice = Choice(
         candidates=(candidate,),
         asked=tolerance,
@@ -122,6 +127,7 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         seconds=budget.seconds,
         compile_seconds=steps.compile_seconds,
         test_states=np.asarray(tested.z0),
+        test_args=tested.args,
         model_determinant_min=float("nan"),
         pairs=pairs,
         stated_by=f"{len(test):,} pairs that were not fitted to",
@@ -155,31 +161,47 @@ def _next(data: Pairs | Recording, verdict: str) -> str:
 
 
 def pairs_of_states(recording: Recording) -> Pairs:
-    """Pairs of the states that a recording's positions are, each with the next of its run; a row
-    with a missing value is none. Raises InputError where there are fewer than two columns."""
-    names, parts = recording.positions, []
+    """Pairs of the states that a recording's positions are, each with the next of its run and the
+    run's parameters; a row with a missing value is none. Raises InputError where there are fewer
+    than two columns, or inputs."""
+    names, parts, own = recording.positions, [], parameters_of(recording)
     if len(names) < 2:
         raise InputError(
             f"expected two or more columns of states, got {len(names)}: --positions A,B"
+        )
+    if recording.inputs:
+        raise InputError(
+            f"a law with a bracket has no inputs, got {', '.join(recording.inputs)}. It may depend "
+            "on parameters, one number of each run, and on the time of a periodic drive: "
+            'gfnn.Pairs(z0, z1, dt, structure="poisson", t0=times, period=T)'
         )
     for number, run in enumerate(recording.runs):
         z, t = np.asarray(recording.array("positions", run)), recording.times(run)
         known = np.asarray(np.isfinite(z).all(axis=1))
         rows = np.flatnonzero(known[:-1] & known[1:])
         runs = np.full(len(rows), number)
-        parts.append((z[rows], z[rows + 1], t[rows + 1] - t[rows], runs, rows))
-    z0, z1, dt, run, place = (np.concatenate(part) for part in zip(*parts, strict=True))
+        args = np.tile(args_of(recording, run, own), (len(rows), 1))
+        parts.append((z[rows], z[rows + 1], t[rows + 1] - t[rows], runs, rows, args))
+    z0, z1, dt, run, place, args = (np.concatenate(part) for part in zip(*parts, strict=True))
     usual = float(np.median(dt))
     even = np.abs(dt - usual).max() <= EVEN * usual
     dt = usual if even else dt
-    return Pairs(z0, z1, dt, run=run, place=place, structure=POISSON, names=symbols(names))
+    given = dict(zip(symbols(own), args.T, strict=True)) or None
+    known = {"run": run, "place": place, "structure": POISSON, "names": symbols(names)}
+    return Pairs(z0, z1, dt, given, **known)
 
 
-def _checked(pairs: Any, bracket: Bracket | None) -> tuple[np.ndarray, np.ndarray]:
-    """z0 and z1 (N, n), finite. Raises FitError for other values, or states where the bracket has
-    no step."""
-    if pairs.args is not None or pairs.t0 is not None:
-        raise FitError("a law with a bracket of its own has no parameters and no drive yet")
+def _data_of(pairs: Pairs) -> Data:
+    """Pairs with runs as the search has them."""
+    beside = Beside.of(pairs)
+    z0, z1, run, place = (np.asarray(a) for a in (pairs.z0, pairs.z1, pairs.run, pairs.place))
+    z0, z1 = beside.behind(z0), beside.behind(z1, np.asarray(pairs.dt))
+    return Data(z0, z1, pairs.dt, run, place, sizes(z0), beside)
+
+
+def _checked(pairs: Any, bracket: Bracket | None) -> int:
+    """Number n of coordinates of states that are finite. Raises FitError for other values, or
+    states where the bracket has no step."""
     states = []
     for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
         z = np.asarray(z, np.float64)
@@ -201,7 +223,7 @@ def _checked(pairs: Any, bracket: Bracket | None) -> tuple[np.ndarray, np.ndarra
                 "Without them: gfnn.fit(pairs.take(~(bracket.outside(pairs.z0) | "
                 "bracket.outside(pairs.z1))), bracket=bracket)"
             )
-    return states[0], states[1]
+    return states[0].shape[1]
 
 
 def _given(terms, names: tuple[str, ...]) -> Terms | None:
@@ -232,19 +254,25 @@ class _Learned(NamedTuple):
     sigma: np.ndarray | None = None
 
 
-def _of_law(law: PoissonLaw, z: np.ndarray, dt: float) -> _Learned:
-    """The flow of a law over dt."""
-    family = law.field.library
-    inner = _inner(z, law.bracket)
-    piece = law_flow(family, law.fit.c, law.bracket, dt, inner, law.field.friction)
-    map_ = _map(piece, law.bracket, z, dt, Posterior(0, law.fit.root))
+def _of_law(law: PoissonLaw, data: Data, dt: float) -> _Learned:
+    """The flow of a law over dt, what is beside the states its args."""
+    own, n = law.field.library, law.bracket.size
+    family = dataclasses.replace(own, parameters=own.names[n:], names=own.names[:n])
+    states = np.concatenate([_inner(data.z0[:, :n], law.bracket), data.z0[:, n:]], axis=1)
+    piece = law_flow(family, law.fit.c, law.bracket, dt, states, law.field.friction)
+    map_ = _map(piece, law.bracket, data, dt, Posterior(0, law.fit.root))
     label = f"H of {family.num_parameters} terms"
     return _Learned(map_, law.bracket, label, family, law.fit.relative, law, law.notes, law.sigma)
 
 
 def _generated(data: Data, bracket: Bracket | None) -> _Learned:
     """The map without a law that S generates in the chart of a bracket. Raises FitError without a
-    bracket, and for pairs of several dt."""
+    bracket, and for pairs of several dt, parameters or a drive."""
+    if data.beside.names:
+        raise FitError(
+            f"a map without a law is one of one system, got {', '.join(data.beside.names)}. A law "
+            "may depend on them: gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=bracket))"
+        )
     if bracket is None:
         raise FitError(
             "a map without a law needs its bracket, such as "
@@ -254,7 +282,7 @@ def _generated(data: Data, bracket: Bracket | None) -> _Learned:
         raise FitError("a map without a law is one of pairs with one dt")
     y0, y1 = (_inner(z, bracket) for z in (data.z0, data.z1))
     found = fit_lie_map(y0, y1, chart_of(bracket), data.dt)
-    map_ = _map(found.piece, bracket, data.z0, data.dt)
+    map_ = _map(found.piece, bracket, data, data.dt)
     label = f"S of degree {found.degree}"
     return _Learned(map_, bracket, label, found.piece.family, found.error)
 
@@ -264,13 +292,14 @@ def _inner(z: np.ndarray, bracket: Bracket) -> np.ndarray:
     return np.log(z) if isinstance(bracket, Log) else z
 
 
-def _map(piece, bracket: Bracket, z: np.ndarray, dt: float, posterior=None) -> SymplecticMap:
-    """The map of a piece, its domain that of the states z (N, n)."""
+def _map(piece, bracket: Bracket, data: Data, dt: float, posterior=None) -> SymplecticMap:
+    """The map of a piece, its domain and its parameters those of the data."""
     inner = LOG if isinstance(bracket, Log) else CARTESIAN
+    z, beside = data.z0[:, : bracket.size], data.beside
     domain, angles = covering(_inner(z, bracket)), np.zeros(0)
-    return SymplecticMap(
-        (piece,), inner, domain, sizes(z), angles, dt, posterior=posterior, bracket=bracket
-    )
+    given = sampled(beside.names, beside.values, dt, beside.period) if beside.names else None
+    known: dict[str, Any] = {"parameters": given, "posterior": posterior, "bracket": bracket}
+    return SymplecticMap((piece,), inner, domain, sizes(z), angles, dt, **known)
 
 
 def _learned(law, map_, candidate, messages) -> LearnedHamiltonian:
@@ -315,10 +344,8 @@ def other_bracket(pairs: Pairs) -> list[str]:
     if pairs.args is not None or pairs.z0.shape[1] > MOST_COLUMNS:
         return []
     pairs = identified(pairs).pairs
-    split = split_rows(pairs, 0)
-    z0, z1, run, place = (np.asarray(a) for a in (pairs.z0, pairs.z1, pairs.run, pairs.place))
-    every = Data(z0, z1, pairs.dt, run, place, sizes(z0))
-    names = tuple(f"z{i + 1}" for i in range(z0.shape[1]))
+    split, every = split_rows(pairs, 0), _data_of(pairs)
+    names = tuple(f"z{i + 1}" for i in range(pairs.z0.shape[1]))
     try:
         law = law_of(every.take(np.sort(split.training)), every.take(split.validation), names)
     except FitError:

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares, minimize
 
 from gfnn_jax.brackets import Bracket, jacobi_failure
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.terms import Terms, exponents
+from gfnn_jax.families.terms import Terms, exponents, multiplied
 from gfnn_jax.flows.damped import Dilations
 from gfnn_jax.models.brackets.algebra import Algebra, analysed
 from gfnn_jax.models.brackets.null_space import CONSTANT, LINEAR, LOG, NullSpace
@@ -77,24 +77,40 @@ class Found(NamedTuple):
         return len(bracket.relations()) + int(np.count_nonzero(bracket.matrix(probe)))
 
 
-def polynomials(names: tuple[str, ...], degree: int, *, constant: bool = False) -> Terms:
-    """All monomials of degree 1 to ``degree`` in the coordinates of these names; with 1 first."""
+def polynomials(
+    names: tuple[str, ...], degree: int, *, constant: bool = False, factors: Terms | None = None
+) -> Terms:
+    """All monomials of degree 1 to ``degree`` in the coordinates of these names, times all of the
+    factors; with 1 first."""
     rows = exponents(len(names), degree)
-    return Terms(0, names, ((0,) * len(names), *rows) if constant else tuple(rows), (), names)
+    return _times(names, ((0,) * len(names), *rows) if constant else tuple(rows), names, factors)
 
 
-def library_of(kind: str, names: tuple[str, ...], degree: int, given: Terms | None) -> Terms:
-    """Terms of H for a field of this degree."""
+def _times(variables, rows, names: tuple[str, ...], factors: Terms | None) -> Terms:
+    """Products of these terms and the factors, whose names are the coordinates' and more."""
+    if factors is None:
+        return Terms(0, variables, rows, (), names)
+    return multiplied(Terms(0, variables, rows, (), factors.names), factors)
+
+
+def library_of(
+    kind: str,
+    names: tuple[str, ...],
+    degree: int,
+    given: Terms | None,
+    factors: Terms | None = None,
+) -> Terms:
+    """Terms of H for a field of this degree, times the factors."""
     if given is not None:
         return given
     if kind == CONSTANT:
-        return polynomials(names, degree + 1)
+        return polynomials(names, degree + 1, factors=factors)
     if kind == LINEAR:
-        return polynomials(names, degree)
+        return polynomials(names, degree, factors=factors)
     n, own = len(names), exponents(len(names), max(degree - 1, 1))
     logs = [tuple(int(k == n + i) for k in range(2 * n)) for i in range(n)]
     rows = (*logs, *((*row, *(0,) * n) for row in own))
-    return Terms(0, (*names, *(f"log({name})" for name in names)), rows, (), names)
+    return _times((*names, *(f"log({name})" for name in names)), rows, names, factors)
 
 
 def brackets_of(
@@ -103,13 +119,14 @@ def brackets_of(
     """Brackets among the null vectors with an H whose B∇H is the field, best first; of those that
     shrink with the uniform friction that the field then has.
 
-    z, f: (N, n) states and the field there. noise: of f, relative.
+    z, f: (N, ≥ n) states, with what H depends on beside them, and the field there. noise: of f,
+    relative.
     """
-    found = []
-    for vector, rule in _combinations(null, z, noise):
+    found, own = [], z[:, : null.tensors.width]
+    for vector, rule in _combinations(null, own, noise):
         made = [
             (name, *_with_energy(bracket, library, z, f, noise, bool(null.rate)))
-            for bracket, name in _made(null, vector, library.names, noise, z)
+            for bracket, name in _made(null, vector, library.names[: own.shape[1]], noise, own)
         ]
         least = min((own.misfit for *_, own in made), default=0.0)
         limit = min(max(OPTIONS.misfit, 3 * noise), OPTIONS.rounded * least + OPTIONS.misfit)
@@ -308,8 +325,8 @@ def _with_energy(bracket, library, z, f, noise, damped: bool) -> tuple[PoissonFi
 def upright(bracket: Any, library: Terms, c: np.ndarray, z: np.ndarray) -> tuple[Any, np.ndarray]:
     """The bracket and H, both reversed where H would be concave: (−B, −H) is the same motion."""
     some = z[:: max(1, len(z) // 50)]
-    hessian = library.gradient_and_hessian(c, some)[1]
-    bends = np.diagonal(hessian, axis1=1, axis2=2) * np.mean(z**2, axis=0)
+    hessian, n = library.gradient_and_hessian(c, some)[1], bracket.size
+    bends = (np.diagonal(hessian, axis1=1, axis2=2) * np.mean(z**2, axis=0))[:, :n]
     if np.abs(bends.sum()) <= 1e-6 * np.abs(bends).sum():
         bends = c * term_sizes(library, z)
     if bends.sum() >= 0:

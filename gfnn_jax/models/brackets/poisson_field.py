@@ -13,6 +13,7 @@ from scipy.optimize import linprog
 from gfnn_jax.brackets import Bracket
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.damped import Dilations
+from gfnn_jax.phase_space import TIME
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +30,10 @@ OPTIONS = Options()
 
 @dataclasses.dataclass(frozen=True)
 class PoissonField:
-    """f = Σ_j c_j B ∇φ_j − Σ_k c_k E_k z, φ the terms of H, E_k those of uniform friction."""
+    """f = Σ_j c_j B ∇φ_j − Σ_k c_k E_k z, φ the terms of H, E_k those of uniform friction.
+
+    States may have parameters, which stay, and the time, which goes on, behind the n coordinates.
+    """
 
     bracket: Bracket
     library: Terms
@@ -63,25 +67,37 @@ class PoissonField:
 
     def rate(self, c, z):
         """f (N, n)."""
-        gradient = self.library.gradient(self.of_h(c), z)
-        found = np.einsum("nij,nj->ni", self.bracket.matrix(z), gradient)
-        return found if self.friction is None else found - z @ self.damping(c).T
+        n = self.bracket.size
+        own, gradient = z[:, :n], self.library.gradient(self.of_h(c), z)[:, :n]
+        found = np.zeros_like(z)
+        found[:, :n] = np.einsum("nij,nj->ni", self.bracket.matrix(own), gradient)
+        if self.friction is not None:
+            found[:, :n] -= own @ self.damping(c).T
+        if self.library.names[n:] and self.library.names[-1] == TIME:
+            found[:, -1] = 1.0
+        return found
 
     def jacobian(self, c, z):
         """∂f/∂z (N, n, n); that of B by complex steps, which are exact of polynomials."""
+        n = self.bracket.size
         gradient, hessian = self.library.gradient_and_hessian(self.of_h(c), z)
-        found = self.bracket.matrix(z) @ hessian - self.damping(c)
-        for k, h in enumerate(np.maximum(np.abs(z).max(axis=0), 1e-300) * 1e-20):
-            moved = z.astype(complex)
+        own, gradient = z[:, :n], gradient[:, :n]
+        found = np.zeros((*z.shape, z.shape[1]))
+        inner = found[:, :n, :n]
+        inner += self.bracket.matrix(own) @ hessian[:, :n, :n] - self.damping(c)
+        for k, h in enumerate(np.maximum(np.abs(own).max(axis=0), 1e-300) * 1e-20):
+            moved = own.astype(complex)
             moved[:, k] += 1j * h
-            found[:, :, k] += np.einsum("nij,nj->ni", self.bracket.matrix(moved).imag / h, gradient)
+            inner[:, :, k] += np.einsum("nij,nj->ni", self.bracket.matrix(moved).imag / h, gradient)
         return found
 
     def columns(self, z):
         """B ∇φ_j and −E_k z (N, n, J)."""
-        own = self.bracket.matrix(z) @ self.library.term_gradients(z)
-        drags = -np.einsum("kij,nj->nik", self._matrices, z)
-        return np.concatenate([own, drags], axis=2) if drags.size else own
+        n, found = self.bracket.size, np.zeros((*z.shape, self.num))
+        own, gradients = z[:, :n], self.library.term_gradients(z)[:, :n]
+        found[:, :n, : gradients.shape[2]] = self.bracket.matrix(own) @ gradients
+        found[:, :n, gradients.shape[2] :] = -np.einsum("kij,nj->nik", self._matrices, own)
+        return found
 
 
 class OfField(NamedTuple):
@@ -96,15 +112,16 @@ class OfField(NamedTuple):
 def hamiltonian_of(
     field: PoissonField, z: np.ndarray, f: np.ndarray, noise: float = 0.0
 ) -> OfField:
-    """H with B∇H = f, or with friction B∇H − Ez = f, at states z (N, n), f (N, n), by linear least
-    squares; of all that differ by Casimirs the one with the smallest sum of its coefficients'
-    sizes, in units of the terms.
+    """H with B∇H = f, or with friction B∇H − Ez = f, at states z (N, ≥ n), by linear least squares;
+    of all that differ by Casimirs the one with the smallest sum of its coefficients' sizes, in
+    units of the terms. f: (N, ≥ n), of which the first n count.
 
     noise: of f, relative: what of singular values is none.
     """
+    f = f[:, : field.bracket.size]
     units, scale = term_sizes(field.library, z), np.sqrt(np.mean(f**2, axis=0)) + 1e-300
     units = np.append(units, np.ones(field.num - len(units)))
-    columns = field.columns(z) / units / scale[:, None]
+    columns = field.columns(z)[:, : f.shape[1]] / units / scale[:, None]
     matrix, right = columns.reshape(-1, field.num), (f / scale).ravel()
     u, s, vt = np.linalg.svd(matrix, full_matrices=False)
     known = s > max(OPTIONS.casimir, noise) * s[0]

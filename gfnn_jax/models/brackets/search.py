@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.models.brackets.arcs import arcs_of, equal_arcs, fit_arcs, lagged
 from gfnn_jax.models.brackets.atoms import with_shapes
+from gfnn_jax.models.brackets.beside import NOTHING, Beside
 from gfnn_jax.models.brackets.fields import (
     Field,
     FieldFit,
@@ -78,8 +80,9 @@ OPTIONS = Options()
 
 
 class Data(NamedTuple):
-    """Pairs: states z0, z1 (N, n), dt a number or (N,), their run and place along it (N,). spread:
-    (n,) of all pairs, of which these are some."""
+    """Pairs: states z0, z1 (N, n), with what H depends on beside them behind them, dt a number or
+    (N,), their run and place along it (N,). spread: (n,) of all pairs, of which these are some.
+    beside: what H depends on, of all of them."""
 
     z0: np.ndarray
     z1: np.ndarray
@@ -87,12 +90,13 @@ class Data(NamedTuple):
     run: np.ndarray
     place: np.ndarray
     spread: np.ndarray
+    beside: Beside = NOTHING
 
     def take(self, rows) -> Data:
         """The pairs of these rows."""
         dt = self.dt[rows] if np.ndim(self.dt) else self.dt
         z0, z1, run, place = (a[rows] for a in (self.z0, self.z1, self.run, self.place))
-        return Data(z0, z1, dt, run, place, self.spread)
+        return Data(z0, z1, dt, run, place, self.spread, self.beside)
 
 
 class PoissonLaw(NamedTuple):
@@ -130,7 +134,8 @@ def law_of(
     terms: Terms | None = None,
     on_progress: Callable[[str], Any] = lambda message: None,
 ) -> PoissonLaw:
-    """The law of these pairs. held: pairs that choose the degree of the field.
+    """The law of these pairs. held: pairs that choose the degree of the field. names: of the n
+    coordinates.
 
     bracket: a known one; None: it is found. terms: of H, where they are known; None: polynomials,
     and logarithms for log-canonical brackets.
@@ -141,7 +146,7 @@ def law_of(
     if bracket is not None:
         return _of_bracket(bracket, train, held, terms, on_progress)
     law = _of_field(train, held, names, terms, on_progress)
-    if law.field.friction is None and _one_level(law, train.z0):
+    if not train.beside.names and law.field.friction is None and _one_level(law, train.z0):
         several = (
             "H has one value along all runs, and every function of H with the same slope there "
             "moves them so: add runs that start at other values of H"
@@ -171,7 +176,17 @@ def _energies(law: PoissonLaw, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) -> PoissonLaw:
     """The law of a field whose bracket is found."""
-    field, fit, error, notes = _free_field(train, held, names, terms, on_progress)
+    n, more = len(names), train.beside.names
+    field, fit, error, notes, factors = _free_field(train, held, names, terms, on_progress)
+    degree = _degree(field, n)
+    if error > OPTIONS.exact and more:
+        raise FitError(
+            f"the field of degree {degree} with {', '.join(more)} leaves {error:.1e} of the "
+            "spread, which is misfit or noise; only pairs without noise tell how a law with a "
+            "bracket depends on parameters or a drive. Where H has other terms, give them and the "
+            "bracket: gfnn.fit(pairs, bracket=…, terms=[…])",
+            f"no law: the field with {', '.join(more)} leaves {error:.1e} of the spread",
+        )
     if error > OPTIONS.exact and terms is None:
         sigma = _noise_of(train, fit)
         law = _of_populations(train, held, names, sigma)
@@ -187,16 +202,16 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
         if law is not None:
             return law._replace(notes=notes)
     some = train.z0[:: max(1, len(train.z0) // OPTIONS.states)]
-    f, slope = field.rate(fit.c, some), field.jacobian(fit.c, some)
+    f, slope = _at(field, fit.c, some, n)
     rng = np.random.default_rng(OPTIONS.seed)
     drawn = [rng.normal(size=len(fit.root)) @ fit.root for _ in range(OPTIONS.draws)]
-    draws = [(field.rate(c, some), field.jacobian(c, some)) for c in drawn]
+    draws = [_at(field, c, some, n) for c in drawn]
     off = [np.mean((one[0] / sizes(f)) ** 2) for one in draws]
     unsure = float(np.sqrt(np.mean(off)))
     nearest: dict[str, float] = {}
     missed: list[str] = []  # brackets whose laws do not leave noise alone
     shrunk: list[str] = []
-    for null in _nulls(some, f, slope, draws, noisy is None):
+    for null in _nulls(some[:, :n], f, slope, draws, noisy is None):
         kind = null.tensors.kind
         if null.rate:
             shrunk.append(f"{null.rate:.8g}")
@@ -205,7 +220,7 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
         on_progress(f"{kind} brackets: {len(null.vectors)}, the nearest at {null.nearest:.1e}")
         if not len(null.vectors) or (null.rate and kind == LOG):
             continue
-        library = library_of(kind, names, _degree(field), terms)
+        library = library_of(kind, names, degree, terms, factors)
         for found in brackets_of(null, some, f, library, OPTIONS.errors * unsure):
             missed.append(found.name)
             try:
@@ -232,7 +247,7 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
     values = ", ".join(f"{value:.2g} ({kind})" for kind, value in nearest.items())
     raise FitError(
         f"no bracket: L_f B = 0 has no solution among these, the nearest singular value being "
-        f"{values}, where 0 is a bracket. The field of degree {_degree(field)} leaves {error:.1e} "
+        f"{values}, where 0 is a bracket. The field of degree {degree} leaves {error:.1e} "
         f"of the spread{more}",
         f"no law: no bracket, nearest singular value {min(nearest.values()):.2g}",
     )
@@ -245,26 +260,33 @@ def _nulls(z, f, slope, draws, clean: bool) -> Iterator[NullSpace]:
         yield from null_spaces(z, f, slope, draws, rate)
 
 
-def _degree(field: FreeField) -> int:
-    """Total degree of a field of polynomials; 1 of others."""
+def _at(field: FreeField, c: np.ndarray, z: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rates (N, n) of the coordinates, and their derivatives in these (N, n, n)."""
+    return field.rate(c, z)[:, :n], field.jacobian(c, z)[:, :n, :n]
+
+
+def _degree(field: FreeField, n: int) -> int:
+    """Total degree in the coordinates, which are the first n variables, of a field of polynomials;
+    1 of others."""
     own = field.library
-    return 1 if isinstance(own, Partials) else max(map(sum, own.powers))
+    return 1 if isinstance(own, Partials) else max(sum(row[:n]) for row in own.powers)
 
 
 def _free_field(train, held, names, terms, on_progress):
-    """(field, its fit, its error on held-out pairs, notes): of the smallest degree that a higher
-    one does not beat."""
+    """(field, its fit, its error on held-out pairs, notes, functions of what is beside the state):
+    of the smallest degree that a higher one does not beat."""
     best, notes = None, ()
     if terms is not None:
         field = FreeField(Partials.of(terms, train.z0))
         fit = fit_field(field, *train[:3])
         best = field, fit, error_on(field, fit.c, held)
         if best[2] <= OPTIONS.exact:
-            return (*best, ())
-    for degree in OPTIONS.degrees:
-        library = polynomials(names, degree, constant=True)
+            return (*best, (), None)
+    kept = None
+    for degree, factors in product(OPTIONS.degrees, tuple(train.beside.factors(names))):
+        library = polynomials(names, degree, constant=True, factors=factors)
         if library.num_parameters * OPTIONS.rows_per_term > len(train.z0):
-            break
+            continue
         field, missing = FreeField(library), ()
         relations = undetermined(field, train.z0, 0.0)
         if len(relations):
@@ -281,7 +303,7 @@ def _free_field(train, held, names, terms, on_progress):
             continue
         error = error_on(field, fit.c, held)
         if best is None or error <= OPTIONS.better * best[2]:
-            best = field, fit, error
+            best, kept = (field, fit, error), factors
             notes = (_SHELL.format(count=len(relations)),) if len(relations) else ()
         if error <= OPTIONS.exact:
             break
@@ -289,7 +311,7 @@ def _free_field(train, held, names, terms, on_progress):
         raise FitError(
             f"{len(train.z0)} pairs gave no field of degree 1 or 2: add pairs, or take a shorter dt"
         )
-    return (*best, notes)
+    return (*best, notes, kept)
 
 
 _SHELL = (
@@ -472,10 +494,11 @@ def _of_bracket(bracket, train, held, terms, on_progress) -> PoissonLaw:
     """H of a known bracket: polynomials of the smallest degree that a higher one does not beat, or,
     where none is exact, shapes of single coordinates beside the quadratic terms."""
     best = None
-    for degree in OPTIONS.given_degrees if terms is None else (1,):
-        library = library_of(_kind_of(bracket), bracket.labels, degree, terms)
+    sizes_of_h = product(OPTIONS.given_degrees, tuple(train.beside.factors(bracket.labels)))
+    for degree, factors in sizes_of_h if terms is None else ((1, None),):
+        library = library_of(_kind_of(bracket), bracket.labels, degree, terms, factors)
         if library.num_parameters * OPTIONS.rows_per_term > train.z0.size:
-            break
+            continue
         on_progress(f"H of {library.num_parameters} terms")
         try:
             law = _of_library(bracket, library, train, held)
@@ -487,7 +510,7 @@ def _of_bracket(bracket, train, held, terms, on_progress) -> PoissonLaw:
             return law
     if best is None:
         raise FitError(f"no H of the library has a flow near these {len(train.z0)} pairs")
-    if terms is None:
+    if terms is None and not train.beside.names:
         shaped = _of_shapes(bracket, train, held, on_progress)
         best = min((best, shaped), key=lambda law: law.error) if shaped else best
     return best
