@@ -9,6 +9,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.brackets import Bracket
 from gfnn_jax.errors import FitError
 from gfnn_jax.models.brackets.algebra import analysed, changed
+from gfnn_jax.models.brackets.beside import Beside
 from gfnn_jax.models.brackets.search import Data, law_of
 from gfnn_jax.phase_space import sizes
 
@@ -63,6 +64,20 @@ def learned(field, starts, dt=0.2, steps=20, noise=0.0):
     held = data.run >= len(starts) - max(1, len(starts) // 5)
     names = tuple(f"z{i + 1}" for i in range(data.z0.shape[1]))
     return law_of(data.take(~held), data.take(held), names), starts
+
+
+def test_a_moment_that_differs_from_run_to_run():
+    def rates(z):  # the moment is one more state
+        return np.append(np.cross(z[:3], z[:3] * [0.5, 0.7, 1 / z[3]]), 0.0)
+
+    rng = np.random.default_rng(0)
+    starts = np.column_stack([rng.normal(size=(20, 3)), rng.uniform(0.5, 1.5, 20)])
+    data = runs_of(rates, starts, 0.2, 20)
+    data = data._replace(beside=Beside(("m",), data.z0[:, 3:]))
+    law = law_of(data.take(data.run < 16), data.take(data.run >= 16), ("a", "b", "c"))
+    assert law.bracket.blocks == ("so3",)
+    assert law.field.library.term_names == ("b²", "c²", "c² (1/m)")  # H less L² / 4
+    assert law.error < 1e-13
 
 
 def field_error(law, field, states):

@@ -174,6 +174,54 @@ def test_states_without_a_bracket_are_told_what_to_type(tmp_path, capsys):
     assert (asked.data, asked.positions) == ([path], ("x", "y"))
 
 
+@pytest.mark.slow
+def test_a_driven_spin():
+    """The field along y turns with the period 7.5; runs begin at times of their own."""
+
+    def rates(z):  # the time is one more state
+        field = np.array([0.3, 0.4 * np.cos(2 * np.pi * z[3] / 7.5), 0.2])
+        return np.append(np.cross(z[:3], field + np.array([1.0, 0.5, 0.2]) * z[:3]), 1.0)
+
+    rng = np.random.default_rng(0)
+    starts = np.column_stack([rng.normal(size=(30, 3)), rng.uniform(0, 30, 30)])
+    data = runs_of(rates, starts, 0.2, 20)
+    known = {"t0": data.z0[:, 3], "period": 7.5, "run": data.run, "place": data.place}
+    fit = gfnn.fit(gfnn.Pairs(data.z0[:, :3], data.z1[:, :3], 0.2, structure="poisson", **known))
+    assert (fit.verdict, fit.bracket.blocks) == ("identified", ("so3",))
+    assert fit.formula == "0.3*z1 + 0.4*z2*cos(2*pi*t/7.5) + 0.2*z3 + 0.25*z1**2 - 0.15*z3**2"
+    ends, begun = data.z1[19::20, :3], data.z0[::20]
+    found = np.asarray(fit.map.rollout(begun[:, :3], 20, t0=begun[:, 3])[0])[:, -1]
+    assert np.abs(found - ends).max() < 1e-12
+    assert fit.symplecticity_defect < 1e-13
+
+
+@pytest.mark.slow
+def test_tops_whose_moment_differs_from_run_to_run(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    starts = np.column_stack([rng.normal(size=(20, 3)), rng.uniform(0.5, 1.5, 20)])
+    data = runs_of(
+        lambda z: np.append(np.cross(z[:3], z[:3] * [0.5, 0.7, 1 / z[3]]), 0.0), starts, 0.2, 20
+    )
+    columns = dict(zip(("L1", "L2", "L3", "inertia"), data.z0.T, strict=True))
+    path = tmp_path / "tops.csv"
+    path.write_text(to_text({"run": data.run, "t": 0.2 * data.place, **columns}))
+    asked = f"fit {path} --structure poisson --states L1,L2,L3 --parameters inertia --out"
+    assert cli.main([*asked.split(), str(tmp_path / "m")]) == 0
+    fit = gfnn.load(tmp_path / "m")
+    assert fit.verdict == "identified"
+    assert fit.formula.endswith("/inertia)")
+    command = capsys.readouterr().out.split("next: gfnn ")[1].replace("1000", "10")
+    assert cli.main(shlex.split(command.replace("prediction.npz", f"{tmp_path}/p.npz"))) == 0
+    with np.load(tmp_path / "p.npz") as file:
+        ahead = file["trajectories"][0]
+    own = {"inertia": starts[0, 3]}
+    again = np.asarray(fit.map.rollout(data.z0[19, :3], 10, params=own)[0])
+    assert np.abs(again - ahead).max() < 1e-9  # the file has ten digits
+    two = np.where(data.run % 2, 1.0, 2.0)
+    with pytest.raises(FitError, match=r"has 2 values.*pairs.args\['m'\] == 1\)"):
+        gfnn.fit(gfnn.Pairs(data.z0[:, :3], data.z1[:, :3], 0.2, {"m": two}, structure="poisson"))
+
+
 def test_a_gyroscope_on_the_command_line(tmp_path, capsys):
     data = gyroscope(tmp_path / "gyro.csv", 6)
     figure = str(tmp_path / "look.png")

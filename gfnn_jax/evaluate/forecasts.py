@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.data.recording import Recording
+from gfnn_jax.data.recording import Recording, args_of, parameters_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.learn.fitted import Choice, Fit
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -150,7 +150,9 @@ def _of_state(
     steps = int(longest / dt * (1 + 1e-9))
     sigma = np.zeros(z.shape[1]) if noise is None else noise
     starts = z[k] + sigma * np.random.default_rng(k).normal(size=(_OPTIONS.drawn, z.shape[1]))
-    found = np.asarray(map_.rollout(np.concatenate([z[k : k + 1], starts]), steps)[0])[:, 1:]
+    own = None if map_.parameters is None else args_of(recording, run, parameters_of(recording))
+    states = np.concatenate([z[k : k + 1], starts])
+    found = np.asarray(map_.rollout(states, steps, params=own)[0])[:, 1:]
     later = t[k] + dt * np.arange(1, steps + 1)
     spread = np.sqrt(np.nanmean((found[1:] - found[0]) ** 2, axis=0) + sigma**2)
     measured, values, std = {}, {}, {}

@@ -12,7 +12,7 @@ import numpy as np
 
 from gfnn_jax.budget import READING
 from gfnn_jax.data.files import iterate_pairs, read_trajectories, summary
-from gfnn_jax.data.recording import Recording, read
+from gfnn_jax.data.recording import Recording, parameters_of, read
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.errors import FitError, InputError, OutOfTime, WorkError
@@ -213,7 +213,8 @@ def fit_states(
             command = shlex.join(map(str, typed))
             raise FitError(f"{error}. If these are positions: {command}", error.verdict) from error
     result = fitted.report(seed=asked.seed, data={"source": recording.source, "states": names})
-    job = {**_job(recording, columns, asked), "states": names}
+    own = parameters_of(recording)
+    job = {**_job(recording, columns, asked), "states": names, "parameters": own}
     with atomic_folder(output.out) as folder:
         write(folder, folder, fitted, result, job)
     return Ran(fitted, output.out, result)

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gfnn_jax.brackets import Bracket
 from gfnn_jax.data.blocks import damage
 from gfnn_jax.data.files import are_recordings, read_initial, read_initial_noise
 from gfnn_jax.data.predictions import (
@@ -24,6 +23,7 @@ from gfnn_jax.data.predictions import (
     part_of,
     put_together,
 )
+from gfnn_jax.data.recording import args_of
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.jobs.output import Output, read_in_units, refuse_other_units
 from gfnn_jax.maps import saved
@@ -133,7 +133,7 @@ def predict(
     if map_.bracket is not None:
         if asked.horizon is not None:
             raise InputError("--horizon: is a length of positions, and these states have none")
-        z0, params = _states_of(map_.bracket, model, initial), None
+        z0, params = _states_of(map_, model, initial)
     elif map_.of_positions and are_recordings(initial):
         z0, params = _last_states(map_, model, initial), None
     else:
@@ -207,21 +207,33 @@ def _refused_as(option: str) -> Iterator[None]:
         raise InputError(f"{option}: {error}") from error
 
 
-def _states_of(bracket: Bracket, model: Path, initial: Path) -> np.ndarray:
-    """(B, n): the rows of an array, ``z0`` of an archive, or the last state of every run of a file
-    with the columns that the model was learned from."""
+def _states_of(map_: SymplecticMap, model: Path, initial: Path) -> tuple[np.ndarray, Any]:
+    """States (B, n) and their parameters (B, k) or None: the rows of an array, ``z0`` of an
+    archive with its parameters by name, or the last state of every run of a file with the columns
+    that the model was learned from."""
+    bracket: Any = map_.bracket
+    names, params = () if map_.parameters is None else map_.parameters.names, None
     if initial.suffix.lower() in (".npy", ".npz") and not are_recordings(initial):
         with damage(initial, "the array"):
             found: Any = np.load(initial, allow_pickle=False)
+            if names and initial.suffix.lower() == ".npz" and set(names) <= set(found.files):
+                params = np.stack([np.atleast_1d(found[name]) for name in names], axis=-1)
             if initial.suffix.lower() == ".npz":
                 found = found["z0"] if "z0" in found.files else found["trajectories"][:, -1]
         z0 = np.atleast_2d(np.asarray(found, np.float64))
     else:
         job = saved.record(model).get("job", {})
         states = job.get("states", bracket.labels)
-        recording = read_in_units(initial, job, {"positions": states})
+        own = job.get("parameters", ())
+        recording = read_in_units(initial, job, {"positions": states, "parameters": own})
         refuse_other_units(recording, job)
         z0 = np.array([recording.array("positions", run)[-1] for run in recording.runs])
+        params = np.array([args_of(recording, run, own) for run in recording.runs]) if own else None
+    if names and params is None:
+        raise InputError(
+            f"{initial}: expected the parameters {', '.join(names)} of these states: a text file "
+            "with their columns, or an .npz with z0 and an array of each name"
+        )
     if z0.ndim != 2 or z0.shape[1] != bracket.size or not np.isfinite(z0).all():
         raise InputError(
             f"{initial}: expected states {', '.join(bracket.labels)} that are finite, got an array "
@@ -231,7 +243,7 @@ def _states_of(bracket: Bracket, model: Path, initial: Path) -> np.ndarray:
         bracket.require_inside(z0)
     except FitError as error:
         raise InputError(f"{initial}: {error}") from error
-    return z0
+    return z0, params
 
 
 def _last_states(map_: SymplecticMap, model: Path, initial: Path) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,7 @@ class Beside:
         columns = np.reshape([*args.values()], (len(args), len(pairs))).T
         return cls(tuple(args), columns, pairs.period)
 
-    def behind(self, z: np.ndarray, after=0.0) -> np.ndarray:
+    def behind(self, z: np.ndarray, after: Any = 0.0) -> np.ndarray:
         """States z (N, n) with these behind them, a time ``after`` (N,) later: (N, n + k)."""
         if not self.names:
             return z

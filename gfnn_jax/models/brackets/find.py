@@ -122,11 +122,12 @@ def brackets_of(
     z, f: (N, ≥ n) states, with what H depends on beside them, and the field there. noise: of f,
     relative.
     """
-    found, own = [], z[:, : null.tensors.width]
-    for vector, rule in _combinations(null, own, noise):
+    found, states = [], z[:, : null.tensors.width]
+    names = library.names[: null.tensors.width]
+    for vector, rule in _combinations(null, states, noise):
         made = [
             (name, *_with_energy(bracket, library, z, f, noise, bool(null.rate)))
-            for bracket, name in _made(null, vector, library.names[: own.shape[1]], noise, own)
+            for bracket, name in _made(null, vector, names, noise, states)
         ]
         least = min((own.misfit for *_, own in made), default=0.0)
         limit = min(max(OPTIONS.misfit, 3 * noise), OPTIONS.rounded * least + OPTIONS.misfit)

@@ -52,6 +52,7 @@ class Options:
     given_degrees: tuple[int, ...] = (1, 2, 3, 4, 6)  # of H, where the bracket is given
     rows_per_term: float = 1.5  # pairs for each function of the library, at least
     exact: float = 1e-10  # of the spread: what a field without noise or misfit leaves at most
+    printed: float = 1e-6  # the same of numbers that were printed, of pairs with parameters
     better: float = 0.9  # of the error on held-out pairs: what a higher degree must lower it to
     partly: float = 1e-2  # of the spread: an error of a field that is a start at all
     states: int = 400  # at which the field is analysed
@@ -179,7 +180,7 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
     n, more = len(names), train.beside.names
     field, fit, error, notes, factors = _free_field(train, held, names, terms, on_progress)
     degree = _degree(field, n)
-    if error > OPTIONS.exact and more:
+    if error > OPTIONS.printed and more:
         raise FitError(
             f"the field of degree {degree} with {', '.join(more)} leaves {error:.1e} of the "
             "spread, which is misfit or noise; only pairs without noise tell how a law with a "
@@ -187,7 +188,7 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
             "bracket: gfnn.fit(pairs, bracket=…, terms=[…])",
             f"no law: the field with {', '.join(more)} leaves {error:.1e} of the spread",
         )
-    if error > OPTIONS.exact and terms is None:
+    if error > OPTIONS.exact and terms is None and not more:
         sigma = _noise_of(train, fit)
         law = _of_populations(train, held, names, sigma)
         if law is not None:
@@ -195,9 +196,9 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
         hidden = _hidden_relations(train, names, sigma)
         if hidden:
             raise _too_few_runs(hidden + 1, 2, len(np.unique(train.run)))
-    noisy = _noise(field, fit, error, train)
+    noisy = None if more else _noise(field, fit, error, train)
     fit = fit if noisy is None else noisy.fit
-    if noisy is None and error > OPTIONS.exact and terms is None:
+    if noisy is None and error > OPTIONS.exact and terms is None and not more:
         law = _without_polynomials(train, held, names, on_progress)
         if law is not None:
             return law._replace(notes=notes)
