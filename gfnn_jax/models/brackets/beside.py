@@ -1,4 +1,4 @@
-"""What H depends on beside the state: parameters of a system, the time of a periodic drive.
+"""Arguments of H beside the state: parameters of a system, the time of a periodic drive.
 
 They stand behind the coordinates of a state, as more of them: parameters stay, the time goes on. A
 bracket is the same for all of them, so that only H has them in its terms. NumPy.
