@@ -199,6 +199,7 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
             "text": str(fit.friction),
             **_kinds(fit.which_friction),
         },
+        "rivals": [rival._asdict() for rival in fit.rivals],
         "inputs": {
             "hold": sensors.hold,
             "other_rules": fit.input_rules,

@@ -42,6 +42,11 @@ class Evidence:
     log_odds: float = 20.0
     logarithm: float = 10.0
 
+    @property
+    def deciding(self) -> float:
+        """The difference of Schwarz's criteria of two models with odds that decide."""
+        return 2 * float(np.log(self.decided))
+
     def odds(self, cost: float, other: float, count: float) -> float:
         """Odds of a model of this held-out sum of squares over another, by ``count`` independent
         residuals."""
@@ -50,6 +55,13 @@ class Evidence:
 
 
 EVIDENCE = Evidence()
+
+
+class Rival(NamedTuple):
+    """Another law that the data allow, and the odds of the one that was taken against it."""
+
+    formula: str
+    odds: float
 
 
 class Comparison(NamedTuple):

@@ -16,13 +16,14 @@ from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.text import Term
+from gfnn_jax.fitting.evidence import Rival
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.learn.fitted import Choice, Fit, OfPositions
 from gfnn_jax.maps import saved as maps
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.arms.identify import BaseParameters, Columns, Identified, Prior
 from gfnn_jax.models.arms.learned_arm import LearnedArm
-from gfnn_jax.models.hamiltonians.fitted_law import Dropped, PartialLaw, Rival
+from gfnn_jax.models.hamiltonians.fitted_law import Dropped, PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.calibration import Horizon
 from gfnn_jax.models.lagrangians.friction_choice import WhichFriction

@@ -24,10 +24,10 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.rows import of_differences
 from gfnn_jax.dataset.runs import next_of
 from gfnn_jax.errors import InputError
-from gfnn_jax.fitting.evidence import EVIDENCE
+from gfnn_jax.fitting.evidence import EVIDENCE, Rival
 from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_with_constants
 from gfnn_jax.flows.collocation import Steps, operations
-from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw, PartialLaw, Rival, Term
+from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw, PartialLaw, Term
 from gfnn_jax.models.hamiltonians.fitted_law import formula as formula_of
 from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.sequences import OPTIONS as ARCS

@@ -12,14 +12,8 @@ from gfnn_jax.dataset.measured_error import OneStepError
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.families.text import Term, added, digits, plain
+from gfnn_jax.fitting.evidence import Rival
 from gfnn_jax.fitting.gauss_newton import FlowFit
-
-
-class Rival(NamedTuple):
-    """Another law that the pairs allow, and the odds of the one that was taken against it."""
-
-    formula: str
-    odds: float
 
 
 class PartialLaw(NamedTuple):

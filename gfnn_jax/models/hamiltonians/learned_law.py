@@ -20,6 +20,7 @@ from gfnn_jax.exports.symbolic import as_latex, as_sympy
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.families.told import Constrained
+from gfnn_jax.fitting.evidence import Rival
 from gfnn_jax.flows.collective import Collective
 from gfnn_jax.flows.collocation import truncation
 from gfnn_jax.flows.flow import Flow
@@ -30,7 +31,6 @@ from gfnn_jax.models.hamiltonians.covariance import covariance_root
 from gfnn_jax.models.hamiltonians.fitted_law import (
     Dropped,
     FittedLaw,
-    Rival,
     Term,
     as_code,
     formula,

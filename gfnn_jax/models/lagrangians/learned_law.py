@@ -12,7 +12,7 @@ from gfnn_jax.exports import symbolic
 from gfnn_jax.exports.symbolic import Equation, Formula, equations_of_motion
 from gfnn_jax.families.lagrangian import DRY, Lagrangian
 from gfnn_jax.families.text import Term, measured
-from gfnn_jax.fitting.evidence import EVIDENCE
+from gfnn_jax.fitting.evidence import EVIDENCE, Rival
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.calibration import Horizon
@@ -24,6 +24,7 @@ from gfnn_jax.models.lagrangians.text import Names, of_systems, terms_of
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
 ONLY_TOGETHER = "only together"  # end of a line about coefficients that are identified as a sum
+_TOLD = 2  # rivals that the verdict lists
 _SHOWN = 3  # pairs of nearly collinear coefficients that are listed
 
 
@@ -109,6 +110,7 @@ class LearnedLaw:
     symbols: tuple[tuple[str, ...], ...] = ((), ())
     nature: str = ""
     rival: str = ""
+    rivals: tuple[Rival, ...] = ()
 
     @property
     def equations(self) -> tuple[Equation, ...]:
@@ -140,6 +142,9 @@ class LearnedLaw:
             return f"partly: {'; '.join((*self.flaws, *filter(None, [self.nature])))}"
         if self.rival:
             return f"one of several: {self.rival}"
+        if self.rivals:
+            told = " or ".join(one.formula for one in self.rivals[:_TOLD])
+            return f"one of several: {told} follows the record as well"
         together = [names for names in self.alike if names.endswith(ONLY_TOGETHER)]
         if together:
             return f"one of several: {'; '.join(together)}"

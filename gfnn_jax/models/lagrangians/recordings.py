@@ -31,12 +31,14 @@ from gfnn_jax.dataset.stretches import (
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import INPUTS, shape_of
 from gfnn_jax.families.text import measured
+from gfnn_jax.fitting.evidence import Rival
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.dependence import search_of_systems
 from gfnn_jax.models.lagrangians.drives import hidden_frequency, with_frequency
+from gfnn_jax.models.lagrangians.exchange import rivals
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.first_order import plain_field
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
@@ -56,7 +58,13 @@ from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, last_of_seri
 from gfnn_jax.models.lagrangians.nature import Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions
 from gfnn_jax.models.lagrangians.rivals import constant_of, one_sided, other_powers
-from gfnn_jax.models.lagrangians.search import SearchResult, fit_given, search, search_on
+from gfnn_jax.models.lagrangians.search import (
+    SearchResult,
+    TermSearch,
+    fit_given,
+    search,
+    search_on,
+)
 from gfnn_jax.models.lagrangians.starts import no_law
 from gfnn_jax.models.lagrangians.text import Names, speed_names
 from gfnn_jax.models.lagrangians.traces import traces_of
@@ -161,7 +169,8 @@ def fit_recording(
         if not terms and not hidden:
             messages = (*law.messages, *_with_constants(best.fit))
             rival = law.rival or _other_shapes(best.fit)
-            law = dataclasses.replace(law, rival=rival, messages=messages)
+            others = () if law.flaws else _rivals(recording, data, best.fit)
+            law = dataclasses.replace(law, rival=rival, rivals=others, messages=messages)
     except (FitError, np.linalg.LinAlgError):
         if missed is not None:
             raise _with_nature(missed, data) from None
@@ -198,6 +207,17 @@ def _other_shapes(fit: LawFit) -> str:
         return SERIES.format(fit.problem.word(("term", last)))
     names = symbols(fit.problem.observation.coordinates)
     return other_powers(fit, names) or one_sided(fit, names)
+
+
+def _rivals(recording: Recording, data: RecordingData, fit: LawFit) -> tuple[Rival, ...]:
+    """Laws that are one exchange of terms away and follow a record as well."""
+    every = TermSearch.of(fit.problem).every
+    assert every is not None
+    found = () if fit.problem.parameters else rivals(fit, every)
+    return tuple(
+        Rival(line_of(recording, GaugedLaw.of(data, other)), float(np.exp(above / 2)))
+        for other, above in found
+    )
 
 
 def _is_no_law(law: LearnedLaw) -> bool:

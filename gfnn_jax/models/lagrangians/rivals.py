@@ -109,7 +109,7 @@ def with_a_shape(fit: LawFit) -> LawFit:
             size = criterion(other.fitted.cost, count, len(other.p) + 1)
             found.append((size, name, other))
     (least, name, best), *others = sorted(found, key=lambda one: one[0])
-    decide = 2 * np.log(fit.problem.options.evidence.decided)
+    decide = fit.problem.options.evidence.deciding
     if best is fit or min(one[0] for one in others) < least + decide:
         return fit
     fit.problem.on_progress(f"  {name} in place of {many} powers")

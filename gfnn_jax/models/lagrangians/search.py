@@ -21,6 +21,7 @@ from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import LINEAR, UNIFORM, has_inputs, shape_of
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.exchange import may_be_chosen, with_exchanges
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, table_of
@@ -266,7 +267,19 @@ class TermSearch:
             if fit.structure != before:
                 fit, choice = self.with_friction(fit)
                 fit = with_constant(fit)
+            if self.frictions is not None and not fit.problem.parameters:
+                fit, choice = self._exchanged(fit, choice)
         return SearchResult(with_delay(fit), choice)
+
+    def _exchanged(self, fit: LawFit, choice: FrictionChoice) -> tuple[LawFit, FrictionChoice]:
+        """The fit with other terms and friction where these are likelier, and the odds of these."""
+        assert self.every is not None
+        other = with_exchanges(fit, self.every)
+        if other is fit:
+            return fit, choice
+        other = self.prune(other, friction=False)
+        table = table_of(other, self._may_rub(other))
+        return other, chosen(table, rows=other.structure.friction)
 
     def telling_more(self, fit: LawFit) -> LawFit | None:
         """The fit to arcs of the length that tells the coefficients best, longer ones first as long
@@ -352,6 +365,9 @@ class TermSearch:
 
     # Friction.
 
+    def _may_rub(self, fit: LawFit) -> list[Loss]:
+        return [row for row in self.frictions or () if fit.structure.may_have(("loss", row))]
+
     def with_friction(self, fit: LawFit) -> tuple[LawFit, FrictionChoice]:
         """The fit with the friction that held-out arcs choose, and how sure that is. Arcs are as
         long as those of the fit, or as long as three of them can be. A choice holds close to its
@@ -360,7 +376,7 @@ class TermSearch:
         if self.frictions is None:
             return fit, FrictionChoice(fit.structure.friction, {}, {}, gains=False)
         problem, options, begun = fit.problem, fit.problem.options, fit
-        frictions = [row for row in self.frictions if fit.structure.may_have(("loss", row))]
+        frictions = self._may_rub(fit)
         third = problem.systems.a_third(problem.nodes)
         length = max(options.fewest, min(fit.arcs.t.shape[1], third))
         arcs = arcs_of(problem.nodes, length)
@@ -505,7 +521,7 @@ def likeliest(
 ) -> tuple[LawFit, FrictionChoice]:
     """The likeliest of these fits whose friction does not drive, by Schwarz's criterion: what their
     residuals add up to, of which those that are correlated count once."""
-    fits = [one for one in tried if _can_be_chosen(one[0])] or tried[-1:]
+    fits = [one for one in tried if may_be_chosen(one[0])] or tried[-1:]
     last = tried[-1][0]
     loss = last.problem.observation.loss
     count = np.count_nonzero(np.isfinite(last.arcs.y)) / last.correlation
@@ -516,13 +532,6 @@ def likeliest(
         return criterion(float(cost), count, len(fit.p))
 
     return min(fits, key=lambda one: of(one[0]))
-
-
-def _can_be_chosen(fit: LawFit) -> bool:
-    """Return whether the friction does not drive, and is not both linear and uniform."""
-    losses = [value for key, value in fit.values.items() if key[0] == "loss"]
-    kinds = {row[1] for row in fit.structure.friction}
-    return fit.follows and min(losses, default=0.0) >= 0 and not {LINEAR, UNIFORM} <= kinds
 
 
 def _dropped(fit: LawFit, key: Key, why: str) -> None:

@@ -1,0 +1,245 @@
+"""Laws that are one exchange away from a fit: up to two of its terms for up to two others.
+
+The triangle of the arcs' residuals in all terms of a library (`fitting.linearised`) has the least
+sum of squares of every set of them without another fit. Of the sets that are one exchange away
+(Miller, Subset Selection in Regression, 1990) the likeliest by Schwarz's criterion are fitted to
+arcs. The plainest of those that are likely takes the place of the fit; those that are as likely as
+the law in the end are its *rivals*. A rival is lean: it holds neither the law nor a smaller rival
+as a special case.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
+from gfnn_jax.fitting.evidence import Comparison, criterion
+from gfnn_jax.models.lagrangians.fit import LawFit
+from gfnn_jax.models.lagrangians.libraries import RARE
+from gfnn_jax.models.lagrangians.structure import Structure, is_constant
+from gfnn_jax.models.lagrangians.weak_form import protected
+
+
+@dataclasses.dataclass(frozen=True)
+class ExchangeOptions:
+    """Limits of an exchange (`benchmarks/certificates.py`).
+
+    most: terms that leave, and that come. imitated: share of what a term does that the others do
+    not, below which it does not come; same: below which they hold it as a special case. screened:
+    sets of each exchange that are looked at, and of all that are fitted: fitted. slack: of the
+    criterion, by which arcs may differ from the triangle; far: the same where terms only leave, for
+    laws along which masses and springs are nearly collinear are far apart. rounds: exchanges in a
+    row.
+    """
+
+    most: int = 2
+    imitated: float = 0.03
+    same: float = 1e-6
+    screened: int = 20
+    fitted: int = 6
+    slack: float = 3.0
+    far: float = 200.0
+    rounds: int = 4
+
+
+OPTIONS = ExchangeOptions()
+
+
+class Exchanged(NamedTuple):
+    """A fit with other terms, and by how much its criterion is above that of the fit before."""
+
+    fit: LawFit
+    above: float
+
+
+def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
+    """The fit with terms (of ``every``) in place of as many or more of its own: the plainest of the
+    fits against which the likeliest has no odds that decide, where held-out arcs do not lose."""
+    deciding = fit.problem.options.evidence.deciding
+    for _ in range(OPTIONS.rounds):
+        near = [one for one in _near(fit, every) if len(one.fit.p) <= len(fit.p)]
+        found = [Exchanged(fit, 0.0), *near]
+        least = min(one.above for one in found)
+        likely = [one for one in found if one.above < least + deciding]
+        likely.sort(key=lambda one: (_plainness(one.fit), one.fit is not fit, one.above))
+        before, fit = fit, next((one.fit for one in likely if _holds(one.fit, fit)), fit)
+        if fit is before:
+            break
+        come, gone = (
+            ", ".join(fit.problem.word(key) for key in a.values if key not in b.values) or "nothing"
+            for a, b in ((fit, before), (before, fit))
+        )
+        fit.problem.on_progress(f"  {come} in place of {gone}")
+        fit = fit.again()
+    return fit
+
+
+def _holds(other: LawFit, fit: LawFit) -> bool:
+    """Return whether held-out arcs do not lose by another fit in place of one."""
+    if other is fit:
+        return True
+    theirs = fit.cross_validate(other.structure, other.values)
+    return not Comparison.of(theirs, fit.cross_validate()).is_higher()
+
+
+def rivals(fit: LawFit, every: Structure) -> list[Exchanged]:
+    """Lean laws of ``every`` against which a fit has no odds that decide, the likeliest first."""
+    decide = fit.problem.options.evidence.deciding
+    found = [one for one in _near(fit, every, lean=True) if one.above < decide]
+    return sorted(found, key=lambda one: one.above)
+
+
+def may_be_chosen(fit: LawFit) -> bool:
+    """Return whether the friction does not drive, and is not both linear and uniform."""
+    losses = [value for key, value in fit.values.items() if key[0] == "loss"]
+    kinds = {row[1] for row in fit.structure.friction}
+    return fit.follows and min(losses, default=0.0) >= 0 and not {LINEAR, UNIFORM} <= kinds
+
+
+def _plainness(fit: LawFit) -> tuple[int, ...]:
+    """The number of terms, of masses that depend on position, of rare frictions; and the degree."""
+    terms, friction = fit.structure.terms, fit.structure.friction
+    return (
+        len(fit.p),
+        sum(any(row[0]) and not is_constant(row) for row in terms),
+        sum(row[1] in RARE for row in friction),
+        sum(sum(row[1]) for row in terms),
+    )
+
+
+def _near(fit: LawFit, every: Structure, lean: bool = False) -> list[Exchanged]:
+    """Fits that are one exchange away, and about as likely as the likeliest by the triangle; a few
+    of fewer terms that are not."""
+    if fit.is_exact or not fit.follows:
+        return []
+    screen, found, kept = _Screen.of(fit, every), [], []
+    sets = screen.sets()
+    likely = min([0.0, *(above for _, above in sets)]) + fit.problem.options.evidence.deciding
+    fewer = [one for one, above in sets if one < screen.own and above < likely + OPTIONS.far]
+    about = [one for one, above in sets if one not in fewer and above < likely + OPTIONS.slack]
+    for places in (*fewer[: OPTIONS.fitted], *about[: OPTIONS.fitted]):
+        if lean and (screen.holds_law(places) or any(one <= places for one in kept)):
+            continue
+        other = screen.fitted(places)
+        if other is not None:
+            found.append(other)
+            kept.append(places)
+    return found
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Screen:
+    """The linearised problem of all terms: columns (m, n) of unit size, and the target (m,) that
+    they explain. own: places of what the fit has; leave: of these, what may; come: what it lacks.
+    """
+
+    fit: LawFit
+    larger: Structure
+    columns: np.ndarray
+    size: np.ndarray
+    target: np.ndarray
+    own: frozenset[int]
+    leave: list[int]
+    come: np.ndarray
+
+    @classmethod
+    def of(cls, fit: LawFit, every: Structure) -> _Screen:
+        every = dataclasses.replace(every, leaders=fit.structure.leaders)
+        kinds = ("term", "loss") if fit.problem.options.choose_friction else ("term",)
+        named = (k for k in every.keys() if k[0] in kinds and k not in fit.values)  # noqa: SIM118
+        larger = fit.structure.plus([k for k in named if fit.structure.may_have(k)])
+        near, keys, fixed = fit.problem.linearised(larger, fit), larger.keys(), protected(larger)
+        size = np.linalg.norm(near.columns, axis=0)
+        columns = near.columns / np.where(size > 0, size, 1.0)
+        own = [i for i, key in enumerate(keys) if key in set(fit.structure.keys())]
+        return cls(
+            fit,
+            larger,
+            columns,
+            np.where(size > 0, size, 1.0),
+            near.columns @ near.p + near.residual,
+            frozenset(own),
+            [i for i in own if keys[i][0] in kinds and keys[i] not in fixed],
+            np.array([i for i in range(len(keys)) if i not in own and size[i] > 0], int),
+        )
+
+    @property
+    def count(self) -> float:
+        """The number of residuals that are independent."""
+        return np.count_nonzero(np.isfinite(self.fit.arcs.y)) / self.fit.correlation
+
+    def sets(self) -> list[tuple[frozenset[int], float]]:
+        """Sets of places, and by how much their criterion is above that of the fit; the likeliest
+        first. None has friction that drives."""
+        rough: dict[frozenset[int], float] = {}
+        for leaving in range(OPTIONS.most + 1):
+            for gone in combinations(self.leave, leaving):
+                rough |= self._exchanges(self.own - set(gone))
+        begun = sorted(rough, key=lambda one: rough[one])[: OPTIONS.screened * OPTIONS.fitted]
+        begun += [one for one in rough if one < self.own]
+        known = self._criterion(self.own)
+        found = {places: self._criterion(places) - known for places in map(self._rubbing, begun)}
+        found.pop(self.own, None)
+        return sorted(found.items(), key=lambda one: one[1])
+
+    def _exchanges(self, kept: frozenset[int]) -> dict[frozenset[int], float]:
+        """The likeliest sets of what is kept and up to two more, with their criterion."""
+        basis = np.linalg.qr(self.columns[:, sorted(kept)])[0]
+        rest, new = (x - basis @ (basis.T @ x) for x in (self.target, self.columns[:, self.come]))
+        size = np.linalg.norm(new, axis=0)
+        come, new = self.come[size > OPTIONS.imitated], new[:, size > OPTIONS.imitated]
+        new = new / np.linalg.norm(new, axis=0)
+        along, products = new.T @ rest, new.T @ new
+        i, j = np.triu_indices(len(come), 1)
+        apart = np.maximum(1 - products[i, j] ** 2, OPTIONS.imitated**2)
+        two = (along[i] ** 2 + along[j] ** 2 - 2 * along[i] * along[j] * products[i, j]) / apart
+        found = {kept: float(rest @ rest)}
+        found |= {kept | {a}: rest @ rest - b**2 for a, b in zip(come.tolist(), along, strict=True)}
+        for k in np.argsort(-two)[: OPTIONS.screened]:
+            found[kept | {int(come[i[k]]), int(come[j[k]])}] = rest @ rest - two[k]
+        if kept == self.own:  # one more alone is what a search has tried
+            found = {places: left for places, left in found.items() if len(places - kept) > 1}
+        return {places: criterion(left, self.count, len(places)) for places, left in found.items()}
+
+    def _solved(self, places: frozenset[int]) -> tuple[np.ndarray, float]:
+        """Coefficients of these places, in their order, and the sum of squares that they leave."""
+        columns = self.columns[:, sorted(places)]
+        found = np.linalg.lstsq(columns, self.target, rcond=None)[0]
+        return found, float(np.sum((self.target - columns @ found) ** 2))
+
+    def _criterion(self, places: frozenset[int]) -> float:
+        return criterion(self._solved(places)[1], self.count, len(places))
+
+    def _rubbing(self, places: frozenset[int]) -> frozenset[int]:
+        """The places without friction that would drive, the strongest first."""
+        keys = self.larger.keys()
+        while True:
+            found = dict(zip(sorted(places), self._solved(places)[0].tolist(), strict=True))
+            driving = {i: c for i, c in found.items() if keys[i][0] == "loss" and c < 0}
+            if not driving:
+                return places
+            places = places - {min(driving, key=lambda i: driving[i])}
+
+    def holds_law(self, places: frozenset[int]) -> bool:
+        """Return whether these terms hold what the fit has as a special case."""
+        basis = np.linalg.qr(self.columns[:, sorted(places)])[0]
+        gone = self.columns[:, sorted(self.own - places)]
+        return bool(np.all(np.linalg.norm(gone - basis @ (basis.T @ gone), axis=0) < OPTIONS.same))
+
+    def fitted(self, places: frozenset[int]) -> Exchanged | None:
+        """The fit of these terms to arcs; None where it is no law: M is not positive, or friction
+        drives."""
+        keys, ordered = self.larger.keys(), sorted(places)
+        gone = {keys[i] for i in self.own - places}
+        structure = self.fit.structure.without(gone).plus([keys[i] for i in places - self.own])
+        values = self._solved(places)[0] / self.size[ordered]
+        known = {keys[i]: float(value) for i, value in zip(ordered, values, strict=True)}
+        other = self.fit.again(structure, known, rescale=False)
+        if not (may_be_chosen(other) and other.is_definite):
+            return None
+        sizes = (criterion(f.fitted.cost, self.count, len(f.p)) for f in (other, self.fit))
+        return Exchanged(other, float(np.subtract(*sizes)))

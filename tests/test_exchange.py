@@ -1,0 +1,57 @@
+"""Laws that are one exchange of terms away, against the systems that made the records."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import gfnn_jax as gfnn
+
+
+def record(rate, start, end, dt, noise, seed=0):
+    """Positions of q'' = rate(q, v) from rest, with noise, a share of the spread of the first."""
+    d = len(start)
+    t = np.arange(0, end, dt)
+    found = solve_ivp(
+        lambda _, z: [*z[d:], *rate(z[:d], z[d:])],
+        (0, end),
+        [*start, *np.zeros(d)],
+        t_eval=t,
+        rtol=1e-10,
+        atol=1e-12,
+        max_step=dt,
+    )
+    q = found.y[:d]
+    q = q + noise * q[0].std() * np.random.default_rng(seed).normal(size=q.shape)
+    names = [f"x{i + 1}" for i in range(d)]
+    return gfnn.Recording({"t": t, **dict(zip(names, q, strict=True))}, positions=names)
+
+
+def words(formula):
+    return {term.term for term in formula.terms}
+
+
+@pytest.mark.parametrize(("noise", "alone"), [(3e-2, False), (1e-4, True)])
+def test_a_law_beside_which_noise_leaves_others_is_one_of_several(noise, alone):
+    made = record(lambda q, v: -q - 0.3 * q**3 - 0.02 * v, [1.0], 100.0, 0.6, noise)
+    law = gfnn.fit(made).law
+    assert words(law.lagrangian) == {"v1**2", "x1**2", "x1**4"}
+    if alone:
+        assert (law.rivals, law.verdict) == ((), "identified")
+    else:
+        assert law.verdict.startswith("one of several")
+        assert law.rivals
+        assert all(rival.odds < 20 for rival in law.rivals)
+
+
+@pytest.mark.slow
+def test_dry_friction_of_two_carts_is_not_that_of_their_relative_speed():
+    """Masses, springs and friction of both carts are nearly collinear: no single term may go."""
+
+    def rate(q, v):
+        force = np.array([-1.7 * q[0] + 0.9 * q[1], 0.9 * q[0] - 1.7 * q[1]])
+        return (force - 0.004 * np.tanh(v / 1e-4)) / [1.0, 1.2]
+
+    made = record(rate, [1.0, -0.4], 80.0, 0.3, 1e-4)
+    law = gfnn.fit(made).law
+    assert words(law.lagrangian) == {"v1**2", "v2**2", "x1**2", "x1*x2", "x2**2"}
+    assert words(law.friction) == {"abs(v1)", "abs(v2)"}
