@@ -3,6 +3,7 @@
     python benchmarks/certificates.py             pieces of 50 records that have no result yet
     python benchmarks/certificates.py --only 0,1  two of them
     python benchmarks/certificates.py --quick     ten records, into runs/
+    python benchmarks/certificates.py --only rivals
 
 Systems, sampling, noise and friction are drawn as in `random_recordings`, from seeds of which no
 option was chosen; every fifth record is of something that has no law of the vocabulary. A law is
@@ -11,6 +12,9 @@ what has no law is wrong wherever it is "identified". Each law forecasts what co
 record, and the band of nominal 95 % holds the whole trajectory or does not: one and five periods,
 all channels, all samples. Its width is told beside that of the narrowest band of one constant
 factor on all standard deviations that would hold 95 % of these trajectories.
+
+*rivals*: ten designs that leave open which law it is: one start, few periods, much noise. The terms
+of the law that made the record are those of the law found, or of one of the rivals that it lists.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import sympy as sp
 from harness import TABLES, Numbers, between_markers, main, markdown, number, once, provenance
 from harness import results as results_of
 from random_recordings import SYSTEMS, record
@@ -190,12 +195,112 @@ def measured(piece: int, quick: bool) -> Numbers:
     return {"cases": cases}
 
 
-PIECES = {str(k): partial(measured, k) for k in range(PIECE_COUNT)}
+Rate = Callable[[float, float], float]
+AMBIGUOUS: dict[str, tuple[Rate, str, str]] = {  # acceleration; terms of L, and of R
+    "hardening spring": (lambda q, v: -q - 0.2 * q**3, "q_dot**2 + q**2 + q**4", "0"),
+    "softening spring": (lambda q, v: -q + 0.1 * q**3, "q_dot**2 + q**2 + q**4", "0"),
+    "one-sided spring": (lambda q, v: -q - 0.15 * q**2, "q_dot**2 + q**2 + q**3", "0"),
+    "steep spring": (lambda q, v: -q - 0.3 * q**5, "q_dot**2 + q**2 + q**6", "0"),
+    "bead on a parabola": (
+        lambda q, v: -q * (1 + 0.5 * v**2) / (1 + 0.5 * q**2),
+        "q_dot**2 + q_dot**2*q**2 + q**2",
+        "0",
+    ),
+    "viscous friction": (lambda q, v: -q - 0.01 * v, "q_dot**2 + q**2", "q_dot**2"),
+    "quadratic friction": (
+        lambda q, v: -q - 0.01 * v * abs(v),
+        "q_dot**2 + q**2",
+        "abs(q_dot)**3",
+    ),
+    "dry friction": (
+        lambda q, v: -q - 0.005 * np.tanh(v / 1e-3),
+        "q_dot**2 + q**2",
+        "abs(q_dot)",
+    ),
+    "hardening spring in oil": (
+        lambda q, v: -q - 0.2 * q**3 - 0.03 * v,
+        "q_dot**2 + q**2 + q**4",
+        "q_dot**2",
+    ),
+    "viscous and dry friction": (
+        lambda q, v: -q - 0.01 * v - 0.005 * np.tanh(v / 1e-3),
+        "q_dot**2 + q**2",
+        "q_dot**2 + abs(q_dot)",
+    ),
+}
+
+
+def terms_in(law: str) -> tuple[set[str], set[str]]:
+    """Terms of L and of R in "L = …; R = …", of one coordinate, without their coefficients."""
+    names = dict(zip(("q", "q_dot"), sp.symbols("q v", real=True), strict=True))
+    parts = (sp.expand(sp.sympify(part.split("=")[1], names)) for part in law.split(";"))
+    lagrangian, friction = ({str(t.as_coeff_Mul()[1]) for t in p.as_ordered_terms()} for p in parts)
+    return lagrangian, friction
+
+
+def ambiguous(quick: bool) -> Numbers:
+    cases = []
+    for k, kind in enumerate(list(AMBIGUOUS)[: 2 if quick else None]):
+        rate, lagrangian, loss = AMBIGUOUS[kind]
+        rng = np.random.default_rng([SEED, 10_000 + k])
+        samples, periods, noise = rng.uniform(10, 25), rng.uniform(5, 9), rng.uniform(0.01, 0.03)
+        t = 2 * np.pi / samples * np.arange(int(samples * periods))
+        x = solve_ivp(
+            lambda _, z, rate=rate: [z[1], rate(*z)],
+            (0, t[-1]),
+            [rng.uniform(0.7, 1.3), 0.0],
+            t_eval=t,
+            rtol=1e-9,
+            atol=1e-11,
+            max_step=t[1],
+        ).y[0]
+        x = x + noise * x.std() * rng.normal(size=len(x))
+        true = terms_in(f"L = {lagrangian}; R = {loss}")
+        c: Numbers = {"kind": kind, "samples": samples, "periods": periods, "noise": noise}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", gfnn.FitWarning)
+            made = gfnn.Recording({"t": t, "q": x}, positions=["q"])
+            done = once(lambda made=made: gfnn.fit(made))
+        fit: Any = done.out
+        listed = [f"L = {fit.formula}; R = {fit.law.friction.formula}"]
+        listed += [rival.formula for rival in fit.law.rivals]
+        c |= {
+            "verdict": fit.verdict.partition(":")[0],
+            "laws": listed,
+            "odds": [rival.odds for rival in fit.law.rivals],
+            "place": next((i for i, law in enumerate(listed) if terms_in(law) == true), None),
+            "processor_seconds": done.processor_seconds,
+        }
+        cases.append(c)
+        print(f"  {kind}: {c['verdict']}, place {c['place']} of {len(listed)}", flush=True)
+    return {"cases": cases}
+
+
+PIECES: dict[str, Callable[[bool], Numbers]] = {
+    **{str(k): partial(measured, k) for k in range(PIECE_COUNT)},
+    "rivals": ambiguous,
+}
 
 
 def tables() -> None:
     """The tables of RESULTS.md."""
     found = results_of(PIECES, "certificates")
+    apart = {name: found.pop(name) for name in ["rivals"] if name in found}
+    if apart:
+        table = markdown(
+            ("", "verdict", "laws listed", "the true one's place", "CPU s"),
+            [
+                [
+                    c["kind"],
+                    c["verdict"],
+                    str(len(c["laws"])),
+                    "not listed" if c["place"] is None else str(c["place"] + 1),
+                    number(c["processor_seconds"]),
+                ]
+                for c in apart["rivals"]["measured"]["cases"]
+            ],
+        )
+        between_markers(TABLES, "certificates-rivals", f"{table}\n\n{provenance(apart)}")
     if not found:
         return
     cases = [c for r in found.values() for c in r["measured"]["cases"]]

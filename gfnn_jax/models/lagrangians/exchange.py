@@ -4,8 +4,8 @@ The triangle of the arcs' residuals in all terms of a library (`fitting.linearis
 sum of squares of every set of them without another fit. Of the sets that are one exchange away
 (Miller, Subset Selection in Regression, 1990) the likeliest by Schwarz's criterion are fitted to
 arcs. The plainest of those that are likely takes the place of the fit; those that are as likely as
-the law in the end are its *rivals*. A rival is lean: it holds neither the law nor a smaller rival
-as a special case.
+the law in the end are its *rivals*. A rival is lean: it holds no smaller rival as a special case,
+nor the law itself with terms beside which its coefficients are as well known.
 """
 
 from __future__ import annotations
@@ -29,21 +29,25 @@ class ExchangeOptions:
     """Limits of an exchange (`benchmarks/certificates.py`).
 
     most: terms that leave, and that come. imitated: share of what a term does that the others do
-    not, below which it does not come; same: below which they hold it as a special case. screened:
-    sets of each exchange that are looked at, and of all that are fitted: fitted. slack: of the
-    criterion, by which arcs may differ from the triangle; far: the same where terms only leave, for
-    laws along which masses and springs are nearly collinear are far apart. rounds: exchanges in a
-    row.
+    not, below which it does not come; same: below which they hold it as a special case. vague: of
+    a coefficient, vaguer: times its standard error, by which that has to grow by further terms
+    which make a rival of the law. screened: sets of each exchange that are looked at, and of all
+    that are fitted: fitted. slack: of the criterion, by which arcs may differ from the triangle;
+    far: the same where terms only leave, for laws along which masses and springs are nearly
+    collinear are far apart. rounds: exchanges in a row. listed: rivals, at most.
     """
 
     most: int = 2
-    imitated: float = 0.03
+    imitated: float = 1e-3
     same: float = 1e-6
+    vague: float = 0.05
+    vaguer: float = 3.0
     screened: int = 20
     fitted: int = 6
     slack: float = 3.0
     far: float = 200.0
     rounds: int = 4
+    listed: int = 5
 
 
 OPTIONS = ExchangeOptions()
@@ -90,7 +94,7 @@ def rivals(fit: LawFit, every: Structure) -> list[Exchanged]:
     """Lean laws of ``every`` against which a fit has no odds that decide, the likeliest first."""
     decide = fit.problem.options.evidence.deciding
     found = [one for one in _near(fit, every, lean=True) if one.above < decide]
-    return sorted(found, key=lambda one: one.above)
+    return sorted(found, key=lambda one: one.above)[: OPTIONS.listed]
 
 
 def may_be_chosen(fit: LawFit) -> bool:
@@ -116,18 +120,24 @@ def _near(fit: LawFit, every: Structure, lean: bool = False) -> list[Exchanged]:
     of fewer terms that are not."""
     if fit.is_exact or not fit.follows:
         return []
-    screen, found, kept = _Screen.of(fit, every), [], []
+    screen, deciding = _Screen.of(fit, every), fit.problem.options.evidence.deciding
     sets = screen.sets()
-    likely = min([0.0, *(above for _, above in sets)]) + fit.problem.options.evidence.deciding
+    likely = min([0.0, *(above for _, above in sets)]) + deciding
     fewer = [one for one, above in sets if one < screen.own and above < likely + OPTIONS.far]
     about = [one for one, above in sets if one not in fewer and above < likely + OPTIONS.slack]
-    for places in (*fewer[: OPTIONS.fitted], *about[: OPTIONS.fitted]):
-        if lean and (screen.holds_law(places) or any(one <= places for one in kept)):
-            continue
-        other = screen.fitted(places)
-        if other is not None:
-            found.append(other)
-            kept.append(places)
+    found: list[Exchanged] = []
+    smaller: list[frozenset[int]] = []
+    for some in (fewer, about):
+        end = len(found) + OPTIONS.fitted
+        for places in some:
+            if lean and (screen.adds_little(places) or any(one <= places for one in smaller)):
+                continue
+            other = screen.fitted(places)
+            if other is not None:
+                found.append(other)
+                smaller += [places] if other.above < deciding else []
+            if len(found) == end:
+                break
     return found
 
 
@@ -201,8 +211,6 @@ class _Screen:
         found |= {kept | {a}: rest @ rest - b**2 for a, b in zip(come.tolist(), along, strict=True)}
         for k in np.argsort(-two)[: OPTIONS.screened]:
             found[kept | {int(come[i[k]]), int(come[j[k]])}] = rest @ rest - two[k]
-        if kept == self.own:  # one more alone is what a search has tried
-            found = {places: left for places, left in found.items() if len(places - kept) > 1}
         return {places: criterion(left, self.count, len(places)) for places, left in found.items()}
 
     def _solved(self, places: frozenset[int]) -> tuple[np.ndarray, float]:
@@ -224,11 +232,26 @@ class _Screen:
                 return places
             places = places - {min(driving, key=lambda i: driving[i])}
 
-    def holds_law(self, places: frozenset[int]) -> bool:
-        """Return whether these terms hold what the fit has as a special case."""
-        basis = np.linalg.qr(self.columns[:, sorted(places)])[0]
+    def adds_little(self, places: frozenset[int]) -> bool:
+        """Return whether these terms hold what the fit has as a special case, and leave the
+        coefficients that both have about as well known."""
         gone = self.columns[:, sorted(self.own - places)]
-        return bool(np.all(np.linalg.norm(gone - basis @ (basis.T @ gone), axis=0) < OPTIONS.same))
+        basis = np.linalg.qr(self.columns[:, sorted(places)])[0]
+        if np.any(np.linalg.norm(gone - basis @ (basis.T @ gone), axis=0) > OPTIONS.same):
+            return False
+        before, after = self._errors(self.own), self._errors(places)
+        values = dict(zip(sorted(self.own), self._solved(self.own)[0], strict=True))
+        return not any(
+            after[i] > OPTIONS.vague * abs(values[i]) and after[i] > OPTIONS.vaguer * before[i]
+            for i in self.leave
+            if i in after
+        )
+
+    def _errors(self, places: frozenset[int]) -> dict[int, float]:
+        """Standard errors of the coefficients of these places."""
+        inverse = np.linalg.pinv(self.columns[:, sorted(places)])
+        errors = np.sqrt(self.fit.correlation) * np.linalg.norm(inverse, axis=1)
+        return dict(zip(sorted(places), errors.tolist(), strict=True))
 
     def fitted(self, places: frozenset[int]) -> Exchanged | None:
         """The fit of these terms to arcs; None where it is no law: M is not positive, or friction

@@ -51,7 +51,7 @@ from gfnn_jax.models.lagrangians.in_use import (
     RecordingData,
     best_in_use,
 )
-from gfnn_jax.models.lagrangians.in_words import Findings, in_words, line_of
+from gfnn_jax.models.lagrangians.in_words import Findings, in_words, line_of, rival_of
 from gfnn_jax.models.lagrangians.input_rules import RULES, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, last_of_series
@@ -215,7 +215,7 @@ def _rivals(recording: Recording, data: RecordingData, fit: LawFit) -> tuple[Riv
     assert every is not None
     found = () if fit.problem.parameters else rivals(fit, every)
     return tuple(
-        Rival(line_of(recording, GaugedLaw.of(data, other)), float(np.exp(above / 2)))
+        rival_of(recording, GaugedLaw.of(data, other), float(np.exp(above / 2)))
         for other, above in found
     )
 
