@@ -229,6 +229,14 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
         and OPTIONS.followed <= one.fit_percent < OPTIONS.nearly
         and loud > OPTIONS.beyond
     }
+    noise = float(np.max(best.fit.sigma / best.fit.spread))
+    for fraction, seconds, _ in best.calibration.horizons[-1:]:
+        if not seconds > 0 and noise < fraction / 2:
+            share = f"{100 * fraction:.0f} % of the spread"
+            flaws[f"no forecast of a held-out part errs by less than {share}"] = (
+                "the law fits this record and no other part of it: record a longer motion, or more "
+                "samples a period"
+            )
     if not best.fit.fitted.converged:
         flaws["the fit of the law did not converge"] = (
             "its coefficients and standard errors are not reliable. Fit a shorter part of the "
