@@ -93,7 +93,7 @@ def _holds(other: LawFit, fit: LawFit) -> bool:
 def rivals(fit: LawFit, every: Structure) -> list[Exchanged]:
     """Lean laws of ``every`` against which a fit has no odds that decide, the likeliest first."""
     decide = fit.problem.options.evidence.deciding
-    found = [one for one in _near(fit, every, lean=True) if one.above < decide]
+    found = [one for one in _near(fit, every) if one.above < decide]
     return sorted(found, key=lambda one: one.above)[: OPTIONS.listed]
 
 
@@ -115,7 +115,7 @@ def _plainness(fit: LawFit) -> tuple[int, ...]:
     )
 
 
-def _near(fit: LawFit, every: Structure, lean: bool = False) -> list[Exchanged]:
+def _near(fit: LawFit, every: Structure) -> list[Exchanged]:
     """Fits that are one exchange away, and about as likely as the likeliest by the triangle; a few
     of fewer terms that are not."""
     if fit.is_exact or not fit.follows:
@@ -130,7 +130,7 @@ def _near(fit: LawFit, every: Structure, lean: bool = False) -> list[Exchanged]:
     for some in (fewer, about):
         end = len(found) + OPTIONS.fitted
         for places in some:
-            if lean and (screen.adds_little(places) or any(one <= places for one in smaller)):
+            if screen.adds_little(places) or any(one <= places for one in smaller):
                 continue
             other = screen.fitted(places)
             if other is not None:
@@ -232,13 +232,19 @@ class _Screen:
                 return places
             places = places - {min(driving, key=lambda i: driving[i])}
 
-    def adds_little(self, places: frozenset[int]) -> bool:
-        """Return whether these terms hold what the fit has as a special case, and leave the
-        coefficients that both have about as well known."""
+    def holds_law(self, places: frozenset[int]) -> bool:
+        """Return whether these terms hold what the fit has as a special case."""
         gone = self.columns[:, sorted(self.own - places)]
         basis = np.linalg.qr(self.columns[:, sorted(places)])[0]
-        if np.any(np.linalg.norm(gone - basis @ (basis.T @ gone), axis=0) > OPTIONS.same):
+        return bool(np.all(np.linalg.norm(gone - basis @ (basis.T @ gone), axis=0) < OPTIONS.same))
+
+    def adds_little(self, places: frozenset[int]) -> bool:
+        """Return whether these terms hold the law, and leave the coefficients that both have about
+        as well known; as they do where they are the law in other words."""
+        if not self.holds_law(places):
             return False
+        if len(places) == len(self.own):
+            return True
         before, after = self._errors(self.own), self._errors(places)
         values = dict(zip(sorted(self.own), self._solved(self.own)[0], strict=True))
         return not any(
