@@ -46,7 +46,7 @@ from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.rivals import one_sided, other_powers, with_likeliest_power
 from gfnn_jax.models.lagrangians.search import search, search_on, with_fewer_waves
 from gfnn_jax.models.lagrangians.structure import Structure
-from gfnn_jax.models.lagrangians.text import speed_names, terms_of
+from gfnn_jax.models.lagrangians.text import Names, speed_names, terms_of
 from gfnn_jax.signals.local_polynomials import choose_half, smooth
 from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
 
@@ -266,7 +266,7 @@ def test_text_of_a_law():
     terms = Terms.of([((2, 0), (0, 0), (0, 0), 0.0), ((1, 1), (0, 0), (1, -1), 0.1)], 2)
     names = ("theta1", "theta2")
     speeds = speed_names(names, ())
-    found = terms_of(terms, np.array([0.5, 0.25]), np.array([0, 0.01]), names, speeds)
+    found = terms_of(terms, np.array([0.5, 0.25]), np.array([0, 0.01]), Names(names, speeds))
     assert found.formula == "0.5*omega1**2 + 0.25*omega1*omega2*cos(theta1 - theta2 + 0.1)"
     assert str(found) == "0.5 ω₁² + 0.25(1) ω₁ ω₂ cos(θ₁−θ₂ + 0.1)"
     assert found.latex().startswith(r"0.5 \omega_{1}^{2} + 0.25(1) \omega_{1} \omega_{2} \cos")
@@ -274,7 +274,7 @@ def test_text_of_a_law():
 
 def test_names_of_functions_are_columns_all_the_same():
     terms = Terms.of([((2, 0), (0, 0), (0, 0), 0.0), ((0, 0), (0, 0), (1, 0), 0.0)], 2)
-    found = terms_of(terms, np.ones(2), np.zeros(2), ("beta", "E"), ("gamma", "I"))
+    found = terms_of(terms, np.ones(2), np.zeros(2), Names(("beta", "E"), ("gamma", "I")))
     assert str(found.sympy()) == "gamma**2 + cos(beta)"
 
 
