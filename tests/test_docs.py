@@ -121,6 +121,17 @@ def test_site_builds_without_warnings(tmp_path):
     assert (tmp_path / "reference" / "index.html").exists()
 
 
+def test_numbers_in_prose_are_what_the_results_hold():
+    import summary
+
+    named = 0
+    for page in [ROOT / "README.md", *PAGES]:
+        text = page.read_text(encoding="utf-8")
+        assert summary.in_prose(text) == text, page.name
+        named += len(re.findall(r"\S<!-- [\w.-]+/", text))
+    assert named > 10
+
+
 def test_the_ten_lines_are_what_the_results_hold():
     import summary
 

@@ -168,7 +168,7 @@ def test_a_fit_forecasts_plots_and_shows_itself(tmp_path):
     assert fit._repr_latex_().startswith("$L = ")
     fit.report(tmp_path / "r.html")
     fit.save(tmp_path / "model")
-    with pytest.raises(ValueError, match="still has its data"):
+    with pytest.raises(ValueError, match="after=gfnn"):
         gfnn.load(tmp_path / "model").forecast(times)
     assert gfnn.load(tmp_path / "model").forecast(times, after=fit.seen).values["x"].shape == (1, 2)
 

@@ -24,7 +24,7 @@ from gfnn_jax.dataset.runs import identified
 from gfnn_jax.diagnosis.diagnosis import NOT_SYMPLECTIC
 from gfnn_jax.diagnosis.outliers import clean, looked_for_errors
 from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
-from gfnn_jax.errors import FitError, FitWarning, InputError, said
+from gfnn_jax.errors import FitError, FitWarning, InputError, said, unexpected
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.choose import Chosen, choose, stated, with_posterior, with_test_rows
@@ -32,7 +32,7 @@ from gfnn_jax.learn.conclude import conclude
 from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit
 from gfnn_jax.learn.gross_errors import without_gross_errors
 from gfnn_jax.learn.noisy_sweeps import without_bias
-from gfnn_jax.learn.options import FitOptions, Watch, with_options
+from gfnn_jax.learn.options import OPTIONS, FitOptions, Watch, with_options
 from gfnn_jax.learn.poisson import learn_poisson, other_bracket
 from gfnn_jax.learn.positions import learn_positions
 from gfnn_jax.learn.request import checked, diagnose_request, paid_for, structures_to_try, wrapped
@@ -84,8 +84,8 @@ def fit(
     recording where its law did not converge, misses a drive, or has an input of no effect.
     """
     require_x64("a fit")
-    _refuse_roles(changes)
     watch = Watch.taken_from(changes)
+    _refuse_others(changes)
     positions = scene if _is_array(scene) else None
     scene = None if positions is not None else scene
     pairs, proposed = as_pairs_or_recording(data, positions)
@@ -225,14 +225,16 @@ def _told(fitted: Fit) -> Fit:
     return fitted
 
 
-def _refuse_roles(changes: Mapping[str, Any]) -> None:
-    """Raises TypeError where a keyword says what columns are."""
+def _refuse_others(changes: Mapping[str, Any]) -> None:
+    """Raises TypeError where a keyword says what columns are, or is none of `FitOptions`."""
     roles = {*ReadOptions.__annotations__} - {"angles"}
     for name in roles & {*changes}:
         raise TypeError(
             f"fit: unexpected keyword argument '{name}': it belongs to the data. Give it to "
             f"gfnn.read(path, {name}=…) or gfnn.Recording(table, {name}=…), and fit what they give"
         )
+    for name in {*changes} - {*OPTIONS}:
+        raise TypeError(unexpected("fit", name, [*OPTIONS]))
 
 
 _OF_TABLES = ("columns", "to_dataframe")  # attributes
