@@ -398,7 +398,7 @@ def whole(folder: Path, quick: bool, *, from_published: bool) -> Numbers:
     setting = Setting(transits, len(transits.t))
     start = published(folder) if from_published else flat(setting)
     end, _, seconds = once(lambda: fitted(setting, start, quick))
-    table = {"found": end.x, "published": published(folder)}
+    table = {"found": end.x.tolist(), "published": published(folder).tolist()}
     return {"cost": end.cost, "processor_seconds": seconds} | table
 
 
@@ -411,8 +411,8 @@ def errors(folder: Path, quick: bool) -> Numbers:
     assert end is not None
     (hessian, ways), _, seconds = once(end.hessian)
     return {
-        "errors": np.sqrt(np.diag(ways @ np.linalg.inv(hessian) @ ways.T)),
-        "linearised": np.sqrt(np.diag(end.covariance())),
+        "errors": np.sqrt(np.diag(ways @ np.linalg.inv(hessian) @ ways.T)).tolist(),
+        "linearised": np.sqrt(np.diag(end.covariance())).tolist(),
         "least_curvature": float(np.linalg.eigvalsh(hessian)[0]),
         "processor_seconds": seconds,
     }
@@ -442,7 +442,7 @@ def forecast(folder: Path, quick: bool) -> Numbers:
             "within": float(within[0]),
             "within_without_factor": float(within[1]),
             "band_seconds": SECONDS * float(np.median(BAND * np.sqrt(factor**2 * model + noise))),
-            "found": end.x,
+            "found": end.x.tolist(),
             "processor_seconds": seconds,
         }
         enough = np.array(within[1:]) >= INSIDE
