@@ -142,7 +142,7 @@ def check(studies: Sequence[str], only: Sequence[str], folder: Path, *, tell: bo
     for piece, path, study in asked:
         found = json.loads(path.read_text(encoding="utf-8"))
         why = list(islice(changed(found.get("code"), path.name), _TOLD))
-        why += filter(None, [behind(found.get("versions", {}).get("gfnn_jax", "0.0.0"))])
+        why += filter(None, [behind(found.get("versions", {}).get("gfnn_jax") or "0.0.0")])
         if why:
             took = f"{found['seconds']:.0f} s" if "seconds" in found else "time not known"
             old.append((found.get("date", ""), path, study, piece, f"{', '.join(why)}; {took}"))
