@@ -23,7 +23,11 @@ from pathlib import PurePosixPath
 
 # With two former modules of the harness
 NO_NUMBERS = ("commits", "current", "harness", "ran", "reached", "summary")
-RUNNERS = ("main", "run_pieces", "harness.main")  # of the harness; the second argument is the pieces
+RUNNERS = (
+    "main",
+    "run_pieces",
+    "harness.main",
+)  # of the harness; the second argument is the pieces
 Place = tuple[str, str]  # script, and name of what is defined in it, "" of what it only runs
 
 

@@ -12,10 +12,11 @@ Levenberg–Marquardt descends on least squares and then on Student's t (Agol et
 ν 3.36, scale² 0.709), from flat starts (masses 1e-5, e 0, periods and times by straight lines) and
 from the published values.
 
-Standard errors are by the Hessian of the cost: differences of its gradient in the directions that
-the linearised problem says are alike. Forecasts are of later times by fits of the first ones, with
-a prior of 0.01 on e cos ω and e sin ω. The residuals of these fits are no white noise, so their
-bands take a factor: that by which the fit of the first 60 % needs it to hold 95 % of the next 20 %.
+Standard errors are by the Hessian of the cost: differences of its gradient in directions that the
+linearised problem makes alike. Forecasts are of later times by fits of the first ones, in which
+e cos ω and e sin ω have a normal prior; its width is found in turn with them (empirical Bayes), from
+0.01 on. Bands take a factor: that by which the fit of the first 60 % would have held 95 % of the
+next 20 %.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from harness import (
     once,
     provenance,
     read,
+    results,
 )
 
 # isort: split
@@ -58,13 +60,14 @@ FLAT_MASS, FLAT_E = 1e-5, 1e-3  # of the star's; of e cos ω and e sin ω, where
 FINE = 14  # steps in the shortest period
 BEFORE = 1.0  # days, that the flow begins before the first transit and ends after the last
 LARGEST_E, LARGEST_MASS = 0.1, 3e-4  # of a step that is tried
-PRIOR_E = 0.01  # standard deviation of e cos ω and e sin ω in fits that forecast
+PRIOR_E, ROUNDS = 0.01, 3  # width of the prior that fits begin with, and how often it is found
 FREEDOM, SCALE = 3.36, 0.709  # ν and the square of the scale, of the residuals ÷ their errors
 SQUARES = 1e6  # ν of least squares
 SETTLED = 1e-3  # decrease that ends a descent: absolute of Student's cost, relative of squares
-FIRST, LEAST = 1e-2, 0.1  # damping of the first step; decrease ÷ promised one of a step that counts
+FIRST, AGAIN = 1e-2, 1e-4  # damping of the first step, and where a descent goes on
+LEAST = 0.1  # decrease ÷ promised one of a step that counts
 MOST, QUICK = 40, 3  # iterations of each of the two losses
-SMALL = 0.05  # difference of the Hessian, in standard deviations of the linearised problem
+SMALL = 0.01  # difference of the Hessian, in standard deviations of the linearised problem
 NEWTON = 4  # iterations to an event
 BAND, INSIDE = 1.96, 0.95  # standard deviations and their share
 SHARES = (0.6, 0.8)  # of the rows, that are fitted and forecast
@@ -364,9 +367,9 @@ class Descent:
         ways = size[:, None] * np.linalg.cholesky(self.covariance() / np.outer(size, size))
         rows = []
         for way in ways.T:
-            ends = [Descent.at(self.setting, self.loss, self.x + s * way) for s in (SMALL, -SMALL)]
-            above, below = (end.gradient for end in ends if end is not None)
-            rows.append(ways.T @ (above - below) / (2 * SMALL))
+            there = Descent.at(self.setting, self.loss, self.x + SMALL * way)
+            assert there is not None
+            rows.append(ways.T @ (there.gradient - self.gradient) / SMALL)
         return 0.5 * (np.array(rows) + np.array(rows).T), ways
 
 
@@ -389,6 +392,19 @@ def fitted(setting: Setting, x: np.ndarray, quick: bool) -> Descent:
         x = descended(problem, Nielsen(), QUICK if quick else MOST, FIRST).problem.x
     end = Descent.at(setting, STUDENT, x)
     assert end is not None
+    return end
+
+
+def with_prior(setting: Setting, quick: bool) -> Descent:
+    """The fit whose prior is as wide as the e-vectors that it finds, with their variances."""
+    narrow = dataclasses.replace(setting, prior=PRIOR_E)
+    end = fitted(narrow, flat(narrow), quick)
+    for _ in range(ROUNDS):
+        e, variances = end.x[3 * N :], np.diag(end.covariance())[3 * N :]
+        width = float(np.sqrt(np.mean(e**2 + variances)))
+        start = Descent.at(dataclasses.replace(setting, prior=width), STUDENT, end.x)
+        assert start is not None
+        end = descended(start, Nielsen(), QUICK if quick else MOST, AGAIN).problem
     return end
 
 
@@ -421,10 +437,11 @@ def errors(folder: Path, quick: bool) -> Numbers:
 def forecast(folder: Path, quick: bool) -> Numbers:
     """Fits of the first rows in time, and what they say of later ones."""
     transits, factor, found = Transits.of(folder), 1.0, {}
-    ends = [round(share * len(transits.t)) for share in (*SHARES, 1.0)]
+    ends = [int(share * len(transits.t)) for share in (*SHARES, 1.0)]
     for share, first, last in zip(SHARES, ends, ends[1:], strict=False):
-        setting, held = Setting(transits, first, PRIOR_E), slice(first, last)
-        end, _, seconds = once(lambda own=setting: fitted(own, flat(own), quick))
+        held = slice(first, last)
+        end, _, seconds = once(lambda rows=first: with_prior(Setting(transits, rows), quick))
+        setting = end.setting
         later = transits.some(held)
         left = np.abs(end.times[held] - later.t)
         model = np.einsum("ni,ij,nj->n", end.slopes, end.covariance(), end.slopes)[held]
@@ -436,6 +453,7 @@ def forecast(folder: Path, quick: bool) -> Numbers:
         found[f"{share:g}"] = {
             "rows": last - first,
             "cost": end.cost,
+            "prior": setting.prior,
             "median_seconds": SECONDS * float(np.median(left)),
             "straight_seconds": SECONDS * float(np.median(straight)),
             "factor": factor,
@@ -450,14 +468,13 @@ def forecast(folder: Path, quick: bool) -> Numbers:
     return found
 
 
-def pieces(folder: Path) -> dict[str, Any]:
-    """Each of its own file, so that a run goes on where it was stopped."""
-    return {
-        "flat": functools.partial(whole, folder, from_published=False),
-        "published": functools.partial(whole, folder, from_published=True),
-        "errors": functools.partial(errors, folder),
-        "forecast": functools.partial(forecast, folder),
-    }
+# Each of its own file, so that a run goes on where it was stopped.
+PIECES: dict[str, Any] = {
+    "flat": functools.partial(whole, from_published=False),
+    "published": functools.partial(whole, from_published=True),
+    "errors": errors,
+    "forecast": forecast,
+}
 
 
 def apart(x: np.ndarray, y: np.ndarray) -> list[str]:
@@ -469,11 +486,10 @@ def apart(x: np.ndarray, y: np.ndarray) -> list[str]:
 
 def tables() -> None:
     """The table of RESULTS.md."""
-    names = pieces(Path())
-    found = read({name: RESULTS / f"trappist-{name}.json" for name in names})
-    if len(found) < len(names):
+    found = results(PIECES, "trappist")
+    if len(found) < len(PIECES):
         return
-    own, other, error, ahead = (found[name]["measured"] for name in names)
+    own, other, error, ahead = (found[name]["measured"] for name in PIECES)
     x, size = np.array(own["found"]), np.array(error["errors"])
     past = np.array(own["published"]).reshape(5, N)
     rows = [
@@ -493,9 +509,10 @@ def tables() -> None:
         f"{wider} times the linearised ones in the median. The last {last['rows']} times, from the "
         f"first 80 % ({number(last['processor_seconds'])} s): median error "
         f"{number(last['median_seconds'])} s (straight lines {number(last['straight_seconds'])}), "
-        f"{100 * last['within']:.0f} % within bands of {number(last['band_seconds'])} s in the "
-        f"median; without the factor {number(last['factor'])}, told by the 20 % before, "
-        f"{100 * last['within_without_factor']:.0f} %."
+        f"{100 * last['within']:.0f} % within 95 % bands, {number(last['band_seconds'])} s wide on "
+        f"either side in the median; without the factor {number(last['factor'])}, told by the 20 % "
+        f"before, {100 * last['within_without_factor']:.0f} %. The prior's width is found as "
+        f"{number(last['prior'])}."
     )
     heads = ("planet", "mass ÷ star's", "period, days", "conjunction", "e cos ω", "e sin ω")
     table = markdown((*heads, "mass, published"), rows)
@@ -508,4 +525,5 @@ if __name__ == "__main__":
         at = arguments.index(RECORD)
         record = Path(arguments[at + 1])
         del arguments[at : at + 2]
-    main(__doc__ or "", pieces(record), "trappist", tables, arguments)
+    PIECES |= {name: functools.partial(piece, record) for name, piece in PIECES.items()}
+    main(__doc__ or "", PIECES, "trappist", tables, arguments)
