@@ -7,6 +7,7 @@
     python -m benchmarks --check           what is older than its code again, oldest first
     python -m benchmarks --check --tell    only says which these are, and how long they took
     python -m benchmarks args --check      of these studies alone
+    python -m benchmarks args --check --read WHY    their scripts changed in no number, for WHY
 
 Each study is a script with a command line of its own (`python benchmarks/laws.py --help`) and runs
 in a process of its own: a process may map only so many compiled programs.
@@ -58,13 +59,15 @@ def main(argv: Sequence[str]) -> int:
             file=sys.stderr,
         )
         return 2
-    if "--check" in options:
-        if set(options) - {"--check", "--tell"}:
-            print(
-                f"expected --check with --tell or alone, got {' '.join(options)}", file=sys.stderr
-            )
+    if options[:1] == ["--check"]:
+        how = options[1:]
+        if how not in ([], ["--tell"]) and not (names and how[0] == "--read" and len(how) == 2):
+            known_ways = "alone, with --tell, or after studies with --read WHY"
+            print(f"expected --check {known_ways}, got {' '.join(options)}", file=sys.stderr)
             return 2
-        return check(list(known), names, HERE / "results", tell="--tell" in options)
+        read = how[1] if len(how) == 2 else ""
+        folder = HERE / "results"
+        return check(list(known), names, folder, tell=how == ["--tell"], read=read)
     paths = os.pathsep.join([str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     failed = []
     for name in names or known:

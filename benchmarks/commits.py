@@ -1,12 +1,14 @@
 """Which results are old: told, or measured again, oldest first.
 
-A result is old in two cases. Its study changed: a script of this folder that its process had loaded
-(`code`) differs from today's in more than comments, docstrings and layout; the harness measures
-nothing and does not count. Or the package did: it was measured with a version more than one minor
-version behind today's. Between two versions `freeze.py` guards the package, by the bits of thirty
-fits; a commit that moves numbers on purpose measures the studies that it names again. A result
-that was measured with scripts that differed, or that notes no commit of this repository, counts as
-of the commit that it came with.
+A result is old in two cases. Its study changed: what its piece reaches (`reached`) is not what it
+was at the commit of the result. Or the package did: it was measured with a version more than one
+minor version behind today's. Between two versions `freeze.py` guards the package, by the bits of
+thirty fits; a commit that moves numbers on purpose measures the studies that it names again.
+
+A result that was measured with scripts that differed from its commit's, or that notes no commit of
+this repository, counts as of the commit that it came with. So does one whose study somebody read,
+with `--read WHY`: it changed in nothing that is measured, as where a call follows a new interface.
+The result keeps the reason as ``code.read``, and is old again with the next change.
 """
 
 from __future__ import annotations
@@ -19,16 +21,14 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from reached import Scripts, differing
+
 HERE = Path(__file__).resolve().parent
 PACKAGE = "gfnn_jax"
-_NO_NUMBERS = tuple(f"{HERE.name}/{name}.py" for name in ("commits", "harness", "summary"))
 _BEHIND = 1  # minor versions that a result may be
-_WITH_DOCSTRING = (ast.Module, ast.ClassDef, ast.FunctionDef)
-_TOLD = 4  # files of which it is told that they changed
 
 
 def git(*words: str) -> str:
@@ -41,45 +41,50 @@ def git(*words: str) -> str:
 
 
 def code() -> dict[str, Any]:
-    """The commit, whether files differ from it, and the files that this process has loaded."""
-    loaded = (Path(getattr(module, "__file__", None) or "/") for module in [*sys.modules.values()])
-    own = {path.resolve() for path in loaded if path.suffix == ".py"}
-    names = (path.relative_to(HERE.parent) for path in own if path.is_relative_to(HERE.parent))
-    files = sorted(str(name) for name in names if name.parts[0] in (PACKAGE, HERE.name))
+    """The commit, and whether Python files of the package or of this folder differ from it."""
     return {
         "commit": git("rev-parse", "HEAD").strip(),
         "dirty": bool(git("status", "--porcelain", "--", f"{PACKAGE}/*.py", f"{HERE.name}/*.py")),
-        "files": " ".join(files),
     }
 
 
-def changed(noted: Any, result: str) -> Iterator[str]:
-    """The scripts that mean something else today, of those that a result's `code` notes, or why
-    they are not known. result: name of its file."""
-    noted = noted or {}  # {file or folder: digest} in results until 0.3
-    loaded = noted["files"].split() if "commit" in noted else list(noted)
+def old(path: Path, study: Path, piece: str) -> list[str]:
+    """Why a result is old: "script: names" of what changed, and the version where it is behind."""
+    found = json.loads(path.read_text(encoding="utf-8"))
+    noted = found.get("code") or {}
     base = noted.get("commit")
-    if not base or noted["dirty"] or not git("cat-file", "-t", base):
-        base = _came_with().get(result)
-    if not base or not loaded:
-        yield "its code is not recorded"
-        return
-    for name in _differ(base):
-        counts = name.startswith(tuple(loaded)) and name not in _NO_NUMBERS
-        if counts and _meaning(base, name) != _meaning("", name):
-            yield name
+    if not base or noted.get("dirty") or "read" in noted or not git("cat-file", "-t", base):
+        base = _came_with().get(path.name)
+    if not base:
+        return ["it is not committed"]
+    why = differing(study.name, piece, _scripts(base), _scripts("")) if _differ(base) else []
+    version = found.get("versions", {}).get("gfnn_jax") or _version(base)
+    return why + ([f"of version {version}"] if behind(version) else [])
 
 
-def behind(version: str) -> str:
-    """Why a result of this version of the package is old, "" where it is not."""
-    minor = int(version.split(".")[1])
-    return f"of version {version}" if _minor_today() > minor + _BEHIND else ""
+def behind(version: str) -> bool:
+    """Whether a result of this version of the package is old."""
+    then, now = (int(words.split(".")[1]) for words in (version, _version("")))
+    return now > then + _BEHIND
 
 
 @functools.cache
-def _minor_today() -> int:
-    about = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))
-    return int(about["project"]["version"].split(".")[1])
+def _text(commit: str, name: str) -> str:
+    """A file of a commit, or of today; "" where there is none."""
+    if commit:
+        return git("show", f"{commit}:{name}")
+    path = HERE.parent / name
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+
+@functools.cache
+def _version(commit: str) -> str:
+    return tomllib.loads(_text(commit, "pyproject.toml"))["project"]["version"]
+
+
+@functools.cache
+def _scripts(commit: str) -> Scripts:
+    return Scripts(lambda name: _text(commit, f"{HERE.name}/{name}"))
 
 
 @functools.cache
@@ -95,20 +100,8 @@ def _came_with() -> dict[str, str]:
 
 
 @functools.cache
-def _differ(base: str) -> list[str]:
-    return git("diff", "--name-only", "--no-renames", base, "--", f"{HERE.name}/*.py").splitlines()
-
-
-@functools.cache
-def _meaning(commit: str, name: str) -> str:
-    """A module of a commit, or of today, without comments, docstrings and layout; "" if gone."""
-    path = HERE.parent / name
-    now = path.read_text(encoding="utf-8") if path.is_file() else ""
-    tree = ast.parse(git("show", f"{commit}:{name}") if commit else now)
-    for node in ast.walk(tree):
-        if isinstance(node, _WITH_DOCSTRING) and ast.get_docstring(node):
-            del node.body[0]
-    return ast.dump(tree)
+def _differ(base: str) -> bool:
+    return bool(git("diff", "--name-only", "--no-renames", base, "--", f"{HERE.name}/*.py"))
 
 
 def results_of(study: Path, folder: Path) -> Iterator[tuple[str, Path, Path]]:
@@ -126,41 +119,51 @@ def results_of(study: Path, folder: Path) -> Iterator[tuple[str, Path, Path]]:
         yield path.stem.removeprefix(prefix).removeprefix("-"), path, study
 
 
-def check(studies: Sequence[str], only: Sequence[str], folder: Path, *, tell: bool) -> int:
-    """Measure what is old again, oldest first, or only tell it; 1 where a study failed.
+def check(
+    studies: Sequence[str], only: Sequence[str], folder: Path, *, tell: bool, read: str = ""
+) -> int:
+    """Measure what is old again, oldest first; 1 where a study failed, or a result is nobody's.
 
     studies: all that there are, which tells whose a result is. only: those that are looked at; with
-    none, all.
+    none, all. tell: only tell what is old; 1 where something is. read: why what changed since
+    changed no number, which is noted in place of measuring.
     """
     results = [r for name in studies for r in results_of(HERE / f"{name}.py", folder)]
     # Of two prefixes of a name the longer one, which leaves the shorter piece, is its study's.
     known = {r[1]: r for r in sorted(results, key=lambda r: len(r[0]), reverse=True)}
-    for path in sorted(set(folder.glob("*.json")) - set(known)):
+    nobodys = sorted(set(folder.glob("*.json")) - set(known))
+    for path in nobodys:
         print(f"{path.name}: no study of this folder makes it: remove it?")
     asked = [result for result in known.values() if not only or result[2].stem in only]
-    old = []
+    found = []
     for piece, path, study in asked:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        why = list(islice(changed(found.get("code"), path.name), _TOLD))
-        why += filter(None, [behind(found.get("versions", {}).get("gfnn_jax") or "0.0.0")])
-        if why:
-            took = f"{found['seconds']:.0f} s" if "seconds" in found else "time not known"
-            old.append((found.get("date", ""), path, study, piece, f"{', '.join(why)}; {took}"))
-    print(f"{len(asked) - len(old)} of {len(asked)} results are of current studies")
+        if why := old(path, study, piece):
+            result = json.loads(path.read_text(encoding="utf-8"))
+            found.append((result.get("date", ""), path, study, piece, why, result))
+    print(f"{len(asked) - len(found)} of {len(asked)} results are of current studies")
+    failed = int(bool(nobodys) or (tell and bool(found)))
+    for date, path, study, piece, why, result in sorted(found, key=lambda one: one[:2]):
+        took = f"{result['seconds']:.0f} s" if "seconds" in result else "time not known"
+        print(f"{path.name}, {date}: {', '.join(why)}; {took}", flush=True)
+        if read:
+            result["code"] = (result.get("code") or {}) | {"read": read}
+            text = json.dumps(result, indent=1, ensure_ascii=False)
+            path.write_text(f"{text}\n", encoding="utf-8")
+        elif not tell:
+            failed |= not _measured(path, study, piece)
+    return failed
+
+
+def _measured(path: Path, study: Path, piece: str) -> bool:
+    """Measure a result again, or leave it as it was; whether the study ended well."""
     paths = os.pathsep.join(filter(None, [str(HERE.parent), os.environ.get("PYTHONPATH")]))
-    failed = 0
-    for date, path, study, piece, why in sorted(old):
-        print(f"{path.name}, {date}: {why}", flush=True)
-        if tell:
-            continue
-        command = [sys.executable, study, *(["--only", piece, "--overwrite"] if piece else [])]
-        before = path.read_bytes()
-        if not piece:  # such a study measures what has no result
-            path.unlink()
-        try:
-            done = subprocess.run(command, check=False, env=os.environ | {"PYTHONPATH": paths})
-            failed |= done.returncode != 0
-        finally:
-            if not path.exists():
-                path.write_bytes(before)
-    return int(failed)
+    command = [sys.executable, study, *(["--only", piece, "--overwrite"] if piece else [])]
+    before = path.read_bytes()
+    if not piece:  # such a study measures what has no result
+        path.unlink()
+    try:
+        done = subprocess.run(command, check=False, env=os.environ | {"PYTHONPATH": paths})
+    finally:
+        if not path.exists():
+            path.write_bytes(before)
+    return done.returncode == 0

@@ -91,7 +91,8 @@ class Scripts:
         self.script = functools.cache(self._read)
 
     def _read(self, name: str) -> Script:
-        tree = _Plain().visit(ast.parse(self.source(name)))
+        tree = ast.parse(self.source(name))
+        _Plain().visit(tree)
         calls = (x for x in ast.walk(tree) if isinstance(x, ast.Call) and x.args[2:])
         run = [x.args[1] for x in calls if ast.unparse(x.func) in RUNNERS]
         pieces = [x.id for one in run for x in ast.walk(one) if isinstance(x, ast.Name)]
@@ -102,8 +103,9 @@ class Scripts:
                 continue
             nodes = [node]
             if isinstance(node, ast.If) and "__name__" in ast.unparse(node.test):
-                more = (x for x in ast.walk(node) if isinstance(x, ast.AugAssign))
+                more = [x for x in ast.walk(node) if isinstance(x, ast.AugAssign)]
                 nodes = [x for x in more if ast.unparse(x.target) in own.definitions]
+                own.definitions["__file__"] = [node]  # what a process of its own runs
             for one in nodes:
                 for defined in _named(one)[0] or {""}:
                     own.definitions.setdefault(defined, []).append(one)
@@ -220,7 +222,7 @@ def _slug(text: str) -> str:
 
 
 def differing(study: str, piece: str, then: Scripts, now: Scripts) -> list[str]:
-    """What a piece reaches that two versions of the scripts have not alike, "script: names" each."""
+    """What a piece reaches that two versions of the scripts have not alike: "script: names"."""
     before, today = (scripts.reached(study, piece) for scripts in (then, now))
     found: dict[str, list[str]] = {}
     for script, name in sorted(before.keys() | today.keys()):

@@ -14,7 +14,7 @@ from the published values.
 
 Standard errors are by the Hessian of the cost: differences of its gradient in directions that the
 linearised problem makes alike. Forecasts are of later times by fits of the first ones, in which
-e cos ω and e sin ω have a normal prior; its width is found in turn with them (empirical Bayes), from
+e cos ω and e sin ω have a normal prior; its width is found in turn with them, from
 0.01 on. Bands take a factor: that by which the fit of the first 60 % would have held 95 % of the
 next 20 %.
 """
