@@ -146,7 +146,10 @@ def check(
         took = f"{result['seconds']:.0f} s" if "seconds" in result else "time not known"
         print(f"{path.name}, {date}: {', '.join(why)}; {took}", flush=True)
         if read:
-            result["code"] = (result.get("code") or {}) | {"read": read}
+            noted = {
+                k: v for k, v in (result.get("code") or {}).items() if k in ("commit", "dirty")
+            }
+            result["code"] = noted | {"read": read}
             text = json.dumps(result, indent=1, ensure_ascii=False)
             path.write_text(f"{text}\n", encoding="utf-8")
         elif not tell:

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from other_python import run_python
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
@@ -17,14 +16,23 @@ from benchmarks.__main__ import studies
 STUDY = """
 import json, pathlib, sys
 import commits
+import used
+
+SYSTEMS = {"first": 1, "other": 2}
+PIECES = {"one": lambda: used.f(SYSTEMS["first"]), "broken": None}
+PIECES |= {"other": lambda: SYSTEMS["other"]}
+
+def tables():
+    return "a table"
 
 def main(doc, pieces, prefix):
     if sys.argv[2] == "broken":
         sys.exit(1)
-    found = {"code": commits.code(), "measured": {"rms": 2.0}}
+    found = {"code": commits.code(), "versions": {"gfnn_jax": "0.4.0"}, "measured": {"rms": 2.0}}
     pathlib.Path(f"benchmarks/results/{prefix}-{sys.argv[2]}.json").write_text(json.dumps(found))
 
-main(__doc__, {}, "a-try")
+if __name__ == "__main__":
+    main(__doc__, PIECES, "a-try")
 """
 
 
@@ -49,64 +57,73 @@ def repository(tmp_path, monkeypatch):
     Path("gfnn_jax/room.py").write_text("Y = 1\n")
     Path("pyproject.toml").write_text('[project]\nversion = "0.4.0"\n')
     Path("benchmarks/a_try.py").write_text(STUDY)
-    source = Path(__file__).parent.parent / "benchmarks/commits.py"
-    Path("benchmarks/commits.py").write_bytes(source.read_bytes())
+    for name in ("commits.py", "reached.py"):
+        source = Path(__file__).parent.parent / "benchmarks" / name
+        Path("benchmarks", name).write_bytes(source.read_bytes())
     forget()
     yield tmp_path, commit
     forget()
 
 
 def forget():
-    for cached in (commits._came_with, commits._differ, commits._meaning, commits._minor_today):
+    for cached in (commits._came_with, commits._differ, commits._text, commits._scripts):
         cached.cache_clear()
+    commits._version.cache_clear()
 
 
-def is_old(code, name="a-try-one.json"):
+def is_old(root, code, piece="one"):
+    result = root / f"benchmarks/results/a-try-{piece}.json"
+    result.write_text(json.dumps({"code": code, "versions": {"gfnn_jax": "0.4.0"}}))
     forget()
-    return list(commits.changed(code, name))
+    return commits.old(result, root / "benchmarks/a_try.py", piece)
 
 
-def test_a_result_is_old_where_a_script_changed_that_it_loaded(repository):
+def test_a_result_is_old_where_something_changed_that_its_piece_reaches(repository):
     root, commit = repository
-    first = commit()
-    code = {
-        "commit": first,
-        "dirty": False,
-        "files": "benchmarks/a_try.py benchmarks/used.py gfnn_jax/room.py",
-    }
-    assert is_old(code) == []
-    used = root / "benchmarks/used.py"
-    used.write_text("def f(x):  # the same\n    '''Other words.'''\n    return (x)\n")
+    code = {"commit": commit(), "dirty": False}
+    used, study = root / "benchmarks/used.py", root / "benchmarks/a_try.py"
+    assert is_old(root, code) == []
+    used.write_text("def f(x: int):  # the same\n    '''Other words.'''\n    return (x)\n")
     (root / "gfnn_jax/room.py").write_text("Y = 2\n")
-    assert is_old(code) == []
+    study.write_text(STUDY.replace('"a table"', '"another"'))
+    assert is_old(root, code) == []
+    study.write_text(STUDY.replace('"other": 2', '"other": 3'))  # a row of another piece
+    assert is_old(root, code) == []
+    assert is_old(root, code, "other") == ["a_try.py: SYSTEMS"]
+    study.write_text(STUDY.replace('"first": 1', '"first": 3'))
+    assert is_old(root, code) == ["a_try.py: SYSTEMS"]
+    study.write_text(STUDY)
     used.write_text("def f(x):\n    return 2 * x\n")
-    assert is_old(code) == ["benchmarks/used.py"]
-    # One that was measured beside this change is of the commit that it came with, as one of 0.3.
-    for other in (code | {"dirty": True}, {"benchmarks/used.py": "ab1 cd2"}, {"benchmarks": "ab1"}):
-        (root / "benchmarks/results/a-try-one.json").write_text(json.dumps({"code": other}))
+    assert is_old(root, code) == ["used.py: f"]
+    # One measured beside this change, or whose study was read, is of the commit that it came with.
+    for other in (
+        code | {"dirty": True},
+        {"benchmarks/used.py": "ab1"},
+        code | {"read": "renamed"},
+    ):
+        is_old(root, other)
         commit()
-        assert is_old(other) == []
-        used.write_text(used.read_text() + "Z = 1\n")
-        assert is_old(other) == ["benchmarks/used.py"]
+        assert is_old(root, other) == []
+        used.write_text(used.read_text().replace("return", "return 1 +"))
+        assert is_old(root, other) == ["used.py: f"]
     used.unlink()
-    assert is_old(code) == ["benchmarks/used.py"]
-    assert len(is_old(None)) == len(is_old(code, "")) == 1
-    assert [commits.behind(f"0.{minor}.1") for minor in (2, 3, 4)] == ["of version 0.2.1", "", ""]
+    assert is_old(root, code) == ["used.py: f"]
+    assert is_old(root, None, "never") == ["it is not committed"]
+    assert [commits.behind(f"0.{minor}.1") for minor in (2, 3, 4)] == [True, False, False]
 
 
 def test_what_is_old_is_measured_again(repository, capsys):
     root, commit = repository
     results = root / "benchmarks/results"
-    commit()
     for name in ("one", "broken", "other"):
-        code = None if name != "other" else {"benchmarks/used.py": ""}
-        found = {"code": code, "versions": {"gfnn_jax": "0.4.0"}}
-        (results / f"a-try-{name}.json").write_text(json.dumps(found))
+        is_old(root, None, name)
     (results / "nobody.json").write_text("{}")
     commit()
+    study = root / "benchmarks/a_try.py"
+    study.write_text(STUDY.replace('"broken": None', '"broken": True').replace("first", "third"))
     forget()
     before = (results / "a-try-broken.json").read_bytes()
-    assert commits.check(["a_try"], [], results, tell=True) == 0
+    assert commits.check(["a_try"], [], results, tell=True) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("nobody.json")
     assert lines[1].startswith("1 of 3")
@@ -115,18 +132,14 @@ def test_what_is_old_is_measured_again(repository, capsys):
     assert (results / "a-try-broken.json").read_bytes() == before
     found = json.loads((results / "a-try-one.json").read_text())
     assert found["measured"] == {"rms": 2.0}
-    assert found["code"]["dirty"] is False
-    assert "benchmarks/a_try.py" in found["code"]["files"].split()
+    (results / "nobody.json").unlink()
+    assert commits.check(["a_try"], ["a_try"], results, tell=False, read="renamed") == 0
+    commit()
+    forget()
+    assert commits.check(["a_try"], ["a_try"], results, tell=True) == 0
 
 
 def test_every_result_of_the_repository_has_a_study():
     here = commits.HERE
     made = [r for s in studies() for r in commits.results_of(here / f"{s}.py", here / "results")]
     assert {path for _, path, _ in made} == set((here / "results").glob("*.json"))
-
-
-def test_a_study_tells_its_commit_and_files():
-    text = "import harness, json; print(json.dumps(harness.circumstances()['code']))"
-    code = json.loads(run_python(text))
-    assert {"gfnn_jax/phase_space.py", "benchmarks/harness.py"} <= set(code["files"].split())
-    assert "gfnn_jax/cli.py" not in code["files"]
