@@ -61,6 +61,7 @@ FINE = 14  # steps in the shortest period
 BEFORE = 1.0  # days, that the flow begins before the first transit and ends after the last
 LARGEST_E, LARGEST_MASS = 0.1, 3e-4  # of a step that is tried
 PRIOR_E, ROUNDS = 0.01, 3  # width of the prior that fits begin with, and how often it is found
+FEW = 8  # iterations, of each time
 FREEDOM, SCALE = 3.36, 0.709  # ν and the square of the scale, of the residuals ÷ their errors
 SQUARES = 1e6  # ν of least squares
 SETTLED = 1e-3  # decrease that ends a descent: absolute of Student's cost, relative of squares
@@ -404,7 +405,7 @@ def with_prior(setting: Setting, quick: bool) -> Descent:
         width = float(np.sqrt(np.mean(e**2 + variances)))
         start = Descent.at(dataclasses.replace(setting, prior=width), STUDENT, end.x)
         assert start is not None
-        end = descended(start, Nielsen(), QUICK if quick else MOST, AGAIN).problem
+        end = descended(start, Nielsen(), QUICK if quick else FEW, AGAIN).problem
     return end
 
 
@@ -434,38 +435,38 @@ def errors(folder: Path, quick: bool) -> Numbers:
     }
 
 
-def forecast(folder: Path, quick: bool) -> Numbers:
-    """Fits of the first rows in time, and what they say of later ones."""
-    transits, factor, found = Transits.of(folder), 1.0, {}
-    ends = [int(share * len(transits.t)) for share in (*SHARES, 1.0)]
-    for share, first, last in zip(SHARES, ends, ends[1:], strict=False):
-        held = slice(first, last)
-        end, _, seconds = once(lambda rows=first: with_prior(Setting(transits, rows), quick))
-        setting = end.setting
-        later = transits.some(held)
-        left = np.abs(end.times[held] - later.t)
-        model = np.einsum("ni,ij,nj->n", end.slopes, end.covariance(), end.slopes)[held]
-        noise = SCALE * FREEDOM / (FREEDOM - 2) * later.sigma**2
-        period, start = setting.lines[later.planet].T
-        straight = np.abs(start + period * later.epoch - later.t)
-        tried = np.geomspace(1, 100, 400)
-        within = [np.mean(left < BAND * np.sqrt(f**2 * model + noise)) for f in (factor, *tried)]
-        found[f"{share:g}"] = {
-            "rows": last - first,
-            "cost": end.cost,
-            "prior": setting.prior,
-            "median_seconds": SECONDS * float(np.median(left)),
-            "straight_seconds": SECONDS * float(np.median(straight)),
-            "factor": factor,
-            "within": float(within[0]),
-            "within_without_factor": float(within[1]),
-            "band_seconds": SECONDS * float(np.median(BAND * np.sqrt(factor**2 * model + noise))),
-            "found": end.x.tolist(),
-            "processor_seconds": seconds,
-        }
-        enough = np.array(within[1:]) >= INSIDE
-        factor = float(tried[np.argmax(enough)] if enough.any() else tried[-1])
-    return found
+def forecast(folder: Path, quick: bool, *, share: float) -> Numbers:
+    """The fit of the first rows in time, and what it says of the next fifth. Its bands take the
+    factor that the fit before would have needed."""
+    transits, out = Transits.of(folder), Path("runs/trappist") if quick else RESULTS
+    before = read({"before": out / "trappist-first-60.json"}) if share > SHARES[0] else {}
+    factor = before["before"]["measured"]["needed"] if before else 1.0
+    first, last = (int(s * len(transits.t)) for s in (share, share + 0.2 + 1e-9))
+    end, _, seconds = once(lambda: with_prior(Setting(transits, first), quick))
+    held = slice(first, last)
+    later = transits.some(held)
+    left = np.abs(end.times[held] - later.t)
+    model = np.einsum("ni,ij,nj->n", end.slopes, end.covariance(), end.slopes)[held]
+    noise = SCALE * FREEDOM / (FREEDOM - 2) * later.sigma**2
+    period, start = end.setting.lines[later.planet].T
+    straight = np.abs(start + period * later.epoch - later.t)
+    tried = np.geomspace(1, 100, 400)
+    within = [np.mean(left < BAND * np.sqrt(f**2 * model + noise)) for f in (factor, *tried)]
+    enough = np.array(within[1:]) >= INSIDE
+    return {
+        "rows": last - first,
+        "cost": end.cost,
+        "prior": end.setting.prior,
+        "median_seconds": SECONDS * float(np.median(left)),
+        "straight_seconds": SECONDS * float(np.median(straight)),
+        "factor": factor,
+        "within": float(within[0]),
+        "within_without_factor": float(within[1]),
+        "needed": float(tried[np.argmax(enough)] if enough.any() else tried[-1]),
+        "band_seconds": SECONDS * float(np.median(BAND * np.sqrt(factor**2 * model + noise))),
+        "found": end.x.tolist(),
+        "processor_seconds": seconds,
+    }
 
 
 # Each of its own file, so that a run goes on where it was stopped.
@@ -473,7 +474,8 @@ PIECES: dict[str, Any] = {
     "flat": functools.partial(whole, from_published=False),
     "published": functools.partial(whole, from_published=True),
     "errors": errors,
-    "forecast": forecast,
+    "first-60": functools.partial(forecast, share=SHARES[0]),
+    "first-80": functools.partial(forecast, share=SHARES[1]),
 }
 
 
@@ -489,7 +491,7 @@ def tables() -> None:
     found = results(PIECES, "trappist")
     if len(found) < len(PIECES):
         return
-    own, other, error, ahead = (found[name]["measured"] for name in PIECES)
+    own, other, error, _, last = (found[name]["measured"] for name in PIECES)
     x, size = np.array(own["found"]), np.array(error["errors"])
     past = np.array(own["published"]).reshape(5, N)
     rows = [
@@ -499,7 +501,6 @@ def tables() -> None:
         )
     ]
     between = apart(x, np.array(other["found"]))
-    last = ahead[f"{SHARES[-1]:g}"]
     wider = number(float(np.median(size / np.array(error["linearised"]))))
     text = (
         f"Cost {own['cost']:.3f} from flat starts and {other['cost']:.3f} from the published "
