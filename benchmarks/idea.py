@@ -134,14 +134,15 @@ def symplectic() -> Figure:
         text = "∝ n" if power == 1 else "∝ n²"
         position.loglog(shown, size * shown**power, ":", color="black", lw=0.8)
         last = (shown[-1], size * shown[-1] ** power)
-        position.annotate(text, last, (-22, -14), textcoords="offset points")
+        beside = (-24, 4) if power == 1 else (-32, -8)
+        position.annotate(text, last, beside, textcoords="offset points")
     plane.set_aspect("equal", "datalim")
     plane.set(xlabel="q", ylabel="p", title=f"one orbit, {count:,} steps")
     energy.set(xlabel="step n", ylabel="largest relative error so far")
     energy.set_title("energy: bounded, or growing")
     position.set(xlabel="step n", ylabel="largest error so far", title="position: as n, or as n²")
-    for ax in (plane, energy, position):
-        ax.legend(loc="upper left", markerscale=4)
+    for ax, where in ((plane, "center"), (energy, "upper left"), (position, "upper left")):
+        ax.legend(loc=where, markerscale=4)
     return figure
 
 
