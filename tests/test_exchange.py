@@ -41,6 +41,8 @@ def test_a_law_beside_which_noise_leaves_others_is_one_of_several(noise, alone):
         assert law.verdict.startswith("one of several")
         assert law.rivals
         assert all(rival.odds < 20 for rival in law.rivals)
+        assert law.next_motions[0].start["x1"] > 1.5  # farther out than the record
+        assert law.next_motions[0].apart > 3
 
 
 @pytest.mark.slow

@@ -117,7 +117,7 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         velocities={n: one.in_file(recording, n) for n, one in findings.velocities.items()},
         whiteness=found,
         traces=traces,
-        next_motions=_next_motions(findings.motions, recording, names),
+        next_motions=named_motions(findings.motions, recording),
         observe={n: str(f) for n, f in shown.items() if n != f},
         sensors=parameters,
         alike=_alike(fit, lagrangian, friction),
@@ -336,11 +336,9 @@ def about_parameters(
     return found
 
 
-def _next_motions(
-    motions: Sequence[Motion], recording: Recording, names: Names
-) -> tuple[NextMotion, ...]:
+def named_motions(motions: Sequence[Motion], recording: Recording) -> tuple[NextMotion, ...]:
     """Motions to record, in the file's units where a column shows the coordinate."""
-    named = []
+    named, names = [], Names.of(recording)
     for motion in motions:
         start = {
             name: float(q / recording.factors.get(name, 1.0))
@@ -348,7 +346,7 @@ def _next_motions(
         }
         units = {name: recording.unit(name) for name in start}
         gains = {word_of(k, names): g for k, g in motion.gains.items()}
-        named.append(NextMotion(start, gains, units))
+        named.append(NextMotion(start, gains, units, motion.apart))
     return tuple(named)
 
 

@@ -40,14 +40,21 @@ def _of(value: float, unit: str) -> str:
 
 class NextMotion(NamedTuple):
     """A motion to record: where to let go, at rest, and by how much that makes the standard errors
-    of terms smaller, the most improved first. units: of the coordinates, "" where not known."""
+    of terms smaller, the most improved first. units: of the coordinates, "" where not known. apart:
+    standard deviations of its readings together between the law and its nearest rival."""
 
     start: dict[str, float]
     gains: dict[str, float]
     units: dict[str, str]
+    apart: float = 0.0
 
     def __str__(self) -> str:
         at = ", ".join(f"{name} = {_of(q, self.units[name])}" for name, q in self.start.items())
+        if self.apart:
+            return (
+                f"release from rest at {at}. Its readings together put {self.apart:.2g} standard "
+                "deviations between the law and its nearest rival"
+            )
         best = ", ".join(f"of {t} {min(g, 1000):.2g}×" for t, g in [*self.gains.items()][:3])
         return f"release from rest at {at}. Standard errors shrink: {best}"
 

@@ -41,11 +41,13 @@ OPTIONS = MotionOptions()
 
 
 class Motion(NamedTuple):
-    """A start from rest (d,), and by how much it makes the standard errors of coefficients (by
-    their keys) smaller, the most improved first."""
+    """A start from rest (d,), by how much it makes the standard errors of coefficients (by their
+    keys) smaller, the most improved first, and by how many standard deviations of its
+    readings together the nearest of rivals is apart."""
 
     start: np.ndarray
     gains: dict[Key, float]
+    apart: float = 0.0
 
 
 def next_motions(fit: LawFit) -> list[Motion]:
@@ -76,6 +78,20 @@ def next_motions(fit: LawFit) -> list[Motion]:
     return found[: OPTIONS.most]
 
 
+def parting(fit: LawFit, others: Sequence[LawFit]) -> list[Motion]:
+    """The motion along which the nearest of other laws is farthest from that of a fit; none where
+    all leave for far away."""
+    starts = _starts(fit)
+    own, *theirs = (
+        one.problem.observation(_lanes(one, starts)[0]).values / fit.sigma for one in (fit, *others)
+    )
+    apart = np.min([np.sqrt(np.sum((y - own) ** 2, axis=(1, 2))) for y in theirs], axis=0)
+    if not np.isfinite(apart).any():
+        return []
+    best = int(np.nanargmax(apart))
+    return [Motion(starts[best], {}, float(apart[best]))]
+
+
 def _starts(fit: LawFit) -> list[np.ndarray]:
     """One coordinate, or all of them with either sign, let go from rest at some deflections."""
     d, angles = fit.form.dim, list(fit.problem.angles)
@@ -94,12 +110,23 @@ def _starts(fit: LawFit) -> list[np.ndarray]:
 
 
 def _followed(fit: LawFit, starts: Sequence[np.ndarray]) -> list[Arcs]:
-    """The motions from these starts as arcs, without inputs; those that leave for far away are left
-    out."""
+    """The motions from these starts as arcs; those that leave for far away are left out."""
+    lanes, h = _lanes(fit, starts)
+    length = lanes.shape[1]
+    home, t = ((fit.arcs.home[0][0], 0, length),), h * np.arange(length)[None]
+    arcs = []
+    for lane in lanes[np.isfinite(lanes).all(axis=(1, 2))]:
+        y = fit.problem.observation(lane[None]).values
+        arcs.append(Arcs(t, y, lane[None], np.ones(y.shape), home))
+    return arcs
+
+
+def _lanes(fit: LawFit, starts: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
+    """States (S, n, 2d) of the motions from these starts, without inputs, NaN of those that leave
+    for far away, and the time between them."""
     d, length, problem = fit.form.dim, fit.arcs.t.shape[1], fit.problem
     steps = np.diff(fit.arcs.t, axis=1)
-    h = np.full(len(starts), np.median(steps[steps > 0]))
-    h = np.repeat(h[:, None], length - 1, axis=1)
+    h = np.full((len(starts), length - 1), np.median(steps[steps > 0]))
     still = np.zeros((*h.shape, *problem.inputs(fit.arcs).shape[2:]))
     form, coefficients = fit.form, fit.p[: fit.form.count]
     if form.powers is not None and problem.systems.names:  # of the first arc's system
@@ -111,10 +138,6 @@ def _followed(fit: LawFit, starts: Sequence[np.ndarray]) -> list[Arcs]:
     followed = form.follow(coefficients, x, h, still, order=0).states
     states = np.concatenate([x[:, None], followed], axis=1)
     off = np.abs(states[..., :d] - first[:, None])
-    far = 10 * (np.ptp(fit.problem.gauge, axis=0) + np.abs(first))
-    home, t = ((fit.arcs.home[0][0], 0, length),), h[0, 0] * np.arange(length)[None]
-    arcs = []
-    for lane in states[np.all(off < far[:, None], axis=(1, 2))]:  # no NaN either
-        y = problem.observation(lane[None]).values
-        arcs.append(Arcs(t, y, lane[None], np.ones(y.shape), home))
-    return arcs
+    far = 10 * (np.ptp(problem.gauge, axis=0) + np.abs(first))
+    near = np.all(off < far[:, None], axis=(1, 2))  # no NaN either
+    return np.where(near[:, None, None], states, np.nan), float(h[0, 0])

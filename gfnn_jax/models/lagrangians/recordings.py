@@ -31,7 +31,6 @@ from gfnn_jax.dataset.stretches import (
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import INPUTS, shape_of
 from gfnn_jax.families.text import measured
-from gfnn_jax.fitting.evidence import Rival
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.observation import Observation, observed
@@ -51,12 +50,18 @@ from gfnn_jax.models.lagrangians.in_use import (
     RecordingData,
     best_in_use,
 )
-from gfnn_jax.models.lagrangians.in_words import Findings, in_words, line_of, rival_of
+from gfnn_jax.models.lagrangians.in_words import (
+    Findings,
+    in_words,
+    line_of,
+    named_motions,
+    rival_of,
+)
 from gfnn_jax.models.lagrangians.input_rules import RULES, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, last_of_series
 from gfnn_jax.models.lagrangians.nature import Nature, nature
-from gfnn_jax.models.lagrangians.next_motion import next_motions
+from gfnn_jax.models.lagrangians.next_motion import next_motions, parting
 from gfnn_jax.models.lagrangians.rivals import constant_of, one_sided, other_powers
 from gfnn_jax.models.lagrangians.search import (
     SearchResult,
@@ -169,8 +174,8 @@ def fit_recording(
         if not terms and not hidden:
             messages = (*law.messages, *_with_constants(best.fit))
             rival = law.rival or _other_shapes(best.fit)
-            others = () if law.flaws else _rivals(recording, data, best.fit)
-            law = dataclasses.replace(law, rival=rival, rivals=others, messages=messages)
+            law = dataclasses.replace(law, rival=rival, messages=messages)
+            law = law if law.flaws else _with_rivals(law, recording, data, best.fit)
     except (FitError, np.linalg.LinAlgError):
         if missed is not None:
             raise _with_nature(missed, data) from None
@@ -209,15 +214,22 @@ def _other_shapes(fit: LawFit) -> str:
     return other_powers(fit, names) or one_sided(fit, names)
 
 
-def _rivals(recording: Recording, data: RecordingData, fit: LawFit) -> tuple[Rival, ...]:
-    """Laws that are one exchange of terms away and follow a record as well."""
+def _with_rivals(
+    law: LearnedLaw, recording: Recording, data: RecordingData, fit: LawFit
+) -> LearnedLaw:
+    """The law with those that are one exchange of terms away and follow a record as well, and the
+    motion that tells them apart as the first to record next."""
     every = TermSearch.of(fit.problem).every
     assert every is not None
-    found = () if fit.problem.parameters else rivals(fit, every)
-    return tuple(
+    found = [] if fit.problem.parameters else rivals(fit, every)
+    if not found:
+        return law
+    listed = tuple(
         rival_of(recording, GaugedLaw.of(data, other), float(np.exp(above / 2)))
         for other, above in found
     )
+    motions = named_motions(parting(fit, [other for other, _ in found]), recording)
+    return dataclasses.replace(law, rivals=listed, next_motions=(*motions, *law.next_motions))
 
 
 def _is_no_law(law: LearnedLaw) -> bool:
