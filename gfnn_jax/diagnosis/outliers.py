@@ -70,7 +70,7 @@ class Options:
     most_errors: float = 0.45
     # Among so many neighbours of the state or of the image all but so many are ordinary; of all
     # that are far from the polynomial so many stand alone in that way.
-    neighbours_of_error: int = 10
+    neighbours: int = 10
     but: int = 4
     alone: float = 0.8
     # Of the stretches of sequences between two good states so many are bridged by the polynomial,
@@ -137,7 +137,7 @@ def clean(
     if len(found_outliers):
         messages.append(
             f"{len(found_outliers)} of {count} pairs contradict the pairs around them "
-            f"(numbers {_named(row[found_outliers])}, from 0): "
+            f"(numbers {named(row[found_outliers])}, from 0): "
             + (
                 "outliers, they are left out"
                 if few
@@ -146,14 +146,25 @@ def clean(
         )
     if len(gross):
         messages.append(
-            f"{len(gross)} of {count} pairs (numbers {_named(row[gross])}, from 0) are far from a "
+            f"{len(gross)} of {count} pairs (numbers {named(row[gross])}, from 0) are far from a "
             "polynomial fitted to the others: outliers, they are left out"
         )
     return data, messages
 
 
-def _named(rows: np.ndarray) -> str:
+def named(rows: np.ndarray) -> str:
+    """Write the numbers of the first rows."""
     return ", ".join(map(str, rows[:5])) + (", …" if len(rows) > 5 else "")
+
+
+def around(data: Dataset, unit: np.ndarray, size: np.ndarray, rows, but: int) -> np.ndarray:
+    """Bound (n,) on the residuals ``size`` (N,) of all ``but`` so many of the neighbours of these
+    rows, of the state or of the image: a state that is a gross error has none but its like."""
+    found = np.full(len(rows), np.inf)
+    for y in (data.y0 / unit, data.y1 / unit):
+        near = cKDTree(y).query(y[rows], k=OPTIONS.neighbours + 1)[1][:, 1:]
+        found = np.minimum(found, np.sort(size[near], axis=1)[:, -1 - but])
+    return found
 
 
 def outliers(y0, y1, scale, given=None) -> np.ndarray:
@@ -255,7 +266,7 @@ def gross_errors(data: Dataset, goes_on: np.ndarray, left_out: np.ndarray) -> np
         return none
     if goes_on.any():
         return _borne_out(best, far, goes_on, left_out)
-    alone = far[_ordinary_around(data, best.unit, size, far)]
+    alone = far[around(data, best.unit, size, far, OPTIONS.but) < OPTIONS.ordinary]
     return alone if len(alone) >= OPTIONS.alone * len(far) else none
 
 
@@ -356,16 +367,6 @@ def _resistant(design, move) -> tuple[np.ndarray, float]:
         else:
             weight = _TUKEY.weights(size / median)
     return turn @ coefficients, median
-
-
-def _ordinary_around(data: Dataset, unit, size, rows) -> np.ndarray:
-    """Mark the rows that have ordinary neighbours, of the state or of the image: a state that is a
-    gross error has no neighbours but its like."""
-    near_one = np.zeros(len(rows), bool)
-    for y in (data.y0 / unit, data.y1 / unit):
-        near = cKDTree(y).query(y[rows], k=OPTIONS.neighbours_of_error + 1)[1][:, 1:]
-        near_one |= np.sort(size[near], axis=1)[:, -1 - OPTIONS.but] < OPTIONS.ordinary
-    return near_one
 
 
 def _borne_out(model: _Model, rows, goes_on, left_out) -> np.ndarray:

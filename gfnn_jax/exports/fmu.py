@@ -24,8 +24,8 @@ import numpy as np
 from gfnn_jax.errors import WorkError
 from gfnn_jax.exports import c_parts
 from gfnn_jax.exports.graph import LawGraph, graph_of
-from gfnn_jax.exports.jax_source import FUNCTIONS, rates_of
-from gfnn_jax.exports.symbols import Tape, literal
+from gfnn_jax.exports.jax_source import rates_on_tape
+from gfnn_jax.exports.symbols import literal
 from gfnn_jax.exports.taylor import c_of_flow
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
@@ -79,15 +79,12 @@ def _compiled(text: str, name: str) -> tuple[str, bytes]:
 
 def _source(graph: LawGraph, smooth: LawGraph, starts: list[float]) -> str:
     """Write the C of the FMU: ours, and the interface about it."""
-    tape, width, count = Tape(), len(graph.rates), len(graph.arguments)
-    coefficients = len(graph.values)
-    inputs = {
-        "z": tape.inputs("z", width)[0],
-        "u": tape.inputs("u", max(count, 1))[0],
-        "p": tape.inputs("p", max(coefficients, 1))[0],
-    }
-    functions = {own: (lambda *a, own=own: tape.made(own, *a)) for own in FUNCTIONS}
-    rates = tape.function("rates_of", {"r": rates_of(smooth, inputs, functions)})
+    tape, found = rates_on_tape(smooth)
+    rates, count, coefficients = (
+        tape.function("rates_of", {"r": found}),
+        len(graph.arguments),
+        len(graph.values),
+    )
     time = "" if graph.time is None else f"    one->u[{graph.time}] = one->time;\n"
     stubs = [f"STUB(fmi3{own})" for own in _UNSERVED.split()]
     stubs += [f"STUB(fmi3{way}{kind})" for kind in _TYPES.split() for way in ("Get", "Set")]

@@ -30,6 +30,15 @@ def rates_of(graph: LawGraph, inputs: Mapping[str, Any], functions: Mapping[str,
     return graph.tape.evaluated(graph.rates, inputs, functions)
 
 
+def rates_on_tape(graph: LawGraph) -> tuple[Tape, list[Any]]:
+    """The rates on a tape of their own, whose inputs are z, u and p."""
+    tape = Tape()
+    sizes = {"z": len(graph.rates), "u": len(graph.arguments), "p": len(graph.values)}
+    inputs = {name: tape.inputs(name, max(size, 1))[0] for name, size in sizes.items()}
+    functions = {own: (lambda *a, own=own: tape.made(own, *a)) for own in FUNCTIONS}
+    return tape, rates_of(graph, inputs, functions)
+
+
 def jax_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     """Write a module with ``step(z, u, p, h)`` and ``rates(z, u, p)``, z (2d,) = (q, p).
 
@@ -39,14 +48,7 @@ def jax_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     map without a law, or with one that is no formula.
     """
     graph, piece = graph_of(map_, sharp=False), map_.pieces[0]
-    tape = Tape()
-    inputs = {
-        "z": tape.inputs("z", len(graph.rates))[0],
-        "u": tape.inputs("u", max(len(graph.arguments), 1))[0],
-        "p": tape.inputs("p", max(len(graph.values), 1))[0],
-    }
-    functions = {own: (lambda *a, own=own: tape.made(own, *a)) for own in FUNCTIONS}
-    found = rates_of(graph, inputs, functions)
+    tape, found = rates_on_tape(graph)
     lines = tape.lines({f"r{i}": rate for i, rate in enumerate(found)})
     body = "\n".join(f"    {_in_python(line)}" for line in lines)
     rule = gauss(piece.stages)

@@ -105,7 +105,7 @@ def forecast_recording(model: Path, initial: Path, output: Output, asked: Ahead)
     compared = None if measured is None else _compared(known, found, measured)
     second = SECONDS[recording.time_unit]
     factors = dict.fromkeys(known.job.get("degrees", ()), np.pi / 180) | recording.factors
-    found = {run: _in_units(one, factors, second) for run, one in found.items()}
+    found = {run: one.divided(factors, second) for run, one in found.items()}
     _write(out, found)
     return Forecasts(found, recording.time_unit, compared)
 
@@ -157,15 +157,6 @@ class _Model:
 def _same_run(measured: Recording, run: str) -> str:
     """Name of the measured run that goes on with this one: its only one, or that of this name."""
     return run if len(measured.runs) > 1 else next(iter(measured.runs))
-
-
-def _in_units(one: Forecast, factors: Mapping[str, float], second: float) -> Forecast:
-    """Convert to the units of the file."""
-    values, std = (
-        {name: array / factors.get(name, 1.0) for name, array in of.items()}
-        for of in (one.values, one.std)
-    )
-    return one._replace(times=one.times / second, values=values, std=std)
 
 
 def _compared(known: _Model, found: dict[str, Forecast], measured: Recording) -> Comparison:

@@ -17,12 +17,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.budget import FLOW
 from gfnn_jax.candidates.assemble import Candidate, stepped
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import error_of_each
+from gfnn_jax.diagnosis.outliers import OPTIONS as SCREEN
+from gfnn_jax.diagnosis.outliers import around, named
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.learn.request import Request, diagnose_request
 from gfnn_jax.learn.searches import Searched, searched
@@ -36,7 +37,6 @@ class GrossErrorOptions:
     # A residual beyond so many times what all but two of its neighbours stay below, and the median
     # of all. Of normal noise and d = 1 it is four times the median in one of 60,000 pairs.
     beyond: float = 5.0
-    neighbours: int = 10
     but: int = 2
     # Those neighbours' residuals are ordinary, below so many times the median: a map that cannot
     # follow a close passage errs around it too.
@@ -99,13 +99,13 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
             # A search without them is followed by another look at the residuals.
             work = _work_of_neighbours(found.data, far)
             with request.budget.unit(_WHAT, FLOW, work, then=(FLOW, left.work)):
-                around = _around(found.data, size, far)
+                near = around(found.data, found.data.scale, size, far, OPTIONS.but)
         except OutOfTime:
             request.budget.leave_out(_WHAT, request.budget.ended)
             break
-        rows, rise = _standing_alone(size, far, around, OPTIONS.ordinary), OPTIONS.rise
+        rows, rise = _standing_alone(size, far, near, OPTIONS.ordinary), OPTIONS.rise
         if not len(rows):
-            rows, rise = _standing_alone(size, far, around, np.inf), OPTIONS.mended
+            rows, rise = _standing_alone(size, far, near, np.inf), OPTIONS.mended
         gone = len(wrong) + len(rim) + len(rows)
         if not len(rows) or gone > OPTIONS.most * count:
             break
@@ -125,8 +125,8 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
         # These pairs are exact: without them the tolerance is to be met, and no more lost there.
         if at_rim and (left is not None or not _follows(found, again, rows)):
             break
-        named = found.data.row[rows]
-        wrong, rim = (wrong, np.append(rim, named)) if at_rim else (np.append(wrong, named), rim)
+        gone = found.data.row[rows]
+        wrong, rim = (wrong, np.append(rim, gone)) if at_rim else (np.append(wrong, gone), rim)
         found = again
     messages = []
     if len(wrong):
@@ -144,8 +144,7 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
 
 
 def _named(rows: np.ndarray, count: int) -> str:
-    first = ", ".join(map(str, np.sort(rows)[:5])) + (", …" if len(rows) > 5 else "")
-    return f"{len(rows)} of {count} pairs (numbers {first}, from 0)"
+    return f"{len(rows)} of {count} pairs (numbers {named(np.sort(rows))}, from 0)"
 
 
 def _rms(size) -> float:
@@ -238,23 +237,13 @@ def _follows(found: Searched, again: Searched, rows: np.ndarray) -> bool:
 def _far(size: np.ndarray) -> np.ndarray:
     """The rows whose residual is far beyond the median."""
     middle = np.median(size)
-    known = len(size) > OPTIONS.neighbours and middle > 0
+    known = len(size) > SCREEN.neighbours and middle > 0
     return np.flatnonzero(size > OPTIONS.beyond * middle) if known else np.zeros(0, int)
 
 
 def _work_of_neighbours(data: Dataset, far: np.ndarray) -> float:
-    """Operations of `_around`."""
+    """Operations of `around`."""
     return OPTIONS.of_trees * len(data) + OPTIONS.of_neighbours * data.y0.shape[1] ** 2 * len(far)
-
-
-def _around(data: Dataset, size: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Bound on the residuals of all but a few of the neighbours of these rows, of the state or of
-    the image: a state that is a gross error has no neighbours but its like."""
-    around = np.full(len(far), np.inf)
-    for y in (data.y0 / data.scale, data.y1 / data.scale):
-        near = cKDTree(y).query(y[far], k=OPTIONS.neighbours + 1)[1][:, 1:]
-        around = np.minimum(around, np.sort(size[near], axis=1)[:, -1 - OPTIONS.but])
-    return around
 
 
 def _standing_alone(

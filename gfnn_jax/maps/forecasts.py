@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,12 +51,17 @@ class Forecast(NamedTuple):
     def in_units_of(self, recording: Recording) -> Forecast:
         """Convert values and standard deviations to the units of a recording's file."""
         factors = recording.factors
+        units = {n: recording.unit(n) if n in factors else unit for n, unit in self.units.items()}
+        return self.divided(factors)._replace(units=units)
+
+    def divided(self, factors: Mapping[str, float], second: float = 1.0) -> Forecast:
+        """Divide values, standard deviations and bands by the factors of their columns, times by
+        ``second``."""
         values, std, band = (
             None if of is None else {name: x / factors.get(name, 1.0) for name, x in of.items()}
             for of in (self.values, self.std, self.band)
         )
-        units = {n: recording.unit(n) if n in factors else unit for n, unit in self.units.items()}
-        return self._replace(values=values, std=std, units=units, band=band)
+        return self._replace(times=self.times / second, values=values, std=std, band=band)
 
 
 def estimate(map_: Any, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
