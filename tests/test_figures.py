@@ -52,7 +52,6 @@ def every_figure():
             [1.0, 2.0], [1e-3, 1e-6], ["one", "two"], 1, tolerance=1e-5
         ),
         "work_precision": lambda: figures.work_precision({"GFNN": ([1, 2], [1e-3, 1e-6])}),
-        "training_curve": lambda: figures.training_curve(0.9**STEPS, 1.1 * 0.9**STEPS),
     }
 
 
@@ -84,7 +83,7 @@ def test_pyplot_is_never_imported(tmp_path):
     code = (
         "import sys, numpy as np\n"
         "from gfnn_jax import figures\n"
-        "ax = figures.training_curve(np.ones(3), np.ones(3))\n"
+        "ax = figures.work_precision({'one': ([1, 2], [1, 2])})\n"
         "figures.save(ax.figure, sys.argv[1])\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )
@@ -187,11 +186,6 @@ def test_speed_against_error_marks_the_choice_and_the_front():
     assert texts[4].splitlines() == ["1  b", "2  c  (chosen)", "3  d", "4  a"]
 
 
-def test_training_curve_marks_the_best_epoch():
-    ax = figures.training_curve([4.0, 2.0, 1.0], [4.0, np.nan, 5.0])
-    np.testing.assert_array_equal(line(ax, "kept: epoch 1").ravel(), [1, 4.0])
-
-
 def test_methods_differ_in_colour_and_marker():
     curves = {f"method {i}": ([1, 2], [1, 2]) for i in range(9)}
     lines = figures.work_precision(curves).get_lines()
@@ -200,7 +194,7 @@ def test_methods_differ_in_colour_and_marker():
 
 
 def test_a_given_axes_is_drawn_on():
-    first = figures.training_curve([1.0], [1.0])
+    first = figures.work_precision({"one": ([1, 2], [1, 2])})
     assert figures.work_precision({"GFNN": ([1, 2], [1, 2])}, ax=first) is first
 
 

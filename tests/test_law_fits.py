@@ -350,7 +350,8 @@ def test_a_driven_mass_has_a_law_of_one_term():
     assert friction.coefficient == pytest.approx(0.25, rel=1e-3)
 
 
-@pytest.mark.parametrize("moved", [0.1, pytest.param(0.7, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("moved", [0.1, 0.7])
 def test_a_law_that_does_not_follow_its_record_is_said_to(moved):
     """As where the sensor moved half way, for good."""
     t, x = pendulum(end=20.0)
@@ -812,7 +813,8 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     np.testing.assert_allclose(p, found["hold"].fit.p, atol=2 * error.max())
 
 
-@pytest.mark.parametrize("hold", [pytest.param("hold", marks=pytest.mark.slow), "linear"])
+@pytest.mark.slow
+@pytest.mark.parametrize("hold", ["hold", "linear"])
 def test_rules_that_chance_tells_apart_have_no_delay(hold):
     """ẍ = −36.8 x − 0.32 ẋ + 1.24 u, u slow beside its samples: held, or linear in between. Half a
     sample later one rule acts as the other does."""

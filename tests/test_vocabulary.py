@@ -102,6 +102,7 @@ def test_a_constant_torque_on_an_angle_that_turns_over():
     within_errors(fit.friction, {"v1**2": 0.6})
 
 
+@pytest.mark.slow
 def test_an_elastic_pendulum_in_the_plane_has_a_distance():
     """V = 3 (r − 1)² + y: the coefficient of r, and of x² and y²."""
 

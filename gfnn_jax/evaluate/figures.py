@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
 from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.evaluate.figures_of_recordings import begin_of as begin_of
@@ -545,22 +545,6 @@ def _front(ax, curves):
     cost, error = (np.concatenate([np.ravel(c[i]) for c in curves]) for i in (0, 1))
     look: dict[str, Any] = {"color": COLOURS[5], "lw": 4, "alpha": 0.45, "zorder": 1.5}
     ax.step(*_unbeaten(cost, error), where="post", label="best of our maps", **look)
-
-
-@style()
-def training_curve(train_rms, validation_rms, ax=None) -> Axes:
-    """Draw the residual on training and validation pairs after each epoch, (E,) each."""
-    ax = _axes_or_new(ax)
-    epochs = 1 + np.arange(len(train_rms))
-    best = int(np.nanargmin(validation_rms))
-    ax.plot(epochs, train_rms, color=COLOURS[0], label="training pairs")
-    ax.plot(epochs, validation_rms, color=COLOURS[1], ls="--", label="held-out pairs")
-    star = _ALONE | {"marker": "*", "ms": 10, "color": COLOURS[1]}
-    ax.plot(epochs[best], validation_rms[best], label=f"kept: epoch {best + 1}", **star)
-    ax.set(yscale="log", xlabel="epoch", ylabel="residual (RMS)")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.legend()
-    return ax
 
 
 @style()

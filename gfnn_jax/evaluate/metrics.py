@@ -32,17 +32,12 @@ class ErrorStatistics(NamedTuple):
 
 
 def position_error(predicted, reference, angles=()):
-    """Euclidean error of q, (B, L), of trajectories (B, L, 2d). See `momentum_error`."""
-    return _euclidean(split(_difference(predicted, reference, angles))[0])
-
-
-def momentum_error(predicted, reference, angles=()):
-    """Euclidean error of p, (B, L), of trajectories (B, L, 2d).
+    """Euclidean error of q, (B, L), of trajectories (B, L, 2d).
 
     ``angles`` are the indices in z of the coordinates with period 2π, a q or a p: their
     differences are taken to the nearest image, in [−π, π].
     """
-    return _euclidean(split(_difference(predicted, reference, angles))[1])
+    return _euclidean(split(_difference(predicted, reference, angles))[0])
 
 
 def absolute_error(predicted, reference):
@@ -53,7 +48,7 @@ def absolute_error(predicted, reference):
 def one_step_rms(predicted, reference, angles=()) -> float:
     """RMS per component of predicted − reference, both (N, 2d): the one-step state error.
 
-    angles: argument of `momentum_error`. The result is inf where a prediction is not finite.
+    angles: as of `position_error`. The result is inf where a prediction is not finite.
     """
     return float(np.sqrt(np.mean(_difference(predicted, reference, angles) ** 2)))
 
