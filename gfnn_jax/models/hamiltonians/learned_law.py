@@ -42,9 +42,7 @@ from gfnn_jax.models.hamiltonians.friction import (
     without_turns,
 )
 from gfnn_jax.models.hamiltonians.problem import (
-    CONTRACTING,
-    FAST,
-    FREQUENCY_STATES,
+    OPTIONS,
     LawProblem,
     contraction_of,
     omega_h_of,
@@ -181,7 +179,7 @@ class LearnedHamiltonian:
     @property
     def fast(self) -> bool:
         """Return whether H oscillates so fast that other laws are not far from the same pairs."""
-        return self.omega_h > FAST
+        return self.omega_h > OPTIONS.fast
 
 
 TURNS = "friction is not smooth in steps in which a body turns or stops"
@@ -201,7 +199,7 @@ def learned_from(
     to arcs of them."""
     seconds = time.perf_counter() - started
     data, family, fit, whole = problem.data, found.family, found.fit, found.whole
-    c, scale, some = fit.coefficients, data.scale, slice(FREQUENCY_STATES)
+    c, scale, some = fit.coefficients, data.scale, slice(OPTIONS.rated)
     z, args = data.y0[data.validation], data.given(data.validation)[1]
     fastest = rates(family, c, data.y0[some], data.given(some)[1])
     own_steps = problem.cheapest(family, fit, fastest, without_turns(data, family, c).training)
@@ -210,7 +208,7 @@ def learned_from(
     steps = dataclasses.replace(own_steps, substeps=max(fewest, own_steps.substeps))
     steps = problem.resolving(family, c, steps)
     contraction = contraction_of(fastest, data.dt, steps)
-    by_newton = (contraction > CONTRACTING or bool(widths)) and not matrix_free(family)
+    by_newton = (contraction > OPTIONS.contracting or bool(widths)) and not matrix_free(family)
     off = truncation(family, c, z, data.dt, steps, args=args, scale=scale) / scale
     flow = Flow(family, c, data.dt, scale, steps.stages, steps.substeps, by_newton)
     of_all = dataclasses.replace(steps, substeps=flow.over(np.max(data.each_dt)).substeps)

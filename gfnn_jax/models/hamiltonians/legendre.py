@@ -20,16 +20,9 @@ from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
-from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.hamiltonians.problem import OPTIONS, LawProblem
 from gfnn_jax.models.lagrangians.libraries import SINE, modes, unit
 from gfnn_jax.phase_space import split
-
-# Σ|m_i| of the modes of angles and the degree of the powers of lengths in a mass; the degree of
-# those in a potential (benchmarks/double_pendulum.py).
-_SHORTEST, _POTENTIAL = 2, 4
-# Shares of p and ṗ: the terms that make more in the middle of pairs are fitted first. A law of few
-# terms is then found for a tenth of the operations; the middle is off by O(dt²), some per cent.
-_SHARES = (0.05, 0.01)
 
 
 def lagrangian_of(
@@ -48,7 +41,7 @@ def lagrangian_of(
         return None
     start = _start(family, problem.flows, rows)
     last = None
-    for share in (*_SHARES, 0.0):
+    for share in (*problem.options.shares, 0.0):
         kept, few = start.large(share)
         if last is not None and len(kept) == last.family.num_parameters:
             continue
@@ -71,7 +64,7 @@ def _fitted(problem: LawProblem, family: Legendre, start: np.ndarray, forces) ->
 def library(dim: int, angles: tuple[int, ...]) -> Terms:
     """Masses of modes of the angles and powers of the lengths, potentials of both."""
     none, lengths = (0,) * dim, [i for i in range(dim) if i not in angles]
-    waves = [none, *sorted(modes(dim, angles, _SHORTEST))]
+    waves = [none, *sorted(modes(dim, angles, OPTIONS.shortest))]
 
     def functions(degree: int) -> list[tuple]:
         powers = [
@@ -83,8 +76,8 @@ def library(dim: int, angles: tuple[int, ...]) -> Terms:
         return [(n, wave, phase) for n in powers for wave in waves for phase in phases[wave]]
 
     speeds = [unit(dim, *pair) for pair in combinations_with_replacement(range(dim), 2)]
-    masses = [(speed, *rest) for speed in speeds for rest in functions(_SHORTEST)]
-    potentials = [(none, *rest) for rest in functions(_POTENTIAL)]
+    masses = [(speed, *rest) for speed in speeds for rest in functions(OPTIONS.shortest)]
+    potentials = [(none, *rest) for rest in functions(OPTIONS.potential)]
     return Terms.of([*masses, *(row for row in potentials if any(row[1]) or any(row[2]))], dim)
 
 

@@ -19,12 +19,8 @@ from gfnn_jax.families.told import Constrained, Told, anything_told, told_of, un
 from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
-from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.hamiltonians.problem import OPTIONS, LawProblem
 from gfnn_jax.models.parameters import angles_and_others
-
-# Pairs, from which on the midpoints of a sample tell libraries apart, and times what another one
-# leaves of their gradients, too far from them (three bodies).
-_TELLING, _WORSE = 60, 3.0
 
 
 def modes_of(problem: LawProblem) -> Modes | None:
@@ -97,14 +93,11 @@ def libraries_of(problem: LawProblem) -> Iterator[Terms | Sums | Constrained]:
 def promising(libraries: list[Any], data: Dataset) -> list[Any]:
     """The libraries but those that leave far more of the midpoints' gradients over than another
     does, as that of equal bodies does of unequal ones: the fit of such a one takes longest."""
-    if data.varied or len(data.training) < _TELLING:
+    if data.varied or len(data.training) < OPTIONS.telling:
         return libraries
     left = [misfit(family, data, MIDPOINT) for family in libraries]
-    most = _WORSE * min(left, default=np.inf)
+    most = OPTIONS.worse * min(left, default=np.inf)
     return [f for f, part in zip(libraries, left, strict=True) if part <= most]
-
-
-_ROUNDS = 10  # of holding and fitting, at most
 
 
 def told_terms(dim: int, terms: Iterable[Any]) -> tuple[Told, ...]:
@@ -144,7 +137,7 @@ def within_bounds(problem: LawProblem, law: FittedLaw) -> FittedLaw:
     held: dict[int, float] = {}
     fit = law.fit
     rows = np.setdiff1d(problem.data.training, np.setdiff1d(law.rows, fit.used))
-    for _ in range(_ROUNDS):
+    for _ in range(problem.options.rounds):
         found = problem.flows.linearised(family, c, fit.steps, rows).rebased(c)
         columns, target = found.factor[:, :-1], found.factor[:, -1]
         size = np.linalg.norm(columns, axis=0)

@@ -33,7 +33,7 @@ from gfnn_jax.models.hamiltonians.libraries import (
     own_terms,
     promising,
 )
-from gfnn_jax.models.hamiltonians.problem import FAST, FREQUENCY_STATES, LawProblem, operations_of
+from gfnn_jax.models.hamiltonians.problem import LawProblem, operations_of
 from gfnn_jax.models.parameters import states_and_functions, walked
 
 NONE: Mapping[int, FittedLaw] = MappingProxyType({})
@@ -314,7 +314,7 @@ def exceeds_cost(problem: LawProblem, family, last: FittedLaw) -> bool:
     if not np.isfinite(problem.dearest):
         return False
     data, fit, flows = problem.data, last.fit, problem.flows
-    fastest = rates(last.family, fit.coefficients, data.y0[:FREQUENCY_STATES])
+    fastest = rates(last.family, fit.coefficients, data.y0[: problem.options.rated])
 
     def dear(family) -> bool:
         cost = operations_of(family, 2 * family.dim, fastest, flows.dt, fit.steps)
@@ -379,10 +379,10 @@ def _starts(problem: LawProblem, family, rows, last: FittedLaw | None) -> Iterat
     known = len(many) > flows.z0.shape[1] and not matrix_free(family)
     if args is None and np.ndim(dt) == 0 and known:
         turned = forward_start(family, flows.z0[many], flows.z1[many], dt, flows.scale)
-    if turned is not None and turned[0] > FAST:
+    if turned is not None and turned[0] > problem.options.fast:
         yield turned[1]
     yield _start(problem, family, rows, last)
-    if turned is not None and turned[0] <= FAST:
+    if turned is not None and turned[0] <= problem.options.fast:
         yield turned[1]
 
 

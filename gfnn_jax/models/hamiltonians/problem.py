@@ -61,6 +61,15 @@ class LawOptions:
     misses the tolerance is of no use, so that the search ends where it is out of reach.
     roundoff: of the spread, above it the pairs carry noise, and every one of them counts;
     near_roundoff: of a flow's own error.
+    fast: of ωh, from here on other laws are not far from the same pairs. contracting: a fixed
+    point's factor up to which it is preferred to Newton's method. rated: states by which
+    frequencies are known. telling: pairs, from which on the midpoints of a sample tell libraries
+    apart, and worse: times what another one leaves of their gradients, too far from them (three
+    bodies). rounds: of holding coefficients at their bounds and fitting, at most.
+    shortest, potential: of L, Σ|m_i| of the modes of angles and the degree of the powers of lengths
+    in a mass, and the degree in a potential (benchmarks/double_pendulum.py). shares: of p and ṗ,
+    the terms that make more in the middle of pairs are fitted first: a law of few terms is then
+    found for a tenth of the operations; the middle is off by O(dt²), some per cent.
     """
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
@@ -104,14 +113,18 @@ class LawOptions:
     only_within: bool = True
     roundoff: float = 1e-12
     near_roundoff: float = 3e-15
+    fast: float = np.pi / 2
+    contracting: float = 0.8
+    rated: int = 500
+    telling: int = 60
+    worse: float = 3.0
+    rounds: int = 10
+    shortest: int = 2
+    potential: int = 4
+    shares: tuple[float, ...] = (0.05, 0.01)
 
 
 OPTIONS = LawOptions()
-
-
-FAST = np.pi / 2  # of ωh: from here on other laws are not far from the same pairs
-CONTRACTING = 0.8  # a fixed point's factor up to which it is preferred to Newton's method
-FREQUENCY_STATES = 500  # by which frequencies are known
 
 
 def contraction_of(fastest, dt: float, steps: Steps) -> float:
@@ -126,16 +139,16 @@ def operations_of(family, width: int, fastest, dt: float, steps: Steps) -> float
     gradient, with_hessian = family.operations
     s = steps.stages
     factor = contraction_of(fastest, dt, steps)
-    if factor > CONTRACTING and not matrix_free(family):
+    if factor > OPTIONS.contracting and not matrix_free(family):
         one = s * with_hessian + (s * width) ** 3 * 2 / 3
         return float(steps.substeps * 4 * one)
-    iterations = 2 + np.log(1e-16) / np.log(np.clip(factor, 1e-3, CONTRACTING))
+    iterations = 2 + np.log(1e-16) / np.log(np.clip(factor, 1e-3, OPTIONS.contracting))
     return float(steps.substeps * iterations * s * (gradient + 2 * width * s))
 
 
 def flow_operations(flow: Flow, data: Dataset) -> float:
     """Floating-point operations per step of the flow."""
-    fastest = rates(flow.family, flow.params, data.y0[:FREQUENCY_STATES])
+    fastest = rates(flow.family, flow.params, data.y0[: OPTIONS.rated])
     steps = Steps(flow.stages, flow.substeps)
     return operations_of(flow.family, len(data.scale), fastest, float(flow.dt), steps)
 
@@ -143,7 +156,7 @@ def flow_operations(flow: Flow, data: Dataset) -> float:
 def omega_h_of(family, coefficients, data: Dataset, fastest) -> float:
     """The fastest oscillation of the linearised flow, radians per step, its median over states."""
     if not matrix_free(family):
-        some = slice(FREQUENCY_STATES)
+        some = slice(OPTIONS.rated)
         z, args = data.y0[some], data.given(some)[1]
         _, hessian = family.gradient_and_hessian(coefficients, z, args)
         turned = symplectic_form(data.dim) @ hessian
