@@ -23,13 +23,8 @@ from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.rates import rates
 from gfnn_jax.models.generating_functions.sweeps import sweeps_for, trial_residual
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
-from gfnn_jax.models.hamiltonians.problem import (
-    CONTRACTING,
-    FREQUENCY_STATES,
-    LawProblem,
-    contraction_of,
-    flow_operations,
-)
+from gfnn_jax.models.hamiltonians.problem import OPTIONS as OF_H
+from gfnn_jax.models.hamiltonians.problem import LawProblem, contraction_of, flow_operations
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.search.search import Entry, Found, Search
 
@@ -186,8 +181,8 @@ def flow_of(family: Terms, params, data: Dataset) -> Flow:
     y0, y1, dt, scale = data.y0, data.y1, data.dt, data.scale
     problem = Problem(y0, y1, dt, scale)
     (steps,) = problem.fine_steps(family, params, np.arange(len(y0)))
-    fastest = rates(family, params, y0[:FREQUENCY_STATES])
-    by_newton = not contraction_of(fastest, dt, steps) <= CONTRACTING
+    fastest = rates(family, params, y0[: OF_H.rated])
+    by_newton = not contraction_of(fastest, dt, steps) <= OF_H.contracting
     flow = Flow(family, params, dt, scale, steps.stages, steps.substeps, by_newton)
     failed = ~np.isfinite(np.concatenate([flow.image(y0), flow.inverse().image(y1)])).all(axis=1)
     if failed.any():
