@@ -7,7 +7,9 @@ A map without a law is S in the chart of a known bracket, as far as `fit_lie_map
 80 % of 1,000 to 1,300 pairs; its error is that of the executed step on 200 further ones, RMS ÷
 spread. ``beside``: a free top from the same 400 pairs by the law with its bracket, and by fields
 of degree 2: PySINDy's (``pip install gfnn_jax[peers]``), one of finite differences, and one fitted
-through the Runge–Kutta step of order 4 that steps all fields. |M| and orbits of five fresh starts
+through the Runge–Kutta step of order 4 that steps all fields; and by a Poisson network (P. Jin et
+al., arXiv:2012.03133), coupling layers to (q, p, c), shears of (q, p) that c enters, and back. |M|
+and orbits of five fresh starts
 are compared with the flow of the true law. M² is a Casimir of the true bracket; the law's may have
 another of a top's family, with M² as its H.
 """
@@ -19,11 +21,13 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+import optax
 from harness import FIGURES, TABLES, Numbers, between_markers, markdown, number, provenance, results
 from harness import main as run_pieces
 from scipy.integrate import solve_ivp
@@ -167,9 +171,86 @@ def beside(quick: bool) -> Numbers:
     states = np.concatenate([short, long[:, np.array(own) // 200]], axis=1).swapaxes(0, 1)
     found = {"law with its bracket": compared(states, reference)}
     found |= {name: compared(rolled(step), reference) for name, step in by_steps.items()}
+    trained = trained_network(z0, z1, 500 if quick else TRAINING)
+    network = compared(rolled(partial(network_step, trained.params)), reference)
+    found[f"Poisson network, {trained.numbers:,} numbers"] = {
+        **network,
+        "error": trained.error,
+        "cpu_seconds": trained.cpu_seconds,
+    }
     if sindy is None:
         found["PySINDy's field, Runge–Kutta 4"] = {"absent": "not installed"}
     return found
+
+
+COUPLINGS, SHEARS, WIDTH, TRAINING = 6, 8, 32, 20_000
+
+
+class Trained(NamedTuple):
+    """A Poisson network: its one-step error RMS ÷ spread, and how long Adam took."""
+
+    params: Any
+    numbers: int
+    error: float
+    cpu_seconds: float
+
+
+def perceptron(params, x):
+    """Numbers (..., out) of one hidden layer."""
+    inside, shift, outside = params
+    return jnp.tanh(x @ inside + shift) @ outside
+
+
+def to_darboux(couplings, z, back: bool = False):
+    """(q, p, c) of states z (..., 3), each coordinate in turn scaled and moved by the others."""
+    order = range(COUPLINGS)
+    for k in reversed(order) if back else order:
+        own = jnp.arange(3) == k % 3
+        scale, move = jnp.split(perceptron(couplings[k], jnp.where(own, 0.0, z)), 2, axis=-1)
+        moved = (z - move) * jnp.exp(-scale) if back else z * jnp.exp(scale) + move
+        z = jnp.where(own, moved, z)
+    return z
+
+
+def network_step(params, z):
+    """The next states (..., 3) by a Poisson network."""
+    couplings, shears = params
+    y = to_darboux(couplings, z)
+    for k, own in enumerate(shears):
+        moved = jnp.arange(3) == k % 2
+        y = y + jnp.where(moved, perceptron(own, jnp.where(moved, 0.0, y)), 0.0)
+    return to_darboux(couplings, y, back=True)
+
+
+def trained_network(z0, z1, iterations: int) -> Trained:
+    """A Poisson network fitted to all pairs at once by Adam, whose rate falls along a cosine."""
+    rng, started = np.random.default_rng(0), time.process_time()
+
+    def layer(out: int):
+        inside = rng.normal(size=(3, WIDTH)) / np.sqrt(3)
+        return inside, 0.3 * rng.normal(size=WIDTH), 0.1 * rng.normal(size=(WIDTH, out))
+
+    params = [layer(2) for _ in range(COUPLINGS)], [layer(1) for _ in range(SHEARS)]
+    adam = optax.adam(optax.cosine_decay_schedule(3e-3, iterations, 1e-3))
+    spread = z0.std(axis=0)
+
+    def loss(params):
+        return jnp.mean(((network_step(params, z0) - z1) / spread) ** 2)
+
+    def more(carry, _):
+        params, state = carry
+        value, slope = jax.value_and_grad(loss)(params)
+        change, state = adam.update(slope, state)
+        return (optax.apply_updates(params, change), state), value
+
+    @jax.jit
+    def train(params):
+        return jax.lax.scan(more, (params, adam.init(params)), length=iterations)
+
+    (params, _), values = jax.block_until_ready(train(jax.tree.map(jnp.asarray, params)))
+    numbers = sum(leaf.size for leaf in jax.tree.leaves(params))
+    seconds = time.process_time() - started
+    return Trained(params, numbers, float(np.sqrt(values[-1])), seconds)
 
 
 def by_sindy(orbits: np.ndarray, dt: float) -> np.ndarray | None:
@@ -214,6 +295,11 @@ def draw(found: Numbers) -> None:
     save(figure, FIGURES / "bracket_peers.png", dpi=130)
 
 
+def trained(m: Numbers) -> str:
+    """What a network's training took and reached."""
+    return f"{m['cpu_seconds']:.0f} CPU s, step {m['error']:.1e}" if "error" in m else "–"
+
+
 NAMES = ("kicked top", "free top", "heavy top", "four populations in logs")
 PIECES = {
     name.replace(" ", "-"): (lambda quick, name=name: without_law(name, quick)) for name in NAMES
@@ -234,10 +320,10 @@ def tables() -> None:
         peers = found["beside"]["measured"]
         draw(peers)
         rows = [
-            [name, m.get("absent") or number(m["casimir"]), number(m.get("orbit"))]
+            [name, m.get("absent") or number(m["casimir"]), number(m.get("orbit")), trained(m)]
             for name, m in peers.items()
         ]
-        heads = ("free top, 400 pairs; after 10⁵ steps", "change of M", "orbit")
+        heads = ("free top, 400 pairs; after 10⁵ steps", "change of M", "orbit", "training")
         text += "\n\n" + markdown(heads, rows)
         text += "\n\n![Changes of M and errors of orbits over 10⁵ steps](figures/bracket_peers.png)"
     between_markers(TABLES, "bracket_maps", f"{text}\n\n{provenance(found)}")
