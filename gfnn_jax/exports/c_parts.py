@@ -88,6 +88,16 @@ static void to_user(const double y[4], double z[4])
 """
 
 
+def logarithms(width: int) -> str:
+    """Write the change of states (width,) to their logarithms in C, and back."""
+    ways = (("inner", "y", "log(z[i])"), ("user", "z", "exp(y[i])"))
+    return "\n".join(
+        f"static void to_{way}(const double *{'z' if to == 'y' else 'y'}, double *{to})\n"
+        f"{{\n    for (int i = 0; i < {width}; i++)\n        {to}[i] = {value};\n}}\n"
+        for way, to, value in ways
+    )
+
+
 def newton_solver(unknowns: int, width: int) -> str:
     """Write Newton's method in C for at most ``unknowns`` unknowns of states (width,)."""
     rules, bend = newton.RULES, newton.RULES.bent

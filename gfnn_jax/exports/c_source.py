@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax.coordinates import CARTESIAN, polar
+from gfnn_jax.coordinates import CARTESIAN, LOG, polar
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports import c_parts
 from gfnn_jax.exports.c_pieces import (
@@ -42,11 +42,12 @@ def why_not(map_: SymplecticMap) -> str | None:
     """Reason why a map cannot be written in C; None where it can."""
     if np.dtype(map_.scale.dtype) != np.float64:
         return f"the map is of {np.dtype(map_.scale.dtype)}, not of float64"
-    if map_.coordinates.forward not in (CARTESIAN.forward, _POLAR):
+    if map_.coordinates.forward not in (CARTESIAN.forward, LOG.forward, _POLAR):
         return f"the map has the {map_.coordinates.name} coordinates of its scene"
     if not isinstance(map_.domain, Domain):
         return "the map is a sum over equal sites"
-    return next((why for piece in map_.pieces if (why := why_not_piece(piece))), None)
+    pieces = map_.pieces if map_.bracket is None else ()  # its rates are formulas
+    return next((why for piece in pieces if (why := why_not_piece(piece))), None)
 
 
 def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any], taylor: bool = False) -> str:
@@ -59,7 +60,7 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any], taylor: b
     a map that cannot be written in C.
     """
     graph = graph_of(map_) if taylor else None
-    if graph is not None:  # stiff friction needs no Newton's method: bodies slide or stick
+    if graph is not None and map_.bracket is None:  # stiff friction needs no Newton's method
         map_ = dataclasses.replace(
             map_, pieces=(dataclasses.replace(map_.pieces[0], newton=False),)
         )
@@ -69,7 +70,7 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any], taylor: b
             "and formulas: use --to stablehlo"
         )
     map_ = jax.tree.map(np.asarray, map_)
-    pieces, width, domain = map_.pieces, 2 * map_.dim, map_.domain
+    pieces, width, domain = map_.pieces, map_.width, map_.domain
     more = num_args(map_)
     assert isinstance(domain, Domain)
     sticks = graph is not None and graph.sticks
@@ -78,6 +79,8 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any], taylor: b
         parts.append(c_parts.ANGLES)
     if map_.coordinates.forward is _POLAR:
         parts.append(c_parts.POLAR)
+    if map_.coordinates.forward is LOG.forward:
+        parts.append(c_parts.logarithms(width))
     most = max((unknowns(p, map_.dim) for p in pieces if isinstance(p, Generated)), default=0)
     if most:
         parts.append(c_parts.newton_solver(most, width))
@@ -109,7 +112,7 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any], taylor: b
 
 
 def _signature(map_: SymplecticMap, name: str) -> str:
-    width, more = 2 * map_.dim, num_args(map_)
+    width, more = map_.width, num_args(map_)
     args = f"const double args[{more}], " if more else ""
     return f"int {name}(const double z[{width}], {args}double Z[{width}])"
 
@@ -117,7 +120,7 @@ def _signature(map_: SymplecticMap, name: str) -> str:
 def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str], ahead: Sequence[str]) -> str:
     """Write the public function: `maps.inner.applied` of one state; args follow it in y, moved by
     the lines ``ahead``."""
-    width, angles, domain = 2 * map_.dim, map_.coordinates.angles, map_.domain
+    width, angles, domain = map_.width, map_.coordinates.angles, map_.domain
     more = num_args(map_)
     changed = map_.coordinates.forward is not CARTESIAN.forward
     centres = np.ravel(np.asarray(map_.angle_centre))
@@ -164,7 +167,7 @@ def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any], sticks: b
         else """
    Bodies stick and slide. What sticks does not tell where it came from: the inverse answers 3."""
     )
-    names = coordinate_names(map_.dim)
+    names = coordinate_names(map_.dim) if map_.bracket is None else map_.bracket.labels
     sizes = ", ".join(f"{n} {s:.3g}" for n, s in zip(names, map_.scale, strict=True))
     angles = [names[i] for i in map_.coordinates.angles if map_.coordinates.forward is not _POLAR]
     turned = f" {', '.join(angles)}: period 2 pi, any number of turns." if angles else ""
@@ -210,7 +213,7 @@ def _num_coefficients(signals: Signals) -> int:
 
 def args_after(map_: SymplecticMap) -> list[str]:
     """Lines that move the args in y from a step's begin to its end, where the inverse begins."""
-    width, more, dt = 2 * map_.dim, num_args(map_), float(map_.dt)
+    width, more, dt = map_.width, num_args(map_), float(map_.dt)
     if map_.parameters is not None and map_.parameters.period is not None:
         names, period = map_.parameters.names, float(map_.parameters.period)
         later = map_.parameters.after(np.zeros((1, len(names))), 1, dt)[0, -1]
@@ -258,7 +261,7 @@ def inside_ranges(map_: SymplecticMap) -> list[str]:
     if map_.parameters is None:
         return []
     low, high = map_.parameters.bounds
-    given, lines = [f"y[{2 * map_.dim + k}]" for k in range(len(low))], []
+    given, lines = [f"y[{map_.width + k}]" for k in range(len(low))], []
     if map_.parameters.period is not None:
         time, period = given[-1], literal(float(map_.parameters.period))
         turns = f"floor(({time} - {literal(low[-1])})/{period})"

@@ -103,12 +103,13 @@ def export(
         return out
     map_ = map_ if isinstance(map_, SymplecticMap) else saved.load(map_)
     about = _about(folder)
-    if to in _PRINTERS and map_.bracket is not None:
+    of_law = isinstance(map_.pieces[0], (Flow, LieFlow, DampedFlow))
+    if to in _PRINTERS and map_.bracket is not None and (to != "c-taylor" or not of_law):
         raise InputError(
             f"this map has a bracket of its own, {map_.bracket.name}, of which --to {to} makes no "
             "step: use --to stablehlo"
-            + " or, for the formula of its law, --to latex"
-            * isinstance(map_.pieces[0], (Flow, LieFlow, DampedFlow))
+            + ", --to c-taylor or, for the formula of its law, --to latex"
+            * of_law
         )
     if to in _PRINTERS:
         atomic_write(out, _PRINTERS[to](map_, _identifier(out), about))

@@ -16,16 +16,19 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.brackets import Bracket, Log
+from gfnn_jax.coordinates import CARTESIAN, LOG
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports.c_pieces import on_symbols, why_not_piece
 from gfnn_jax.exports.symbols import Symbol, Tape
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.lagrangian import DRY, LINEAR, ONE_SIDED, POWER, QUADRATIC, Friction
+from gfnn_jax.flows.damped import DampedFlow
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.legendre import Legendre, law_of
+from gfnn_jax.flows.lie import LieFlow
 from gfnn_jax.flows.uniform import without_forces
 from gfnn_jax.maps.laws import is_of_law
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -107,30 +110,33 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
     Raises InputError for a map that is no flow of a law in Cartesian coordinates, or whose law is
     no formula.
     """
-    if len(map_.pieces) != 1 or not isinstance(map_.pieces[0], Flow):
+    piece, bracket = map_.pieces[0], map_.bracket
+    if len(map_.pieces) != 1 or not isinstance(piece, Flow | LieFlow | DampedFlow):
         raise InputError(
             "this map has no law, whose rates would be exported: use --to c or --to stablehlo"
         )
-    if map_.coordinates.forward is not CARTESIAN.forward:
+    if map_.coordinates.forward not in (CARTESIAN.forward, LOG.forward):
         raise InputError(
             f"this law is one in {map_.coordinates.name} coordinates: use --to c or --to stablehlo"
         )
     sensors = map_.sensors
     map_ = jax.tree.map(np.asarray, map_)  # drops the sensors
-    piece = map_.pieces[0]
-    reason = why_not_piece(dataclasses.replace(piece, newton=False))
+    piece: Any = map_.pieces[0]
+    reason = why_not_piece(dataclasses.replace(piece, newton=False)) if bracket is None else None
     if reason is not None:
         raise InputError(f"this law cannot be written as formulas: {reason}")
     dim, params = map_.dim, np.asarray(piece.params)
     base, inputs, degree = _arguments(map_)
     tape = Tape()
-    z, u = tape.inputs("z", 2 * dim), tape.inputs("u", len(base) + len(inputs))
+    z, u = tape.inputs("z", map_.width), tape.inputs("u", len(base) + len(inputs))
     plain = params.ndim == 1
     p = tape.inputs("p", params.size)[0] if plain else params
     args = u if u.size else None
     family = on_symbols(_held(piece.family))
     speeds, limits, directions = [], [], np.zeros((0, dim), int)
-    if is_of_law(map_):
+    if bracket is not None:
+        rates = _of_bracket(bracket, piece, p, z, args)
+    elif is_of_law(map_):
         rates, speeds, limits, directions = _of_lagrangian(
             tape, family, p, z, args, getattr(sensors, "creep", 0.0) if sharp else -1.0
         )
@@ -149,15 +155,32 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
         speeds,
         limits,
         directions,
-        coordinate_names(dim),
+        coordinate_names(dim) if bracket is None else bracket.labels,
         (*base, *inputs),
-        tuple(piece.family.term_names) if plain else (),
+        tuple(getattr(piece.family, "family", piece.family).term_names)
+        if bracket is not None
+        else tuple(piece.family.term_names)
+        if plain
+        else (),
         params if plain else np.zeros(0),
         tuple(series),
         time,
         float(map_.dt),
         np.asarray(map_.scale, float),
     )
+
+
+def _of_bracket(bracket: Bracket, piece: Any, p, z, args) -> list[Any]:
+    """B∇H − Ez, of log z where the bracket is log-canonical."""
+    if isinstance(bracket, Log):
+        return list(bracket.form @ piece.family.gradient(p, z, args)[0])
+    family = piece.family.family if isinstance(piece, Flow) else piece.family
+    count = family.num_parameters
+    rates = list(bracket.matrix(z)[0] @ family.gradient(p[:count], z, args)[0])
+    drags = piece.frame.dilations.matrices if isinstance(piece, DampedFlow) else ()
+    for c, matrix in zip(p[count:], drags, strict=True):
+        rates = [rate - c * drag for rate, drag in zip(rates, matrix @ z[0], strict=True)]
+    return rates
 
 
 def _arguments(map_: SymplecticMap) -> tuple[tuple[str, ...], tuple[str, ...], int]:
