@@ -147,7 +147,7 @@ def run(path: Path, case: Case) -> Numbers:
         assert process.stdout is not None
         for line in process.stdout:
             lines.append(line)
-            if "law, its bands are yet to come" in line and law is None:
+            if "law (its bands follow)" in line and law is None:
                 law = time.perf_counter() - started, processor_seconds(process.pid)
             if time.perf_counter() - started > MOST_SECONDS:
                 process.kill()

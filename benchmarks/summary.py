@@ -22,7 +22,7 @@ def measured(name: str) -> Numbers:
     return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))["measured"]
 
 
-_IN_PROSE = re.compile(r"[^\s(]+(?=<!-- ([\w.-]+)/([^>]+?) -->)")
+_IN_PROSE = re.compile(r"[^\s(]+(?=<!--\s([\w.-]+)/([^>]+?)\s-->)")
 
 
 def in_prose(text: str) -> str:
@@ -30,7 +30,7 @@ def in_prose(text: str) -> str:
 
     def shown(found: re.Match[str]) -> str:
         value = measured(found[1])
-        for key in found[2].split("/"):
+        for key in " ".join(found[2].split()).split("/"):
             value = value[key]
         return number(value)
 

@@ -104,7 +104,7 @@ class Bracket:
         if failure > _ROUNDOFF * size**2:
             raise FitError(
                 f"Jacobi's identity fails by {failure / size**2:.1e} of the constants' size: "
-                "these are no constants of a Lie algebra"
+                "these constants are not those of a Lie algebra"
             )
         return LieAlgebra(constants, None, (), tuple(names))
 
@@ -134,7 +134,7 @@ class Bracket:
         slope = np.asarray(bracket.curl_slopes(probes))  # ∂_k F_ij
         closed = slope + np.moveaxis(slope, -1, -3) + np.moveaxis(slope, -3, -1)
         if np.abs(closed).max() > _ROUNDOFF * max(np.abs(slope).max(), 1e-300):
-            raise FitError("the field F(x) is no curl: ∂_k F_ij + ∂_i F_jk + ∂_j F_ki is not 0")
+            raise FitError("the field F(x) is not a curl: ∂_k F_ij + ∂_i F_jk + ∂_j F_ki is not 0")
         return bracket
 
     @property

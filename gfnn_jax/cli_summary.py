@@ -140,7 +140,10 @@ def _print_ahead(found: Any, held_out: Any) -> None:
             f"forecasts of the last third, which no fit has seen: median error of {name} "
             f"{sizes}{unit} after {ahead} s"
         )
-    print(f"{100 * found.within:.0f} % of it lies within two standard deviations (95 % expected)")
+    print(
+        f"{100 * found.within:.0f} % of what was measured lies within two standard deviations "
+        "(95 % expected)"
+    )
 
 
 def print_law(fit: Any, ahead: Callable[[], None] | None = None) -> None:

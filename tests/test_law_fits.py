@@ -559,7 +559,7 @@ def test_the_friction_that_a_record_shows(swing):
 @pytest.mark.parametrize("asked", ["dry+linear", "linear+uniform", "quadratic"])
 def test_friction_that_is_asked_for_dissipates_or_is_said_to_be_none(asked):
     """Of a record without any: ρ ≥ 0 at its bound, with a limit."""
-    with pytest.warns(gfnn.FitWarning, match="friction was asked for, and the record shows none"):
+    with pytest.warns(gfnn.FitWarning, match="friction was requested, and the record shows none"):
         fit = gfnn.fit(undamped(), friction=asked)
     assert fit.friction.terms == ()
     assert 0 < max(fit.which_friction.limits.values()) < 1e-3

@@ -341,7 +341,7 @@ def _trajectories(
         if times is not None:
             raise InputError(f"{path}: expected t0 or times, found both")
         if step is None:
-            raise InputError(f"{path}: expected dt or times, by which t0 goes on, found neither")
+            raise InputError(f"{path}: expected dt or times, by which t0 increases, found neither")
         count, length = (1, *array.shape)[-3:-1]
         times = archive.t0(count)[:, None] + step * np.arange(length)
     step = np.nan if request.initial or step is None else step

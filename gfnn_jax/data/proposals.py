@@ -91,7 +91,7 @@ def _states(traits: Traits) -> Iterator[Fault]:
     yield Fault(
         "first order",
         f"the rates of {shown} are functions of {shown} themselves{keeps}, as {what}: these are "
-        "no positions",
+        "not positions",
         f"Learn their bracket: --structure poisson --states {shlex.quote(','.join(names))}",
         {"structure": "poisson", "states": names},
     )

@@ -43,7 +43,7 @@ _MEANING = {
     "not fitted": "The data were not fitted as they are.",
     "no law": "No law that was tried follows the motion.",
     "not mechanical": "The motion is not that of a mechanical system.",
-    "map": "No law of physics was found or asked for. The step is exactly symplectic all the same.",
+    "map": "No law of physics was found or requested. The step is exactly symplectic all the same.",
 }
 
 

@@ -110,7 +110,7 @@ def robot_of(map_: SymplecticMap) -> Robot:
     gyroscopic = np.abs(law.momentum(q, none)).max()
     if best.off > OPTIONS.most or gyroscopic > 1e-9:
         raise InputError(
-            f"this law is no planar chain of links, from which it differs by {best.off:.0%}: use "
+            f"this law is not a planar chain of links: it differs from one by {best.off:.0%}: use "
             "--to fmu or --to c"
         )
     return _of_chain(map_, law, best)

@@ -69,7 +69,7 @@ class OfPositions:
     def __str__(self) -> str:
         """Line about what was learned."""
         left = self.num_parameters - self.rank
-        kind = "symmetric, as of a reversible map" if self.symmetric else "of no symmetry"
+        kind = "symmetric, as S of a reversible map is" if self.symmetric else "of no symmetry"
         listed = "" if self.noise is None else ", ".join(f"{s:.3g}" for s in self.noise)
         return (
             f"S(q, Q) of {self.num_triples:,} triples of successive positions, {kind}. Positions "

@@ -158,7 +158,7 @@ def told(terms: Sequence[Any] | Mapping[Any, Any]) -> Sequence[Any]:
     texts = []
     for term, value in terms.items():
         if value is not None and not isinstance(term, str):
-            raise FitError("terms: expected text as a term of whose coefficient something is told")
+            raise FitError("terms: expected text as a term that is given with its coefficient")
         if isinstance(value, Between):
             texts.append(f"{value.low!r} <= {term} <= {value.high!r}")
         elif value is None:

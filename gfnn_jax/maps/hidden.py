@@ -46,7 +46,7 @@ class Hidden:
         names = ", ".join(self.names)
         if all(self.weights):
             return f"{names} are the modes of small swings, of which the column shows the sum"
-        return f"{self.names[1]} is a pendulum on {self.names[0]}, in a unit of its own"
+        return f"{self.names[1]} is a pendulum on {self.names[0]}, in its own unit"
 
     @property
     def rivals(self) -> str:

@@ -92,7 +92,7 @@ class LearnedArm:
         shown = "; ".join(lacking[:3]) + ("; …" if len(lacking) > 3 else "")
         return (
             f"partly: {len(lacking)} of {len(self.base.names)} base parameters are not determined "
-            f"by this motion ({shown}); swings of {self.swing} would tell most of them"
+            f"by this motion ({shown}); swings of {self.swing} would determine most of them"
         )
 
     @property

@@ -259,7 +259,7 @@ def rival(fit: LawFit, names: tuple[str, ...]) -> str:
     if unlikely - likely > OPTIONS.decided:
         return ""
     return (
-        "first order or mechanical: along this record positions tell the velocities, and "
+        "first order or mechanical: along this record the positions determine the velocities, and "
         f"{found.text(names)} follows it as the law does, with {numbers[0]} numbers for its "
         f"{numbers[1]}. Another start at the same positions would decide"
     )

@@ -213,9 +213,9 @@ def _zeros_and_sensors(
 def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str]:
     """Reasons why the law is not all of the motion, or is not reliable -> their remedy."""
     flaws = {
-        f"the law follows only {one.fit_percent:.0f} % of the variation of {name}, and the rest is "
-        "no noise": "a force, an input or a change of the sensor is missing. law.png (fit.traces) "
-        "shows when"
+        f"the law explains only {one.fit_percent:.0f} % of the variation of {name}, and the rest "
+        "is not noise": "a force, an input or a change of the sensor is missing. law.png "
+        "(fit.traces) shows when"
         for name, one in found.items()
         if one.fit_percent < OPTIONS.followed and not one.white
     }

@@ -106,8 +106,9 @@ def nature(
     if field or (not alone and first > max(OPTIONS.first, plain)):
         return Nature(
             "not mechanical",
-            f"first order, or one orbit: positions tell {100 * first:.1f} % of the velocities, "
-            "as of populations or concentrations" + (f": {field} to the noise" if field else ""),
+            f"first order, or one orbit: positions determine {100 * first:.1f} % of the "
+            "velocities, as of populations or concentrations"
+            + (f": {field} to the noise" if field else ""),
             partly=False,
         )
     jumps, when = _jumps(found)
@@ -129,18 +130,18 @@ def nature(
     if 1 - memory < (1 - OPTIONS.gains) * (1 - second):
         return Nature(
             "no law",
-            f"memory (hysteresis): positions and velocities tell {100 * second:.0f} % of the "
+            f"memory (hysteresis): positions and velocities explain {100 * second:.0f} % of the "
             f"accelerations, with the past of the positions {100 * memory:.0f} %",
         )
     if second > OPTIONS.second:
         return Nature(
             "no law",
-            f"positions and velocities tell {100 * second:.1f} % of the accelerations, by a force "
-            "that the terms tried lack: give terms that you know (--terms)",
+            f"positions and velocities explain {100 * second:.1f} % of the accelerations, by a "
+            "force that the terms tried lack: give terms that you know (--terms)",
         )
     return Nature(
         "no law",
-        f"unrecorded: positions and velocities tell only {100 * second:.0f} % of the "
+        f"unrecorded: positions and velocities explain only {100 * second:.0f} % of the "
         "accelerations. An input is missing (--inputs), or a coordinate",
         mostly=second > OPTIONS.mostly,
     )

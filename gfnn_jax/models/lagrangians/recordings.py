@@ -276,7 +276,7 @@ def _findings(
 ) -> tuple[CalibratedLaw, Findings]:
     """The law that was found, made ready for forecasts, and what its fit shows."""
     note, options = data.problem.on_progress, data.problem.options
-    note(f"law, its bands are yet to come: {line_of(recording, GaugedLaw.of(data, found.fit))}")
+    note(f"law (its bands follow): {line_of(recording, GaugedLaw.of(data, found.fit))}")
     model, choice, _ = _forecasting_best(found, data)
     fit = with_fine_steps(model.fit)
     measured = velocities(recording, fit)
@@ -352,7 +352,7 @@ def _at_bound(options: SearchOptions, choice: FrictionChoice, dim: int) -> list[
     if not absent:
         return []
     return [
-        f"{' and '.join(absent)} friction was asked for, and the record shows none: its "
+        f"{' and '.join(absent)} friction was requested, and the record shows none: its "
         "coefficient is 0, the least that friction can have. fit.which_friction tells the largest "
         "that the record allows"
     ]
@@ -603,7 +603,7 @@ def _with_hidden_drive(
     for stiff in (False, True) if searches else ():
         if (omega := hidden_frequency(problem, stiff)) is None:
             continue
-        problem.on_progress(f"a drive that nobody recorded: {omega:.5g} rad/s")
+        problem.on_progress(f"a drive that was not recorded: {omega:.5g} rad/s")
         with contextlib.suppress(FitError):
             _, law = searched(recording.driven_by(wave_names(omega)), "band")
             if _loudest(law.fit) < OPTIONS.explained * loud:
