@@ -326,7 +326,7 @@ def case(export: Export, folder: Path) -> Numbers:
         found = gfnn.read(path)
     except InputError as error:
         refused, options = str(error), dict(export.options)
-        if not options or not all(f"--{name}" in refused for name in options):
+        if not options or not all(f"{name}=" in refused for name in options):
             return {"read": False, "refused": refused}
         found = gfnn.read(path, **options)
     times, values = [], []

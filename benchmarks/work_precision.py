@@ -16,7 +16,7 @@ import functools
 import importlib.metadata
 import json
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 # Sets float64, so it comes before all of JAX.
@@ -43,9 +43,12 @@ from harness import main as run_pieces
 import jax
 import numpy as np
 from integrators import runners
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 import gfnn_jax as gfnn
 from gfnn_jax.evaluate import figures, metrics
+from gfnn_jax.evaluate.figures_style import GREY
 from gfnn_jax.jobs.methods import separable
 from gfnn_jax.scenes import Scene
 from gfnn_jax.solve.status import LEFT_DOMAIN
@@ -396,9 +399,7 @@ def draw(name: str, result: Numbers) -> None:
         "one trajectory alone": panel(points, "microseconds_single"),
     }
     label = f"median position error after {m['horizon_steps']} steps"
-    figures.save(
-        figures.work_precision_panels(panels, label), FIGURES / f"work_precision_{name}.png"
-    )
+    figures.save(panels_figure(panels, label), FIGURES / f"work_precision_{name}.png")
 
 
 def within(
@@ -536,6 +537,68 @@ def law_table(result: Numbers) -> str:
         "µs together, alone",
     )
     return markdown(heads, rows)
+
+
+@figures.style()
+def panels_figure(panels: Mapping, ylabel) -> Figure:
+    """Draw error against time, log–log, of learned maps and other methods, in panels side by side.
+
+    panels: title -> {"ours", "float32", "known", "others"}, each a mapping of name -> (cost (K,),
+    error (K,), size (K,) as text). Ours have a colour and a filled marker each, with the size
+    beside it; the same names in float32 are hollow. The thick line joins those of ours that no
+    other of ours beats. Methods that know H are grey. Numbered crosses are single results of other
+    methods.
+    """
+    figure = Figure(figsize=(figures.WIDTH * 0.85 * len(panels) + 1.6, figures.HEIGHT * 1.25))
+    axes = np.ravel(figure.subplots(1, len(panels), sharey=True))
+    # A name looks alike in all panels, also where one of them lacks another.
+    named = [n for group in ("ours", "known") for p in panels.values() for n in p[group]]
+    place = {name: i for i, name in enumerate(dict.fromkeys(named))}
+    grey = GREY
+    cross: dict[str, Any] = {"color": figures.REFERENCE, "ms": 4}
+    for ax, (title, groups) in zip(axes, panels.items(), strict=True):
+        _front(ax, [*groups["ours"].values(), *groups["float32"].values()])
+        for name, points in groups["ours"].items():
+            look = figures._look_of(place[name]) | figures._ALONE | {"ms": 5.5}
+            ax.plot(*points[:2], label=name, **look)
+            beside: dict[str, Any] = {
+                "fontsize": 6,
+                "color": look["color"],
+                "path_effects": figures._HALO,
+            }
+            for cost, error, size in zip(*points, strict=True):
+                ax.annotate(size, (cost, error), (5, 3), textcoords="offset points", **beside)
+            if name in groups["float32"]:
+                ax.plot(*groups["float32"][name][:2], mfc="white", **look)
+        if groups["float32"]:
+            ax.plot([], [], "o", mfc="white", color=grey, label="hollow: in float32")
+        for name, points in groups["known"].items():
+            look = figures._look_of(place[name]) | {"color": grey, "linewidth": 0.8, "ms": 3.5}
+            ax.plot(*points[:2], label=f"{name} (given H)", **look)
+        others = groups["others"].values()
+        costs, errors = (np.array([np.ravel(v[i])[0] for v in others]) for i in (0, 1))
+        if len(costs):
+            ax.plot(costs, errors, "x", **cross)
+        ax.set(title=title, xlabel="time per trajectory and unit time (µs)", **figures._LOG_LOG)
+        ax.xaxis.set_minor_formatter(NullFormatter())  # they would cover each other
+        if len(costs):
+            figures._number_points(ax, costs, errors, np.arange(len(costs)))
+            for number, name in enumerate(groups["others"], 1):
+                ax.plot([], [], "x", label=f"{number}  {name}", **cross)
+    axes[0].set_ylabel(ylabel)
+    handles = {}
+    for ax in axes:
+        for handle, name in zip(*ax.get_legend_handles_labels(), strict=True):
+            handles.setdefault(name, handle)
+    figure.legend(handles.values(), handles, loc="outside right center", frameon=False)
+    return figure
+
+
+def _front(ax, curves):
+    """Draw the staircase through the points that no other beats in both cost and error."""
+    cost, error = (np.concatenate([np.ravel(c[i]) for c in curves]) for i in (0, 1))
+    look: dict[str, Any] = {"color": figures.COLOURS[5], "lw": 4, "alpha": 0.45, "zorder": 1.5}
+    ax.step(*figures.unbeaten(cost, error), where="post", label="best of our maps", **look)
 
 
 def tables() -> None:

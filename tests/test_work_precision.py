@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax.evaluate import figures
 from gfnn_jax.phase_space import hamiltonian_vector_field
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
@@ -87,7 +86,7 @@ def test_the_figure_joins_the_best_of_ours_in_both_precisions():
         "others": {"HNN": ([9], [1], ["200"])},
     }
     bare = {"ours": groups["ours"], "float32": {}, "known": {}, "others": {}}
-    figure = figures.work_precision_panels({"together": groups, "alone": bare}, "error")
+    figure = work_precision.panels_figure({"together": groups, "alone": bare}, "error")
     first, _ = figure.axes
     front = next(ln for ln in first.get_lines() if str(ln.get_label()).startswith("best"))
     np.testing.assert_array_equal(front.get_data(orig=True), [[0.5, 1, 3], [1e-1, 1e-2, 1e-6]])
@@ -105,7 +104,7 @@ def test_a_name_looks_alike_in_all_panels():
         "together": {"ours": both, "float32": {}, "known": {"heyoka": points}, "others": {}},
         "alone": {"ours": second, "float32": {}, "known": {"heyoka": points}, "others": {}},
     }
-    figure = figures.work_precision_panels(panels, "error")
+    figure = work_precision.panels_figure(panels, "error")
     looks = [
         {str(ln.get_label()): (ln.get_color(), ln.get_marker()) for ln in ax.get_lines()}
         for ax in figure.axes

@@ -28,7 +28,6 @@ from gfnn_jax.evaluate.figures_of_recordings import residuals_figure as residual
 from gfnn_jax.evaluate.figures_of_recordings import swings_figure as swings_figure
 from gfnn_jax.evaluate.figures_style import (
     COLOURS,
-    GREY,
     HEIGHT,
     LINES,
     MARKERS,
@@ -420,7 +419,7 @@ def speed_against_error(
     ax = _axes_or_new(None, WIDTH * 1.6, HEIGHT * 1.15)
     cost, error = np.asarray(kilo_operations, float), np.asarray(errors, float)
     order = np.argsort(cost, kind="stable")
-    front = _unbeaten(cost, error)
+    front = unbeaten(cost, error)
     ax.step(*front, where="post", color=COLOURS[0], lw=1, label="best for its cost")
     about = np.isin(np.arange(len(cost)), estimated)
     dots = _ALONE | {"marker": "o", "color": COLOURS[0], "ms": 5}
@@ -481,70 +480,12 @@ def work_precision(
     return ax
 
 
-@style()
-def work_precision_panels(panels: Mapping, ylabel) -> Figure:
-    """Draw error against time, log–log, of learned maps and other methods, in panels side by side.
-
-    panels: title -> {"ours", "float32", "known", "others"}, each a mapping of name -> (cost (K,),
-    error (K,), size (K,) as text). Ours have a colour and a filled marker each, with the size
-    beside it; the same names in float32 are hollow. The thick line joins those of ours that no
-    other of ours beats. Methods that know H are grey. Numbered crosses are single results of other
-    methods.
-    """
-    figure = Figure(figsize=(WIDTH * 0.85 * len(panels) + 1.6, HEIGHT * 1.25))
-    axes = np.ravel(figure.subplots(1, len(panels), sharey=True))
-    # A name looks alike in all panels, also where one of them lacks another.
-    named = [n for group in ("ours", "known") for p in panels.values() for n in p[group]]
-    place = {name: i for i, name in enumerate(dict.fromkeys(named))}
-    grey = GREY
-    cross: dict[str, Any] = {"color": REFERENCE, "ms": 4}
-    for ax, (title, groups) in zip(axes, panels.items(), strict=True):
-        _front(ax, [*groups["ours"].values(), *groups["float32"].values()])
-        for name, points in groups["ours"].items():
-            look = _look_of(place[name]) | _ALONE | {"ms": 5.5}
-            ax.plot(*points[:2], label=name, **look)
-            beside: dict[str, Any] = {"fontsize": 6, "color": look["color"], "path_effects": _HALO}
-            for cost, error, size in zip(*points, strict=True):
-                ax.annotate(size, (cost, error), (5, 3), textcoords="offset points", **beside)
-            if name in groups["float32"]:
-                ax.plot(*groups["float32"][name][:2], mfc="white", **look)
-        if groups["float32"]:
-            ax.plot([], [], "o", mfc="white", color=grey, label="hollow: in float32")
-        for name, points in groups["known"].items():
-            look = _look_of(place[name]) | {"color": grey, "linewidth": 0.8, "ms": 3.5}
-            ax.plot(*points[:2], label=f"{name} (given H)", **look)
-        others = groups["others"].values()
-        costs, errors = (np.array([np.ravel(v[i])[0] for v in others]) for i in (0, 1))
-        if len(costs):
-            ax.plot(costs, errors, "x", **cross)
-        ax.set(title=title, xlabel="time per trajectory and unit time (µs)", **_LOG_LOG)
-        ax.xaxis.set_minor_formatter(NullFormatter())  # they would cover each other
-        if len(costs):
-            _number_points(ax, costs, errors, np.arange(len(costs)))
-            for number, name in enumerate(groups["others"], 1):
-                ax.plot([], [], "x", label=f"{number}  {name}", **cross)
-    axes[0].set_ylabel(ylabel)
-    handles = {}
-    for ax in axes:
-        for handle, name in zip(*ax.get_legend_handles_labels(), strict=True):
-            handles.setdefault(name, handle)
-    figure.legend(handles.values(), handles, loc="outside right center", frameon=False)
-    return figure
-
-
-def _unbeaten(cost, error) -> tuple[np.ndarray, np.ndarray]:
+def unbeaten(cost, error) -> tuple[np.ndarray, np.ndarray]:
     """Points, by rising cost, that no other beats in both cost and error."""
     order = np.lexsort((error, cost))
     best = np.minimum.accumulate(error[order])
     front = np.flatnonzero(np.append(True, best[1:] < best[:-1]))
     return cost[order][front], best[front]
-
-
-def _front(ax, curves):
-    """Draw the staircase through the points that no other beats in both cost and error."""
-    cost, error = (np.concatenate([np.ravel(c[i]) for c in curves]) for i in (0, 1))
-    look: dict[str, Any] = {"color": COLOURS[5], "lw": 4, "alpha": 0.45, "zorder": 1.5}
-    ax.step(*_unbeaten(cost, error), where="post", label="best of our maps", **look)
 
 
 @style()
