@@ -163,39 +163,6 @@ def test_terms_of_coordinates_that_are_led_act_on_these_alone(leaders):
     np.testing.assert_allclose(slope, by, atol=1e-7)
 
 
-def test_padding_moves_nothing():
-    q, v = states()
-    model = law()
-    longer = Lagrangian(
-        model.terms.padded(12),
-        np.pad(THETA, (0, 3)),
-        model.friction.padded(8),
-        np.pad(RHO, (0, 3)),
-        0.03,
-        GAINS,
-    )
-    np.testing.assert_allclose(longer.acceleration(q, v), model.acceleration(q, v), rtol=1e-13)
-
-
-def test_padded_laws_share_one_program():
-    count = 0
-
-    @jax.jit
-    def acceleration(model, q, v):
-        nonlocal count
-        count += 1
-        return model.acceleration(q, v)
-
-    q, v = states()
-    for keep in (slice(0, 5), slice(0, 7)):
-        terms, theta = law().terms.take(keep), THETA[keep]
-        theta = np.pad(theta, (0, 8 - len(theta)))
-        friction = law().friction
-        model = Lagrangian(terms.padded(8), theta, friction, RHO, np.float64(0.03), GAINS)
-        np.testing.assert_allclose(acceleration(model, q, v), model.acceleration(q, v), rtol=1e-10)
-    assert count == 1
-
-
 def test_bad_terms_are_refused():
     with pytest.raises(ValueError, match="two factors v"):
         Terms.of([((2, 1), (0, 0), (0, 0), 0.0)], 2)

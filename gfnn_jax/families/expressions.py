@@ -11,7 +11,7 @@ import ast
 import dataclasses
 import keyword
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from typing import Any
 
@@ -376,30 +376,28 @@ def _text(tree: Expression, names, width: int) -> tuple[str, int]:
     return f"{operation}({_text(operands[0], names, width)[0]})", _ATOM
 
 
+def leaves(tree: Expression) -> Iterator[Expression]:
+    """The numbers, coordinates and parameters of an expression, as often as they stand in it."""
+    inner = [o for o in tree.operands if isinstance(o, Expression)]
+    yield from (leaf for o in inner for leaf in leaves(o)) if inner else (tree,)
+
+
+def with_leaves(tree: Expression, new: Callable[[Expression], Expression]) -> Expression:
+    """An expression with other numbers, coordinates and parameters in place of its own."""
+    if not any(isinstance(o, Expression) for o in tree.operands):
+        return new(tree)
+    inner = (with_leaves(o, new) if isinstance(o, Expression) else o for o in tree.operands)
+    return Expression(tree.operation, tuple(inner))
+
+
 def depends_on(tree: Expression) -> set[int]:
     """Indices of the coordinates in the expression; parameters do not count."""
-    if tree.operation == "coordinate":
-        return {tree.operands[0]}
-    return set().union(*(depends_on(o) for o in tree.operands if isinstance(o, Expression)))
-
-
-def along_parameters(tree: Expression, count: int, step: float) -> Expression:
-    """The derivative of an expression along the first ``count`` parameters, times the ``count``
-    that follow, by the difference over two steps."""
-
-    def moved(tree: Expression, by: float) -> Expression:
-        if tree.operation == "parameter":
-            return tree + by * parameter(tree.operands[0] + count)
-        inner = (moved(o, by) if isinstance(o, Expression) else o for o in tree.operands)
-        return Expression(tree.operation, tuple(inner))
-
-    return (moved(tree, step) - moved(tree, -step)) * (0.5 / step)
+    return {leaf.operands[0] for leaf in leaves(tree) if leaf.operation == "coordinate"}
 
 
 def has_parameters(tree: Expression) -> bool:
     """Return whether a parameter is in the expression."""
-    inner = (o for o in tree.operands if isinstance(o, Expression))
-    return tree.operation == "parameter" or any(map(has_parameters, inner))
+    return any(leaf.operation == "parameter" for leaf in leaves(tree))
 
 
 def whole_multiples(tree: Expression) -> tuple[dict[int, int], float] | None:

@@ -10,8 +10,7 @@ exp(−q1); of a term without v it may have inputs too, u1²/(0.3 + q1). With s 
 coordinate or the relative speed of two, friction is linear, r = ½s²; quadratic, r = ⅓|s|³; dry, r =
 √(s² + ε²) − ε; a power a of the speed, r = |s|^(a + 1)/(a + 1); or one-sided, r = ½ max(s, 0)²,
 which beside linear friction makes it depend on the direction. Everything is batch first, in closed
-form, and runs in NumPy or JAX. A term is a row of arrays, none of which is static, so that another
-library of as many terms (`Terms.padded`) compiles nothing.
+form, and runs in NumPy or JAX.
 
 Of systems that differ in parameters μ, a length or a mass, each coefficient is multiplied by a
 product of whole powers of these: L = Σ θ_j ∏ μ_i^a_ji ℓ_j(q, v), and R and G alike. The law of one
@@ -180,13 +179,6 @@ class Terms:
         own = (self.speeds[keep], self.powers[keep], self.modes[keep], self.phases[keep])
         return Terms(*own, shapes if any(shapes) else (), self.leaders)
 
-    def padded(self, count: int) -> Terms:
-        """Pad with constants, which move nothing, to ``count`` terms in all."""
-        more = count - self.count
-        k, n, m = (np.pad(a, ((0, more), (0, 0))) for a in (self.speeds, self.powers, self.modes))
-        shapes = self.shapes and (*self.shapes, *[""] * more)
-        return Terms(k, n, m, np.pad(self.phases, (0, more)), shapes, self.leaders)
-
     @property
     def follows(self) -> Any:
         """Return whether each term (P,) is one of coordinates that are moved by ``leaders``."""
@@ -349,15 +341,6 @@ class Friction:
 
     def take(self, keep: Any) -> Friction:
         return Friction(self.directions[keep], self.kinds[keep], self.widths[keep])
-
-    def padded(self, count: int) -> Friction:
-        """Pad with terms along no direction to ``count`` in all."""
-        more = count - self.count
-        return Friction(
-            np.pad(self.directions, ((0, more), (0, 0))),
-            np.pad(self.kinds, (0, more)),
-            np.pad(self.widths, (0, more), constant_values=1.0),
-        )
 
     def tables(self, v: Any) -> tuple[Any, Any, Any]:
         """r_k, dr_k/ds and d²r_k/ds² at v (..., d), each (..., F)."""

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs, arcs_of
-from gfnn_jax.families.expressions import along_parameters, to_text
+from gfnn_jax.families.expressions import Expression, parameter, to_text, with_leaves
 from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
 from gfnn_jax.fitting.evidence import Comparison
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
@@ -167,5 +167,13 @@ def correction(fit: LawFit, slope: np.ndarray) -> tuple[float, float]:
 def _along_inputs(row: Row, count: int) -> Row:
     """The derivative of a term along its inputs, times the ``count`` inputs that follow."""
     d = len(row[0])
-    tree = along_parameters(tree_of(shape_of(row), d), count, OPTIONS.step)
-    return (*row[:4], to_text(tree, d, INPUTS), *row[5:])
+
+    def moved(by: float) -> Expression:
+        def later(leaf: Expression) -> Expression:
+            of_input = leaf.operation == "parameter"
+            return leaf + by * parameter(leaf.operands[0] + count) if of_input else leaf
+
+        return with_leaves(tree_of(shape_of(row), d), later)
+
+    slope = (moved(OPTIONS.step) - moved(-OPTIONS.step)) * (0.5 / OPTIONS.step)
+    return (*row[:4], to_text(slope, d, INPUTS), *row[5:])

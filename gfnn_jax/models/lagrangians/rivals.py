@@ -18,7 +18,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from gfnn_jax.families.expressions import Expression, factors_of, number, to_text
+from gfnn_jax.families.expressions import (
+    Expression,
+    factors_of,
+    leaves,
+    number,
+    to_text,
+    with_leaves,
+)
 from gfnn_jax.families.lagrangian import (
     INPUTS,
     LINEAR,
@@ -134,40 +141,37 @@ def with_constant(fit: LawFit, rescale: bool = True) -> LawFit:
 def constant_of(fit: LawFit) -> tuple[float, float, float]:
     """The number inside the shapes of a law, 0 where there is none, its relative change that fits
     best, and the standard error of that; NaN where the coefficients imitate it."""
-    step, changes, numbers = OPTIONS.apart, {}, [0.0]
+    d, changes, numbers = fit.structure.dim, {}, [0.0]
     for row in fit.structure.terms:
-        if numbers_in := _numbers(tree_of(shape_of(row), fit.structure.dim)):
-            numbers = [*numbers_in, *numbers]
-            ends = (
-                tree_of(shape_of(_scaled(row, 1 + by)), fit.structure.dim) for by in (step, -step)
+        own = [leaf.value for leaf in leaves(tree_of(shape_of(row), d)) if _is_free(leaf)]
+        if own:
+            numbers = [*own, *numbers]
+            more, less = (
+                tree_of(shape_of(_scaled(row, 1 + by)), d) for by in (OPTIONS.apart, -OPTIONS.apart)
             )
-            slope = to_text((next(ends) - next(ends)) * (0.5 / step), fit.structure.dim, INPUTS)
+            slope = to_text((more - less) * (0.5 / OPTIONS.apart), d, INPUTS)
             changes["term", (*row[:4], slope, *row[5:])] = fit.values["term", row]
     if not changes or not fit.follows:
         return numbers[0], 0.0, np.nan
     return numbers[0], *fit.along(changes, fit.structure.plus(list(changes)))
 
 
-def _numbers(tree: Expression) -> list[float]:
-    """The numbers in a shape that are not whole."""
-    if tree.value is not None:
-        return [] if tree.value.is_integer() else [tree.value]
-    return [x for o in tree.operands if isinstance(o, Expression) for x in _numbers(o)]
+def _is_free(leaf: Expression) -> bool:
+    """Return whether a leaf of a shape is a number that is not whole."""
+    return leaf.value is not None and not leaf.value.is_integer()
 
 
 def _scaled(row: Row, by: float) -> Row:
     """A row with the numbers in its shape that are not whole times a factor."""
-
-    def turned(tree: Expression) -> Expression:
-        if tree.value is not None:
-            return tree if tree.value.is_integer() else number(float(f"{tree.value * by:.8g}"))
-        inner = (turned(o) if isinstance(o, Expression) else o for o in tree.operands)
-        return Expression(tree.operation, tuple(inner))
-
+    d = len(row[0])
     if not shape_of(row):
         return row
-    dim = len(row[0])
-    return (*row[:4], to_text(turned(tree_of(shape_of(row), dim)), dim, INPUTS), *row[5:])
+
+    def turned(leaf: Expression) -> Expression:
+        return number(float(f"{leaf.value * by:.8g}")) if _is_free(leaf) else leaf
+
+    tree = with_leaves(tree_of(shape_of(row), d), turned)
+    return (*row[:4], to_text(tree, d, INPUTS), *row[5:])
 
 
 def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
