@@ -4,6 +4,7 @@ The oracle is the system that made the recording; `benchmarks/vocabulary.py` dra
 
 import re
 
+import jax
 import numpy as np
 import pytest
 import sympy as sp
@@ -13,6 +14,8 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import Friction, Terms
+from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.legendre import family_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.given_terms import given_terms
@@ -170,6 +173,11 @@ def test_terms_with_inputs_move_by_the_compiled_law_as_by_the_lagrangian():
     law = form.lagrangian(p)
     assert law.acceleration(x[:1], x[1:], u) == pytest.approx(force(x[0]))
     assert law.energy(x[:1], x[1:]) == pytest.approx(0.5 * x[1] ** 2)  # without inputs
+    family, params = family_of(law)
+    Z, supplied = jax.jit(Flow.work)(Flow(family, params, 0.2, np.ones(2), 8), x[None], u[None])
+    np.testing.assert_allclose(Z[0], exact.y[:, -1], atol=1e-12)
+    gained = family.value(params, Z) - family.value(params, x[None])
+    assert float(np.sum(supplied.supplied)) == pytest.approx(float(gained[0]), abs=1e-12)
     with pytest.raises(InputError, match="without inputs"):
         given_terms(["v**2*u"], ["x"], ["v"], (), ["u"])
 

@@ -31,6 +31,7 @@ from gfnn_jax.families.expressions import (
     Expression,
     depends_on,
     has_parameters,
+    leaves,
     number,
     parse,
     to_named_text,
@@ -150,6 +151,14 @@ class Terms:
     def driven(self) -> bool:
         """Return whether some term has inputs in its shape."""
         return any(map(has_parameters, self.trees.values()))
+
+    def first_inputs(self, count: int) -> np.ndarray:
+        """1 (P, count) of each term that has inputs, at the first of them; 0 elsewhere."""
+        found = np.zeros((self.count, count))
+        for j, tree in self.trees.items():
+            for leaf in [x for x in leaves(tree) if x.operation == "parameter"][:1]:
+                found[j, leaf.operands[0]] = 1.0
+        return found
 
     def texts(
         self, names: Sequence[str], speeds: Sequence[str], inputs: Sequence[str] = INPUTS

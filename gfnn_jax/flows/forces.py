@@ -78,6 +78,11 @@ class Forced(WithForces):
         return (*self.family.term_names, *self.friction.names, *gains)
 
     @property
+    def _driven(self) -> bool:
+        """Return whether terms of H have inputs."""
+        return getattr(getattr(self.family, "terms", None), "driven", False)
+
+    @property
     def quadratic(self) -> bool:
         """Return whether the field is affine."""
         return self.family.quadratic and not np.any(self.friction.kinds != LINEAR)
@@ -168,13 +173,18 @@ class Forced(WithForces):
 
     def power(self, params, w, args=None):
         """Energy per unit of time at states w (..., 2d): lost by each friction (..., F), supplied
-        by each input (..., k)."""
+        by each input (..., k); by a term that has several, by the first of them."""
         own, losses, gains = self.parts(params)
         v = split(self.family.gradient(own, w, self._inner(args)))[1]
         _, slope, _ = self.friction.tables(v)
         speeds = matmul(v, self.friction.directions.astype(v.dtype).T)
         lost = as_row(losses, slope) * slope * speeds
-        return lost, pushed(namespace(gains).swapaxes(gains, -1, -2), v) * self._inputs(args)
+        supplied = pushed(namespace(gains).swapaxes(gains, -1, -2), v) * self._inputs(args)
+        if not self._driven:
+            return lost, supplied
+        f = self.family.terms.potentials(split(w)[0], 1, self._inputs(args))
+        along = as_row(own, f.value) * (f.slope * v[..., None, :]).sum(-1)
+        return lost, supplied + matmul(along, self.family.terms.first_inputs(self.num_inputs))
 
     def parts(self, params) -> tuple[Any, Any, Any]:
         """The params of H, ρ (F,) and G (d, k)."""
@@ -187,7 +197,7 @@ class Forced(WithForces):
         """Args of H: inputs, where its terms have such."""
         if args is None:
             return None
-        if getattr(getattr(self.family, "terms", None), "driven", False):
+        if self._driven:
             return self._inputs(args)
         others = args.shape[-1] - (self.degree + 1) * self.num_inputs
         return args[..., :others] if others else None

@@ -218,6 +218,10 @@ def inverse_dynamics(map_: SymplecticMap, q, v, a, args=None) -> InverseDynamics
             f"{a.shape}"
         )
     law = _law_at(map_, args)
+    if isinstance(law, Lagrangian) and law.terms.driven:
+        raise ValueError(
+            "terms of this law have inputs: a motion tells no inputs by its gains alone"
+        )
     masses, forces = law.balance(q, v)
     needed = np.einsum("...ij,...j->...i", masses, a) - forces
     gains = np.broadcast_to(law.gains, (*q.shape[:-1], *law.gains.shape[-2:]))

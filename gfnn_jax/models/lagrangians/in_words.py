@@ -122,11 +122,7 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         sensors=parameters,
         alike=_alike(fit, lagrangian, friction),
         horizon=tuple(best.calibration.horizons),
-        energy=(
-            {}
-            if law.terms.leaders or law.terms.driven
-            else _energy(traces, friction, recording.inputs)
-        ),
+        energy={} if law.terms.leaders else _energy(traces, friction, recording.inputs),
         messages=(
             *findings.messages,
             *(f"{flaw}: {remedy}" for flaw, remedy in flaws.items()),

@@ -13,7 +13,7 @@ from gfnn_jax.models.lagrangians.residuals import Trace
 
 def traces_of(recording: Recording, fit: LawFit, law: Lagrangian) -> tuple[Trace, ...]:
     """The arcs of a fit, channels in the file's units. An input supplies the mean of its force over
-    a step times the way; friction takes the mean of its power at the ends."""
+    a step times the way, and what terms that have it rise by at its mean; friction takes the mean of its power at the ends."""
     arcs, found, d = fit.arcs, [], fit.form.dim
     nodes, channels = fit.problem.nodes, fit.problem.observation.channels
     factors = np.array([recording.factors[name] for name in channels])
@@ -28,7 +28,12 @@ def traces_of(recording: Recording, fit: LawFit, law: Lagrangian) -> tuple[Trace
         own = law.at(stretch.args)
         rate = own.power(q, v)[0][:, : law.friction.count + (law.uniform != 0)]
         lost = 0.5 * np.diff(t)[:, None] * (rate[1:] + rate[:-1])
-        supplied = acting[k, : n - 1] * (np.diff(q, axis=0) @ law.gains)
+        u = acting[k, : n - 1]
+        supplied = u * (np.diff(q, axis=0) @ law.gains)
+        if law.terms.driven:
+            before, after = (law.terms.potentials(x, 0, u).value for x in (q[:-1], q[1:]))
+            raised = own.coefficients * (after - before)
+            supplied += raised @ law.terms.first_inputs(law.num_inputs)
         found.append(
             Trace(
                 stretch.run,
