@@ -13,7 +13,8 @@ from gfnn_jax.models.lagrangians.residuals import Trace
 
 def traces_of(recording: Recording, fit: LawFit, law: Lagrangian) -> tuple[Trace, ...]:
     """The arcs of a fit, channels in the file's units. An input supplies the mean of its force over
-    a step times the way, and what terms that have it rise by at its mean; friction takes the mean of its power at the ends."""
+    a step times the way, and what terms that have it rise by at its mean; friction takes the mean
+    of its power at the ends."""
     arcs, found, d = fit.arcs, [], fit.form.dim
     nodes, channels = fit.problem.nodes, fit.problem.observation.channels
     factors = np.array([recording.factors[name] for name in channels])
