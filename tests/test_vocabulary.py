@@ -10,6 +10,7 @@ import pytest
 import sympy as sp
 from analytic import motion
 from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError, InputError
@@ -204,6 +205,39 @@ def test_a_magnet_pulls_by_its_current_squared_and_its_gap():
     gap = 1 / float(re.fullmatch(r"i\*\*2/\(1 \+ ([\d.]+)\*x\)", shape)[1])
     assert gap == pytest.approx(2, rel=0.02)
     assert any("inside i**2" in message for message in fit.messages)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "named"), [("shutter", "line by line"), ("filter", "smoothed")])
+def test_a_sensor_that_spoils_the_law_is_named(kind, named):
+    """A pendulum seen line by line, and behind a low-pass of 1.5 samples; the command that is named
+    leads to its law."""
+    t, rng = np.arange(0, 105, 0.15), np.random.default_rng(0)
+    swing = solve_ivp(
+        lambda t, z: [z[1], -np.sin(z[0]) - 0.03 * z[1]],
+        (0, 106),
+        [1.7, 0.0],
+        rtol=1e-9,
+        atol=1e-11,
+        dense_output=True,
+    ).sol
+    x = swing(t)[0]
+    if kind == "shutter":
+        for _ in range(40):
+            x = swing(t + 0.03 * x)[0]
+    else:
+        fine = np.arange(0, 105, 0.01)
+        share = 1 - np.exp(-0.01 / 0.225)
+        x = lfilter([share], [1, share - 1], swing(fine)[0], zi=[1.7 * (1 - share)])[0]
+        x = np.interp(t, fine, x)
+    x = (x + NOISE * x.std() * rng.normal(size=len(x)))[20:]
+    data = {"t": t[20:], "x": x}
+    fit = gfnn.fit(gfnn.Recording(data, positions=["x"], angles=["x"]))
+    assert named in fit.verdict
+    formula = re.search(r"observe=\{'x': '(.*?)'\}", fit.verdict)[1]
+    again = gfnn.fit(gfnn.Recording(data, positions=["x"], angles=["x"], observe={"x": formula}))
+    found = {term.term: term.coefficient for term in again.lagrangian.terms}
+    assert found["cos(x)"] / (2 * found["v**2"]) == pytest.approx(1, rel=5e-3)
 
 
 @pytest.mark.slow

@@ -62,7 +62,12 @@ from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, last_of_series
 from gfnn_jax.models.lagrangians.nature import Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions, parting
-from gfnn_jax.models.lagrangians.rivals import constant_of, one_sided, other_powers
+from gfnn_jax.models.lagrangians.rivals import (
+    constant_of,
+    of_a_sensor,
+    one_sided,
+    other_powers,
+)
 from gfnn_jax.models.lagrangians.search import (
     SearchResult,
     TermSearch,
@@ -173,8 +178,9 @@ def fit_recording(
         law = in_words(recording, best, findings)
         if not terms and not hidden:
             messages = (*law.messages, *_with_constants(best.fit))
-            rival = law.rival or _other_shapes(best.fit)
-            law = dataclasses.replace(law, rival=rival, messages=messages)
+            sensor = of_a_sensor(best.fit)
+            rival = law.rival or sensor or _other_shapes(best.fit)
+            law = dataclasses.replace(law, rival=rival, nature=sensor, messages=messages)
             law = law if law.flaws else _with_rivals(law, recording, data, best.fit)
     except (FitError, np.linalg.LinAlgError):
         if missed is not None:
@@ -183,7 +189,7 @@ def fit_recording(
     lost = _loses_a_channel(law)
     if _is_no_law(law) or (hidden and lost):
         missed = missed or no_law(data.problem.scales)
-    if missed is None and (law.flaws or lost) and not hidden:
+    if missed is None and (law.flaws or lost) and not hidden and not law.nature:
         what = _nature(data)
         if what.mostly if lost else what.partly:
             law = dataclasses.replace(law, nature=what.reason)

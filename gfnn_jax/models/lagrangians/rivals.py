@@ -11,6 +11,7 @@ coefficients have odds by the sums of their squares (`fitting.evidence`).
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -18,6 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from gfnn_jax.data.roles import symbols
+from gfnn_jax.errors import FitError
 from gfnn_jax.families.expressions import (
     Expression,
     factors_of,
@@ -35,6 +38,7 @@ from gfnn_jax.families.lagrangian import (
     tree_of,
 )
 from gfnn_jax.fitting.evidence import criterion
+from gfnn_jax.maps.observation import observed
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.libraries import (
     GAINS,
@@ -43,10 +47,11 @@ from gfnn_jax.models.lagrangians.libraries import (
     losses,
     shaped,
     springs,
+    textbook,
     torques,
 )
 from gfnn_jax.models.lagrangians.structure import Row, Structure, is_constant
-from gfnn_jax.models.lagrangians.weak_form import weak_share
+from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +61,8 @@ class RivalOptions:
     most: powers of the distance to either side. series: potentials, from which on they may be the
     series of a shape. constants: inside a shape, times the range of the motion, where it begins;
     apart: relative, over which it is differentiated; corrections: of it; furthest: relative, of
-    each; settled: standard errors, within which it is found.
+    each; settled: standard errors, within which it is found. noise: times it, that is no more;
+    clearly: of Schwarz's criterion, that a sensor gains where a law leaves more.
     """
 
     most: int = 4
@@ -66,9 +72,19 @@ class RivalOptions:
     corrections: int = 6
     furthest: float = 0.3
     settled: float = 0.1
+    noise: float = 2.0
+    clearly: float = 10.0
 
 
 OPTIONS = RivalOptions()
+SENSORS = (  # of a position q with the velocity v
+    (
+        "is read later where it is larger, as line by line",
+        "{q} + late*{q}*{v} + late**2*({q}*{v}**2 + 0.5*{q}**2*{q}_ddot)",
+    ),
+    ("is smoothed, as by a low-pass", "{q} + smooth*{q}_ddot"),
+    ("is late", "{q} - late*{v} + 0.5*late**2*{q}_ddot"),
+)
 
 
 def with_likeliest_power(fit: LawFit) -> LawFit:
@@ -168,7 +184,7 @@ def _scaled(row: Row, by: float) -> Row:
         return row
 
     def turned(leaf: Expression) -> Expression:
-        return number(float(f"{leaf.value * by:.8g}")) if _is_free(leaf) else leaf
+        return number(float(f"{leaf.operands[0] * by:.8g}")) if _is_free(leaf) else leaf
 
     tree = with_leaves(tree_of(shape_of(row), d), turned)
     return (*row[:4], to_text(tree, d, INPUTS), *row[5:])
@@ -186,6 +202,44 @@ def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
         f"the power of the distance r = sqrt({squares}) may be {named} in place of "
         f"r**{_power(fit):g}. A start farther out, or closer in, would decide"
     )
+
+
+def of_a_sensor(fit: LawFit) -> str:
+    """A line on a sensor of one coordinate beside which plain terms, the textbook's and springs
+    between angles, are as likely as a law that leaves noise, or likelier than one that leaves more
+    (Schwarz's criterion); "" where there is none, or the law has such terms and leaves noise. Of
+    several coordinates whose law leaves noise one may be late."""
+    problem, seen, d = fit.problem, fit.problem.observation, fit.structure.dim
+    terms = textbook(d, problem.angles)
+    terms += springs(d, problem.within_a_turn) if d > 1 else []
+    is_noise = np.max(fit.rms() / problem.scales.sigma) < OPTIONS.noise
+    is_plain = set(fit.structure.terms) <= set(terms)
+    if not seen.is_plain or problem.parameters or (is_noise and is_plain):
+        return ""
+    friction, count, best = losses(d, (LINEAR,), 0.0)[:d], _independent(fit), ""
+    least = criterion(fit.fitted.cost, count, len(fit.p))
+    least += 2 * np.log(problem.options.evidence.decided) if is_noise else -OPTIONS.clearly
+    plain = dataclasses.replace(fit.structure, terms=tuple(terms), friction=tuple(friction))
+    plain = dataclasses.replace(plain, zeros=())
+    try:
+        known = weak_start(plain, problem, prune=False)[1]
+    except FitError:
+        return ""
+    for i, name in enumerate(seen.coordinates):
+        q, v = symbols((name, seen.speeds[i]))
+        for what, sensor in SENSORS[-1:] if is_noise and d > 1 else SENSORS:
+            text = sensor.format(q=q, v=v) + " + zero" * (i in fit.structure.zeros)
+            shown = observed({name: text}, seen.coordinates, seen.speeds, {}, columns=seen.channels)
+            shown = dataclasses.replace(shown, loss=seen.loss)
+            other = dataclasses.replace(problem, observation=shown)
+            own = dataclasses.replace(plain, sensors=other.sensors)
+            again = other.fit(own, known, fit.followed, fit.sigma, rescale=False)
+            unlikely = criterion(again.fitted.cost, count, len(again.p))
+            early = what == "is late" and again.values["sensor", "late"] < 0  # and another late
+            if again.follows and again.is_definite and unlikely < least and not early:
+                typed, least = shlex.quote(f"{name} = {text}"), unlikely
+                best = f"a plainer law follows the record where {name} {what}: --observe {typed}"
+    return best
 
 
 def one_sided(fit: LawFit, coordinates: Sequence[str]) -> str:
