@@ -149,13 +149,6 @@ class _Command:
             given |= {"choices": about.kind.choices} if about.kind.choices else {}
             given |= {"type": _reader(about.kind)} if about.metavar else {}
             group.add(f"--{name.replace('_', '-')}", shown, about.metavar, **given)
-        of_map.add(
-            "--scalar",  # the old name of --family
-            argparse.SUPPRESS,
-            dest="family",
-            choices=OPTIONS["family"].kind.choices,
-            default=argparse.SUPPRESS,
-        )
         of_map.flag("--strict", "exit status 1 where the tolerance is not met")
         self.add_output()
 

@@ -66,9 +66,7 @@ class PositionArcs:
         )
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
-        m = x.shape[-1]
-        by_state = np.broadcast_to(np.eye(m), (*x.shape, m))
-        return Observed(x, by_state, np.broadcast_to(0.0, (*x.shape, len(p))))
+        return observed_whole(x, len(p))
 
     def take(self, arcs: np.ndarray) -> PositionArcs:
         return self
