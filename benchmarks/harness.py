@@ -12,6 +12,7 @@ import datetime
 import json
 import os
 import platform
+import re
 import sys
 import time
 import warnings
@@ -296,11 +297,31 @@ def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def between_markers(path: Path, name: str, text: str) -> None:
-    """Put ``text`` between <!-- name --> and <!-- /name --> of a file."""
+    """Put ``text`` between <!-- name --> and <!-- /name --> of a file, and renew the numbers in the
+    prose of README and docs that name a result."""
     before, after = f"<!-- {name} -->\n", f"<!-- /{name} -->"
     whole = path.read_text(encoding="utf-8")
     start, end = whole.index(before) + len(before), whole.index(after)
     path.write_text(whole[:start] + text + "\n" + whole[end:], encoding="utf-8")
+    for page in [README, *(README.parent / "docs").glob("*.md")]:
+        prose = page.read_text(encoding="utf-8")
+        if (renewed := in_prose(prose)) != prose:
+            page.write_text(renewed, encoding="utf-8")
+
+
+_IN_PROSE = re.compile(r"[^\s(]+(?=<!--\s([\w.-]+)/([^>]+?)\s-->)")
+
+
+def in_prose(text: str) -> str:
+    """The text with each number before a <!-- RESULT/KEY/KEY --> as the result's file has it."""
+
+    def shown(found: re.Match[str]) -> str:
+        value = json.loads((RESULTS / f"{found[1]}.json").read_text(encoding="utf-8"))["measured"]
+        for key in " ".join(found[2].split()).split("/"):
+            value = value[key]
+        return number(value)
+
+    return _IN_PROSE.sub(shown, text)
 
 
 def provenance(found: Mapping[str, Numbers]) -> str:

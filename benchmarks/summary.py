@@ -1,5 +1,4 @@
-"""Ten lines on top of RESULTS.md, and five of them in README.md: claim, figure, command; and the
-numbers in the prose of README.md and docs/ that name a result, as 4.7e-05<!-- targets-x/error -->.
+"""Ten lines on top of RESULTS.md, and five of them in README.md: claim, figure, command.
 
     python benchmarks/summary.py
 
@@ -9,7 +8,6 @@ Measures nothing: every figure is read from the JSON files in benchmarks/results
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 
 from bands import calibration
@@ -20,21 +18,6 @@ from posteriors.calibration import WIDEST, Cell, cells
 def measured(name: str) -> Numbers:
     """Read the measurements in results/``name``.json."""
     return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))["measured"]
-
-
-_IN_PROSE = re.compile(r"[^\s(]+(?=<!--\s([\w.-]+)/([^>]+?)\s-->)")
-
-
-def in_prose(text: str) -> str:
-    """The text with each number before a <!-- NAME/KEY/KEY --> as the result has it."""
-
-    def shown(found: re.Match[str]) -> str:
-        value = measured(found[1])
-        for key in " ".join(found[2].split()).split("/"):
-            value = value[key]
-        return number(value)
-
-    return _IN_PROSE.sub(shown, text)
 
 
 def accuracy() -> str:
@@ -142,8 +125,6 @@ def main() -> None:
     heads = ["claim", "measured", "command"]
     between_markers(TABLES, "summary", markdown(heads, [cells for cells, _ in rows]))
     between_markers(README, "five", markdown(heads, [cells for cells, shown in rows if shown]))
-    for page in [README, *(README.parent / "docs").glob("*.md")]:
-        page.write_text(in_prose(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -122,12 +122,12 @@ def test_site_builds_without_warnings(tmp_path):
 
 
 def test_numbers_in_prose_are_what_the_results_hold():
-    import summary
+    import harness
 
     named = 0
     for page in [ROOT / "README.md", *PAGES]:
         text = page.read_text(encoding="utf-8")
-        assert summary.in_prose(text) == text, page.name
+        assert harness.in_prose(text) == text, page.name
         named += len(re.findall(r"\S<!--\s[\w.-]+/", text))
     assert named > 10
 
