@@ -393,13 +393,71 @@ def damped(quick: bool) -> Numbers:
     return found
 
 
+def varied_top(of_moment: bool) -> Field:
+    """A heavy top whose third moment, or whose gravity, is the last state, and stays."""
+
+    def field(z):
+        m, g, one = z[:3], z[3:6], np.ones_like(z[6])
+        moment, pull = (z[6], one) if of_moment else (one, z[6])
+        w = m * np.array([0.5 * one, 0.6 * one, 1 / moment])
+        turned = np.cross(m, w) + pull * np.cross(g, [0.1, 0.2, 0.9])
+        return np.concatenate([turned, np.cross(g, w), [0 * one]])
+
+    return field
+
+
+def driven_spin(z):
+    """A spin in a field that turns with the period 7.5; the time is the last state."""
+    field = np.array([0.3, 0.4 * np.cos(2 * np.pi * z[3] / 7.5), 0.2])
+    return np.append(np.cross(z[:3], field + np.array([1.0, 0.5, 0.2]) * z[:3]), 1.0)
+
+
+VARIED = {  # the last state is a parameter, or the time of a drive
+    "heavy top, its moment a parameter": (varied_top(True), 6, {"m": (0.5, 1.5)}),
+    "heavy top, gravity a parameter": (varied_top(False), 6, {"m": (0.5, 1.5)}),
+    "driven spin": (driven_spin, 3, {"t": (0.0, 30.0)}),
+}
+
+
+def varied(quick: bool) -> Numbers:
+    """Laws that depend on a parameter of each run, or on the time: errors on fresh systems."""
+    found = {}
+    for name, (field, n, beside) in list(VARIED.items())[: 1 if quick else None]:
+        rng, ((key, limits),) = np.random.default_rng(0), beside.items()
+
+        def draw(rng, n=n, limits=limits):
+            return np.append(rng.normal(size=n), rng.uniform(*limits))
+
+        runs = [orbit(field, draw(rng), 0.2, 20) for _ in range(40)]
+        z0, z1 = (np.concatenate([r[k : k + 20] for r in runs]) for k in (0, 1))
+        known: dict[str, Any] = {"args": {key: z0[:, n]}}
+        known = {"t0": z0[:, n], "period": 7.5} if key == "t" else known
+        known |= {"run": np.repeat(np.arange(40), 20), "structure": "poisson"}
+        fit, seconds = learned(gfnn.Pairs(z0[:, :n], z1[:, :n], 0.2, **known))
+        assert fit.bracket is not None
+        fresh = np.array([draw(rng) for _ in range(3)])
+        reference = np.array([orbit(field, z, 0.2, 100) for z in fresh])[..., :n]
+        own: dict[str, Any] = {"params": {key: fresh[:, n]}}
+        own = {"t0": fresh[:, n]} if key == "t" else own
+        off = np.abs(np.asarray(fit.map.rollout(fresh[:, :n], 100, **own)[0]) - reference)
+        found[name] = {
+            "found": fit.bracket.name,
+            "law": str(fit.law),
+            "one_step": float(np.median(off.max(axis=2)[:, 1])),
+            "last": float(np.median(off.max(axis=2)[:, -1])),
+            "defect": fit.symplecticity_defect,
+            "cpu_seconds": seconds,
+        }
+    return found
+
+
 def piece_of(name: str) -> str:
     """Name of a system's piece: letters, digits and hyphens."""
     return re.sub("[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
 PIECES = {piece_of(name): partial(of_system, name) for name in SYSTEMS}
-PIECES |= {"without": without, "damped": damped, "noisy": noisy}
+PIECES |= {"without": without, "damped": damped, "varied": varied, "noisy": noisy}
 
 
 def tables() -> None:
@@ -457,6 +515,14 @@ def tables() -> None:
             "fit, CPU s",
         )
         text += "\n\n" + markdown(heads, said)
+    if "varied" in found:
+        keys = ("one_step", "last", "defect", "cpu_seconds")
+        said = [
+            [name, m["found"], m["law"], *(number(m[key]) for key in keys)]
+            for name, m in found["varied"]["measured"].items()
+        ]
+        heads = ("parameters and a drive", "bracket", "H", "one step", "step 100", "defect")
+        text += "\n\n" + markdown((*heads, "fit, CPU s"), said)
     if "noisy" in found:
         said = [
             [
