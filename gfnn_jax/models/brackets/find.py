@@ -207,13 +207,11 @@ def _nearest_sphere(null: NullSpace, rows: np.ndarray, z: np.ndarray) -> np.ndar
     """The combination (J,) whose Casimir ½ zᵀQz has the least condition number, in units of the
     coordinates: B = [Qz]ₓ in three dimensions."""
     scale = np.sqrt(np.mean(z**2, axis=0))
-    forms = []
-    for row in rows:
-        c = _constants(null, row)[1]
-        q = np.array([c[1, 2], c[2, 0], c[0, 1]])
-        forms.append(0.5 * (q + q.T) * scale * scale[:, None])
-    forms = np.array([q / np.linalg.norm(q) for q in forms])
-    norms = [np.linalg.norm(q) for q in forms]
+    constants = (_constants(null, row)[1] for row in rows)
+    forms = np.array([[c[1, 2], c[2, 0], c[0, 1]] for c in constants])
+    forms = 0.5 * (forms + forms.transpose(0, 2, 1)) * scale * scale[:, None]
+    norms = np.linalg.norm(forms, axis=(1, 2))
+    forms /= norms[:, None, None]
 
     def condition(t: np.ndarray) -> float:
         values = np.linalg.eigvalsh(np.tensordot(t / np.linalg.norm(t), forms, 1))
@@ -222,13 +220,7 @@ def _nearest_sphere(null: NullSpace, rows: np.ndarray, z: np.ndarray) -> np.ndar
     rng = np.random.default_rng(OPTIONS.seed)
     starts = rng.normal(size=(OPTIONS.starts, len(rows)))
     best = min((minimize(condition, t, method="Nelder-Mead") for t in starts), key=lambda s: s.fun)
-    units = [np.linalg.norm(_units(_constants(null, row)[1], scale)) for row in rows]
-    return (best.x / np.array(units) / norms) @ rows
-
-
-def _units(c: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    q = np.array([c[1, 2], c[2, 0], c[0, 1]])
-    return 0.5 * (q + q.T) * scale * scale[:, None]
+    return (best.x / norms) @ rows
 
 
 def _made(

@@ -144,9 +144,10 @@ def law_of(
     Raises FitError where the runs do not determine a field, no field has the pairs' flow, or it has
     no bracket: with a verdict, and the nearest singular value.
     """
-    if bracket is not None:
-        return _of_bracket(bracket, train, held, terms, on_progress)
-    law = _of_field(train, held, names, terms, on_progress)
+    if bracket is None:
+        law = _of_field(train, held, names, terms, on_progress)
+    else:
+        law = _of_bracket(bracket, train, held, terms, on_progress)
     if not train.beside.names and law.field.friction is None and _one_level(law, train.z0):
         several = (
             "H has one value along all runs, and every function of H with the same slope there "
