@@ -183,7 +183,7 @@ def beside(quick: bool) -> Numbers:
     return found
 
 
-COUPLINGS, SHEARS, WIDTH, TRAINING = 6, 8, 32, 20_000
+COUPLINGS, SHEARS, WIDTH, TRAINING = 6, 8, 32, 12_000
 
 
 class Trained(NamedTuple):

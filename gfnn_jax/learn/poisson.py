@@ -357,5 +357,5 @@ def other_bracket(pairs: Pairs) -> list[str]:
         what = "(q, p) in another order or scale"
     elif isinstance(law.bracket, Magnetic):
         what = "positions and velocities in a magnetic field"
-    learn = 'gfnn.Pairs(…, structure="poisson")'
+    learn = 'gfnn.fit(dataclasses.replace(pairs, structure="poisson"))'
     return [f"the columns are {what}: {law.bracket}. Learn them with {learn}"]
