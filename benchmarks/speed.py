@@ -1,4 +1,4 @@
-"""Speed of the first answer, of predicted steps and of a training step; growth with the size.
+"""Speed of the first answer, of motion, of predicted steps and of training; growth with the size.
 
     python benchmarks/speed.py                    pieces that have no result yet, then the tables
     python benchmarks/speed.py --only step --overwrite
@@ -20,6 +20,7 @@ from harness import main as run_pieces
 
 # isort: split
 from speeds.growth import scaling
+from speeds.motion import OLD, ROWS, motion
 from speeds.start import START, start, startup
 from speeds.step import STEPS, step
 from speeds.training import training
@@ -35,6 +36,7 @@ TARGETS = {
 
 PIECES = {
     "start": start,
+    "motion": motion,
     "step": step,
     "training": training,
     "startup": startup,
@@ -106,6 +108,18 @@ def start_table(m: Numbers) -> str:
     )
 
 
+def motion_table(m: Numbers) -> str:
+    """Motion of laws, beside the commit before it was compiled and what was asked."""
+    rows = []
+    for key, (title, (unit, factor), most) in ROWS.items():
+        before, now = m.get("before", {}).get(key), m["now"].get(key)
+        if now is not None:
+            gain = "–" if before is None else f"{number(before / now)} ×"
+            before = "–" if before is None else number(factor * before)
+            rows.append([f"{title}, {unit}", before, met(factor * now, most), gain])
+    return markdown(["processor time", f"before (`{OLD}`)", "now", "as fast"], rows)
+
+
 def beside_torch(m: Numbers) -> str:
     """The training step against PyTorch's, in words."""
     if m["torch"] is None:
@@ -136,6 +150,8 @@ def tables() -> None:
     parts = []
     if "start" in found:
         parts.append("### The first answer\n\n" + start_table(found["start"]["measured"]))
+    if "motion" in found:
+        parts.append("### Motion of laws\n\n" + motion_table(found["motion"]["measured"]))
     if "step" in found:
         parts.append("### A predicted step\n\n" + step_table(found["step"]["measured"]))
     if "training" in found:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC, Friction, Lagrangian, Terms
-from gfnn_jax.flows.compiled_steps import Stepper
+from gfnn_jax.flows.compiled_steps import Stepper, program
 from gfnn_jax.maps import lanes
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import map_of_law
@@ -69,3 +69,9 @@ def test_energy_stays_and_many_turns_cost_no_digit():
     assert np.max(abs(np.asarray(energy) / energy[0] - 1)) < 1e-11  # cos of 2e4 loses 4 digits
     steps = jax.jit(lambda z: map_.rollout(z, 10)[0])(np.array([0.0, 2.5]))
     assert steps.shape == (11, 2)
+
+
+@pytest.mark.parametrize("branches", [lambda q: q == 0, lambda q: q != 0, bool, lambda q: q > 0])
+def test_a_field_that_branches_by_the_state_is_left_to_jax(branches):
+    with pytest.raises(TypeError):
+        program(lambda z, _: [z[0, 1] if branches(z[0, 0]) else -z[0, 1], -z[0, 0]], 2, 0)

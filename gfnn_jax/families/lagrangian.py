@@ -357,9 +357,8 @@ class Friction:
         s = matmul(v, self.directions.astype(v.dtype).T)
         size = xp.abs(s)
         kinds, widths = as_row(self.kinds, s), as_row(self.widths, s)
-        root = xp.sqrt(s * s + widths**2)
-        # At rest with ε = 0 there is no direction to push.
-        root = root + (root == 0).astype(root.dtype)
+        # At rest with ε = 0 there is no direction to push: s/root is 0.
+        root = xp.sqrt(s * s + widths**2 + np.finfo(widths.dtype).tiny)
         linear, quadratic = kinds == LINEAR, kinds == QUADRATIC
         dry = (widths / root) ** 2 / root  # small speeds would underflow in ε²/root³
         value = xp.where(linear, 0.5 * s * s, xp.where(quadratic, size**3 / 3, root - widths))

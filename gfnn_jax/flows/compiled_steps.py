@@ -6,9 +6,10 @@ the list at all stages of a step at once. So no law is compiled, and no family o
 its own.
 
 States stay on a lift from the first step to the last, with what rounding loses of them. The momenta
-of its fibres, quadratic in w, are what Casimirs are made of, and are kept to twice the digits. The
-stages begin with the polynomial through those of the step before: that halves the iterations, and
-changes nothing that they converge to. This module imports numba.
+of its fibres, quadratic in w, are what Casimirs are made of, and are kept to twice the digits. Each
+stage begins with the polynomial through the same stage of the steps before: that halves the
+iterations, and changes nothing that they converge to. A polynomial through all stages of one step
+would begin worse than at nothing: their errors differ. This module imports numba.
 """
 
 from __future__ import annotations
@@ -27,12 +28,13 @@ from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.collective import Casimirs
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
-from gfnn_jax.flows.kernel import _cached, _function
+from gfnn_jax.flows.kernel import cached, function
 from gfnn_jax.flows.lifts import Itself
 from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform
 
 STAGES = 8  # a constant of the compiled loops, as many as processors do at once
 _MOST = 100  # iterations
+_KNOWN = 6  # steps before, by which stages begin: more amplify what jumps, by 2 to this power
 _FLOOR, _SETTLED = 1.1e-17, 1.8e-12  # as in `flows.flow`: 0.05 eps, eps^¾
 _SPLIT = 134217729.0  # 2²⁷ + 1 halves a number's digits (T. J. Dekker, Numer. Math. 18, 1971)
 _PARALLEL = 1.0 + 1e-9  # as in `flows.collective`
@@ -145,6 +147,12 @@ class Node:
     def __abs__(self) -> Node:
         return self.fabs()
 
+    def __bool__(self) -> bool:
+        raise TypeError("a number that is not known yet decides nothing")
+
+    def __eq__(self, other: object) -> bool:
+        return bool(self)
+
     def __getattr__(self, name: str) -> Callable[[], Node]:
         if name not in _FUNCTIONS:
             raise AttributeError(name)
@@ -203,29 +211,31 @@ def program(field: Callable[[np.ndarray, Any], Any], width: int, given: int) -> 
     return Program(*found, np.array([at[end] for end in ends]), inputs, inputs + len(still))
 
 
-@_function
+@function
 def _two_sum(a, b):
     total = a + b
     rest = total - a
     return total, (a - (total - rest)) + (b - rest)
 
 
-@_function
+@function
 def _high(a):
     split = _SPLIT * a
     return split - (split - a)
 
 
-@_function
+@function
 def _two_product(a, b):
     total, high, other = a * b, _high(a), _high(b)
     low, below = a - high, b - other
     return total, ((high * other - total) + high * below + low * other) + low * below
 
 
-@_function
-def _run(code, constants, v, begin, end):
-    """Run the operations of these places at the states in v, one a column."""
+@function
+def _run(code, constants, v, places, stages):
+    """Run the operations of these places at the states in v, one a column. Sums and products of all
+    columns are done at once, functions one by one: of the ``stages`` that there are."""
+    begin, end = places
     for i in range(begin, end):
         kind, a, b, c = code[i, 0], code[i, 1], code[i, 2], constants[i]
         if kind == PRODUCT:
@@ -244,7 +254,7 @@ def _run(code, constants, v, begin, end):
             for s in range(STAGES):
                 v[i, s] = 1.0 / v[a, s]
         else:
-            for s in range(STAGES):
+            for s in range(stages):
                 x = v[a, s]
                 if kind == SIN:
                     v[i, s] = math.sin(x)
@@ -272,7 +282,7 @@ def _run(code, constants, v, begin, end):
                     v[i, s] = math.atan(x)
 
 
-@_function
+@function
 def _kept(w, moved, entries, values, slopes, system):
     """Move w (2, W), whose second row is what rounding has lost, without the invariants' change:
     `flows.collective.Casimirs.kept`. system: a row for each of their corrections, its matrix beside
@@ -321,7 +331,7 @@ def _kept(w, moved, entries, values, slopes, system):
         w[0, i], w[1, i] = _two_sum(begun, lost + rest)
 
 
-@_function
+@function
 def _sheared(w, slopes, q, p):
     """Put p − s q in place of p, both of four numbers from these places on, by a whole number s: p
     grows along the fibre of se(3) as long as it goes, and its digits would be lost."""
@@ -337,15 +347,17 @@ def _sheared(w, slopes, q, p):
         total, error = _two_sum(w[0, p + i], by)
         rest += error - share * w[1, q + i] + w[1, p + i]
         w[0, p + i], w[1, p + i] = _two_sum(total, rest)
-        for s in range(STAGES):
-            slopes[p + i, s] -= share * slopes[q + i, s]
+        for before in slopes:
+            for s in range(STAGES):
+                before[p + i, s] -= share * before[q + i, s]
 
 
 class Law(NamedTuple):
     """Tables of a law and its lift, for `roll`: the program of the field; places (F, 2) of the
-    bracket's entries, and these; rows of the stages' couplings and of the predictor, by columns of
-    stages, and h b; the invariants; the lift's ``fibres`` (S, 3); the sizes (W,) of w, what
-    uniform friction makes of it in a substep, less 1; places (A,) of angles and their centres."""
+    bracket's entries, and these; rows of the stages' couplings by columns of stages, and h b; the
+    weights (K, K) of 1, …, K steps before in where a stage begins; the invariants; the lift's
+    ``fibres`` (S, 3); the sizes (W,) of w, what uniform friction makes of it in a substep, less 1;
+    places (A,) of angles and their centres."""
 
     code: np.ndarray
     constants: np.ndarray
@@ -353,6 +365,7 @@ class Law(NamedTuple):
     form: np.ndarray
     by_form: np.ndarray
     rule: np.ndarray
+    ahead: np.ndarray
     entries: np.ndarray
     values: np.ndarray
     fibres: np.ndarray
@@ -362,7 +375,7 @@ class Law(NamedTuple):
     centre: np.ndarray
 
 
-@_function
+@function
 def _balanced(w, slopes, q, p):
     """Make q and p of a Casimir coordinate q p of a size, by exact powers of two: they grow and
     shrink exponentially."""
@@ -371,12 +384,13 @@ def _balanced(w, slopes, q, p):
         for k in range(2):
             w[k, q] *= by
             w[k, p] /= by
-        for s in range(STAGES):
-            slopes[q, s] *= by
-            slopes[p, s] /= by
+        for before in slopes:
+            for s in range(STAGES):
+                before[q, s] *= by
+                before[p, s] /= by
 
 
-@_function
+@function
 def _turned(w, place, centre):
     """Take whole turns from an angle, 2π to twice the digits: how many."""
     turns = np.rint((w[0, place] - centre) / _TWO_PI)
@@ -388,48 +402,56 @@ def _turned(w, place, centre):
     return turns
 
 
-@_cached
+@cached
 def roll(law, task, substeps, inputs, moving):
     """Follow the lanes of a `Task`."""
-    code, constants, ends, form, by_form, rule, entries, values, fibres = law[:9]
-    unit, decay, angles, centre = law[9:]
+    code, constants, ends, form, by_form, rule, ahead, entries, values = law[:9]
+    fibres, unit, decay, angles, centre = law[9:]
     lanes, steps, width, count = task.out.shape[0], task.out.shape[1], len(unit), 0
+    stages = 0
+    while stages < STAGES and rule[STAGES, stages] != 0.0:
+        stages += 1
     for e in range(len(entries)):
         count = max(count, entries[e, 0] + 1)
     v, new, moved = np.zeros((len(code), STAGES)), np.zeros((width, STAGES)), np.zeros(width)
+    now = np.zeros((width, STAGES))
     along, system = np.zeros((count, width)), np.zeros((count, count + 2))
     given = task.given.shape
     for lane in range(lanes):
         w, slopes, most, n = task.w[lane], task.slopes[lane], 0, 0
-        goes = True
+        goes, known = True, 0
+        while known < len(ahead) and not np.isnan(slopes[known, 0, 0]):
+            known += 1
         while goes and n < steps:
             for part_of in range(substeps):
                 row, column = min(lane, given[0] - 1), min(n, given[1] - 1)
                 for i in range(width, inputs):
                     for s in range(STAGES):
                         v[i, s] = task.given[row, column, part_of, i - width, s]
-                _run(code, constants, v, inputs, moving)
+                _run(code, constants, v, (inputs, moving), stages)
                 for i in range(width):
                     for s in range(STAGES):
-                        new[i, s] = 0.0
-                    for t in range(STAGES):
+                        now[i, s] = 0.0
+                for k in range(known - 1, -1, -1):
+                    for i in range(width):
                         for s in range(STAGES):
-                            new[i, s] += rule[STAGES + t, s] * slopes[i, t]
-                    for s in range(STAGES):
-                        slopes[i, s] = (1.0 + decay[i]) * new[i, s]
-                before, change, iterations = np.inf, np.inf, 0
+                            before = (1.0 + decay[i]) * slopes[k, i, s]
+                            now[i, s] += ahead[known - 1, k] * before
+                            if k + 1 < len(ahead):
+                                slopes[k + 1, i, s] = before
+                last, change, iterations = np.inf, np.inf, 0
                 while iterations < _MOST:
                     iterations += 1
                     for i in range(width):
                         for s in range(STAGES):
                             v[i, s] = 0.0
-                        for t in range(STAGES):
+                        for t in range(stages):
                             for s in range(STAGES):
-                                v[i, s] += rule[t, s] * slopes[i, t]
+                                v[i, s] += rule[t, s] * now[i, t]
                         for s in range(STAGES):
                             v[i, s] += w[0, i]
                             new[i, s] = 0.0
-                    _run(code, constants, v, moving, len(code))
+                    _run(code, constants, v, (moving, len(code)), stages)
                     for e in range(len(form)):
                         i, j, by = form[e, 0], ends[form[e, 1]], by_form[e]
                         for s in range(STAGES):
@@ -437,17 +459,17 @@ def roll(law, task, substeps, inputs, moving):
                     change, total = 0.0, 0.0
                     for i in range(width):
                         part = (abs(w[0, i]) + unit[i]) / STAGES
-                        for s in range(STAGES):
-                            value = rule[2 * STAGES, s] * new[i, s]
+                        for s in range(stages):
+                            value = rule[STAGES, s] * new[i, s]
                             total += value
-                            change = max(change, abs(value - slopes[i, s]) / part)
-                            slopes[i, s] = value
+                            change = max(change, abs(value - now[i, s]) / part)
+                            now[i, s] = value
                     if not abs(total) < np.inf:
                         goes = False
                         break
-                    if change <= _FLOOR or (change <= _SETTLED and change > 0.5 * before):
+                    if change <= _FLOOR or (change <= _SETTLED and change > 0.5 * last):
                         break
-                    before = change
+                    last = change
                 most = max(most, iterations)
                 goes = goes and change <= _SETTLED
                 if not goes:
@@ -455,8 +477,10 @@ def roll(law, task, substeps, inputs, moving):
                 for i in range(width):
                     moved[i] = 0.0
                     for s in range(STAGES):
-                        moved[i] += slopes[i, s]
+                        slopes[0, i, s] = now[i, s]
+                        moved[i] += now[i, s]
                     moved[i] += decay[i] * (w[0, i] + moved[i])
+                known = min(known + 1, len(ahead))
                 _kept(w, moved, entries, values, along, system)
             if not goes:
                 break
@@ -475,7 +499,7 @@ def roll(law, task, substeps, inputs, moving):
 
 class Task(NamedTuple):
     """N lanes: their states w (N, 2, W), whose second row is what rounding has lost, the stages
-    (N, W, stages) of the step before, and the args (N or 1, M or 1, substeps, k, stages) of M
+    (N, K, W, stages) of the steps before, the last one first, NaN of none, and the args (N or 1, M or 1, substeps, k, stages) of M
     steps; and what becomes of them: the states out (N, M, 2, W), NaN from where a step fails, the
     turns (N, M, A) that angles made in each step, how many steps did not fail (N,), and the most
     iterations of one (N,)."""
@@ -533,7 +557,8 @@ class Stepper:
         entries, values = lift.quadratic_invariants or (casimirs.entries, casimirs.values)
         entries = np.array(entries, np.int64).reshape(-1, 3)
         fibres = np.array(getattr(lift, "fibres", ()), np.int64).reshape(-1, 3)
-        law = (*found[:3], places, form[tuple(places.T)], _rule(flow.stages, h), entries)
+        rule = _rule(flow.stages, h)
+        law = (*found[:3], places, form[tuple(places.T)], rule, _ahead(), entries)
         law = (*law, np.asarray(values, float), fibres, np.asarray(unit, float), decay)
         law = (*law, np.array(angles, np.int64), np.array(centre, float))
         owned = tuple(np.require(a, requirements=["C", "W", "O"]) for a in law)
@@ -544,7 +569,7 @@ class Stepper:
         w = self.lift.up(np.asarray(z, np.longdouble) + lost)
         rounded = w.astype(float)
         w = np.stack([rounded, (w - rounded).astype(float)], axis=1)
-        return w, np.zeros((*rounded.shape, STAGES))
+        return w, np.full((len(w), _KNOWN, w.shape[2], STAGES), np.nan)
 
     def steps(self, lanes: tuple[np.ndarray, np.ndarray], count: int, args: Any) -> Task:
         """Follow lanes by ``count`` steps. args: (N or 1, M or 1, k) as each begins, or None."""
@@ -582,21 +607,14 @@ class Stepper:
 
 def _rule(stages: int, h: float) -> np.ndarray:
     """The rows of Gauss's rule that `Law` has; stages that it lacks have no weight."""
-    rule, found = gauss(stages), np.zeros((2 * STAGES + 1, STAGES))
+    rule, found = gauss(stages), np.zeros((STAGES + 1, STAGES))
     found[:stages, :stages] = rule.coupling.T
-    ahead = _extrapolated(rule.nodes) * rule.weights / rule.weights[:, None]
-    found[STAGES : STAGES + stages, :stages] = ahead
     found[-1, :stages] = h * rule.weights
     return found
 
 
-def _extrapolated(nodes: np.ndarray) -> np.ndarray:
-    """(s, s): values at the nodes of the next step of the polynomials that are 1 at one node and 0
-    at the others, by rows of these."""
-    ahead = 1.0 + nodes
-    apart = nodes[:, None] - nodes + np.eye(len(nodes))
-    found = np.empty((len(nodes), len(nodes)))
-    for j in range(len(nodes)):
-        others = np.arange(len(nodes)) != j
-        found[j] = np.prod((ahead - nodes[others, None]) / apart[j, others, None], axis=0)
-    return found
+def _ahead() -> np.ndarray:
+    """(K, K): weights of values at −1, …, −k in that at 0 of the polynomial through them, a row for
+    each k."""
+    weights = [[(-1) ** j * math.comb(k + 1, j + 1) for j in range(_KNOWN)] for k in range(_KNOWN)]
+    return np.array(weights, float)

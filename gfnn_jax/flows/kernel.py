@@ -125,19 +125,21 @@ class Task(NamedTuple):
 
 # Compilation optimises a function with all that it calls, again in each that calls it: the large
 # large ones call no large ones, but for `follow`.
-_function = numba.njit(  # pyright: ignore[reportCallIssue]: two options lack in its types
+function = numba.njit(  # pyright: ignore[reportCallIssue]: two options lack in its types
     error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
 )
 
 
 class _Compilation(event.Listener):
-    """Says that `follow` is compiled, where no cache holds it, and keeps LLVM from unrolling loops
-    meanwhile: of loops as short as these that is a third of the time, and makes them slower. Numba
-    has no option of a function for it; who compiles holds its lock."""
+    """Says what is compiled, where no cache holds it, and keeps LLVM from unrolling the loops of
+    `follow` meanwhile: of loops as short as these that is a third of the time, and makes them
+    slower. Numba has no option of a function for it; who compiles holds its lock."""
 
     def on_start(self, event: event.Event) -> None:
-        if (event.data or {}).get("dispatcher") is follow:
+        compiled = (event.data or {}).get("dispatcher")
+        if any(compiled is one for one in _said):
             print("the motion of laws is compiled: some seconds, kept on disk", file=sys.stderr)
+        if compiled is follow:
             llvm.create_pipeline_tuning_options = _rolled
 
     def on_end(self, event: event.Event) -> None:
@@ -146,6 +148,7 @@ class _Compilation(event.Listener):
 
 
 _options = llvm.create_pipeline_tuning_options
+_said: list = []  # functions of which it is said that they are compiled
 
 
 def _rolled(*arguments, **options):
@@ -155,12 +158,18 @@ def _rolled(*arguments, **options):
     return made
 
 
-def _cached(function):
+def cached(whole):
+    """Compile with a cache on disk, and say so when it is done."""
+    _said.append(_kept(whole))
+    return _said[-1]
+
+
+def _kept(whole):
     """Compile with a cache on disk: numba's own, or a temporary folder where neither the package
     nor the user's cache can be written; without one where that cannot be either."""
     options = {"error_model": "numpy", "nogil": True}
     try:
-        return numba.njit(cache=True, **options)(function)
+        return numba.njit(cache=True, **options)(whole)
     except RuntimeError:
         user = getattr(os, "getuid", int)()
         folder = Path(tempfile.gettempdir()) / f"gfnn_jax-{user}"
@@ -170,20 +179,20 @@ def _cached(function):
         if made.st_uid != user or made.st_mode & 0o022:  # of others, who might change what runs
             raise RuntimeError
         config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
-        return numba.njit(cache=True, **options)(function)
+        return numba.njit(cache=True, **options)(whole)
     except (OSError, RuntimeError):
         print("no folder can be written: the motion of laws is compiled anew", file=sys.stderr)
-        return numba.njit(**options)(function)
+        return numba.njit(**options)(whole)
 
 
-@_function
+@function
 def _sign(value):
     if value > 0.0:
         return 1.0
     return -1.0 if value < 0.0 else 0.0
 
 
-@_function
+@function
 def _solve(f, matrix, rhs, size, width):
     """The solution of a system of the rows from ``matrix`` on into those from ``rhs`` on, by
     elimination with partial pivoting."""
@@ -214,7 +223,7 @@ def _solve(f, matrix, rhs, size, width):
             f[rhs + k, j] = value / f[matrix + k, k]
 
 
-@_function
+@function
 def _shape(n, f, j, u):
     """The shape of a term at X with inputs in the row u, with its derivatives in the term's
     coordinates, into the first column of the stack."""
@@ -315,7 +324,7 @@ def _shape(n, f, j, u):
             f[jet, top] = value
 
 
-@_function
+@function
 def _with_shape(n, f, j, u, value):
     """Multiply the factor ``value`` of a term and its derivatives by the shape; return f."""
     count, most, jet = n[COUNT, j], n[SIZES, MOST], n[SIZES, JET]
@@ -332,7 +341,7 @@ def _with_shape(n, f, j, u, value):
     return value * g
 
 
-@_function
+@function
 def _terms(n, f, gamma, u, order):
     """The terms' factors f = ∏ q_i^n_i cos(m·q + φ) at X with their derivatives, and the masses,
     forces and momenta that the terms make, with inputs in the row u."""
@@ -406,7 +415,7 @@ def _terms(n, f, gamma, u, order):
                 f[FORCE, at] += weight * g * f[slope + i, j]
 
 
-@_function
+@function
 def _friction(n, f, order):
     """The forces of friction but for uniform friction, and their derivatives in v."""
     d, c, raw = n[SIZES, DIM], n[SIZES, DIRECTIONS], n[SIZES, RAW]
@@ -444,7 +453,7 @@ def _friction(n, f, order):
                     f[raw + i, d + m] += loss * stiffness * f[c + i, k] * f[c + m, k]
 
 
-@_function
+@function
 def _stuck(n, f):
     """The number of directions that stick."""
     stuck = 0
@@ -453,7 +462,7 @@ def _stuck(n, f):
     return stuck
 
 
-@_function
+@function
 def _hold(n, f):
     """Constrain the directions that stick, of which M⁻¹ is known: HOLDING (F, d) of a that makes λ,
     MOVED (d, F) what λ does to a, and FREE = 1 − moved holding. False where none sticks."""
@@ -481,7 +490,7 @@ def _hold(n, f):
     return True
 
 
-@_function
+@function
 def _among(n, f, target, width):
     """The x with ALIKE (F, F) x = target (F, width) among the directions that stick, 0 of the
     others, into the target; the least x where they depend on each other (Tikhonov's, iterated
@@ -524,7 +533,7 @@ def _among(n, f, target, width):
                         f[target + k, i] -= f[alike + k, m] * f[rhs + m, i]
 
 
-@_function
+@function
 def _derivatives(n, f, gamma, order):
     """∂r/∂(q, v) of all terms, and with ``order`` 2 their own residuals, added to RAW."""
     d, raw, most = n[SIZES, DIM], n[SIZES, RAW], n[SIZES, MOST]
@@ -566,7 +575,7 @@ def _derivatives(n, f, gamma, order):
                 f[raw + row, 2 * d + n[COLUMNS, e]] += f[PARTS, e] * own
 
 
-@_function
+@function
 def _width(n, order):
     """The number of derivatives of each part of a state."""
     width = 2 * n[SIZES, DIM] if order > 0 else 0
@@ -575,7 +584,7 @@ def _width(n, order):
     return width
 
 
-@_function
+@function
 def _rates(n, f, u, order):
     """Accelerations A at the state X, with inputs in the row u, and the forces HELD of friction;
     with ``order`` 1 or 2 ∂r/∂(q, v) or ∂r/∂(q, v, p) in RAW, of which −RESPONSE makes derivatives
@@ -639,7 +648,7 @@ def _rates(n, f, u, order):
                 f[raw + i, first + column] = -f[u, m]
 
 
-@_function
+@function
 def _smooth(n, f, span, order, u):
     """A step of the time ``span`` from X0 and its derivatives D0 to X1 and D1, with inputs in six
     rows from u on; a and λ at its begin stay in A_FIRST and HELD_FIRST. With an ``order`` below 0
@@ -699,7 +708,7 @@ def _smooth(n, f, span, order, u):
                         f[slope + d + j, m] -= by * f[ROW, m]
 
 
-@_function
+@function
 def _within(n, f, begin, end):
     """Inputs INSIDE at the nodes of the part of a step from ``begin`` to ``end``, by the polynomial
     through those at the nodes of the whole, U."""
@@ -718,7 +727,7 @@ def _within(n, f, begin, end):
             f[INSIDE + i, k] = value
 
 
-@_function
+@function
 def _speed(n, f, k, row, first):
     """c·v of the direction k, v from the place ``first`` of a row on."""
     speed = 0.0
@@ -727,7 +736,7 @@ def _speed(n, f, k, row, first):
     return speed
 
 
-@_function
+@function
 def _root(before, after, slope_before, slope_after):
     """The part of a step at which the cubic with these values and slopes at its ends, first above
     and then below zero, crosses it: Newton's method between bounds."""
@@ -751,7 +760,7 @@ def _root(before, after, slope_before, slope_after):
     return s
 
 
-@_function
+@function
 def _carried(n, f):
     """The directions that slide by their modes and whose speeds are sums of those that stick, as a
     relative speed where both bodies do: they are 0, and turn nowhere. λ is then ρ there, and the
@@ -779,7 +788,7 @@ def _carried(n, f):
                 f[CARRIED, k] = 1.0
 
 
-@_function
+@function
 def _changes(n, f):
     """Speeds along the modes AFTER the step, of directions that slide; whether one of them has
     turned or one sticks."""
@@ -793,7 +802,7 @@ def _changes(n, f):
     return changes
 
 
-@_function
+@function
 def _first_event(n, f, span):
     """The part of a step at which its first direction changes, 1 where none does, and which one: of
     the rates at both ends of the step."""
@@ -816,7 +825,7 @@ def _first_event(n, f, span):
     return part, event
 
 
-@_function
+@function
 def _turn(n, f, event):
     """The modes after that of a direction has changed at X1, whose a is kept in A_FIRST; speeds
     that stick become 0."""
@@ -839,7 +848,7 @@ def _turn(n, f, event):
         f[X, i] = f[X1, i]
 
 
-@_function
+@function
 def _jump(n, f, event, turning):
     """The derivatives D1 after a has jumped from A_FIRST to A, where a speed turned at this
     rate."""
@@ -853,7 +862,7 @@ def _jump(n, f, event, turning):
             f[end + i, m] += (f[A_FIRST, i] - f[A, i]) * late
 
 
-@_function
+@function
 def _released(n, f):
     """Let go the direction that sticks by a λ farthest beyond ρ: it slides to where λ held it from.
     False where there is none."""
@@ -867,7 +876,7 @@ def _released(n, f):
     return most > 0.0
 
 
-@_function
+@function
 def _forget(n, f):
     """Take from derivatives the speeds of directions that stick: they end at once."""
     d, begin, stage = n[SIZES, DIM], n[SIZES, D0] + n[SIZES, DIM], n[SIZES, D]
@@ -882,7 +891,7 @@ def _forget(n, f):
                 f[begin + i, m] += free * f[stage + k, m]
 
 
-@_function
+@function
 def _coefficients(n, f, laws, lane):
     """The numbers of the law that a lane follows."""
     (coefficients, turns), count, frictions = laws, n[SIZES, TERMS], n[SIZES, FRICTIONS]
@@ -900,7 +909,7 @@ def _coefficients(n, f, laws, lane):
             f[n[SIZES, GAINS] + i, m] = coefficients[row, place]
 
 
-@_function
+@function
 def _lane(n, f, task, lane, begins):
     """Begin a lane: its state and its modes, those of the state where ``begins``."""
     d = n[SIZES, DIM]
@@ -914,7 +923,7 @@ def _lane(n, f, task, lane, begins):
                 f[MODES, k] = 1.0
 
 
-@_function
+@function
 def _store(n, f, task, place, fine):
     """Keep the state after a step, its derivatives and modes; NaN where none was found."""
     (lane, m), d = place, n[SIZES, DIM]
@@ -926,7 +935,7 @@ def _store(n, f, task, place, fine):
         task.after[lane, m, k] = f[MODES, k] if fine else np.nan
 
 
-@_cached
+@cached
 def follow(n, f, laws, task, order):
     """Follow all lanes of a task, with derivatives in the state (``order`` 1) and in the
     coefficients (2). laws: the coefficients (R, ·) and the cosines and sines of the phases (R', 2

@@ -1,0 +1,163 @@
+"""Motion of laws: steps, rollouts, forecasts and fits beside those of the commit before the kernel.
+
+    python benchmarks/speeds/motion.py           rows of the package that is imported, as JSON
+
+Each checkout is measured by a process of its own, with the package of that checkout, on one thread;
+this file imports nothing else of the studies. Steps are of a double pendulum with seven
+coefficients and derivatives in the state and in all coefficients: smooth, and with dry friction of
+both joints, which sticks. Rollouts are of the map of its law: without friction, symplectic to
+roundoff, and with dry friction as of a recording's law, smoothed over 1e-4 where no events are
+followed. Fits are of the first seconds of measured records, with law and bands; forecasts of fifty
+times by these. Times are processor seconds, the least of several calls of what is short; the first
+step of a law compiles, with an empty cache."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded
+import jax
+import numpy as np
+
+import gfnn_jax as gfnn
+from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Terms
+from gfnn_jax.flows.motion import Form
+from gfnn_jax.maps.laws import map_of_law, smoothed
+from gfnn_jax.maps.sensors import Sensors
+
+OLD = "f45649e9^"  # before laws were followed by compiled code
+LANES = (1, 768)
+RECORDS = {"pendulum": 60.0, "two_carts": 6.0, "double_pendulum": 3.53}  # seconds of each
+SECONDS, MILLI, MICRO = ("s", 1.0), ("ms", 1e3), ("µs", 1e6)
+# row -> (title, its unit, the most it may be)
+ROWS: dict[str, tuple[str, tuple[str, float], float | None]] = {
+    "first step": ("first step of a law on a machine, compiled", SECONDS, 5.0),
+    **{
+        f"step, {kind}, {lanes}": (f"step with derivatives, {kind}, lanes: {lanes}", MICRO, None)
+        for kind in ("smooth", "dry")
+        for lanes in LANES
+    },
+    "rollout, alone": ("step of a rollout, double pendulum, alone", MICRO, 3.0),
+    "rollout, lanes": ("the same, one of 100 lanes", MICRO, 1.0),
+    "rollout, dry, alone": ("step of a rollout with dry friction, alone", MICRO, 10.0),
+    "rollout, dry, lanes": ("the same, one of 100 lanes", MICRO, 10.0),
+    "forecast, pendulum": ("forecast of a recording, pendulum", MILLI, 5.0),
+    "forecast, double_pendulum": ("the same, double pendulum", MILLI, 5.0),
+    **{f"fit, {name}": (f"fit of `{name}`, law and bands", SECONDS, None) for name in RECORDS},
+}
+
+
+def double_pendulum(kind: int | None) -> tuple[Form, np.ndarray]:
+    """A double pendulum with friction of this kind of both joints, or without."""
+    rows = [
+        ((2, 0), (0, 0), (0, 0), 0.0),
+        ((1, 1), (0, 0), (1, -1), 0.0),
+        ((0, 2), (0, 0), (0, 0), 0.0),
+        ((0, 0), (0, 0), (1, 0), 0.0),
+        ((0, 0), (0, 0), (0, 1), 0.0),
+    ]
+    joints = [] if kind is None else [((1, 0), kind, 0.0), ((-1, 1), kind, 0.0)]
+    form = Form(Terms.of(rows, 2), np.zeros(5), np.eye(5), Friction.of(joints, 2), 0)
+    return form, np.array([0.5, 0.4, 0.25, 20.0, 8.0, *[0.3] * len(joints)])
+
+
+def map_of(kind: int | None) -> Any:
+    """The map of its law; with dry friction that of a recording, with sensors."""
+    form, p = double_pendulum(kind)
+    law = form.lagrangian(p) if kind is None else smoothed(form.lagrangian(p), 1e-4)
+    q, v = np.split(np.random.default_rng(0).normal(size=(200, 4)), 2, axis=1)
+    found = map_of_law(law, np.concatenate([q, law.momentum(q, v)], axis=1), 0.01, tolerance=1e-6)
+    if kind is None:
+        return found
+    none, lead, sigma = np.zeros((1, 2)), np.array([1.0]), np.full(2, 1e-5)
+    sensors = Sensors(("a", "b"), (), (), sigma, 8.0, 1.0, "hold", 0.0, lead, none, creep=1e-4)
+    return dataclasses.replace(found, sensors=sensors)
+
+
+def step_of(form: Form) -> Callable[..., Any]:
+    """The step of a form; of commits before the kernel that with events was a function."""
+    if hasattr(form, "follow"):
+        return form.step
+    from gfnn_jax.flows import coulomb  # pyright: ignore[reportAttributeAccessIssue]
+
+    return lambda *arguments: coulomb.step(form, *arguments)
+
+
+def least(call: Callable[[], object], calls: int) -> float:
+    """Processor seconds of the fastest call."""
+    times = []
+    for _ in range(calls):
+        begin = time.process_time()
+        call()
+        times.append(time.process_time() - begin)
+    return min(times)
+
+
+def measured(quick: bool) -> dict[str, float]:
+    """The rows of the package that is imported; quick: no fits."""
+    found = {}
+    for name, kind in (("smooth", LINEAR), ("dry", DRY)):
+        form, p = double_pendulum(kind)
+        for lanes in LANES:
+            x, h = np.random.default_rng(0).normal(size=(lanes, 4)), np.full(lanes, 0.02)
+            x[::3, 2:] *= 0.02
+            step = partial(step_of(form), p, x, h, np.zeros((lanes, 1, 6, 0)))
+            found.setdefault("first step", least(step, 1))
+            found[f"step, {name}, {lanes}"] = least(step, 30) / lanes
+    for name, kind, steps in (("", None, 20_000), (", dry", DRY, 1_000)):
+        map_, z = map_of(kind), np.array([[0.5, -0.3, 0.0, 0.0]])
+        for row, lanes, count in (("alone", 1, steps), ("lanes", 100, steps // 10)):
+            many = np.repeat(z, lanes, axis=0) + 1e-3 * np.arange(lanes)[:, None]
+            ahead = partial(lambda *a: np.asarray(a[0].rollout(*a[1:])[0]), map_, many, count)
+            ahead()
+            found[f"rollout{name}, {row}"] = least(ahead, 3) / (lanes * count)
+    for name, stop in () if quick else RECORDS.items():
+        of = gfnn.records.RECORDS[name]
+        recording = gfnn.read(
+            gfnn.records.path(name), positions=list(of.positions), angles=list(of.angles)
+        ).slice(stop=stop)
+        begin = time.process_time()
+        fit = gfnn.fit(recording, max_seconds=None)
+        found[f"fit, {name}"] = time.process_time() - begin
+        times = stop + 0.02 * np.arange(1, 51)
+        found[f"forecast, {name}"] = least(partial(fit.map.forecast, recording, times), 20)
+    return found
+
+
+def of_checkout(checkout: Path, quick: bool) -> dict[str, float]:
+    """The rows of a checkout's package, in a process of its own that compiles anew."""
+    with tempfile.TemporaryDirectory() as cache:
+        environment = {**os.environ, "PYTHONPATH": str(checkout), "NUMBA_CACHE_DIR": cache}
+        command = [sys.executable, str(Path(__file__).resolve()), *["--quick"] * quick]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def motion(quick: bool) -> dict[str, Any]:
+    """The rows now, and, where not quick, of the commit `OLD`: one process after the other."""
+    here = Path(__file__).resolve().parents[2]
+    found = {"now": of_checkout(here, quick)}
+    if quick:
+        return found
+    with tempfile.TemporaryDirectory() as folder:
+        git = partial(subprocess.run, cwd=here, check=True, capture_output=True)
+        git(["git", "worktree", "add", "--detach", f"{folder}/old", OLD])
+        try:
+            return {"before": of_checkout(Path(folder) / "old", quick), **found}
+        finally:
+            git(["git", "worktree", "remove", "--force", f"{folder}/old"])
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    print(json.dumps(measured("--quick" in sys.argv)))
