@@ -499,10 +499,10 @@ def roll(law, task, substeps, inputs, moving):
 
 class Task(NamedTuple):
     """N lanes: their states w (N, 2, W), whose second row is what rounding has lost, the stages
-    (N, K, W, stages) of the steps before, the last one first, NaN of none, and the args (N or 1, M or 1, substeps, k, stages) of M
-    steps; and what becomes of them: the states out (N, M, 2, W), NaN from where a step fails, the
-    turns (N, M, A) that angles made in each step, how many steps did not fail (N,), and the most
-    iterations of one (N,)."""
+    (N, K, W, stages) of the steps before, the last one first, NaN of none, and the args (N or 1, M
+    or 1, substeps, k, stages) of M steps; and what becomes of them: the states out (N, M, 2, W),
+    NaN from where a step fails, the turns (N, M, A) that angles made in each step, how many steps
+    did not fail (N,), and the most iterations of one (N,)."""
 
     w: np.ndarray
     slopes: np.ndarray
