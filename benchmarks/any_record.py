@@ -31,6 +31,7 @@ from gfnn_jax.errors import FitError
 DRAWS, QUICK = 10, 2
 FIRST = 100  # draw; nothing was tuned to these
 NOISE, RIGHT = 1e-3, 0.01  # of the spread
+CLEAN, CLEAN_DRAWS = 1e-6, 4
 COUNT, RUNS = 1_500, 200
 MISSING = 0.3
 OFF = 0.05  # of a force, up to which a law of one orbit is right
@@ -57,8 +58,8 @@ SAMPLINGS = {
 SHORT = "200 runs of 6 to 10 samples"
 
 
-def case(name: str, sampling: str, draw: int) -> Numbers:
-    """One recording, its fit and how right it is."""
+def case(name: str, sampling: str, draw: int, noise: float = NOISE) -> Numbers:
+    """One recording with this noise, its fit and how right it is."""
     rng = np.random.default_rng([MECHANICAL.index(name), draw])
     system, d = SYSTEMS[name](rng), 0
     d = len(system.start)
@@ -86,7 +87,7 @@ def case(name: str, sampling: str, draw: int) -> Numbers:
     names = [f"x{i}" for i in range(1, d + 1)]
     tables = []
     for t, states in runs:
-        seen = states[:, :d] + NOISE * spread * rng.normal(size=(len(t), d))
+        seen = states[:, :d] + noise * spread * rng.normal(size=(len(t), d))
         if "missing" in sampling:
             seen = np.where(rng.uniform(size=seen.shape) < MISSING, np.nan, seen)
         tables.append({"t": t, **dict(zip(names, seen.T, strict=True))})
@@ -144,6 +145,18 @@ def sampled(sampling: str, name: str, quick: bool) -> Numbers:
         right = "right" if c["right"] else "WRONG"
         print(f"  {name} {draw} ({c['friction']}): {right} {what[:150]}", flush=True)
     return {"cases": cases}
+
+
+def clean_case(name: str, draw: int) -> Numbers:
+    """Even readings without noise beside the same with 1e-6 of the spread: the law is no worse
+    where it errs by no more than that of noise, or is right to 1e-6."""
+    clean, noisy = (case(name, "even, 30 s", draw, noise) for noise in (0.0, CLEAN))
+    errors = [np.inf if c.get("error") is None else c["error"] for c in (clean, noisy)]
+    found: Numbers = {k: clean[k] for k in ("draw", "verdict", "formula", "error") if k in clean}
+    found["named"] = bool(errors[0] <= max(errors[1], CLEAN) and clean["right"] >= noisy["right"])
+    if "formula" in clean and "formula" in noisy:
+        found["times"] = clean["processor_seconds"] / noisy["processor_seconds"]
+    return found | {"of_noise": noisy.get("error"), "rubs": [clean.get("rubs"), noisy.get("rubs")]}
 
 
 # Sensors that show no position
@@ -549,6 +562,7 @@ PIECES |= {
     _slug(f"outside {n}"): partial(drawn, outside_case, n, k)
     for n, k in zip(OUTSIDE, EACH, strict=True)
 }
+PIECES |= {_slug(f"clean {n}"): partial(drawn, clean_case, n, CLEAN_DRAWS) for n in MECHANICAL}
 PIECES |= {_slug(f"worn {n}"): partial(drawn, worn_case, n, DRAWS) for n in WORN}
 HIDDEN = ("carts", "double pendulum")
 PIECES |= {_slug(f"hidden {n}"): partial(drawn, hidden_case, n, DRAWS) for n in HIDDEN}
@@ -588,6 +602,18 @@ def tables() -> None:
         "CPU s",
     )
     text = markdown(heads, rows)
+    rows = []
+    for name in MECHANICAL:
+        own = cases.get(_slug(f"clean {name}"), [])
+        times = [number(max(c["times"] for c in own if "times" in c))] if own else []
+        if own:
+            rows.append([name, f"{sum(c['named'] for c in own)} of {len(own)}", *times])
+    heads = (
+        "without noise, beside σ 1e-6",
+        "law no worse",
+        "largest ratio of seconds",
+    )
+    text += "\n\n" + markdown(heads, rows)
     rows = []
     for name in WORN:
         own = cases.get(_slug(f"worn {name}"), [])

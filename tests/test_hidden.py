@@ -29,6 +29,8 @@ def test_oscillations_are_the_parts_of_a_sum():
     parts, rates = Oscillations(np.array([1.7, 4.1])).parts(t, slow + fast)
     np.testing.assert_allclose(parts, np.stack([slow, fast], 1), atol=1e-6)
     np.testing.assert_allclose(rates[:, 1], 4.1 * 0.4 * np.cos(4.1 * t), atol=1e-5)
+    t = 0.05 * np.arange(400)
+    assert oscillations(t, np.exp(-0.1 * t) * np.cos(2 * t), 3) == []
 
 
 @pytest.mark.parametrize(

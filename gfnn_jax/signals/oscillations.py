@@ -96,7 +96,7 @@ def oscillations(t: np.ndarray, y: np.ndarray, count: int) -> list[Oscillations]
                 tried.append(_refined(t, y, np.append(one.omega, 2 * np.pi * peak)))
         tried = [one for one in tried if one.are_apart]
         tried.sort(key=lambda one: one.left(t, y))
-        if len(found[0].omega) == 1:
+        if found and len(found[0].omega) == 1:
             strongest = found[0].omega[0]
             tried = tried[: _OPTIONS.kept - 1] + [
                 Oscillations(np.sort(strongest * np.array([1.0, ratio])))

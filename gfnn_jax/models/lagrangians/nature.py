@@ -142,7 +142,9 @@ def nature(
     return Nature(
         "no law",
         f"unrecorded: positions and velocities explain only {100 * second:.0f} % of the "
-        "accelerations. An input is missing (--inputs), or a coordinate",
+        "accelerations. An input is missing (--inputs), or a coordinate"
+        + " (--hidden 1)"
+        * (alone and not u.shape[1]),
         mostly=second > OPTIONS.mostly,
     )
 
