@@ -65,7 +65,8 @@ def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
     fits against which the likeliest has no odds that decide, where held-out arcs do not lose."""
     deciding = fit.problem.options.evidence.deciding
     for _ in range(OPTIONS.rounds):
-        near = [one for one in _near(fit, every) if len(one.fit.p) <= len(fit.p)]
+        near = [_leaner(one, fit) for one in _near(fit, every)]
+        near = [one for one in near if len(one.fit.p) <= len(fit.p)]
         found = [Exchanged(fit, 0.0), *near]
         least = min(one.above for one in found)
         likely = [one for one in found if one.above < least + deciding]
@@ -80,6 +81,26 @@ def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
         fit.problem.on_progress(f"  {come} in place of {gone}")
         fit = fit.again()
     return fit
+
+
+def _leaner(one: Exchanged, fit: LawFit) -> Exchanged:
+    """A likelier law of more terms than a fit has, without those that are not significant."""
+    z, least = one.fit.significance, fit.problem.options.evidence.significant
+    weak = {k for k in z if k[0] in ("term", "loss") and z[k] < least}
+    weak -= protected(one.fit.structure)
+    if len(one.fit.p) <= len(fit.p) or one.above > 0 or not weak:
+        return one
+    other = one.fit.again(one.fit.structure.without(weak), rescale=False)
+    return _compared(other, fit) or one
+
+
+def _compared(other: LawFit, fit: LawFit) -> Exchanged | None:
+    """A fit beside another one; None where it is no law: M is not positive, or friction drives."""
+    if not (may_be_chosen(other) and other.is_definite):
+        return None
+    count = fit.independent
+    sizes = (criterion(f.fitted.cost, count, len(f.p)) for f in (other, fit))
+    return Exchanged(other, float(np.subtract(*sizes)))
 
 
 def _holds(other: LawFit, fit: LawFit) -> bool:
@@ -177,11 +198,6 @@ class _Screen:
             np.array([i for i in range(len(keys)) if i not in own and size[i] > 0], int),
         )
 
-    @property
-    def count(self) -> float:
-        """The number of residuals that are independent."""
-        return np.count_nonzero(np.isfinite(self.fit.arcs.y)) / self.fit.correlation
-
     def sets(self) -> list[tuple[frozenset[int], float]]:
         """Sets of places, and by how much their criterion is above that of the fit; the likeliest
         first. None has friction that drives."""
@@ -211,7 +227,10 @@ class _Screen:
         found |= {kept | {a}: rest @ rest - b**2 for a, b in zip(come.tolist(), along, strict=True)}
         for k in np.argsort(-two)[: OPTIONS.screened]:
             found[kept | {int(come[i[k]]), int(come[j[k]])}] = rest @ rest - two[k]
-        return {places: criterion(left, self.count, len(places)) for places, left in found.items()}
+        return {
+            places: criterion(left, self.fit.independent, len(places))
+            for places, left in found.items()
+        }
 
     def _solved(self, places: frozenset[int]) -> tuple[np.ndarray, float]:
         """Coefficients of these places, in their order, and the sum of squares that they leave."""
@@ -220,7 +239,7 @@ class _Screen:
         return found, float(np.sum((self.target - columns @ found) ** 2))
 
     def _criterion(self, places: frozenset[int]) -> float:
-        return criterion(self._solved(places)[1], self.count, len(places))
+        return criterion(self._solved(places)[1], self.fit.independent, len(places))
 
     def _rubbing(self, places: frozenset[int]) -> frozenset[int]:
         """The places without friction that would drive, the strongest first."""
@@ -260,15 +279,11 @@ class _Screen:
         return dict(zip(sorted(places), errors.tolist(), strict=True))
 
     def fitted(self, places: frozenset[int]) -> Exchanged | None:
-        """The fit of these terms to arcs; None where it is no law: M is not positive, or friction
-        drives."""
+        """The fit of these terms to arcs; None where it is no law."""
         keys, ordered = self.larger.keys(), sorted(places)
         gone = {keys[i] for i in self.own - places}
         structure = self.fit.structure.without(gone).plus([keys[i] for i in places - self.own])
         values = self._solved(places)[0] / self.size[ordered]
         known = {keys[i]: float(value) for i, value in zip(ordered, values, strict=True)}
         other = self.fit.again(structure, known, rescale=False)
-        if not (may_be_chosen(other) and other.is_definite):
-            return None
-        sizes = (criterion(f.fitted.cost, self.count, len(f.p)) for f in (other, self.fit))
-        return Exchanged(other, float(np.subtract(*sizes)))
+        return _compared(other, self.fit)

@@ -285,6 +285,11 @@ class LawFit:
         """Return whether orbits of the law follow all arcs."""
         return bool(np.isfinite(self.fitted.cost))
 
+    @property
+    def independent(self) -> float:
+        """The number of residuals that are independent."""
+        return np.count_nonzero(np.isfinite(self.arcs.y)) / self.correlation
+
     @functools.cached_property
     def is_definite(self) -> bool:
         """Return whether M is positive definite at all states: else there is no least energy."""

@@ -12,7 +12,7 @@ from gfnn_jax.exports import symbolic
 from gfnn_jax.exports.symbolic import Equation, Formula, equations_of_motion
 from gfnn_jax.families.lagrangian import DRY, Lagrangian
 from gfnn_jax.families.text import Term, measured
-from gfnn_jax.fitting.evidence import EVIDENCE, Rival
+from gfnn_jax.fitting.evidence import Rival
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.calibration import Horizon
@@ -155,14 +155,6 @@ class LearnedLaw:
         together = [names for names in self.alike if names.endswith(ONLY_TOGETHER)]
         if together:
             return f"one of several: {'; '.join(together)}"
-        kinds, odds = set(self.which_friction.kinds), self.which_friction.odds
-        rivals = [
-            name
-            for name in odds
-            if odds[name] < EVIDENCE.decided and not kinds < {*name.split("+")}
-        ]
-        if rivals:
-            return f"one of several: friction may be {' or '.join(['+'.join(kinds), *rivals])}"
         return "identified"
 
     def _repr_latex_(self) -> str:

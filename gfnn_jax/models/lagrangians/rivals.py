@@ -104,7 +104,7 @@ def with_a_shape(fit: LawFit) -> LawFit:
     """The fit of one length with a shape (`libraries.SHAPES`) in place of its powers, or beside
     springs in place of the powers that inputs are multiplied by, where that is likelier than these,
     and than any other shape, by odds that decide."""
-    structure, count = fit.structure, _independent(fit)
+    structure, count = fit.structure, fit.independent
     potentials = [row for row in structure.terms if not any(row[0])]
     driven = Counter(shape_of(row) for row in potentials if has_inputs(row))
     of_inputs, many = driven.most_common(1)[0] if driven else ("1", len(potentials))
@@ -258,7 +258,7 @@ def one_sided(fit: LawFit, coordinates: Sequence[str]) -> str:
         known = values | dict.fromkeys((("loss", side) for side in own), values["loss", rubs])
         other = structure.without({("term", force), ("loss", rubs)})
         again = fit.again(other.plus([("loss", side) for side in own]), known, rescale=False)
-        odds = evidence.odds(fit.fitted.cost, again.fitted.cost, _independent(fit))
+        odds = evidence.odds(fit.fitted.cost, again.fitted.cost, fit.independent)
         if again.follows and odds < evidence.decided:
             return (
                 f"friction of {coordinates[i]} that is stronger one way follows the record as the "
@@ -266,11 +266,6 @@ def one_sided(fit: LawFit, coordinates: Sequence[str]) -> str:
                 "shifts where it rests"
             )
     return ""
-
-
-def _independent(fit: LawFit) -> float:
-    """The number of residuals that are independent."""
-    return np.count_nonzero(np.isfinite(fit.arcs.y)) / fit.correlation
 
 
 def _power(fit: LawFit) -> float | None:
@@ -293,7 +288,7 @@ def _as_likely(fit: LawFit) -> dict[float, LawFit]:
     def odds(fit: LawFit) -> float:
         """Odds of the best so far over a fit."""
         least = min(other.fitted.cost for other in found.values())
-        return evidence.odds(least, fit.fitted.cost, _independent(fit))
+        return evidence.odds(least, fit.fitted.cost, fit.independent)
 
     for step in (-0.5, 0.5):
         first = np.ceil(2 * own) / 2 if step < 0 else np.floor(2 * own) / 2

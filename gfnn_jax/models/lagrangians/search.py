@@ -430,7 +430,7 @@ def with_fewer_waves(fit: LawFit, rows: Sequence[Row]) -> LawFit:
     """The fit with one of ``rows`` in place of several masses of the same speeds, as long as it is
     likelier by Schwarz's criterion: two waves imitate a third, v_i v_j (1 + cos 2q) that of cos q.
     """
-    begun, count = fit, np.count_nonzero(np.isfinite(fit.arcs.y)) / fit.correlation
+    begun, count = fit, fit.independent
 
     def unlikely(fit: LawFit) -> float:
         if not (fit.follows and fit.is_definite):
@@ -524,12 +524,11 @@ def likeliest(
     fits = [one for one in tried if may_be_chosen(one[0])] or tried[-1:]
     last = tried[-1][0]
     loss = last.problem.observation.loss
-    count = np.count_nonzero(np.isfinite(last.arcs.y)) / last.correlation
 
     def of(fit: LawFit) -> float:
         unit = last.fitted.sigma / fit.fitted.sigma
         cost = np.nansum(loss.of(fit.fitted.residuals / unit))
-        return criterion(float(cost), count, len(fit.p))
+        return criterion(float(cost), last.independent, len(fit.p))
 
     return min(fits, key=lambda one: of(one[0]))
 
