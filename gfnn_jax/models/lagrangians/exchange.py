@@ -149,15 +149,15 @@ def _near(fit: LawFit, every: Structure) -> list[Exchanged]:
     found: list[Exchanged] = []
     smaller: list[frozenset[int]] = []
     for some in (fewer, about):
-        end = len(found) + OPTIONS.fitted
+        tried = 0
         for places in some:
             if screen.adds_little(places) or any(one <= places for one in smaller):
                 continue
-            other = screen.fitted(places)
+            tried, other = tried + 1, screen.fitted(places)
             if other is not None:
                 found.append(other)
                 smaller += [places] if other.above < deciding else []
-            if len(found) == end:
+            if tried == OPTIONS.fitted:
                 break
     return found
 
