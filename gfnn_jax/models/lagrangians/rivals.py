@@ -216,7 +216,7 @@ def of_a_sensor(fit: LawFit) -> str:
     is_plain = set(fit.structure.terms) <= set(terms)
     if not seen.is_plain or problem.parameters or (is_noise and is_plain):
         return ""
-    friction, count, best = losses(d, (LINEAR,), 0.0)[:d], _independent(fit), ""
+    friction, count, best = losses(d, (LINEAR,), 0.0)[:d], fit.independent, ""
     least = criterion(fit.fitted.cost, count, len(fit.p))
     least += 2 * np.log(problem.options.evidence.decided) if is_noise else -OPTIONS.clearly
     plain = dataclasses.replace(fit.structure, terms=tuple(terms), friction=tuple(friction))
