@@ -7,8 +7,8 @@ whose keys are words those entries count whose key is in the name of the piece, 
 code that is reached; all of them, where there are none. A study without pieces reaches all that it
 defines.
 
-Comments, docstrings, annotations and layout mean nothing; nor does the harness, which measures
-nothing.
+Comments, docstrings, annotations, layout and what is printed mean nothing; nor does the harness,
+which measures nothing.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Place = tuple[str, str]  # script, and name of what is defined in it, "" of what
 
 
 class _Plain(ast.NodeTransformer):
-    """Without docstrings and annotations, but those of a class, which may be a dataclass."""
+    """Without docstrings, prints, and annotations except those of a class, maybe a dataclass."""
 
     def visit(self, node: ast.AST) -> ast.AST | None:
         documented = isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef))
@@ -48,6 +48,8 @@ class _Plain(ast.NodeTransformer):
             own = [x if isinstance(x, ast.AnnAssign) else self.visit(x) for x in node.body]
             node.body = [x for x in own if isinstance(x, ast.stmt)] or [ast.Pass()]
             return node
+        if isinstance(node, ast.Expr) and ast.unparse(node).startswith("print("):
+            return ast.copy_location(ast.Pass(), node)
         if isinstance(node, ast.AnnAssign):
             if node.value is None:
                 return None
