@@ -2,6 +2,7 @@
 
     python benchmarks/public.py                     the flows of dysts, which are made here
     python benchmarks/public.py --odebench FILE     ODEBench too, FILE its strogatz_extended.json
+    python benchmarks/public.py --records DIR       SNLS80mV.csv and dataBenchmark.csv in DIR too
     python benchmarks/public.py --quick             two flows, into runs/
 
 dysts (Gilpin, arXiv:2110.05266): Hamiltonian and nearly Hamiltonian flows at its initial states and
@@ -15,6 +16,10 @@ metric R² > 0.9 on the trajectory of the second initial state. Systems of our k
 any was fitted: `MECHANICAL`, as recordings of a position and its velocity, angles named, and
 `POISSON`, populations as states without a bracket. The other 53 are of first order, self-excited
 or have friction that depends on position.
+
+Silverbox (Wigren & Schoukens, ECC 2013): the law of the multisine, and the free run of the arrow,
+which is the first 40,000 samples, from its first 20 on. Cascaded tanks (Schoukens & Noël, 2017):
+the estimation record, of which there is no mechanical law.
 """
 
 from __future__ import annotations
@@ -28,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from harness import TABLES, Numbers, between_markers, main, markdown, number, once, provenance
 from harness import results as results_of
 from scipy.integrate import solve_ivp
@@ -35,11 +41,14 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
 
-FILE = "--odebench"
+FILE, FOLDER = "--odebench", "--records"
 # Number in ODEBench -> whether its position is an angle
 MECHANICAL = {24: False, 25: False, 28: True, 32: False, 34: True, 43: True, 44: True}
 POISSON = (27, 31)
 GAMMAS = (0.0, 0.05)  # γ, of the multiplicative noise
+RATE = 1e7 / 2**14  # Hz, of Silverbox
+ARROW, MULTISINE = slice(0, 40_000), slice(40_650, 105_712)  # samples
+SEEN = 20  # samples that a free run begins with
 RIGHT = 0.9  # R² of a trajectory that counts as right
 TRAINED, AHEAD, A_PERIOD = 1000, 200, 100  # samples
 _TOLERANCES = {"rtol": 1e-13, "atol": 1e-13, "method": "DOP853"}
@@ -202,6 +211,39 @@ def _learned(t: np.ndarray, y: np.ndarray, name: int) -> gfnn.Fit:
     return gfnn.fit(gfnn.Recording(table, positions=["x"], velocities=["v"], angles=angles))
 
 
+def silverbox(folder: Path, quick: bool) -> Numbers:
+    """The error of a free run of the arrow, by the law of the multisine."""
+    table = np.loadtxt(folder / "SNLS80mV.csv", delimiter=",")
+    t = np.arange(len(table)) / RATE
+
+    def recording(rows: slice) -> gfnn.Recording:
+        columns = {"t": t[rows], "u": table[rows, 0], "y": table[rows, 1]}
+        return gfnn.Recording(columns, positions=["y"], inputs=["u"], angles=[])
+
+    arrow = recording(slice(0, 4_000) if quick else ARROW)
+    fit, result = fitted(lambda: gfnn.fit(recording(MULTISINE)))
+    if fit is not None:
+        later = arrow.times()[SEEN:]
+        start = arrow.slice(stop=arrow.times()[SEEN - 1])
+        seen = arrow.values("y")[SEEN:]
+        left = fit.map.forecast(start, later, arrow).values["y"][0] - seen
+        result["rms_millivolts"] = 1e3 * float(np.sqrt(np.mean(left**2)))
+        result["largest_millivolts"] = 1e3 * float(np.max(np.abs(left)))
+    print(f"  {result}", flush=True)
+    return result
+
+
+def tanks(folder: Path, quick: bool) -> Numbers:
+    """What is said of a record that is not mechanical."""
+    table = pd.read_csv(folder / "dataBenchmark.csv")
+    t = table["Ts"].iloc[0] * np.arange(len(table))
+    columns = {"t": t, "u": table["uEst"].to_numpy(), "y": table["yEst"].to_numpy()}
+    recording = gfnn.Recording(columns, positions=["y"], inputs=["u"], angles=[])
+    _, result = fitted(lambda: gfnn.fit(recording))
+    print(f"  {result}", flush=True)
+    return result
+
+
 PIECES: dict[str, Callable[[bool], Numbers]] = {
     f"dysts-{name}": functools.partial(flow, name) for name in FLOWS
 }
@@ -226,6 +268,7 @@ def tables() -> None:
     if rows:
         heads = ("flow of dysts", "best of its table, sMAPE", "ours", "verdict", "law", "CPU s")
         between_markers(TABLES, "dysts", f"{markdown(heads, rows)}\n\n{provenance(found)}")
+    _records()
     names = {f"odebench-{gamma:g}": None for gamma in GAMMAS}
     levels = results_of(names, "public")  # type: ignore[arg-type]
     if not levels:
@@ -245,6 +288,24 @@ def tables() -> None:
     between_markers(TABLES, "odebench", f"{markdown(heads, rows)}\n\n{provenance(levels)}")
 
 
+def _records() -> None:
+    """The two records of a folder."""
+    names = {"silverbox-arrow": silverbox, "cascaded-tanks": tanks}
+    found = results_of(names, "public")  # type: ignore[arg-type]
+    if not found:
+        return
+    rows = []
+    for name, result in found.items():
+        m = result["measured"]
+        error = f"{number(m['rms_millivolts'])} mV" if "rms_millivolts" in m else "–"
+        law = f"`{m['formula']}`, R = `{m['friction']}`" if m.get("formula") else "–"
+        said = m.get("refused", m.get("verdict", ""))
+        best = "0.26 mV" if "rms_millivolts" in m else "not mechanical"
+        rows.append([name, best, error, said, law, number(m.get("processor_seconds"))])
+    heads = ("record", "to compare with", "free run", "verdict", "law", "CPU s")
+    between_markers(TABLES, "public-records", f"{markdown(heads, rows)}\n\n{provenance(found)}")
+
+
 if __name__ == "__main__":
     arguments = sys.argv[1:]
     if FILE in arguments:
@@ -252,4 +313,10 @@ if __name__ == "__main__":
         file = Path(arguments[at + 1])
         del arguments[at : at + 2]
         PIECES |= {f"odebench-{g:g}": functools.partial(odebench, file, g) for g in GAMMAS}
+    if FOLDER in arguments:
+        at = arguments.index(FOLDER)
+        folder = Path(arguments[at + 1])
+        del arguments[at : at + 2]
+        PIECES |= {"silverbox-arrow": functools.partial(silverbox, folder)}
+        PIECES |= {"cascaded-tanks": functools.partial(tanks, folder)}
     main(__doc__ or "", PIECES, "public", tables, arguments, tuple(PIECES)[:2])
