@@ -223,9 +223,9 @@ def silverbox(folder: Path, quick: bool) -> Numbers:
     arrow = recording(slice(0, 4_000) if quick else ARROW)
     fit, result = fitted(lambda: gfnn.fit(recording(MULTISINE)))
     if fit is not None:
-        later = arrow.times()[SEEN:]
-        start = arrow.slice(stop=arrow.times()[SEEN - 1])
-        seen = arrow.values("y")[SEEN:]
+        run = arrow.runs[0]
+        t, seen = arrow.times(run), arrow.values("y", run)[SEEN:]
+        start, later = arrow.slice(stop=t[SEEN - 1]), t[SEEN:]
         left = fit.map.forecast(start, later, arrow).values["y"][0] - seen
         result["rms_millivolts"] = 1e3 * float(np.sqrt(np.mean(left**2)))
         result["largest_millivolts"] = 1e3 * float(np.max(np.abs(left)))

@@ -15,6 +15,7 @@ states of the RMS error of one period ahead, of the spread of the positions.
 from __future__ import annotations
 
 import functools
+import importlib
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -192,7 +193,8 @@ class Recorded(NamedTuple):
         samples, periods = np.exp([rng.uniform(*np.log(ends)) for ends in (SAMPLES, PERIODS)])
         t = system.period / samples * np.arange(int(samples * periods))
         truth = rates(d, text_of(system.lagrangian), text_of(system.friction))
-        states = integrated(truth, *map(np.array, system.start), t)
+        q0, v0 = map(np.array, system.start)
+        states = integrated(truth, q0, v0, t)
         q = states[:, :d]
         seen = q + NOISE * q.std(axis=0) * rng.normal(size=q.shape)
         names = [f"x{i + 1}" for i in range(d)]
@@ -256,9 +258,8 @@ def by_pysindy(recorded: Recorded, features: Features, quick: bool) -> Numbers:
 
 
 def by_mujoco(recorded: Recorded, model: Model) -> Numbers:
-    import mujoco
-    from mujoco import sysid
-
+    mujoco: Any = importlib.import_module("mujoco")
+    sysid: Any = importlib.import_module("mujoco.sysid")
     d = recorded.states.shape[1] // 2
     spec = mujoco.MjSpec.from_string(model.xml(d))
     rng = np.random.default_rng(0)
