@@ -118,9 +118,8 @@ def public_flows() -> str:
     found = [measured(path.stem) for path in sorted(RESULTS.glob("public-dysts-*.json"))]
     seen = [(m["smape"], m["best_of_the_table"]) for m in found if m.get("smape") is not None]
     better = [own for own, best in seen if own < best]
-    return (
-        f"{len(better)} of {len(found)}, by {number(max(better))} at most; the others are refused"
-    )
+    most = number(max(better))
+    return f"{len(better)} of {len(found)}, {most} at most; no law is claimed of the others"
 
 
 def odebench() -> str:
