@@ -63,7 +63,9 @@ def _followed(stepper, map_, lanes: Lanes, args, saving: Saving) -> tuple[Any, R
         most = np.maximum(most, task.most).astype(most.dtype)
         own = winding[:, None] + np.cumsum(task.turns, axis=1)
         ended = task.fine
-        y = stepper.down(task.out)
+        whole = numbers % saving.every == 0
+        states = stepper.down(task.out[:, whole])
+        y = states if whole.all() else stepper.lift.down(task.out[:, :, 0])  # to tell the domain
         outside = ~contains(map_, y, _of_runs(map_, args)) & (np.arange(steps) < ended[:, None])
         left, first = outside.any(axis=1) & going, outside.argmax(axis=1)
         left_at = np.where(left & (left_at < 0), done + 1 + first, left_at)
@@ -73,10 +75,9 @@ def _followed(stepper, map_, lanes: Lanes, args, saving: Saving) -> tuple[Any, R
         if saving.stop_outside:
             status = np.where(left, STOPPED_AT_EDGE, status)
             ended = np.where(left, first, ended)
-        y[~going[:, None] | (np.arange(steps) >= ended[:, None])] = np.nan
-        whole = numbers % saving.every == 0
+        states[~going[:, None] | (np.flatnonzero(whole) >= ended[:, None])] = np.nan
         block = numbers[whole] // saving.every - 1
-        saved[:, block], turns[:, block] = y[:, whole], own[:, whole]
+        saved[:, block], turns[:, block] = states, own[:, whole]
         going = status <= LEFT_DOMAIN
         now[0][~going], winding, done = np.nan, own[:, -1], done + steps
     states = _outside(map_, saved, turns)
