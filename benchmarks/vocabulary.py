@@ -269,7 +269,7 @@ def motor_cart(rng: np.random.Generator) -> System:
 
 def magnet_on_a_spring(rng: np.random.Generator) -> System:
     """A force i² ÷ (a + y)² beside a spring, by a current that is recorded."""
-    gap, pull = rng.uniform(1.5, 3), rng.uniform(0.3, 1)
+    gap, pull = rng.uniform(3, 4.5), rng.uniform(0.3, 0.8)
     return System(
         {"v1**2": 0.5, "x1**2": -0.5, f"u1**2/({gap} + x1)": pull * gap},
         ((rng.uniform(-0.3, 0.3),), (0.0,)),
