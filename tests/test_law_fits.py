@@ -39,12 +39,13 @@ from gfnn_jax.maps.estimates import (
     propagate_each,
 )
 from gfnn_jax.maps.laws import states_of
+from gfnn_jax.models.lagrangians.exchange import with_exchanges
 from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.libraries import central, textbook
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.rivals import one_sided, other_powers, with_likeliest_power
-from gfnn_jax.models.lagrangians.search import search, search_on, with_fewer_waves
+from gfnn_jax.models.lagrangians.search import search, search_on
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.text import Names, speed_names, terms_of
 from gfnn_jax.signals.local_polynomials import choose_half, smooth
@@ -533,7 +534,7 @@ def test_a_cart_that_its_motor_moves_drives_a_pendulum_that_does_not_move_it(giv
     )
     known |= {("loss", friction[0]): 6, ("loss", friction[1]): 0.2, ("gain", 0, 0): 9}
     imitated = problem.fit(structure, known, problem.arcs(1.0), problem.scales.sigma)
-    fewer = with_fewer_waves(imitated, waves).structure.terms
+    fewer = with_exchanges(imitated, structure.plus([("term", waves[2])])).structure.terms
     assert [row for row in fewer if row[0] == (1, 1)] == waves[2:]
 
 

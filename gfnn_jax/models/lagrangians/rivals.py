@@ -218,7 +218,7 @@ def of_a_sensor(fit: LawFit) -> str:
         return ""
     friction, count, best = losses(d, (LINEAR,), 0.0)[:d], fit.independent, ""
     least = criterion(fit.fitted.cost, count, len(fit.p))
-    least += 2 * np.log(problem.options.evidence.decided) if is_noise else -OPTIONS.clearly
+    least += problem.options.evidence.deciding if is_noise else -OPTIONS.clearly
     plain = dataclasses.replace(fit.structure, terms=tuple(terms), friction=tuple(friction))
     plain = dataclasses.replace(plain, zeros=())
     try:

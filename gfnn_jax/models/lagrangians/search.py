@@ -261,8 +261,6 @@ class TermSearch:
             fit = with_a_shape(fit)
             for angle in fit.problem.within_a_turn:
                 fit = with_a_spring(fit, angle)
-            if fit.structure.leaders:
-                fit = with_fewer_waves(fit, self.every.terms)
             fit = fit if fit is waves else with_constant(self.prune(fit, friction=False))
             if fit.structure != before:
                 fit, choice = self.with_friction(fit)
@@ -424,31 +422,6 @@ def with_a_spring(fit: LawFit, angle: int) -> LawFit:
     word = fit.problem.word(spring[0])
     fit.problem.on_progress(f"  {word} in place of {len(waves)} waves: held-out arcs do not lose")
     return fit.again(plainer)
-
-
-def with_fewer_waves(fit: LawFit, rows: Sequence[Row]) -> LawFit:
-    """The fit with one of ``rows`` in place of several masses of the same speeds, as long as it is
-    likelier by Schwarz's criterion: two waves imitate a third, v_i v_j (1 + cos 2q) that of cos q.
-    """
-    begun, count = fit, fit.independent
-
-    def unlikely(fit: LawFit) -> float:
-        if not (fit.follows and fit.is_definite):
-            return np.inf
-        return criterion(fit.fitted.cost, count, len(fit.p))
-
-    while True:
-        terms, plainer = fit.structure.terms, []
-        for row in rows:
-            gone = {("term", other) for other in terms if any(row[0]) and other[0] == row[0]}
-            one = fit.structure.without(gone - {("term", row)}).plus([("term", row)])
-            if len(one.terms) < len(terms):
-                plainer.append(fit.again(one, rescale=False))
-        best = min(plainer, key=unlikely, default=fit)
-        if unlikely(best) >= unlikely(fit):
-            return fit if fit is begun else fit.again()
-        fit.problem.on_progress(f"  {len(best.structure.terms)} terms in place of {len(terms)}")
-        fit = best
 
 
 def frictions_tried(dim: int, options: SearchOptions) -> tuple[Loss, ...]:
