@@ -439,15 +439,16 @@ class Observation:
         found = []
         for k, even, turned in product(range(len(self.channels)), (False, True), (False, True)):
             own = np.isfinite(y[:, k])
-            (line,) = dominant_frequencies([t[own]], y[own, k], 1)
-            one = Swing(k, 2 * np.pi * line, even, turned, bool(angles))
-            z = one.along(t, y)
-            unit = 1.0 if angles else np.nanstd(y[:, k]) / one.own_omega**2
-            for size in OPTIONS.sizes:
-                for sign in (1, -1):
-                    swing = dataclasses.replace(one, size=sign * size * unit / np.max(np.abs(z)))
+            for line in dominant_frequencies([t[own]], y[own, k], 1):
+                one = Swing(k, 2 * np.pi * line, even, turned, bool(angles))
+                z = one.along(t, y)
+                unit = 1.0 if angles else np.nanstd(y[:, k]) / one.own_omega**2
+                for size in np.outer(OPTIONS.sizes, (1, -1)).ravel() * unit / np.max(np.abs(z)):
+                    swing = dataclasses.replace(one, size=float(size))
                     suited, cost = self._suited(*swing.states(z), y)
                     found.append((cost, dataclasses.replace(suited, swing=swing)))
+        if not found:
+            raise InputError(f"observe: none of {', '.join(self.channels)} oscillates")
         return min(found, key=lambda one: one[0])[1]
 
     def _swinging(self, t: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -15,14 +15,16 @@ from gfnn_jax.signals.steps import dominant_frequencies
 class _Options:
     """periods: of the slowest oscillation, in a window. fewest: samples of a window, for each
     oscillation. peaks: of a spectrum that are tried. kept: sets that more is added to. steps: of a
-    window, from one to the next. apart: ratio of neighbouring frequencies that a window tells from
-    one whose size changes. beside: ratios to the strongest, that a weak oscillation may have."""
+    window, from one to the next, where sets are compared; places: where states are told. apart:
+    ratio of neighbouring frequencies that a window tells from one whose size changes. beside:
+    ratios to the strongest, that a weak oscillation may have."""
 
     periods: float = 1.5
     fewest: int = 8
     peaks: int = 4
     kept: int = 3
     steps: int = 4
+    places: int = 64
     apart: float = 1.15
     beside: tuple[float, ...] = (0.5, 0.7, 1.4, 2.0, 0.85, 1.2)
 
@@ -50,7 +52,7 @@ class Oscillations(NamedTuple):
         """The parts (n, count) of y (n,) at times t (n,), and their rates of change; y may have
         NaN."""
         known = np.flatnonzero(np.isfinite(y))
-        _, at, _, c = self._fitted(t[known], y[known], 1)
+        _, at, _, c = self._fitted(t[known], y[known], _OPTIONS.places)
         nearest = np.abs(t[:, None] - at).argmin(axis=1)
         turned = np.exp(1j * self.omega * (t - at[nearest])[:, None])
         z = (c[nearest, 0::2] + 1j * c[nearest, 1::2]) * turned
@@ -67,7 +69,7 @@ class Oscillations(NamedTuple):
         step = np.ptp(t) / max(len(t) - 1, 1)
         size = max(round(self.seconds / step), _OPTIONS.fewest * len(self.omega))
         size = min(size, len(t))
-        begun = np.arange(0, len(t) - size + 1, 1 if parts == 1 else max(1, size // parts))
+        begun = np.arange(0, len(t) - size + 1, max(1, size // parts))
         index = begun[:, None] + np.arange(size)
         at = t[index].mean(axis=1)
         turned = np.exp(1j * self.omega * (t[index] - at[:, None])[..., None])
