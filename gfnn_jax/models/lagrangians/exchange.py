@@ -145,7 +145,13 @@ def _near(fit: LawFit, every: Structure) -> list[Exchanged]:
     sets = screen.sets()
     likely = min([0.0, *(above for _, above in sets)]) + deciding
     fewer = [one for one, above in sets if one < screen.own and above < likely + OPTIONS.far]
-    about = [one for one, above in sets if one not in fewer and above < likely + OPTIONS.slack]
+    about = [
+        one
+        for one, above in sets
+        if one not in fewer
+        and above < likely + OPTIONS.slack
+        and (above < -deciding or not screen.adds_little(one | screen.own))
+    ]
     found: list[Exchanged] = []
     smaller: list[frozenset[int]] = []
     for some in (fewer, about):
