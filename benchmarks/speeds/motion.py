@@ -114,9 +114,9 @@ def measured(quick: bool) -> dict[str, float]:
             step = partial(step_of(form), p, x, h, np.zeros((lanes, 1, 6, 0)))
             found.setdefault("first step", least(step, 1))
             found[f"step, {name}, {lanes}"] = least(step, 30) / lanes
-    for name, kind, steps in (("", None, 20_000), (", dry", DRY, 1_000)):
+    for name, kind, steps in (("", None, 10_000), (", dry", DRY, 1_000)):
         map_, z = map_of(kind), np.array([[0.5, -0.3, 0.0, 0.0]])
-        for row, lanes, count in (("alone", 1, steps), ("lanes", 100, steps // 10)):
+        for row, lanes, count in (("alone", 1, steps), ("lanes", 100, steps // 50)):
             many = np.repeat(z, lanes, axis=0) + 1e-3 * np.arange(lanes)[:, None]
             ahead = partial(lambda *a: np.asarray(a[0].rollout(*a[1:])[0]), map_, many, count)
             ahead()
