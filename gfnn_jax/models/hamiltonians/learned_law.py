@@ -183,8 +183,6 @@ class LearnedHamiltonian:
 
 
 TURNS = "friction is not smooth in steps in which a body turns or stops"
-_NAMED = 5  # terms in a message
-_NO_FORCE = 1e-9  # of the forces' sum: a total that is roundoff
 
 
 def learned_from(
@@ -314,7 +312,7 @@ def _messages(
             )
     if found.undetermined:
         names = found.undetermined
-        some = ", ".join(names[:_NAMED]) + (", …" if len(names) > _NAMED else "")
+        some = ", ".join(names[: OPTIONS.named]) + (", …" if len(names) > OPTIONS.named else "")
         yield (
             f"the pairs do not determine {len(names)} terms of H ({some}): they are left out, and "
             "H holds only where the pairs are"
@@ -350,7 +348,7 @@ def _in_relative_domain(flow: Flow, data: Dataset) -> Dataset:
     if data.structure is None:
         return data
     force = flow.family.gradient(flow.params, data.y0)[:, : data.dim]
-    moves = np.abs(force.sum(axis=1)).max() > _NO_FORCE * np.abs(force).sum(axis=1).max()
+    moves = np.abs(force.sum(axis=1)).max() > OPTIONS.no_force * np.abs(force).sum(axis=1).max()
     return dataclasses.replace(
         data, domain=data.structure.domain(data.y0, uses_positions=bool(moves))
     )

@@ -70,6 +70,7 @@ class LawOptions:
     in a mass, and the degree in a potential (benchmarks/double_pendulum.py). shares: of p and ṗ,
     the terms that make more in the middle of pairs are fitted first: a law of few terms is then
     found for a tenth of the operations; the middle is off by O(dt²), some per cent.
+    named: terms in a message. no_force: of the forces' sum, a total that is roundoff.
     """
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 8)
@@ -101,6 +102,8 @@ class LawOptions:
     goal: float = 0.3
     generators: tuple[int, ...] = (2, 3, 4, 5, 6)
     beyond: int = 2
+    named: int = 5
+    no_force: float = 1e-9
     sampled_rows: int = 6
     fewest_sampled: int = 2_000
     white_pairs: int = 2_000
