@@ -227,8 +227,9 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
         and OPTIONS.followed <= one.fit_percent < OPTIONS.nearly
         and loud > OPTIONS.beyond
     }
-    beyond = np.flatnonzero(np.min(best.calibration.median, axis=0) > OPTIONS.lost)
-    if len(beyond) and np.max(best.fit.sigma / best.fit.spread) < OPTIONS.lost / 2:
+    least = np.min(best.calibration.median, axis=0, initial=np.inf)
+    beyond = np.isfinite(least) & (least > OPTIONS.lost)
+    if beyond.any() and np.max(best.fit.sigma / best.fit.spread) < OPTIONS.lost / 2:
         flaws["half of the forecasts of held-out parts err by a fifth of the spread"] = (
             "the law fits this record and no other part of it: record a longer motion, or more "
             "samples a period"
