@@ -299,6 +299,7 @@ def _records() -> None:
         m = result["measured"]
         error = f"{number(m['rms_millivolts'])} mV" if "rms_millivolts" in m else "–"
         law = f"`{m['formula']}`, R = `{m['friction']}`" if m.get("formula") else "–"
+        law = law.replace("|", "\\|")
         said = m.get("refused", m.get("verdict", ""))
         best = "0.26 mV" if "rms_millivolts" in m else "not mechanical"
         rows.append([name, best, error, said, law, number(m.get("processor_seconds"))])

@@ -221,7 +221,7 @@ def ours(name: str) -> Numbers:
     found = vocabulary.case(name, 0)
     law = " ".join(filter(None, [found.get("formula"), found.get("friction")]))
     return {
-        "given": "which columns are angles" if SYSTEMS[name] else "",
+        "given": "which columns are angles",
         "found": f"{law} ({found.get('verdict', 'refused').split(':')[0]})",
         "error": found.get("error"),
         "processor_seconds": found["processor_seconds"],
@@ -329,13 +329,20 @@ def tables() -> None:
     """The table of RESULTS.md."""
     found = results_of(PIECES, "rivals")
     rows = [
-        [name, method, one["given"], f"`{one['found']}`", number(one["error"]), number(seconds)]
+        [
+            name,
+            method,
+            one["given"],
+            f"`{one['found']}`".replace("|", "\\|"),
+            number(one["error"]),
+            number(seconds),
+        ]
         for name, result in found.items()
         for method, one in result["measured"].items()
         for seconds in [one["processor_seconds"]]
     ]
     if rows:
-        heads = ("recording", "method", "given", "found", "error ÷ spread", "CPU s")
+        heads = ("recording", "method", "given", "found: L and R, or a", "error ÷ spread", "CPU s")
         between_markers(TABLES, "rivals", f"{markdown(heads, rows)}\n\n{provenance(found)}")
 
 
