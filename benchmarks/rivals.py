@@ -343,7 +343,10 @@ def tables() -> None:
     ]
     if rows:
         heads = ("recording", "method", "given", "found: L and R, or a", "error ÷ spread", "CPU s")
-        between_markers(TABLES, "rivals", f"{markdown(heads, rows)}\n\n{provenance(found)}")
+        missing = ", ".join(name for name in PIECES if name not in found)
+        note = f"Not measured yet: {missing}. " if missing else ""
+        text = f"{markdown(heads, rows)}\n\n{note}{provenance(found)}"
+        between_markers(TABLES, "rivals", text)
 
 
 if __name__ == "__main__":
