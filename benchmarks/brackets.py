@@ -279,7 +279,7 @@ def of_system(name: str, quick: bool) -> Numbers:
     flow = fit.map.pieces[0]
     off = np.abs(rollout - reference).max(axis=2)
     own = fit.bracket.matrix(states) @ gradient_of(fit, states)[..., None]
-    one = timed(lambda: fit.map.rollout(states[0], 10_000, save_every=10_000)[0], 1)
+    one = timed(lambda: fit.map.rollout(states[0], 10_000, save_every=10_000)[0])
     count_of = 10_000 if quick else 100_000 if one.seconds > 0.08 else 1_000_000
     long = np.asarray(fit.map.rollout(states[0], count_of, save_every=1_000)[0])
     drift = [np.nanmax(np.abs(c(long) / c(long)[0] - 1)) for c in fit.casimirs]
