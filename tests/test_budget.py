@@ -347,7 +347,7 @@ def test_a_faster_clock_ends_at_an_earlier_unit_which_operations_reproduce(learn
         same_bits(fit, again)
         assert again.operations == fit.operations
         assert ("there was no time" in fit.ended) == (tick > 1)
-        assert fit.budget.ended in fit.ended
+        assert fit.budget.ended.partition(" (")[0] in fit.ended
     operations = [fit.operations for fit in found]
     assert operations == sorted(operations, reverse=True)
     assert len(set(operations)) == len(operations)

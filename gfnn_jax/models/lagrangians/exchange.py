@@ -99,8 +99,8 @@ def _compared(other: LawFit, fit: LawFit) -> Exchanged | None:
     if not (may_be_chosen(other) and other.is_definite):
         return None
     count = fit.independent
-    sizes = (criterion(f.fitted.cost, count, len(f.p)) for f in (other, fit))
-    return Exchanged(other, float(np.subtract(*sizes)))
+    theirs, ours = (criterion(f.fitted.cost, count, len(f.p)) for f in (other, fit))
+    return Exchanged(other, theirs - ours)
 
 
 def _holds(other: LawFit, fit: LawFit) -> bool:
