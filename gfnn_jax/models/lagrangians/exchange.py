@@ -142,6 +142,8 @@ def _near(fit: LawFit, every: Structure) -> list[Exchanged]:
     if fit.is_exact or not fit.follows:
         return []
     screen, deciding = _Screen.of(fit, every), fit.problem.options.evidence.deciding
+    if not np.isfinite(screen.columns).all():
+        return []  # a term of the library overflows along the arcs
     sets = screen.sets()
     likely = min([0.0, *(above for _, above in sets)]) + deciding
     fewer = [one for one, above in sets if one < screen.own and above < likely + OPTIONS.far]
