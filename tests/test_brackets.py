@@ -64,7 +64,7 @@ def test_text():
         (lambda: gfnn.Bracket.se3().require_inside([[1, 2, 3, 0, 0, 0]]), "rows 0"),
         (
             lambda: gfnn.Bracket.magnetic([[[0, 1, 0], [-1, 0, 0], [0, 0, 0]]], [[0, 0, 1]]),
-            "no curl",
+            "curl",
         ),
     ],
 )

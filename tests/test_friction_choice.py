@@ -116,8 +116,7 @@ def test_friction_that_falls_below_zero_by_longer_arcs_is_dropped():
 def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():
     """By residuals and how many coefficients they took, in the noise of the last; friction that
     drives, or an arc that no orbit follows, is not taken."""
-    rng, x = np.random.default_rng(0), np.zeros((1, 200, 2))
-    noise = rng.normal(size=(1, 200, 1))
+    noise = np.random.default_rng(0).normal(size=(1, 200, 1))
 
     def fit(size, losses, sigma=1.0, cost=1.0):
         friction = tuple(((1,), kind, 0.0) for kind in range(len(losses)))
@@ -126,8 +125,7 @@ def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():
             values=values,
             structure=SimpleNamespace(friction=friction),
             p=np.array(losses),
-            correlation=2.0,
-            arcs=SimpleNamespace(y=x[..., :1]),
+            independent=100.0,
             follows=bool(np.isfinite(cost)),
             problem=SimpleNamespace(observation=SimpleNamespace(loss=SOFT_L1)),
             fitted=SimpleNamespace(residuals=size * noise / sigma, sigma=np.array([sigma])),

@@ -543,6 +543,13 @@ class Observation:
             n for n, a in zip(self.parameters, along, strict=True) if abs(a) > OPTIONS.same
         )
 
+    def hidden_places(self) -> list[int]:
+        """Places of the coordinates of which no channel shows anything, nor of their rates."""
+        rng, d = np.random.default_rng(0), self.dim
+        x, c, a = rng.normal(size=(40, 2 * d)), np.ones(len(self.parameters)), np.ones((40, d))
+        by = np.abs(self._shown(x, c, a)[1][..., : 3 * d]).max(axis=(0, 1)).reshape(3, d)
+        return np.flatnonzero(~by.any(axis=0)).tolist()
+
     def alike(self) -> tuple[list[str], list[str]]:
         """Parameters that no motion tells apart through the channels, whatever its law, and the
         products and ratios of two of these that it tells, as A*l and A*g of A*(l*a + g*sin(q))."""

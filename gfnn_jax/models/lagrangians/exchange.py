@@ -34,7 +34,9 @@ class ExchangeOptions:
     which make a rival of the law. screened: sets of each exchange that are looked at, and of all
     that are fitted: fitted. slack: of the criterion, by which arcs may differ from the triangle;
     far: the same where terms only leave, for laws along which masses and springs are nearly
-    collinear are far apart. rounds: exchanges in a row. listed: rivals, at most.
+    collinear are far apart. rounds: exchanges in a row. coloured: neighbours among which a residual
+    counts as one, above which the residuals are motion that the law lacks: an exchange then leaves
+    at most the share ``explained`` of the cost. listed: rivals, at most.
     """
 
     most: int = 2
@@ -47,6 +49,8 @@ class ExchangeOptions:
     slack: float = 3.0
     far: float = 200.0
     rounds: int = 4
+    coloured: float = 2.0
+    explained: float = 0.5
     listed: int = 5
 
 
@@ -66,7 +70,9 @@ def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
     deciding = fit.problem.options.evidence.deciding
     for _ in range(OPTIONS.rounds):
         near = [_leaner(one, fit) for one in _near(fit, every)]
-        near = [one for one in near if len(one.fit.p) <= len(fit.p)]
+        coloured = fit.correlation > OPTIONS.coloured
+        cost = fit.fitted.cost * (OPTIONS.explained if coloured else np.inf)
+        near = [one for one in near if len(one.fit.p) <= len(fit.p) and one.fit.fitted.cost < cost]
         found = [Exchanged(fit, 0.0), *near]
         least = min(one.above for one in found)
         likely = [one for one in found if one.above < least + deciding]

@@ -416,13 +416,19 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
         scales=recording.scales,
         columns=recording.columns,
     )
+    unseen = [names[i] for i in observation.hidden_places()] if recording.observe else []
+    if unseen:
+        raise InputError(
+            f"{', '.join(unseen)}: no column shows it. Leave it out of the coordinates, or write "
+            "it into a formula of a column (--observe)"
+        )
     alike, told = observation.alike()
     if alike:
         one = re.compile(rf"\b{alike[0]}\b")
         texts = {n: one.sub("1", f) for n, f in recording.observe.items() if isinstance(f, str)}
         typed = " ".join(f"--observe {shlex.quote(f'{n} = {f}')}" for n, f in texts.items())
         raise InputError(
-            f"observe: {', '.join(alike)} are not identifiable one by one"
+            f"observe: not identifiable one by one: {', '.join(alike)}"
             + f", but {', '.join(told)} are" * bool(told)
             + f". Write a number for {alike[0]}: {typed}"
         )
