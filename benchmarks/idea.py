@@ -141,8 +141,9 @@ def symplectic() -> Figure:
     energy.set(xlabel="step n", ylabel="largest relative error so far")
     energy.set_title("energy: bounded, or growing")
     position.set(xlabel="step n", ylabel="largest error so far", title="position: as n, or as n²")
-    for ax, where in ((plane, "center"), (energy, "upper left"), (position, "upper left")):
-        ax.legend(loc=where, markerscale=4)
+    plane.legend(loc="center", markerscale=4)
+    for ax in (energy, position):
+        ax.legend(loc="upper left", markerscale=4)
     return figure
 
 
