@@ -232,7 +232,8 @@ AMBIGUOUS: dict[str, tuple[Rate, str, str]] = {  # acceleration; terms of L, and
 
 def terms_in(law: str) -> tuple[set[str], set[str]]:
     """Terms of L and of R in "L = …; R = …", of one coordinate, without their coefficients."""
-    names = dict(zip(("q", "q_dot"), sp.symbols("q v", real=True), strict=True))
+    q, v = sp.symbols("q v", real=True)
+    names: dict[str, Any] = {"q": q, "q_dot": v}
     parts = (sp.expand(sp.parse_expr(part.split("=")[1], names)) for part in law.split(";"))
     lagrangian, friction = ({str(t.as_coeff_Mul()[1]) for t in p.as_ordered_terms()} for p in parts)
     return lagrangian, friction
