@@ -10,6 +10,7 @@ import warnings
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from other_python import killed_and_resumed
 
@@ -44,8 +45,8 @@ def assert_same(a, b):
         assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
 
 
-def latest(saved):
-    found = saved.latest()
+def latest(saved, like=None):
+    found = saved.latest(like)
     assert found is not None
     return found
 
@@ -76,6 +77,8 @@ def test_failed_save_changes_nothing(model, monkeypatch):
     before = {p: p.read_bytes() for p in model.rglob("*") if p.is_file()}
     with pytest.raises(TypeError, match="mlp/name"):
         save_model(model, {"mlp": {"name": "x"}}, {})
+    with pytest.raises(TypeError, match="key_data"):
+        save_model(model, {"key": jax.random.key(0)}, {})
     with pytest.raises(TypeError, match="object"):
         save_model(model, {"a": np.array([None])}, {})
     with pytest.raises(TypeError, match="JSON"):
@@ -171,8 +174,10 @@ def test_float64_needs_x64(model):
 
 
 def training_tree(seed):
+    params = {"w": jax.random.normal(jax.random.key(seed), (20, 3)), "b": jnp.zeros(3, jnp.float32)}
     return {
-        "params": {"w": RNG.normal(size=(20, 3)), "b": np.zeros(3, np.float32)},
+        "params": params,
+        "optimiser": optax.adam(1e-3).init(params),
         "best": (np.float32(0.5), [np.arange(seed + 1), None]),
         "epoch": seed,
         "loss": 0.1 + seed,
@@ -183,15 +188,21 @@ def training_tree(seed):
 def test_checkpoints_round_trip(tmp_path):
     saved = TrainingCheckpoints(tmp_path / "c", {"data": "d", "seed": 1})
     assert saved.latest() is None
-    wanted = training_tree(3)
     for step in (5, 10, 15):
-        saved.save(step, wanted)
+        saved.save(step, training_tree(3))
     assert sorted(os.listdir(tmp_path / "c")) == ["step_000000000010", "step_000000000015"]
     again = TrainingCheckpoints(tmp_path / "c", {"seed": 1, "data": "d"})
-    step, tree = latest(again)
+    step, tree = latest(again, training_tree(3))
     assert step == 15
-    assert_same(tree, wanted)
+    assert_same(tree, training_tree(3))
+    assert isinstance(tree["params"]["w"], jax.Array)
+    assert isinstance(tree["best"][1][0], np.ndarray)
     assert (type(tree["epoch"]), type(tree["loss"]), tree["stopped"]) == (int, float, False)
+    with pytest.raises(InputError, match="pass a tree like it"):
+        saved.latest()
+    plain = {"a": (1, [2.5, np.ones(2)]), "b": None}
+    saved.save(20, plain)
+    assert_same(latest(saved)[1], plain)
 
 
 def test_checkpoints_refuse_another_training(tmp_path):
@@ -199,6 +210,16 @@ def test_checkpoints_refuse_another_training(tmp_path):
     saved.save(1, {"w": jnp.ones(3)})
     with pytest.raises(InputError, match=r"data"):
         TrainingCheckpoints(tmp_path, {"data": "e"}).latest()
+    for like, message in [
+        ({"w": jnp.ones(4)}, "expected w with shape"),
+        ({"w": jnp.ones(3, jnp.float32)}, "expected w with dtype float32, found w with dtype"),
+        ({"v": jnp.ones(3)}, "expected v with name v, found w"),
+        ({"w": jnp.ones(3), "x": 1}, "expected 2 leaves, found 1"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            saved.latest(like)
+    with jax.enable_x64(False), pytest.raises(InputError, match="w is float64"):
+        saved.latest()
 
 
 def test_damaged_checkpoint_is_passed_over(tmp_path):

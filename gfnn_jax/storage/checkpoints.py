@@ -2,8 +2,8 @@
 
 A folder holds
 
-- ``arrays.npz``: the arrays, under their names in the tree; of a model that 0.3 saved,
-  ``arrays/``, by Orbax;
+- ``arrays.npz``: the arrays, under their names in the tree; of a checkpoint, and of a model that
+  0.3 saved, ``arrays/``, by Orbax;
 - ``model.json``: everything else in plain text, with shape, dtype and SHA-256 of every array;
 - ``SHA256SUMS``: the digest of every file (``sha256sum -c SHA256SUMS`` checks it too).
 
@@ -31,9 +31,10 @@ from gfnn_jax.storage.outputs import (
     atomic_folder,
     failures_as_work_errors,
     restore_interrupted,
+    uninterrupted,
 )
 
-# Formats of folders: 0.3 has its arrays by Orbax.
+# Formats of folders: 0.3 and checkpoints have their arrays by Orbax, models since 0.4 in one .npz.
 BY_ORBAX, AS_NPZ = 2, 3
 _ARRAYS = {BY_ORBAX: "arrays", AS_NPZ: "arrays.npz"}
 _SUMS = "SHA256SUMS"
@@ -46,7 +47,7 @@ def save_model(folder, arrays: dict[str, Any], description: dict[str, Any]) -> N
     An existing ``folder`` is replaced; `outputs.ensure_new` checks first. Raises WorkError if
     writing fails; an existing folder is then unchanged.
     """
-    _write(Path(folder), arrays, {"description": description})
+    _write(Path(folder), arrays, {"format": AS_NPZ, "description": description})
 
 
 def load_model(folder) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -71,7 +72,9 @@ class TrainingCheckpoints:
     identity: a JSON-able dict that says which training this is (digests of data and settings);
     `latest` refuses the checkpoints of another one.
 
-    A tree is made of dicts, lists, tuples and None, with arrays, numbers and booleans as leaves.
+    A tree is made of dicts, lists, tuples and None, or of any registered PyTree node (an
+    optimiser's state), with NumPy or JAX arrays, Python numbers and booleans as leaves. Keys of
+    ``jax.random.key`` are saved as ``jax.random.key_data``.
     """
 
     def __init__(self, folder, identity: dict[str, Any]):
@@ -80,7 +83,8 @@ class TrainingCheckpoints:
 
     def save(self, step: int, tree: Any) -> None:
         """Save the tree of ``step``; it and the checkpoint before it remain. Raises WorkError."""
-        _write(self._path(step), tree, {"step": int(step), "identity": self.identity})
+        about = {"format": BY_ORBAX, "step": int(step), "identity": self.identity}
+        _write(self._path(step), tree, about)
         before = [old for old in self._steps() if old < step]
         # Later steps are damaged ones that were passed over; a kill leaves hidden folders.
         unused = [
@@ -89,21 +93,35 @@ class TrainingCheckpoints:
         for path in [*unused, *self.folder.glob(".step_*")]:
             shutil.rmtree(path, ignore_errors=True)
 
-    def latest(self) -> tuple[int, Any] | None:
+    def latest(self, like: Any = None) -> tuple[int, Any] | None:
         """Load the newest undamaged checkpoint as (step, tree), or None.
 
-        Leaves come back bit for bit as they were saved, arrays as NumPy's. A damaged checkpoint is
-        passed over with a warning. Raises InputError where the checkpoint is of another training.
+        Leaves come back bit for bit as they were saved: NumPy as NumPy, JAX as JAX, numbers as
+        numbers. ``like`` is a tree of the same structure, shapes and dtypes, needed where the tree
+        has nodes other than dicts, lists and tuples. A damaged checkpoint is passed over with a
+        warning. Raises InputError where the checkpoint is of another training, or differs from
+        ``like``, or is float64 while JAX's x64 mode is off.
         """
         for step in reversed(self._steps()):
             path = self._path(step)
             try:
-                tree, record = _read(path)
+                tree, record = _read(path, like)
             except Damaged as error:
                 warnings.warn(f"{error}: the checkpoint before it is used", stacklevel=2)
                 continue
             self._check(path, record)
-            return step, tree
+            kinds = [leaf["kind"] for leaf in record["leaves"]]
+            leaves, structure = jax.tree.flatten(tree)
+            for leaf, kind, entry in zip(leaves, kinds, record["leaves"], strict=True):
+                if kind == "jax" and _would_be_rounded(leaf):
+                    raise InputError(
+                        f"{path}: {entry['name']} is {leaf.dtype}: switch on JAX's x64 mode first"
+                    )
+            leaves = [
+                jax.numpy.asarray(leaf) if kind == "jax" else leaf
+                for leaf, kind in zip(leaves, kinds, strict=True)
+            ]
+            return step, jax.tree.unflatten(structure, leaves)
         return None
 
     def _check(self, path: Path, record: dict[str, Any]) -> None:
@@ -124,6 +142,11 @@ class Damaged(InputError):
     """Error of a folder that is incomplete or has changed since it was saved."""
 
 
+# ---------------------------------------------------------------------------------------------
+# One folder
+# ---------------------------------------------------------------------------------------------
+
+
 def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
     named, _ = jax.tree_util.tree_flatten_with_path(tree)
     leaves, stored = [], {}
@@ -134,15 +157,23 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
         # The number keeps apart names that are equal once other characters are gone.
         if array is not None and array.size:
             entry["key"] = f"{number:04d}.{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
-            if array.dtype.kind == "V":  # bfloat16 has no code in .npz
+            if (
+                record["format"] == AS_NPZ and array.dtype.kind == "V"
+            ):  # bfloat16 has no code in .npz
                 array = np.frombuffer(array.tobytes(), np.uint8)
             stored[entry["key"]] = array
-    structure = _structure(tree, iter(range(len(leaves))))
-    record = {"format": AS_NPZ, **record, "leaves": leaves, "structure": structure}
+    record = {
+        **record,
+        "leaves": leaves,
+        "structure": _structure(tree, iter(range(len(leaves)))),
+    }
     text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
-    with atomic_folder(folder) as new:
-        if stored:
+    # Orbax writes in threads of its own, which would go on in a folder that is gone.
+    with uninterrupted(), atomic_folder(folder) as new:
+        if stored and record["format"] == AS_NPZ:
             np.savez(new / _ARRAYS[AS_NPZ], allow_pickle=False, **stored)
+        elif stored:
+            _orbax().save((new / _ARRAYS[BY_ORBAX]).absolute(), stored)
         (new / _JSON).write_text(text, encoding="utf-8")
         sums = [
             f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(new).as_posix()}\n"
@@ -152,7 +183,7 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
         (new / _SUMS).write_text("".join(sums), encoding="utf-8")
 
 
-def _read(folder: Path) -> tuple[Any, dict[str, Any]]:
+def _read(folder: Path, like: Any = None) -> tuple[Any, dict[str, Any]]:
     """Read the tree, with NumPy leaves, and the content of ``model.json``; verify both."""
     with failures_as_work_errors(folder):
         restore_interrupted(folder)
@@ -176,11 +207,13 @@ def _read(folder: Path) -> tuple[Any, dict[str, Any]]:
     try:
         stored = _stored(folder / _ARRAYS[version]) if _any_stored(record) else {}
         leaves = [_restored(folder, entry, stored) for entry in record["leaves"]]
-        return _rebuild(record["structure"], leaves), record
+        if like is None:
+            return _rebuild(folder, record["structure"], leaves), record
     except InputError:
         raise
     except Exception as error:
         raise Damaged(f"{folder}: cannot be restored ({str(error)[:200]})") from error
+    return _as_like(folder, like, record["leaves"], leaves), record
 
 
 def _any_stored(record: dict[str, Any]) -> bool:
@@ -190,11 +223,23 @@ def _any_stored(record: dict[str, Any]) -> bool:
 def _stored(path: Path) -> dict[str, Any]:
     """Arrays by key, of an ``.npz`` or of a folder of Orbax's."""
     if path.suffix != ".npz":
-        import orbax.checkpoint as ocp  # takes half a second
-
-        return ocp.PyTreeCheckpointer().restore(path.absolute())
+        return _orbax().restore(path.absolute())
     with np.load(path, allow_pickle=False) as arrays:
         return dict(arrays)
+
+
+def _orbax():
+    import orbax.checkpoint as ocp  # takes half a second
+
+    if jax.process_count() == 1:
+        return ocp.PyTreeCheckpointer()
+    # Else it would wait for all processes of a job, which know nothing of this folder.
+    own = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+    )
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
+    return ocp.Checkpointer(handler, multiprocessing_options=alone)
 
 
 def _verify_files(folder: Path) -> None:
@@ -222,6 +267,8 @@ def _describe(name: str, leaf: Any) -> tuple[dict[str, Any], np.ndarray | None]:
     """Make the entry of a leaf in ``model.json``, and the array to store or None."""
     if isinstance(leaf, (bool, int, float)) and not isinstance(leaf, np.generic):
         return {"name": name, "kind": "number", "value": leaf}, None
+    if isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        raise TypeError(f"{name}: save jax.random.key_data of a key")
     if not isinstance(leaf, (jax.Array, np.ndarray, np.generic)):
         raise TypeError(f"{name}: a leaf must be an array or a number, got {type(leaf).__name__}")
     array = np.ascontiguousarray(leaf).reshape(np.shape(leaf))
@@ -229,7 +276,7 @@ def _describe(name: str, leaf: Any) -> tuple[dict[str, Any], np.ndarray | None]:
         raise TypeError(f"{name}: a leaf must hold numbers, got dtype {array.dtype}")
     return {
         "name": name,
-        "kind": "array",
+        "kind": "jax" if isinstance(leaf, jax.Array) else "numpy",
         "shape": list(array.shape),
         "dtype": str(array.dtype),
         "sha256": hashlib.sha256(array.tobytes()).hexdigest(),
@@ -260,26 +307,54 @@ def _would_be_rounded(leaf: Any) -> bool:
 
 
 def _structure(tree: Any, numbers) -> Any:
-    """Write the tree as JSON, each leaf as its number."""
+    """Write the tree as JSON, each leaf as its number, a registered node as {"node": type}."""
     if tree is None:
         return None
-    if isinstance(tree, dict):
+    if type(tree) is dict and all(type(key) is str for key in tree):
         return {"dict": {key: _structure(tree[key], numbers) for key in sorted(tree)}}
     if type(tree) in (list, tuple):
         return {type(tree).__name__: [_structure(item, numbers) for item in tree]}
-    return next(numbers)
+    if jax.tree_util.all_leaves([tree]):
+        return next(numbers)
+    for _ in jax.tree.leaves(tree):
+        next(numbers)
+    return {"node": type(tree).__name__}
 
 
-def _rebuild(structure: Any, leaves: list[Any]) -> Any:
+def _rebuild(folder: Path, structure: Any, leaves: list[Any]) -> Any:
     if structure is None:
         return None
     if isinstance(structure, int):
         return leaves[structure]
     ((kind, content),) = structure.items()
+    if kind == "node":
+        raise InputError(
+            f"{folder}: holds a {content}, which JSON cannot describe: pass a tree like it"
+        )
     if kind == "dict":
-        return {key: _rebuild(item, leaves) for key, item in content.items()}
-    items = [_rebuild(item, leaves) for item in content]
+        return {key: _rebuild(folder, item, leaves) for key, item in content.items()}
+    items = [_rebuild(folder, item, leaves) for item in content]
     return tuple(items) if kind == "tuple" else items
+
+
+def _as_like(folder: Path, like: Any, entries: list[dict[str, Any]], leaves: list[Any]) -> Any:
+    """Put the leaves into the structure of ``like``. Raises InputError where they differ in name,
+    shape or dtype."""
+    named, structure = jax.tree_util.tree_flatten_with_path(like)
+    expected = [
+        _describe(jax.tree_util.keystr(path, simple=True, separator="/"), leaf)[0]
+        for path, leaf in named
+    ]
+    for want, have in zip(expected, entries, strict=False):
+        for what in ("name", "shape", "dtype"):
+            if want.get(what) != have.get(what):
+                raise InputError(
+                    f"{folder}: expected {want['name']} with {what} {want.get(what)}, found "
+                    f"{have['name']} with {what} {have.get(what)}"
+                )
+    if len(expected) != len(entries):
+        raise InputError(f"{folder}: expected {len(expected)} leaves, found {len(entries)}")
+    return jax.tree.unflatten(structure, leaves)
 
 
 FACTORS = "factors"
