@@ -220,7 +220,7 @@ def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
     option = "tolerance" if tolerance.relative else "absolute_tolerance"
     return [
         f"a step moves the states by {size:.1e} {unit}: maps close to the identity meet the "
-        f"tolerance {tolerance.bound:g}. Set --{option.replace('_', '-')} ({option}=) to "
+        f"tolerance {tolerance.bound:g}. Set --{option.replace('_', '-')} to "
         f"{OPTIONS.coarse * size:.0e} or less"
     ]
 
