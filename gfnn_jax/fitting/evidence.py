@@ -58,10 +58,12 @@ EVIDENCE = Evidence()
 
 
 class Rival(NamedTuple):
-    """Another law that the data allow, and the odds of the one that was taken against it."""
+    """Another law that the data allow, the odds of the one that was taken against it, and its terms
+    beside those of that one, "" where they are not told: "with x**4 in place of x**6"."""
 
     formula: str
     odds: float
+    terms: str = ""
 
 
 class Comparison(NamedTuple):

@@ -80,13 +80,20 @@ def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
         before, fit = fit, next((one.fit for one in likely if _holds(one.fit, fit)), fit)
         if fit is before:
             break
-        come, gone = (
-            ", ".join(fit.problem.word(key) for key in a.values if key not in b.values) or "nothing"
-            for a, b in ((fit, before), (before, fit))
-        )
-        fit.problem.on_progress(f"  {come} in place of {gone}")
+        fit.problem.on_progress(f"  {other_terms(before, fit)}")
         fit = fit.again()
     return fit
+
+
+def other_terms(fit: LawFit, other: LawFit) -> str:
+    """The terms of another fit beside those of one: "with x**4 in place of x**6"."""
+    come, gone = (
+        ", ".join(fit.problem.word(key) for key in a.values if key not in b.values)
+        for a, b in ((other, fit), (fit, other))
+    )
+    if not come:
+        return f"without {gone}"
+    return f"with {come} in place of {gone}" if gone else f"with {come} too"
 
 
 def _leaner(one: Exchanged, fit: LawFit) -> Exchanged:

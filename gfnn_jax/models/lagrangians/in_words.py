@@ -149,10 +149,11 @@ def line_of(recording: Recording, found: GaugedLaw) -> str:
     return f"L = {lagrangian}; R = {friction}"
 
 
-def rival_of(recording: Recording, found: GaugedLaw, odds: float) -> Rival:
-    """A law against which that of the recording has these odds, as Python writes it."""
+def rival_of(recording: Recording, found: GaugedLaw, odds: float, terms: str) -> Rival:
+    """A law against which that of the recording has these odds, as Python writes it, and its terms
+    beside those of that law."""
     lagrangian, friction = _expressions(found, Names.of(recording))
-    return Rival(f"L = {lagrangian.formula}; R = {friction.formula}", odds)
+    return Rival(f"L = {lagrangian.formula}; R = {friction.formula}", odds, terms)
 
 
 def _standard_errors(

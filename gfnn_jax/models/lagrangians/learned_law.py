@@ -150,8 +150,8 @@ class LearnedLaw:
         if self.rival:
             return f"one of several: {self.rival}"
         if self.rivals:
-            told = " or ".join(one.formula for one in self.rivals[:_TOLD])
-            return f"one of several: {told} follows the record as well"
+            told = ", or one ".join(one.terms for one in self.rivals[:_TOLD])
+            return f"one of several: a law {told} fits the record as well"
         together = [names for names in self.alike if names.endswith(ONLY_TOGETHER)]
         if together:
             return f"one of several: {'; '.join(together)}"

@@ -37,7 +37,7 @@ from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.dependence import search_of_systems
 from gfnn_jax.models.lagrangians.drives import hidden_frequency, with_frequency
-from gfnn_jax.models.lagrangians.exchange import rivals
+from gfnn_jax.models.lagrangians.exchange import other_terms, rivals
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.first_order import plain_field
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
@@ -231,7 +231,12 @@ def _with_rivals(
     if not found:
         return law
     listed = tuple(
-        rival_of(recording, GaugedLaw.of(data, other), float(np.exp(above / 2)))
+        rival_of(
+            recording,
+            GaugedLaw.of(data, other),
+            float(np.exp(above / 2)),
+            other_terms(fit, other),
+        )
         for other, above in found
     )
     motions = named_motions(parting(fit, [other for other, _ in found]), recording)
