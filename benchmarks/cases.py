@@ -140,8 +140,10 @@ def run(path: Path, case: Case) -> Numbers:
         # One core: this process and all that it starts.
         if hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+        # As an installed package, with its bytecode on disk.
+        kept = {n: value for n, value in os.environ.items() if n != "PYTHONDONTWRITEBYTECODE"}
         process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=kept
         )
         lines, law = [], None
         assert process.stdout is not None

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import signal
 
 from gfnn_jax.data.columns import SECONDS
 from gfnn_jax.data.traits import (
@@ -397,6 +396,8 @@ def _settled(traits: Traits, name: str) -> bool:
 
 def _swing(runs: list[np.ndarray]) -> float:
     """The median way between turning points, the ends of runs among them; 0 where nothing turns."""
+    from scipy import signal  # takes half a second: loaded when first used
+
     ways = [np.empty(0)]
     for x in runs:
         prominence = 0.05 * np.ptp(x) if len(x) else 0.0

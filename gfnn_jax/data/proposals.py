@@ -11,7 +11,7 @@ import shlex
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import optimize, signal
+from scipy import optimize
 
 from gfnn_jax.data.columns import TOLD, first_order
 from gfnn_jax.data.faults import Fault, faults
@@ -291,6 +291,8 @@ def _caught(traits: Traits) -> float | None:
         away = np.flatnonzero(np.abs(off) > _OPTIONS.at_rest * sigma)
         if not len(away) or len(x) - away[-1] <= _OPTIONS.still:
             continue
+        from scipy import signal  # takes half a second: loaded when first used
+
         swing = off[: away[-1] + 1]
         size = float(np.ptp(swing))
         prominent = (

@@ -25,7 +25,7 @@ from gfnn_jax.evaluate.figures import Figure
 from gfnn_jax.evaluate.figures_style import as_svg
 from gfnn_jax.evaluate.forecasts import Forecasts, forecasts_of
 from gfnn_jax.evaluate.physics import Physics, physics
-from gfnn_jax.evaluate.report import PAGE, REPORT, device, to_json
+from gfnn_jax.evaluate.report import PAGE, REPORT, About, device, to_json
 from gfnn_jax.evaluate.simulation import simulation
 from gfnn_jax.exports.symbolic import as_mathml, defines
 from gfnn_jax.families.text import in_letters, measured
@@ -62,13 +62,6 @@ class Section(NamedTuple):
     @property
     def empty(self) -> bool:
         return not any(self._replace(title="", heads=()))
-
-
-class About(NamedTuple):
-    """Facts that a fit does not hold: the command that made it, and what was done to its data."""
-
-    command: str = ""
-    notes: tuple[str, ...] = ()
 
 
 def page(fit: Fit, *, about: About = About(), forecasts: Forecasts | None = None) -> str:  # noqa: B008

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,6 +23,13 @@ STEPS_REPORTED = (1, 10, 100, 1000)
 _LABELS = ("learns", "family", "label", "chart", "num_parameters")
 _ERRORS = ("validation_rms", "validation_relative", "validation_bound", "outside")
 _COSTS = ("operations", "microseconds_per_step", "fit_seconds", "rank", "condition", "chosen")
+
+
+class About(NamedTuple):
+    """Facts that a fit does not hold: the command that made it, and what was done to its data."""
+
+    command: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def device() -> str:

@@ -16,10 +16,7 @@ from gfnn_jax.data.recording import Recording, parameters_of, read
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.errors import FitError, InputError, OutOfTime, WorkError
-from gfnn_jax.evaluate.figures_of_recordings import law_figure
-from gfnn_jax.evaluate.figures_style import save
-from gfnn_jax.evaluate.page import About, write_page
-from gfnn_jax.evaluate.report import PAGE
+from gfnn_jax.evaluate.report import PAGE, About
 from gfnn_jax.families.told import anything_told
 from gfnn_jax.fitting import row_blocks
 from gfnn_jax.jobs.output import (
@@ -171,6 +168,8 @@ def fit(
         with atomic_folder(output.out) as folder:
             write(folder, folder, fitted, result, job)
             if command is not None:
+                from gfnn_jax.evaluate.page import write_page  # matplotlib, when first drawn
+
                 write_page(fitted, folder / PAGE, about=About(command))
     return Ran(fitted, output.out, result)
 
@@ -275,6 +274,9 @@ def fit_recording(
     with atomic_folder(output.out) as folder:
         write(folder, folder, fitted, result, job)
         if is_law:
+            from gfnn_jax.evaluate.figures_of_recordings import law_figure
+            from gfnn_jax.evaluate.figures_style import save  # matplotlib, when first drawn
+
             law: Any = fitted.found
             save(law_figure(law, recording), folder / LAW_FIGURE, dpi=110)
     if refused is not None:

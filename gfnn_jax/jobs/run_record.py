@@ -13,10 +13,8 @@ from gfnn_jax.data.recording import SECONDS, Recording
 from gfnn_jax.data.recording_summary import as_typed
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.evaluate import report
-from gfnn_jax.evaluate.figures_of_recordings import forecasts_figure
-from gfnn_jax.evaluate.figures_style import save
 from gfnn_jax.evaluate.forecasts import Forecasts, end_of_part, forecasts_of
-from gfnn_jax.evaluate.page import About, write_page, write_refusal
+from gfnn_jax.evaluate.report import About
 from gfnn_jax.jobs.fit import fit_recording, fit_states
 from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.output import Ran as Learned
@@ -68,6 +66,8 @@ def run_record(
                 **asked,
             )
         except (InputError, WorkError) as error:
+            from gfnn_jax.evaluate.page import write_refusal
+
             refused: InputError | WorkError | None = error
             write_refusal(whole, error, folder, about)
         else:
@@ -81,6 +81,10 @@ def run_record(
 def _report(
     learned: Learned, whole: Recording, end: float, folder: Path, output: Output, about: About
 ) -> Ran:
+    from gfnn_jax.evaluate.figures_of_recordings import forecasts_figure
+    from gfnn_jax.evaluate.figures_style import save  # matplotlib, when the law is on screen
+    from gfnn_jax.evaluate.page import write_page
+
     fit = dataclasses.replace(learned.fit, data=whole, learned_to=end)
     held_out = fit.held_out
     assert held_out is not None

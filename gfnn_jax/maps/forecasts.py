@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
@@ -113,7 +113,7 @@ def forecast(
         return found._replace(band={name: tubes[:, None] * of for name, of in std.items()})
     if asked.coverage is not None:
         # Two standard deviations are calibrated to hold 95 % of the readings.
-        factor = 2 * norm.ppf((1 + asked.coverage) / 2) / norm.ppf((1 + TUBE) / 2)
+        factor = 2 * ndtri((1 + asked.coverage) / 2) / ndtri((1 + TUBE) / 2)
         return found._replace(band={name: factor * of for name, of in std.items()})
     return found
 

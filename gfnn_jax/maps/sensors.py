@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.solve.noise import Wander
@@ -129,5 +129,5 @@ class Sensors:
         if len(logs) < 2:
             return np.nan
         count = np.clip(_PHASES * self.observed / self.leads[lead], 2, len(logs))
-        reach = stats.t.ppf(coverage, count - 1) * np.sqrt(1 + 1 / count)
+        reach = stdtrit(count - 1, coverage) * np.sqrt(1 + 1 / count)
         return float(np.exp(logs.mean() + reach * logs.std(ddof=1)))

@@ -7,8 +7,8 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial import legendre
-from scipy import signal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,9 +124,24 @@ def _welch(runs: list, step: float, length: int) -> tuple[np.ndarray, np.ndarray
         even = np.arange(t[0], t[-1] + 0.5 * step, step)
         series = np.interp(even, t[known], x[known])
         size = min(length, len(series))
-        _, power = signal.welch(series, 1 / step, nperseg=size, nfft=length, detrend="linear")
+        power = _periodograms(series, size, length) * step
         total, weight = total + power * len(series), weight + len(series)
     return frequencies, np.asarray(total) / max(weight, 1) * np.ones_like(frequencies)
+
+
+def _periodograms(series: np.ndarray, size: int, length: int) -> np.ndarray:
+    """Mean of the periodograms of parts of this size that overlap by half, each without its line,
+    under a Hann window, filled up with zeros to ``length``: Welch's spectrum for a step of 1.
+
+    Of scipy, `signal.welch` gives the same, and takes half a second to load.
+    """
+    parts = sliding_window_view(series, size)[:: size - size // 2].T
+    line = np.vander(np.linspace(-1, 1, size), 2)
+    parts = parts - line @ np.linalg.lstsq(line, parts, rcond=None)[0]
+    window = np.hanning(size + 1)[:-1, None]
+    power = np.mean(np.abs(np.fft.rfft(window * parts, length, axis=0)) ** 2, axis=1)
+    power[1 : (length + 1) // 2] *= 2  # the negative frequencies
+    return power / np.sum(window**2)
 
 
 def dominant_frequencies(
@@ -136,8 +151,8 @@ def dominant_frequencies(
     frequencies, power = spectrum(times, values)
     if len(frequencies) < 4 or not np.any(power > 0):
         return []
-    peaks, _ = signal.find_peaks(np.concatenate([[0], power[1:], [0]]))
-    peaks = peaks[peaks < len(power)]
+    among = np.concatenate([[0], power[1:], [0]])
+    peaks = 1 + np.flatnonzero((among[1:-1] > among[:-2]) & (among[1:-1] >= among[2:]))
     if len(peaks) == 0:
         return []
     order = peaks[np.argsort(power[peaks])[::-1]]
