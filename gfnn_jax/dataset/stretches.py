@@ -429,6 +429,16 @@ def with_states(nodes: Sequence[Nodes], arcs: Arcs, x: np.ndarray) -> list[Nodes
     return [dataclasses.replace(n, x=s) for n, s in zip(nodes, states, strict=True)]
 
 
+def with_noise(nodes: Sequence[Nodes], arcs: Arcs, sigma: np.ndarray) -> tuple[list[Nodes], Arcs]:
+    """The nodes and arcs of them with normal noise σ (k,) in their channels, always the same."""
+    rng, y = np.random.default_rng(0), arcs.y.copy()
+    added = [sigma * rng.normal(size=node.y.shape) for node in nodes]
+    for k, (i, a, b) in enumerate(arcs.home):
+        y[k, : b - a] += added[i][a:b]
+    nodes = [dataclasses.replace(n, y=n.y + e) for n, e in zip(nodes, added, strict=True)]
+    return nodes, dataclasses.replace(arcs, y=y)
+
+
 def shifted(nodes: Sequence[Nodes], zeros: Mapping[str, np.ndarray]) -> list[Nodes]:
     """The nodes with further zeros (d,) of each run, of channels that are the coordinates."""
     found = []

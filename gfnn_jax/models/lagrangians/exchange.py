@@ -152,7 +152,7 @@ def _plainness(fit: LawFit) -> tuple[int, ...]:
 def _near(fit: LawFit, every: Structure) -> list[Exchanged]:
     """Fits that are one exchange away, and about as likely as the likeliest by the triangle; a few
     of fewer terms that are not."""
-    if fit.is_exact or not fit.follows:
+    if not fit.follows:
         return []
     screen, deciding = _Screen.of(fit, every), fit.problem.options.evidence.deciding
     if not np.isfinite(screen.columns).all():

@@ -37,7 +37,8 @@ def with_fine_steps(fit: LawFit) -> LawFit:
         if not moved > _MOVED:
             return fit
         count = int(max(np.ceil(now * (moved / _MOVED) ** (1 / _ORDER)), now + 1))
-        if moved > _GAINS * before:
+        size = moved * float(np.mean(fit.sigma / fit.spread))  # errors of steps are in σ too
+        if size > _GAINS * before:
             count = within(now)
         if now >= most or count == now:
             break
@@ -49,7 +50,7 @@ def with_fine_steps(fit: LawFit) -> LawFit:
             f"{finer.inputs.substeps} steps between nodes: {now} move coefficients by {moved:.2g} "
             "standard errors"
         )
-        fit, before = other, moved
+        fit, before = other, size
     count = fit.problem.inputs.substeps
     problem.on_progress(f"{count} steps between nodes, which are too few for this noise")
     return fit

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.dataset.stretches import Arcs, Nodes, Scales, arcs_of, with_states
+from gfnn_jax.dataset.stretches import Arcs, Nodes, Scales, arcs_of, with_noise, with_states
 from gfnn_jax.fitting.evidence import EVIDENCE, Evidence, correlation_time
 from gfnn_jax.fitting.linearised import Linearised, without_each
 from gfnn_jax.fitting.triangle import Triangle
@@ -37,8 +37,8 @@ class SearchOptions:
     tried. as_well: times the cost, with which a law follows the record as well. settled: ratio of
     noise scales that needs no second fit. least_left: of the squares of residuals, that an added
     term may leave. imitated: share of what a term changes, below which the fitted ones imitate it.
-    rounding: residual, of a channel's spread, that is the rounding of data and steps. frictions:
-    kinds that are tried; choose_friction: by held-out arcs, else all of these.
+    least: noise of a channel, of its spread; rounding, truncation and printed digits are below it.
+    frictions: kinds that are tried; choose_friction: by held-out arcs, else all of these.
     """
 
     periods: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
@@ -51,7 +51,7 @@ class SearchOptions:
     settled: float = 1.15
     least_left: float = 1e-4
     imitated: float = 0.03
-    rounding: float = 1e-9
+    least: float = 1e-7
     frictions: tuple[str, ...] = FRICTIONS
     choose_friction: bool = True
 
@@ -231,7 +231,11 @@ class ArcProblem:
         sigma: np.ndarray,
         rescale: bool = True,
     ) -> LawFit:
-        """Fit coefficients from those ``known``; σ is made that of the residuals if ``rescale``."""
+        """Fit coefficients from those ``known``; σ is made that of the residuals if ``rescale``.
+
+        Residuals of recordings without noise are rounding and truncation, and coloured: a channel
+        that leaves less than the least noise is given what is missing.
+        """
         p = structure.start(structure.in_gauge(known, self.gauge))
         law, x = self.law(structure, arcs, p), arcs.x
         readings = self.readings(law, arcs, sigma)
@@ -247,7 +251,14 @@ class ArcProblem:
             sigma = sigma * change
         followed = dataclasses.replace(self, nodes=with_states(self.nodes, arcs, found.x))
         time = correlation_time(found.whitened)
-        return LawFit(followed, structure, law.form, arcs, found, sigma, time)
+        fit = LawFit(followed, structure, law.form, arcs, found, sigma, time)
+        least, left = self.options.least * fit.spread, fit.rms()
+        missing = np.sqrt(np.where(left < 0.9 * least, least**2 - left**2, 0.0))
+        if not (rescale and missing.any()):
+            return fit
+        nodes, arcs = with_noise(followed.nodes, fit.followed, missing)
+        noisy = dataclasses.replace(self, nodes=nodes)
+        return noisy.fit(structure, fit.values, arcs, np.hypot(sigma, missing), False)
 
     def linearised(self, structure: Structure, fit: LawFit, arcs: Arcs | None = None) -> Linearised:
         """The problem of a structure close to a fit of it, or of a part of it, the states of arcs
@@ -362,11 +373,6 @@ class LawFit:
         """Root mean square residual (k,), in units of the channels."""
         left = self.fitted.residuals * self.arcs.noise
         return np.sqrt(np.nanmean(left**2, axis=(0, 1))) * self.sigma
-
-    @property
-    def is_exact(self) -> bool:
-        """Return whether the residuals are rounding, in which no further term is seen."""
-        return bool(np.all(self.rms() < self.problem.options.rounding * self.spread))
 
     @property
     def spread(self) -> np.ndarray:

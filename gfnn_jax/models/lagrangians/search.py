@@ -303,10 +303,9 @@ class TermSearch:
     def prune(self, fit: LawFit, friction: bool = True) -> LawFit:
         """The fit without terms that are not seen, the least seen first, as long as held-out arcs
         do not lose; and, unless ``friction`` has been chosen, without that which would drive.
-        First, of terms that the record determines only together, without one; and, where the
-        residuals are rounding, without those that are not needed for that."""
+        First, of terms that the record determines only together, without one."""
         refused: set[Key] = set()
-        fit, evidence = without_rounding(without_degeneracies(fit)), fit.problem.options.evidence
+        fit, evidence = without_degeneracies(fit), fit.problem.options.evidence
         costs = None
         while True:
             z = fit.significance
@@ -328,7 +327,7 @@ class TermSearch:
 
     def grow(self, fit: LawFit, every: Structure | None = None) -> LawFit:
         """The fit with terms (of ``every``) that the residuals ask for, each kept where held-out
-        arcs gain; as it is where the residuals are rounding."""
+        arcs gain."""
         every = every or self.every
         assert every is not None  # terms are searched
         every = dataclasses.replace(every, leaders=fit.structure.leaders)
@@ -339,7 +338,7 @@ class TermSearch:
         refused: set[Key] = set()
         options, problem, costs = fit.problem.options, fit.problem, None
         evidence = options.evidence
-        for _ in range(0 if fit.is_exact else options.tries):
+        for _ in range(options.tries):
             scores = fit.scores(every)
             open_ = (k for k in scores if k not in refused and fit.structure.may_have(k))
             scores = {k: scores[k] for k in open_ if scores[k] > evidence.scored}
@@ -432,19 +431,6 @@ def frictions_tried(dim: int, options: SearchOptions) -> tuple[Loss, ...]:
     rows = libraries.losses(dim, kinds, 0.0)
     turned = [one for one in map(libraries.opposite, rows) if one is not None]
     return tuple(sorted((*rows, *turned), key=lambda row: row[1] == UNIFORM))
-
-
-def without_rounding(fit: LawFit) -> LawFit:
-    """Drop, where the residuals of a fit are rounding, the terms whose coefficients are
-    rounding too: without them it is as exact."""
-    z = fit.significance if fit.is_exact else {}
-    free = [k for k in z if k[0] == "term" and k not in protected(fit.structure)]
-    for key in sorted(free, key=lambda k: z[k]):
-        smaller = fit.again(fit.structure.without({key}))
-        if smaller.is_exact and smaller.is_definite:
-            _dropped(fit, key, "the residuals are rounding without it too")
-            fit = smaller
-    return fit
 
 
 def without_degeneracies(fit: LawFit) -> LawFit:
