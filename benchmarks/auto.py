@@ -33,7 +33,7 @@ from harness import (
 )
 
 import gfnn_jax as gfnn
-from gfnn_jax.models.hamiltonians.choose_law import MAX_COST_RATIO
+from gfnn_jax.models.hamiltonians.search import MAX_COST_RATIO
 
 STEPS, ORBITS, BATCH = 1_000, 100, 1_000
 SCENES = (

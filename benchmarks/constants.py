@@ -182,7 +182,7 @@ CONSTANTS = tuple(
         ("learn.gross_errors", "OPTIONS.beyond", ("outliers",), "residual ÷ neighbours'"),
         ("fitting.significance", "CERTAIN", ("damped",), "standard errors"),
         ("fitting.significance", "ABOVE_NOISE", ("law", "sequences"), "standard errors"),
-        (f"{H}.choose_law", "MAX_COST_RATIO", ("law",), "operations ÷ the map's"),
+        (f"{H}.search", "MAX_COST_RATIO", ("law",), "operations ÷ the map's"),
         (f"{H}.options", "OPTIONS.rise", ("law", "sequences"), "held-out error ÷ before"),
         (f"{H}.options", "OPTIONS.flat", ("sequences",), "error ÷ error"),
         ("solve.latent_arcs", "OUTLYING", ("sequences",), "standard deviations"),

@@ -25,7 +25,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import measure, stretches
 from gfnn_jax.maps.estimates import Law, law_of
 from gfnn_jax.maps.observation import Observation
-from gfnn_jax.models.lagrangians.arcs import LawOnArcs
+from gfnn_jax.models.lagrangians.fit import LawOnArcs
 from gfnn_jax.signals.local_polynomials import smooth
 from gfnn_jax.solve.latent_arcs import SOFT_L1, Readings
 

@@ -49,7 +49,7 @@ from matplotlib.ticker import NullFormatter
 import gfnn_jax as gfnn
 from gfnn_jax.evaluate import figures, metrics
 from gfnn_jax.evaluate.figures_style import GREY
-from gfnn_jax.jobs.methods import separable
+from gfnn_jax.jobs.compare import separable
 from gfnn_jax.scenes import Scene
 from gfnn_jax.solve.status import LEFT_DOMAIN
 

@@ -39,8 +39,7 @@ from gfnn_jax.data.files import are_recordings
 from gfnn_jax.data.roles import ROLES
 from gfnn_jax.errors import InputError, WorkError, read_in_a_shell
 from gfnn_jax.jobs import progress
-from gfnn_jax.storage.outputs import ensure_new, signals_handled
-from gfnn_jax.storage.partial import unfinished_note
+from gfnn_jax.storage.outputs import ensure_new, signals_handled, unfinished_note
 
 _TO_BEGIN = "try `gfnn double_pendulum`, or your own `gfnn FILE`; `gfnn --help` says more"
 

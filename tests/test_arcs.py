@@ -14,7 +14,6 @@ from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.models.hamiltonians import choose_law
 from gfnn_jax.models.hamiltonians import search as flows
 from gfnn_jax.models.hamiltonians.sequences import arcs_of
 
@@ -122,8 +121,8 @@ def test_a_counted_budget_ends_where_it_is_spent():
 @QUIETLY
 def test_a_search_for_h_ends_at_its_cap(monkeypatch):
     pairs = sequences(0.3, 0.0)
-    few = dataclasses.replace(choose_law._BESIDE, max_operations=1.0)
-    monkeypatch.setattr(choose_law, "_BESIDE", few)
+    few = dataclasses.replace(flows._BESIDE, max_operations=1.0)
+    monkeypatch.setattr(flows, "_BESIDE", few)
     found = gfnn.fit(pairs, tolerance=1e-9, max_seconds=None)
     assert found.hamiltonian is None
     assert any("left out: H (" in message for message in found.messages)

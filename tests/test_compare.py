@@ -11,10 +11,9 @@ from gfnn_jax.baselines import Budget
 from gfnn_jax.baselines.paper_gfnn import paper_gfnn
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs import compare as comparison
-from gfnn_jax.jobs import methods
+from gfnn_jax.jobs.compare import SharedData, separable
 from gfnn_jax.jobs.figures import divergences
 from gfnn_jax.jobs.measure import Rollouts, without_runaways
-from gfnn_jax.jobs.methods import SharedData, separable
 from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.progress import Progress
 
@@ -25,10 +24,10 @@ CHEAP = ("p-sympnet", "hnn")
 def small():
     """Little data, short rollouts."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(methods, "_QUICK_PAIRS", 500)
-        patch.setattr(methods, "_QUICK_TRAJECTORIES", 3)
-        patch.setattr(methods, "_NUM_FRESH", 50)
-        patch.setattr(methods, "NUM_STEPS", 100)
+        patch.setattr(comparison, "_QUICK_PAIRS", 500)
+        patch.setattr(comparison, "_QUICK_TRAJECTORIES", 3)
+        patch.setattr(comparison, "_NUM_FRESH", 50)
+        patch.setattr(comparison, "NUM_STEPS", 100)
         yield
 
 

@@ -19,7 +19,7 @@ from scipy.linalg import expm
 import gfnn_jax as gfnn
 from gfnn_jax import cli, cli_parser, scenes
 from gfnn_jax.coordinates import CARTESIAN, Coordinates, polar, to_inner
-from gfnn_jax.exports import polynomials
+from gfnn_jax.exports import c_pieces
 from gfnn_jax.exports.export import SUFFIXES
 from gfnn_jax.exports.symbols import Tape
 from gfnn_jax.families import lagrangian
@@ -554,13 +554,13 @@ def test_polynomials_are_arranged_anew():
         np.sin(x[:, 1]),
         *np.clip(x[:, 2:].T, -model.reach[2], model.reach[2]),
     ]
-    terms = polynomials.in_powers(model)
+    terms = c_pieces.in_powers(model)
     for k, expected in enumerate(model(z).T):
-        found = polynomials.horner({n: c[k] for n, c in terms.items()}, within)
+        found = c_pieces.horner({n: c[k] for n, c in terms.items()}, within)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
     far = 3 * z
     expected = map_.domain.christoffel(far)
-    np.testing.assert_allclose(polynomials.christoffel(map_.domain, far.T), expected, rtol=1e-12)
+    np.testing.assert_allclose(c_pieces.christoffel(map_.domain, far.T), expected, rtol=1e-12)
 
 
 # Symbols

@@ -22,9 +22,9 @@ from gfnn_jax.diagnosis.symmetries import generators
 from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import figures
 from gfnn_jax.evaluate.figures_of_recordings import law_figure, recording_figure
+from gfnn_jax.jobs.compare import TITLES
 from gfnn_jax.jobs.figures import OURS, figures_of_comparison, figures_of_run
 from gfnn_jax.jobs.measure import Rollouts, affine_errors, measure
-from gfnn_jax.jobs.methods import TITLES
 from gfnn_jax.models.lagrangians.calibration import Horizon
 
 DOCS = Path(__file__).parent.parent / "docs"

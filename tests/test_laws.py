@@ -17,9 +17,9 @@ from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.evaluate import report
 from gfnn_jax.families.text import Term
 from gfnn_jax.learn import searches
-from gfnn_jax.models.hamiltonians import choose_law
-from gfnn_jax.models.hamiltonians.choose_law import preferred
+from gfnn_jax.models.hamiltonians import search
 from gfnn_jax.models.hamiltonians.fitted_law import formula
+from gfnn_jax.models.hamiltonians.search import preferred
 from gfnn_jax.models.maps_of_laws.law_maps import Drawing, drawn
 
 FORMULA = "0.5 q1² + 0.5 q2² + 0.5 p1² + 0.5 p2² + q1² q2 - 0.333333333333 q2³"
@@ -327,7 +327,7 @@ def test_pairs_are_drawn_in_the_region_that_is_named(law):
 @pytest.mark.slow
 def test_a_map_that_is_far_cheaper_than_the_law_is_fitted_to_pairs_of_the_law(pairs, monkeypatch):
     few = pairs.take(np.arange(60))
-    for module in (searches, choose_law):  # as if the law's step were ten times as dear
+    for module in (searches, search):  # as if the law's step were ten times as dear
         monkeypatch.setattr(module, "MAX_COST_RATIO", 0.4)
     found = gfnn.fit(few, tolerance=1e-5)
     assert found.chosen.learns == "map"

@@ -6,7 +6,7 @@ import pytest
 
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.storage import outputs
-from gfnn_jax.storage.partial import kept, unfinished
+from gfnn_jax.storage.outputs import kept, unfinished
 
 
 def test_ensure_new(tmp_path):

@@ -11,7 +11,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting.linear_starts import backwards, forward_logarithm, tangent, turns
 from gfnn_jax.flows.collocation import Steps, images
-from gfnn_jax.models.hamiltonians.choose_law import long_step
+from gfnn_jax.models.hamiltonians.search import long_step
 from gfnn_jax.phase_space import symplectic_form
 
 

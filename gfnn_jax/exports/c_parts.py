@@ -12,7 +12,7 @@ from gfnn_jax.coordinates import TWO_PI
 from gfnn_jax.exports.symbols import literal
 from gfnn_jax.flows import flow
 from gfnn_jax.generating.generated import MOST_UPDATES
-from gfnn_jax.maps.inner import parts_of_two_pi
+from gfnn_jax.maps.programs import parts_of_two_pi
 from gfnn_jax.solve import newton
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, OK, STATUS_NAMES
 

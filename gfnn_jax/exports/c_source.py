@@ -17,6 +17,7 @@ from gfnn_jax.coordinates import CARTESIAN, LOG, polar
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports import c_parts
 from gfnn_jax.exports.c_pieces import (
+    christoffel,
     flow_piece,
     moves_args,
     piece_functions,
@@ -24,7 +25,6 @@ from gfnn_jax.exports.c_pieces import (
     why_not_piece,
 )
 from gfnn_jax.exports.graph import graph_of
-from gfnn_jax.exports.polynomials import christoffel
 from gfnn_jax.exports.symbols import Tape, literal, table
 from gfnn_jax.exports.taylor import c_of_flow
 from gfnn_jax.families.expressions import coordinate_names
@@ -118,7 +118,7 @@ def _signature(map_: SymplecticMap, name: str) -> str:
 
 
 def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str], ahead: Sequence[str]) -> str:
-    """Write the public function: `maps.inner.applied` of one state; args follow it in y, moved by
+    """Write the function: `maps.programs.applied` of one state; args follow it in y, moved by
     the lines ``ahead``."""
     width, angles, domain = map_.width, map_.coordinates.angles, map_.domain
     more = num_args(map_)

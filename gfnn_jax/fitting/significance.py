@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from gfnn_jax.fitting.descent import ROUNDOFF
+from gfnn_jax.fitting.gauss_newton import ROUNDOFF
 from gfnn_jax.fitting.triangle import Triangle
 
 # Standard errors. A term that is smaller than the first is noise (a larger one is so by chance once

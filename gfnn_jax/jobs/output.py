@@ -31,8 +31,7 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
 from gfnn_jax.storage.checkpoints import KeptFactors, TrainingCheckpoints
-from gfnn_jax.storage.outputs import atomic_folder
-from gfnn_jax.storage.partial import unfinished
+from gfnn_jax.storage.outputs import atomic_folder, unfinished
 
 MODEL = "model"
 _ANGLES = ("deg", "°", "rad")  # begins of the units that `gfnn_jax.read` turns into radians
@@ -52,7 +51,7 @@ class Output:
     progress: Progress = SILENT
 
     def unfinished(self, job: dict[str, Any]) -> AbstractContextManager[Path]:
-        """Open the folder in which this job keeps its work (`storage.partial.unfinished`)."""
+        """Open the folder in which this job keeps its work (`storage.outputs.unfinished`)."""
         return unfinished(
             self.out, job, what=job["command"], overwrite=self.overwrite, resume=self.resume
         )

@@ -40,9 +40,9 @@ from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.models.generating_functions.map_of_terms import assembled as map_assembled
-from gfnn_jax.models.hamiltonians.choose_law import preferred
 from gfnn_jax.models.hamiltonians.learned_law import assembled as flow_assembled
 from gfnn_jax.models.hamiltonians.problem import work_of_refit
+from gfnn_jax.models.hamiltonians.search import preferred
 from gfnn_jax.search.search import Entry
 
 

@@ -25,9 +25,9 @@ from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.request import Request, not_radians, proposed, wrapped
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.sweeps import OF_SOLVE, OF_STEPS
-from gfnn_jax.models.hamiltonians.choose_law import long_step
 from gfnn_jax.models.hamiltonians.covariance import leaves_white
 from gfnn_jax.models.hamiltonians.learned_law import TURNS
+from gfnn_jax.models.hamiltonians.search import long_step
 from gfnn_jax.search.search import GAINED, MET, Entry
 
 _NO_MORE = {

@@ -37,7 +37,7 @@ from gfnn_jax.models.generating_functions.sweeps import (
     Size,
     part_of_noise,
 )
-from gfnn_jax.models.hamiltonians.choose_law import preferred
+from gfnn_jax.models.hamiltonians.search import preferred
 from gfnn_jax.search.search import GAINED, Entry
 
 _MOST_SWEEPS = 3

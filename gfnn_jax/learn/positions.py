@@ -40,8 +40,13 @@ from gfnn_jax.models.positions.discrete_lagrangian import (
     solve,
     triples_of,
 )
-from gfnn_jax.models.positions.latent_positions import starting_noise, without_noise
-from gfnn_jax.models.positions.position_maps import images_of, map_of, states_of
+from gfnn_jax.models.positions.latent_positions import (
+    images_of,
+    map_of,
+    starting_noise,
+    states_of,
+    without_noise,
+)
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.search.search import MET
 

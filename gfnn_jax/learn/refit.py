@@ -27,8 +27,7 @@ from gfnn_jax.errors import FitWarning
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.time_step import OfTimeStep
 from gfnn_jax.fitting import gauss_newton, least_squares
-from gfnn_jax.fitting.descent import descended
-from gfnn_jax.fitting.gauss_newton import FlowFit
+from gfnn_jax.fitting.gauss_newton import FlowFit, descended
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow

@@ -23,10 +23,10 @@ from gfnn_jax.models.generating_functions.map_of_terms import LearnedMap, SumOfT
 from gfnn_jax.models.generating_functions.model_sweep import ModelSweep
 from gfnn_jax.models.generating_functions.networks import EnsembleSweep, NetworkSweep
 from gfnn_jax.models.generating_functions.sweeps import sweep_of_dt, sweeps_for
-from gfnn_jax.models.hamiltonians.choose_law import MAX_COST_RATIO, law_of, preferred
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.networks import learn_network
 from gfnn_jax.models.hamiltonians.problem import LawProblem
+from gfnn_jax.models.hamiltonians.search import MAX_COST_RATIO, law_of, preferred
 from gfnn_jax.models.maps_of_laws.law_maps import LawMaps, LawMapSearch
 from gfnn_jax.search.search import Entry, Found, Search
 

@@ -10,8 +10,8 @@ import numpy as np
 from jax.core import Tracer
 
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.maps.inner import after, contains, outer, parts_of_two_pi
 from gfnn_jax.maps.lanes import Lanes, RolloutInfo, Saving, start_lanes
+from gfnn_jax.maps.programs import after, contains, outer, parts_of_two_pi
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, STOPPED_AT_EDGE
 
 # Fewer steps of all lanes are done before compiled code is loaded; more lanes a GPU steps together.

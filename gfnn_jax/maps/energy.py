@@ -15,7 +15,7 @@ import numpy as np
 from gfnn_jax.compiling import compiled_sooner
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.uniform import Power, power
-from gfnn_jax.maps.inner import after, inner
+from gfnn_jax.maps.programs import after, inner
 
 
 class Ledger(NamedTuple):

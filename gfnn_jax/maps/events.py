@@ -21,10 +21,10 @@ from gfnn_jax.flows.dormand_prince import NODES
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.schedules import of_polynomials
 from gfnn_jax.maps.estimates import Law, substeps_of
-from gfnn_jax.maps.inner import contains, parts_of_two_pi
 from gfnn_jax.maps.inputs import Scheduled
 from gfnn_jax.maps.lanes import Lanes, RolloutInfo, Saving, start_lanes
 from gfnn_jax.maps.laws import is_of_law, law_of_map
+from gfnn_jax.maps.programs import contains, parts_of_two_pi
 from gfnn_jax.phase_space import split
 from gfnn_jax.solve.status import (
     LEFT_DOMAIN,

@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from gfnn_jax.compiling import compiled_sooner
-from gfnn_jax.maps.inner import after, contains, inner, outer, reduced, worst
 from gfnn_jax.maps.posterior import Bands
-from gfnn_jax.maps.programs import of_one_or_many
+from gfnn_jax.maps.programs import after, contains, inner, of_one_or_many, outer, reduced, worst
 from gfnn_jax.maps.rollout import scan_steps
 from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, OK, STOPPED_AT_EDGE
 

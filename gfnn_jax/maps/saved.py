@@ -46,9 +46,8 @@ from gfnn_jax.generating.charts import Chart, TypeOne
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.generating.predictor import PolynomialModel, Predictor
 from gfnn_jax.maps.domain import Domain, Ranges
-from gfnn_jax.maps.hidden import Hidden
 from gfnn_jax.maps.inputs import Signals
-from gfnn_jax.maps.observation import Crossing, Observation
+from gfnn_jax.maps.observation import Crossing, Hidden, Observation
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.piece import Affine, Damping, FunctionsOfArgs
 from gfnn_jax.maps.posterior import Posterior

@@ -6,7 +6,7 @@ Where a descent stands its residual is linearised, r(x + δ) ≈ r + A δ. Steps
 
 are tried under growing damping μ until one lowers the cost (Levenberg, Quart. Appl. Math. 2 (1944)
 164; Marquardt, SIAM J. Appl. Math. 11 (1963) 431); then the damping shrinks. What a `Problem`
-brings is the linear algebra: the singular values of a triangle (`fitting.descent`), normal
+brings is the linear algebra: the singular values of a triangle (`fitting.gauss_newton`), normal
 equations in one compiled program (`fitting.levenberg_marquardt`), arcs whose own states are
 eliminated (`solve.latent_arcs`), coefficients that are projected out (`models.textbook.matching`).
 Outside jit: NumPy alone.

@@ -28,9 +28,9 @@ from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.rates import rates, substeps_for
 from gfnn_jax.generating.charts import MIDPOINT
-from gfnn_jax.models.hamiltonians.choose_law import unfit_for_law
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.problem import LawProblem, omega_h_of, operations_of
+from gfnn_jax.models.hamiltonians.search import unfit_for_law
 
 
 @dataclasses.dataclass(frozen=True)

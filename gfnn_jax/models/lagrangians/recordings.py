@@ -20,17 +20,11 @@ import numpy as np
 from gfnn_jax.data.recording import Recording, channels_of, parameters_of
 from gfnn_jax.data.roles import by_name, symbols, wave_names
 from gfnn_jax.data.traits import without_wrong_values
-from gfnn_jax.dataset.stretches import (
-    Moving,
-    Stretch,
-    measure,
-    nodes_of,
-    stretches,
-    without_rests,
-)
+from gfnn_jax.dataset.stretches import Moving, Stretch, measure, nodes_of, stretches, without_rests
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import INPUTS, shape_of
+from gfnn_jax.families.lagrangian import INPUTS, Lagrangian, shape_of
 from gfnn_jax.families.text import measured
+from gfnn_jax.flows.dormand_prince import WEIGHTS
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.observation import Observation, observed
@@ -44,12 +38,7 @@ from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.hidden import no_hidden_law, search_hidden, with_hidden
-from gfnn_jax.models.lagrangians.in_use import (
-    CalibratedLaw,
-    GaugedLaw,
-    RecordingData,
-    best_in_use,
-)
+from gfnn_jax.models.lagrangians.in_use import CalibratedLaw, GaugedLaw, RecordingData, best_in_use
 from gfnn_jax.models.lagrangians.in_words import (
     Findings,
     in_words,
@@ -62,12 +51,8 @@ from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, last_of_series
 from gfnn_jax.models.lagrangians.nature import Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions, parting
-from gfnn_jax.models.lagrangians.rivals import (
-    constant_of,
-    of_a_sensor,
-    one_sided,
-    other_powers,
-)
+from gfnn_jax.models.lagrangians.residuals import Trace
+from gfnn_jax.models.lagrangians.rivals import constant_of, of_a_sensor, one_sided, other_powers
 from gfnn_jax.models.lagrangians.search import (
     SearchResult,
     TermSearch,
@@ -77,9 +62,53 @@ from gfnn_jax.models.lagrangians.search import (
 )
 from gfnn_jax.models.lagrangians.starts import no_law
 from gfnn_jax.models.lagrangians.text import Names, speed_names
-from gfnn_jax.models.lagrangians.traces import traces_of
 from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
 from gfnn_jax.solve.noise import Loss
+
+
+def traces_of(recording: Recording, fit: LawFit, law: Lagrangian) -> tuple[Trace, ...]:
+    """The arcs of a fit, channels in the file's units. An input supplies the mean of its force over
+    a step times the way, and what terms that have it rise by at its mean; friction takes the mean
+    of its power at the ends."""
+    arcs, found, d = fit.arcs, [], fit.form.dim
+    nodes, channels = fit.problem.nodes, fit.problem.observation.channels
+    factors = np.array([recording.factors[name] for name in channels])
+    left = fit.fitted.residuals * fit.sigma * arcs.noise
+    acting = np.tensordot(fit.problem.inputs(arcs), WEIGHTS, axes=(3, 0)).mean(
+        axis=2
+    )  # (A, L − 1, m)
+    for k, (i, a, b) in enumerate(arcs.home):
+        n, stretch = b - a, nodes[i].stretch
+        t, y, x = arcs.t[k, :n], arcs.y[k, :n] + nodes[i].zero, fit.fitted.x[k, :n]
+        q, v = x[:, :d] + fit.zeros, x[:, d:]
+        own = law.at(stretch.args)
+        rate = own.power(q, v)[0][:, : law.friction.count + (law.uniform != 0)]
+        lost = 0.5 * np.diff(t)[:, None] * (rate[1:] + rate[:-1])
+        u = acting[k, : n - 1]
+        supplied = u * (np.diff(q, axis=0) @ law.gains)
+        if law.terms.driven:
+            before, after = (law.terms.potentials(x, 0, u).value for x in (q[:-1], q[1:]))
+            raised = own.coefficients * (after - before)
+            supplied += raised @ law.terms.first_inputs(law.num_inputs)
+        found.append(
+            Trace(
+                stretch.run,
+                t,
+                y / factors,
+                (y - left[k, :n]) / factors,
+                fit.fitted.residuals[k, :n],
+                stretch.u[nodes[i].at[a:b]],
+                own.energy(q, v),
+                _summed(lost),
+                _summed(supplied),
+            )
+        )
+    return tuple(found)
+
+
+def _summed(steps: np.ndarray) -> np.ndarray:
+    """Sums (n, ...) of steps (n − 1, ...) since the first."""
+    return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
 
 
 @dataclasses.dataclass(frozen=True)
