@@ -1,4 +1,4 @@
-"""Maps with a bracket and no law, and what a bracket is worth: Casimirs and orbits over 10⁵ steps.
+"""Maps with a bracket and no law, and what a bracket is worth: Casimirs and orbits over 10⁶ steps.
 
     python benchmarks/bracket_maps.py --processor-time     all rows, then the table in RESULTS.md
     python benchmarks/bracket_maps.py --only beside --quick
@@ -40,7 +40,7 @@ from gfnn_jax.models.brackets.lie_maps import fit_lie_map
 
 INVERSE = np.linalg.inv([[1.0, 0.2, 0.1], [0.2, 1.7, 0.3], [0.1, 0.3, 2.5]])
 # Steps that are saved: of a rollout all up to the seventh, then every 200th.
-SAVED = (1, 2, 5, 10, 20, 50, 100, 200, 600, 1_000, 2_000, 6_000, 10_000, 20_000, 60_000, 100_000)
+SAVED = (1, 2, 5, 10, 20, 50, 100, *(k * 10**e for e in (2, 3, 4, 5) for k in (2, 6, 10)))
 SPIN, TOP = gfnn.Bracket.so3(), gfnn.Bracket.se3()
 CHAIN = gfnn.Bracket.constant(
     [[0, 1.3, 0.3, -1], [-1.3, 0, 1, 0.3], [-0.3, -1, 0, 1.3], [1, -0.3, -1.3, 0]]
@@ -115,7 +115,7 @@ def without_law(name: str, quick: bool) -> Numbers:
 
 def beside(quick: bool) -> Numbers:
     """A free top by its law with the bracket, and by fields without one."""
-    rng, dt, steps = np.random.default_rng(0), 0.1, 10_000 if quick else 100_000
+    rng, dt, steps = np.random.default_rng(0), 0.1, 10_000 if quick else 1_000_000
     starts = shell(rng, 20, 0.5, 1.2)
     runs = [starts]
     for _ in range(20):
@@ -323,9 +323,9 @@ def tables() -> None:
             [name, m.get("absent") or number(m["casimir"]), number(m.get("orbit")), trained(m)]
             for name, m in peers.items()
         ]
-        heads = ("free top, 400 pairs; after 10⁵ steps", "change of M", "orbit", "training")
+        heads = ("free top, 400 pairs; after 10⁶ steps", "change of M", "orbit", "training")
         text += "\n\n" + markdown(heads, rows)
-        text += "\n\n![Changes of M and errors of orbits over 10⁵ steps](figures/bracket_peers.png)"
+        text += "\n\n![Changes of M and errors of orbits over 10⁶ steps](figures/bracket_peers.png)"
     between_markers(TABLES, "bracket_maps", f"{text}\n\n{provenance(found)}")
 
 
