@@ -161,6 +161,9 @@ def _noise_table(found: dict[str, Numbers]) -> str:
                     *(_cell(c) for c in cells(m)),
                 ]
             )
+        if "whole" in m:
+            held = f"{100 * m['whole']:.0f} % of whole trajectories of 100 steps"
+            rows.append([str(m["dt"]), "all", "tube of 95 %", held, "", "", ""])
     return markdown(head, rows)
 
 

@@ -284,7 +284,7 @@ def forecasts(
         windows.append(Window(s.t[rows], s.y[rows], s.t, s.u))
     x, covariance = estimate_states(law, windows)
     last = np.array([w.t[-1] for w in windows])
-    orbits = propagate(law, windows, x, covariance, last, ahead)
+    orbits = propagate([law], np.zeros(len(x), int), windows, x, covariance, last, ahead)
     error = np.abs(orbits.values - measured)
     seen = np.isfinite(error)
     median, share = [], []

@@ -1,5 +1,7 @@
 """Laws that are one exchange of terms away, against the systems that made the records."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -31,9 +33,10 @@ def words(formula):
 
 
 @pytest.mark.parametrize(("noise", "alone"), [(3e-2, False), (1e-4, True)])
-def test_a_law_beside_which_noise_leaves_others_is_one_of_several(noise, alone):
+def test_a_law_beside_which_noise_leaves_others_is_one_of_several(noise, alone, tmp_path):
     made = record(lambda q, v: -q - 0.3 * q**3 - 0.02 * v, [1.0], 100.0, 0.6, noise)
-    law = gfnn.fit(made).law
+    fit = gfnn.fit(made)
+    law = fit.law
     assert words(law.lagrangian) == {"v1**2", "x1**2", "x1**4"}
     if alone:
         assert (law.rivals, law.verdict) == ((), "identified")
@@ -43,6 +46,15 @@ def test_a_law_beside_which_noise_leaves_others_is_one_of_several(noise, alone):
         assert all(rival.odds < 20 for rival in law.rivals)
         assert law.next_motions[0].start["x1"] > 1.5  # farther out than the record
         assert law.next_motions[0].apart > 3
+        ahead, sensors = 100.0 + 0.6 * np.arange(1, 40), law.map.sensors
+        alone = dataclasses.replace(law.map, sensors=dataclasses.replace(sensors, rivals=()))
+        found, narrow = (map_.forecast(made, ahead) for map_ in (law.map, alone))
+        np.testing.assert_array_equal(found.values["x1"], narrow.values["x1"])
+        assert np.all(found.std["x1"] > narrow.std["x1"])
+        assert 0 < sum(share for _, share in sensors.rivals) < 1
+        fit.map.save(tmp_path / "model")
+        again = gfnn.load(tmp_path / "model").map.forecast(made, ahead)
+        np.testing.assert_array_equal(again.std["x1"], found.std["x1"])
 
 
 @pytest.mark.slow
@@ -57,3 +69,11 @@ def test_dry_friction_of_two_carts_is_not_that_of_their_relative_speed():
     law = gfnn.fit(made).law
     assert words(law.lagrangian) == {"v1**2", "v2**2", "x1**2", "x1*x2", "x2**2"}
     assert words(law.friction) == {"abs(v1)", "abs(v2)"}
+
+
+def test_a_constant_force_that_one_sided_friction_imitates_is_one_of_several():
+    """Friction that is stronger one way by a tenth."""
+    made = record(lambda q, v: -q - 0.04 * v + 0.004 * abs(v), [1.5], 60.0, 0.25, 1e-3, 1)
+    law = gfnn.fit(made).law
+    assert "x1" in words(law.lagrangian)
+    assert any("abs(v1)" in rival.terms for rival in law.rivals)

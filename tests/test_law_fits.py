@@ -36,7 +36,6 @@ from gfnn_jax.maps.estimates import (
     estimate_states,
     law_of,
     propagate,
-    propagate_each,
 )
 from gfnn_jax.maps.laws import states_of
 from gfnn_jax.models.lagrangians.exchange import with_exchanges
@@ -44,7 +43,7 @@ from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.libraries import central, textbook
 from gfnn_jax.models.lagrangians.recordings import samples_of
-from gfnn_jax.models.lagrangians.rivals import one_sided, other_powers, with_likeliest_power
+from gfnn_jax.models.lagrangians.rivals import other_powers, with_likeliest_power
 from gfnn_jax.models.lagrangians.search import search, search_on
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.text import Names, speed_names, terms_of
@@ -288,15 +287,17 @@ def test_lanes_that_follow_their_own_laws_are_followed_as_if_alone(swing):
     x, covariance = estimate_states(law, windows)
     last = np.array([w.t[-1] for w in windows])
     times, which = last[:, None] + [0.3, 2.0, 7.0], np.array([1, 0, 1])
-    together = propagate_each(laws, which, windows, x, covariance, last, times)
+    together = propagate(laws, which, windows, x, covariance, last, times)
     for n, one in enumerate(which):
         own = slice(n, n + 1)
-        alone = propagate(laws[one], windows[own], x[own], covariance[own], last[own], times[own])
+        alone = propagate(
+            [laws[one]], np.array([0]), windows[own], x[own], covariance[own], last[own], times[own]
+        )
         for name in ("values", "std", "states", "covariances"):
             expected = getattr(alone, name)
             found = getattr(together, name)[own]
             np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-14)
-    first = propagate(law, windows, x, covariance, last, times)
+    first = propagate([law], 0 * which, windows, x, covariance, last, times)
     assert np.abs(together.values[0] - first.values[0]).max() > 0.01  # the laws differ
 
 
@@ -431,26 +432,6 @@ def test_a_power_of_the_distance_that_others_imitate_is_one_of_several():
     found = with_likeliest_power(fit)
     assert found.structure.terms[-1] == central(2, 4.0)[0]
     assert re.search(r"r\*\*3.5 .* in place of r\*\*4\.", other_powers(found, ["x", "y"]))
-
-
-@pytest.mark.parametrize("pushed", [False, True])
-def test_a_constant_force_that_one_sided_friction_imitates_is_named(pushed):
-    """ẍ = −x − 0.04 ẋ, stronger one way by a tenth, or pushed by 0.3."""
-    t = 0.25 * np.arange(240)
-
-    def rates(_, z):
-        friction = 0.04 * z[1] + (0.3 if pushed else -0.004 * abs(z[1]))
-        return [z[1], -z[0] - friction]
-
-    x = solve_ivp(rates, (0, 60), [1.5, 0], t_eval=t, rtol=1e-9).y[0]
-    x = x + 1e-3 * np.random.default_rng(0).normal(size=len(t))
-    problem = samples_of(gfnn.Recording({"t": t, "x": x}, positions=["x"])).problem
-    rows = ((2,), (0,)), ((0,), (1,)), ((0,), (2,))
-    terms = tuple((*row, (0,), 0.0) for row in rows)
-    structure = Structure(1, terms, (((1,), LINEAR, 0.0),))
-    known = dict(zip(structure.keys(), (0.0, -0.5, 0.04), strict=True))
-    fit = problem.fit(structure, known, problem.arcs(4.0), problem.scales.sigma)
-    assert ("friction of x that is stronger one way" in one_sided(fit, ["x"])) is not pushed
 
 
 @pytest.mark.slow

@@ -222,7 +222,7 @@ def test_a_forecast_and_its_band_across_a_stop():
     used = law_in_use(law, root, sensors)
     window = Window(time[:1], np.full((1, 1), turn), np.zeros(0), np.zeros((0, 0)))
     start = np.array([[turn, 0.0]]), covariance[None], time[:1]
-    found = propagate(used, [window], *start, time[None, 1:])
+    found = propagate([used], np.array([0]), [window], *start, time[None, 1:])
 
     expected, stop = block(turn, friction, time)
     assert abs(stop) < friction  # it has stopped, and not where the spring is slack

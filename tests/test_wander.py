@@ -81,7 +81,7 @@ def test_a_state_and_its_zero_are_those_of_the_normal_distribution(rng, size):
     law = free_body(sigma, wander)
     window = Window(t, y[:, None], t, np.zeros((20, 0)))
     x, covariance = estimate_states(law, [window])
-    orbits = propagate(law, [window], x, covariance, t[-1:], t[-1] + ahead[None])
+    orbits = propagate([law], np.array([0]), [window], x, covariance, t[-1:], t[-1] + ahead[None])
 
     times = np.append(t, t[-1] + ahead)
     every = np.stack([np.ones_like(times), times - t[-1]], axis=1)
@@ -121,7 +121,9 @@ def test_the_level_of_friction_is_that_of_the_window():
     x = np.array([[0.2, 0.5]])
     drive = Window(t, np.zeros((len(t), 1)), t, u)
     covariance = np.zeros((1, 2, 2))
-    path = propagate(true, [drive], x, covariance, t[:1], t[None, 1:]).values[0, :, 0]
+    path = propagate([true], np.array([0]), [drive], x, covariance, t[:1], t[None, 1:]).values[
+        0, :, 0
+    ]
     path = np.append(x[0, 0], path)
     rng, end, found = np.random.default_rng(0), 120, []
     windows = [
@@ -136,7 +138,9 @@ def test_the_level_of_friction_is_that_of_the_window():
     last, ahead = np.full(8, t[end - 1]), np.broadcast_to(t[end:], (8, len(t) - end))
     errors = []
     for one in (law, stiff):
-        orbits = propagate(one, windows, *estimate_states(one, windows), last, ahead)
+        orbits = propagate(
+            [one], np.zeros(len(windows), int), windows, *estimate_states(one, windows), last, ahead
+        )
         errors.append(orbits.values[..., 0] - path[end:])
         found.append(orbits.std[..., 0])
     assert np.abs(errors[0]).max() < 0.1 * np.abs(errors[1]).max()

@@ -189,7 +189,8 @@ def forecast(
     laws, which = of_windows([law], np.zeros(len(windows), int), windows)
     x, covariance = estimates_of(laws, which, windows)
     ahead = np.broadcast_to(times, (len(windows), len(times)))
-    orbits = propagate_each(laws, which, windows, x, covariance, last, ahead)
+    orbits = propagate(laws, which, windows, x, covariance, last, ahead)
+    orbits = _with_rivals(sensors, orbits, windows, last, ahead)
     names = sensors.observation_model.channels
     values = {n: orbits.values[..., k] for k, n in enumerate(names)}
     std = {n: orbits.std[..., k] for k, n in enumerate(names)}
@@ -208,9 +209,26 @@ def forecast(
     return values, std, outside + beyond, tubes
 
 
+def _with_rivals(
+    sensors: Sensors, orbits: Orbits, windows: Sequence[Window], last: np.ndarray, ahead: np.ndarray
+) -> Orbits:
+    """The orbits with the second moments, about them, of the forecasts of all laws that the data
+    allow; of one that leaves for far away as of one that does not part from them."""
+    which = np.zeros(len(windows), int)
+    for other, share in sensors.rivals:
+        laws = [law_in_use(other, None, sensors)]
+        theirs = propagate(laws, which, windows, *estimates_of(laws, which, windows), last, ahead)
+        apart = theirs.values - orbits.values
+        own = np.sqrt(share) * np.where(np.isfinite(apart), apart, 0.0)[..., None]
+        orbits = orbits._replace(modes=np.concatenate([orbits.modes, own], axis=-1))
+    return orbits
+
+
 def _uncertified(sensors: Sensors, recording: Recording, ahead: np.ndarray) -> tuple[str, ...]:
     """Lines about runs that are forecast farther than held-out forecasts went, (runs,) seconds."""
-    most = sensors.leads[-1]
+    if not sensors.held_out:
+        return ("no forecast could be held out: the band over all times is the law's own",)
+    most = sensors.leads[sensors.held_out - 1]
     return tuple(
         f"run {run}: no held-out forecast went farther than {most:.3g} s: the band over "
         f"{seconds:.3g} s is extrapolated"
@@ -487,11 +505,10 @@ def estimates_of(
     states: list[Any] = [None] * len(windows)
     for number in np.unique(which).tolist():
         own = np.flatnonzero(which == number).tolist()
-        for n, x, covariance in zip(
-            own, *estimate_states(laws[number], [windows[n] for n in own]), strict=True
-        ):
-            states[n] = x, covariance
-    x, covariance = (np.stack(part) for part in zip(*states, strict=True))
+        found = estimate_states(laws[number], [windows[n] for n in own])
+        for n, *state in zip(own, *found, strict=True):
+            states[n] = state
+    x, covariance = map(np.stack, zip(*states, strict=True))
     return x, covariance
 
 
@@ -500,7 +517,8 @@ def _started(sensors: Sensors, window: Window) -> tuple[Window, np.ndarray]:
     seen, and the states (n, 2d) of local cubics: one long step would make all of them shorter."""
     t, own = window.t, sensors.coordinates_of(window.y, window.t)
     if np.isfinite(own).all():
-        start = smooth(t, own, min(len(t), _near(sensors, t)))[0]
+        near = max(3, int(np.pi / 3 / sensors.omega / np.median(np.diff(t))))  # a sixth of a period
+        start = smooth(t, own, min(len(t), near))[0]
     else:
         start = splines([(t, own, np.ones(own.shape))]).smooth(t, own, t)
     x = np.concatenate([start.q, start.v], axis=1)
@@ -518,12 +536,6 @@ def _started(sensors: Sensors, window: Window) -> tuple[Window, np.ndarray]:
         noise[measured] = window.noise
     x = np.stack([np.interp(times, t, column) for column in x.T], axis=1)
     return window._replace(t=times, y=y, noise=noise), x
-
-
-def _near(sensors: Sensors, t: np.ndarray) -> int:
-    """Samples within a sixth of a period, over which a cubic follows the motion."""
-    step = np.median(np.diff(t))
-    return max(3, int(np.pi / 3 / sensors.omega / step))
 
 
 class Orbits(NamedTuple):
@@ -562,19 +574,6 @@ class Orbits(NamedTuple):
 
 
 def propagate(
-    law: Law,
-    windows: Sequence[Window],
-    x: np.ndarray,
-    covariance: np.ndarray,
-    last: np.ndarray,
-    times: np.ndarray,
-) -> Orbits:
-    """Orbits from what `estimate_states` found, x (B, m) with its covariance, at times ``last``
-    (B,), to times (B, n)."""
-    return propagate_each([law], np.zeros(len(x), int), windows, x, covariance, last, times)
-
-
-def propagate_each(
     laws: Sequence[Law],
     which: np.ndarray,
     windows: Sequence[Window],
@@ -583,7 +582,8 @@ def propagate_each(
     last: np.ndarray,
     times: np.ndarray,
 ) -> Orbits:
-    """`propagate` of lanes of which each follows its own law, ``laws[which]``, which (B,).
+    """Orbits from what `estimate_states` found, x (B, m) with its covariance, at times ``last``
+    (B,), to times (B, n); each lane follows its own law, ``laws[which]``, which (B,).
 
     The laws differ in coefficients, phases, covariance and the parameters of their channels only;
     all else of the sensors is that of the first.

@@ -56,14 +56,16 @@ QUANTILES = (0.05, 0.5, 0.95)
 
 
 class Bands(NamedTuple):
-    """Bands of a prediction: std (B, S, 2d) and quantiles (3, B, S, 2d) at 5, 50 and 95 %.
+    """Bands of a prediction: std (B, S, 2d), quantiles (3, B, S, 2d) at 5, 50 and 95 %, and tube
+    (B,): the multiple of std that 95 % of the samples stay within at all steps and coordinates.
 
-    std is the root mean square about the map's own prediction. Both are over the samples that have
+    std is the root mean square about the map's own prediction. All are over the samples that have
     not failed, and NaN where all have.
     """
 
     std: np.ndarray
     quantiles: np.ndarray
+    tube: np.ndarray
 
     @property
     def median(self) -> np.ndarray:
@@ -84,7 +86,9 @@ def bands(drawn, states, angles: tuple[int, ...] = ()) -> Bands:
         warnings.simplefilter("ignore", RuntimeWarning)  # for lanes in which all samples failed
         std = np.sqrt(np.nanmean(off**2, axis=0))
         quantiles = states + np.nanquantile(off, QUANTILES, axis=0)
-    return Bands(std, quantiles)
+        sizes = np.abs(off) / np.where(std > 0, std, np.inf)
+        tube = np.nanquantile(np.nanmax(sizes, axis=(2, 3)), QUANTILES[-1], axis=0)
+    return Bands(std, quantiles, tube)
 
 
 def horizon(std, steps, size: float) -> np.ndarray:

@@ -24,7 +24,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.families import lagrangian
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import Inputs
-from gfnn_jax.families.lagrangian import Friction
+from gfnn_jax.families.lagrangian import Friction, Lagrangian
 from gfnn_jax.families.mlp import Ensemble, Mlp
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.rigid_bodies import Bodies
@@ -51,7 +51,7 @@ from gfnn_jax.maps.observation import Crossing, Hidden, Observation
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.piece import Affine, Damping, FunctionsOfArgs
 from gfnn_jax.maps.posterior import Posterior
-from gfnn_jax.maps.sensors import Sensors
+from gfnn_jax.maps.sensors import OtherLaw, Sensors
 from gfnn_jax.maps.stroboscopic import OverPhases
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.maps.unseen import Swing
@@ -96,6 +96,8 @@ _TYPES: dict[str, type] = {
         Signals,
         OfSystems,
         Sensors,
+        OtherLaw,
+        Lagrangian,
         Wander,
         Observation,
         OfBodies,

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
+from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.solve.noise import Wander
 
 TUBE = 0.95  # of trajectories lie in the tube that scores are multiples of
 _PHASES = 3.0  # starts of forecasts within their length that tell something of their own
+
+
+class OtherLaw(NamedTuple):
+    """A law that the same data allow, with its probability ``share`` beside the one that was taken
+    and the others."""
+
+    law: Lagrangian
+    share: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +44,7 @@ class Sensors:
     their start to each lead, as multiples of the tube that their law gives; None where unknown.
     observed: seconds of data that they are from. level: relative standard deviation of the strength
     of friction between times of the data; where it is not 0 each state is estimated with its own.
+    rivals: laws whose forecasts the bands hold too, by their shares.
     """
 
     positions: tuple[str, ...]
@@ -56,6 +66,7 @@ class Sensors:
     scores: Any = None
     observed: float = 0.0
     level: float = 0.0
+    rivals: tuple[OtherLaw, ...] = ()
 
     def with_level(self, level: float) -> Sensors:
         """The same with a level of friction, and windows of a quarter of the longest held-out
@@ -109,25 +120,27 @@ class Sensors:
         slope = np.zeros(m.shape[1])
         if np.sum(recent) > 1:
             slope = np.polyfit(np.log(t[recent]), np.log(m[recent]), 1)[0]
-        power = np.clip(slope, 0.0, 1.0)
         beyond = np.maximum(1.0, ahead / t[-1])
-        return np.stack(columns, axis=-1) * beyond[..., None] ** power
+        return np.stack(columns, axis=-1) * beyond[..., None] ** np.clip(slope, 0.0, 1.0)
+
+    @cached_property
+    def held_out(self) -> int:
+        """The number of leads that two held-out forecasts or more went to."""
+        scores = np.zeros((0, 0)) if self.scores is None else self.scores
+        return int(np.sum(np.sum(np.isfinite(scores), axis=0) > 1))
 
     def widening(self, ahead: float, coverage: float) -> float:
         """Factor by which a tube over a time ahead has to be wider than the law by itself says, so
         that it holds the whole of a further trajectory with the probability ``coverage``.
 
         A prediction interval of the scores' logarithms, by Student's t: of held-out forecasts that
-        overlap, each stretch as long as their lead counts as ``_PHASES``. NaN where none was held
-        out.
+        overlap, each stretch as long as their lead counts as ``_PHASES``. Those of the farthest
+        lead where none went so far, 1 where none was held out.
         """
-        if self.scores is None or not len(self.leads):
-            return np.nan
-        lead = min(int(np.searchsorted(self.leads, ahead)), len(self.leads) - 1)
-        scores = self.scores[:, lead]
-        logs = np.log(scores[np.isfinite(scores)])
-        if len(logs) < 2:
-            return np.nan
+        if not self.held_out:
+            return 1.0
+        lead = min(int(np.searchsorted(self.leads, ahead)), self.held_out - 1)
+        logs = np.log(self.scores[np.isfinite(self.scores[:, lead]), lead])
         count = np.clip(_PHASES * self.observed / self.leads[lead], 2, len(logs))
         reach = stdtrit(count - 1, coverage) * np.sqrt(1 + 1 / count)
         return float(np.exp(logs.mean() + reach * logs.std(ddof=1)))

@@ -507,7 +507,7 @@ class SymplecticMap:
         drawn, _ = maps.rollout(begun, num_steps, inputs=inputs, **options)
         found = bands(drawn, states if z0.ndim == 2 else states[None], self.angles_of_z)
         if z0.ndim == 1:
-            found = Bands(found.std[0], found.quantiles[:, 0])
+            found = Bands(found.std[0], found.quantiles[:, 0], found.tube[0])
         return states, info._replace(bands=found)
 
     @property

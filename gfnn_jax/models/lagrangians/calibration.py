@@ -16,7 +16,7 @@ import dataclasses
 import warnings
 from bisect import bisect
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,9 +26,9 @@ from gfnn_jax.maps.estimates import (
     Law,
     Orbits,
     Window,
-    estimate_states,
+    estimates_of,
     of_windows,
-    propagate_each,
+    propagate,
     thinned,
 )
 from gfnn_jax.maps.sensors import TUBE, Sensors
@@ -188,15 +188,11 @@ def level_of_friction(thirds: Thirds, found: Sequence[Stretch], scales: Scales) 
     if not starts or not thirds.laws[0].form.friction.count:
         return 0.0
     starts = starts[:: -(-len(starts) // OPTIONS.tried)]
-    wide, excess = thirds.with_level(OPTIONS.widest).laws, []
-    for i, k in starts:
-        s = found[i]
-        first = int(np.searchsorted(s.t, s.t[k] - scales.period))
-        window = thinned(_window(s, min(first, max(0, k - OPTIONS.short + 1)), k + 1))
-        laws, (one,) = of_windows(wide, np.array([thirds.of(i, s.t[k])]), [window])
-        (x,), (covariance,) = estimate_states(laws[one], [window])
-        d = 2 * laws[one].form.dim
-        excess.append(x[d] ** 2 - covariance[d, d])
+    cut = [_window(found[i], k, scales.period) for i, k in starts]
+    third = np.array([thirds.of(i, found[i].t[k]) for i, k in starts])
+    x, covariance = estimates_of(thirds.with_level(OPTIONS.widest).laws, third, cut)
+    d = 2 * thirds.laws[0].form.dim
+    excess = x[:, d] ** 2 - covariance[:, d, d]
     return float(np.sqrt(max(0.0, np.median(excess))))
 
 
@@ -249,8 +245,11 @@ def _passed(error: np.ndarray, leads: np.ndarray, fraction: float) -> float:
     return float(np.interp(fraction, error[k - 1 : k + 1], leads[k - 1 : k + 1])) if k else 0.0
 
 
-def _window(s: Stretch, begin: int, end: int) -> Window:
-    return Window(s.t[begin:end], s.y[begin:end], s.t, s.u, s.noise[begin:end], s.args)
+def _window(s: Stretch, last: int, seconds: float) -> Window:
+    """The samples of so many seconds up to the last, and of ``short`` at least."""
+    first = min(int(np.searchsorted(s.t, s.t[last] - seconds)), max(0, last - OPTIONS.short + 1))
+    own = slice(first, last + 1)
+    return thinned(Window(s.t[own], s.y[own], s.t, s.u, s.noise[own], s.args))
 
 
 def _starts(found: Sequence[Stretch], scales: Scales) -> list[tuple[int, int]]:
@@ -275,8 +274,7 @@ def _forecasts(
     cut, times, measured = [], [], []
     for (i, k), window in zip(starts, windows.tolist(), strict=True):
         s = found[i]
-        first = min(int(np.searchsorted(s.t, s.t[k] - window)), max(0, k - OPTIONS.short + 1))
-        cut.append(thinned(_window(s, first, k + 1)))
+        cut.append(_window(s, k, window))
         at = np.minimum(np.searchsorted(s.t, s.t[k] + leads), len(s.t) - 1)
         inside = s.t[k] + leads <= s.t[-1]
         times.append(np.where(inside, s.t[at], s.t[at[inside][-1]] if inside.any() else s.t[k]))
@@ -284,13 +282,9 @@ def _forecasts(
     third = np.array([thirds.of(i, found[i].t[k]) for i, k in starts])
     laws, which = of_windows(thirds.laws, third, cut)
     last = np.array([w.t[-1] for w in cut])
-    states: list[Any] = [None] * len(cut)
-    for number, window in sorted(set(zip(which.tolist(), windows.tolist(), strict=True))):
-        own = np.flatnonzero((which == number) & (windows == window)).tolist()
-        found_there = estimate_states(laws[number], [cut[n] for n in own])
-        for n, x, covariance in zip(own, *found_there, strict=True):
-            states[n] = x, covariance
-    x, covariance = (np.stack(part) for part in zip(*states, strict=True))
-    orbits = propagate_each(laws, which, cut, x, covariance, last, np.array(times))
+    kinds, kind = np.unique(windows, return_inverse=True)  # together they would all be the longest
+    each = [law for law in laws for _ in kinds]
+    x, covariance = estimates_of(each, which * len(kinds) + kind, cut)
+    orbits = propagate(laws, which, cut, x, covariance, last, np.array(times))
     d = thirds.laws[0].form.dim
     return orbits.values - np.array(measured), orbits, x[:, : 2 * d]

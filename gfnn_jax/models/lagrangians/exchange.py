@@ -3,9 +3,11 @@
 The triangle of the arcs' residuals in all terms of a library (`fitting.linearised`) has the least
 sum of squares of every set of them without another fit. Of the sets that are one exchange away
 (Miller, Subset Selection in Regression, 1990) the likeliest by Schwarz's criterion are fitted to
-arcs. The plainest of those that are likely takes the place of the fit; those that are as likely as
-the law in the end are its *rivals*. A rival is lean: it holds no smaller rival as a special case,
-nor the law itself with terms beside which its coefficients are as well known.
+arcs. A law with fewer terms is likely too where what leaves is not significant: the largest of many
+terms that are not there stands three standard errors from zero. The plainest of those that are
+likely takes the place of the fit; those that are as likely as the law in the end are its *rivals*.
+A rival is lean: it holds no smaller rival as a special case, nor the law itself with terms beside
+which its coefficients are as well known.
 """
 
 from __future__ import annotations
@@ -111,9 +113,16 @@ def _compared(other: LawFit, fit: LawFit) -> Exchanged | None:
     """A fit beside another one; None where it is no law: M is not positive, or friction drives."""
     if not (may_be_chosen(other) and other.is_definite):
         return None
-    count = fit.independent
-    theirs, ours = (criterion(f.fitted.cost, count, len(f.p)) for f in (other, fit))
-    return Exchanged(other, theirs - ours)
+    theirs, ours = (criterion(f.fitted.cost, fit.independent, len(f.p)) for f in (other, fit))
+    return Exchanged(other, theirs - ours - _for_fewer(fit, len(other.p)))
+
+
+def _for_fewer(fit: LawFit, count: int) -> float:
+    """The criterion's share for a law of ``count`` terms where these are fewer than those of a fit:
+    one that is not significant may go, however few residuals there are."""
+    evidence = fit.problem.options.evidence
+    least = evidence.significant**2 - evidence.deciding - np.log(fit.independent)
+    return max(0.0, float(least)) if count < len(fit.p) else 0.0
 
 
 def _holds(other: LawFit, fit: LawFit) -> bool:
@@ -229,7 +238,10 @@ class _Screen:
         begun = sorted(rough, key=lambda one: rough[one])[: OPTIONS.screened * OPTIONS.fitted]
         begun += [one for one in rough if one < self.own]
         known = self._criterion(self.own)
-        found = {places: self._criterion(places) - known for places in map(self._rubbing, begun)}
+        found = {
+            places: self._criterion(places) - known - _for_fewer(self.fit, len(places))
+            for places in map(self._rubbing, begun)
+        }
         found.pop(self.own, None)
         return sorted(found.items(), key=lambda one: one[1])
 

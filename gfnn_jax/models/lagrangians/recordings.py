@@ -28,6 +28,7 @@ from gfnn_jax.flows.dormand_prince import WEIGHTS
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.observation import Observation, observed
+from gfnn_jax.maps.sensors import OtherLaw
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.dependence import search_of_systems
 from gfnn_jax.models.lagrangians.drives import hidden_frequency, with_frequency
@@ -52,7 +53,7 @@ from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, last_of_seri
 from gfnn_jax.models.lagrangians.nature import Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions, parting
 from gfnn_jax.models.lagrangians.residuals import Trace
-from gfnn_jax.models.lagrangians.rivals import constant_of, of_a_sensor, one_sided, other_powers
+from gfnn_jax.models.lagrangians.rivals import constant_of, of_a_sensor, other_powers
 from gfnn_jax.models.lagrangians.search import (
     SearchResult,
     TermSearch,
@@ -245,8 +246,7 @@ def _other_shapes(fit: LawFit) -> str:
     last = last_of_series(fit.structure.terms)
     if last is not None:
         return SERIES.format(fit.problem.word(("term", last)))
-    names = symbols(fit.problem.observation.coordinates)
-    return other_powers(fit, names) or one_sided(fit, names)
+    return other_powers(fit, symbols(fit.problem.observation.coordinates))
 
 
 def _with_rivals(
@@ -259,17 +259,19 @@ def _with_rivals(
     found = [] if fit.problem.parameters else rivals(fit, every)
     if not found:
         return law
+    laws = [GaugedLaw.of(data, other) for other, _ in found]
+    logs = np.array([0.0, *(-above / 2 for _, above in found)])
+    shares = np.exp(logs - np.logaddexp.reduce(logs))
     listed = tuple(
-        rival_of(
-            recording,
-            GaugedLaw.of(data, other),
-            float(np.exp(above / 2)),
-            other_terms(fit, other),
-        )
-        for other, above in found
+        rival_of(recording, one, float(np.exp(-log)), other_terms(fit, one.fit))
+        for one, log in zip(laws, logs[1:], strict=True)
     )
+    others = tuple(map(OtherLaw, (one.law for one in laws), shares[1:].tolist()))
+    map_: Any = law.map
+    map_ = dataclasses.replace(map_, sensors=dataclasses.replace(map_.sensors, rivals=others))
     motions = named_motions(parting(fit, [other for other, _ in found]), recording)
-    return dataclasses.replace(law, rivals=listed, next_motions=(*motions, *law.next_motions))
+    motions = (*motions, *law.next_motions)
+    return dataclasses.replace(law, map=map_, rivals=listed, next_motions=motions)
 
 
 def _is_no_law(law: LearnedLaw) -> bool:

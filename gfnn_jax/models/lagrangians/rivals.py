@@ -1,11 +1,10 @@
 """Terms of other shapes that may follow a record as well as those of its law.
 
 Beside springs r^3.5 imitates r^4 along an orbit whose distance changes little, so that a law with a
-power of the distance is fitted again with the next halves of whole numbers. A small constant force
-pushes as friction does that is stronger one way, so that a law with both it and linear friction is
-fitted again with friction of either side. Powers of a length may be a series of another shape: the
-weak form tells the constant inside it, and fits beside that correct it. Laws with as many
-coefficients have odds by the sums of their squares (`fitting.evidence`).
+power of the distance is fitted again with the next halves of whole numbers. Powers of a length may
+be a series of another shape: the weak form tells the constant inside it, and fits beside that
+correct it. Laws with as many coefficients have odds by the sums of their squares
+(`fitting.evidence`).
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ from gfnn_jax.families.expressions import (
 from gfnn_jax.families.lagrangian import (
     INPUTS,
     LINEAR,
-    ONE_SIDED,
     has_inputs,
     shape_of,
     tree_of,
@@ -240,32 +238,6 @@ def of_a_sensor(fit: LawFit) -> str:
                 typed, least = shlex.quote(f"{name} = {text}"), unlikely
                 best = f"a plainer law follows the record where {name} {what}: --observe {typed}"
     return best
-
-
-def one_sided(fit: LawFit, coordinates: Sequence[str]) -> str:
-    """A line on the coordinate whose friction may be stronger one way in place of a constant force
-    beside it; "" where there is none, or where that has no odds against it that decide."""
-    structure, evidence = fit.structure, fit.problem.options.evidence
-    d, values = structure.dim, fit.values
-    sides = losses(d, (ONE_SIDED,), 0.0)
-    if not fit.problem.options.choose_friction:
-        return ""
-    for i, force in enumerate(torques(d, range(d))):
-        rubs = losses(d, (LINEAR,), 0.0)[i]
-        own = sides[2 * i : 2 * i + 2]
-        if force not in structure.terms or rubs not in structure.friction:
-            continue
-        known = values | dict.fromkeys((("loss", side) for side in own), values["loss", rubs])
-        other = structure.without({("term", force), ("loss", rubs)})
-        again = fit.again(other.plus([("loss", side) for side in own]), known, rescale=False)
-        odds = evidence.odds(fit.fitted.cost, again.fitted.cost, fit.independent)
-        if again.follows and odds < evidence.decided:
-            return (
-                f"friction of {coordinates[i]} that is stronger one way follows the record as the "
-                "constant force on it does. A record that ends at rest would decide: the force "
-                "shifts where it rests"
-            )
-    return ""
 
 
 def _power(fit: LawFit) -> float | None:
