@@ -130,6 +130,16 @@ def test_the_page_is_whole_small_and_needs_no_network():
     assert discovered().verdict.partition(":")[0] in text
 
 
+def test_the_simulation_begins_at_its_first_dot_and_names_the_columns():
+    found = re.search("const shown = (.*);\n", page(discovered()))
+    assert found is not None
+    shown = json.loads(found[1])
+    t = shown["t"][0]
+    moved = np.exp(-DAMPING * t) * np.cos(np.sqrt(OMEGA**2 - DAMPING**2) * t)
+    assert shown["start"][0] == pytest.approx(REST + moved, abs=0.01)
+    assert [slider["label"] for slider in shown["sliders"]] == ["x", "x²", "damping rate"]
+
+
 def test_a_refusal_has_its_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     t = np.arange(0.0, 20.0, 0.05)

@@ -213,12 +213,15 @@ def _of_law(
     )
     yield Section(
         "What to record next",
-        heads=("release from rest at", "standard errors shrink by"),
+        heads=("release from rest at", "what it tells"),
         rows=[
             (
                 ", ".join(f"{n} = {q:.3g} {m.units[n]}".rstrip() for n, q in m.start.items()),
-                ", ".join(
-                    f"{in_letters(t)}: {min(g, 1000):.2g}×" for t, g in [*m.gains.items()][:4]
+                f"{m.apart:.2g} standard deviations between this law and its nearest rival"
+                if m.apart
+                else "standard errors smaller, "
+                + ", ".join(
+                    f"{in_letters(t)}: {min(g, 1000):.3g}×" for t, g in [*m.gains.items()][:4]
                 ),
             )
             for m in law.next_motions
@@ -229,7 +232,7 @@ def _of_law(
 
 def _physics(law: LearnedLaw, known: Physics) -> Section:
     drawn = []
-    if known.swings is not None:
+    if known.swings is not None and known.swings.vary:
         assert law.map.sensors is not None
         name = law.map.sensors.positions[0]
         unit = "rad" if name in law.map.sensors.angles else law.units.get(name, "")
@@ -308,7 +311,8 @@ def _rivals(law: LearnedLaw) -> Iterator[tuple[str, str, str]]:
     for name, odds in sorted(law.which_friction.odds.items(), key=lambda pair: pair[1])[:8]:
         note = "as likely" if odds < EVIDENCE.decided else ""
         yield f"friction {name.replace('+', ' + ')}", odds_text(odds), note
-    yield from ((one.formula, odds_text(one.odds), "as likely") for one in law.rivals)
+    rivals = ((in_letters(one.formula), odds_text(one.odds), "as likely") for one in law.rivals)
+    yield from rivals
     for rule, cost in law.input_rules.items():
         yield f"inputs between samples: {rule}", "", f"held-out cost {cost:.4g} × that of this law"
 

@@ -72,6 +72,11 @@ class Swings(NamedTuple):
     quality: np.ndarray
     quality_std: np.ndarray
 
+    @property
+    def vary(self) -> bool:
+        """Whether the frequency or Q depends on the amplitude."""
+        return any(np.ptp(x) > 1e-6 * x[0] for x in (self.frequency, self.quality) if x[0] < np.inf)
+
 
 class Physics(NamedTuple):
     """Quantities of a law, and the swings of one with a single degree of freedom."""
@@ -414,14 +419,15 @@ def _of_swings(swings: Swings, system: _System) -> list[Quantity]:
     """Frequency and Q of the largest swings."""
     a, unit = swings.amplitude[-1], system.units[0]
     at = f"swings of ± {a:.3g} {unit}".rstrip()
-    drift = 100 * (swings.frequency[-1] / swings.frequency[0] - 1)
+    drift = swings.frequency[-1] / swings.frequency[0] - 1
+    against = f"{100 * drift:+.2g} % against small swings" if abs(drift) > 1e-6 else "as small ones"
     found = [
         Quantity(
             f"{at}: frequency",
             float(swings.frequency[-1]),
             float(swings.frequency_std[-1]),
             "Hz",
-            f"{drift:+.2g} % against small swings",
+            f"without friction, {against}",
         )
     ]
     if np.isfinite(swings.quality[-1]):

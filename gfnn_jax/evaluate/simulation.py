@@ -52,12 +52,14 @@ def simulation(law: LearnedLaw, recording: Recording, begin: float) -> str | Non
         return None
     try:
         source = javascript(law.map)
-        z, _ = law.map.estimate(recording.slice(stop=begin))
+        before = recording.slice(stop=begin)
+        z, _ = law.map.estimate(before)
     except InputError:
         return None
     (run,) = recording.runs
     t = recording.times(run)
-    rows = np.flatnonzero(t >= begin)[:: max(1, int(np.sum(t >= begin)) // OPTIONS.points)]
+    rows = np.arange(len(before.times(run)) - 1, len(t))  # the state is that of the last row before
+    rows = rows[:: max(1, len(rows) // OPTIONS.points)]
     if len(rows) < 2:
         return None
     d, args = law.map.dim, _parameters(law, recording, run)
@@ -146,10 +148,12 @@ def _is_friction(law: LearnedLaw, place: int) -> bool:
 
 def _label(law: LearnedLaw, term: str) -> str:
     """A term of the map in the names of the recording."""
+    if term == "friction":
+        return "damping rate"
     named = dict(zip("qv", law.symbols, strict=True))
 
     def own(found: re.Match) -> str:
         names, place = named[found[1]], int(found[2]) - 1
         return names[place] if place < len(names) else found[0]
 
-    return in_letters(re.sub(r"\b([qv])(\d+)\b", own, term))
+    return in_letters(re.sub(r"(?<![A-Za-z_])([qv])(\d+)", own, term))

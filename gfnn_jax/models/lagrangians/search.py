@@ -64,7 +64,7 @@ def search_on(model: InputModel) -> SearchResult:
     """The law that a search comes to from one that was found, with its inputs as they are found to
     act and arcs of a period."""
     problem = model.fit.problem
-    problem.on_progress(f"1 periods: {model.fit}")
+    problem.on_progress(f"arcs of 1 period: {model.fit}")
     longer = [periods for periods in problem.options.periods if periods > 1]
     return TermSearch.of(problem).along(model.fit, longer)
 
@@ -93,7 +93,7 @@ def fit_given(given: Given, scale: float, problem: ArcProblem) -> SearchResult:
             raise
         structure = own.plus([("zero", i) for i in zeros])
         model = choose_rule(problem, structure, known, problem.arcs(first), problem.scales.sigma)
-        problem.on_progress(f"{first:g} periods: {model.fit}")
+        problem.on_progress(f"arcs of {first:g} periods: {model.fit}")
         models.append(model)
         if misfit(model.fit) < OPTIONS.noise:
             break
@@ -226,7 +226,7 @@ class TermSearch:
                 fit = with_fine_steps(fit)
                 fit = self.grow(fit, dataclasses.replace(self.every, terms=self.every.terms[:1]))
                 fit = self.grow(self.prune(fit))
-            fit.problem.on_progress(f"{periods:g} periods: {fit}")
+            fit.problem.on_progress(f"arcs of {periods:g} periods: {fit}")
             reached.append(fit)
         for fit in reversed(reached):
             found = self.finished(fit)

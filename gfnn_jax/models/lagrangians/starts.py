@@ -198,7 +198,7 @@ class _Starts:
         self.problem = dataclasses.replace(problem, inputs=inputs, rules=(rule.hold,))
         self.fits.append(rule.fit)
         self.ranks.append(library.rank)
-        problem.on_progress(f"{periods:g} periods: {rule.fit}")
+        problem.on_progress(f"arcs of {periods:g} periods: {rule.fit}")
 
     def add_richer(self, rows: Sequence[Row], rank: int) -> None:
         """Start from a richer library where the residuals of all starts are more than noise: of
