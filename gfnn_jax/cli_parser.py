@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import difflib
 import math
 import re
 import textwrap
@@ -101,7 +102,17 @@ the table of candidates:
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message} (see {self.prog} --help)")
+        raise InputError(f"{message}{self._nearest(message)} (see {self.prog} --help)")
+
+    def _nearest(self, message: str) -> str:
+        """The command or option that is nearest to the unknown one of a message."""
+        unknown = re.match(r"(?:unrecognized arguments: |.*invalid choice: ')([\w-]+)", message)
+        named = [a.choices for a in self._actions if isinstance(a.choices, dict)]
+        known = {word for commands in named for word in commands}
+        for one in (one for commands in named for one in commands.values()):
+            known |= set(one._option_string_actions)
+        near = difflib.get_close_matches(unknown[1], known, n=1) if unknown else []
+        return f". Did you mean {near[0]}?" if near else ""
 
 
 class _Version(argparse.Action):

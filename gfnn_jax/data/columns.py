@@ -223,18 +223,18 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int)
     shown = f"{', '.join(names)} {'is a rate' if len(names) == 1 else 'are rates'} of turning"
     if len(names) == 3 and strengths[1] > _OPTIONS.one_axis * strengths[0]:
         states = ",".join(names)
+        least = _OPTIONS.runs_of_a_body
+        wanted = f", from {least} or more runs of different speeds" * (runs < least)
         return Undecided(
-            f"{source}: {shown} about three axes: --structure poisson --states "
-            f"{shlex.quote(states)} learns the bracket of a body that turns"
-            + f", which wants runs of {_OPTIONS.runs_of_a_body} speeds or more"
-            * (runs < _OPTIONS.runs_of_a_body),
+            f"{source}: {shown} about three axes. To learn the bracket of a body that turns{wanted}: "
+            f"--structure poisson --states {shlex.quote(states)}",
             {"structure": "poisson", "states": tuple(names)},
         )
     main = names[int(np.argmax(known.std(axis=1)))] if known.size else names[0]
     observe = {main: "omega + b"}
     return Undecided(
-        f"{source}: {shown}, and no column shows the angle: --coordinates theta --observe "
-        f"{shlex.quote(f'{main} = omega + b')} has an offset b",
+        f"{source}: {shown}, and no column shows the angle. To learn its law, with an offset b of "
+        f"the sensor: --coordinates theta --observe {shlex.quote(f'{main} = omega + b')}",
         {"coordinates": ("theta",), "observe": observe},
     )
 

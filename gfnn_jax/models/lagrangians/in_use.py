@@ -7,6 +7,7 @@ wander is taken where its forecasts of held-out data do not err more than chance
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -135,7 +136,7 @@ def _in_gauge(data: RecordingData, fit: LawFit) -> tuple[Lagrangian, np.ndarray,
     names, scale = data.recording.coordinates, 1.0
     gauge = (
         f"the mean inertia M11 (of {names[0]}) over the data is 1, the unit of L, R, gains and "
-        f"energies; --mass {names[0]}=VALUE gives them theirs"
+        f"energies; for units of their own: --mass {shlex.quote(f'{names[0]}=VALUE')}"
     )
     for name, value in data.mass.items():
         q, i = fit.problem.states[:, : fit.form.dim], names.index(name)
