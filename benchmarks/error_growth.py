@@ -441,9 +441,10 @@ def draw(found: dict[str, Numbers]) -> None:
         if name in m
     }
     if points:
-        ax: Any = figures.proportionality(
-            points, r"one-step error $\varepsilon$ (RMS)", "position error at step 100"
-        )
+        about = (r"one-step error $\varepsilon$ (RMS)", "position error at step 100")
+        ax: Any = figures.work_precision(points, xlabel=about[0], ylabel=about[1])
+        ends = np.array(ax.get_xlim())
+        ax.plot(ends, ends, ":", color="0.6", lw=1, scalex=False, scaley=False)
         figures.save(ax.figure, FIGURES / "growth_proportionality.png")
     if "two-body" in m:
         curves = {

@@ -30,6 +30,7 @@ from hard.long_times import long_times
 from hard.precision import precision
 from hard.singular import singular
 from hard.solver import solver
+from matplotlib.figure import Figure
 
 from gfnn_jax.evaluate import figures
 
@@ -113,8 +114,28 @@ def draw(found: dict[str, Numbers]) -> None:
         figures.save(axes.figure, FIGURES / "hard_energy_drift.png")
     if "large-steps" in found:
         swept = {n: m for n, m in found["large-steps"]["measured"].items() if n in SWEEPS}
-        axes = figures.digits_against_step_size(swept)
-        figures.save(axes[0].figure, FIGURES / "hard_large_steps.png")
+        figures.save(digits_against_step_size(swept), FIGURES / "hard_large_steps.png")
+
+
+@figures.style()
+def digits_against_step_size(sweeps: Numbers) -> Figure:
+    """Digits kept in a step against the time step, a panel for each system, a curve for each chart;
+    a fit that was refused is a cross on the axis."""
+    figure = Figure(figsize=(2.8 * len(sweeps), 2.9))
+    axes = figure.subplots(1, len(sweeps), sharey=True, squeeze=False)[0]
+    for ax, (system, curves) in zip(axes, sweeps.items(), strict=True):
+        dt = np.asarray(curves["dt"], float)
+        digits = {n: np.array(v, float) for n, v in curves.items() if n != "dt"}  # None: NaN
+        for place, (name, values) in enumerate(digits.items()):
+            (line,) = ax.plot(dt, values, "o-", label=name)
+            lost = dt[np.isnan(values)]
+            # Crosses of charts that fail alike stand above each other.
+            ax.plot(lost, np.full(len(lost), -0.4 * place), "x", color=line.get_color())
+        ax.set(title=system, xlabel="time step $dt$")
+    axes[0].set_ylabel("digits kept in one step")
+    axes[0].plot([], [], "x", color="0.5", label="fit refused")
+    axes[0].legend(loc="lower left")
+    return figure
 
 
 def main(argv: Sequence[str] | None = None) -> None:

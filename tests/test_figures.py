@@ -196,16 +196,3 @@ def test_methods_differ_in_colour_and_marker():
 def test_a_given_axes_is_drawn_on():
     first = figures.work_precision({"one": ([1, 2], [1, 2])})
     assert figures.work_precision({"GFNN": ([1, 2], [1, 2])}, ax=first) is first
-
-
-def test_digits_against_step_size_marks_what_was_refused(tmp_path):
-    sweeps = {
-        "oscillator": {"dt": [0.5, 1.0, 1.5], "type2": [8.0, 7.0, None], "midpoint": [9, 9, 9]},
-        "pendulum": {"dt": [0.5, 1.0], "type2": [8.0, None], "midpoint": [9.0, 6.0]},
-    }
-    axes = figures.digits_against_step_size(sweeps)
-    assert [ax.get_title() for ax in axes] == list(sweeps)
-    curve, refused = axes[0].get_lines()[:2]
-    np.testing.assert_array_equal(curve.get_ydata(), [8, 7, np.nan])
-    np.testing.assert_array_equal(refused.get_xdata(), [1.5])
-    figures.save(axes[0].figure, tmp_path / "sweep.png")

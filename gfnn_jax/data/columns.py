@@ -226,7 +226,7 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int)
         least = _OPTIONS.runs_of_a_body
         wanted = f", from {least} or more runs of different speeds" * (runs < least)
         return Undecided(
-            f"{source}: {shown} about three axes. To learn the bracket of a body that turns{wanted}: "
+            f"{source}: {shown} of a body about three axes. To learn its bracket{wanted}: "
             f"--structure poisson --states {shlex.quote(states)}",
             {"structure": "poisson", "states": tuple(names)},
         )

@@ -144,20 +144,6 @@ def error_growth(errors: Mapping, ylabel="position error", ax=None, band=None) -
 
 
 @style()
-def proportionality(points: Mapping, xlabel, ylabel, ax=None) -> Axes:
-    """Draw a positive quantity against another, log–log, with a dotted line proportional to x.
-
-    points: name -> (x (K,), y (K,)).
-    """
-    ax = _axes_or_new(ax)
-    _curves(ax, points)
-    ax.set(xlabel=xlabel, ylabel=ylabel, **_LOG_LOG)
-    _guide(ax, 1.0, r"$\propto\varepsilon$")
-    _legend_above(ax)
-    return ax
-
-
-@style()
 def element_errors(errors: Mapping, axes=None) -> tuple[Axes, Axes]:
     """Draw errors of semi-major axis and eccentricity against step (paper, Fig. 2, upper row).
 
@@ -486,32 +472,6 @@ def unbeaten(cost, error) -> tuple[np.ndarray, np.ndarray]:
     best = np.minimum.accumulate(error[order])
     front = np.flatnonzero(np.append(True, best[1:] < best[:-1]))
     return cost[order][front], best[front]
-
-
-@style()
-def digits_against_step_size(sweeps: Mapping, axes=None) -> list[Axes]:
-    """Draw digits kept against the time step, a panel for each system, a curve for each chart.
-
-    sweeps: system -> {"dt": (K,), chart: digits (K,), ...}. A fit that was refused is None or NaN,
-    and is drawn as a cross on the axis.
-    """
-    if axes is None:
-        figure = Figure(figsize=(WIDTH * 0.62 * len(sweeps), HEIGHT))
-        axes = list(np.atleast_1d(figure.subplots(1, len(sweeps), sharey=True)))
-    cross = _ALONE | {"marker": "x"}
-    for ax, (system, curves) in zip(axes, sweeps.items(), strict=True):
-        dt = np.asarray(curves["dt"], float)
-        digits = {n: np.array(v, float) for n, v in curves.items() if n != "dt"}  # None: NaN
-        for place, (name, values) in enumerate(digits.items()):
-            look, lost = _look_of(place), np.isnan(values)
-            ax.plot(dt, values, label=name, **look)
-            # Crosses of charts that fail alike stand above each other.
-            ax.plot(dt[lost], np.full(lost.sum(), -0.4 * place), color=look["color"], **cross)
-        ax.set(title=system, xlabel="time step $dt$")
-    axes[0].set_ylabel("digits kept in one step")
-    axes[0].plot([], [], color=REFERENCE, label="fit refused", **cross)
-    axes[0].legend(loc="lower left")
-    return axes
 
 
 # Many degrees of freedom, one trajectory: the reference has a panel of its own, so that nothing
