@@ -105,7 +105,7 @@ class _Parser(argparse.ArgumentParser):
         raise InputError(f"{message}{self._nearest(message)} (see {self.prog} --help)")
 
     def _nearest(self, message: str) -> str:
-        """The command or option that is nearest to the unknown one of a message."""
+        """Return the command or option that is nearest to the unknown one of a message."""
         unknown = re.match(r"(?:unrecognized arguments: |.*invalid choice: ')([\w-]+)", message)
         named = [a.choices for a in self._actions if isinstance(a.choices, dict)]
         known = {word for commands in named for word in commands}

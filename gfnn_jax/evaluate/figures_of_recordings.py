@@ -4,6 +4,7 @@ file's own names and units."""
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -267,7 +268,8 @@ def _energy(ax, fit: LearnedLaw) -> None:
     trace = max(fit.traces, key=lambda one: np.ptp(one.t))
     stored = trace.energy - trace.energy[0]
     ax.plot(trace.t, stored, lw=2.6, color="0.6", label="stored")
-    losses = {f"− lost by {in_letters(term.term)}": -1 for term in fit.friction.terms}
+    terms = (textwrap.fill(in_letters(term.term), 32) for term in fit.friction.terms)
+    losses = {f"− lost by {term}": -1 for term in terms}
     gains = {f"supplied by {name}": 1 for name in fit.gains}
     for sums, names in ((trace.lost, losses), (trace.supplied, gains)):
         for column, (name, sign) in zip(sums.T, names.items(), strict=True):

@@ -74,7 +74,7 @@ class Swings(NamedTuple):
 
     @property
     def vary(self) -> bool:
-        """Whether the frequency or Q depends on the amplitude."""
+        """Tell whether the frequency or Q depends on the amplitude."""
         return any(np.ptp(x) > 1e-6 * x[0] for x in (self.frequency, self.quality) if x[0] < np.inf)
 
 

@@ -113,6 +113,8 @@ def as_mathml(text: str) -> str:
     typeset = mathml(expression.xreplace(dict(zip(names, plain, strict=True))), "presentation")
     for placeholder, name in shown.items():
         typeset = typeset.replace(placeholder, name)
+    # Names of several letters stand apart.
+    typeset = typeset.replace("<mo>&InvisibleTimes;</mo>", '<mspace width="0.2em"/>')
     typeset = typeset.replace("<mo>(</mo>", '<mo stretchy="false">(</mo>')
     typeset = typeset.replace("<mo>)</mo>", '<mo stretchy="false">)</mo>')
     return typeset.replace("<mi>sign</mi>", "<mi>sgn</mi>")
