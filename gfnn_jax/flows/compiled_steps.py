@@ -6,23 +6,23 @@ the list at all stages of a step at once. So no law is compiled, and no family o
 its own.
 
 States stay on a lift from the first step to the last, with what rounding loses of them. The momenta
-of its fibres, quadratic in w, are what Casimirs are made of, and are kept to twice the digits. Each
-stage begins with the polynomial through the same stage of the steps before: that halves the
-iterations, and changes nothing that they converge to. The polynomial through all stages of one step
-is better where steps are long and stages many, and worse than nothing where their errors differ:
-two steps of 64 tell which of both takes fewer iterations. This module imports numba.
+of its fibres, quadratic in w, are what Casimirs are made of, and are kept to twice the digits.
+Stages begin with the polynomial nearest to all stages of the two steps before: that halves the
+iterations, and changes nothing that they converge to. This module imports numba.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.core import Tracer
+from numpy.polynomial.chebyshev import chebvander
 
 from gfnn_jax.families.family import at_time, form_of
 from gfnn_jax.families.sums import matrix_free
@@ -35,17 +35,18 @@ from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform
 
 STAGES = 8  # a constant of the compiled loops, as many as processors do at once
 _MOST = 100  # iterations
-_TRIED = 64  # steps, of the first two of which each way to begin their stages is tried
-_KNOWN = 6  # steps before, by which stages begin: more amplify what jumps, by 2 to this power
+_BEFORE = 2  # steps, by whose stages those of a step begin
+_HIGHER = 3  # degree of the polynomial through them, less the stages: more amplify rounding
 _FLOOR, _SETTLED = 1.1e-17, 1.8e-12  # as in `flows.flow`: 0.05 eps, eps^¾
 _SPLIT = 134217729.0  # 2²⁷ + 1 halves a number's digits (T. J. Dekker, Numer. Math. 18, 1971)
 _PARALLEL = 1.0 + 1e-9  # as in `flows.collective`
 _TWO_PI, _BEYOND = 2 * math.pi, 2.4492935982947064e-16  # 2π and what this number lacks of it
 _MOST_OPERATIONS = 10_000  # of a gradient: JAX's products of matrices are faster beyond
 
-# v_i = v_a + c v_b; c v_a v_b; c v_a; v_a^c; functions of v_a; INPUT stands first.
-INPUT, CONSTANT, SUM, PRODUCT, SCALED, POWER, INVERSE, EXP, LOG, SIN, COS, ROOT, ABS = range(13)
-TAN, SINH, COSH, TANH, ARCTAN = range(13, 18)
+# Of a tape: v_i = v_a + c v_b; c v_a v_b; c v_a. Of a program: v_i = v_a + c v_b v_d; of both:
+# v_a^c; functions of v_a.
+INPUT, CONSTANT, SUM, PRODUCT, SCALED, JOINED, POWER, INVERSE, EXP, LOG, SIN, COS = range(12)
+ROOT, ABS, TAN, SINH, COSH, TANH, ARCTAN = range(12, 19)
 _FUNCTIONS = {
     "exp": EXP,
     "log": LOG,
@@ -62,7 +63,7 @@ _FUNCTIONS = {
 
 
 class Program(NamedTuple):
-    """Operations (N, 3) (kind, a, b) and their constants (N,); the places (W,) of the values.
+    """Operations (N, 4) (kind, a, b, d) and their constants (N,); the places (W,) of the values.
     First come ``inputs`` of them, the state and the args, then, up to ``moving``, those that the
     state does not enter."""
 
@@ -165,11 +166,12 @@ class Node:
 
 
 class _Tape:
-    """Operations so far, each once."""
+    """Operations so far, each once. forms: sums that are kept, the factors of what they add."""
 
     def __init__(self, width: int):
         self.rows: list[tuple[int, int, int, float]] = [(INPUT, 0, 0, 0.0)] * width
         self.known: dict[tuple, int] = {}
+        self.forms: dict[int, dict[int, Any]] = {}
 
     def put(self, kind: int, a: int, b: int, c: float) -> Node:
         row = kind, a, b, c
@@ -178,10 +180,66 @@ class _Tape:
             self.rows.append(row)
         return Node(self, self.known[row])
 
-    def operands(self, place: int) -> list[int]:
+    def operands(self, place: int) -> Collection[int]:
         """Places of what an operation takes."""
         kind, a, b, _ = self.rows[place]
+        if place in self.forms:
+            return self.forms[place]
         return [a, b] if kind in (SUM, PRODUCT) else [] if kind in (INPUT, CONSTANT) else [a]
+
+    def needed(self, ends: list[int]) -> list[int]:
+        """Places that these are made of, and these, in order."""
+        used, ahead = set(), list(ends)
+        while ahead:
+            place = ahead.pop()
+            if place not in used:
+                used.add(place)
+                ahead += self.operands(place)
+        return sorted(used)
+
+    def join(self, ends: list[int]) -> None:
+        """Make forms of sums. One that stands in one other alone is put into it; those of the same
+        places that stand in forms alone are put into these where fewer factors are left then, as of
+        matrices one after another."""
+        used, forms = self.needed(ends), self.forms
+        uses = Counter([*ends, *(of for place in used for of in self.operands(place))])
+        linear = [place for place in used if self.rows[place][0] in (SUM, SCALED)]
+        fixed = {*ends, *(of for p in {*used} - {*linear} for of in self.operands(p))}
+        for place in linear:
+            kind, a, b, c = self.rows[place]
+            share = np.longdouble(c)  # matrices that are symmetric stay so
+            terms = {a: np.longdouble(1), b: share} if kind == SUM else {a: share}
+            once = {of for of in terms if of in forms and uses[of] == 1 and of not in fixed}
+            forms[place] = _without(once, terms, forms)
+            for of in once:
+                del forms[of]
+        joined = True
+        while joined:
+            alike = defaultdict(set)
+            for place in forms.keys() - fixed:
+                alike[frozenset(forms[place])].add(place)
+            joined = any(self._merged(group) for group in alike.values())
+
+    def _merged(self, group: set[int]) -> bool:
+        """Put the forms of a group into others, if that leaves fewer factors."""
+        forms = self.forms
+        others = [p for p in forms if not group.isdisjoint(forms[p])]
+        new = {p: _without(group, forms[p], forms) for p in others}
+        if sum(map(len, new.values())) >= sum(len(forms[p]) for p in (*others, *group)):
+            return False
+        forms.update(new)
+        for place in group:
+            del forms[place]
+        return True
+
+
+def _without(group: Collection[int], terms: dict[int, Any], forms: dict) -> dict[int, Any]:
+    """A form, with those of a group put in."""
+    found: dict[int, Any] = defaultdict(float)
+    for of, by in terms.items():
+        for place, share in (forms[of] if of in group else {of: 1.0}).items():
+            found[place] += by * share
+    return dict(found)
 
 
 def program(field: Callable[[np.ndarray, Any], Any], width: int, given: int) -> Program:
@@ -194,23 +252,47 @@ def program(field: Callable[[np.ndarray, Any], Any], width: int, given: int) -> 
     nodes = np.array([[Node(tape, i) for i in range(inputs)]], dtype=object)
     values = np.ravel(field(nodes[:, :width], nodes[:, width:] if given else None))
     ends = [nodes[0, 0]._other(value).place for value in values]
-    used, ahead = set(range(inputs)), list(ends)
-    while ahead:
-        place = ahead.pop()
-        if place not in used:
-            used.add(place)
-            ahead += tape.operands(place)
+    tape.join(ends)
+    used = [place for place in tape.needed(ends) if place >= inputs]
+    uses = Counter([*ends, *(of for place in used for of in tape.operands(place))])
+    summed = {of for form in tape.forms.values() for of in form if uses[of] == 1}
+    inside = {of for of in summed if tape.rows[of][0] == PRODUCT}  # done with the sum
     moving = set(range(width))
-    for place in sorted(used):
-        if any(of in moving for of in tape.operands(place)):
+    for place in used:
+        if not moving.isdisjoint(tape.operands(place)):
             moving.add(place)
-    still = sorted(used - moving - set(range(inputs)))  # once in a step
-    order = [*range(inputs), *still, *sorted(moving - set(range(width)))]
-    at = {place: k for k, place in enumerate(order)}
-    rows = [tape.rows[place] for place in order]
-    code = [(kind, at.get(a, 0), at.get(b, 0)) for kind, a, b, _ in rows]
-    found = np.array(code), np.array([row[3] for row in rows])
-    return Program(*found, np.array([at[end] for end in ends]), inputs, inputs + len(still))
+    zero, one, at = inputs, inputs + 1, {place: place for place in range(inputs)}
+    rows = [(INPUT, 0, 0, 0, 0.0)] * inputs
+    rows += [(CONSTANT, 0, 0, 0, 0.0), (CONSTANT, 0, 0, 0, 1.0)]
+
+    def write(place: int) -> None:
+        kind, a, b, c = tape.rows[place]
+        if place in tape.forms:
+            form = tape.forms[place]
+            first = next((of for of, by in form.items() if by == 1 and of not in inside), None)
+            at[place] = zero if first is None else at[first]
+            for of, by in form.items():
+                _, a, b, c = tape.rows[of]
+                factors = (at[a], at[b], by * c) if of in inside else (at[of], one, by)
+                if of != first:
+                    rows.append((JOINED, at[place], *factors))
+                    at[place] = len(rows) - 1
+        elif place not in inside:
+            row = (
+                (JOINED, zero, at[a], at[b], c)
+                if kind == PRODUCT
+                else (kind, at.get(a, 0), 0, 0, c)
+            )
+            rows.append(row)
+            at[place] = len(rows) - 1
+
+    for place in (place for place in used if place not in moving):  # once in a step
+        write(place)
+    still = len(rows)
+    for place in (place for place in used if place in moving):
+        write(place)
+    code, constants = np.array([row[:4] for row in rows]), np.array([float(row[4]) for row in rows])
+    return Program(code, constants, np.array([at[end] for end in ends]), inputs, still)
 
 
 @function
@@ -235,20 +317,19 @@ def _two_product(a, b):
 
 @function
 def _run(code, constants, v, places, stages):
-    """Run the operations of these places at the states in v, one a column. Sums and products of all
-    columns are done at once, functions one by one: of the ``stages`` that there are."""
+    """Run the operations of these places at the states in v, one a column. Sums and products are
+    done four columns at once, functions one by one: of the ``stages`` that there are."""
     begin, end = places
     for i in range(begin, end):
-        kind, a, b, c = code[i, 0], code[i, 1], code[i, 2], constants[i]
-        if kind == PRODUCT:
-            for s in range(STAGES):
-                v[i, s] = c * v[a, s] * v[b, s]
-        elif kind == SUM:
-            for s in range(STAGES):
-                v[i, s] = v[a, s] + c * v[b, s]
-        elif kind == SCALED:
-            for s in range(STAGES):
-                v[i, s] = c * v[a, s]
+        kind, a, c = code[i, 0], code[i, 1], constants[i]
+        if kind == JOINED:
+            b, d = code[i, 2], code[i, 3]
+            for s in range(0, STAGES, 4):
+                one = v[a, s] + c * v[b, s] * v[d, s]
+                two = v[a, s + 1] + c * v[b, s + 1] * v[d, s + 1]
+                three = v[a, s + 2] + c * v[b, s + 2] * v[d, s + 2]
+                four = v[a, s + 3] + c * v[b, s + 3] * v[d, s + 3]
+                v[i, s], v[i, s + 1], v[i, s + 2], v[i, s + 3] = one, two, three, four
         elif kind == CONSTANT:
             for s in range(STAGES):
                 v[i, s] = c
@@ -282,6 +363,20 @@ def _run(code, constants, v, places, stages):
                     v[i, s] = math.tanh(x)
                 else:
                     v[i, s] = math.atan(x)
+
+
+@function
+def _weighted(out, matrix, x):
+    """Put Σ_t x_it matrix_t into the rows i of out, four columns at once."""
+    for i in range(len(x)):
+        for s in range(0, STAGES, 4):
+            one, two, three, four = 0.0, 0.0, 0.0, 0.0
+            for t in range(len(matrix)):
+                one += x[i, t] * matrix[t, s]
+                two += x[i, t] * matrix[t, s + 1]
+                three += x[i, t] * matrix[t, s + 2]
+                four += x[i, t] * matrix[t, s + 3]
+            out[i, s], out[i, s + 1], out[i, s + 2], out[i, s + 3] = one, two, three, four
 
 
 @function
@@ -349,27 +444,22 @@ def _sheared(w, slopes, q, p):
         total, error = _two_sum(w[0, p + i], by)
         rest += error - share * w[1, q + i] + w[1, p + i]
         w[0, p + i], w[1, p + i] = _two_sum(total, rest)
-        for before in slopes:
-            for s in range(STAGES):
-                before[p + i, s] -= share * before[q + i, s]
+        for s in range(slopes.shape[1]):
+            slopes[p + i, s] -= share * slopes[q + i, s]
 
 
 class Law(NamedTuple):
-    """Tables of a law and its lift, for `roll`: the program of the field; places (F, 2) of the
-    bracket's entries, and these; rows of the stages' couplings by columns of stages, and h b; the
-    weights (K, K) of 1, …, K steps before in where a stage begins, and those of all stages of one
-    step before; the invariants; the lift's
-    ``fibres`` (S, 3); the sizes (W,) of w, what uniform friction makes of it in a substep, less 1;
-    places (A,) of angles and their centres."""
+    """Tables of a law and its lift, for `roll`: the program of the field; rows of the stages'
+    couplings by columns of stages, and their weights h b; those of the stages of the steps before
+    in where stages begin; the invariants; the lift's ``fibres`` (S, 3); the sizes (W,) of w, what
+    uniform friction makes of it in a substep, less 1; places (A,) of angles and their centres."""
 
     code: np.ndarray
     constants: np.ndarray
     ends: np.ndarray
-    form: np.ndarray
-    by_form: np.ndarray
     rule: np.ndarray
-    ahead: np.ndarray
-    within: np.ndarray
+    weights: np.ndarray
+    before: np.ndarray
     entries: np.ndarray
     values: np.ndarray
     fibres: np.ndarray
@@ -388,10 +478,9 @@ def _balanced(w, slopes, q, p):
         for k in range(2):
             w[k, q] *= by
             w[k, p] /= by
-        for before in slopes:
-            for s in range(STAGES):
-                before[q, s] *= by
-                before[p, s] /= by
+        for s in range(slopes.shape[1]):
+            slopes[q, s] *= by
+            slopes[p, s] /= by
 
 
 @function
@@ -409,23 +498,19 @@ def _turned(w, place, centre):
 @cached
 def roll(law, task, substeps, inputs, moving):
     """Follow the lanes of a `Task`."""
-    code, constants, ends, form, by_form, rule, ahead, within, entries, values = law[:10]
-    fibres, unit, decay, angles, centre = law[10:]
+    code, constants, ends, rule, weights, before, entries, values = law[:8]
+    fibres, unit, decay, angles, centre = law[8:]
     lanes, steps, width, count = task.out.shape[0], task.out.shape[1], len(unit), 0
-    stages = 0
-    while stages < STAGES and rule[STAGES, stages] != 0.0:
-        stages += 1
+    stages = np.count_nonzero(weights)
     for e in range(len(entries)):
         count = max(count, entries[e, 0] + 1)
-    v, new, moved = np.zeros((len(code), STAGES)), np.zeros((width, STAGES)), np.zeros(width)
-    now, took = np.zeros((width, STAGES)), np.zeros(2)
+    v, now = np.zeros((len(code), STAGES)), np.zeros((width, STAGES))
+    moved, part = np.zeros(width), np.zeros(width)
     along, system = np.zeros((count, width)), np.zeros((count, count + 2))
     given = task.given.shape
     for lane in range(lanes):
         w, slopes, most, n = task.w[lane], task.slopes[lane], 0, 0
-        goes, known = True, 0
-        while known < len(ahead) and not np.isnan(slopes[known, 0, 0]):
-            known += 1
+        goes = True
         while goes and n < steps:
             for part_of in range(substeps):
                 row, column = min(lane, given[0] - 1), min(n, given[1] - 1)
@@ -434,68 +519,46 @@ def roll(law, task, substeps, inputs, moving):
                         v[i, s] = task.given[row, column, part_of, i - width, s]
                 _run(code, constants, v, (inputs, moving), stages)
                 for i in range(width):
-                    for s in range(STAGES):
-                        now[i, s] = 0.0
-                turn = n % _TRIED
-                inside = turn if turn < 2 else int(took[1] < took[0])
-                for k in range(known - 1, -1, -1):
-                    weight = 0.0 if inside else ahead[known - 1, k]
-                    for i in range(width):
-                        for s in range(STAGES):
-                            before = (1.0 + decay[i]) * slopes[k, i, s]
-                            now[i, s] += weight * before
-                            if k + 1 < len(ahead):
-                                slopes[k + 1, i, s] = before
-                if inside and known:
-                    for i in range(width):
-                        for t in range(stages):
-                            before = (1.0 + decay[i]) * slopes[0, i, t]
-                            for s in range(STAGES):
-                                now[i, s] += within[t, s] * before
+                    part[i] = STAGES / (abs(w[0, i]) + unit[i])
+                if np.isnan(slopes[0, len(before) - 1]):
+                    now[:] = 0.0
+                else:
+                    _weighted(now, before, slopes)
                 last, change, iterations = np.inf, np.inf, 0
                 while iterations < _MOST:
                     iterations += 1
+                    _weighted(v, rule, now)
                     for i in range(width):
-                        for s in range(STAGES):
-                            v[i, s] = 0.0
-                        for t in range(stages):
-                            for s in range(STAGES):
-                                v[i, s] += rule[t, s] * now[i, t]
                         for s in range(STAGES):
                             v[i, s] += w[0, i]
-                            new[i, s] = 0.0
                     _run(code, constants, v, (moving, len(code)), stages)
-                    for e in range(len(form)):
-                        i, j, by = form[e, 0], ends[form[e, 1]], by_form[e]
-                        for s in range(STAGES):
-                            new[i, s] += by * v[j, s]
-                    change, total = 0.0, 0.0
+                    change, whole = 0.0, 0.0
                     for i in range(width):
-                        part = (abs(w[0, i]) + unit[i]) / STAGES
+                        off, total = 0.0, 0.0
                         for s in range(stages):
-                            value = rule[STAGES, s] * new[i, s]
+                            value = weights[s] * v[ends[i], s]
                             total += value
-                            change = max(change, abs(value - now[i, s]) / part)
+                            off = max(off, abs(value - now[i, s]))
                             now[i, s] = value
-                    if not abs(total) < np.inf:
+                        whole += total
+                        change = max(change, off * part[i])
+                    if not abs(whole) < np.inf:
                         goes = False
                         break
                     if change <= _FLOOR or (change <= _SETTLED and change > 0.5 * last):
                         break
                     last = change
                 most = max(most, iterations)
-                if turn < 2:
-                    took[turn] = iterations
                 goes = goes and change <= _SETTLED
                 if not goes:
                     break
                 for i in range(width):
                     moved[i] = 0.0
                     for s in range(STAGES):
-                        slopes[0, i, s] = now[i, s]
                         moved[i] += now[i, s]
+                        slopes[i, STAGES + s] = (1.0 + decay[i]) * slopes[i, s]
+                        slopes[i, s] = (1.0 + decay[i]) * now[i, s]
                     moved[i] += decay[i] * (w[0, i] + moved[i])
-                known = min(known + 1, len(ahead))
                 _kept(w, moved, entries, values, along, system)
             if not goes:
                 break
@@ -514,10 +577,10 @@ def roll(law, task, substeps, inputs, moving):
 
 class Task(NamedTuple):
     """N lanes: their states w (N, 2, W), whose second row is what rounding has lost, the stages
-    (N, K, W, stages) of the steps before, the last one first, NaN of none, and the args (N or 1, M
-    or 1, substeps, k, stages) of M steps; and what becomes of them: the states out (N, M, 2, W),
-    NaN from where a step fails, the turns (N, M, A) that angles made in each step, how many steps
-    did not fail (N,), and the most iterations of one (N,)."""
+    (N, W, 2 × STAGES) of the two steps before, the last one first, NaN of none, and the args (N or
+    1, M or 1, substeps, k, STAGES) of M steps; and what becomes of them: the states out (N, M, 2,
+    W), NaN from where a step fails, the turns (N, M, A) that angles made in each step, how many
+    steps did not fail (N,), and the most iterations of one (N,)."""
 
     w: np.ndarray
     slopes: np.ndarray
@@ -562,19 +625,21 @@ class Stepper:
         if isinstance(family, Uniform):
             decay[width // 2 :] = np.expm1(-flow.params[-1] * h)
             family, args = CaldirolaKanai(family.family), args + 1
+        form = form_of(family, width)
+
+        def field(w, given):
+            return family.gradient(flow.params, w, given) @ form.T
+
         try:
-            found = program(lambda w, given: family.gradient(flow.params, w, given), width, args)
+            found = program(field, width, args)
         except (TypeError, AttributeError):
             return None
-        form = form_of(family, width)
-        places = np.argwhere(form)
         casimirs = getattr(family, "casimirs", Casimirs((), ()))
         entries, values = lift.quadratic_invariants or (casimirs.entries, casimirs.values)
         entries = np.array(entries, np.int64).reshape(-1, 3)
         fibres = np.array(getattr(lift, "fibres", ()), np.int64).reshape(-1, 3)
-        rule = _rule(flow.stages, h)
-        law = (*found[:3], places, form[tuple(places.T)], rule, _ahead(), _within(flow.stages))
-        law = (*law, entries, np.asarray(values, float), fibres, np.asarray(unit, float), decay)
+        law = (*found[:3], *_rule(flow.stages, h), entries, np.asarray(values, float), fibres)
+        law = (*law, np.asarray(unit, float), decay)
         law = (*law, np.array(angles, np.int64), np.array(centre, float))
         owned = tuple(np.require(a, requirements=["C", "W", "O"]) for a in law)
         return cls(flow, lift, Law(*owned), (found.inputs, found.moving))
@@ -584,7 +649,7 @@ class Stepper:
         w = self.lift.up(np.asarray(z, np.longdouble) + lost)
         rounded = w.astype(float)
         w = np.stack([rounded, (w - rounded).astype(float)], axis=1)
-        return w, np.full((len(w), _KNOWN, w.shape[2], STAGES), np.nan)
+        return w, np.full((len(w), w.shape[2], _BEFORE * STAGES), np.nan)
 
     def steps(self, lanes: tuple[np.ndarray, np.ndarray], count: int, args: Any) -> Task:
         """Follow lanes by ``count`` steps. args: (N or 1, M or 1, k) as each begins, or None."""
@@ -620,27 +685,14 @@ class Stepper:
         return self.lift.down(w.astype(np.longdouble).sum(axis=-2)).astype(float)
 
 
-def _rule(stages: int, h: float) -> np.ndarray:
-    """The rows of Gauss's rule that `Law` has; stages that it lacks have no weight."""
-    rule, found = gauss(stages), np.zeros((STAGES + 1, STAGES))
-    found[:stages, :stages] = rule.coupling.T
-    found[-1, :stages] = h * rule.weights
-    return found
-
-
-def _within(stages: int) -> np.ndarray:
-    """(stages, stages): weights of the stages of a step, by rows, in those of the next, of the
-    polynomial through them."""
-    rule, found = gauss(stages), np.zeros((STAGES, STAGES))
-    powers = np.arange(stages)
-    ahead = np.linalg.inv((rule.nodes - 0.5)[:, None] ** powers).T
-    ahead = ahead @ ((rule.nodes + 0.5) ** powers[:, None])
-    found[:stages, :stages] = ahead * rule.weights / rule.weights[:, None]
-    return found
-
-
-def _ahead() -> np.ndarray:
-    """(K, K): weights of values at −1, …, −k in that at 0 of the polynomial through them, a row for
-    each k."""
-    weights = [[(-1) ** j * math.comb(k + 1, j + 1) for j in range(_KNOWN)] for k in range(_KNOWN)]
-    return np.array(weights, float)
+def _rule(stages: int, h: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Couplings, weights, and weights of the steps before, as `Law` has them; stages that Gauss's
+    rule lacks have none."""
+    rule, weights = gauss(stages), np.zeros(STAGES)
+    coupling, before = np.zeros((STAGES, STAGES)), np.zeros((_BEFORE, STAGES, STAGES))
+    coupling[:stages, :stages], weights[:stages] = rule.coupling.T, h * rule.weights
+    degree, times = min(2 * stages - 1, stages + _HIGHER), (rule.nodes, rule.nodes - 1)
+    known, sought = (chebvander(t, degree) for t in (np.concatenate(times), rule.nodes + 1))
+    shares = (sought @ np.linalg.pinv(known)).T.reshape(_BEFORE, stages, stages)
+    before[:, :stages, :stages] = shares / rule.weights[:, None] * rule.weights
+    return coupling, weights, before.reshape(-1, STAGES)

@@ -131,20 +131,27 @@ function = numba.njit(  # pyright: ignore[reportCallIssue]: two options lack in 
 
 
 class _Compilation(event.Listener):
-    """Says what is compiled, where no cache holds it, and keeps LLVM from unrolling the loops of
-    `follow` meanwhile: of loops as short as these that is a third of the time, and makes them
-    slower. Numba has no option of a function for it; who compiles holds its lock."""
+    """Says what is compiled, where no cache holds it, and sets options of LLVM meanwhile, of which
+    numba has none of a function; who compiles holds its lock. The loops of `follow` are not
+    unrolled: short as they are that is a third of the time, and makes them slower. In other
+    functions four numbers are done at once where lines of them stand side by side."""
 
     def on_start(self, event: event.Event) -> None:
         compiled = (event.data or {}).get("dispatcher")
-        if any(compiled is one for one in _said):
-            print("the motion of laws is compiled: some seconds, kept on disk", file=sys.stderr)
+        if not any(compiled is one for one in _said):
+            return
+        print("the motion of laws is compiled: some seconds, kept on disk", file=sys.stderr)
         if compiled is follow:
             llvm.create_pipeline_tuning_options = _rolled
+        else:
+            config.SLP_VECTORIZE = 1  # pyright: ignore[reportAttributeAccessIssue]
 
     def on_end(self, event: event.Event) -> None:
-        if (event.data or {}).get("dispatcher") is follow:
+        compiled = (event.data or {}).get("dispatcher")
+        if compiled is follow:
             llvm.create_pipeline_tuning_options = _options
+        elif any(compiled is one for one in _said):
+            config.SLP_VECTORIZE = 0  # pyright: ignore[reportAttributeAccessIssue]
 
 
 _options = llvm.create_pipeline_tuning_options

@@ -272,6 +272,8 @@ def _sized(algebra: Algebra, z: np.ndarray) -> np.ndarray:
         a, b = (np.arange(2 * algebra.blocks.count("aff"))[k::2] for k in (0, 1))
         basis[a] *= np.sign(np.median(z @ basis[a].T, axis=0))[:, None]
         basis[b] /= np.abs(basis[b]).max()
+        still = basis[2 * len(a) :]  # of Casimirs, whose whole numbers are told only at this size
+        still /= np.abs(still).max(axis=1, keepdims=True)
         return basis
     basis *= np.sqrt(3) / np.linalg.norm(basis[:3])
     if algebra.blocks == ("se3",):  # {M, Γ} = Γ holds for Γ of any size
