@@ -112,19 +112,35 @@ def test_few_runs_with_noise_are_told_to_be_too_few(count):
     assert raised.value.verdict == f"no law: {count} run{'s' * (count > 1)} do not determine it"
 
 
-def test_one_noisy_orbit_of_predators_and_prey():
-    def rates(z):
-        return z * np.array([0.9 - 0.03 * z[1], 0.02 * z[0] - 0.8])
+@pytest.mark.parametrize(
+    ("law", "start", "off"),
+    [
+        (
+            {"log(prey)": 0.8, "log(predator)": 0.9, "prey": -0.02, "predator": -0.03},
+            (31.0, 19.5),
+            0.1,
+        ),
+        ({"log(prey)": 0.3, "prey": -0.01, "predator": -0.01}, (120.0, 6.0), 0.2),  # an epidemic
+    ],
+)
+def test_one_noisy_orbit_of_two_populations(law, start, off):
+    """The noise is in proportion to populations that fall to a hundredth."""
+    c = [law.get(name, 0.0) for name in ("log(prey)", "log(predator)", "prey", "predator")]
 
-    data = runs_of(rates, np.array([[31.0, 19.5]]), 0.5, 160)
-    rng, known = np.random.default_rng(0), np.array([0.8, 0.9, -0.02, -0.03])
+    def rates(z):
+        return z * np.array([c[1] + c[3] * z[1], -c[2] * z[0] - c[0]])
+
+    data = runs_of(rates, np.array([start]), 0.25, 200)
     z = np.concatenate([data.z0, data.z1[-1:]])
-    z *= np.exp(0.05 * rng.normal(size=z.shape))
+    z *= np.exp(0.05 * np.random.default_rng(0).normal(size=z.shape))
     about = {"run": data.run, "place": data.place, "structure": "poisson"}
-    fit = gfnn.fit(gfnn.Pairs(z[:-1], z[1:], 0.5, **about, names=("prey", "predator")))
+    fit = gfnn.fit(gfnn.Pairs(z[:-1], z[1:], 0.25, **about, names=("prey", "predator")))
     assert fit.bracket.name == "log-canonical"
-    assert [t.term for t in fit.law.terms] == ["log(prey)", "log(predator)", "prey", "predator"]
-    assert np.array([t.coefficient for t in fit.law.terms]) == pytest.approx(known, rel=0.1)
+    found = {t.term: (t.coefficient, t.std) for t in fit.law.terms}
+    assert found.keys() == law.keys()
+    for name, (value, std) in found.items():
+        assert value == pytest.approx(law[name], rel=off)
+        assert abs(value - law[name]) < 3 * std
 
 
 @pytest.mark.parametrize("own", [0.002, 0.01])

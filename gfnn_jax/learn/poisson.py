@@ -75,7 +75,7 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         except FitError as error:
             raise FitError(f"{error}{_next(data, error.verdict)}", error.verdict) from error
         learned = _of_law(law, every, float(np.median(dt)))
-    seconds, map_, sigma = time.perf_counter() - started, learned.map_, learned.sigma
+    seconds, map_, law = time.perf_counter() - started, learned.map_, learned.law
     watch.on_progress(f"compiling the step of {learned.label}")
     test = split.test if len(split.test) else split.validation
     tested = pairs.take(test)
@@ -85,7 +85,11 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
     off = images - np.asarray(tested.z1)
     error = one_step_error(off, every.spread[:n], tolerance, split.stretch[test])
     # both states of a pair have the noise that its sequence tells
-    white = sigma is not None and bool(np.sqrt(np.mean((off / sigma) ** 2)) <= NOISE * np.sqrt(2))
+    sigma, white = None, False
+    if law is not None and law.sigma is not None:
+        each = law.noise_of(np.asarray(tested.z1))
+        sigma = np.sqrt(np.mean(each**2, axis=0))
+        white = bool(np.sqrt(np.mean((off / each) ** 2)) <= NOISE * np.sqrt(2))
     candidate = Candidate.of(
         error,
         label=learned.label,
@@ -242,7 +246,7 @@ def _given(terms, names: tuple[str, ...]) -> Terms | None:
 
 
 class _Learned(NamedTuple):
-    """A map with what its line in the table says; ``law`` where there is one; sigma: noise (n,)."""
+    """A map with what its line in the table says; ``law`` where there is one."""
 
     map_: SymplecticMap
     bracket: Bracket
@@ -251,7 +255,6 @@ class _Learned(NamedTuple):
     relative: float
     law: PoissonLaw | None = None
     notes: tuple[str, ...] = ()
-    sigma: np.ndarray | None = None
 
 
 def _of_law(law: PoissonLaw, data: Data, dt: float) -> _Learned:
@@ -262,7 +265,7 @@ def _of_law(law: PoissonLaw, data: Data, dt: float) -> _Learned:
     piece = law_flow(family, law.fit.c, law.bracket, dt, states, law.field.friction)
     map_ = _map(piece, law.bracket, data, dt, Posterior(0, law.fit.root))
     label = f"H of {family.num_parameters} terms"
-    return _Learned(map_, law.bracket, label, family, law.fit.relative, law, law.notes, law.sigma)
+    return _Learned(map_, law.bracket, label, family, law.fit.relative, law, law.notes)
 
 
 def _generated(data: Data, bracket: Bracket | None) -> _Learned:

@@ -29,6 +29,7 @@ class Options:
     rate: float = 0.2  # largest h‖f'‖ of a Runge–Kutta step
     most_substeps: int = 16
     nodes: int = 64  # of an arc, at most
+    used: float = 0.8  # part of the states, at least, that an arc's length may leave in use
     # standard errors of a coefficient that stays
     significant: float = 4.0
     # distance of a constant of the bracket from a whole number that it may be, and the rise of
@@ -139,12 +140,13 @@ class PoissonArcs:
 
 class ArcsFit(NamedTuple):
     """A law fitted to arcs: the field, c, a root of the covariance of c, the noise σ (n,), and the
-    residuals' RMS in units of it."""
+    residuals' RMS, which outliers raise (n,)."""
 
     field: PoissonField
     c: np.ndarray
     root: np.ndarray
     sigma: np.ndarray
+    left: np.ndarray
 
 
 def fit_arcs(
@@ -186,7 +188,8 @@ def fit_arcs(
         if sizes[0] - sizes[1] <= OPTIONS.whole * whole.sum():
             free, fitted = fixed, tried
     found = PoissonField(free.moved(fitted.p[count:]), library)
-    return ArcsFit(found, fitted.p[:count], _root(fitted)[:, :count], fitted.sigma)
+    left = fitted.sigma * np.sqrt(np.mean(fitted.residuals.reshape(-1, y.shape[2]) ** 2, axis=0))
+    return ArcsFit(found, fitted.p[:count], _root(fitted)[:, :count], fitted.sigma, left)
 
 
 def _root(fitted: Fitted) -> np.ndarray:
@@ -209,10 +212,12 @@ def arcs_of(z0: np.ndarray, z1: np.ndarray, run: np.ndarray, place: np.ndarray) 
 
 
 def equal_arcs(sequences: list[np.ndarray]) -> np.ndarray:
-    """The sequences cut into arcs of one length (A, L, n): an arc begins with the state that the
-    one before ends with; what is shorter is left out."""
-    longest = max(map(len, sequences))
-    length = min(OPTIONS.nodes, longest)
+    """The sequences cut into arcs of one length (A, L, n), the longest that leaves few states out:
+    an arc begins with the state that the one before ends with; what is shorter is left out."""
+    ends = np.array([len(states) for states in sequences]) - 1
+    lengths = np.arange(min(OPTIONS.nodes - 1, ends.max()), 0, -1)
+    used = np.array([np.sum(ends // length * length) for length in lengths])
+    length = lengths[np.argmax(used >= OPTIONS.used * used.max())] + 1
     parts = [
         states[first : first + length]
         for states in sequences

@@ -53,6 +53,7 @@ class Options:
     rows_per_term: float = 1.5  # pairs for each function of the library, at least
     exact: float = 1e-10  # of the spread: what a field without noise or misfit leaves at most
     printed: float = 1e-6  # the same of numbers that were printed, of pairs with parameters
+    solved: float = 1e-5  # the same of states whose errors are a solver's, smooth and no noise
     better: float = 0.9  # of the error on held-out pairs: what a higher degree must lower it to
     partly: float = 1e-2  # of the spread: an error of a field that is a start at all
     states: int = 400  # at which the field is analysed
@@ -103,8 +104,9 @@ class Data(NamedTuple):
 class PoissonLaw(NamedTuple):
     """ż = B∇H. field: with the terms of H that count. fit: of their coefficients. error: RMS on
     held-out pairs ÷ spread. name: of the bracket's kind. notes: lines about what was found. sigma:
-    (n,) noise of the states, where sequences were fitted. several: why other laws may have made the
-    pairs too, else ""."""
+    (n,) noise of the states, where sequences were fitted; of their logarithms where ``relative``.
+    several: why other laws may have made the pairs too, else "".
+    """
 
     field: PoissonField
     fit: FieldFit
@@ -113,6 +115,13 @@ class PoissonLaw(NamedTuple):
     notes: tuple[str, ...]
     sigma: np.ndarray | None = None
     several: str = ""
+    relative: bool = False
+
+    def noise_of(self, z: np.ndarray) -> np.ndarray:
+        """Noise (N, n) of states z (N, n); zeros where no sequences were fitted."""
+        if self.sigma is None:
+            return np.zeros_like(z)
+        return self.sigma * (np.abs(z) if self.relative else np.ones_like(z))
 
     @property
     def bracket(self) -> Bracket:
@@ -169,10 +178,10 @@ def _energies(law: PoissonLaw, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """H (N,) at states z (N, n), and what their noise makes of it, to second order: near an
     equilibrium H has no slope."""
     library, c = law.field.library, law.fit.c
-    sigma = np.zeros(z.shape[1]) if law.sigma is None else law.sigma
+    sigma = law.noise_of(z)
     slopes, bends = library.gradient_and_hessian(c, z)
     first = np.sum((slopes * sigma) ** 2, axis=-1)
-    second = 0.5 * np.sum((bends * sigma[:, None] * sigma) ** 2, axis=(-2, -1))
+    second = 0.5 * np.sum((bends * sigma[:, :, None] * sigma[:, None]) ** 2, axis=(-2, -1))
     return library.value(c, z), np.sqrt(first + second)
 
 
@@ -191,7 +200,7 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
         )
     if error > OPTIONS.exact and terms is None and not more:
         sigma = _noise_of(train, fit)
-        law = _of_populations(train, held, names, sigma)
+        law = _of_populations(train, held, names, sigma, error)
         if law is not None:
             return law
         hidden = _hidden_relations(train, names, sigma)
@@ -324,11 +333,15 @@ _SHELL = (
 
 def _noise_of(train: Data, fit: FieldFit) -> np.ndarray:
     """Noise (n,) of the states, at most: what local polynomials and the field leave."""
-    sequences = arcs_of(train.z0, train.z1, train.run, train.place)
+    left = np.sqrt(np.mean(fit.residual**2, axis=0) / 2)
+    return np.fmin(_white(arcs_of(train.z0, train.z1, train.run, train.place)), left)
+
+
+def _white(sequences: list[np.ndarray]) -> np.ndarray:
+    """Noise (n,) that local polynomials leave of sequences (L, n); NaN of short ones."""
     times = [np.arange(float(len(s))) for s in sequences]
     known = [one.sigma for one in noise(times, np.concatenate(sequences).T)]
-    left = np.sqrt(np.mean(fit.residual**2, axis=0) / 2)
-    return np.array([r if s is None else min(s, r) for s, r in zip(known, left, strict=True)])
+    return np.array([np.nan if s is None else s for s in known])
 
 
 def _hidden_relations(train: Data, names: tuple[str, ...], sigma: np.ndarray) -> int:
@@ -342,30 +355,60 @@ def _hidden_relations(train: Data, names: tuple[str, ...], sigma: np.ndarray) ->
     return int(np.sum(s <= OPTIONS.hidden * by_noise))
 
 
-def _of_populations(train: Data, held: Data, names, sigma: np.ndarray) -> PoissonLaw | None:
+def _of_populations(train: Data, held: Data, names, sigma, error: float) -> PoissonLaw | None:
     """The law of one kind of predators and one of prey: {x, y} = x y, and one orbit with noise
-    determines H of x, y and their logarithms. None of other states, and where it leaves more than
-    their noise, or H is not the same in all parts of a run."""
+    determines H of x, y and their logarithms. The noise is of one size, or in proportion to the
+    states, in whose logarithms the same H is fitted then: the likelier first. None of other states,
+    and where it leaves more than their noise, or H is not the same in all parts of a run. error: of
+    the field without structure, which a law that leaves a solver's errors alone does not exceed."""
     z = np.concatenate([train.z0, train.z1])
     if z.shape[1] != 2 or (z <= 0).any() or np.ndim(train.dt):
         return None
-    bracket = Bracket.log([[0, 1], [-1, 0]], names)
-    field = PoissonField(bracket, library_of(LOG, names, 1, None))
+    bracket, library = Bracket.log([[0, 1], [-1, 0]], names), library_of(LOG, names, 1, None)
+    field = PoissonField(bracket, library)
+    sequences = arcs_of(train.z0, train.z1, train.run, train.place)
     middle, rate = 0.5 * (train.z0 + train.z1), (train.z1 - train.z0) / train.dt
-    start = hamiltonian_of(field, middle, rate)
-    arcs = equal_arcs(arcs_of(train.z0, train.z1, train.run, train.place))
-    own = fit_arcs(field, start.c, arcs, train.dt, sigma)
-    left = np.broadcast_to(own.sigma, train.z0.shape)
-    relative = float(np.mean(own.sigma / train.spread))
-    fit = FieldFit(own.c, left, relative, own.root, 0, own.field)
-    error = error_on(own.field, own.c, held)
-    law = PoissonLaw(own.field, fit, error, bracket.name, (), own.sigma)
-    return law if _leaves_noise(law, sigma, train, held) else None
+    start = hamiltonian_of(field, middle, rate).c
+    own = fit_arcs(field, start, equal_arcs(sequences), train.dt, sigma)
+    logs = [np.log(states) for states in sequences]
+    relative, places = _white(logs), library.term_names
+    tried = [(np.log(own.left).sum(), own, sigma)]
+    if np.isfinite(relative).all():
+        start = np.zeros(len(places))
+        start[[places.index(name) for name in own.field.library.term_names]] = own.c
+        variables = (*(f"exp({name})" for name in names), *names)  # as those of H: z, log z
+        in_logs = Terms(0, variables, library.powers, (), names)
+        standard = PoissonField(canonical(1).named(names), in_logs)
+        own = fit_arcs(standard, start, equal_arcs(logs), train.dt, relative)
+        kept = [in_logs.term_names.index(name) for name in own.field.library.term_names]
+        unit = np.log(z).mean(axis=0).sum()  # of the density of a state by that of its logarithm
+        own = own._replace(field=field.take(kept))
+        tried.append((np.log(own.left).sum() + unit, own, relative))
+    for _, own, sigma in sorted(tried, key=lambda one: one[0]):
+        if not own.field.library.gradient(own.c, z).any(axis=0).all():
+            continue  # one of the populations would never change
+        law = PoissonLaw(
+            own.field,
+            FieldFit(own.c, np.zeros(0), np.nan, own.root, 0, own.field),
+            error_on(own.field, own.c, held),
+            bracket.name,
+            (),
+            own.sigma,
+            relative=sigma is relative,
+        )
+        left = law.noise_of(train.z0)
+        part = float(np.mean(np.sqrt(np.mean(left**2, axis=0)) / train.spread))
+        law = law._replace(fit=law.fit._replace(residual=left, relative=part))
+        close = law.error <= min(OPTIONS.solved, OPTIONS.worse * error)
+        if close or _leaves_noise(law, sigma, train, held):
+            return law
+    return None
 
 
 def _leaves_noise(law: PoissonLaw, sigma: np.ndarray, train: Data, held: Data) -> bool:
     """Return whether a law leaves no more than the noise (n,) of the states, and has the same H in
-    all parts of a run. Arcs tell no drift of H, as by friction: each has an H of its own."""
+    all parts of a run, to the errors of its coefficients. Arcs tell no drift of H, as by
+    friction: each has an H of its own."""
     if law.sigma is None or (law.sigma > OPTIONS.grown * sigma).any():
         return False
     z, run, place = (
@@ -373,12 +416,20 @@ def _leaves_noise(law: PoissonLaw, sigma: np.ndarray, train: Data, held: Data) -
         for key in ("z0", "run", "place")
     )
     total, count = 0.0, 0
+    library, c = law.field.library, law.fit.c[: law.field.library.num_parameters]
+    root = law.fit.root[:, : len(c)]
     for own in (run == r for r in np.unique(run)):
-        h, errors = _energies(law, z[own][np.argsort(place[own])])
-        parts = np.array_split(np.arange(len(h)), min(OPTIONS.parts, len(h)))
-        weight = np.array([np.sum(errors[part] ** -2.0) for part in parts])
-        mean = np.array([np.average(h[part], weights=errors[part] ** -2.0) for part in parts])
-        total += np.sum(weight * (mean - np.average(mean, weights=weight)) ** 2)
+        states = z[own][np.argsort(place[own])]
+        _, errors = _energies(law, states)
+        parts = np.array_split(np.arange(len(states)), min(OPTIONS.parts, len(states)))
+        weights = [errors[part] ** -2.0 for part in parts]
+        terms = [library.term_values(states[part]) for part in parts]
+        means = np.array([np.average(t, 0, w) for t, w in zip(terms, weights, strict=True)])
+        by_law = (means - means.mean(axis=0)) @ root.T
+        covariance = np.diag([1 / np.sum(w) for w in weights]) + by_law @ by_law.T
+        both = np.stack([means @ c, np.ones(len(parts))], axis=1)
+        h, one = np.linalg.solve(np.linalg.cholesky(covariance), both).T
+        total += h @ h - (h @ one) ** 2 / (one @ one)
         count += len(parts) - 1
     return total <= OPTIONS.uneven * max(count, 1)
 
