@@ -75,11 +75,11 @@ def uncoupled(dim: int, angles: tuple[int, ...]) -> list[Row]:
     return [row for row in rows if sum(map(any, zip(*row[:3], strict=True))) == 1]
 
 
-def bodies(dim: int, angles: tuple[int, ...]) -> list[Row]:
-    """The same, and potentials of lengths to degree 4: bodies with masses of their own."""
+def bodies(dim: int, angles: tuple[int, ...], highest: int = 4) -> list[Row]:
+    """The same, and potentials of lengths to a degree: bodies with masses of their own."""
     rows, none = uncoupled(dim, angles), (0,) * dim
     lengths = [i for i in range(dim) if i not in angles]
-    for degree in (2, 3, 4):
+    for degree in range(2, highest + 1):
         for axes in combinations_with_replacement(lengths, degree):
             rows.append((none, unit(dim, *axes), none, 0.0))
     return list(dict.fromkeys(rows))

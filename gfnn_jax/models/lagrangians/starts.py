@@ -47,6 +47,7 @@ class StartOptions:
     few: float = 8.0
     plain: float = 1.5
     noise: float = 2.0
+    white: float = 1.1
     exponents: tuple[float, ...] = (-3.0, -2.0, -1.0, -0.5, 0.5, 1.0, 1.5, 3.0, 4.0)
     beside: float = 0.6
     rounded: float = 0.1
@@ -112,6 +113,8 @@ def best_start(problem: ArcProblem) -> LawFit:
         some.add(_Library(libraries.relative(d, angles)))
     some.add_richer([*textbook.rows, *pulls], 1)
     some.add(_Library(first, 2))
+    for degree in (3, 4):
+        some.add_bodies(degree)
     if inputs := problem.num_inputs:
         driven = libraries.driven(d, angles, inputs, problem.squares)
         some.add_richer([*textbook.rows, *driven], 3)
@@ -129,10 +132,7 @@ def best_start(problem: ArcProblem) -> LawFit:
     some.add_led([*first, *libraries.couplings(d, angles)], 7)
     if not some.fits or (some.one_valued and not some.followed):
         raise no_law(problem.scales)
-    most = OPTIONS.plain * min(map(misfit, some.fits))
-    ranked = zip(some.ranks, some.fits, strict=True)
-    near = [(rank, misfit(fit), fit) for rank, fit in ranked if misfit(fit) <= most]
-    return min(near, key=lambda one: one[:2])[2]
+    return some.likeliest() if some.are_noise else some.plainest()
 
 
 def misfit(fit: LawFit) -> float:
@@ -212,6 +212,13 @@ class _Starts:
         if not self.are_noise:
             self.add(_Library(rows, rank, apart=True))
 
+    def add_bodies(self, degree: int) -> None:
+        """Start from equal masses in a potential of lengths up to a degree, where some start leaves
+        more than noise: along a straight orbit masses are told only together with forces."""
+        d, least = self.problem.dim, min(map(misfit, self.fits), default=np.inf)
+        if d > 1 and not (self.problem.angles or self.one_valued or least < OPTIONS.white):
+            self.add(_Library(libraries.bodies(d, (), degree), 1, apart=True, equal=True))
+
     def add_led(self, rows: Sequence[Row], rank: int) -> None:
         """Start from coordinates that drive others and are not moved by them, as a cart whose motor
         holds its course moves a pendulum, where the residuals of all starts are more than noise."""
@@ -282,6 +289,22 @@ class _Starts:
                 attempt(
                     plain if abs(best - plain) < OPTIONS.rounded else float(f"{best:.4g}"), others
                 )
+
+    def plainest(self) -> LawFit:
+        """The plainest of those that leave little more than the best."""
+        most = OPTIONS.plain * min(map(misfit, self.fits))
+        ranked = zip(self.ranks, self.fits, strict=True)
+        near = [(rank, misfit(fit), fit) for rank, fit in ranked if misfit(fit) <= most]
+        return min(near, key=lambda one: one[:2])[2]
+
+    def likeliest(self) -> LawFit:
+        """The likeliest by Schwarz's criterion, which holds where the residuals of some are noise."""
+        count = max(fit.independent for fit in self.fits if misfit(fit) < OPTIONS.noise)
+
+        def of(fit: LawFit) -> float:
+            return criterion(misfit(fit) ** 2, count, len(fit.p))
+
+        return min(self.fits, key=of)
 
     @property
     def are_noise(self) -> bool:
