@@ -298,7 +298,7 @@ class _Starts:
         return min(near, key=lambda one: one[:2])[2]
 
     def likeliest(self) -> LawFit:
-        """The likeliest by Schwarz's criterion, which holds where the residuals of some are noise."""
+        """The likeliest by Schwarz's criterion, which asks for residuals that are noise."""
         count = max(fit.independent for fit in self.fits if misfit(fit) < OPTIONS.noise)
 
         def of(fit: LawFit) -> float:
