@@ -18,7 +18,7 @@ from gfnn_jax.fitting.evidence import Rival
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.first_order import rival
-from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
+from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.in_use import CalibratedLaw, GaugedLaw
 from gfnn_jax.models.lagrangians.input_rules import InputModel
 from gfnn_jax.models.lagrangians.learned_law import (
@@ -53,7 +53,8 @@ class WarningOptions:
     energy that is gained. alike: correlation of two coefficients that the
     record cannot tell apart. energies: range of the energy, as a share of the largest kinetic one,
     below which a motion of one coordinate shows M and V together only. hides: noise of an angle, in
-    radians, above which other laws follow the record as well. lost: of the spread, by which half of
+    radians, or residual of another channel, of its spread, above which other laws follow the record
+    as well. lost: of the spread, by which half of
     the forecasts of held-out parts err, however short, of a law that fits its own record alone.
     """
 
@@ -138,8 +139,7 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         ended="every length of arcs was fitted",
         flaws=tuple(flaws),
         symbols=(names.coordinates, names.speeds),
-        rival=rival(fit, names.coordinates)
-        or _hidden(fit.problem, names.coordinates, tuple(channels)),
+        rival=rival(fit, names.coordinates) or _hidden(fit, names.coordinates, tuple(channels)),
     )
 
 
@@ -251,17 +251,19 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
     return flaws | _trend(best.fit)
 
 
-def _hidden(problem: ArcProblem, coordinates: Sequence[str], channels: Sequence[str]) -> str:
-    """Reason why other laws follow the record as well: hidden coordinates that are modes, or noise
-    that is a large part of a radian."""
+def _hidden(fit: LawFit, coordinates: Sequence[str], channels: Sequence[str]) -> str:
+    """Reason why other laws follow the record as well: hidden coordinates that are modes, noise
+    that is a large part of a radian, or what is left of other channels, a large part of them."""
+    problem = fit.problem
     if problem.observation.hidden is not None:
         return problem.observation.hidden.rivals
-    angles = [coordinates[i] for i in problem.angles if coordinates[i] in channels]
-    sigma = {name: problem.scales.sigma[channels.index(name)] for name in angles}
+    angles = [coordinates[i] for i in problem.angles]
+    shares = zip(channels, problem.scales.sigma, fit.rms() / fit.spread, strict=True)
     return "; ".join(
-        f"noise of {noise:.2g} rad in {name} hides what another law would leave"
-        for name, noise in sigma.items()
-        if noise > OPTIONS.hides
+        f"noise of {f'{noise:.2g} rad in' if name in angles else f'{share:.0%} of the spread of'} "
+        f"{name} hides what another law would leave"
+        for name, noise, share in shares
+        if (noise if name in angles else share) > OPTIONS.hides
     )
 
 
