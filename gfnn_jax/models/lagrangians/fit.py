@@ -491,13 +491,24 @@ class LawFit:
         rescale: bool = True,
     ) -> LawFit:
         """Fit from here, what is not given as it is here."""
+        structure = structure or self.structure
         return (problem or self.problem).fit(
-            structure or self.structure,
-            self.values if known is None else known,
+            structure,
+            self.values_within(structure) if known is None else known,
             arcs or self.followed,
             self.sigma,
             rescale,
         )
+
+    def values_within(self, structure: Structure) -> dict[Key, float]:
+        """The coefficients, close to the fit by least squares, where those that a structure lacks
+        are zero: along a straight orbit a spring that goes leaves its force to others."""
+        keys, p = self.structure.keys(), self.p
+        of, kept = self.linearised.covariance, set(structure.keys())
+        gone = [k for k, key in enumerate(keys) if key not in kept and 0 < of[k, k] < np.inf]
+        if gone:
+            p = p - of[:, gone] @ np.linalg.lstsq(of[np.ix_(gone, gone)], p[gone])[0]
+        return dict(zip(keys, p.tolist(), strict=True))
 
     def in_thirds(self) -> tuple[Arcs, np.ndarray]:
         """Arcs of the nodes, and the third of the record (A,) that each lies in. They are as long

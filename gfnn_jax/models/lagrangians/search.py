@@ -322,8 +322,13 @@ class TermSearch:
                 if Comparison.of(costs, fit.cross_validate(smaller)).is_lower(evidence.gain):
                     refused.add(key)
                     continue
+            less = fit.again(smaller)
+            rise = np.max(np.log(np.maximum(less.rms(), 1e-300) / np.maximum(fit.rms(), 1e-300)))
+            if not 2 * fit.independent * rise < 2 * evidence.significant**2:
+                refused.add(key)  # the others take no orbit to where they would make up for it
+                continue
             _dropped(fit, key, f"{z[key]:.1f} standard errors")
-            fit, costs = fit.again(smaller), None
+            fit, costs = less, None
 
     def grow(self, fit: LawFit, every: Structure | None = None) -> LawFit:
         """The fit with terms (of ``every``) that the residuals ask for, each kept where held-out
