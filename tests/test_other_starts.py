@@ -40,6 +40,22 @@ def test_a_trap_whose_axes_are_not_coupled_has_its_law():
     assert kind == "uniform"
 
 
+def test_a_spring_that_goes_leaves_its_force_to_no_other_coordinate():
+    """The mass and the spring of y are told only together: the fit without the spring is no fit."""
+    trap = recorded(
+        lambda q, v: -np.array([1.0, 1.45]) * q - 0.017 * v,
+        [0.8, 0.5, 0, 0],
+        ["x", "y"],
+        end=175.0,
+        samples=290,
+        noise=4e-5,
+    )
+    found = coefficients(gfnn.fit(trap).lagrangian)
+    assert found == pytest.approx(
+        {"x_dot**2": 0.5, "y_dot**2": 0.5, "x**2": -0.5, "y**2": -0.725}, rel=1e-3
+    )
+
+
 @pytest.mark.parametrize(
     ("eccentricity", "part"),
     [
