@@ -24,6 +24,7 @@ from harness import TABLES, Numbers, between_markers, main, markdown, number, on
 from harness import results as results_of
 from random_recordings import SYSTEMS, friction, integrated, law_of
 from scipy.integrate import solve_ivp
+from scipy.signal import lfilter, sawtooth, square
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
@@ -351,6 +352,75 @@ def turbulence(rng: np.random.Generator) -> np.ndarray:
     )
 
 
+def one_of_three(rng: np.random.Generator) -> np.ndarray:
+    """A coordinate of a chaotic flow of first order: Rössler's, Lorenz' or Thomas'."""
+    fast, which = rng.uniform(0.7, 1.3), int(rng.integers(3))
+    flows = (
+        lambda x, y, z: (-y - z, x + 0.2 * y, 0.2 + z * (x - 5.7)),
+        lambda x, y, z: (10 * (y - x), x * (28 - z) - y, x * y - 8 / 3 * z),
+        lambda x, y, z: (np.sin(y) - 0.19 * x, np.sin(z) - 0.19 * y, np.sin(x) - 0.19 * z),
+    )
+    fast *= (2.0, 0.4, 3.0)[which]
+    start = np.array([1.0, 0.5, (0.1, 20.0, 0.5)[which]]) * rng.uniform(0.9, 1.1, 3)
+    found = _orbit(lambda _, s: fast * np.array(flows[which](*s)), start)
+    return found[:, [int(rng.integers(3))]]
+
+
+def unrecorded_waves(rng: np.random.Generator) -> np.ndarray:
+    """A pendulum or a spring under a square wave or a saw tooth that nobody recorded."""
+    angle, wave = bool(rng.integers(2)), (square, sawtooth)[rng.integers(2)]
+    omega2, c = rng.uniform(4, 20), rng.uniform(0.05, 0.5)
+    drive, size = np.sqrt(omega2) * rng.uniform(0.25, 1.7), omega2 * rng.uniform(0.1, 0.5)
+
+    def rates(t, s):
+        pull = np.sin(s[0]) if angle else s[0]
+        return [s[1], -omega2 * pull - c * s[1] + size * wave(drive * t)]
+
+    return _orbit(rates, [rng.uniform(-0.5, 0.5), 0.0], max_step=0.02)[:, :1]
+
+
+def relay(rng: np.random.Generator) -> np.ndarray:
+    """A mass that a relay holds, with a dead zone in which it keeps its last sign, or without."""
+    omega2, c, size = rng.uniform(0, 6), rng.uniform(0.05, 0.5), rng.uniform(1, 4)
+    lead, dead = rng.uniform(-0.1, 0.3), rng.choice([0.0, rng.uniform(0.05, 0.3)])
+    x, v, u, fine, found = 1.0, 0.0, -1.0, 20, []
+    for k in range(fine * len(TIMES)):
+        asked = x + lead * v
+        u = -float(np.sign(asked)) if abs(asked) > dead else u
+        v += TIMES[1] / fine * (-omega2 * x - c * v + size * u)
+        x += TIMES[1] / fine * v
+        found += [x] * (k % fine == 0)
+    return np.array(found)[:, None]
+
+
+def backlash(rng: np.random.Generator) -> np.ndarray:
+    """A mass that an unrecorded support moves, through a spring with play."""
+    gap, k, w, c = rng.uniform([0.1, 20, 1, 0.1], [0.4, 60, 4, 0.6])
+
+    def rates(t, s):
+        pull = np.sin(w * t) + 0.5 * np.sin(1.618 * w * t) - s[0]
+        return [s[1], k * np.sign(pull) * max(abs(pull) - gap, 0.0) - c * s[1]]
+
+    return _orbit(rates, [0.0, 0.0], max_step=0.01)[:, :1]
+
+
+def steps(rng: np.random.Generator) -> np.ndarray:
+    """A swing that is held for some samples, or rounded; or a telegraph's signal."""
+    x, kind = np.sin(rng.uniform(2, 5) * TIMES)[:, None], int(rng.integers(3))
+    if kind == 0:
+        return x[np.arange(len(x)) // (n := int(rng.integers(3, 12))) * n]
+    if kind == 1:
+        return np.round(x / (coarse := rng.uniform(0.1, 0.4))) * coarse
+    return np.cumprod(np.where(rng.uniform(size=x.shape) < 0.04, -1.0, 1.0), axis=0)
+
+
+def resonant_noise(rng: np.random.Generator) -> np.ndarray:
+    """An autoregression of order 2."""
+    w, damping = rng.uniform(2, 8) * TIMES[1], rng.uniform(0.02, 0.3)
+    part = [1.0, -2 * np.exp(-damping * w) * np.cos(w), np.exp(-2 * damping * w)]
+    return lfilter([1.0], part, rng.normal(size=(len(TIMES), 1)), axis=0)
+
+
 def _band(rng: np.random.Generator, highest: float) -> np.ndarray:
     """Noise (n,) of unit size up to a frequency (Hz)."""
     f = np.fft.rfftfreq(len(TIMES), TIMES[1])
@@ -364,6 +434,7 @@ def _orbit(rates: Callable, start: Any, **options: Any) -> np.ndarray:
 
 
 TIMES = 0.02 * np.arange(2_000)
+UNCERTAIN = "no certain cause"
 OUTSIDE = {  # generator -> words of a verdict that names what the record is
     "hysteresis": (hysteresis, ("memory", "hysteresis")),
     "impacts": (impacts, ("impact", "jump")),
@@ -372,8 +443,14 @@ OUTSIDE = {  # generator -> words of a verdict that names what the record is
     "unrecorded broadband force": (unrecorded_force, ("unrecorded",)),
     "maglev, current unrecorded": (maglev, ("unrecorded",)),
     "turbulence-like noise": (turbulence, ("chance",)),
+    "one coordinate of a chaotic flow": (one_of_three, ("unrecorded", UNCERTAIN)),
+    "unrecorded square wave or saw tooth": (unrecorded_waves, ("unrecorded", UNCERTAIN, "drive")),
+    "relay": (relay, ("memory", "force", UNCERTAIN)),
+    "backlash of an unrecorded support": (backlash, ("unrecorded", UNCERTAIN)),
+    "steps": (steps, ("steps",)),
+    "autoregression": (resonant_noise, ("unrecorded", "chance")),
 }
-EACH = (6, 6, 6, 5, 6, 5, 6)
+EACH = (6, 6, 6, 5, 6, 5, 6, *6 * (4,))
 
 
 def outside_case(name: str, draw: int) -> Numbers:
@@ -381,7 +458,7 @@ def outside_case(name: str, draw: int) -> Numbers:
     rng = np.random.default_rng([*name.encode(), draw])
     make, words = OUTSIDE[name]
     x = make(rng)
-    x = x + NOISE * x.std(axis=0) * rng.normal(size=x.shape)
+    x = x + (name != "steps") * NOISE * x.std(axis=0) * rng.normal(size=x.shape)
     names = [f"x{i}" for i in range(1, x.shape[1] + 1)]
     table = {"t": TIMES, **dict(zip(names, x.T, strict=True))}
     _, said = _fitted(gfnn.Recording(table, positions=names, angles=[]))

@@ -75,9 +75,34 @@ def walk():
     return np.cumsum(np.random.default_rng(2).normal(size=(2_000, 1)), axis=0)
 
 
+def spikes_of_chaos():
+    """z of Rössler's flow: narrow spikes, as of impacts, and no jump of a velocity."""
+
+    def rates(_, s):
+        return 2 * np.array([-s[1] - s[2], s[0] + 0.2 * s[1], 0.2 + s[2] * (s[0] - 5.7)])
+
+    return orbit(rates, [1.0, 1.0, 0.1])[:, 2:]
+
+
+def square_wave():
+    """Forced oscillations are locked to the wave: its sign is one of the positions' past."""
+    return orbit(
+        lambda t, z: [z[1], -9 * np.sin(z[0]) - 0.3 * z[1] + 3 * np.sign(np.sin(2 * t))],
+        [0.3, 0.0],
+        max_step=0.02,
+    )[:, :1]
+
+
+def held():
+    return np.sin(3 * 0.02 * (np.arange(2_000) // 5 * 5))[:, None]
+
+
 @pytest.mark.parametrize(
     ("make", "verdict"),
     [
+        (spikes_of_chaos, ("no law: no certain cause", "no law: unrecorded")),
+        (square_wave, ("no law: no certain cause", "no law: unrecorded")),
+        (held, "no law: steps"),
         (walk, "not mechanical: chance"),
         (prey_and_predators, "not mechanical: first order"),
         (van_der_pol, "not mechanical: self-excited"),
@@ -118,7 +143,10 @@ def test_a_pendulum_is_none_of_these(noise):
     found = stretches(gfnn.Recording(table, positions=["theta"], angles=["theta"]))
     what = nature(found, measure(found), (0,))
     assert what.kind == "no law"
-    assert "noise hides" in what.reason or "by a force that the terms tried lack" in what.reason
+    if noise < 0.01:
+        assert "by a force that the terms tried lack" in what.reason
+    else:
+        assert what.reason.startswith(("noise hides", "no certain cause"))
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,20 @@
-"""Nature of a record whose law was not found: chance, first order, self-excited, impacts, memory,
-or moved by what is not recorded. Each is a property of the record and of no library of terms.
+"""Nature of a record whose law was not found, where it is certain; else what was found of it.
 
+Each is a property of the record and of no library of terms, and is named where the nearest other
+one is ruled out:
+
+- *Steps*: most neighbouring samples are equal: the column is held, or rounded.
 - *Chance*: mean squares of differences over a time τ grow as τ² where there is a velocity, as τ in
   a random walk, as τ^(2/3) in turbulence, and not at all in white noise.
 - *First order*: the velocities are functions of the positions.
-- *Impacts*: a few samples hold most of the squares of second differences.
-- *Self-excited*: accelerations are functions of positions and velocities, and friction is negative
-  where motion is slow.
-- *Memory*: they are, once the past is counted in by a play between position and force.
-- *Unrecorded*: they are not; an input or a coordinate is missing.
+- *Impacts*: peaks of second differences as narrow as a few samples hold most of their squares.
+- *Self-excited*: polynomials of positions and velocities leave no more of the accelerations than
+  noise, and friction is negative where motion is slow.
+- *Memory*: plays between position and force leave much less of the accelerations than these
+  polynomials, and than the same with as many of the past positions, as of a hidden coordinate.
+- *Unrecorded*: states that nearly coincide have accelerations that differ. What the nearest states
+  differ by is extrapolated to none between them (Stefánsson, Končar & Jones, Neural Comput. Appl. 5
+  (1997) 131).
 
 Shares are of squares that a polynomial explains in quarters of the record it was not fitted to.
 """
@@ -31,25 +37,35 @@ from gfnn_jax.signals.splines import Splines
 class NatureOptions:
     """Limits (`benchmarks/any_record.py`, outside).
 
-    rough: power of time by which differences grow, below which there is no velocity. early: of the
-    variance, up to which they are looked at. lags: samples, at most. first: share of the velocities
-    that positions explain. second: share of the accelerations that positions and velocities
-    explain. real: share of the squares of accelerations that is no noise. few, most: share of
-    samples that hold a share of the squares. gains: share of what was left, that memory explains.
-    degree: of polynomials. samples: that are looked at. plays: widths, in amplitudes. blocks: of
-    ``parts`` of the record in turn.
+    still: share of equal neighbours, of steps. rough: power of time by which differences grow,
+    below which there is no velocity. early: of the variance, up to which they are looked at. lags:
+    samples, at most. first: share of the velocities that positions explain. mostly: share of the
+    accelerations, of a law that may be one in part. real: share of their squares that is no noise.
+    most: share of the squares of second differences in narrow peaks, which fall to a quarter within
+    ``width`` samples. closed: squares of the accelerations that are left, in those of noise.
+    excited: negative friction, in ω. memory: share that plays explain; gains, beats: of what
+    polynomials and past positions leave, that they leave. near: rms distance of states, in
+    standard deviations, from which that to none is extrapolated; differ: share that they determine,
+    below which more acts. degree: of polynomials. samples: that are looked at. plays: widths, in
+    amplitudes, and as many past positions within a period. blocks: of ``parts`` of the record.
     """
 
+    still: float = 0.5
     rough: float = 1.5
     early: float = 0.3
     lags: int = 40
     first: float = 0.95
-    second: float = 0.97
     mostly: float = 0.9
     real: float = 0.5
-    few: float = 0.05
     most: float = 0.7
-    gains: float = 0.6
+    width: int = 5
+    closed: float = 5.0
+    excited: float = 0.1
+    memory: float = 0.9
+    gains: float = 0.5
+    beats: float = 0.75
+    near: float = 0.2
+    differ: float = 0.95
     degree: int = 3
     samples: int = 4_000
     plays: tuple[float, ...] = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.6)
@@ -85,6 +101,14 @@ def nature(
     """Tell what the record of these stretches is, whose law was not found. runs: channels (n, k) of
     whole runs, also where a body would be at rest; by default those of the stretches. field:
     equations of first order that follow it to its noise, "" where none were found."""
+    still = np.mean(np.concatenate([np.diff(s.y, axis=0) == 0 for s in found]), axis=0).min()
+    if still > OPTIONS.still:
+        return Nature(
+            "no law",
+            f"steps: {100 * still:.0f} % of the samples are equal to the one before, as of a "
+            "column that is held or rounded, and show no velocity. Record it finer",
+            partly=False,
+        )
     exponent = roughness(runs or [s.y for s in found])
     if exponent < OPTIONS.rough:
         grows = f"as time to the power of {exponent:.2g}" if exponent > 0 else "by no more"
@@ -100,9 +124,7 @@ def nature(
         return Nature("no law", "noise hides what its accelerations depend on")
     first = _best(_variables(q, angles), v, block)
     state = np.concatenate([_variables(q, angles), v / v.std(axis=0), u], axis=1)
-    plain = _best(state, a, block)
-    second = min(1.0, plain / real)
-    alone = q.shape[1] == 1  # it would not come back
+    plain, alone = _best(state, a, block), q.shape[1] == 1  # one would not come back
     if field or (not alone and first > max(OPTIONS.first, plain)):
         return Nature(
             "not mechanical",
@@ -115,37 +137,53 @@ def nature(
     if jumps > OPTIONS.most:
         return Nature(
             "no law",
-            f"impacts: {100 * OPTIONS.few:.0f} % of the samples hold {100 * jumps:.0f} % of the "
-            f"accelerations, velocities jump, as at {when:.4g} s. Cut them off (--from, --to)",
+            f"impacts: {100 * jumps:.0f} % of the squares of the accelerations are in peaks of a "
+            f"few samples, velocities jump, as at {when:.4g} s. Cut them off (--from, --to)",
         )
-    if second > OPTIONS.second:
+    if 1 - plain < OPTIONS.closed * max(1 - real, 1e-6):
         rate = _rate_at_rest(state, a / v.std(axis=0), state.shape[1] - v.shape[1] - u.shape[1])
-        if rate > 0:
+        if rate > OPTIONS.excited * scales.omega:
             return Nature(
                 "not mechanical",
                 "self-excited: friction is negative where motion is slow, "
                 f"{rate:.2g} 1/s, and feeds the energy that faster motion loses",
             )
-    memory = min(1.0, _best(state, a, block, _plays(q)) / real)
-    if 1 - memory < (1 - OPTIONS.gains) * (1 - second):
         return Nature(
             "no law",
-            f"memory (hysteresis): positions and velocities explain {100 * second:.0f} % of the "
-            f"accelerations, with the past of the positions {100 * memory:.0f} %",
+            f"positions and velocities explain the accelerations to the noise, {100 * plain:.2f} "
+            "%, by a force that the terms tried lack: give terms that you know (--terms)",
         )
-    if second > OPTIONS.second:
+    period = scales.period * len(q) / sum(float(np.ptp(s.t)) for s in found)
+    memory, past = (
+        max(plain, *(_best(state, a, block, columns[:, ::k]) for k in (1, 2, 4, 8)))
+        for columns in (_plays(q), _past(q, period))
+    )
+    rivals = OPTIONS.gains * (1 - plain), OPTIONS.beats * (1 - past)
+    if memory > OPTIONS.memory and 1 - memory < min(rivals):
         return Nature(
             "no law",
-            f"positions and velocities explain {100 * second:.1f} % of the accelerations, by a "
-            "force that the terms tried lack: give terms that you know (--terms)",
+            f"memory (hysteresis): positions and velocities explain {100 * plain:.3g} % of the "
+            f"accelerations, with past positions {100 * past:.3g} %, and with as many plays of "
+            f"them {100 * memory:.3g} %",
+        )
+    near, mostly = _of_near_states(state, a, period), plain > OPTIONS.mostly
+    shares = (
+        f"positions and velocities explain {100 * plain:.3g} % of the accelerations, with past "
+        f"positions {100 * past:.3g} %"
+    )
+    hidden = " (--hidden 1)" * (alone and not u.shape[1])
+    if near < OPTIONS.differ:
+        return Nature(
+            "no law",
+            f"unrecorded: states that nearly coincide have other accelerations: {shares}. An input "
+            f"is missing (--inputs), or a coordinate{hidden}",
+            mostly=mostly,
         )
     return Nature(
         "no law",
-        f"unrecorded: positions and velocities explain only {100 * second:.0f} % of the "
-        "accelerations. An input is missing (--inputs), or a coordinate"
-        + " (--hidden 1)"
-        * (alone and not u.shape[1]),
-        mostly=second > OPTIONS.mostly,
+        f"no certain cause: {shares}, and no states come so close that they tell more. A force of "
+        f"another shape (--terms), an input (--inputs) or a coordinate{hidden} may be missing",
+        mostly=mostly,
     )
 
 
@@ -283,17 +321,51 @@ def _rate_at_rest(state: np.ndarray, a: np.ndarray, first: int) -> float:
 
 
 def _jumps(found: Sequence[Stretch]) -> tuple[float, float]:
-    """The share of the squares of second differences that a few samples hold, and when the largest
-    is; of the column that has the largest share."""
-    best = (0.0, 0.0)
+    """The share of the squares of second differences in narrow peaks, and when the largest is; of
+    the column that has the largest share."""
+    best, width = (0.0, 0.0), OPTIONS.width
     for k in range(found[0].q.shape[1]):
-        parts = [(s.t[1:-1], np.diff(s.q[:, k], 2) ** 2) for s in found if len(s.t) > 2]
-        t, squares = (np.concatenate(part) for part in zip(*parts, strict=True))
-        t, squares = t[np.isfinite(squares)], squares[np.isfinite(squares)]
-        order = np.argsort(squares)[::-1]
-        most = np.sum(squares[order[: max(1, int(OPTIONS.few * len(order)))]])
-        best = max(best, (float(most / max(np.sum(squares), 1e-300)), float(t[order[0]])))
+        whole, times, peaks = 0.0, [], []
+        for s in found:
+            size = np.abs(np.nan_to_num(np.diff(s.q[:, k], 2)))
+            beside = np.pad(size, width)
+            beside = np.maximum(beside[: -2 * width], beside[2 * width :])
+            whole += float(np.sum(size**2))
+            peaks.append(np.where(beside < size / 4, size, 0.0) ** 2)
+            times.append(s.t[1:-1])
+        square = np.concatenate(peaks)
+        share = float(np.sum(square)) / max(whole, 1e-300)
+        best = max(best, (share, float(np.concatenate(times)[np.argmax(square)])))
     return best
+
+
+def _of_near_states(x: np.ndarray, target: np.ndarray, period: float) -> float:
+    """The share of the targets (n, d) that states x (n, k) determine, by their nearest neighbours
+    at other times than within half a ``period`` of samples; 1 where none are near."""
+    from scipy.spatial import cKDTree  # loaded when first used
+
+    x, place, order = x / x.std(axis=0), np.arange(len(x)), range(8)
+    others = cKDTree(x).query(x, k=min(len(x), 60))[1]
+    apart = np.abs(others - place[:, None]) > period / 2
+    known = apart.sum(axis=1) >= len(order)
+    nearest = np.argsort(~apart[known], axis=1, kind="stable")[:, : len(order)]
+    others = np.take_along_axis(others[known], nearest, axis=1)
+    if known.mean() < 0.5:
+        return 1.0
+    distance = np.sum((x[others] - x[known][:, None]) ** 2, axis=2).mean(axis=0)
+    differ = 0.5 * np.mean((target[others] - target[known][:, None]) ** 2, axis=0)
+    if distance[0] > OPTIONS.near**2:
+        return 1.0
+    rows = np.stack([np.ones(len(order)), distance], axis=1)
+    at_none = np.linalg.lstsq(rows, differ, rcond=None)[0][0]
+    return float(np.min(1 - np.maximum(at_none, 0.0) / target.var(axis=0)))
+
+
+def _past(q: np.ndarray, period: float) -> np.ndarray:
+    """As many past positions within a ``period`` of samples as there are plays, (n, d w)."""
+    size, n = (q - q.mean(axis=0)) / q.std(axis=0), len(OPTIONS.plays)
+    back = np.arange(len(q))[:, None] - np.round(np.arange(1, n + 1) * period / n).astype(int)
+    return size[np.maximum(back, 0)].transpose(0, 2, 1).reshape(len(q), -1)
 
 
 def _plays(q: np.ndarray) -> np.ndarray:
