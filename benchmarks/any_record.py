@@ -405,12 +405,12 @@ def backlash(rng: np.random.Generator) -> np.ndarray:
 
 
 def steps(rng: np.random.Generator) -> np.ndarray:
-    """A swing that is held for some samples, or rounded; or a telegraph's signal."""
-    x, kind = np.sin(rng.uniform(2, 5) * TIMES)[:, None], int(rng.integers(3))
+    """Noise of a band that is held for some samples, or rounded; or a telegraph's signal."""
+    x, kind = _band(rng, rng.uniform(0.5, 2.0))[:, None], int(rng.integers(3))
     if kind == 0:
         return x[np.arange(len(x)) // (n := int(rng.integers(3, 12))) * n]
     if kind == 1:
-        return np.round(x / (coarse := rng.uniform(0.1, 0.4))) * coarse
+        return np.round(x / (coarse := rng.uniform(0.2, 1.0))) * coarse
     return np.cumprod(np.where(rng.uniform(size=x.shape) < 0.04, -1.0, 1.0), axis=0)
 
 
@@ -418,7 +418,7 @@ def resonant_noise(rng: np.random.Generator) -> np.ndarray:
     """An autoregression of order 2."""
     w, damping = rng.uniform(2, 8) * TIMES[1], rng.uniform(0.02, 0.3)
     part = [1.0, -2 * np.exp(-damping * w) * np.cos(w), np.exp(-2 * damping * w)]
-    return lfilter([1.0], part, rng.normal(size=(len(TIMES), 1)), axis=0)
+    return np.asarray(lfilter([1.0], part, rng.normal(size=(len(TIMES), 1)), axis=0))
 
 
 def _band(rng: np.random.Generator, highest: float) -> np.ndarray:

@@ -342,7 +342,7 @@ def _jumps(found: Sequence[Stretch]) -> tuple[float, float]:
 def _of_near_states(x: np.ndarray, target: np.ndarray, period: float) -> float:
     """The share of the targets (n, d) that states x (n, k) determine, by their nearest neighbours
     at other times than within half a ``period`` of samples; 1 where none are near."""
-    from scipy.spatial import cKDTree  # loaded when first used
+    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
     x, place, order = x / x.std(axis=0), np.arange(len(x)), range(8)
     others = cKDTree(x).query(x, k=min(len(x), 60))[1]
@@ -362,7 +362,7 @@ def _of_near_states(x: np.ndarray, target: np.ndarray, period: float) -> float:
 
 
 def _past(q: np.ndarray, period: float) -> np.ndarray:
-    """As many past positions within a ``period`` of samples as there are plays, (n, d w)."""
+    """Past positions (n, d w), as many within a ``period`` of samples as there are plays."""
     size, n = (q - q.mean(axis=0)) / q.std(axis=0), len(OPTIONS.plays)
     back = np.arange(len(q))[:, None] - np.round(np.arange(1, n + 1) * period / n).astype(int)
     return size[np.maximum(back, 0)].transpose(0, 2, 1).reshape(len(q), -1)
