@@ -536,9 +536,8 @@ def set_up_jax(devices: int | str | None = None) -> None:
 
 def _cores() -> int:
     """Number of processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return here or 1
 
 
 @contextlib.contextmanager

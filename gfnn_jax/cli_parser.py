@@ -107,10 +107,8 @@ class _Parser(argparse.ArgumentParser):
     def _nearest(self, message: str) -> str:
         """Return the command or option that is nearest to the unknown one of a message."""
         unknown = re.match(r"(?:unrecognized arguments: |.*invalid choice: ')([\w-]+)", message)
-        named = [a.choices for a in self._actions if isinstance(a.choices, dict)]
-        known = {word for commands in named for word in commands}
-        for one in (one for commands in named for one in commands.values()):
-            known |= set(one._option_string_actions)
+        commands = next((a.choices for a in self._actions if isinstance(a.choices, dict)), {})
+        known = {*commands, *(o for one in commands.values() for o in one._option_string_actions)}
         near = difflib.get_close_matches(unknown[1], known, n=1) if unknown else []
         return f". Did you mean {near[0]}?" if near else ""
 

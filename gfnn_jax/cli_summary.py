@@ -46,18 +46,13 @@ def error_line(fit: dict[str, Any]) -> str:
     )
 
 
-def print_verdict(fit: Any) -> None:
-    """Print the verdict, the first line of a result."""
-    print(f"verdict: {fit.verdict}")
-
-
 def print_summary(ran: Any, out: Path) -> None:
     if ran is None:
         print(f"{out}: already holds the result of this job")
         return
     from gfnn_jax.learn.fitted import candidates_table
 
-    print_verdict(ran.fit)
+    print(f"verdict: {ran.fit.verdict}")
     print_table(candidates_table(ran.fit))
     report = ran.report
     fit, defect = report["fit"], report["map"]["symplecticity_defect"]
@@ -151,7 +146,7 @@ def print_law(fit: Any, ahead: Callable[[], None] | None = None) -> None:
     prints; and the details."""
     from gfnn_jax.evaluate.physics import physics
 
-    print_verdict(fit)
+    print(f"verdict: {fit.verdict}")
     law = fit.found
     quantities = [str(q) for q in physics(law).quantities if not q.name.startswith("energy")]
     for line in (*law.result_lines, *quantities, *law.horizon_lines):

@@ -124,12 +124,7 @@ def write_reports(fit: Fit, folder: Path, about: About) -> None:
     _write(to_json(fit.report()), folder / REPORT)
 
 
-def write_refusal(
-    recording: Recording,
-    error: Exception,
-    folder: Path,
-    about: About = About(),  # noqa: B008
-) -> None:
+def write_refusal(recording: Recording, error: Exception, folder: Path, about: About) -> None:
     """Write the page of a recording that gave no law into a folder: why, what it holds, what to do;
     and as JSON the verdict, ``error``, and the report of the law that was refused, where there is
     one."""

@@ -333,14 +333,9 @@ class _System(NamedTuple):
         known = np.isfinite(frequency)
         if not known[0] or np.sum(known) < 2:
             return None
-        errors = np.split(std, 2)
-        return Swings(
-            amplitude[known],
-            frequency[known],
-            errors[0][known],
-            quality[known],
-            errors[1][known],
-        )
+        of_frequency, of_quality = np.split(std, 2)
+        columns = (amplitude, frequency, of_frequency, quality, of_quality)
+        return Swings(*(x[known] for x in columns))
 
     def _swing(self, rest: float, amplitude: float) -> tuple[float, float]:
         """(frequency, Q) of a swing that turns ``amplitude`` beyond rest: quadratures over the
