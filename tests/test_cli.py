@@ -123,6 +123,8 @@ BAD_USAGE = [
     ("run two-bdy", "Did you mean two-body?"),
     ("run pendulums", "Did you mean pendulum?"),
     ("look pendulums", "Did you mean pendulum?"),
+    ("lok pendulum", "Did you mean look?"),
+    ("look pendulum --degres theta", "Did you mean --degrees?"),
     ("nowhere.csv", "nowhere.csv: no such file"),
     ("run two-body --dt 0", "--dt"),
     ("run two-body --dt nan", "--dt"),
