@@ -69,24 +69,38 @@ def rotated(z, angle):
 
 
 def henon_heiles_pairs(num, seed=0, radius=0.4, dt=0.5):
-    """Pairs of states that are uniform in a box, all orbits in one integration."""
+    """Pairs of states that are uniform in a box."""
 
-    def field(_, flat):
-        q1, q2, p1, p2 = flat.reshape(4, -1)
-        return np.stack([p1, p2, -q1 - 2 * q1 * q2, -q2 - q1**2 + q2**2]).ravel()
+    def field(_, z):
+        q1, q2, p1, p2 = z
+        return [p1, p2, -q1 - 2 * q1 * q2, -q2 - q1**2 + q2**2]
 
     z0 = np.random.default_rng(seed).uniform(-radius, radius, (num, 4))
-    # Many orbits share the tolerance of a step: each is closer than one alone would be.
-    solved = solve_ivp(field, (0, dt), z0.T.ravel(), "DOP853", rtol=2.3e-14, atol=1e-16)
-    return Pairs(z0, solved.y[:, -1].reshape(4, -1).T, dt)
+    return Pairs(z0, moved(field, z0, dt, rtol=2.3e-14, atol=1e-16), dt)
+
+
+def moved(field, z0, dt, rtol=1e-13, atol=1e-14):
+    """States z0 (N, 2d) a time dt later by ż = field(t, z), z (2d, N), of SciPy's in one
+    integration: many share the tolerance of a step, and each is closer than alone."""
+    shape = z0.T.shape
+
+    def flat(t, z):
+        return np.ravel(field(t, z.reshape(shape)))
+
+    found = solve_ivp(flat, (0, dt), z0.T.ravel(), "DOP853", rtol=rtol, atol=atol)
+    return found.y[:, -1].reshape(shape).T
 
 
 def motion(acceleration, start, t, **options):
-    """Positions (d, T) at times t of q̈ = acceleration(q, v) from ``start`` (2d,), by SciPy."""
-    d = len(start) // 2
+    """Positions (d, T) of `states_in_motion`."""
+    return states_in_motion(acceleration, start, t, **options)[: len(start) // 2]
+
+
+def states_in_motion(acceleration, start, t, **options):
+    """(2d, T) at times t of q̈ = acceleration(q, v) from ``start`` (2d,), by SciPy."""
+    d, options = len(start) // 2, {"rtol": 1e-10, "atol": 1e-12, **options}
 
     def rates(_, z):
         return np.concatenate([z[d:], acceleration(z[:d], z[d:])])
 
-    span = (t[0], t[-1])
-    return solve_ivp(rates, span, start, t_eval=t, rtol=1e-10, atol=1e-12, **options).y[:d]
+    return solve_ivp(rates, (t[0], t[-1]), start, t_eval=t, **options).y

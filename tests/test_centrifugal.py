@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import moved
 
 import gfnn_jax as gfnn
 
@@ -12,15 +12,14 @@ def spherical_pendulum_pairs(count, latitude=False):
     rng = np.random.default_rng(0)
     q1, q2 = rng.uniform(0.4, 2.7, count), rng.uniform(-np.pi, np.pi, count)
     p1, p2 = rng.uniform(-1, 1, (2, count))
-    z0 = np.stack([q1, q2, p1, p2 * np.sin(q1)])
+    z0 = np.stack([q1, q2, p1, p2 * np.sin(q1)], axis=1)
 
-    def slope(t, y):
-        q1, _, p1, p2 = y.reshape(4, count)
+    def slope(_, z):
+        q1, _, p1, p2 = z
         sin, cos = np.sin(q1), np.cos(q1)
-        return np.concatenate([p1, p2 / sin**2, p2**2 * cos / sin**3 - sin, 0 * p2])
+        return [p1, p2 / sin**2, p2**2 * cos / sin**3 - sin, 0 * p2]
 
-    found = solve_ivp(slope, (0, 0.1), z0.ravel(), "DOP853", rtol=1e-13, atol=1e-13)
-    states = np.stack([z0.T, found.y[:, -1].reshape(4, count).T])
+    states = np.stack([z0, moved(slope, z0, 0.1)])
     if latitude:
         states[..., 0] -= np.pi / 2
     return gfnn.Pairs(*states, 0.1)

@@ -5,7 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import moved
 from scipy.linalg import expm
 
 import gfnn_jax as gfnn
@@ -178,13 +178,7 @@ def test_two_factors_that_depend_on_a_parameter():
 
 def test_friction_that_differs_over_phase_space_is_said_to():
     z = np.random.default_rng(0).normal(size=(600, 2))
-
-    def field(_, y):
-        q, v = np.split(y, 2)
-        return np.concatenate([v, -q - 0.3 * q**2 * v])
-
-    end = solve_ivp(field, (0, 0.3), z.T.ravel(), rtol=1e-10, atol=1e-10).y[:, -1]
-    pairs = Pairs(z, end.reshape(2, -1).T, 0.3)
+    pairs = Pairs(z, moved(lambda _, z: [z[1], -z[0] - 0.3 * z[0] ** 2 * z[1]], z, 0.3), 0.3)
     with pytest.warns(gfnn.FitWarning) as told:
         learned = gfnn.fit(pairs, family="polynomial")
     assert learned.damping is None
@@ -201,14 +195,10 @@ def test_a_damped_driven_pendulum_by_its_period():
         radius, angle = 0.8 * np.sqrt(rng.uniform(size=number)), rng.uniform(0, 2 * np.pi, number)
         z = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
-        def field(t, y):
-            q, p = np.split(y, 2)
-            return np.concatenate([p, -np.sin(q) - rate * p + 0.15 * np.cos(t)])
+        def field(t, z):
+            return [z[1], -np.sin(z[0]) - rate * z[1] + 0.15 * np.cos(t)]
 
-        end = solve_ivp(field, (0, period), z.T.ravel(), method="DOP853", rtol=1e-13, atol=1e-14).y[
-            :, -1
-        ]
-        return Pairs(z, end.reshape(2, -1).T, period)
+        return Pairs(z, moved(field, z, period), period)
 
     learned, test = gfnn.fit(pairs_of(3_000), tolerance=1e-10), pairs_of(300)
     assert abs(learned.damping.factor / np.exp(-rate * period) - 1) < 1e-10

@@ -4,25 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import motion
 
 import gfnn_jax as gfnn
 
 
 def record(rate, start, end, dt, noise, seed=0):
     """Positions of q'' = rate(q, v) from rest, with noise, a share of the spread of the first."""
-    d = len(start)
-    t = np.arange(0, end, dt)
-    found = solve_ivp(
-        lambda _, z: [*z[d:], *rate(z[:d], z[d:])],
-        (0, end),
-        [*start, *np.zeros(d)],
-        t_eval=t,
-        rtol=1e-10,
-        atol=1e-12,
-        max_step=dt,
-    )
-    q = found.y[:d]
+    d, t = len(start), np.arange(0, end, dt)
+    q = motion(rate, [*start, *np.zeros(d)], t, max_step=dt)
     q = q + noise * q[0].std() * np.random.default_rng(seed).normal(size=q.shape)
     names = [f"x{i + 1}" for i in range(d)]
     return gfnn.Recording({"t": t, **dict(zip(names, q, strict=True))}, positions=names)

@@ -10,7 +10,6 @@ from other_python import run_python
 
 import gfnn_jax as gfnn
 from gfnn_jax.budget import Allowance, Counted
-from gfnn_jax.cli import main
 from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
@@ -273,12 +272,3 @@ def test_other_threads_work_while_rows_are_folded():
 def test_devices_that_there_are_not(devices):
     with pytest.raises(gfnn.FitError, match="expected"):
         gfnn.fit(kicked(60), devices=devices)
-
-
-def test_more_devices_than_there_are_is_bad_usage(tmp_path, capsys):
-    pairs = kicked(60)
-    np.savez(tmp_path / "p.npz", z0=pairs.z0, z1=pairs.z1, dt=DT)
-    out = tmp_path / "m"
-    assert main(["fit", str(tmp_path / "p.npz"), "--out", str(out), "--devices", "10000"]) == 2
-    assert "--devices: expected 1 to 1 devices" in capsys.readouterr().err
-    assert not out.exists()

@@ -5,7 +5,7 @@ import io
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import states_in_motion
 from scipy.linalg import expm
 
 from gfnn_jax.cli import main
@@ -144,15 +144,8 @@ def swings(tmp_path_factory):
     """Files of a damped swing in degrees and in radians, and models of the first part of each."""
     rng, folder = np.random.default_rng(1), tmp_path_factory.mktemp("swings")
     t = DT * np.arange(SEEN)
-    swing = solve_ivp(
-        lambda _, x: [x[1], -9 * np.sin(x[0]) - 0.1 * x[1]],
-        (0, t[-1]),
-        [0.8, 0],
-        t_eval=t,
-        rtol=1e-9,
-        atol=1e-9,
-    )
-    theta = swing.y[0] + 1e-4 * rng.normal(size=SEEN)
+    swing, _ = states_in_motion(lambda q, v: -9 * np.sin(q) - 0.1 * v, [0.8, 0], t)
+    theta = swing + 1e-4 * rng.normal(size=SEEN)
     for unit, factor in (("deg", 180 / np.pi), ("rad", 1.0), ("mrad", 1e3)):
         np.savetxt(
             folder / f"{unit}.csv",

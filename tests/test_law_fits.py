@@ -7,6 +7,7 @@ import re
 import jax
 import numpy as np
 import pytest
+from analytic import motion
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.stats import norm
@@ -58,15 +59,8 @@ def recorded(t, theta):
 def pendulum(gamma=0.05, noise=1e-3, end=40.0, dt=0.05, amplitude=1.2):
     """θ̈ = −2 sin θ − γ θ̇, by SciPy."""
     t = np.arange(0, end, dt)
-    found = solve_ivp(
-        lambda _, x: [x[1], -2 * np.sin(x[0]) - gamma * x[1]],
-        (0, end),
-        [amplitude, 0.0],
-        t_eval=t,
-        rtol=1e-10,
-        atol=1e-12,
-    )
-    return t, found.y[0] + noise * np.random.default_rng(0).normal(size=len(t))
+    (theta,) = motion(lambda q, v: -2 * np.sin(q) - gamma * v, [amplitude, 0.0], t)
+    return t, theta + noise * np.random.default_rng(0).normal(size=len(t))
 
 
 def chain(noise=1e-3, runs=3, end=12.0, dt=0.02, uniform=0.0):

@@ -7,9 +7,8 @@ import jax
 import numpy as np
 import pytest
 import sympy
-from analytic import henon_heiles_pairs
+from analytic import henon_heiles_pairs, moved
 from command_line import gfnn as command
-from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
@@ -160,20 +159,13 @@ def test_refusals(options, words):
 def pendulum_pairs(num, reach, sigma):
     """States of |q1| and |p1| up to ``reach`` and 0.2 later, by another solver; noise on both."""
     rng = np.random.default_rng(0)
-    q, p = z0 = rng.uniform(-1, 1, (2, num)) * np.array(reach)[:, None]
-    found = (
-        solve_ivp(
-            lambda t, z: np.concatenate([z[num:], -np.sin(z[:num])]),
-            (0, 0.2),
-            np.concatenate([q, p]),
-            method="DOP853",
-            rtol=1e-12,
-            atol=1e-12,
-        )
-        .y[:, -1]
-        .reshape(2, num)
-    )
-    return gfnn.Pairs(*(z.T + sigma * rng.normal(size=(num, 2)) for z in (z0, found)), 0.2)
+    z0 = (rng.uniform(-1, 1, (2, num)) * np.array(reach)[:, None]).T
+    found = moved(pendulums, z0, 0.2)
+    return gfnn.Pairs(*(z + sigma * rng.normal(size=(num, 2)) for z in (z0, found)), 0.2)
+
+
+def pendulums(_, z):
+    return [z[1], -np.sin(z[0])]
 
 
 @pytest.mark.slow
@@ -182,12 +174,11 @@ def test_a_law_that_misses_the_tolerance_is_the_best_there_is():
     bring nothing."""
     z0 = np.random.default_rng(0).uniform(-1.3, 1.3, (300, 2))
 
-    def slope(t, y):
-        q, p = y.reshape(2, -1)
-        return np.concatenate([p, -(np.sin(q) + 0.2 * q * np.cos(q)) * np.exp(-0.1 * q * q)])
+    def slope(_, z):
+        q, p = z
+        return [p, -(np.sin(q) + 0.2 * q * np.cos(q)) * np.exp(-0.1 * q * q)]
 
-    found = solve_ivp(slope, (0, 0.2), z0.T.ravel(), "DOP853", rtol=1e-13, atol=1e-13)
-    pairs = gfnn.Pairs(z0, found.y[:, -1].reshape(2, -1).T, 0.2)
+    pairs = gfnn.Pairs(z0, moved(slope, z0, 0.2), 0.2)
     with pytest.warns(gfnn.FitWarning, match="no candidate meets"):
         fit = gfnn.fit(pairs, learn="hamiltonian", tolerance=1e-10)
     assert fit.hamiltonian is not None
@@ -347,19 +338,8 @@ def test_a_known_law_leaves_little_to_learn(tmp_path):
     def kicked(num, seed):
         rng = np.random.default_rng(seed)
         z0 = np.column_stack([rng.uniform(-np.pi, np.pi, num), rng.uniform(-1.5, 1.5, num)])
-        half = (
-            solve_ivp(
-                lambda _, y: np.concatenate([y[num:], -np.sin(y[:num])]),
-                (0, 1.0),
-                z0.T.ravel(),
-                method="DOP853",
-                rtol=1e-13,
-                atol=1e-13,
-            )
-            .y[:, -1]
-            .reshape(2, num)
-        )
-        z1 = np.column_stack([half[0], half[1] + 0.5 * np.sin(3 * half[0])])
+        z1 = moved(pendulums, z0, 1.0)
+        z1[:, 1] += 0.5 * np.sin(3 * z1[:, 0])
         return gfnn.Pairs(z0, z1, 1.0)
 
     fit = gfnn.fit(kicked(300, 0), angles=(0,), base="0.5*p**2 - cos(q)", tolerance=1e-11)

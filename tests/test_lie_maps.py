@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import moved
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
@@ -30,12 +30,7 @@ def made(piece, z):
 
 
 def flow_of(bracket, gradient, z, dt):
-    def field(_, y):
-        y = y.reshape(z.shape)
-        return bracket.apply(y, gradient(y)).ravel()
-
-    solved = solve_ivp(field, (0, dt), z.ravel(), method="DOP853", rtol=1e-13, atol=1e-15)
-    return solved.y[:, -1].reshape(z.shape)
+    return moved(lambda _, y: bracket.apply(y.T, gradient(y.T)).T, z, dt, atol=1e-15)
 
 
 def test_mean_of_arc():

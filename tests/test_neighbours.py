@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import moved
 
 import gfnn_jax as gfnn
 from gfnn_jax.diagnosis.residuals import hidden_friction, is_noise
@@ -66,15 +66,10 @@ def test_friction_is_told_apart_from_what_a_map_misses():
 def test_a_loose_tolerance_hides_no_friction(friction):
     """A pendulum by another solver; a map of degree 2 keeps areas and meets the tolerance."""
     z = RNG.uniform(-1, 1, (300, 2))
-
-    def slope(t, y):
-        q, p = y.reshape(2, -1)
-        return np.concatenate([p, -np.sin(q) - friction * p])
-
-    image = solve_ivp(slope, (0, 0.2), z.T.ravel(), rtol=1e-10, atol=1e-12).y[:, -1]
+    image = moved(lambda _, z: [z[1], -np.sin(z[0]) - friction * z[1]], z, 0.2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
-        fit = gfnn.fit(gfnn.Pairs(z, image.reshape(2, -1).T, 0.2), tolerance=2e-2, learn="map")
+        fit = gfnn.fit(gfnn.Pairs(z, image, 0.2), tolerance=2e-2, learn="map")
     assert fit.met
     told = [m for m in fit.messages if "as by friction" in m]
     assert bool(told or fit.damping is not None) == (friction > 0)

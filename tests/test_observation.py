@@ -6,7 +6,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import states_in_motion
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
@@ -20,10 +20,7 @@ GUESS = {"x0": 300.0, "y0": 250.0, "R": 180.0, "tilt": 0.0}
 def motion(force, start, end=20.0, dt=0.04):
     """q̈ = force(q, v), by SciPy: t, q, v, and a generator of noise."""
     t, rng = np.arange(0, end, dt), np.random.default_rng(3)
-    found = solve_ivp(
-        lambda _, z: [z[1], force(*z)], (0, end), start, t_eval=t, rtol=1e-10, atol=1e-12
-    )
-    return t, *found.y, lambda size: size * rng.normal(size=len(t))
+    return t, *states_in_motion(force, start, t), lambda size: size * rng.normal(size=len(t))
 
 
 def swing(**options):

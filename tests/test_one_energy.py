@@ -2,22 +2,14 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import motion
 
 import gfnn_jax as gfnn
 
 
 def disc(amplitude, t):
     """L = ½(1 + q²) v² − ½ q²."""
-    done = solve_ivp(
-        lambda _, z: [z[1], -z[0] * (1 + z[1] ** 2) / (1 + z[0] ** 2)],
-        (0, t[-1]),
-        [amplitude, 0.0],
-        t_eval=t,
-        rtol=1e-10,
-        atol=1e-12,
-    )
-    return done.y[0]
+    return motion(lambda q, v: -q * (1 + v**2) / (1 + q**2), [amplitude, 0.0], t)[0]
 
 
 @pytest.mark.parametrize(("amplitudes", "kind"), [((0.9,), "one"), ((0.9, 0.4), "identified")])

@@ -6,7 +6,7 @@ import pytest
 
 from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.storage import outputs
-from gfnn_jax.storage.outputs import kept, unfinished
+from gfnn_jax.storage.outputs import unfinished
 
 
 def test_ensure_new(tmp_path):
@@ -118,51 +118,6 @@ def job(tmp_path, *, overwrite=False, resume=False, **what):
     return unfinished(
         tmp_path / "out", {"seed": 0} | what, what="job", overwrite=overwrite, resume=resume
     )
-
-
-def stop(tmp_path, name="part.npz", **options):
-    """A job that is interrupted after it has kept a file; returns the notes."""
-    try:
-        with job(tmp_path, **options) as folder:
-            (folder / name).write_text("kept")
-            raise KeyboardInterrupt
-    except KeyboardInterrupt as stopped:
-        return stopped.__notes__
-
-
-def test_a_finished_job_leaves_no_partial_folder(tmp_path):
-    with job(tmp_path) as folder:
-        assert folder == tmp_path / "out.partial"
-        (folder / "part.npz").write_text("kept")
-        assert kept(folder) == ["part"]
-    assert not list(tmp_path.iterdir())
-
-
-def test_an_interrupted_job_says_what_it_keeps(tmp_path):
-    assert stop(tmp_path) == [f"{tmp_path}/out.partial keeps part: --resume goes on with it"]
-    with pytest.raises(InputError, match="an unfinished job"), job(tmp_path):
-        pass
-    with pytest.raises(InputError, match="seed, more"):
-        stop(tmp_path, resume=True, seed=1, more=2)
-    with job(tmp_path, resume=True) as folder:
-        assert kept(folder) == ["part"]
-        (folder / "more.npz").write_text("kept")
-    assert not list(tmp_path.iterdir())
-
-
-def test_overwriting_discards_what_was_kept(tmp_path):
-    stop(tmp_path)
-    with job(tmp_path, overwrite=True, seed=1) as folder:
-        assert kept(folder) == []
-
-
-def test_a_job_that_kept_nothing_leaves_nothing(tmp_path):
-    with pytest.raises(KeyboardInterrupt) as stopped, job(tmp_path):
-        raise KeyboardInterrupt
-    assert stopped.value.__notes__ == ["nothing of the job was kept"]
-    with pytest.raises(ValueError, match="wrong"), job(tmp_path):
-        raise ValueError("wrong")
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_of_others_is_never_removed(tmp_path):

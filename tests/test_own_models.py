@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import own_module
 import pytest
+from analytic import motion, moved
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
@@ -118,14 +119,7 @@ def test_a_noise_model(tmp_path):
 def test_a_sensor(tmp_path):
     """An angle seen through a camera of unknown scale and tilt: ÿ = −4 sin y − 0.05 ẏ."""
     t = 0.04 * np.arange(300)
-    swing = solve_ivp(
-        lambda _, z: [z[1], -4 * np.sin(z[0]) - 0.05 * z[1]],
-        (0, t[-1]),
-        [1.5, 0.0],
-        t_eval=t,
-        rtol=1e-10,
-        atol=1e-10,
-    ).y[0]
+    (swing,) = motion(lambda q, v: -4 * np.sin(q) - 0.05 * v, [1.5, 0.0], t)
     seen = 2.0 * np.tan((swing - 0.1) / 2) + 1e-3 * np.random.default_rng(0).normal(size=300)
     recording = gfnn.Recording(
         {"t": t, "x": seen}, coordinates="theta", observe={"x": own_module.Tilted()}
@@ -142,13 +136,7 @@ def test_a_sensor(tmp_path):
 def test_a_term(tmp_path):
     """A particle that a soft wall, one of the terms, sends back: H = p²/2 + q²/2 + 4 wall(q)."""
     z0 = np.random.default_rng(0).uniform(-2, 2, (300, 2))
-
-    def field(_, z):
-        q, p = z.reshape(-1, 2).T
-        return np.stack([p, -q - 8 * np.maximum(q - 1, 0)], axis=1).ravel()
-
-    options = {"rtol": 1e-12, "atol": 1e-12}
-    z1 = solve_ivp(field, (0, 0.1), z0.ravel(), **options).y[:, -1].reshape(-1, 2)
+    z1 = moved(lambda _, z: [z[1], -z[0] - 8 * np.maximum(z[0] - 1, 0)], z0, 0.1)
     smooth = (np.maximum(z0[:, 0], z1[:, 0]) < 0.9) | (np.minimum(z0[:, 0], z1[:, 0]) > 1.1)
     pairs = gfnn.Pairs(z0[smooth], z1[smooth], 0.1)
     fit = gfnn.fit(pairs, learn="hamiltonian", terms=["p**2", "q**2", "wall(q)"], tolerance=1e-7)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import states_in_motion
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
@@ -15,15 +15,7 @@ NOISE = 1e-3
 
 def swing(times, start=(1.2, 0.0), friction=0.05):
     """States (n, 2) of θ̈ = −9 sin θ − friction θ̇ at these times, by SciPy."""
-    found = solve_ivp(
-        lambda _, z: [z[1], -9 * np.sin(z[0]) - friction * z[1]],
-        (0, times[-1]),
-        start,
-        t_eval=times,
-        rtol=1e-10,
-        atol=1e-12,
-    )
-    return found.y.T
+    return states_in_motion(lambda q, v: -9 * np.sin(q) - friction * v, start, times).T
 
 
 def law_is_right(fit):

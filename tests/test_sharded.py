@@ -6,10 +6,10 @@ import time
 import numpy as np
 import pytest
 from analytic import map_of
+from command_line import gfnn
 from other_python import ended, run_python, started
 
 from gfnn_jax import processes
-from gfnn_jax.cli import main
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data import predictions
 from gfnn_jax.data.predictions import PredictionJob, PredictionWriter
@@ -142,23 +142,8 @@ def predicting(folder, out, *more, num_steps=STEPS, count=2, **flags):
 
 @pytest.fixture(scope="module")
 def alone(folder):
-    assert (
-        main(
-            [
-                "predict",
-                str(folder / "m"),
-                "--initial",
-                str(folder / "z0.npy"),
-                "--num-steps",
-                str(STEPS),
-                "--out",
-                str(folder / "alone.npz"),
-                "--devices",
-                "all",
-            ]
-        )
-        == 0
-    )
+    of = ("predict", folder / "m", "--initial", folder / "z0.npy", "--num-steps", STEPS)
+    assert gfnn(*of, "--out", folder / "alone.npz", "--devices", "all") == 0
     return (folder / "alone.npz").read_bytes()
 
 
@@ -260,23 +245,6 @@ def test_nobody_says_where_the_others_are(told, line, monkeypatch):
         monkeypatch.setenv(name, value)
     with pytest.raises(InputError, match=line):
         processes.join()
-
-
-def test_more_devices_than_cores(folder, capsys):
-    command = [
-        "predict",
-        folder / "m",
-        "--initial",
-        folder / "z0.npy",
-        "--num-steps",
-        5,
-        "--out",
-        folder / "s.npz",
-        "--devices",
-        10_000,
-    ]
-    assert main([str(part) for part in command]) == 2
-    assert "--devices: expected 1 to 1 devices" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

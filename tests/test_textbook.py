@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import moved
 
 import gfnn_jax as gfnn
 from gfnn_jax.evaluate.report import assemble
@@ -37,13 +37,7 @@ from posteriors.calibration import pendulum
 
 def pairs_of(gradient, z0, dt=0.1):
     """Pairs of ż = J∇H by another solver."""
-    shape = z0.shape
-
-    def field(t, y):
-        return apply_j(gradient(y.reshape(shape))).ravel()
-
-    found = solve_ivp(field, (0, dt), z0.ravel(), "DOP853", rtol=1e-13, atol=1e-13)
-    return gfnn.Pairs(z0, found.y[:, -1].reshape(shape), dt)
+    return gfnn.Pairs(z0, moved(lambda _, z: apply_j(gradient(z.T)).T, z0, dt), dt)
 
 
 def ring(count, dim=2):

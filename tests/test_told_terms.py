@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import moved
 from scipy.optimize import least_squares
 
 import gfnn_jax as gfnn
@@ -29,11 +29,11 @@ def pairs(noise):
     z0 = rng.uniform(-1, 1, (80, 2))
 
     def field(_, z):
-        q, p = z.reshape(2, -1)
-        return np.concatenate([p + 0.05 * q, -q - 0.05 * p - 0.4 * q**3])
+        q, p = z
+        return [p + 0.05 * q, -q - 0.05 * p - 0.4 * q**3]
 
-    z1 = solve_ivp(field, (0, 0.2), z0.T.ravel(), rtol=1e-12, atol=1e-13).y[:, -1]
-    return gfnn.Pairs(z0, z1.reshape(2, -1).T + noise * rng.normal(size=z0.shape), 0.2)
+    z1 = moved(field, z0, 0.2)
+    return gfnn.Pairs(z0, z1 + noise * rng.normal(size=z0.shape), 0.2)
 
 
 def problem_of(told, noise=1e-3):

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from analytic import states_in_motion
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
@@ -12,15 +12,8 @@ from gfnn_jax.cli import main
 
 def swing(end=16.0, dt=0.04):
     t, rng = np.arange(0, end, dt), np.random.default_rng(3)
-    found = solve_ivp(
-        lambda _, z: [z[1], -4 * np.sin(z[0]) - 0.05 * z[1]],
-        (0, end),
-        [1.4, 0.0],
-        t_eval=t,
-        rtol=1e-10,
-        atol=1e-12,
-    )
-    return t, *found.y, lambda size: size * rng.normal(size=len(t))
+    found = states_in_motion(lambda q, v: -4 * np.sin(q) - 0.05 * v, [1.4, 0.0], t)
+    return t, *found, lambda size: size * rng.normal(size=len(t))
 
 
 @pytest.fixture(scope="module")

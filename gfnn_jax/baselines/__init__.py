@@ -8,8 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from gfnn_jax.baselines.fields import hnn, vfnn
-from gfnn_jax.baselines.learned import Budget, Learned, Sequences
+from gfnn_jax.baselines.learned import Budget, Learned, Sequences, hnn, vfnn
 from gfnn_jax.baselines.srnn import o_net, srnn
 from gfnn_jax.baselines.sympnets import g_sympnet, la_sympnet, p_sympnet
 

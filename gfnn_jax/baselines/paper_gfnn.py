@@ -13,8 +13,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.baselines.fields import q_angles
-from gfnn_jax.baselines.learned import Budget, Sequences, held, in_float64
+from gfnn_jax.baselines.learned import Budget, Sequences, held, in_float64, q_angles
 from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import PAPER_HIDDEN, PAPER_HIDDEN_STANDARD_MAP, Mlp, amplitude_of

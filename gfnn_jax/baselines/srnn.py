@@ -23,8 +23,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gfnn_jax.baselines.fields import network_field, q_angles
-from gfnn_jax.baselines.learned import Budget, Learned, Sequences, learn_map
+from gfnn_jax.baselines.learned import (
+    Budget,
+    Learned,
+    Sequences,
+    learn_map,
+    network_field,
+    q_angles,
+)
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp, amplitude_of
 from gfnn_jax.fitting.adam import Recipe

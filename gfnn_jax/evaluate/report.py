@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +23,7 @@ REPORT, PAGE = "report.json", "report.html"
 STEPS_REPORTED = (1, 10, 100, 1000)
 _LABELS = ("learns", "family", "label", "chart", "num_parameters")
 _ERRORS = ("validation_rms", "validation_relative", "validation_bound", "outside")
+_OF_LAW = ("terms", "friction", "constants", "symmetries", "rivals", "notes", "dropped")
 _COSTS = ("operations", "microseconds_per_step", "fit_seconds", "rank", "condition", "chosen")
 
 
@@ -70,8 +72,8 @@ def assemble(
         "data": {
             "num_pairs": fit.num_pairs,
             "symplecticity_defect": fit.data_defect,
-            "noise": None if fit.noise is None else fit.noise.tolist(),
-            "symmetries": [symmetry._asdict() for symmetry in fit.symmetries],
+            "noise": fit.noise,
+            "symmetries": fit.symmetries,
             **(data or {}),
         },
         "model": {
@@ -82,11 +84,7 @@ def assemble(
             "seconds": chosen.fit_seconds,
             "compile_seconds": fit.compile_seconds,
             "total_seconds": fit.seconds,
-            "train_rms": chosen.train_rms,
-            "validation_rms": chosen.validation_rms,
-            "validation_relative": chosen.validation_relative,
-            "validation_bound": chosen.validation_bound,
-            "deviations": np.asarray(chosen.deviations).tolist(),
+            **{name: getattr(chosen, name) for name in ("train_rms", *_ERRORS[:3], "deviations")},
             "stated_by": fit.stated_by,
             "tolerance": fit.tolerance,
             "tolerance_is_relative": fit.asked.relative,
@@ -94,15 +92,15 @@ def assemble(
             "ended": fit.ended,
             "operations": fit.operations,
             "max_operations": fit.max_operations,
-            "messages": list(fit.messages),
+            "messages": fit.messages,
         },
         "hamiltonian": _hamiltonian(fit),
         "bracket": _bracket(fit),
-        "partial_laws": [law._asdict() for law in fit.partial_laws],
+        "partial_laws": fit.partial_laws,
         "map": {
             "multiplier": fit.map.multiplier(),
             "damping": _damping(fit),
-            "positions": None if fit.positions is None else vars(fit.positions),
+            "positions": fit.positions,
             "symplecticity_defect": fit.symplecticity_defect if fit.defect_known else None,
             "chart_determinant_min": fit.model_determinant_min,
             "chart_determinants_of_data": {n: j.low for n, j in fit.determinants.items()},
@@ -123,10 +121,9 @@ def _damping(fit: Fit) -> dict[str, Any] | None:
     damping = fit.damping
     if damping is None:
         return None
-    names = ("factor", "std", "shift")
-    found: dict[str, Any] = {name: getattr(damping, name).tolist() for name in names}
+    found: dict[str, Any] = {name: getattr(damping, name) for name in ("factor", "std", "shift")}
     if damping.functions is not None:
-        low, high = (values.tolist() for values in damping.extremes)
+        low, high = damping.extremes
         found |= {
             "parameters": damping.names,
             "degrees": damping.functions.degrees,
@@ -144,15 +141,9 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     which = law.which_friction
     return {
         "formula": fit.formula,
-        "terms": [term._asdict() for term in law.terms],
-        "friction": [term._asdict() for term in law.friction],
         "which_friction": which and {**_kinds(which), "text": str(which)},
-        "constants": [term._asdict() for term in law.constants],
-        "symmetries": list(law.symmetries),
-        "rivals": [rival._asdict() for rival in law.rivals],
-        "notes": list(law.notes),
-        "dropped": law.dropped._asdict() if law.dropped is not None else None,
         "search_cut_short": law.ended or None,
+        **{name: getattr(law, name) for name in _OF_LAW},
     }
 
 
@@ -194,10 +185,10 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
             "tolerance": None,
             "tolerance_met": None,
             "ended": fit.ended,
-            "messages": list(fit.messages),
-            "steps": list(fit.steps),
-            "alike": list(fit.alike),
-            "next_motions": [motion._asdict() for motion in fit.next_motions],
+            "messages": fit.messages,
+            "steps": fit.steps,
+            "alike": fit.alike,
+            "next_motions": fit.next_motions,
         },
         "hamiltonian": None if fit.hamiltonian is None else _law(fit.hamiltonian),
         "lagrangian": {**_law(fit.lagrangian), "text": str(fit.lagrangian)},
@@ -206,7 +197,7 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
             "text": str(fit.friction),
             **_kinds(fit.which_friction),
         },
-        "rivals": [rival._asdict() for rival in fit.rivals],
+        "rivals": fit.rivals,
         "inputs": {
             "hold": sensors.hold,
             "other_rules": fit.input_rules,
@@ -224,22 +215,12 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
         "noise": {n: {"sigma": s, "residual": fit.residual[n]} for n, s in fit.noise.items()},
         "units": fit.units,
         "friction_level": sensors.level,
-        "wander": None if sensors.wander is None else dataclasses.asdict(sensors.wander),
-        "velocities": {name: one._asdict() for name, one in fit.velocities.items()},
-        "whiteness": {
-            name: {
-                "white": of.white,
-                "lags": of.lags.tolist(),
-                "autocorrelation": of.autocorrelation.tolist(),
-                "bound": of.bound,
-                "inputs": {u: one._asdict() for u, one in of.inputs.items()},
-                "fit_percent": of.fit_percent,
-            }
-            for name, of in fit.whiteness.items()
-        },
+        "wander": sensors.wander,
+        "velocities": fit.velocities,
+        "whiteness": fit.whiteness,
         "gauge": fit.gauge,
         "energy": fit.energy,
-        "horizon": [h._asdict() for h in fit.horizon],
+        "horizon": fit.horizon,
         "map": {
             "multiplier": map_.multiplier(),
             "symplecticity_defect": None,
@@ -252,19 +233,12 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
 
 
 def _law(expression: Any) -> dict[str, Any]:
-    return {
-        "formula": expression.formula,
-        "terms": [term._asdict() for term in expression.terms],
-    }
+    return {"formula": expression.formula, "terms": expression.terms}
 
 
 def _kinds(friction: Any) -> dict[str, Any]:
     """The kinds of friction that were found, the odds of each, the limits of the others."""
-    return {
-        "kinds": list(friction.kinds),
-        "odds": dict(friction.odds),
-        "limits": dict(friction.limits),
-    }
+    return {name: getattr(friction, name) for name in ("kinds", "odds", "limits")}
 
 
 def rollout_part(*, seconds: float, status, statistics, growth, drift) -> dict[str, Any]:
@@ -305,13 +279,18 @@ def to_json(report: dict[str, Any]) -> str:
 
 
 def finite(value: Any) -> Any:
-    """Copy a tree of dicts and lists, with None for numbers that are not finite."""
-    if isinstance(value, dict):
+    """Copy a tree as dicts, of named tuples and dataclasses too, and lists, also of arrays, with
+    None for numbers that are not finite."""
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    elif dataclasses.is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [finite(item) for item in value]
-    if isinstance(value, (np.generic, np.ndarray, jax.Array)) and np.ndim(value) == 0:
-        value = np.asarray(value).item()
+    if isinstance(value, (np.generic, np.ndarray, jax.Array)):
+        return finite(np.asarray(value).tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -96,12 +96,8 @@ class Symbol:
         return self.tape.made("clip", self, low, high)
 
 
-def _method(function: str) -> Callable:
-    return lambda self: self.tape.made(function, self)
-
-
 for _name, _function in _FUNCTIONS.items():
-    setattr(Symbol, _name, _method(_function))
+    setattr(Symbol, _name, lambda self, function=_function: self.tape.made(function, self))
 
 
 def _sum(a, b):

@@ -351,7 +351,7 @@ def compare(
     ) as kept_in:
         data = SharedData(scene, seed, quick)
         for method in chosen:
-            if _is_finished(kept_in, method):
+            if (kept_in / f"{method}.json").exists():
                 continue
             progress.status(f"{TITLES[method]}: data")
             try:
@@ -449,10 +449,6 @@ def _already_done(out: Path, job: dict[str, Any], chosen: Sequence[str]) -> bool
     except (OSError, ValueError):
         return False
     return found.get("job") == job and set(found.get("methods", ())) == set(chosen)
-
-
-def _is_finished(folder: Path, method: str) -> bool:
-    return (folder / f"{method}.json").exists()
 
 
 def _keep(folder: Path, method: str, part: dict[str, Any], rollouts: Rollouts) -> None:

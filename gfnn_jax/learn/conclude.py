@@ -308,7 +308,10 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     known_noise = data.noise_of_channels
     if known_noise is not None:
         return _beside_known(noise, known_noise)
-    own, sizes_of_noise = "", _by_name(noise)
+    own, sizes_of_noise = (
+        "",
+        ", ".join(f"{s:.1e} ({n})" for n, s in zip(_names(len(noise)), noise, strict=True)),
+    )
     if candidate.learns == "map" and entry is not None and entry.sweep.linear:
         part = entry.sweep.error_by_noise(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))
         if part > OPTIONS.own_error:
@@ -335,11 +338,6 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         return _LeftOver(noise, [message], _WHITE)
     message = f"the residuals are noise of about {sizes_of_noise}{own}{hidden}"
     return _LeftOver(noise, [message], reason)
-
-
-def _by_name(noise: np.ndarray) -> str:
-    """Noise (2d,) of each coordinate, in the data's units."""
-    return ", ".join(f"{s:.1e} ({n})" for n, s in zip(_names(len(noise)), noise, strict=True))
 
 
 def _names(width: int) -> list[str]:

@@ -96,7 +96,7 @@ def functions_of_parameters(
     """Rows of sets of functions of the parameters, whose values args are (N, k); in each row every
     set spans those before it. own: whether none at all is the first. period: of a drive, whose
     time is the last of them."""
-    none = [_constant(dim, parameters)] if own else []
+    none = [Terms(dim, (), ((),), parameters)] if own else []
     if period is None:
         powers = _powers(dim, parameters, args)
         series = [_chebyshev(dim, parameters, args, degree) for degree in OPTIONS.degrees]
@@ -128,10 +128,6 @@ def _harmonics(dim: int, parameters: tuple[str, ...], most: int, period: float) 
     variables = tuple(f"{f}({turn})" for turn in turns for f in ("cos", "sin"))
     rows = np.concatenate([np.zeros((1, len(variables)), int), np.eye(len(variables), dtype=int)])
     return Terms(dim, variables, tuple(map(tuple, rows.tolist())), parameters)
-
-
-def _constant(dim: int, parameters: tuple[str, ...]) -> Terms:
-    return Terms(dim, (), ((),), parameters)
 
 
 def _powers(dim: int, parameters: tuple[str, ...], args) -> Terms:
