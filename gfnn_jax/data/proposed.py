@@ -9,7 +9,7 @@ from typing import Any
 
 from gfnn_jax.data.columns import Undecided
 from gfnn_jax.data.faults import Fault
-from gfnn_jax.data.recording import ReadOptions, Recording, as_recording
+from gfnn_jax.data.recording import ReadOptions, Recording, read
 from gfnn_jax.data.recording_summary import RecordingSummary, summarise
 
 _ROWS = ("start", "stop", "every")
@@ -49,7 +49,7 @@ def as_proposed(source: Any, given: Mapping[str, Any]) -> Proposed:
     why = (
         tuple(f.message for f in summary.faults if set(f.options) & {*new, "states"}) if new else ()
     )
-    recording = as_recording(source, **reading) if new else found
+    recording = read(source, **reading) if new else found
     return Proposed(recording, reading, asked, summary, new, why)
 
 
@@ -61,15 +61,13 @@ def summarised(source: Any, options: Mapping[str, Any]) -> tuple[Recording, Reco
     """
     reading = {name: value for name, value in options.items() if name != "mass"}
     try:
-        recording = as_recording(source, **reading)
+        recording = read(source, **reading)
         return recording, summarise(recording, options)
     except Undecided as error:
         told, message = error.options, str(error)
     of_fit = {name: told[name] for name in ("structure", "states") if name in told}
     roles = {name: value for name, value in told.items() if name not in of_fit}
-    recording = as_recording(
-        source, **{**reading, **(roles or {"positions": told.get("states", ())})}
-    )
+    recording = read(source, **{**reading, **(roles or {"positions": told.get("states", ())})})
     message = message.removeprefix(f"{recording.source}: ")
     fault = Fault("roles", message, "", of_fit, wrong=False, proposed=True)
     return recording, summarise(recording, {**options, **roles}, [fault])

@@ -424,24 +424,31 @@ class Recording:
 
 
 def read(
-    paths: str | Path | Sequence[str | Path],
+    paths: Any,
     *,
     start: float = -np.inf,
     stop: float = np.inf,
     every: int = 1,
     **options: Unpack[ReadOptions],
 ) -> Recording:
-    """The recording that a file holds, or several files, one run each or more.
+    """The recording that a file holds, or several files, one run each or more, or a table.
 
     paths:    ``.csv`` and other text, of any encoding (separated by commas, semicolons, tabs or
               blanks; decimal points or commas; lines of comments, preambles, a line of units below
               the names; ``.gz`` and ``.zip`` too), ``.npz`` and ``.mat`` of named arrays, ``.npy``;
-              with python-calamine ``.xlsx``, ``.xls`` and ``.ods``.
+              with python-calamine ``.xlsx``, ``.xls`` and ``.ods``. A table, as of `Recording`.
     start, stop, every: rows to keep: between these times (in the file's unit), every so many.
     options:  `ReadOptions`.
     Raises InputError, one line with the file and the line, where a file cannot be used.
     """
-    several = [paths] if isinstance(paths, (str, Path)) else list(paths)
+    alone = isinstance(paths, (str, Path, Mapping)) or hasattr(paths, "columns")
+    several: list[Any] = [paths] if alone else list(paths)
+    if not all(isinstance(one, (str, Path)) for one in several):
+        if every != 1:
+            raise InputError("every: only of files")
+        found = Recording(paths, **options)
+        begin, end = start * found.second, stop * found.second
+        return found if start == -stop == -np.inf else found.slice(begin, end)
     chosen, time = listed(options.get("columns")), options.get("time")
     tables = []
     for path in map(Path, several):
@@ -454,18 +461,6 @@ def read(
             rows = {"start": start, "stop": stop, "every": every}
             tables.append(from_text(path, chosen, time=time, **rows))
     return Recording(tables, **options)
-
-
-def as_recording(source: Any, **options: Any) -> Recording:
-    """The recording of files, as `read` gives it, or of a table, by the same keywords."""
-    several = source if isinstance(source, (list, tuple)) else [source]
-    if all(isinstance(one, (str, Path)) for one in several):
-        return read(source, **options)
-    rows = {name: options.pop(name) for name in ("start", "stop", "every") if name in options}
-    if rows.pop("every", 1) != 1:
-        raise InputError("every: only of files")
-    found = Recording(source, **options)
-    return found.slice(**{name: time * found.second for name, time in rows.items()})
 
 
 def _timed(table: Table, time: str | None) -> Table:
