@@ -31,6 +31,7 @@ import numpy as np
 from gfnn_jax.dataset.stretches import Scales, Stretch
 from gfnn_jax.signals.local_polynomials import smooth
 from gfnn_jax.signals.splines import Splines
+from gfnn_jax.solve.linear import non_negative
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +43,8 @@ class NatureOptions:
     samples, at most. first: share of the velocities that positions explain. mostly: share of the
     accelerations, of a law that may be one in part. real: share of their squares that is no noise.
     most: share of the squares of second differences in narrow peaks, which fall to a quarter within
-    ``width`` samples. closed: squares of the accelerations that are left, in those of noise.
+    ``width`` samples. closed: squares of the accelerations that are left, in those of noise; bias:
+    the share that these are at least, by the curves' own bias.
     excited: negative friction, in ω. memory: share that plays explain; gains, beats: of what
     polynomials and past positions leave, that they leave. near: rms distance of states, in
     standard deviations, from which that to none is extrapolated; differ: share that they determine,
@@ -60,6 +62,7 @@ class NatureOptions:
     most: float = 0.7
     width: int = 5
     closed: float = 5.0
+    bias: float = 1e-4
     excited: float = 0.1
     memory: float = 0.9
     gains: float = 0.5
@@ -109,7 +112,8 @@ def nature(
             "column that is held or rounded, and show no velocity. Record it finer",
             partly=False,
         )
-    exponent = roughness(runs or [s.y for s in found])
+    runs = runs or [s.y for s in found]
+    exponent = max(_power([y[:, k] for y in runs]) for k in range(runs[0].shape[1]))
     if exponent < OPTIONS.rough:
         grows = f"as time to the power of {exponent:.2g}" if exponent > 0 else "by no more"
         return Nature(
@@ -140,7 +144,7 @@ def nature(
             f"impacts: {100 * jumps:.0f} % of the squares of the accelerations are in peaks of a "
             f"few samples, velocities jump, as at {when:.4g} s. Cut them off (--from, --to)",
         )
-    if 1 - plain < OPTIONS.closed * max(1 - real, 1e-6):
+    if 1 - plain < OPTIONS.closed * max(1 - real, OPTIONS.bias):
         rate = _rate_at_rest(state, a / v.std(axis=0), state.shape[1] - v.shape[1] - u.shape[1])
         if rate > OPTIONS.excited * scales.omega:
             return Nature(
@@ -193,17 +197,14 @@ def told_by_positions(q: np.ndarray, v: np.ndarray, angles: Sequence[int]) -> bo
     return q.shape[1] > 1 and _best(_variables(q, angles), v, _blocks(len(q))) > OPTIONS.first
 
 
-def roughness(runs: Sequence[np.ndarray]) -> float:
-    """The power of time by which mean squares of differences grow beyond the noise, of the
-    smoothest column of runs y (n, k); 2 where samples are too far apart to tell it."""
-    return max(_power([y[:, k] for y in runs]) for k in range(runs[0].shape[1]))
-
-
 def _power(columns: Sequence[np.ndarray]) -> float:
+    """The power of time by which mean squares of differences of a column grow beyond the noise; 2
+    where samples are too far apart to tell it."""
     longest = min(OPTIONS.lags, max(map(len, columns)) // 4)
     if longest < 4:
         return 2.0
-    squares = np.array([_square(columns, lag) for lag in range(1, longest + 1)])
+    apart = ([c[lag:] - c[:-lag] for c in columns] for lag in range(1, longest + 1))
+    squares = np.array([np.nanmean(np.concatenate(one) ** 2) for one in apart])
     whole = 2 * float(np.nanvar(np.concatenate(columns)))
     count = sum(len(column) for column in columns)
     if np.all(np.abs(1 - squares / whole) < 5 / np.sqrt(count)):
@@ -216,16 +217,8 @@ def _power(columns: Sequence[np.ndarray]) -> float:
     powers, left = np.arange(0.1, 2.05, 0.05), []
     for power in powers:
         rows = np.stack([np.ones(last), lags**power], axis=1) / squares[:, None]
-        c = np.linalg.lstsq(rows, np.ones(last), rcond=None)[0]
-        if c[0] < 0:
-            c = np.array([0.0, np.sum(rows[:, 1]) / np.sum(rows[:, 1] ** 2)])
-        left.append(np.sum((rows @ c - 1) ** 2) if c[1] > 0 else np.inf)
+        left.append(np.sum((rows @ non_negative(rows, np.ones(last)) - 1) ** 2))
     return float(powers[int(np.argmin(left))])
-
-
-def _square(columns: Sequence[np.ndarray], lag: int) -> float:
-    apart = [column[lag:] - column[:-lag] for column in columns if len(column) > lag]
-    return float(np.nanmean(np.concatenate(apart) ** 2))
 
 
 def _states(
