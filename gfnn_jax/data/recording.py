@@ -441,8 +441,8 @@ def read(
     options:  `ReadOptions`.
     Raises InputError, one line with the file and the line, where a file cannot be used.
     """
-    alone = isinstance(paths, (str, Path, Mapping)) or hasattr(paths, "columns")
-    several: list[Any] = [paths] if alone else list(paths)
+    is_table = isinstance(paths, Mapping) or hasattr(paths, "columns")
+    several: list[Any] = [paths] if is_table or isinstance(paths, (str, Path)) else list(paths)
     if not all(isinstance(one, (str, Path)) for one in several):
         if every != 1:
             raise InputError("every: only of files")
