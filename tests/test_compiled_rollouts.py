@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC, Friction, Lagrangian, Terms
-from gfnn_jax.flows.compiled_steps import Stepper, program
+from gfnn_jax.flows.compiled_steps import CONSTANT, INVERSE, JOINED, SIN, Stepper, program
 from gfnn_jax.maps import lanes
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import map_of_law
@@ -69,6 +69,29 @@ def test_energy_stays_and_many_turns_cost_no_digit():
     assert np.max(abs(np.asarray(energy) / energy[0] - 1)) < 1e-11  # cos of 2e4 loses 4 digits
     steps = jax.jit(lambda z: map_.rollout(z, 10)[0])(np.array([0.0, 2.5]))
     assert steps.shape == (11, 2)
+
+
+def test_a_program_is_its_field():
+    """Sums that are joined, of one place twice too, against the field itself."""
+    matrices = np.random.default_rng(0).normal(size=(3, 4, 4))
+
+    def field(z, args):
+        y = z @ matrices[0] @ matrices[1] + 0.5 * z
+        x = np.stack(
+            [y[:, 0] * y[:, 1] + 1.0, z[:, 0] - z[:, 0] * 0.5, args[:, 0], y[:, 3]], axis=1
+        )
+        return np.concatenate([(x * z) @ matrices[2], np.sin(x[:, :1]) / z[:, :1]], axis=1)
+
+    found = program(field, 4, 1)
+    z = np.random.default_rng(1).normal(size=(1, 5))
+    values = [*z[0]]
+    for (kind, a, b, d), c in list(zip(found.code, found.constants, strict=True))[5:]:
+        known = {CONSTANT: lambda c=c: c, SIN: lambda a=a: np.sin(values[a])}
+        known |= {INVERSE: lambda a=a: 1 / values[a]}
+        known |= {JOINED: lambda a=a, b=b, c=c, d=d: values[a] + c * values[b] * values[d]}
+        values.append(known[int(kind)]())
+    expected = field(z[:, :4], z[:, 4:])[0]
+    np.testing.assert_allclose(np.array(values)[found.values], expected, rtol=1e-13)
 
 
 @pytest.mark.parametrize("branches", [lambda q: q == 0, lambda q: q != 0, bool, lambda q: q > 0])

@@ -47,19 +47,8 @@ _MOST_OPERATIONS = 10_000  # of a gradient: JAX's products of matrices are faste
 # v_a^c; functions of v_a.
 INPUT, CONSTANT, SUM, PRODUCT, SCALED, JOINED, POWER, INVERSE, EXP, LOG, SIN, COS = range(12)
 ROOT, ABS, TAN, SINH, COSH, TANH, ARCTAN = range(12, 19)
-_FUNCTIONS = {
-    "exp": EXP,
-    "log": LOG,
-    "sin": SIN,
-    "cos": COS,
-    "sqrt": ROOT,
-    "fabs": ABS,
-    "tan": TAN,
-    "sinh": SINH,
-    "cosh": COSH,
-    "tanh": TANH,
-    "arctan": ARCTAN,
-}
+_NAMES = ("exp", "log", "sin", "cos", "sqrt", "fabs", "tan", "sinh", "cosh", "tanh", "arctan")
+_FUNCTIONS = dict(zip(_NAMES, range(EXP, ARCTAN + 1), strict=True))
 
 
 class Program(NamedTuple):
@@ -207,8 +196,9 @@ class _Tape:
         fixed = {*ends, *(of for p in {*used} - {*linear} for of in self.operands(p))}
         for place in linear:
             kind, a, b, c = self.rows[place]
-            share = np.longdouble(c)  # matrices that are symmetric stay so
-            terms = {a: np.longdouble(1), b: share} if kind == SUM else {a: share}
+            share, terms = np.longdouble(c), {}  # matrices that are symmetric stay so
+            for of, by in ((a, 1), (b, share)) if kind == SUM else ((a, share),):
+                terms[of] = terms.get(of, 0) + by
             once = {of for of in terms if of in forms and uses[of] == 1 and of not in fixed}
             forms[place] = _without(once, terms, forms)
             for of in once:
@@ -385,10 +375,7 @@ def _kept(w, moved, entries, values, slopes, system):
     `flows.collective.Casimirs.kept`. system: a row for each of their corrections, its matrix beside
     the change as a sum of two numbers."""
     width, count = w.shape[1], len(system)
-    for k in range(count):
-        system[k, count], system[k, count + 1] = 0.0, 0.0
-        for i in range(width):
-            slopes[k, i] = 0.0
+    system[:], slopes[:] = 0.0, 0.0
     for e in range(len(entries)):
         k, a, b = entries[e, 0], entries[e, 1], entries[e, 2]
         by, rest = _two_product(values[e], moved[a])
@@ -405,7 +392,6 @@ def _kept(w, moved, entries, values, slopes, system):
     for k in range(count):
         system[k, count] += system[k, count + 1]
         for m in range(count):
-            system[k, m] = 0.0
             for i in range(width):
                 system[k, m] += slopes[k, i] * slopes[m, i]
         system[k, k] *= _PARALLEL

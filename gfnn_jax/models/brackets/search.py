@@ -249,7 +249,9 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
             "act, or more runs are needed",
             "no law: no H of a bracket leaves noise alone",
         )
-    more = ". With noise more runs may show one" if noisy is not None else ""
+    more = ""
+    if noisy is not None:
+        more = ". With noise more runs may show one; friction is found without noise alone"
     if shrunk:
         more = (
             f". Bivectors shrink at the rates {', '.join(dict.fromkeys(shrunk))}, as by uniform "
