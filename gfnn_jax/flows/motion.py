@@ -107,6 +107,13 @@ class Form:
 
         return Tables.of(self.terms, self.basis, self.friction, self.num_inputs)
 
+    def with_phases(self, phases: np.ndarray) -> Form:
+        """The form with other phases, (P,) or (N, P), of which its tables do not depend."""
+        terms = dataclasses.replace(self.terms, phases=phases)
+        other = dataclasses.replace(self, terms=terms)
+        other.__dict__["_tables"] = self._tables
+        return other
+
     def step(
         self,
         p: np.ndarray,

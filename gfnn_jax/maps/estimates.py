@@ -364,26 +364,29 @@ def _check_inputs(t: np.ndarray, begin: float, end: float, run: str) -> None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Windows:
-    """Windows of equal length as arcs whose law is known: what `Readings.fit` asks for. States
-    (q, v), and the level of friction behind them where the law's sensors have one."""
+    """Windows of equal length as arcs whose laws, ``laws[which]``, are known: what `Readings.fit`
+    asks for. States (q, v), and the level of friction behind them where sensors have one."""
 
-    law: Law
+    laws: Sequence[Law]
+    which: np.ndarray
     h: np.ndarray
     u: np.ndarray
 
     def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         arcs, length, m = x.shape
-        num, d = arcs * (length - 1), 2 * self.law.form.dim
+        num, d = arcs * (length - 1), 2 * self.laws[0].form.dim
         u = self.u.reshape(num, *self.u.shape[2:])
         start, level = np.split(x[:, :-1].reshape(num, m), [d], axis=1)
-        order, p = 1 + level.shape[1], self.law.p
-        p = p + level * self.law.friction if order > 1 else p
-        step = self.law.form.step(p, start, self.h.reshape(num), u, order=order)
+        order, which = 1 + level.shape[1], np.repeat(self.which, length - 1)
+        form, p = _side_by_side(self.laws, which)
+        friction = np.stack([law.friction for law in self.laws])[which]
+        p = p + level * friction if order > 1 else p
+        step = form.step(p, start, self.h.reshape(num), u, order=order)
         ends = np.concatenate([step.states, level], axis=1)
         by = np.zeros((num, m, m))
         by[:, :d, :d] = step.by_state
         if order > 1:
-            by[:, :d, d] = step.by_coefficients @ self.law.friction
+            by[:, :d, d:] = step.by_coefficients @ friction[..., None]
             by[:, d, d] = 1.0
         shape = (arcs, length - 1, m)
         closing = ends.reshape(shape) - x[:, 1:]
@@ -391,8 +394,8 @@ class _Windows:
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         u = np.concatenate([self.u[:, :, 0, 0], self.u[:, -1:, -1, -1]], axis=1)
-        x, level = np.split(x, [2 * self.law.form.dim], axis=2)
-        shown = _channels([self.law], np.zeros(len(x), int), x, u)
+        x, level = np.split(x, [2 * self.laws[0].form.dim], axis=2)
+        shown = _channels(self.laws, self.which, x, u)
         shown = shown._replace(by_coefficients=shown.by_coefficients[..., :0])
         if not level.shape[2]:
             return shown
@@ -402,23 +405,33 @@ class _Windows:
         return Observed(np.concatenate([shown.values, level], axis=2), by, none)
 
     def take(self, arcs: np.ndarray) -> _Windows:
-        return dataclasses.replace(self, h=self.h[arcs], u=self.u[arcs])
+        return dataclasses.replace(self, which=self.which[arcs], h=self.h[arcs], u=self.u[arcs])
 
 
 def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
-    """(q, v, λ, b) (B, m) at the last sample of each window, and its covariance (B, m, m) in the
-    law: λ (1,) the level of friction where the sensors have one, b (k,) the zeros of the channels
-    where these wander, each of length 0 where not.
+    """`estimates_of` windows that follow one law."""
+    return estimates_of([law], np.zeros(len(windows), int), windows)
+
+
+def estimates_of(
+    laws: Sequence[Law], which: np.ndarray, windows: Sequence[Window]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(q, v, λ, b) (B, m) at the last sample of each window, and its covariance (B, m, m) in its
+    law, ``laws[which]``, which (B,): λ (1,) the level of friction where the sensors have one, b
+    (k,) the zeros of the channels where these wander, each of length 0 where not. The laws differ
+    as those of `propagate`.
 
     Raises InputError where times of events alone are read, of which no state is estimated yet.
     """
-    sensors = law.sensors
+    laws, which = of_windows(laws, which, windows)
+    sensors = laws[0].sensors
     if sensors.observation_model.crossed:
         raise InputError(
             "times of events alone: no state is estimated from them. The law is fit.law; start "
             "from a state that you know, fit.predict(z0, num_steps)"
         )
-    windows, starts = zip(*(_started(sensors, w) for w in windows), strict=True)
+    started = (_started(laws[k].sensors, w) for k, w in zip(which, windows, strict=True))
+    windows, starts = zip(*started, strict=True)
     length = max(len(w.t) for w in windows)
     count = windows[0].y.shape[1]
     t, y, x, noise = [], [], [], []
@@ -431,8 +444,8 @@ def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np
         x.append(np.concatenate([np.repeat(own[:1], pad, axis=0), own]))
     t, y, x = np.array(t), np.array(y), np.array(x)
     longest = np.max(np.diff(t, axis=1), initial=0.0)
-    u = _inputs(law, windows, t, int(substeps_of(sensors, longest)))
-    arcs = _Windows(law, np.diff(t, axis=1), u)
+    u = _inputs(sensors, windows, t, int(substeps_of(sensors, longest)))
+    arcs = _Windows(laws, which, np.diff(t, axis=1), u)
     sigma = sensors.observation_model.state_sigma(x[:, -1], sensors.sigma, sensors.omega)
     scale = np.concatenate([sigma, sigma * sensors.omega])
     sigma, loss, wander = (
@@ -494,22 +507,6 @@ def _with_zeros(
         ]
     )
     return np.concatenate([x, (c.swapaxes(1, 2) @ r)[..., 0] * sigma], axis=1), covariance
-
-
-def estimates_of(
-    laws: Sequence[Law], which: np.ndarray, windows: Sequence[Window]
-) -> tuple[np.ndarray, np.ndarray]:
-    """`estimate_states` of windows of which each follows its own law, ``laws[which]``, which
-    (B,)."""
-    laws, which = of_windows(laws, which, windows)
-    states: list[Any] = [None] * len(windows)
-    for number in np.unique(which).tolist():
-        own = np.flatnonzero(which == number).tolist()
-        found = estimate_states(laws[number], [windows[n] for n in own])
-        for n, *state in zip(own, *found, strict=True):
-            states[n] = state
-    x, covariance = map(np.stack, zip(*states, strict=True))
-    return x, covariance
 
 
 def _started(sensors: Sensors, window: Window) -> tuple[Window, np.ndarray]:
@@ -588,12 +585,12 @@ def propagate(
     The laws differ in coefficients, phases, covariance and the parameters of their channels only;
     all else of the sensors is that of the first.
     """
-    law, d, sensors = laws[0], laws[0].form.dim, laws[0].sensors
+    d, sensors = laws[0].form.dim, laws[0].sensors
     x, level, zeros = np.split(x, [2 * d, 2 * d + bool(sensors.level)], axis=1)
     large = sensors.size_of(x)[:, None, None]
     root = covariance_root(covariance).swapaxes(1, 2)
     ends, asked = _in_steps(sensors, np.concatenate([last[:, None], times], axis=1))
-    u = _inputs(law, windows, ends, 1)
+    u = _inputs(sensors, windows, ends, 1)
     x, own = np.concatenate([x, level], axis=1), 2 * d + level.shape[1]
     orbit, spread = _followed(laws, which, x, root[:, :own], np.diff(ends, axis=1), u, asked)
     of_zeros = np.pad(root[:, own:], ((0, 0), (0, 0), (0, spread.shape[-1] - root.shape[-1])))
@@ -623,7 +620,10 @@ def _followed(
     """Orbits (B, M + 1, 2d) of the laws from states x (B, 2d), and levels of friction behind them,
     whose covariance is root rootᵀ, by steps h (B, M) with inputs u; and the roots (B, n, 2d, ·) of
     the covariances after the steps that are ``asked`` (n,), with that of the coefficients."""
-    form, p, roots = _side_by_side(laws, which)
+    form, p = _side_by_side(laws, which)
+    longest = max(len(law.root) for law in laws)
+    roots = [np.pad(law.root, ((0, longest - len(law.root)), (0, 0))) for law in laws]
+    roots = np.stack(roots)[which]
     size, count, modes = root.shape[-1], roots.shape[-1], None
     x, level = np.split(x, [2 * form.dim], axis=1)
     root, of_level = np.split(root, [2 * form.dim], axis=1)
@@ -649,16 +649,14 @@ def _followed(
     return np.concatenate(orbit, axis=1), np.stack(spreads, axis=1)
 
 
-def _side_by_side(laws: Sequence[Law], which: np.ndarray) -> tuple[Form, np.ndarray, np.ndarray]:
-    """A form with the phases of each lane, coefficients (B, n) and roots (B, m, n) of lanes of
-    which each follows one of the laws."""
-    form, terms = laws[0].form, laws[0].form.terms
-    if len(laws) > 1:
-        phases = np.stack([law.form.terms.phases for law in laws])[which]
-        form = dataclasses.replace(form, terms=dataclasses.replace(terms, phases=phases))
-    most = max(len(law.root) for law in laws)
-    roots = np.stack([np.pad(law.root, ((0, most - len(law.root)), (0, 0))) for law in laws])
-    return form, np.stack([law.p for law in laws])[which], roots[which]
+def _side_by_side(laws: Sequence[Law], which: np.ndarray) -> tuple[Form, np.ndarray]:
+    """The form and coefficients of lanes that follow ``laws[which]``: (n,) of one law, of several
+    those of each lane (B, n), with its phases."""
+    form = laws[0].form
+    if len(laws) == 1:
+        return form, laws[0].p
+    phases = np.stack([law.form.terms.phases for law in laws])[which]
+    return form.with_phases(phases), np.stack([law.p for law in laws])[which]
 
 
 def _in_steps(sensors: Sensors, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -696,9 +694,11 @@ def substeps_of(sensors: Sensors, h: Any) -> Any:
     return np.maximum(1, np.ceil(h * sensors.omega / _OPTIONS.fine).astype(int))
 
 
-def _inputs(law: Law, windows: Sequence[Window], t: np.ndarray, substeps: int) -> np.ndarray:
+def _inputs(
+    sensors: Sensors, windows: Sequence[Window], t: np.ndarray, substeps: int
+) -> np.ndarray:
     """Inputs (B, L − 1, substeps, 6, k) of the steps between times t (B, L)."""
-    hold, delay = law.sensors.hold, law.sensors.delay
+    hold, delay = sensors.hold, sensors.delay
     return np.stack(
         [
             at_stages(w.inputs_t, w.inputs, ends[:-1], ends[1:], substeps, hold, delay)

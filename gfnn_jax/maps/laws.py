@@ -16,7 +16,7 @@ import numpy as np
 from gfnn_jax.coordinates import Coordinates, lift
 from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian, coordinates_in
 from gfnn_jax.flows.bodies import BodiesLaw, OfBodies
-from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.flows.collocation import Steps, images, of_lanes
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.legendre import Legendre, family_of, law_of
@@ -246,21 +246,35 @@ def _law_at(map_: SymplecticMap, args) -> Lagrangian | BodiesLaw:
 def _steps(law: Lagrangian, flow: Flow, z, args, tolerance: float) -> Steps:
     """The cheapest steps of a flow whose own error is within the tolerance at nearly all of these
     states; and whether Newton's method is to solve them: where dry friction is stiff, whose force
-    turns over within ε, and no more than Newton's method bears in a substep."""
-    dt = float(flow.dt)
+    turns over within ε, and no more than Newton's method bears in a substep.
+
+    Substeps of the most stages are halved until nearly all states stay where they are; those that
+    do are halved no further, and are what steps of fewer stages are compared with."""
+    dt, most = float(flow.dt), OPTIONS.stages[-1]
     turned = dt * stiffness(law, split(z)[0])
     fewest, stiff = turned / OPTIONS.stiffest, bool(turned > OPTIONS.contracting)
 
-    def after(steps: Steps) -> np.ndarray:
-        return images(flow.family, flow.params, z, dt, steps, args=args).states
+    def after(steps: Steps, lanes: Any = slice(None)) -> np.ndarray:
+        given = of_lanes(args, lanes)
+        return images(flow.family, flow.params, z[lanes], dt, steps, args=given).states
 
-    reference = after(Steps(OPTIONS.stages[-1], 2 * OPTIONS.substeps[-1]))
-    every = product(OPTIONS.stages, OPTIONS.substeps)
+    def off(states: np.ndarray, others: np.ndarray) -> np.ndarray:
+        return ~(np.abs((states - others) / flow.scale).max(axis=1) <= tolerance)
+
+    least, allowed = OPTIONS.substeps[-1], (1 - OPTIONS.nearly) * len(z)
+    enough = [n for n in OPTIONS.substeps if n >= min(fewest, least)]
+    reference, moving = after(Steps(most, enough[0])), np.arange(len(z))
+    for substeps in enough:
+        before = reference[moving]
+        reference[moving] = after(Steps(most, 2 * substeps), moving)
+        moving = moving[off(before, reference[moving])]
+        if len(moving) <= allowed:
+            break
+    else:
+        return Steps(most, least, stiff)
+    every = product(OPTIONS.stages, (n for n in enough if n >= substeps))
     for _, stages, substeps in sorted((s**2 * n, s, n) for s, n in every):
         tried = Steps(stages, substeps, stiff)
-        if substeps < min(fewest, OPTIONS.substeps[-1]):
-            continue
-        off = np.abs((after(tried) - reference) / flow.scale).max(axis=1)
-        if np.mean(off <= tolerance) >= OPTIONS.nearly:
+        if np.sum(off(after(tried), reference)) <= allowed:
             return tried
-    return Steps(OPTIONS.stages[-1], OPTIONS.substeps[-1], stiff)
+    return Steps(most, least, stiff)

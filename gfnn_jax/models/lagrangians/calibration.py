@@ -16,7 +16,7 @@ import dataclasses
 import warnings
 from bisect import bisect
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -282,9 +282,13 @@ def _forecasts(
     third = np.array([thirds.of(i, found[i].t[k]) for i, k in starts])
     laws, which = of_windows(thirds.laws, third, cut)
     last = np.array([w.t[-1] for w in cut])
-    kinds, kind = np.unique(windows, return_inverse=True)  # together they would all be the longest
-    each = [law for law in laws for _ in kinds]
-    x, covariance = estimates_of(each, which * len(kinds) + kind, cut)
+    states: list[Any] = [None] * len(cut)
+    for window in np.unique(windows):  # together they would all be the longest
+        own = np.flatnonzero(windows == window).tolist()
+        of_window = estimates_of(laws, which[own], [cut[n] for n in own])
+        for n, *state in zip(own, *of_window, strict=True):
+            states[n] = state
+    x, covariance = (np.stack(part) for part in zip(*states, strict=True))
     orbits = propagate(laws, which, cut, x, covariance, last, np.array(times))
     d = thirds.laws[0].form.dim
     return orbits.values - np.array(measured), orbits, x[:, : 2 * d]

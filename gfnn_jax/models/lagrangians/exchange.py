@@ -13,6 +13,7 @@ which its coefficients are as well known.
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
 
@@ -54,6 +55,11 @@ class ExchangeOptions:
     coloured: float = 2.0
     explained: float = 0.5
     listed: int = 5
+
+    @property
+    def begun(self) -> int:
+        """Sets whose friction is looked at."""
+        return self.screened * self.fitted
 
 
 OPTIONS = ExchangeOptions()
@@ -195,8 +201,8 @@ def _near(fit: LawFit, every: Structure) -> list[Exchanged]:
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Screen:
     """The linearised problem of all terms: columns (m, n) of unit size, and the target (m,) that
-    they explain. own: places of what the fit has; leave: of these, what may; come: what it lacks.
-    """
+    they explain. own: places of what the fit has; leave: of these, what may; come: what it lacks;
+    count: residuals that are independent."""
 
     fit: LawFit
     larger: Structure
@@ -206,6 +212,7 @@ class _Screen:
     own: frozenset[int]
     leave: list[int]
     come: np.ndarray
+    count: float
 
     @classmethod
     def of(cls, fit: LawFit, every: Structure) -> _Screen:
@@ -226,6 +233,7 @@ class _Screen:
             frozenset(own),
             [i for i in own if keys[i][0] in kinds and keys[i] not in fixed],
             np.array([i for i in range(len(keys)) if i not in own and size[i] > 0], int),
+            fit.independent,
         )
 
     def sets(self) -> list[tuple[frozenset[int], float]]:
@@ -235,35 +243,44 @@ class _Screen:
         for leaving in range(OPTIONS.most + 1):
             for gone in combinations(self.leave, leaving):
                 rough |= self._exchanges(self.own - set(gone))
-        begun = sorted(rough, key=lambda one: rough[one])[: OPTIONS.screened * OPTIONS.fitted]
+        begun = sorted(rough, key=lambda one: rough[one])[: OPTIONS.begun]
         begun += [one for one in rough if one < self.own]
-        known = self._criterion(self.own)
+        known = self._criterion(self.own, self._solved(self.own)[1])
         found = {
-            places: self._criterion(places) - known - _for_fewer(self.fit, len(places))
-            for places in map(self._rubbing, begun)
+            places: left - known - _for_fewer(self.fit, len(places))
+            for places, left in map(self._rubbing, begun)
         }
         found.pop(self.own, None)
         return sorted(found.items(), key=lambda one: one[1])
 
+    @cached_property
+    def _products(self) -> np.ndarray:
+        """Products of the columns of what the fit lacks."""
+        return self.columns[:, self.come].T @ self.columns[:, self.come]
+
     def _exchanges(self, kept: frozenset[int]) -> dict[frozenset[int], float]:
         """The likeliest sets of what is kept and up to two more, with their criterion."""
         basis = np.linalg.qr(self.columns[:, sorted(kept)])[0]
-        rest, new = (x - basis @ (basis.T @ x) for x in (self.target, self.columns[:, self.come]))
+        shared = basis.T @ self.columns[:, self.come]
+        rest = self.target - basis @ (basis.T @ self.target)
+        new = self.columns[:, self.come] - basis @ shared
         size = np.linalg.norm(new, axis=0)
-        come, new = self.come[size > OPTIONS.imitated], new[:, size > OPTIONS.imitated]
-        new = new / np.linalg.norm(new, axis=0)
-        along, products = new.T @ rest, new.T @ new
-        i, j = np.triu_indices(len(come), 1)
-        apart = np.maximum(1 - products[i, j] ** 2, OPTIONS.imitated**2)
-        two = (along[i] ** 2 + along[j] ** 2 - 2 * along[i] * along[j] * products[i, j]) / apart
-        found = {kept: float(rest @ rest)}
-        found |= {kept | {a}: rest @ rest - b**2 for a, b in zip(come.tolist(), along, strict=True)}
-        for k in np.argsort(-two)[: OPTIONS.screened]:
-            found[kept | {int(come[i[k]]), int(come[j[k]])}] = rest @ rest - two[k]
-        return {
-            places: criterion(left, self.fit.independent, len(places))
-            for places, left in found.items()
-        }
+        some = np.flatnonzero(size > OPTIONS.imitated)
+        shared, size, left = shared[:, some], size[some], float(rest @ rest)
+        along = new[:, some].T @ rest / size
+        apart = self._products[np.ix_(some, some)] - shared.T @ shared
+        apart /= np.outer(size, size)  # cosines
+        two = -2 * np.outer(along, along) * apart + along**2 + along[:, None] ** 2
+        two /= np.maximum(1 - apart**2, OPTIONS.imitated**2)
+        np.fill_diagonal(two, 0.0)
+        rows = _largest(two.max(axis=1, initial=0.0), 2 * OPTIONS.screened)
+        i, j = np.divmod(_largest(two[rows].ravel(), 2 * OPTIONS.screened), max(len(some), 1))
+        pairs = {(min(one), max(one)) for one in zip(rows[i], j, strict=True) if np.ptp(one)}
+        gains = {(): 0.0} | {(k,): along[k] ** 2 for k in sorted(_largest(along**2, OPTIONS.begun))}
+        gains |= {pair: two[pair] for pair in sorted(pairs, key=lambda pair: (-two[pair], pair))}
+        come = self.come[some].tolist()
+        found = {kept.union(come[k] for k in new): left - gain for new, gain in gains.items()}
+        return {places: self._criterion(places, cost) for places, cost in found.items()}
 
     def _solved(self, places: frozenset[int]) -> tuple[np.ndarray, float]:
         """Coefficients of these places, in their order, and the sum of squares that they leave."""
@@ -271,17 +288,19 @@ class _Screen:
         found = np.linalg.lstsq(columns, self.target, rcond=None)[0]
         return found, float(np.sum((self.target - columns @ found) ** 2))
 
-    def _criterion(self, places: frozenset[int]) -> float:
-        return criterion(self._solved(places)[1], self.fit.independent, len(places))
+    def _criterion(self, places: frozenset[int], left: float) -> float:
+        return criterion(left, self.count, len(places))
 
-    def _rubbing(self, places: frozenset[int]) -> frozenset[int]:
-        """The places without friction that would drive, the strongest first."""
+    def _rubbing(self, places: frozenset[int]) -> tuple[frozenset[int], float]:
+        """The places without friction that would drive, the strongest first, and their
+        criterion."""
         keys = self.larger.keys()
         while True:
-            found = dict(zip(sorted(places), self._solved(places)[0].tolist(), strict=True))
+            coefficients, left = self._solved(places)
+            found = dict(zip(sorted(places), coefficients.tolist(), strict=True))
             driving = {i: c for i, c in found.items() if keys[i][0] == "loss" and c < 0}
             if not driving:
-                return places
+                return places, self._criterion(places, left)
             places = places - {min(driving, key=lambda i: driving[i])}
 
     def holds_law(self, places: frozenset[int]) -> bool:
@@ -320,3 +339,9 @@ class _Screen:
         known = {keys[i]: float(value) for i, value in zip(ordered, values, strict=True)}
         other = self.fit.again(structure, known, rescale=False)
         return _compared(other, self.fit)
+
+
+def _largest(values: np.ndarray, count: int) -> np.ndarray:
+    """Places of the largest values (n,), at most so many."""
+    every = np.arange(len(values))
+    return every if len(every) <= count else np.argpartition(-values, count)[:count]

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -339,7 +339,8 @@ class Table:
         subset = self._not_below_zero(of_kinds)
         if kinds_of([self.candidates[k] for k in subset]) != kinds:
             return None
-        here, other = self._lean(subset, False), self._lean(subset, True)
+        judged = functools.cache(self.judged)
+        here, other = self._lean(subset, False, judged), self._lean(subset, True, judged)
         if here.is_seen != other.is_seen:
             here = here if here.is_seen else other
         elif here.criterion - other.criterion > 2 * np.log(EVIDENCE.decided):
@@ -347,23 +348,25 @@ class Table:
         if not any(_is_coupled(row) for row in here.rows):
             return here
         single = [k for k in of_kinds if not _is_coupled(self.candidates[k])]
-        alone = self._lean(self._not_below_zero(single), False)
+        alone = self._lean(self._not_below_zero(single), False, judged)
         worse = alone.criterion - here.criterion > 2 * np.log(EVIDENCE.decided)
         as_good = alone.kinds == kinds and alone.is_seen >= here.is_seen and not worse
         return alone if as_good else here
 
-    def _not_below_zero(self, subset: Sequence[int]) -> list[int]:
+    def _not_below_zero(self, subset: Sequence[int]) -> tuple[int, ...]:
         """The candidates among these whose ρ from all arcs is above zero."""
         found = self.solve(self.triangles[-1], subset)
-        return [k for k in subset if found[k] > 0]
+        return tuple(k for k in subset if found[k] > 0)
 
-    def _lean(self, subset: list[int], seen_first: bool) -> _Judged:
+    def _lean(
+        self, subset: tuple[int, ...], seen_first: bool, judged: Callable[[tuple], _Judged]
+    ) -> _Judged:
         """The set without its spare directions: first those that are not seen, or first those that
         held-out arcs do not miss. Each of its kinds keeps one."""
-        here = self.judged(subset)
+        here = judged(subset)
         count = here.independent
         while True:
-            fewer = {k: self.judged([other for other in subset if other != k]) for k in subset}
+            fewer = {k: judged(tuple(other for other in subset if other != k)) for k in subset}
             fewer = {k: s for k, s in fewer.items() if s.kinds == here.kinds}
             if not fewer:
                 return here
@@ -375,7 +378,7 @@ class Table:
                 spare = [*spare, missed_least] if seen_first else [missed_least, *spare]
             if not spare:
                 return here
-            here, subset = fewer[spare[0]], [k for k in subset if k != spare[0]]
+            here, subset = fewer[spare[0]], tuple(k for k in subset if k != spare[0])
 
     def others(self, taken: tuple[Loss, ...]) -> dict[Loss, tuple[float, float]]:
         """ρ, of either sign, and its standard error of the candidates that were not taken, each

@@ -83,29 +83,31 @@ class CalibratedLaw(NamedTuple):
 
     @classmethod
     def of(
-        cls, data: RecordingData, fit: LawFit, choice: FrictionChoice, levels: bool = False
+        cls, data: RecordingData, fit: LawFit, choice: FrictionChoice, level: float = 0.0
     ) -> CalibratedLaw:
-        """Make a fit ready for forecasts. levels: with a level of friction for each, as it
-        scatters."""
+        """Make a fit ready for forecasts. level: standard deviation of that of its friction."""
         law, covariance, scale, gauge = _in_gauge(data, fit)
         moving, of_moving = conformal(law, covariance)
-        root, sensors = covariance_root(of_moving), _sensors(data, fit)
+        root, sensors = covariance_root(of_moving), _sensors(data, fit, level)
         spread = np.nanstd(np.concatenate([s.y for s in data.segments]), axis=0)
         thirds, scales = _thirds(data, fit, sensors), fit.problem.scales
-        if levels:
-            level = level_of_friction(thirds, data.segments, scales)
-            thirds, sensors = thirds.with_level(level), dataclasses.replace(sensors, level=level)
         used = law_in_use(moving, root, sensors)
         calibration = calibrated(used, thirds, data.segments, scales, spread)
         return cls(fit, choice, law, covariance, moving, root, scale, gauge, calibration)
 
 
-def best_in_use(data: RecordingData, fit: LawFit, choice: FrictionChoice) -> CalibratedLaw:
+def best_in_use(
+    data: RecordingData,
+    fit: LawFit,
+    choice: FrictionChoice,
+    known: Sequence[CalibratedLaw] = (),
+) -> CalibratedLaw:
     """The fit as it is, or fitted anew with zeros of channels that wander: where its residuals show
     these (the likelihood's evidence) and forecasts of held-out data do not err more with them than
     chance makes. The strength of friction may wander too: where forecasts err less by more than
-    chance makes, each has its own level of it."""
-    steady = CalibratedLaw.of(data, fit, choice)
+    chance makes, each has its own level of it. known: fits that are ready already."""
+    ready = (one for one in known if one.fit is fit)
+    steady = next(ready, None) or CalibratedLaw.of(data, fit, choice)
     wander = None if fit.problem.observation.crossed else wander_of(fit)
     if wander is None:
         return steady
@@ -120,14 +122,17 @@ def best_in_use(data: RecordingData, fit: LawFit, choice: FrictionChoice) -> Cal
         f"err by {apart.cost:.3g} times as much"
     )
     best = steady if apart.is_higher(1.0) else wandering
-    levelled = CalibratedLaw.of(data, best.fit, choice, levels=True)
-    level = levelled.calibration.law.sensors.level
+    thirds = _thirds(data, best.fit, best.calibration.law.sensors)
+    level = level_of_friction(thirds, data.segments, fit.problem.scales)
+    if not level:
+        return best
+    levelled = CalibratedLaw.of(data, best.fit, choice, level)
     apart = levelled.calibration.against(best.calibration)
     fit.problem.on_progress(
         f"friction whose strength varies by {level:.2%}: held-out forecasts err by "
         f"{apart.cost:.3g} times as much (standard error {apart.error:.2g})"
     )
-    return levelled if level and apart.apart < -apart.error else best
+    return levelled if apart.apart < -apart.error else best
 
 
 def _in_gauge(data: RecordingData, fit: LawFit) -> tuple[Lagrangian, np.ndarray, float, str]:
@@ -172,7 +177,7 @@ def _of_systems(law: Lagrangian, parameters: Sequence[str]) -> str:
     return f"; for every {names}, since a run determines only ratios of coefficients"
 
 
-def _sensors(data: RecordingData, fit: LawFit) -> Sensors:
+def _sensors(data: RecordingData, fit: LawFit, level: float) -> Sensors:
     """The sensors, as yet without a misfit."""
     problem, recording = fit.problem, data.recording
     scales, observation, inputs = problem.scales, problem.observation, problem.inputs
@@ -200,7 +205,7 @@ def _sensors(data: RecordingData, fit: LawFit) -> Sensors:
         x[:, : observation.dim].mean(axis=0),
     )
     reach = np.sqrt(np.mean(own.distances(x) ** 2, axis=0))
-    return dataclasses.replace(own, reach=np.maximum(reach, 1e-300))
+    return dataclasses.replace(own, reach=np.maximum(reach, 1e-300), level=level)
 
 
 def _thirds(data: RecordingData, fit: LawFit, sensors: Sensors) -> Thirds:

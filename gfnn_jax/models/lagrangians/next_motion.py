@@ -93,12 +93,15 @@ def parting(fit: LawFit, others: Sequence[LawFit]) -> list[Motion]:
 
 
 def _starts(fit: LawFit) -> list[np.ndarray]:
-    """One coordinate, or all of them with either sign, let go from rest at some deflections."""
+    """One coordinate, or all of them with either sign, let go from rest at some deflections; of
+    more than three with one sign, or with signs in turn."""
     d, angles = fit.form.dim, list(fit.problem.angles)
     middle = np.median(fit.problem.gauge, axis=0)
     reach = np.max(np.abs(fit.problem.gauge - middle), axis=0)
     shapes = [np.eye(d)[i] for i in range(d)]
-    if d > 1:
+    if d > 3:
+        shapes += [np.ones(d), (-1.0) ** np.arange(d)]
+    elif d > 1:
         shapes += [np.array((1.0, *signs)) for signs in product((1.0, -1.0), repeat=d - 1)]
     starts = []
     for shape, further in product(shapes, OPTIONS.further):

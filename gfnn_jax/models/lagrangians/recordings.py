@@ -319,7 +319,7 @@ def _findings(
     """The law that was found, made ready for forecasts, and what its fit shows."""
     note, options = data.problem.on_progress, data.problem.options
     note(f"law (its bands follow): {line_of(recording, GaugedLaw.of(data, found.fit))}")
-    model, choice, _ = _forecasting_best(found, data)
+    (model, choice, _), ready = _forecasting_best(found, data)
     fit = with_fine_steps(model.fit)
     measured = velocities(recording, fit)
     for name, one in measured.items():
@@ -327,7 +327,7 @@ def _findings(
     data, fit = _with_velocities(measured, data, fit)
     _check_identifiable(fit)
     note("bands: forecasting from windows of the record")
-    best = best_in_use(data, fit, choice)
+    best = best_in_use(data, fit, choice, ready)
     note("finding the motion to record next")
     messages = (
         *left_out,
@@ -678,19 +678,22 @@ def _misses(fit: LawFit) -> bool:
     return bool(np.all(missed) or np.any(missed & loud))
 
 
-def _forecasting_best(found: SearchResult, data: RecordingData) -> SearchResult:
+def _forecasting_best(
+    found: SearchResult, data: RecordingData
+) -> tuple[SearchResult, list[CalibratedLaw]]:
     """The law of the longest arcs, or that of shorter ones which tell its coefficients better where
-    it clearly errs less in forecasts of held-out data."""
+    it clearly errs less in forecasts of held-out data; and both, ready for forecasts."""
     if found.shorter is None:
-        return found
+        return found, []
     longer, shorter = (CalibratedLaw.of(data, f.fit, f.choice) for f in (found, found.shorter))
     apart = shorter.calibration.against(longer.calibration)
     data.problem.on_progress(
         f"the law of shorter arcs: held-out forecasts err by {apart.cost:.3g} times as much"
     )
-    if not apart.is_lower(OPTIONS.clearly):
-        return found
-    return found.shorter._replace(model=found.shorter.model._replace(others=found.model.others))
+    if apart.is_lower(OPTIONS.clearly):
+        model = found.shorter.model._replace(others=found.model.others)
+        found = found.shorter._replace(model=model)
+    return found, [longer, shorter]
 
 
 def _with_velocities(

@@ -341,12 +341,12 @@ class TermSearch:
             more = libraries.driven(d, problem.angles, problem.num_inputs, problem.squares)
             every = every.plus([("term", row) for row in more])
         refused: set[Key] = set()
-        options, problem, costs = fit.problem.options, fit.problem, None
+        options, problem, costs, found = fit.problem.options, fit.problem, None, None
         evidence = options.evidence
         for _ in range(options.tries):
-            scores = fit.scores(every)
-            open_ = (k for k in scores if k not in refused and fit.structure.may_have(k))
-            scores = {k: scores[k] for k in open_ if scores[k] > evidence.scored}
+            found = fit.scores(every) if found is None else found
+            open_ = (k for k in found if k not in refused and fit.structure.may_have(k))
+            scores = {k: found[k] for k in open_ if found[k] > evidence.scored}
             if not scores:
                 break
             key = max(scores, key=lambda k: scores[k])
@@ -360,7 +360,7 @@ class TermSearch:
                 f"{apart.cost:.5g}"
             )
             if kept:
-                fit, costs = fit.again(larger), None
+                fit, costs, found = fit.again(larger), None, None
             else:
                 refused.add(key)
         return fit

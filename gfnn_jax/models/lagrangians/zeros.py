@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 
@@ -134,6 +135,7 @@ def wander_of(fit: LawFit) -> Wander | None:
     free = int(np.isfinite(arcs.y).sum()) - len(rows) * m - len(fit.p)
     rows, period = rows.reshape(*arcs.y.shape, -1), fit.problem.scales.period
 
+    @cache
     def likelihood(size: float, periods: float) -> float:
         white = Wander(size, periods * period).whitening(arcs.t, noise)
         mixed = np.einsum("akij,ajkw->aikw", white, rows, optimize=True)
