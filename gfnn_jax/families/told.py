@@ -173,7 +173,3 @@ class Constrained(AroundAnother):
     def term_gradients(self, w, args=None):
         """∂/∂x of the gradient (..., 2d, m)."""
         return self.family.term_gradients(w, args) @ self.basis
-
-    def offset(self, w, args=None):
-        """Gradient (..., 2d) where x = 0."""
-        return self.family.gradient(self.fixed, w, args)

@@ -56,13 +56,9 @@ class ExchangeOptions:
     explained: float = 0.5
     listed: int = 5
 
-    @property
-    def begun(self) -> int:
-        """Sets whose friction is looked at."""
-        return self.screened * self.fitted
-
 
 OPTIONS = ExchangeOptions()
+_BEGUN = OPTIONS.screened * OPTIONS.fitted  # sets whose friction is looked at
 
 
 class Exchanged(NamedTuple):
@@ -243,7 +239,7 @@ class _Screen:
         for leaving in range(OPTIONS.most + 1):
             for gone in combinations(self.leave, leaving):
                 rough |= self._exchanges(self.own - set(gone))
-        begun = sorted(rough, key=lambda one: rough[one])[: OPTIONS.begun]
+        begun = sorted(rough, key=lambda one: rough[one])[:_BEGUN]
         begun += [one for one in rough if one < self.own]
         known = self._criterion(self.own, self._solved(self.own)[1])
         found = {
@@ -276,7 +272,7 @@ class _Screen:
         rows = _largest(two.max(axis=1, initial=0.0), 2 * OPTIONS.screened)
         i, j = np.divmod(_largest(two[rows].ravel(), 2 * OPTIONS.screened), max(len(some), 1))
         pairs = {(min(one), max(one)) for one in zip(rows[i], j, strict=True) if np.ptp(one)}
-        gains = {(): 0.0} | {(k,): along[k] ** 2 for k in sorted(_largest(along**2, OPTIONS.begun))}
+        gains = {(): 0.0} | {(k,): along[k] ** 2 for k in sorted(_largest(along**2, _BEGUN))}
         gains |= {pair: two[pair] for pair in sorted(pairs, key=lambda pair: (-two[pair], pair))}
         come = self.come[some].tolist()
         found = {kept.union(come[k] for k in new): left - gain for new, gain in gains.items()}
