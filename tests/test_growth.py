@@ -13,8 +13,8 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.modes import Mode, Modes
 from gfnn_jax.families.terms import Terms, given_terms, multiplied
 from gfnn_jax.fitting.gauss_newton import Problem
-from gfnn_jax.fitting.growth import grow
 from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.models.hamiltonians.library_search import grow
 from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.phase_space import Pairs
