@@ -535,6 +535,17 @@ class LawFit:
         readings, scale = problem.readings(law, arcs, self.sigma), problem.state_scale(self.sigma)
         return readings.fit(np.zeros(0), arcs.x, scale, max_iterations=15, tolerance=tolerance)
 
+    @functools.cached_property
+    def along_periods(self) -> LawFit:
+        """The law along arcs of two periods, where those of the fit are shorter and its orbits
+        follow them: shorter ones have so many states that their residuals look like noise."""
+        arcs = self.problem.arcs(2.0)
+        if arcs.t.shape[1] <= self.arcs.t.shape[1]:
+            return self
+        found = dataclasses.replace(self._states_of(arcs, tolerance=1e-4), p=self.p)
+        longer = dataclasses.replace(self, arcs=arcs, fitted=found)
+        return longer if longer.follows else self
+
     def cross_validate(
         self, structure: Structure | None = None, known: Mapping[Key, float] | None = None
     ) -> np.ndarray:

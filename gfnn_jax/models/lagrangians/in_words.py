@@ -218,7 +218,7 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
         for name, one in found.items()
         if one.fit_percent < OPTIONS.followed and not one.white
     }
-    times = best.fit.rms() / best.fit.problem.scales.sigma
+    times = best.fit.along_periods.rms() / best.fit.problem.scales.sigma
     flaws |= {
         f"the residuals of {name} are {loud:.2g} times its noise and correlated, "
         f"{one.fit_percent:.1f} % of its variation is followed": "a force, an input or a term is "

@@ -338,7 +338,7 @@ def _findings(
     )
     findings = Findings(
         _map(data, best),
-        traces_of(recording, best.fit, best.law),
+        traces_of(recording, best.fit.along_periods, best.law),
         next_motions(best.fit),
         measured,
         model,
