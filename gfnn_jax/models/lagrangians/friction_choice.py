@@ -199,9 +199,11 @@ def chosen(
         sets = [min((s for s in sets if len(s.kinds) == most), key=lambda s: s.cost)]
     seen = [s for s in sets if s.is_seen] if choose else sets
     best = min(seen, key=lambda s: s.cost)
-    count = best.independent
 
     def odds(one: _Judged, other: _Judged) -> float:
+        """Of one against another, by the residuals that the better of them leaves: a wrong set's
+        are correlated by what it lacks."""
+        count = min(one, other, key=lambda s: s.cost).independent
         return EVIDENCE.odds(one.cost, other.cost, count)
 
     tied = [s for s in seen if odds(best, s) < EVIDENCE.decided]
