@@ -53,9 +53,9 @@ class WarningOptions:
     energy that is gained. alike: correlation of two coefficients that the
     record cannot tell apart. energies: range of the energy, as a share of the largest kinetic one,
     below which a motion of one coordinate shows M and V together only. hides: noise of an angle, in
-    radians, or residual of another channel, of its spread, above which other laws follow the record
-    as well. lost: of the spread, by which half of
-    the forecasts of held-out parts err, however short, of a law that fits its own record alone.
+    radians, above which other laws follow the record as well. lost: of the spread, by which half of
+    the forecasts of held-out parts err, however short, of a law that fits its own record alone; of
+    half of it is noise that hides other laws.
     """
 
     clear: float = 3.0
@@ -263,7 +263,7 @@ def _hidden(fit: LawFit, coordinates: Sequence[str], channels: Sequence[str]) ->
         f"noise of {f'{noise:.2g} rad in' if name in angles else f'{share:.0%} of the spread of'} "
         f"{name} hides what another law would leave"
         for name, noise, share in shares
-        if (noise if name in angles else share) > OPTIONS.hides
+        if (noise > OPTIONS.hides if name in angles else share > OPTIONS.lost / 2)
     )
 
 

@@ -132,7 +132,7 @@ def best_start(problem: ArcProblem) -> LawFit:
     some.add_led([*first, *libraries.couplings(d, angles)], 7)
     if not some.fits or (some.one_valued and not some.followed):
         raise no_law(problem.scales)
-    return some.likeliest() if some.are_noise else some.plainest()
+    return some.likeliest() if some.least < OPTIONS.white else some.plainest()
 
 
 def misfit(fit: LawFit) -> float:
@@ -215,8 +215,8 @@ class _Starts:
     def add_bodies(self, degree: int) -> None:
         """Start from equal masses in a potential of lengths up to a degree, where some start leaves
         more than noise: along a straight orbit masses are told only together with forces."""
-        d, least = self.problem.dim, min(map(misfit, self.fits), default=np.inf)
-        if d > 1 and not (self.problem.angles or self.one_valued or least < OPTIONS.white):
+        d = self.problem.dim
+        if d > 1 and not (self.problem.angles or self.one_valued or self.least < OPTIONS.white):
             self.add(_Library(libraries.bodies(d, (), degree), 1, apart=True, equal=True))
 
     def add_led(self, rows: Sequence[Row], rank: int) -> None:
@@ -278,8 +278,7 @@ class _Starts:
                 attempt(of[which], others)
         for others, (a, b) in found:
             at_a, at_b = (tried.get((len(others), e), np.inf) for e in (a, b))
-            least = min(map(misfit, self.fits), default=0.0)
-            if a == b or min(at_a, at_b) > least or not np.isfinite(max(at_a, at_b)):
+            if a == b or min(at_a, at_b) > self.least or not np.isfinite(max(at_a, at_b)):
                 continue
             for sign in (-1, 1):  # misfits are proportional to the distance from the exponent
                 best = (a * at_b + sign * b * at_a) / max(at_b + sign * at_a, 1e-300, key=abs)
@@ -292,14 +291,14 @@ class _Starts:
 
     def plainest(self) -> LawFit:
         """The plainest of those that leave little more than the best."""
-        most = OPTIONS.plain * min(map(misfit, self.fits))
+        most = OPTIONS.plain * self.least
         ranked = zip(self.ranks, self.fits, strict=True)
         near = [(rank, misfit(fit), fit) for rank, fit in ranked if misfit(fit) <= most]
         return min(near, key=lambda one: one[:2])[2]
 
     def likeliest(self) -> LawFit:
         """The likeliest by Schwarz's criterion, which asks for residuals that are noise."""
-        count = max(fit.independent for fit in self.fits if misfit(fit) < OPTIONS.noise)
+        count = min(self.fits, key=misfit).independent
 
         def of(fit: LawFit) -> float:
             return criterion(misfit(fit) ** 2, count, len(fit.p))
@@ -307,9 +306,14 @@ class _Starts:
         return min(self.fits, key=of)
 
     @property
+    def least(self) -> float:
+        """The least misfit of a start."""
+        return min(map(misfit, self.fits), default=np.inf)
+
+    @property
     def are_noise(self) -> bool:
         """Return whether the residuals of some start are."""
-        return min(map(misfit, self.fits), default=np.inf) < OPTIONS.noise
+        return self.least < OPTIONS.noise
 
     @property
     def followed(self) -> bool:
