@@ -217,7 +217,7 @@ class _Starts:
         more than noise: along a straight orbit masses are told only together with forces."""
         d = self.problem.dim
         if d > 1 and not (self.problem.angles or self.one_valued or self.least < OPTIONS.white):
-            self.add(_Library(libraries.bodies(d, (), degree), 1, apart=True, equal=True))
+            self.add(_Library(libraries.bodies(d, (), degree), 2, apart=True, equal=True))
 
     def add_led(self, rows: Sequence[Row], rank: int) -> None:
         """Start from coordinates that drive others and are not moved by them, as a cart whose motor
