@@ -201,7 +201,7 @@ def chosen(
     best = min(seen, key=lambda s: s.cost)
 
     def odds(one: _Judged, other: _Judged) -> float:
-        """Of one against another, by the residuals that the better of them leaves: a wrong set's
+        """Return the odds of one, by the residuals that the better of both leaves: a wrong set's
         are correlated by what it lacks."""
         count = min(one, other, key=lambda s: s.cost).independent
         return EVIDENCE.odds(one.cost, other.cost, count)
