@@ -10,6 +10,7 @@ from gfnn_jax.brackets import Bracket
 from gfnn_jax.errors import FitError
 from gfnn_jax.models.brackets.algebra import analysed, changed
 from gfnn_jax.models.brackets.beside import Beside
+from gfnn_jax.models.brackets.find import sparse_rows
 from gfnn_jax.models.brackets.search import Data, law_of
 from gfnn_jax.phase_space import sizes
 
@@ -184,6 +185,11 @@ def test_too_few_runs_are_refused():
     data = runs_of(top, np.array([[1.0, 0.5, -0.3]]), 0.2, 80)
     with pytest.raises(FitError, match="2 functions of degree 2 are constant"):
         law_of(data.take(slice(60)), data.take(slice(60, None)), ("a", "b", "c"))
+
+
+def test_null_vectors_that_are_zero_at_some_places_are_made_sparse():
+    rows = sparse_rows(np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0]]) / np.sqrt(2))
+    np.testing.assert_allclose(np.sort(rows, axis=0), [[0, 0, 0], [1, 1, 0]], atol=1e-12)
 
 
 @pytest.mark.parametrize("blocks", [("so3",), ("so3", "so3"), ("se3",), ("aff", "aff", "centre")])

@@ -109,7 +109,20 @@ def test_few_runs_with_noise_are_told_to_be_too_few(count):
     data = runs_of(top, starts, 0.05, 300, noise=1e-3)
     with pytest.raises(FitError, match="more runs that start at other values") as raised:
         gfnn.fit(pairs_of(data))
-    assert raised.value.verdict == f"no law: {count} run{'s' * (count > 1)} do not determine it"
+    named = "1 run does" if count == 1 else "2 runs do"
+    assert raised.value.verdict == f"no law: {named} not determine it"
+
+
+def test_exact_runs_that_are_too_few_to_bound_the_error_say_how_many_more_are_needed():
+    starts = np.random.default_rng(0).normal(size=(6, 3))
+    with pytest.warns(gfnn.FitWarning, match="too few to bound it") as told:
+        fit = gfnn.fit(pairs_of(runs_of(top, starts[:2], 0.2, 20)))
+    assert fit.chosen.validation_relative < 1e-12
+    assert str(told[-1].message).endswith("add 4 or more such runs")
+    assert fit.verdict.endswith(
+        "for 2 runs of 20 pairs are too few to bound it: add 4 or more such runs"
+    )
+    assert gfnn.fit(pairs_of(runs_of(top, starts, 0.2, 20))).met
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,12 @@ class Options:
 OPTIONS = Options()
 
 
+def enough_to_state() -> int:
+    """Pairs of runs, of which three stretches or more are held out to state an error: fewer have no
+    scatter that bounds it."""
+    return int(3 * OPTIONS.fewest / OPTIONS.fraction)
+
+
 class Split(NamedTuple):
     """Rows (n,) of each part, shuffled. test: empty where the pairs are few. stretch: (N,) the
     number of the stretch of a run that each row is in; rows of different stretches, two correlation

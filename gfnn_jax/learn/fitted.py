@@ -182,6 +182,8 @@ class Choice:
         best, relative = self.chosen, self.asked.relative
         error = best.validation_relative if relative else best.validation_rms
         bound = f"at most {best.validation_bound:.1e} with 95 % confidence"
+        if np.isinf(best.validation_bound) and np.isfinite(error):
+            bound = "without a bound"
         return f"a one-step error of {error:.1e}{relative * ' of the spread'}, {bound},"
 
     @property

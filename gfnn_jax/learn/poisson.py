@@ -17,7 +17,7 @@ from gfnn_jax.data.recording import Recording, args_of, parameters_of
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
 from gfnn_jax.dataset.runs import identified
-from gfnn_jax.dataset.split import split_rows
+from gfnn_jax.dataset.split import enough_to_state, split_rows
 from gfnn_jax.dataset.varied import check_varied, without_constants
 from gfnn_jax.errors import FitError, FitWarning, InputError
 from gfnn_jax.families.expressions import parse_named, to_named_text
@@ -107,12 +107,18 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
     )
     watch.on_candidate(candidate)
     met, messages = candidate.validation_bound <= tolerance.bound, [*left_out, *learned.notes]
+    ended = MET if met else "no larger library was more accurate"
     if white and not met and sigma is not None:
         noise = ", ".join(f"{s:.2g}" for s in sigma)
         messages.append(f"the law leaves no more than the noise of the states, {noise}")
     elif not met:
+        size = error.relative if tolerance.relative else error.rms
+        few = size <= tolerance.bound  # the error is small enough, its bound is not
+        ended = _too_few(pairs) if few else ended
         messages.append(
-            f"one-step error {candidate.validation_bound:.1e} misses the tolerance "
+            f"one-step error {size:.1e}: {ended}"
+            if few
+            else f"one-step error {candidate.validation_bound:.1e} misses the tolerance "
             f"{tolerance.bound:g}: pairs with noise, or an H that the library lacks (--terms)"
         )
         warnings.warn(messages[-1], FitWarning, stacklevel=4)
@@ -127,7 +133,7 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         hamiltonian=learned.law and _learned(learned.law, map_, candidate, messages),
         noise=sigma,
         messages=tuple(messages),
-        ended=MET if met else "no larger library was more accurate",
+        ended=ended,
         seconds=budget.seconds,
         compile_seconds=steps.compile_seconds,
         test_states=np.asarray(tested.z0),
@@ -162,6 +168,16 @@ def _next(data: Pairs | Recording, verdict: str) -> str:
         return ""
     call = "gfnn.fit(gfnn.Pairs(pairs.z0, pairs.z1, pairs.dt, run=pairs.run))"
     return f". As positions and momenta, with friction of any kind: {call}"
+
+
+def _too_few(pairs: Pairs) -> str:
+    """Say how many runs to add to these, of which too few stretches are held out to bound an
+    error."""
+    lengths = np.unique(np.asarray(pairs.run), return_counts=True)[1]
+    length = int(np.median(lengths))
+    more = max(1, -((len(pairs) - enough_to_state()) // length))
+    named = f"{len(lengths)} run{'s' * (len(lengths) > 1)} of {length} pairs"
+    return f"{named} are too few to bound it: add {more} or more such runs"
 
 
 def pairs_of_states(recording: Recording) -> Pairs:

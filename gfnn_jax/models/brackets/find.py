@@ -145,7 +145,7 @@ def _combinations(null: NullSpace, z: np.ndarray, noise: float) -> Iterator[tupl
         return
     if not len(null.vectors):
         return
-    rows, few = _sparse_rows(null.vectors), "that of fewest constants"
+    rows, few = sparse_rows(null.vectors), "that of fewest constants"
     if null.tensors.kind != LINEAR:
         yield from ((row, few) for row in (*rows, rows.sum(axis=0)))
         return
@@ -164,12 +164,13 @@ def _combinations(null: NullSpace, z: np.ndarray, noise: float) -> Iterator[tupl
             yield vector, few
 
 
-def _sparse_rows(vectors: np.ndarray) -> np.ndarray:
+def sparse_rows(vectors: np.ndarray) -> np.ndarray:
     """Vectors of few entries that span the same space as vectors (m, J), the fewest first: each the
     one of least Σ|x_j| whose entry at one place is 1 (Spielman, Wang & Wright, COLT 2012)."""
     found = list(vectors)
-    places = np.argsort(-np.linalg.norm(vectors, axis=0))[: OPTIONS.places]
-    for place in places:
+    size = np.linalg.norm(vectors, axis=0)
+    places = np.argsort(-size)[: OPTIONS.places]
+    for place in places[size[places] > OPTIONS.zero * size.max()]:
         first = vectors[:, place] / (vectors[:, place] @ vectors[:, place])
         others = np.linalg.svd(vectors[:, place][None], full_matrices=True)[2][1:]
         found.append(sparse(first @ vectors, others @ vectors))

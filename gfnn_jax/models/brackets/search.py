@@ -442,7 +442,7 @@ def _too_few_runs(missing: int, degree: int, runs: int) -> FitError:
         f"fewer orbits than determine the law: {missing} functions of degree {degree} are constant "
         f"on all of {named}, as energies and Casimirs are. Add {missing} or "
         "more runs that start at other values of these",
-        f"no law: {named} do not determine it",
+        f"no law: {named} do{'es' * (runs == 1)} not determine it",
     )
 
 
