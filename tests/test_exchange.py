@@ -38,12 +38,14 @@ def test_a_law_beside_which_noise_leaves_others_is_one_of_several(noise, alone, 
         assert law.next_motions[0].apart > 3
         ahead, sensors = 100.0 + 0.6 * np.arange(1, 40), law.map.sensors
         alone = dataclasses.replace(law.map, sensors=dataclasses.replace(sensors, rivals=()))
-        found, narrow = (map_.forecast(made, ahead) for map_ in (law.map, alone))
+        found, plain = law.map.forecast(made, ahead, coverage=0.95), law.map.forecast(made, ahead)
+        narrow = alone.forecast(made, ahead, coverage=0.95)
+        np.testing.assert_array_equal(plain.std["x1"], narrow.std["x1"])
         np.testing.assert_array_equal(found.values["x1"], narrow.values["x1"])
         assert np.all(found.std["x1"] > narrow.std["x1"])
         assert 0 < sum(share for _, share in sensors.rivals) < 1
         fit.map.save(tmp_path / "model")
-        again = gfnn.load(tmp_path / "model").map.forecast(made, ahead)
+        again = gfnn.load(tmp_path / "model").map.forecast(made, ahead, coverage=0.95)
         np.testing.assert_array_equal(again.std["x1"], found.std["x1"])
 
 

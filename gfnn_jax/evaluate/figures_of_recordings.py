@@ -17,6 +17,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate.figures_style import COLOURS, style
 from gfnn_jax.evaluate.forecasts import Forecasts
 from gfnn_jax.families.text import in_letters
+from gfnn_jax.maps.sensors import TUBE
 from gfnn_jax.signals.steps import spectrum
 
 if TYPE_CHECKING:
@@ -240,7 +241,7 @@ def draw_forecast(
     ax.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
     ax.set(ylabel=sheet.label(name), xlabel="t [s]")
     try:
-        found = fit.map.forecast(seen, ahead, own if own.inputs else None)
+        found = fit.map.forecast(seen, ahead, own if own.inputs else None, coverage=TUBE)
     except InputError:  # too few samples before
         return
     value, std = found.values[name][0], found.std[name][0]

@@ -12,6 +12,7 @@ import numpy as np
 from gfnn_jax.data.recording import Recording, args_of, parameters_of
 from gfnn_jax.errors import InputError
 from gfnn_jax.learn.fitted import Choice, Fit
+from gfnn_jax.maps.sensors import TUBE
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 
@@ -122,7 +123,7 @@ def _ahead(map_: SymplecticMap, recording: Recording, run: str, k: int, longest:
     later = recording.slice(np.nextafter(begin, np.inf), begin + longest, run=run)
     start = recording.slice(float(t[k - _OPTIONS.samples + 1]), begin, run=run)
     own = recording.slice(run=run) if recording.inputs else None
-    found = map_.forecast(start, later.times(run), own)
+    found = map_.forecast(start, later.times(run), own, coverage=TUBE)
     measured, values, std = {}, {}, {}
     for name in recording.columns:  # a coordinate that none shows is forecast too, and not judged
         if name not in found.values:

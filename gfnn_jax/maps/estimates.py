@@ -28,7 +28,7 @@ from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.sensors import TUBE, Sensors
 from gfnn_jax.signals.local_polynomials import smooth
 from gfnn_jax.signals.splines import splines
-from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
+from gfnn_jax.solve.latent_arcs import Defects, Fitted, Observed, Readings
 from gfnn_jax.solve.linear import covariance_root
 
 FEWEST = 5  # samples from which a state is estimated
@@ -43,6 +43,7 @@ class _Options:
     small: float = 2e-3  # radians of the fastest motion, over which velocities are differenced
     few: int = 4  # steps between inputs, of which those in between are filled in
     at_once: int = 4_096  # steps whose derivatives are taken together
+    settled: float = 1e-3  # of the cost, at 2 % of a standard deviation of the state
     draws: int = 400  # of errors of a trajectory, whose largest multiple of a band is looked for
 
 
@@ -159,10 +160,12 @@ def forecast(
     recording: Recording,
     times: np.ndarray,
     inputs: Recording | None = None,
+    coverage: float | None = None,
     whole: float | None = None,
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...], np.ndarray]:
     """Implement `maps.forecasts.forecast` for the map of a law: values, std, outside, and how many
-    standard deviations (runs,) hold whole trajectories with the probability ``whole``."""
+    standard deviations (runs,) hold whole trajectories with the probability ``whole``. Where it
+    or a coverage is asked for, std holds rivals too."""
     law = map_.law_in_use
     sensors = law.sensors
     windows = windows_of(sensors, recording, map_.parameters)
@@ -190,7 +193,8 @@ def forecast(
     x, covariance = estimates_of(laws, which, windows)
     ahead = np.broadcast_to(times, (len(windows), len(times)))
     orbits = propagate(laws, which, windows, x, covariance, last, ahead)
-    orbits = _with_rivals(sensors, orbits, windows, last, ahead)
+    if coverage is not None or whole is not None:
+        orbits = _with_rivals(sensors, orbits, windows, last, ahead)
     names = sensors.observation_model.channels
     values = {n: orbits.values[..., k] for k, n in enumerate(names)}
     std = {n: orbits.std[..., k] for k, n in enumerate(names)}
@@ -378,9 +382,7 @@ class _Windows:
         u = self.u.reshape(num, *self.u.shape[2:])
         start, level = np.split(x[:, :-1].reshape(num, m), [d], axis=1)
         order, which = 1 + level.shape[1], np.repeat(self.which, length - 1)
-        form, p = _side_by_side(self.laws, which)
-        friction = np.stack([law.friction for law in self.laws])[which]
-        p = p + level * friction if order > 1 else p
+        form, p, friction = _side_by_side(self.laws, which, level)
         step = form.step(p, start, self.h.reshape(num), u, order=order)
         ends = np.concatenate([step.states, level], axis=1)
         by = np.zeros((num, m, m))
@@ -442,18 +444,14 @@ def estimates_of(
         own_noise = np.ones(w.y.shape) if w.noise is None else w.noise
         noise.append(np.concatenate([np.ones((pad, count)), own_noise]))
         x.append(np.concatenate([np.repeat(own[:1], pad, axis=0), own]))
-    t, y, x = np.array(t), np.array(y), np.array(x)
+    t, y, x, noise = map(np.array, (t, y, x, noise))
     longest = np.max(np.diff(t, axis=1), initial=0.0)
     u = _inputs(sensors, windows, t, int(substeps_of(sensors, longest)))
     arcs = _Windows(laws, which, np.diff(t, axis=1), u)
     sigma = sensors.observation_model.state_sigma(x[:, -1], sensors.sigma, sensors.omega)
     scale = np.concatenate([sigma, sigma * sensors.omega])
-    sigma, loss, wander = (
-        sensors.sigma * np.array(noise),
-        sensors.observation_model.loss,
-        sensors.wander,
-    )
-    noise_of_readings = np.where(np.isfinite(y), np.array(noise), np.inf)
+    sigma, loss, wander = sensors.sigma * noise, sensors.observation_model.loss, sensors.wander
+    noise_of_readings = np.where(np.isfinite(y), noise, np.inf)
     white = None if wander is None else wander.whitening(t, noise_of_readings)
     if sensors.level:
         known = np.full((*t.shape, 1), np.nan)
@@ -465,39 +463,31 @@ def estimates_of(
             unit = np.broadcast_to(np.eye(t.shape[1]), (len(t), 1, t.shape[1], t.shape[1]))
             white = np.concatenate([white, unit], axis=1)
     readings = Readings(arcs, y, sigma, loss, white)
-    found = readings.fit(np.zeros(0), x, scale)
+    found = readings.fit(np.zeros(0), x, scale, tolerance=_OPTIONS.settled)
     if wander is None or white is None:
         return found.x[:, -1], found.last_covariance()
-    J, last = readings.linearised(np.zeros(0), found.x)
-    near = wander.latest(t, noise_of_readings)
-    near = np.pad(near, ((0, 0), (0, 0), (0, y.shape[2] - count)))
+    near = np.pad(wander.latest(t, noise_of_readings), ((0, 0), (0, 0), (0, y.shape[2] - count)))
     near = white @ near.swapaxes(1, 2)[..., None]
     weights = np.sqrt(np.nan_to_num(loss.weights(found.whitened)))
     near = weights * near[..., 0].swapaxes(1, 2)
-    return _with_zeros(found.x[:, -1], J, last, near, wander.size**2, sensors.sigma)
+    return _with_zeros(found, near, wander.size**2, sensors.sigma)
 
 
 def _with_zeros(
-    x: np.ndarray,
-    J: np.ndarray,
-    last: np.ndarray,
-    near: np.ndarray,
-    variance: float,
-    sigma: np.ndarray,
+    found: Fitted, near: np.ndarray, variance: float, sigma: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States x (B, m) with the zeros that the same samples tell, and the covariance of both.
+    """Last states (B, m) with the zeros that the same samples tell, and the covariance of both.
 
-    J, last: of `linearised`. near: (B, L, K) covariance of the rows' values with the zeros, those
-    of the k channels first.
+    near: (B, L, K) covariance of the rows' values with the zeros, those of the k channels first.
     variance: of the zeros, in units of σ². Of c = ``near``, rows J for the first state and r of the
     residuals, and P = (JᵀJ)⁻¹: the zeros are cᵀr, their covariance is that of no samples less
     cᵀc − cᵀJ P Jᵀc, and with the first state −P Jᵀc.
     """
     (lanes, length, rows), k = near.shape, len(sigma)
     c = (near[..., None] * np.eye(rows)).reshape(lanes, length * rows, rows)[..., :k]
-    m, r = x.shape[1], J[..., -1:]
-    Q, R = np.linalg.qr(J[..., :-1])
-    root, own = last[..., :m] @ np.linalg.pinv(R), Q.swapaxes(1, 2) @ c
+    J, r = found.rows[..., :-1], found.rows[..., -1:]
+    Q, R = np.linalg.qr(J)
+    root, own = found.transports @ np.linalg.pinv(R), Q.swapaxes(1, 2) @ c
     across = -root @ own * sigma
     open_ = variance * np.eye(k) - c.swapaxes(1, 2) @ c + own.swapaxes(1, 2) @ own
     covariance = np.block(
@@ -506,7 +496,8 @@ def _with_zeros(
             [across.swapaxes(1, 2), sigma[:, None] * open_ * sigma],
         ]
     )
-    return np.concatenate([x, (c.swapaxes(1, 2) @ r)[..., 0] * sigma], axis=1), covariance
+    zeros = (c.swapaxes(1, 2) @ r)[..., 0] * sigma
+    return np.concatenate([found.x[:, -1], zeros], axis=1), covariance
 
 
 def _started(sensors: Sensors, window: Window) -> tuple[Window, np.ndarray]:
@@ -620,15 +611,13 @@ def _followed(
     """Orbits (B, M + 1, 2d) of the laws from states x (B, 2d), and levels of friction behind them,
     whose covariance is root rootᵀ, by steps h (B, M) with inputs u; and the roots (B, n, 2d, ·) of
     the covariances after the steps that are ``asked`` (n,), with that of the coefficients."""
-    form, p = _side_by_side(laws, which)
+    x, level = np.split(x, [2 * laws[0].form.dim], axis=1)
+    form, p, friction = _side_by_side(laws, which, level)
     longest = max(len(law.root) for law in laws)
     roots = [np.pad(law.root, ((0, longest - len(law.root)), (0, 0))) for law in laws]
     roots = np.stack(roots)[which]
     size, count, modes = root.shape[-1], roots.shape[-1], None
-    x, level = np.split(x, [2 * form.dim], axis=1)
     root, of_level = np.split(root, [2 * form.dim], axis=1)
-    friction = np.stack([law.friction for law in laws])[which] if level.size else 0 * p
-    p = p + level * friction if level.size else p
     spread = np.concatenate([root, np.zeros((*x.shape, roots.shape[1]))], axis=2)
     orbit, spreads, most = [x[:, None]], [], max(1, _OPTIONS.at_once // len(x))
     for first in range(0, h.shape[1], most):
@@ -649,14 +638,19 @@ def _followed(
     return np.concatenate(orbit, axis=1), np.stack(spreads, axis=1)
 
 
-def _side_by_side(laws: Sequence[Law], which: np.ndarray) -> tuple[Form, np.ndarray]:
-    """The form and coefficients of lanes that follow ``laws[which]``: (n,) of one law, of several
-    those of each lane (B, n), with its phases."""
-    form = laws[0].form
-    if len(laws) == 1:
-        return form, laws[0].p
-    phases = np.stack([law.form.terms.phases for law in laws])[which]
-    return form.with_phases(phases), np.stack([law.p for law in laws])[which]
+def _side_by_side(
+    laws: Sequence[Law], which: np.ndarray, level: np.ndarray
+) -> tuple[Form, np.ndarray, np.ndarray]:
+    """The form and coefficients of lanes that follow ``laws[which]``, (n,) of one law, of several,
+    or with a level (B, 1), those of each lane (B, n), with its phases; and what levels multiply."""
+    form, p = laws[0].form, laws[0].p
+    if len(laws) > 1:
+        form = form.with_phases(np.stack([law.form.terms.phases for law in laws])[which])
+        p = np.stack([law.p for law in laws])[which]
+    if not level.size:
+        return form, p, p
+    friction = np.stack([law.friction for law in laws])[which]
+    return form, p + level * friction, friction
 
 
 def _in_steps(sensors: Sensors, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

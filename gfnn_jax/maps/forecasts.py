@@ -24,7 +24,7 @@ class Forecast(NamedTuple):
     is not known. outside: lines about runs whose parameters, or whose motion, lie beyond those that
     the law was learned from, which the standard deviations leave out. band: half widths
     (runs, n) of the band that was asked for, None where none was; ``lower`` and ``upper`` are its
-    edges."""
+    edges. Where one was, the standard deviations hold the forecasts of the law's rivals too."""
 
     times: np.ndarray
     values: dict[str, np.ndarray]
@@ -99,14 +99,14 @@ def forecast(
     if times.ndim != 1 or not np.all(np.diff(times) > 0):
         raise InputError("expected rising times (n,) of a forecast")
     asked = asked or Asked()
-    kind, whole = _kind(map_), asked.whole
+    kind, whole, given = _kind(map_), asked.whole, (map_, recording, times, inputs)
     if whole is not None and kind is position_estimates:
         raise InputError("expected a law: of a map of positions alone only bands of each reading")
     with one_thread():
         if kind is position_estimates:
-            values, std, outside = kind.forecast(map_, recording, times, inputs)
+            values, std, outside = kind.forecast(*given)
         else:
-            values, std, outside, tubes = kind.forecast(map_, recording, times, inputs, whole)
+            values, std, outside, tubes = kind.forecast(*given, asked.coverage, whole)
     units = {name: "rad" if name in map_.sensors.angles else "" for name in values}
     found = Forecast(times, values, std, units, outside)
     if whole is not None:

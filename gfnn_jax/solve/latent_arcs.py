@@ -156,7 +156,8 @@ class Fitted:
     estimated, (k,) or (A, L, k). factor: the triangle (n + 1, n + 1) of [∂r/∂p, r] without the
     states; 0 where derivatives along an arc overflow. scores: (A, n) each arc's part of the
     gradient in p. arcs: (A, m, m) triangles of each δx_0 with p fixed. transports: (A, m, m)
-    ∂x_{L−1}/∂x_0. open: (A,) what each arc's defects cost, 0 of an arc that is an orbit. cost:
+    ∂x_{L−1}/∂x_0. rows: (A, L k, m + 1) of [δx_0, r] as of `Readings.linearised`, none where there
+    are coefficients. open: (A,) what each arc's defects cost, 0 of an arc that is an orbit. cost:
     infinite where the defects could not be closed, or derivatives overflow, and open then too.
     """
 
@@ -169,6 +170,7 @@ class Fitted:
     scores: np.ndarray
     arcs: np.ndarray
     transports: np.ndarray
+    rows: np.ndarray
     open: np.ndarray
     cost: float
     iterations: int
@@ -341,7 +343,7 @@ class _AtStates:
         dp, dx = _solve(self._rows, here.defects, damping)
         there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
         stays = np.zeros(len(here.x), bool)
-        if not len(here.p) or not self._decrease(there, share, stays) > 0:
+        if (len(here.x) > 1 and not len(here.p)) or not self._decrease(there, share, stays) > 0:
             there, stays = self._alone(there, share, dx)
         return Tried(there, self._decrease(there, share, stays), damping)
 
@@ -409,6 +411,7 @@ class _AtStates:
             rows.scores,
             rows.arcs[:, :, :m],
             rows.transports,
+            rows.rows,
             best.open if finite else best.open + np.inf,
             best.cost if self.closed(best) and finite else np.inf,
             iterations,
@@ -528,14 +531,15 @@ class _Iterate:
 class _Rows(NamedTuple):
     """Rows of one iteration: each arc's triangle for its own δx_0 (A, m, m + n + 1), the triangle
     for δp (n + 1, n + 1), each arc's part of its gradient (A, n), the transports (A, m, m) to the
-    last states, and, where asked for, how far the arc's own state follows each residual, in
-    [0, 1]."""
+    last states, where asked for how far the arc's own state follows each residual, in [0, 1], and
+    where there are no coefficients what the triangles are of (A, L k, m + 1)."""
 
     arcs: np.ndarray
     factor: np.ndarray
     scores: np.ndarray
     transports: np.ndarray
     leverage: np.ndarray
+    rows: np.ndarray
 
 
 def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
@@ -555,10 +559,10 @@ def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
         if leverage:
             own = np.linalg.qr(J[..., :m])[0]
             follows = np.sum(own**2, axis=-1).reshape(follows.shape)
-        parts.append((R[:, :m], scores, last[..., :m], follows))
-    arcs, scores, transports, follows = (np.concatenate(p) for p in zip(*parts, strict=True))
+        parts.append((R[:, :m], scores, last[..., :m], follows, J[:, :0] if n else J))
+    arcs, scores, *others = (np.concatenate(p) for p in zip(*parts, strict=True))
     factor = np.concatenate([factor, np.zeros((n + 1 - len(factor), n + 1))])
-    return _Rows(arcs, factor, scores, transports, follows)
+    return _Rows(arcs, factor, scores, *others)
 
 
 def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
