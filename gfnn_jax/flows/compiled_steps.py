@@ -36,7 +36,6 @@ from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform
 STAGES = 8  # a constant of the compiled loops, as many as processors do at once
 _MOST = 100  # iterations
 _BEFORE = 2  # steps, by whose stages those of a step begin
-_HIGHER = 3  # degree of the polynomial through them, less the stages: more amplify rounding
 _FLOOR, _SETTLED = 1.1e-17, 1.8e-12  # as in `flows.flow`: 0.05 eps, eps^¾
 _SPLIT = 134217729.0  # 2²⁷ + 1 halves a number's digits (T. J. Dekker, Numer. Math. 18, 1971)
 _PARALLEL = 1.0 + 1e-9  # as in `flows.collective`
@@ -677,7 +676,8 @@ def _rule(stages: int, h: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rule, weights = gauss(stages), np.zeros(STAGES)
     coupling, before = np.zeros((STAGES, STAGES)), np.zeros((_BEFORE, STAGES, STAGES))
     coupling[:stages, :stages], weights[:stages] = rule.coupling.T, h * rule.weights
-    degree, times = min(2 * stages - 1, stages + _HIGHER), (rule.nodes, rule.nodes - 1)
+    degree = min(2 * stages - 1, stages + 3)  # higher ones amplify rounding
+    times = rule.nodes, rule.nodes - 1
     known, sought = (chebvander(t, degree) for t in (np.concatenate(times), rule.nodes + 1))
     shares = (sought @ np.linalg.pinv(known)).T.reshape(_BEFORE, stages, stages)
     before[:, :stages, :stages] = shares / rule.weights[:, None] * rule.weights

@@ -14,9 +14,6 @@ from gfnn_jax.flows.dormand_prince import NODES
 HOLDS = ("hold", "linear", "band")
 TAPS = 32  # samples on either side, of band-limited interpolation
 _DEGREE = 17  # between two samples, of polynomials that are its weights to roundoff
-# Shape of its window: the error, 3e-8 up to four fifths of the Nyquist rate, is of one sign in each
-# frequency and becomes one of the gain (`python benchmarks/parameters.py`); 8 leaves 4e-5.
-_BETA = 16.0
 _AT_ONCE = 4_096  # times
 _GAUSS = 0.5 + np.sqrt(0.15) * np.array([-1, 0, 1])  # nodes of Gauss's rule of order 6, in [0, 1]
 _SHARES = np.array([5, 8, 5]) / 18  # and its weights
@@ -139,5 +136,7 @@ def band_weights(distance: np.ndarray) -> np.ndarray:
     """Weights (n, k) of samples at these distances, in steps, in n band-limited values: a sinc in a
     window of Kaiser's (IEEE Int. Symp. Circuits Syst. (1974) 20)."""
     inside = np.clip(1 - (distance / TAPS) ** 2, 0, None)
-    weight = np.where(inside > 0, np.sinc(distance) * i0(_BETA * np.sqrt(inside)), 0.0)
+    # Shape of the window: the error, 3e-8 up to four fifths of the Nyquist rate, is of one sign in
+    # each frequency and becomes one of the gain (`benchmarks/parameters.py`); 8 leaves 4e-5.
+    weight = np.where(inside > 0, np.sinc(distance) * i0(16.0 * np.sqrt(inside)), 0.0)
     return weight / weight.sum(axis=1, keepdims=True)
