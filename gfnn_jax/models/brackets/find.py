@@ -240,8 +240,8 @@ def _made(
         else:
             yield Bracket.constant(form, names), "constant"
         return
-    form, c = _constants(null, vector)
-    c = np.where(np.abs(c) > zero * np.abs(c).max(), c, 0.0)
+    form, raw = _constants(null, vector)
+    c = np.where(np.abs(raw) > zero * np.abs(raw).max(), raw, 0.0)
     if np.abs(form).max() > OPTIONS.snapped * zero * np.abs(vector).max():
         magnetic = _magnetic(form, c, names, zero)
         if magnetic is not None:
@@ -252,7 +252,11 @@ def _made(
     algebra = next((a for a in tried if a.lifted is not None), tried[0])
     if algebra.lifted is not None:
         basis, inside = _sized(algebra, z), False
-        for by in (OPTIONS.snapped * zero, zero):
+        bases = [(basis, OPTIONS.snapped * zero), (basis, zero)]
+        exact = analysed(raw, min(100 * zero, 0.1)) if noise > OPTIONS.zero else algebra
+        if exact is not algebra and exact.blocks == algebra.blocks:
+            bases.append((_sized(exact, z), OPTIONS.zero))  # constants that are small, and no noise
+        for basis, by in bases:
             with contextlib.suppress(FitError):  # rounded to a singular one
                 bracket = Bracket.lie(algebra.blocks, _rounded(basis, by), names)
                 if not bracket.outside(z).any():
