@@ -21,6 +21,7 @@ from __future__ import annotations
 import time
 import warnings
 from functools import partial
+from typing import Any
 
 import numpy as np
 from harness import SEED, TABLES, Numbers, between_markers, main, markdown, number, provenance
@@ -131,7 +132,7 @@ def measured(name: str, quick: bool) -> Numbers:
         model = ps.SINDy()
         model.fit(middle, t=law.dt, x_dot=rate)
         found["pairs_default"] = by_default(law, model, fresh)
-        smooth = ps.SmoothedFiniteDifference()
+        smooth: Any = ps.SmoothedFiniteDifference()
         rates = [np.asarray(smooth(orbit, law.dt)) for orbit in orbits]
         states = np.concatenate([smooth.smoother(o, **smooth.smoother_kws) for o in orbits])
         found["noise_by_hand"] = by_hand(law, states, np.concatenate(rates), fresh)
