@@ -28,6 +28,7 @@ from gfnn_jax.learn.choose import work_of_posterior
 from gfnn_jax.maps.forecasts import Forecast
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.arms.learned_arm import LearnedArm
+from gfnn_jax.models.brackets.search import ONE_LEVEL, of_noise, on_one_level
 from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
@@ -174,7 +175,20 @@ class Choice:
                 "another law would leave"
             )
         rivals = [rival.formula for rival in law.rivals if rival.odds < EVIDENCE.decided]
-        return f"one of several: {'; '.join(rivals)} is as likely" if rivals else "identified"
+        if rivals:
+            return f"one of several: {'; '.join(rivals)} is as likely"
+        return f"one of several: {ONE_LEVEL}" if self._on_one_level(law) else "identified"
+
+    def _on_one_level(self, law: LearnedHamiltonian) -> bool:
+        """Return whether all states of noisy sequences are of one H."""
+        plain = law.noise is not None and law.noise.ndim == 1 and not law.friction
+        if not plain or self.base_map or self.pairs is None or self.pairs.args is not None:
+            return False
+        z, flow = self.pairs.z0, law.flow
+        h = flow.family.value(flow.params, z, None)
+        slopes, bends = flow.family.gradient_and_hessian(flow.params, z, None)
+        by_noise = of_noise(slopes, bends, np.broadcast_to(law.noise, z.shape))
+        return on_one_level(h, by_noise, slopes, np.std(z, axis=0))
 
     @property
     def _error(self) -> str:

@@ -79,6 +79,10 @@ class Options:
 
 
 OPTIONS = Options()
+ONE_LEVEL = (
+    "H has one value along all runs, and every function of H with the same slope there moves them "
+    "so: add runs that start at other values of H"
+)
 
 
 class Data(NamedTuple):
@@ -158,31 +162,37 @@ def law_of(
     else:
         law = _of_bracket(bracket, train, held, terms, on_progress)
     if not train.beside.names and law.field.friction is None and _one_level(law, train.z0):
-        several = (
-            "H has one value along all runs, and every function of H with the same slope there "
-            "moves them so: add runs that start at other values of H"
-        )
-        law = law._replace(several=several)
+        law = law._replace(several=ONE_LEVEL)
     return law
 
 
 def _one_level(law: PoissonLaw, z: np.ndarray) -> bool:
     """Return whether H has the same value at all states z (N, n), to their noise."""
     h, by_noise = _energies(law, z)
-    slopes = law.field.library.gradient(law.fit.c, z)
-    size = np.mean(np.sum((slopes * sizes(z)) ** 2, axis=-1))  # of H along a coordinate's spread
-    return bool(np.var(h) - np.mean(by_noise**2) <= OPTIONS.level * size)
+    return on_one_level(h, by_noise, law.field.library.gradient(law.fit.c, z), sizes(z))
+
+
+def on_one_level(
+    h: np.ndarray, by_noise: np.ndarray, slopes: np.ndarray, spread: np.ndarray
+) -> bool:
+    """Return whether H (N,) is one value but for its noise (N,), beside what slopes (N, n) make
+    along the spread (n,) of each coordinate: every f(H) of the same slope there moves alike."""
+    across = np.mean(np.sum((slopes * spread) ** 2, axis=-1))
+    return bool(np.var(h) - np.mean(by_noise**2) <= OPTIONS.level * across)
 
 
 def _energies(law: PoissonLaw, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """H (N,) at states z (N, n), and what their noise makes of it, to second order: near an
-    equilibrium H has no slope."""
+    """H (N,) at states z (N, n), and what their noise makes of it."""
     library, c = law.field.library, law.fit.c
-    sigma = law.noise_of(z)
-    slopes, bends = library.gradient_and_hessian(c, z)
+    return library.value(c, z), of_noise(*library.gradient_and_hessian(c, z), law.noise_of(z))
+
+
+def of_noise(slopes: np.ndarray, bends: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """What noise (N, n) of states makes of H, (N,), to second order: near an equilibrium H has no
+    slope."""
     first = np.sum((slopes * sigma) ** 2, axis=-1)
     second = 0.5 * np.sum((bends * sigma[:, :, None] * sigma[:, None]) ** 2, axis=(-2, -1))
-    return library.value(c, z), np.sqrt(first + second)
+    return np.sqrt(first + second)
 
 
 def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) -> PoissonLaw:
