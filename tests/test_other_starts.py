@@ -1,6 +1,8 @@
 """Laws of recordings that the textbook's library does not start: coordinates that nothing couples,
 bodies in potentials of lengths, zeros of angles that are far off."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import sympy as sp
@@ -218,19 +220,9 @@ def test_a_state_whose_derivatives_overflow_is_not_known():
     empty = np.zeros(0)
     triangles = np.array([[[2.0, 0.0], [0.0, 4.0]], [[np.inf, 0.0], [0.0, 1.0]]])
     fitted = Fitted(
-        empty,
-        empty,
-        empty,
-        empty,
-        empty,
-        empty,
-        empty,
-        triangles,
-        np.tile(np.eye(2), (2, 1, 1)),
-        empty,
-        0.0,
-        0,
-        True,
+        **dict.fromkeys([field.name for field in dataclasses.fields(Fitted)], empty)
+        | {"arcs": triangles, "transports": np.tile(np.eye(2), (2, 1, 1))}
+        | {"cost": 0.0, "iterations": 0, "converged": True}
     )
     known, unknown = fitted.last_covariance()
     np.testing.assert_allclose(known, np.diag([0.25, 0.0625]))

@@ -247,7 +247,7 @@ def test_rates_of_a_body_are_no_positions(seed):
 @pytest.mark.parametrize("names", [("wx", "wy", "wz"), ("gyro_x", "gyro_y", "gyro_z")])
 def test_names_tell_rates_of_turning(names):
     begin, w = tumbling(np.random.default_rng(0), 1)
-    with pytest.raises(InputError, match=r"about three axes.*wants runs of 3 speeds or more"):
+    with pytest.raises(InputError, match=r"about three axes.*3 or more runs of different speeds"):
         gfnn.Recording(begin | dict(zip(names, w, strict=True)))
 
 
