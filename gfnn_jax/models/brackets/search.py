@@ -188,8 +188,8 @@ def _energies(law: PoissonLaw, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def of_noise(slopes: np.ndarray, bends: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """What noise (N, n) of states makes of H, (N,), to second order: near an equilibrium H has no
-    slope."""
+    """Return what noise (N, n) of states makes of H, (N,), to second order: near an equilibrium H
+    has no slope."""
     first = np.sum((slopes * sigma) ** 2, axis=-1)
     second = 0.5 * np.sum((bends * sigma[:, :, None] * sigma[:, None]) ** 2, axis=(-2, -1))
     return np.sqrt(first + second)
