@@ -181,13 +181,15 @@ class Choice:
 
     def _on_one_level(self, law: LearnedHamiltonian) -> bool:
         """Return whether all states of noisy sequences are of one H."""
-        plain = law.noise is not None and law.noise.ndim == 1 and not law.friction
-        if not plain or self.base_map or self.pairs is None or self.pairs.args is not None:
+        noise, pairs = law.noise, self.pairs
+        if noise is None or noise.ndim != 1 or pairs is None or pairs.args is not None:
             return False
-        z, flow = self.pairs.z0, law.flow
+        if law.friction or self.base_map:
+            return False
+        z, flow = pairs.z0, law.flow
         h = flow.family.value(flow.params, z, None)
         slopes, bends = flow.family.gradient_and_hessian(flow.params, z, None)
-        by_noise = of_noise(slopes, bends, np.broadcast_to(law.noise, z.shape))
+        by_noise = of_noise(slopes, bends, np.broadcast_to(noise, z.shape))
         return on_one_level(h, by_noise, slopes, np.std(z, axis=0))
 
     @property
