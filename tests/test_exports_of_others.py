@@ -63,6 +63,13 @@ def test_words_beside_numbers_are_put_aside_and_said_so(tmp_path):
     assert "remark holds words and is put aside" in recording.notes
 
 
+def test_a_preamble_may_be_as_wide_as_the_table(tmp_path):
+    rows = "\n".join(f"{k * 0.1:.1f};{k % 7}".replace(".", ",") for k in range(40))
+    (tmp_path / "p.csv").write_text(f"Rig 3;Miller\nZeit [s];Weg [mm]\n{rows}\n")
+    recording = gfnn.read(tmp_path / "p.csv")
+    assert (recording.columns, recording.units["Weg"]) == (("Weg",), "mm")
+
+
 def test_a_damaged_row_below_the_names_is_no_preamble(tmp_path):
     (tmp_path / "bad.csv").write_text("t,x,y\n0,oops,2\n1,2,3\n2,3,4\n3,4,5\n")
     with pytest.raises(InputError, match="line 2, x: 'oops'"):

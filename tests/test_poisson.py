@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from analytic import states_in_motion
 from test_brackets_found import heavy, lorenz, populations, runs_of, top
 from test_exports import by_c, by_c_with, compiled, needs_cc
 
@@ -310,3 +311,21 @@ def test_no_law_has_a_verdict():
     with pytest.raises(FitError) as raised:
         gfnn.fit(pairs_of(runs_of(lorenz, starts, 0.1, 20)))
     assert raised.value.verdict.startswith("no law: no bracket")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("starts", "told"), [((1.0,), True), ((0.6, 1.3), False)])
+def test_noisy_states_of_one_energy_tell_no_more_than_f_of_h(starts, told):
+    """Of a pendulum, as (q, p), by one swing or by two of different size."""
+    rng, t = np.random.default_rng(5), 0.1 * np.arange(401)
+    runs = [states_in_motion(lambda q, v: -np.sin(q), [start, 0.0], t).T for start in starts]
+    noisy = [run + 1e-2 * rng.normal(size=run.shape) for run in runs]
+    pairs = gfnn.Pairs(
+        np.concatenate([z[:-1] for z in noisy]),
+        np.concatenate([z[1:] for z in noisy]),
+        0.1,
+        run=np.repeat(np.arange(len(runs)), 400),
+        place=np.tile(np.arange(400), len(runs)),
+    )
+    verdict = gfnn.fit(pairs, tolerance=0.1, learn="hamiltonian").verdict
+    assert verdict.startswith("one of several: H has one value") == told, verdict

@@ -169,6 +169,8 @@ class TextFile:
         if len(above) > 1 and len(above[-1]) == width:  # lines of another width end a preamble
             last = max((k for k, one in enumerate(above) if len(one) != width), default=-1)
             named = above[last + 1 :]
+        while len(named) > 1 and all(c[-1:] in "])" and split_unit(c)[1] for c in named[1]):
+            del named[0]  # of a preamble that is as wide: names with their units follow
         titles: list[str] = []
         while len(named) > 1 and all(named[1]) and not all(named[0]):
             titles = named.pop(0)

@@ -36,9 +36,9 @@ class StartOptions:
     followed, share: residual of a start, times the noise or of the variation, above which others
     are tried. far: zero of an angle, in radians, that a fit from 0 may not reach. few: samples a
     period, below which more of them are the remedy. plain: times the residual of the larger
-    library, that a plainer one's may have. noise: residual, times the noise, that is no more.
-    exponents: of the distance, where a power of it begins; beside: up to which it is then found;
-    rounded: up to which it is a half, or whole, or none.
+    library, that a plainer one's may have. noise: residual, times the noise, that is no more;
+    white: that lacks no term. exponents: of the distance, where a power of it begins; beside: up to
+    which it is then found; rounded: up to which it is a half, or whole, or none.
     """
 
     followed: float = 10.0
