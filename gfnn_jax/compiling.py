@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,29 @@ from typing import Any
 _SOONER = {"xla_cpu_use_fusion_emitters": False}
 # This option halves what is left of the compile time; such programs run several times slower.
 _SOONEST = {**_SOONER, "xla_backend_optimization_level": 0}
+
+
+def _printed(message: str) -> None:
+    if message:
+        print(f"gfnn_jax: {message}", file=sys.stderr, flush=True)
+
+
+_told: list[Callable[[str], object]] = [_printed]
+
+
+def say(message: str) -> None:
+    """Say what is compiled now, "" when it is done: on standard error, or where `shown_by` says."""
+    _told[-1](message)
+
+
+@contextlib.contextmanager
+def shown_by(told: Callable[[str], object]) -> Iterator[None]:
+    """Hand what `say` says to a function, in place of standard error."""
+    _told.append(told)
+    try:
+        yield
+    finally:
+        _told.remove(told)
 
 
 def enable_compile_cache(folder: str | Path | None = None) -> Path:

@@ -9,7 +9,7 @@ from gfnn_jax.signals.derivatives import derivatives, difference
 from gfnn_jax.signals.local_polynomials import local_fits
 from gfnn_jax.signals.noise import noise, resolution
 from gfnn_jax.signals.steps import dominant_frequencies, drift, even_runs, gaps, median_step
-from gfnn_jax.signals.wrong_values import wrong_values
+from gfnn_jax.signals.wrong_values import wrong_at_jumps, wrong_values
 
 RNG = np.random.default_rng(0)
 T = np.arange(0, 20, 0.01)
@@ -128,6 +128,16 @@ def test_a_sensor_that_is_stuck_at_speed_is_found():
     fast = int(np.abs(np.gradient(x)[100:300]).argmax()) + 100
     x[fast : fast + 25] = x[fast]
     assert found_in(x) == ([(fast + 1, fast + 25)], [])
+
+
+@pytest.mark.parametrize(("at", "wrong"), [(1.5, [100]), (-1.5, []), (0.7, []), (-1.8, [])])
+def test_a_sample_beyond_both_sides_of_a_jump_of_an_input(at, wrong):
+    """Not one that is of a side, between both, or overshoots."""
+    t = 0.02 * np.arange(200)
+    u = 1.5 * np.exp(-4 * (t % 2)) * np.sign(1.99 - t)
+    u[100] = at
+    found = wrong_at_jumps([t], [np.round(u, 4)], 1e-4)
+    assert [row for one in found for row in one.rows] == wrong
 
 
 def stick_slip():

@@ -313,10 +313,10 @@ def _drives(traits: Traits, name: str) -> bool:
     """Return whether accelerations follow a column as they follow an input."""
     recording = traits.recording
     angles = [n in recording.angles for n in recording.positions]
-    without = accelerations(traits, recording.inputs)
     beside = accelerations(traits, (*recording.inputs, name))
-    if without is None or beside is None or without.q.shape != beside.q.shape:
+    if beside is None:
         return False
+    without = dataclasses.replace(beside, u=beside.u[:-1])
     ratio = beside.held_out(angles) / np.maximum(without.held_out(angles), 1e-300)
     return bool(np.any(ratio < _OPTIONS.drives))
 

@@ -13,7 +13,7 @@ from gfnn_jax.signals.derivatives import Derivatives, Relation, derivatives, win
 from gfnn_jax.signals.local_polynomials import local_fits
 from gfnn_jax.signals.noise import Noise, noise, resolution
 from gfnn_jax.signals.steps import median_step
-from gfnn_jax.signals.wrong_values import WrongValues, wrong_values
+from gfnn_jax.signals.wrong_values import WrongValues, wrong_at_jumps, wrong_values
 
 if TYPE_CHECKING:
     from gfnn_jax.data.recording import Recording
@@ -122,7 +122,7 @@ def _rows(gone: np.ndarray) -> np.ndarray:
 
 
 def wrong_values_of(recording: Recording) -> dict[str, tuple[WrongValues, ...]]:
-    """The wrong values of each position and sensor, by name."""
+    """The wrong values of each position, sensor and input, by name."""
     times = [recording.times(run) for run in recording.runs]
     found = {}
     for name in (*recording.positions, *recording.sensors):
@@ -132,6 +132,9 @@ def wrong_values_of(recording: Recording) -> dict[str, tuple[WrongValues, ...]]:
         if name in recording.angles:  # one wrong value makes a wrapped angle seem lifted
             lifted = wrong_values(times, [_lifted(x) for x in parts], resolution(values))
             found[name] = _joined(found[name], lifted)
+    for name in recording.inputs:
+        parts = [recording.values(name, run) for run in recording.runs]
+        found[name] = wrong_at_jumps(times, parts, resolution(np.concatenate(parts)))
     return found
 
 

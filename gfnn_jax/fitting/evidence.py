@@ -59,7 +59,7 @@ EVIDENCE = Evidence()
 
 class Rival(NamedTuple):
     """Another law that the data allow, the odds of the one that was taken against it, and its terms
-    beside those of that one, "" where they are not told: "with x**4 in place of x**6"."""
+    beside those of that one, "" where they are not told: "with x⁴ in place of x⁶"."""
 
     formula: str
     odds: float

@@ -480,7 +480,7 @@ def _turned(w, place, centre):
     return turns
 
 
-@cached
+@cached("rollouts of laws", 5)
 def roll(law, task, substeps, inputs, moving):
     """Follow the lanes of a `Task`."""
     code, constants, ends, rule, weights, before, entries, values = law[:8]

@@ -49,6 +49,8 @@ import numpy as np
 from numba.core import config, event
 from numba.core.llvm_bindings import llvm
 
+from gfnn_jax import compiling
+
 FINE, UNFINISHED, LOST = range(3)  # status of a lane: followed; too many events; not finite
 # Kinds of friction; COULOMB: dry, without a width.
 VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN, RAISED_SPEED, ONE_SIDED = range(7)
@@ -138,9 +140,9 @@ class _Compilation(event.Listener):
 
     def on_start(self, event: event.Event) -> None:
         compiled = (event.data or {}).get("dispatcher")
-        if not any(compiled is one for one in _said):
+        if compiled not in _said:
             return
-        print("the motion of laws is compiled: some seconds, kept on disk", file=sys.stderr)
+        compiling.say(f"compiling, once on this machine, {_said[compiled]}")
         if compiled is follow:
             llvm.create_pipeline_tuning_options = _rolled
         else:
@@ -148,14 +150,17 @@ class _Compilation(event.Listener):
 
     def on_end(self, event: event.Event) -> None:
         compiled = (event.data or {}).get("dispatcher")
+        if compiled not in _said:
+            return
+        compiling.say("")
         if compiled is follow:
             llvm.create_pipeline_tuning_options = _options
-        elif any(compiled is one for one in _said):
+        else:
             config.SLP_VECTORIZE = 0  # pyright: ignore[reportAttributeAccessIssue]
 
 
 _options = llvm.create_pipeline_tuning_options
-_said: list = []  # functions of which it is said that they are compiled
+_said: dict = {}  # functions of which it is said that they are compiled -> what, and how long
 
 
 def _rolled(*arguments, **options):
@@ -165,10 +170,15 @@ def _rolled(*arguments, **options):
     return made
 
 
-def cached(whole):
-    """Compile with a cache on disk, and say so when it is done."""
-    _said.append(_kept(whole))
-    return _said[-1]
+def cached(what: str, seconds: int):
+    """Compile with a cache on disk; where that is done, say what it is and how long it takes."""
+
+    def kept(whole):
+        compiled = _kept(whole)
+        _said[compiled] = f"{what} (about {seconds} s)"
+        return compiled
+
+    return kept
 
 
 def _kept(whole):
@@ -942,7 +952,7 @@ def _store(n, f, task, place, fine):
         task.after[lane, m, k] = f[MODES, k] if fine else np.nan
 
 
-@cached
+@cached("the motion of laws", 15)
 def follow(n, f, laws, task, order):
     """Follow all lanes of a task, with derivatives in the state (``order`` 1) and in the
     coefficients (2). laws: the coefficients (R, ·) and the cosines and sines of the phases (R', 2

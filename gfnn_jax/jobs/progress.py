@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+from gfnn_jax import compiling
+
 # Least and most seconds between lines where standard error is no terminal.
 BETWEEN, LONGEST_SILENCE = 2.0, 5.0
 
@@ -30,7 +32,20 @@ SILENT = Progress()
 
 @contextlib.contextmanager
 def on_stderr() -> Iterator[Progress]:
-    """Show a status line on a terminal; elsewhere a line now and then, every 5 s at least."""
+    """Show a status line on a terminal; elsewhere a line now and then, every 5 s at least. What is
+    compiled meanwhile is a status too, until it is done."""
+    current = ["working"]
+
+    def status(message: str) -> None:
+        current[0] = message
+        shown.status(message)
+
+    with _shown() as shown, compiling.shown_by(lambda line: shown.status(line or current[0])):
+        yield shown._replace(status=status)
+
+
+@contextlib.contextmanager
+def _shown() -> Iterator[Progress]:
     if not sys.stderr.isatty():
         lines = _Lines()
         try:

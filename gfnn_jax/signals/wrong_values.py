@@ -13,6 +13,9 @@ it one that is off by a whole turn: an angle that was not lifted.
 from where it rested, and a coarse sensor shows its turning points by equal values beside which it
 moves by its smallest step. Only a sensor that was stuck while the motion went on catches up in one
 step, with a jump far above the steps around it.
+
+An input may jump and may be a pulse. What it cannot be is smooth on both sides of a jump, with one
+sample between them that is far beyond either (`wrong_at_jumps`).
 """
 
 from __future__ import annotations
@@ -46,6 +49,9 @@ class _Options:
     Stuck are at least ``fewest`` equal values (two or three are what a camera makes of a frame that
     it dropped) among ``around`` steps before and behind; jump: times the fastest of these, at
     least; resolutions: that the motion goes in a step (slower, equal values are a sensor's digits).
+
+    At jumps: smooth: degree of the polynomial of each side; beyond: part of the jump by which the
+    sample is beyond both sides, for the overshoot of a real one is less.
     """
 
     block: int = 16
@@ -67,6 +73,8 @@ class _Options:
     around: int = 8
     jump: float = 3.0
     resolutions: float = 2.0
+    smooth: int = 3
+    beyond: float = 0.5
 
 
 _OPTIONS = _Options()
@@ -103,6 +111,38 @@ def wrong_values(
         for begin, end, off in _outliers(t, x, step, rough):
             found.append(WrongValues(run, rows[begin:end], off))
     return tuple(sorted(found, key=lambda stretch: stretch.rows[0]))
+
+
+def wrong_at_jumps(
+    times: Sequence[np.ndarray], runs: Sequence[np.ndarray], resolution: float | None
+) -> tuple[WrongValues, ...]:
+    """The samples of an input (n_r,) of each run that are beyond both sides of a jump."""
+    begins, found, side = np.cumsum([0, *map(len, times)]), [], _OPTIONS.side
+    for run, (t, x, begin) in enumerate(zip(times, runs, begins, strict=False)):
+        ways = np.diff(x)
+        usual = np.abs(ways[np.isfinite(ways)])
+        high = _OPTIONS.suspected * float(np.median(usual)) if len(usual) else 0.0
+        turns = -ways[:-1] * ways[1:] > high**2  # not where a value is missing
+        for k in 1 + np.flatnonzero(turns):
+            if not side <= k < len(x) - side:
+                continue
+            sides = np.arange(k - side, k), np.arange(k + 1, k + 1 + side)
+            led = [_led(t[rows] - t[k], x[rows], resolution or 0.0) for rows in sides]
+            off, jump = x[k] - np.array([at for at, _ in led]), abs(led[0][0] - led[1][0])
+            least = _OPTIONS.far * max(sigma for _, sigma in led)
+            beyond = float(np.abs(off).min()) if off[0] * off[1] > 0 else 0.0
+            if jump > least and beyond > max(least, _OPTIONS.beyond * jump):
+                found.append(WrongValues(run, np.array([begin + k]), beyond))
+    return tuple(found)
+
+
+def _led(t: np.ndarray, x: np.ndarray, resolution: float) -> tuple[float, float]:
+    """Where samples (n,) of a side lead at time 0, and the standard deviation of that."""
+    q, r = np.linalg.qr(np.vander(t / np.abs(t).max(), _OPTIONS.smooth + 1))
+    left = x - q @ (q.T @ x)
+    sigma = max(resolution, float(np.sqrt(left @ left / (len(x) - _OPTIONS.smooth - 1))))
+    reach = np.linalg.solve(r.T, np.eye(len(r))[-1])
+    return float(q.T @ x @ reach), sigma * float(np.sqrt(1 + reach @ reach))
 
 
 def _misses(t: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
+from gfnn_jax.families.text import in_letters
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.libraries import RARE
@@ -90,9 +91,9 @@ def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
 
 
 def other_terms(fit: LawFit, other: LawFit) -> str:
-    """The terms of another fit beside those of one: "with x**4 in place of x**6"."""
+    """The terms of another fit beside those of one: "with x⁴ in place of x⁶"."""
     come, gone = (
-        ", ".join(fit.problem.word(key) for key in a.values if key not in b.values)
+        ", ".join(in_letters(fit.problem.word(key)) for key in a.values if key not in b.values)
         for a, b in ((other, fit), (fit, other))
     )
     if not come:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs, Nodes, Scales, arcs_of, with_noise, with_states
+from gfnn_jax.families.lagrangian import INPUTS
 from gfnn_jax.fitting.evidence import EVIDENCE, Evidence, correlation_time
 from gfnn_jax.fitting.linearised import Linearised, without_each
 from gfnn_jax.fitting.triangle import Triangle
@@ -197,7 +198,7 @@ class ArcProblem:
     parameters: names of those in which the systems of the runs differ. wander: of the zeros of
     channels, where they do. gauge: (n, d) positions over which the mean inertia is 1; those of the
     nodes unless given. inputs: `ArcInputs`, by the first of the rules unless given, or a function
-    of arcs in their place where nothing else is asked of them.
+    of arcs in their place where nothing else is asked of them. forces: names of the inputs.
     """
 
     nodes: Sequence[Nodes]
@@ -211,6 +212,7 @@ class ArcProblem:
     wander: Wander | None = None
     gauge: np.ndarray = None  # pyright: ignore[reportAssignmentType]
     inputs: Any = None
+    forces: tuple[str, ...] = INPUTS
 
     def __post_init__(self):
         if self.gauge is None:
@@ -283,7 +285,8 @@ class ArcProblem:
     def word(self, key: Key) -> str:
         """A coefficient by the names of columns."""
         seen = self.observation
-        return word_of(key, Names(seen.coordinates, seen.speeds, self.parameters))
+        names = Names(seen.coordinates, seen.speeds, self.parameters, self.forces)
+        return word_of(key, names.symbols)
 
     def law(self, structure: Structure, arcs: Arcs, p: np.ndarray, free: bool = True) -> LawOnArcs:
         """The law of coefficients p on arcs, all of them free or none."""

@@ -537,6 +537,7 @@ def samples_of(
         parameters=parameters,
         options=options,
         on_progress=on_progress,
+        forces=(*recording.inputs, *INPUTS[len(recording.inputs) :]),
     )
     return RecordingData(recording, problem, found, messages=messages)
 

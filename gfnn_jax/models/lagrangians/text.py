@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -28,12 +29,17 @@ class Names(NamedTuple):
     @classmethod
     def of(cls, recording: Recording) -> Names:
         """Make those of a recording; a wave that nobody recorded stands as it is."""
-        names, of_systems = recording.coordinates, parameters_of(recording)
-        speeds, inputs = speed_names(names, recording.velocities), recording.inputs
-        shown = symbols((*names, *speeds, *of_systems, *inputs))
-        a, b = 2 * len(names), len(shown) - len(inputs)
-        pushes = (n if is_wave(n) else s for n, s in zip(inputs, shown[b:], strict=True))
-        return cls(shown[: a // 2], shown[a // 2 : a], shown[a:b], tuple(pushes))
+        speeds = speed_names(recording.coordinates, recording.velocities)
+        of_systems = parameters_of(recording)
+        return cls(recording.coordinates, speeds, of_systems, recording.inputs).symbols
+
+    @property
+    def symbols(self) -> Names:
+        """The same as they can stand in a formula: Cart_A_dot of Cart A_dot."""
+        shown = iter(symbols(itertools.chain(*self)))
+        named = Names(*(tuple(itertools.islice(shown, len(names))) for names in self))
+        pushes = zip(self.inputs, named.inputs, strict=True)
+        return named._replace(inputs=tuple(n if is_wave(n) else s for n, s in pushes))
 
 
 def terms_of(terms: Terms, coefficients: np.ndarray, std: np.ndarray, names: Names) -> Formula:
