@@ -137,7 +137,7 @@ def wrong_at_jumps(
 
 
 def _led(t: np.ndarray, x: np.ndarray, resolution: float) -> tuple[float, float]:
-    """Where samples (n,) of a side lead at time 0, and the standard deviation of that."""
+    """Value that samples (n,) of a side lead to at time 0, and its standard deviation."""
     q, r = np.linalg.qr(np.vander(t / np.abs(t).max(), _OPTIONS.smooth + 1))
     left = x - q @ (q.T @ x)
     sigma = max(resolution, float(np.sqrt(left @ left / (len(x) - _OPTIONS.smooth - 1))))

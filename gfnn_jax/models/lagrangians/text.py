@@ -35,7 +35,7 @@ class Names(NamedTuple):
 
     @property
     def symbols(self) -> Names:
-        """The same as they can stand in a formula: Cart_A_dot of Cart A_dot."""
+        """Names that can stand in a formula: Cart_A_dot of Cart A_dot."""
         shown = iter(symbols(itertools.chain(*self)))
         named = Names(*(tuple(itertools.islice(shown, len(names))) for names in self))
         pushes = zip(self.inputs, named.inputs, strict=True)
