@@ -122,9 +122,11 @@ LAWS = {
 }
 ROBOT = "--robot"
 JOINTS, TORQUES = ["theta1", "theta2"], ["tau1", "tau2"]
+ROLES: dict[str, Any] = {"positions": JOINTS, "angles": JOINTS, "inputs": TORQUES}
 TERMS = [
     "omega1**2",
     "omega2**2",
+    "omega1*omega2",
     "omega1*omega2*cos(theta1 - theta2)",
     "V: cos(theta1)",
     "V: cos(theta2)",
@@ -313,63 +315,98 @@ def _by_mujoco(path: Path, map_: SymplecticMap, z: np.ndarray) -> float:
     return off
 
 
-def robot(quick: bool, path: Path) -> Numbers:
-    """A law of the robot arm as MJCF: how far MuJoCo's motion is from the law's own."""
-    mujoco: Any = importlib.import_module("mujoco")
+@functools.cache
+def of_robot(path: Path, quick: bool) -> tuple[gfnn.Fit, Any]:
+    """The law of the robot arm's first runs, in absolute angles, and the table of its last run."""
     table = pd.read_csv(path)
     table["theta2"] += table["theta1"]
-    table = table[["run", "t", "theta1", "theta2", "tau1", "tau2"]]
-    roles: dict[str, Any] = {"positions": JOINTS, "angles": JOINTS, "inputs": TORQUES}
+    table = table[["run", "t", *JOINTS, *TORQUES]]
     training = table[table["run"] < (1 if quick else TRAINED)]
-    fit = gfnn.fit(gfnn.Recording(training, **roles), terms=TERMS)
-    map_ = fit.map
-    last: Any = table[table["run"] == table["run"].max()]
-    dt, t, torques = float(map_.dt), last["t"].to_numpy(), last[TORQUES].to_numpy()
-    count, starts, states, inputs = round(AHEAD / dt), np.arange(2.0, 9.0, 0.35), [], []
-    for start in starts:
-        before = last[(t >= start - WINDOW) & (t <= start)].drop(columns="run")
-        states.append(np.asarray(map_.estimate(gfnn.Recording(before, **roles))[0])[0])
-        ahead = start + dt * np.arange(count + 1)
-        inputs.append(np.stack([np.interp(ahead, t, u) for u in torques.T], axis=1))
-    z = np.array(states)
-    ends = np.asarray(map_.rollout(z, count, inputs=np.array(inputs))[0])[:, -1]
+    fit = gfnn.fit(gfnn.Recording(training, **ROLES), terms=TERMS)
+    return fit, table[table["run"] == table["run"].max()].drop(columns="run")
+
+
+def robot(quick: bool, path: Path) -> Numbers:
+    """A law of the robot arm as MJCF: how far MuJoCo's motion is from the law's own."""
+    fit, last = of_robot(path, quick)
+    return _beside_mujoco(fit, gfnn.Recording(last, **ROLES), np.arange(2.0, 9.0, 0.35))
+
+
+def swings(quick: bool) -> Numbers:
+    """The same of the double pendulum that comes with the package, the last third of its record."""
+    of = {"angles": JOINTS, "positions": JOINTS}
+    record = gfnn.read(gfnn.records.path("double_pendulum"), **of)
+    t = record.times(record.runs[0])
+    fit = gfnn.fit(record.slice(stop=t[2 * len(t) // 3]))
+    return _beside_mujoco(fit, record, np.linspace(t[2 * len(t) // 3], t[-1] - AHEAD, 22)[1:-1])
+
+
+def _beside_mujoco(fit: gfnn.Fit, record: gfnn.Recording, starts: np.ndarray) -> Numbers:
+    """Forecasts over half a second from states estimated at these times of a record, by the law and
+    by MuJoCo from its MJCF, under the inputs of the record."""
+    map_, run = fit.map, record.runs[0]
+    dt, t = float(map_.dt), record.times(run)
+    count, dim, names = round(AHEAD / dt), map_.dim, record.inputs
+    states = [map_.estimate(record.slice(start - WINDOW, start))[0] for start in starts]
+    z = np.array([np.asarray(state)[0] for state in states])
+    ahead = starts[:, None] + dt * np.arange(count + 1)
+    u = [np.interp(ahead, t, record.values(name, run)) for name in names]
+    given = {"inputs": np.stack(u, axis=-1)} if names else {}
+    own = np.asarray(map_.rollout(z, count, **given)[0])[:, -1, :dim]
+    mujoco: Any = importlib.import_module("mujoco")
     with tempfile.TemporaryDirectory() as folder:
-        for to in ("mjcf", "urdf"):
-            gfnn.export(map_, to, Path(folder) / f"arm{SUFFIXES[to]}")
-        model = mujoco.MjModel.from_xml_path(str(Path(folder) / f"arm{SUFFIXES['mjcf']}"))
-    step, joints, off = model.opt.timestep, np.tril(np.ones((2, 2))), []
-    for start, begun, v, end in zip(starts, z, velocities_of(map_, z), ends, strict=True):
+        gfnn.export(map_, "urdf", Path(folder) / "own.urdf")
+        path = gfnn.export(map_, "mjcf", Path(folder) / "own.xml")
+        model = mujoco.MjModel.from_xml_path(str(path))
+    steps = int(np.ceil(count * dt / model.opt.timestep))
+    model.opt.timestep = count * dt / steps
+    joints, ends = np.tril(np.ones((dim, dim))), []  # absolute angles of those of the joints
+    for n, (begun, v) in enumerate(zip(z, velocities_of(map_, z), strict=True)):
         data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = (np.linalg.solve(joints, x) for x in (begun[:2], v))
-        for k in range(round(count * dt / step)):
-            data.ctrl[:] = [np.interp(start + (k + 0.5) * step, t, u) for u in torques.T]
+        data.qpos[:], data.qvel[:] = (np.linalg.solve(joints, x) for x in (begun[:dim], v))
+        for k in range(steps):
+            now = starts[n] + (k + 0.5) * model.opt.timestep
+            data.ctrl[:] = [np.interp(now, ahead[n], row[n]) for row in u]
             mujoco.mj_step(model, data)
-        off.append(np.abs(joints @ data.qpos - end[:2]))
+        ends.append(joints @ data.qpos)
+    read = [np.interp(ahead[:, -1], t, record.unwrapped(name, run)) for name in record.positions]
+
+    def off(found: np.ndarray, others: Any) -> Numbers:
+        turned = np.abs(np.angle(np.exp(1j * (found - others))))
+        return {"median": 1e3 * float(np.median(turned)), "largest": 1e3 * float(turned.max())}
+
     return {
         "formula": fit.formula,
         "friction": str(fit.friction),
-        "ahead": AHEAD,
-        "step": step,
+        "ahead": count * dt,
+        "step": model.opt.timestep,
         "starts": len(starts),
-        "median": 1e3 * float(np.median(off)),
-        "largest": 1e3 * float(np.max(off)),
+        **off(np.array(ends), own),
+        "measured": {
+            "law": off(own, np.transpose(read)),
+            "mujoco": off(np.array(ends), np.transpose(read)),
+        },
     }
 
 
 PIECES = {name: functools.partial(measured, name=name) for name in LAWS}
+RECORDED = {"robot-arm": "a robot arm, torques", "swings": "a double pendulum, free"}
 
 
 def tables() -> None:
-    arm = results({"robot-arm": PIECES["pendulum"]}, "machines")
-    for result in arm.values():
-        m = result["measured"]
-        text = (
-            f"The robot arm's law as MJCF, {m['starts']} starts in a run that no fit saw: MuJoCo's "
-            f"angles after {m['ahead']} s, at its step of {1e3 * m['step']:g} ms, are "
-            f"{number(m['median'])} mrad from the law's own motion in the median and "
-            f"{number(m['largest'])} at most (5 asked)."
-        )
-        between_markers(TABLES, "machines-robot", f"{text}\n\n{provenance(arm)}")
+    arm = results(dict.fromkeys(RECORDED, swings), "machines")
+    rows = [
+        [
+            RECORDED[name],
+            str(m["starts"]),
+            f"{number(m['median'])} / {number(m['largest'])}",
+            *(number(m["measured"][own]["median"]) for own in ("law", "mujoco")),
+        ]
+        for name, m in ((name, result["measured"]) for name, result in arm.items())
+    ]
+    heads = ["record", "starts", "MuJoCo from the law, median / largest", "law", "MuJoCo"]
+    heads[3:] = [f"{own} from what was measured, median" for own in heads[3:]]
+    between_markers(TABLES, "machines-robot", f"{markdown(heads, rows)}\n\n{provenance(arm)}")
     found = results(PIECES, "machines")
     if not found:
         return
@@ -389,7 +426,7 @@ def tables() -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     arguments = list(sys.argv[1:] if argv is None else argv)
-    pieces = dict(PIECES)
+    pieces: dict[str, Any] = {**PIECES, "swings": swings}
     if ROBOT in arguments:
         at = arguments.index(ROBOT)
         pieces["robot-arm"] = functools.partial(robot, path=Path(arguments[at + 1]))

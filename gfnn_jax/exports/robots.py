@@ -3,10 +3,12 @@ planar chain of links.
 
 With absolute angles θ_i from where links hang, a chain has
 
-    T = ½ Σ_i a_i θ̇_i² + Σ_{i<j} b_ij cos(θ_i − θ_j) θ̇_i θ̇_j,      V = −Σ_i g β_i cos θ_i
+    T = ½ Σ_i a_i θ̇_i² + Σ_{i<j} b_ij cos(θ_i − θ_j) θ̇_i θ̇_j + ½ Σ_{i>1} ρ_i (θ̇_i − θ̇_{i−1})²
+    V = −Σ_i g β_i cos θ_i
     a_i = I_i + m_i c_i² + l_i² Σ_{k>i} m_k,    β_i = m_i c_i + l_i Σ_{k>i} m_k,    b_ij = l_i β_j
 
-with mass m, length l, centre c and inertia I about it of each link. L determines a, b and β, up to
+with mass m, length l, centre c and inertia I about it of each link, and inertia ρ of the rotor of
+its joint, that of the first being part of its link. L determines a, b, β and ρ, up to
 its scale; so the lengths of all links but the last are known. Of each link's m, c and I one number
 is free: it is given the mass of a uniform rod, unless that leaves another link no inertia. All
 choices move alike. What a format cannot hold is told in its comment.
@@ -130,11 +132,13 @@ def _conventions(dim: int) -> Iterator[np.ndarray]:
 
 @dataclasses.dataclass(frozen=True)
 class _Chain:
-    """A chain as fitted: a (d,), b (d, d) above the diagonal, gβ (d,), zeros of the absolute
-    angles, and how far it is from the law. turn: of the measured coordinates into these angles."""
+    """A chain as fitted: a (d,), b (d, d) above the diagonal, ρ (d,), gβ (d,), zeros of the
+    absolute angles, and how far it is from the law. turn: of the measured coordinates into these
+    angles."""
 
     a: np.ndarray
     b: np.ndarray
+    rotors: np.ndarray
     weight: np.ndarray
     zeros: np.ndarray
     turn: np.ndarray
@@ -156,18 +160,22 @@ class _Chain:
         strong = weight > OPTIONS.still * np.abs(masses).max()
         weight, zeros = np.where(strong, weight, 0.0), np.where(strong, zeros, 0.0)
         a, b = masses[:, range(dim), range(dim)].mean(axis=0), np.zeros((dim, dim))
-        model = np.zeros_like(masses)
+        model, rotors, size = np.zeros_like(masses), np.zeros(dim), np.linalg.norm(masses)
         model[:, range(dim), range(dim)] = a
-        for i in range(dim):
-            for j in range(i + 1, dim):
-                wave = np.cos(theta[:, i] - theta[:, j] - zeros[i] + zeros[j])
+        for i, j in zip(*np.triu_indices(dim, 1), strict=True):
+            wave = np.cos(theta[:, i] - theta[:, j] - zeros[i] + zeros[j])
+            rows = np.stack([wave, -np.ones_like(wave)], axis=1)
+            b[i, j], rotor = np.linalg.lstsq(rows, masses[:, i, j])[0]
+            if j == i + 1 and rotor > OPTIONS.still * size:
+                rotors[j] = rotor
+            else:
                 b[i, j] = wave @ masses[:, i, j] / (wave @ wave)
-                model[:, i, j] = model[:, j, i] = b[i, j] * wave
-        size = np.linalg.norm(masses)
+            model[:, i, j] = model[:, j, i] = b[i, j] * wave - rotors[j] * (j == i + 1)
+        a = a - rotors - np.append(rotors[1:], 0.0)
         off = np.linalg.norm(model - masses) / size
         if np.linalg.norm(forces) > OPTIONS.still * size:
             off = max(off, np.linalg.norm(shown - forces) / np.linalg.norm(forces))
-        return _Chain(a, b, weight, zeros, turn, float(off))
+        return _Chain(a, b, rotors, weight, zeros, turn, float(off))
 
 
 def _lengths(chain: _Chain) -> tuple[np.ndarray, np.ndarray, float, list[str]]:
@@ -264,7 +272,8 @@ def _of_chain(map_: SymplecticMap, law: Lagrangian, chain: _Chain) -> Robot:
             Rotation.from_euler("y", -zeros[j]),
             (lengths[j - 1] if j else 0.0) * down,
             np.array([0.0, 1.0, 0.0]),
-            length=lengths[j] or 2 * centres[j] or 1.0,
+            chain.rotors[j],
+            lengths[j] or 2 * centres[j] or 1.0,
         )
         for j in range(dim)
     ]
