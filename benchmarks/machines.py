@@ -9,9 +9,9 @@ Every law is drawn with coefficients at random within a few percent. Its flow is
 of 8 stages in 8 substeps, to roundoff: 10⁴ independent single steps, and 100 steps in a row of 20
 states. MuJoCo follows chains of links for 1 s by steps of 1 ms. FILE is the record of an arm of two
 links moved by motors (Wiebe et al., IEEE RA-L 2024), in absolute angles: its law, of four runs, is
-written as MJCF, and MuJoCo moved by the torques of the last run for 0.5 s from its states. A
-piece's result is one JSON file, machines-*.json in benchmarks/results; formats whose tool is not
-installed are left out.
+written as MJCF, and MuJoCo moved by the torques of the last run for 0.5 s from its states; the same
+of the double pendulum that comes with the package, which moves freely. A piece's result is one JSON
+file, machines-*.json in benchmarks/results; formats whose tool is not installed are left out.
 """
 
 from __future__ import annotations
@@ -316,9 +316,9 @@ def _by_mujoco(path: Path, map_: SymplecticMap, z: np.ndarray) -> float:
 
 
 @functools.cache
-def of_robot(path: Path, quick: bool) -> tuple[gfnn.Fit, Any]:
+def of_robot(path: Path, quick: bool) -> tuple[gfnn.Fit, pd.DataFrame]:
     """The law of the robot arm's first runs, in absolute angles, and the table of its last run."""
-    table = pd.read_csv(path)
+    table: Any = pd.read_csv(path)
     table["theta2"] += table["theta1"]
     table = table[["run", "t", *JOINTS, *TORQUES]]
     training = table[table["run"] < (1 if quick else TRAINED)]
@@ -334,8 +334,8 @@ def robot(quick: bool, path: Path) -> Numbers:
 
 def swings(quick: bool) -> Numbers:
     """The same of the double pendulum that comes with the package, the last third of its record."""
-    of = {"angles": JOINTS, "positions": JOINTS}
-    record = gfnn.read(gfnn.records.path("double_pendulum"), **of)
+    path = gfnn.records.path("double_pendulum")
+    record = gfnn.read(path, angles=JOINTS, positions=JOINTS)
     t = record.times(record.runs[0])
     fit = gfnn.fit(record.slice(stop=t[2 * len(t) // 3]))
     return _beside_mujoco(fit, record, np.linspace(t[2 * len(t) // 3], t[-1] - AHEAD, 22)[1:-1])
@@ -351,8 +351,8 @@ def _beside_mujoco(fit: gfnn.Fit, record: gfnn.Recording, starts: np.ndarray) ->
     z = np.array([np.asarray(state)[0] for state in states])
     ahead = starts[:, None] + dt * np.arange(count + 1)
     u = [np.interp(ahead, t, record.values(name, run)) for name in names]
-    given = {"inputs": np.stack(u, axis=-1)} if names else {}
-    own = np.asarray(map_.rollout(z, count, **given)[0])[:, -1, :dim]
+    given = np.stack(u, axis=-1) if names else None
+    own = np.asarray(map_.rollout(z, count, inputs=given)[0])[:, -1, :dim]
     mujoco: Any = importlib.import_module("mujoco")
     with tempfile.TemporaryDirectory() as folder:
         gfnn.export(map_, "urdf", Path(folder) / "own.urdf")
@@ -360,13 +360,16 @@ def _beside_mujoco(fit: gfnn.Fit, record: gfnn.Recording, starts: np.ndarray) ->
         model = mujoco.MjModel.from_xml_path(str(path))
     steps = int(np.ceil(count * dt / model.opt.timestep))
     model.opt.timestep = count * dt / steps
+    rule = map_.signals
+    is_linear, delay = (rule.degree > 0, rule.delay) if rule is not None else (True, 0.0)
     joints, ends = np.tril(np.ones((dim, dim))), []  # absolute angles of those of the joints
     for n, (begun, v) in enumerate(zip(z, velocities_of(map_, z), strict=True)):
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = (np.linalg.solve(joints, x) for x in (begun[:dim], v))
         for k in range(steps):
-            now = starts[n] + (k + 0.5) * model.opt.timestep
-            data.ctrl[:] = [np.interp(now, ahead[n], row[n]) for row in u]
+            now = (k + 0.5) * model.opt.timestep - delay
+            at = now if is_linear else dt * (now // dt)
+            data.ctrl[:] = [np.interp(at, ahead[n] - starts[n], row[n]) for row in u]
             mujoco.mj_step(model, data)
         ends.append(joints @ data.qpos)
     read = [np.interp(ahead[:, -1], t, record.unwrapped(name, run)) for name in record.positions]

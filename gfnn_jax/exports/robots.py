@@ -252,6 +252,8 @@ def _of_chain(map_: SymplecticMap, law: Lagrangian, chain: _Chain) -> Robot:
         notes.append("friction in proportion to the momenta is left out: these formats have none")
     named = map_.signals.names if map_.signals is not None else ()
     gains = joints.T @ np.asarray(law.gains).reshape(dim, len(named))
+    if map_.signals is not None and map_.signals.delay:
+        notes.append(f"inputs act {map_.signals.delay:.3g} s later than their samples say")
     sensors = map_.sensors
     names = sensors.positions if sensors is not None else tuple(f"q{i + 1}" for i in range(dim))
     notes.append("L is known up to a factor where no mass is: masses, inertias and torques have it")
@@ -384,17 +386,17 @@ def mjcf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
         f'  <motor name={quoteattr(own)} tendon="{along(row)}"/>'
         for own, row in robot.inputs.items()
     ]
-    step, integrator = min(robot.dt, _STEP), "implicitfast" if robot.dry else "RK4"
+    step = min(robot.dt, _STEP)
     # Friction that holds within two steps: MuJoCo's own lets a body creep that friction holds. The
-    # arm of benchmarks/machines.py is 5 mrad off after 0.5 s by that, and 1 mrad by this.
+    # arm of benchmarks/machines.py is 5 mrad off after 0.5 s by that, and 1 mrad by this. Of its
+    # implicit steps, of first order, the free pendulum there is 9 mrad off, by these 0.03.
     stiff = f'solreffriction="{_text(2 * step)} 1" solimpfriction="0.999 0.999 0.001"'
     parts = [
         f"<mujoco model={quoteattr(name)}>",
         _comment(robot, about),
         '<compiler angle="radian" inertiafromgeom="false" boundmass="0" boundinertia="0"/>',
         f"<default><joint {stiff}/><tendon {stiff}/></default>",
-        f'<option timestep="{_text(step)}" gravity="{_text(robot.gravity)}" '
-        f'integrator="{integrator}"/>',
+        f'<option timestep="{_text(step)}" gravity="{_text(robot.gravity)}" integrator="RK4"/>',
         "<worldbody>",
         *(body(i) for i, link in enumerate(links) if link.parent == BASE),
         "</worldbody>",
