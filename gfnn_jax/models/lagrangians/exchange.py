@@ -23,9 +23,9 @@ from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.families.text import in_letters
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians.fit import LawFit
-from gfnn_jax.models.lagrangians.libraries import RARE
+from gfnn_jax.models.lagrangians.libraries import FEW, RARE
 from gfnn_jax.models.lagrangians.structure import Structure, is_constant
-from gfnn_jax.models.lagrangians.weak_form import protected
+from gfnn_jax.models.lagrangians.weak_form import promising, protected
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,7 +213,7 @@ class _Screen:
 
     @classmethod
     def of(cls, fit: LawFit, every: Structure) -> _Screen:
-        every = dataclasses.replace(every, leaders=fit.structure.leaders)
+        every = promising(fit, dataclasses.replace(every, leaders=fit.structure.leaders))
         kinds = ("term", "loss") if fit.problem.options.choose_friction else ("term",)
         named = (k for k in every.keys() if k[0] in kinds and k not in fit.values)  # noqa: SIM118
         larger = fit.structure.plus([k for k in named if fit.structure.may_have(k)])
@@ -237,7 +237,7 @@ class _Screen:
         """Sets of places, and by how much their criterion is above that of the fit; the likeliest
         first. None has friction that drives."""
         rough: dict[frozenset[int], float] = {}
-        for leaving in range(OPTIONS.most + 1):
+        for leaving in range(self.most + 1):
             for gone in combinations(self.leave, leaving):
                 rough |= self._exchanges(self.own - set(gone))
         begun = sorted(rough, key=lambda one: rough[one])[:_BEGUN]
@@ -249,6 +249,11 @@ class _Screen:
         }
         found.pop(self.own, None)
         return sorted(found.items(), key=lambda one: one[1])
+
+    @property
+    def most(self) -> int:
+        """Terms that leave, and that come; of many coordinates one, for pairs would be too many."""
+        return OPTIONS.most if self.larger.dim <= FEW else 1
 
     @cached_property
     def _products(self) -> np.ndarray:
@@ -265,6 +270,17 @@ class _Screen:
         some = np.flatnonzero(size > OPTIONS.imitated)
         shared, size, left = shared[:, some], size[some], float(rest @ rest)
         along = new[:, some].T @ rest / size
+        gains = {(): 0.0} | {(k,): along[k] ** 2 for k in sorted(_largest(along**2, _BEGUN))}
+        if self.most > 1:
+            gains |= self._of_pairs(some, along, shared, size)
+        come = self.come[some].tolist()
+        found = {kept.union(come[k] for k in new): left - gain for new, gain in gains.items()}
+        return {places: self._criterion(places, cost) for places, cost in found.items()}
+
+    def _of_pairs(
+        self, some: np.ndarray, along: np.ndarray, shared: np.ndarray, size: np.ndarray
+    ) -> dict[tuple[int, int], float]:
+        """The pairs that explain most, and the sum of squares that each explains."""
         apart = self._products[np.ix_(some, some)] - shared.T @ shared
         apart /= np.outer(size, size)  # cosines
         two = -2 * np.outer(along, along) * apart + along**2 + along[:, None] ** 2
@@ -273,11 +289,7 @@ class _Screen:
         rows = _largest(two.max(axis=1, initial=0.0), 2 * OPTIONS.screened)
         i, j = np.divmod(_largest(two[rows].ravel(), 2 * OPTIONS.screened), max(len(some), 1))
         pairs = {(min(one), max(one)) for one in zip(rows[i], j, strict=True) if np.ptp(one)}
-        gains = {(): 0.0} | {(k,): along[k] ** 2 for k in sorted(_largest(along**2, _BEGUN))}
-        gains |= {pair: two[pair] for pair in sorted(pairs, key=lambda pair: (-two[pair], pair))}
-        come = self.come[some].tolist()
-        found = {kept.union(come[k] for k in new): left - gain for new, gain in gains.items()}
-        return {places: self._criterion(places, cost) for places, cost in found.items()}
+        return {pair: two[pair] for pair in sorted(pairs, key=lambda pair: (-two[pair], pair))}
 
     def _solved(self, places: frozenset[int]) -> tuple[np.ndarray, float]:
         """Coefficients of these places, in their order, and the sum of squares that they leave."""

@@ -145,16 +145,18 @@ def _is_coupled(row: Loss) -> bool:
     return sum(map(bool, row[0])) > 1
 
 
-class _Judged(NamedTuple):
-    """A set of frictions and its held-out residuals (A, L, k); rounding: of each of these;
-    sizes: each ρ from all arcs, divided by the least that counts as seen, √log n of its standard
-    errors; criterion: Schwarz's, of all arcs."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Judged:
+    """A set of the candidates of a table (indices), by ρ (thirds, n) of all, each from the arcs
+    without a third."""
 
-    rows: tuple[Loss, ...]
-    residuals: np.ndarray
-    rounding: float
-    sizes: np.ndarray
-    criterion: float
+    table: Table
+    subset: tuple[int, ...]
+    losses: np.ndarray
+
+    @property
+    def rows(self) -> tuple[Loss, ...]:
+        return tuple(self.table.candidates[k] for k in self.subset)
 
     @property
     def kinds(self) -> tuple[int, ...]:
@@ -165,14 +167,48 @@ class _Judged(NamedTuple):
         """The rank of its kinds among as many others, uniform friction first."""
         return tuple(sorted(-1 if kind == UNIFORM else kind for kind in self.kinds))
 
-    @property
+    @functools.cached_property
     def cost(self) -> float:
-        return float(np.sum(self.residuals**2) + self.residuals.size * self.rounding**2)
+        """Sum of squares of the held-out residuals."""
+        held = zip(self.table.held_out, self.losses, strict=True)
+        rest = sum(float(np.sum((own[:, -1] - own[:, :-1] @ rho) ** 2)) for own, rho in held)
+        return rest + self.table.rows[..., 0].size * self.table.rounding**2
 
-    @property
+    @functools.cached_property
     def independent(self) -> float:
-        """Residuals that are independent."""
-        return np.count_nonzero(self.residuals) / correlation_time(self.residuals)
+        """Held-out residuals that are independent."""
+        table = self.table
+        residuals = np.zeros(table.rows.shape[:3])
+        for held, rho in zip(table.folds, self.losses, strict=True):
+            residuals[held] = table.reduced[held] @ np.append(-rho, 1.0)
+        return np.count_nonzero(residuals) / correlation_time(residuals)
+
+    @functools.cached_property
+    def _of_all(self) -> np.ndarray:
+        """ρ of all candidates, from all arcs."""
+        return self.table.solve(self.table.own[-1], self.subset)
+
+    @functools.cached_property
+    def criterion(self) -> float:
+        """Schwarz's, of all arcs."""
+        table = self.table
+        rest = table.rest(self._of_all) ** 2 + table.count * table.rounding**2
+        return criterion(rest, table.independent, len(self.subset))
+
+    @functools.cached_property
+    def sizes(self) -> np.ndarray:
+        """Each ρ from all arcs, divided by the least that counts as seen, √log n of its standard
+        errors."""
+        table, columns = self.table, list(self.subset)
+        own = table.own[-1]
+        if len(own) <= len(columns):
+            return np.zeros(len(columns))  # nothing sets their errors
+        norms = np.maximum(np.linalg.norm(own[:, columns], axis=0), 1e-300)
+        inverse = np.linalg.pinv(own[:, columns] / norms, rcond=OPTIONS.rank)
+        noise = table.variance(table.rest(self._of_all)) + table.rounding**2
+        errors = np.linalg.norm(inverse, axis=1) * np.sqrt(table.correlation * noise)
+        z = self._of_all[columns] * norms / np.maximum(errors, 1e-300)
+        return z / np.sqrt(np.log(table.independent))
 
     @property
     def is_seen(self) -> bool:
@@ -280,6 +316,11 @@ class Table:
         """The number of residuals."""
         return int(np.count_nonzero(self.rows[..., -1]))
 
+    @property
+    def independent(self) -> float:
+        """The number of these that are independent."""
+        return max(self.count / self.correlation, np.e)
+
     @functools.cached_property
     def triangles(self) -> list[np.ndarray]:
         """Triangles of the arcs without each third, and of all."""
@@ -287,9 +328,29 @@ class Table:
         flat = [self.rows[keep].reshape(-1, self.rows.shape[-1]) for keep in kept]
         return [np.asarray(np.linalg.qr(part, mode="r")) for part in flat]
 
-    def solve(self, triangle: np.ndarray, subset: Sequence[int]) -> np.ndarray:
+    @functools.cached_property
+    def own(self) -> list[np.ndarray]:
+        """Of the same the triangles of the candidates, other coefficients at their best."""
+        return [triangle[self.width :, self.width :] for triangle in self.triangles]
+
+    @functools.cached_property
+    def reduced(self) -> np.ndarray:
+        """Rows (A, L, k, m + 1) of the m candidates, other coefficients at the best that they have
+        on the arcs of the other thirds."""
+        f, found = self.width, self.rows[..., self.width :].copy()
+        for triangle, held in zip(self.triangles[:-1], self.folds, strict=True):
+            others = np.linalg.pinv(triangle[:f, :f], rcond=OPTIONS.rank) @ triangle[:f, f:]
+            found[held] -= self.rows[held][..., :f] @ others
+        return found
+
+    @functools.cached_property
+    def held_out(self) -> list[np.ndarray]:
+        """Triangles of these rows, of each third."""
+        rows = [self.reduced[held].reshape(-1, self.reduced.shape[-1]) for held in self.folds]
+        return [np.asarray(np.linalg.qr(part, mode="r")) for part in rows]
+
+    def solve(self, own: np.ndarray, subset: Sequence[int]) -> np.ndarray:
         """ρ of all candidates, of these at least 0, of the others 0."""
-        own = triangle[self.width :, self.width :]
         losses, columns = np.zeros(len(self.candidates)), list(subset)
         if columns and len(own):  # a single arc leaves nothing to find them from
             scale = np.maximum(np.linalg.norm(own[:, columns], axis=0), 1e-300)
@@ -297,37 +358,14 @@ class Table:
         return losses
 
     def judged(self, subset: Sequence[int]) -> _Judged:
-        """Residuals of these candidates on the thirds that no coefficient is from."""
-        residuals, f = np.zeros(self.rows.shape[:3]), self.width
-        for triangle, held in zip(self.triangles[:-1], self.folds, strict=True):
-            losses = self.solve(triangle, subset)
-            aim = triangle[:f, -1] - triangle[:f, f:-1] @ losses
-            others = np.linalg.lstsq(triangle[:f, :f], aim, rcond=OPTIONS.rank)[0]
-            residuals[held] = self.rows[held] @ np.concatenate([-others, -losses, [1.0]])
-        rows = tuple(self.candidates[k] for k in subset)
-        n = max(self.count / self.correlation, np.e)
-        rest = self._rest(self.solve(self.triangles[-1], subset)) ** 2
-        rest += self.count * self.rounding**2
-        sizes = self.significance(subset) / np.sqrt(np.log(n))
-        return _Judged(rows, residuals, self.rounding, sizes, criterion(rest, n, len(rows)))
+        """These candidates, judged by the thirds that no coefficient is from."""
+        losses = np.array([self.solve(own, subset) for own in self.own[:-1]])
+        return _Judged(self, tuple(subset), losses)
 
-    def _rest(self, losses: np.ndarray) -> float:
+    def rest(self, losses: np.ndarray) -> float:
         """Norm of the residuals of all arcs with these ρ."""
-        own = self.triangles[-1][self.width :, self.width :]
+        own = self.own[-1]
         return float(np.linalg.norm(own[:, -1] - own[:, :-1] @ losses))
-
-    def significance(self, subset: Sequence[int]) -> np.ndarray:
-        """ρ of these candidates from all arcs, in standard errors."""
-        triangle, columns = self.triangles[-1], list(subset)
-        own = triangle[self.width :, self.width :]
-        if len(own) <= len(columns):
-            return np.zeros(len(columns))  # nothing sets their errors
-        losses = self.solve(triangle, columns)
-        norms = np.maximum(np.linalg.norm(own[:, columns], axis=0), 1e-300)
-        inverse = np.linalg.pinv(own[:, columns] / norms, rcond=OPTIONS.rank)
-        variance = self.correlation * (self._variance(self._rest(losses)) + self.rounding**2)
-        errors = np.linalg.norm(inverse, axis=1) * np.sqrt(variance)
-        return losses[columns] * norms / np.maximum(errors, 1e-300)
 
     def leanest(self, kinds: tuple[int, ...]) -> _Judged | None:
         """The set of all these kinds without the directions that are not seen beside others of
@@ -357,7 +395,7 @@ class Table:
 
     def _not_below_zero(self, subset: Sequence[int]) -> tuple[int, ...]:
         """The candidates among these whose ρ from all arcs is above zero."""
-        found = self.solve(self.triangles[-1], subset)
+        found = self.solve(self.own[-1], subset)
         return tuple(k for k in subset if found[k] > 0)
 
     def _lean(
@@ -365,22 +403,26 @@ class Table:
     ) -> _Judged:
         """The set without its spare directions: first those that are not seen, or first those that
         held-out arcs do not miss. Each of its kinds keeps one."""
-        here = judged(subset)
-        count = here.independent
+        begun = here = judged(subset)
         while True:
-            fewer = {k: judged(tuple(other for other in subset if other != k)) for k in subset}
-            fewer = {k: s for k, s in fewer.items() if s.kinds == here.kinds}
-            if not fewer:
+            kinds = [self.candidates[k][1] for k in here.subset]
+            sizes = dict(zip(here.subset, here.sizes, strict=True))
+            fewer = {
+                k: tuple(other for other in here.subset if other != k)
+                for k, kind in zip(here.subset, kinds, strict=True)
+                if kinds.count(kind) > 1
+            }
+            unseen = [k for k in fewer if sizes[k] <= 1]
+            smallest = min(unseen, key=lambda k: sizes[k], default=None)
+            if smallest is None or not seen_first:
+                missed_least = min(fewer, key=lambda k: judged(fewer[k]).cost, default=None)
+                if missed_least is not None:
+                    cost = judged(fewer[missed_least]).cost
+                    needed = EVIDENCE.odds(here.cost, cost, begun.independent) > EVIDENCE.needed
+                    smallest = smallest if needed else missed_least
+            if smallest is None:
                 return here
-            sizes = dict(zip(subset, here.sizes, strict=True))
-            smallest = min(fewer, key=lambda k: sizes[k])
-            missed_least = min(fewer, key=lambda k: fewer[k].cost)
-            spare = [smallest] if sizes[smallest] <= 1 else []
-            if EVIDENCE.odds(here.cost, fewer[missed_least].cost, count) <= EVIDENCE.needed:
-                spare = [*spare, missed_least] if seen_first else [missed_least, *spare]
-            if not spare:
-                return here
-            here, subset = fewer[spare[0]], tuple(k for k in subset if k != spare[0])
+            here = judged(fewer[smallest])
 
     def others(self, taken: tuple[Loss, ...]) -> dict[Loss, tuple[float, float]]:
         """ρ, of either sign, and its standard error of the candidates that were not taken, each
@@ -392,7 +434,7 @@ class Table:
         one, found = whole.added(base, [places[row] for row in new]), {}
         for k, row in enumerate(new):
             if one.share[k] >= OPTIONS.imitated:  # else others imitate it: there is no limit
-                error = np.sqrt(self.correlation * self._variance(one.left[k])) / one.size[k]
+                error = np.sqrt(self.correlation * self.variance(one.left[k])) / one.size[k]
                 found[row] = float(one.value[k]), float(error)
         return found
 
@@ -401,6 +443,6 @@ class Table:
         others = self.others(taken).items()
         return {row: max(rho, 0.0) + OPTIONS.limit * error for row, (rho, error) in others}
 
-    def _variance(self, rest: float) -> float:
+    def variance(self, rest: float) -> float:
         """Variance of the residuals, by their norm."""
         return float(rest**2 / max(self.count - self.rows.shape[-1], 1))

@@ -9,7 +9,7 @@ asks for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations, combinations_with_replacement, permutations
 
 import numpy as np
@@ -33,6 +33,7 @@ FRICTIONS = ("linear", "quadratic", "dry", "uniform", "cubic", "one-sided")  # t
 RARE = (POWER, ONE_SIDED)  # taken only where they explain a record much better than the others do
 CUBIC = 3.0  # the power of the speed that is tried
 HIGHEST = 6  # degree of potentials of lengths
+FEW = 3  # coordinates: of more of them a term couples two, for others would be too many
 SHAPES = (  # of a length q, of which powers may be the series
     "exp(A*q) + exp(2*A*q)",  # of Morse
     "exp(A*q) + q",  # of Toda
@@ -105,8 +106,29 @@ def relative(dim: int, angles: tuple[int, ...]) -> list[Row]:
     return list(dict.fromkeys([start, *masses, *potentials]))
 
 
+def side_by_side(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """Pendulums on axes of their own that springs couple: cos q_i, cos(q_i − q_j)."""
+    rows, waves = uncoupled(dim, angles), [m for m in modes(dim, angles, 1) if sum(m) == 0]
+    return [*rows, *(((0,) * dim, (0,) * dim, m, 0.0) for m in waves)]
+
+
+def by_twos(
+    of: Callable[[int, tuple[int, ...]], list[Row]], dim: int, angles: tuple[int, ...]
+) -> list[Row]:
+    """The terms that a library ``of`` two coordinates has of each two of these."""
+    rows: dict[Row, None] = {}
+    for pair in combinations(range(dim), 2):
+        at = [pair.index(i) if i in pair else 2 for i in range(dim)]
+        for *parts, phase in of(2, tuple(k for k, i in enumerate(pair) if i in angles)):
+            powers = (tuple((*part, 0)[k] for k in at) for part in parts)
+            rows[(*powers, phase)] = None  # pyright: ignore[reportArgumentType]
+    return list(rows)
+
+
 def first(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """The first library; its first term is v₁²."""
+    if dim > FEW:
+        return by_twos(first, dim, angles)
     none = (0,) * dim
     lengths = [i for i in range(dim) if i not in angles]
     waves = modes(dim, angles, 1)
@@ -225,6 +247,8 @@ def driven(dim: int, angles: Sequence[int], inputs: int, squares: bool) -> list[
 
 def every(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """All terms that a search may come to."""
+    if dim > FEW:
+        return by_twos(every, dim, angles)
     rows = (*first(dim, angles), *gyroscopic(dim, angles, 2), *more(dim, angles))
     return list(dict.fromkeys(rows))
 

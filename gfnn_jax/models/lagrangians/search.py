@@ -30,7 +30,7 @@ from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, wit
 from gfnn_jax.models.lagrangians.rivals import with_a_shape, with_constant, with_likeliest_power
 from gfnn_jax.models.lagrangians.starts import OPTIONS, best_start, leading, misfit
 from gfnn_jax.models.lagrangians.structure import Held, Key, Loss, Row, Structure, is_constant
-from gfnn_jax.models.lagrangians.weak_form import protected, weak_start
+from gfnn_jax.models.lagrangians.weak_form import promising, protected, weak_start
 from gfnn_jax.models.lagrangians.zeros import with_zeros_of_runs
 
 
@@ -340,6 +340,7 @@ class TermSearch:
             problem, d = fit.problem, every.dim
             more = libraries.driven(d, problem.angles, problem.num_inputs, problem.squares)
             every = every.plus([("term", row) for row in more])
+        every = promising(fit, every)
         refused: set[Key] = set()
         options, problem, costs, found = fit.problem.options, fit.problem, None, None
         evidence = options.evidence
@@ -434,6 +435,8 @@ def frictions_tried(dim: int, options: SearchOptions) -> tuple[Loss, ...]:
     if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
         kinds = tuple(kind for kind in kinds if kind != UNIFORM)
     rows = libraries.losses(dim, kinds, 0.0)
+    if dim > libraries.FEW:
+        return tuple(row for row in rows if row[1] not in libraries.RARE)
     turned = [one for one in map(libraries.opposite, rows) if one is not None]
     return tuple(sorted((*rows, *turned), key=lambda row: row[1] == UNIFORM))
 

@@ -109,10 +109,14 @@ def best_start(problem: ArcProblem) -> LawFit:
         some = min(some, other, key=lambda one: min(map(misfit, one.fits), default=np.inf))
     if problem.observation.crossed and some.fits:  # times of one event tell no more
         return some.fits[0]
-    if d > 1 and len(angles) == d:
+    many = d > libraries.FEW  # whose larger libraries take long
+    if many and angles:
+        some.add(_Library(libraries.side_by_side(d, angles)))
+    if 1 < d == len(angles) and not (many and some.are_noise):
         some.add(_Library(libraries.relative(d, angles)))
     some.add_richer([*textbook.rows, *pulls], 1)
-    some.add(_Library(first, 2))
+    if not (many and some.are_noise):
+        some.add(_Library(first, 2))
     for degree in (3, 4):
         some.add_bodies(degree)
     if inputs := problem.num_inputs:

@@ -18,9 +18,9 @@ import numpy as np
 
 from gfnn_jax.dataset.stretches import Nodes
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.lagrangian import functions_of
+from gfnn_jax.families.lagrangian import LINEAR, Friction, Terms, functions_of
 from gfnn_jax.flows.motion import Form
-from gfnn_jax.models.lagrangians.fit import ArcProblem
+from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.libraries import SINE
 from gfnn_jax.models.lagrangians.structure import (
     Key,
@@ -40,7 +40,9 @@ class WeakOptions:
     window's length, to the next. overlap: rows that share samples, of which as many count as one.
     apart: ratio of the weights of coordinates, at most, since a wrong library would make one of
     them all. rounding: residual of a coordinate to the sizes of its terms, below which a law
-    without mass and force solves the equations.
+    without mass and force solves the equations. many: terms of a library, of which the ``kept``
+    ones that explain most are tried, found ``block`` by block; imitated: share of what one does that
+    those of the law do not, below which it explains nothing.
     """
 
     lengths: tuple[float, ...] = (0.5, 1.0)
@@ -51,6 +53,10 @@ class WeakOptions:
     apart: float = 100.0
     rounding: float = 1e-9
     rank: float = 1e-12
+    many: int = 400
+    kept: int = 120
+    block: int = 300
+    imitated: float = 0.03
 
 
 OPTIONS = WeakOptions()
@@ -168,6 +174,51 @@ def weak_start(
     kept = {keys[k]: float(value) for k, value in zip(keep, c, strict=True)}
     kept |= {keys[k]: 0.5 for k in masses}
     return structure.without({k for k in keys if k not in kept}), kept
+
+
+def promising(fit: LawFit, every: Structure) -> Structure:
+    """The structure; of a large one the terms alone that explain most of what the law of a fit
+    leaves of the equations of motion, each by itself: derivatives of all along the arcs would take
+    long, and much memory."""
+    rows = [row for row in every.terms if row not in fit.structure.terms]
+    if len(rows) <= OPTIONS.many:
+        return every
+    problem, d = fit.problem, every.dim
+    period = min(problem.scales.period, max(np.ptp(n.t) for n in problem.nodes) / OPTIONS.periods)
+
+    def columns(terms: Terms, friction: Friction, inputs: int = 0) -> np.ndarray:
+        n = terms.count
+        form = Form(terms, np.zeros(n), np.eye(n), friction, inputs)
+        return np.concatenate(
+            [weak_rows(form, node, OPTIONS.lengths[-1] * period)[0] for node in problem.nodes]
+        )
+
+    linear = [(tuple(axis), LINEAR, 0.0) for axis in np.eye(d, dtype=int).tolist()]
+    friction = Friction.of([*fit.structure.friction, *linear], d)
+    own = columns(fit.form.terms, friction, every.num_inputs)
+    law = fit.form.lagrangian(fit.p[: fit.form.count])
+    left = own[..., : law.terms.count] @ law.coefficients
+    weight = 1 / np.maximum(np.std(left, axis=0), 1e-300)[:, None]  # of each coordinate
+
+    def flat(part: np.ndarray) -> np.ndarray:
+        return (part * weight).reshape(-1, part.shape[-1])
+
+    basis = np.linalg.qr(flat(own))[0]
+
+    def apart(part: np.ndarray) -> np.ndarray:
+        return part - basis @ (basis.T @ part)
+
+    rest, explains = apart(flat(left[..., None]))[:, 0], []
+    for k in range(0, len(rows), OPTIONS.block):
+        some = rows[k : k + OPTIONS.block]
+        whole = flat(columns(Terms.of(some, d, every.leaders), Friction.of([], d)))
+        new = apart(whole)
+        size, least = (np.linalg.norm(part, axis=0) for part in (new, OPTIONS.imitated * whole))
+        explains += np.where(
+            size > least, np.abs(rest @ new) / np.maximum(size, 1e-300), 0.0
+        ).tolist()
+    best = sorted(np.argsort(explains)[-OPTIONS.kept :].tolist())
+    return dataclasses.replace(every, terms=(every.terms[0], *(rows[k] for k in best)))
 
 
 def zeros_of_angles(
