@@ -355,9 +355,9 @@ class ArcProblem:
     def linearised(self, structure: Structure, fit: LawFit, arcs: Arcs | None = None) -> Linearised:
         """The problem of a structure close to a fit of it, or of a part of it, the states of arcs
         eliminated; ``arcs``: others than those of the fit, with their states."""
-        arcs, p = arcs or fit.followed, structure.start(fit.values)
-        readings = self.readings(self.law(structure, arcs, p), arcs, fit.sigma)
-        return Linearised(p, Triangle.of(readings.eliminated_rows(p, arcs.x)), fit.correlation)
+        rows = self.rows(structure, fit, arcs)
+        triangle = Triangle.of(rows.reshape(-1, rows.shape[-1]))
+        return Linearised(structure.start(fit.values), triangle, fit.correlation)
 
     def rows(self, structure: Structure, fit: LawFit, arcs: Arcs | None = None) -> np.ndarray:
         """The rows (A, L, k, n + 1) of the same problem."""

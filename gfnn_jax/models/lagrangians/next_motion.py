@@ -27,7 +27,8 @@ class MotionOptions:
 
     further: of the largest deflections of the record. highest: radians, that an angle is let go.
     imitated: share of what a term does that others do not, below which it is hardly identifiable.
-    most_terms: that are looked at: of larger libraries the first alone. most: motions.
+    most_terms: that are looked at: of larger libraries the first alone, of many coordinates the
+    textbook's. most: motions.
     """
 
     further: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 4.0)
@@ -55,6 +56,7 @@ def next_motions(fit: LawFit) -> list[Motion]:
     structure, d, problem = fit.structure, fit.form.dim, fit.problem
     rows, more = (library(d, problem.angles) for library in (libraries.first, libraries.more))
     rows = [*rows, *more] if len(rows) + len(more) <= OPTIONS.most_terms else rows
+    rows = rows if d <= libraries.FEW else libraries.textbook(d, problem.angles)
     library = libraries.without_forces(rows, problem.observation.shifts())
     lacking = [("term", row) for row in library if row not in structure.terms]
     larger = structure.plus(lacking)
@@ -67,13 +69,17 @@ def next_motions(fit: LawFit) -> list[Motion]:
     here = whole.among(kept)
     if not here.columns.any():
         return []  # the law moves no residual, nor would it elsewhere
+    named = [keys[k] for k in kept]
+    looked_at = larger.without(set(keys) - set(named))
+    places_of = [looked_at.keys().index(key) for key in named]
     still = np.zeros((1, *problem.inputs(fit.arcs).shape[1:]))
     without_inputs = dataclasses.replace(problem, inputs=lambda arcs: still)
     found = []
     for arcs in _followed(fit, _starts(fit)):
-        less = here.sharpened_by(without_inputs.linearised(larger, fit, arcs).among(kept))
+        there = without_inputs.linearised(looked_at, fit, arcs).among(places_of)
+        less = here.sharpened_by(there)
         order = np.argsort(-less)
-        found.append(Motion(arcs.x[0, 0, :d], {keys[kept[k]]: float(less[k]) for k in order}))
+        found.append(Motion(arcs.x[0, 0, :d], {named[k]: float(less[k]) for k in order}))
     found.sort(key=lambda motion: -sum(np.log(list(motion.gains.values()))))
     return found[: OPTIONS.most]
 

@@ -219,6 +219,8 @@ def of_a_sensor(fit: LawFit) -> str:
     least += problem.options.evidence.deciding if is_noise else -OPTIONS.clearly
     plain = dataclasses.replace(fit.structure, terms=tuple(terms), friction=tuple(friction))
     plain = dataclasses.replace(plain, zeros=())
+    if is_noise and len(plain.keys()) > len(fit.p):
+        return ""  # a law of more coefficients is not likelier than one that leaves noise
     try:
         known = weak_start(plain, problem, prune=False)[1]
     except FitError:

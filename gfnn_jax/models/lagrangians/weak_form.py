@@ -41,7 +41,7 @@ class WeakOptions:
     apart: ratio of the weights of coordinates, at most, since a wrong library would make one of
     them all. rounding: residual of a coordinate to the sizes of its terms, below which a law
     without mass and force solves the equations. many: terms of a library, of which the ``kept``
-    ones that explain most are tried, found ``block`` by block; imitated: share of what one does that
+    that explain most are tried, found ``block`` by block; imitated: share of what one does that
     those of the law do not, below which it explains nothing.
     """
 
