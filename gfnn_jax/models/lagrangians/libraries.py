@@ -106,10 +106,20 @@ def relative(dim: int, angles: tuple[int, ...]) -> list[Row]:
     return list(dict.fromkeys([start, *masses, *potentials]))
 
 
-def side_by_side(dim: int, angles: tuple[int, ...]) -> list[Row]:
-    """Pendulums on axes of their own that springs couple: cos q_i, cos(q_i − q_j)."""
-    rows, waves = uncoupled(dim, angles), [m for m in modes(dim, angles, 1) if sum(m) == 0]
-    return [*rows, *(((0,) * dim, (0,) * dim, m, 0.0) for m in waves)]
+def side_by_side(dim: int, angles: tuple[int, ...], highest: int = 2) -> list[Row]:
+    """A chain or ring of pendulums on axes of their own, or of bodies, with springs between
+    neighbours: cos q_i and cos(q_i − q_j), or lengths to a degree."""
+    rows, none = uncoupled(dim, angles), (0,) * dim
+    for pair in ((i, (i + 1) % dim) for i in range(dim)):
+        if all(i in angles for i in pair):
+            rows.append(
+                (none, none, tuple((i == pair[0]) - (i == pair[1]) for i in range(dim)), 0.0)
+            )
+        lengths = [i for i in pair if i not in angles]
+        for degree in range(2, highest + 1):
+            powers = combinations_with_replacement(lengths, degree)
+            rows += [(none, unit(dim, *axes), none, 0.0) for axes in powers]
+    return list(dict.fromkeys(rows))
 
 
 def by_twos(

@@ -110,8 +110,9 @@ def best_start(problem: ArcProblem) -> LawFit:
     if problem.observation.crossed and some.fits:  # times of one event tell no more
         return some.fits[0]
     many = d > libraries.FEW  # whose larger libraries take long
-    if many and angles:
-        some.add(_Library(libraries.side_by_side(d, angles)))
+    if many:
+        some.add(_Library(libraries.side_by_side(d, angles), equal=True))
+        some.add_bodies(4)
     if 1 < d == len(angles) and not (many and some.are_noise):
         some.add(_Library(libraries.relative(d, angles)))
     some.add_richer([*textbook.rows, *pulls], 1)
@@ -221,7 +222,8 @@ class _Starts:
         more than noise: along a straight orbit masses are told only together with forces."""
         d = self.problem.dim
         if d > 1 and not (self.problem.angles or self.one_valued or self.least < OPTIONS.white):
-            self.add(_Library(libraries.bodies(d, (), degree), 2, apart=True, equal=True))
+            of = libraries.bodies if d <= libraries.FEW else libraries.side_by_side
+            self.add(_Library(of(d, (), degree), 2, apart=True, equal=True))
 
     def add_led(self, rows: Sequence[Row], rank: int) -> None:
         """Start from coordinates that drive others and are not moved by them, as a cart whose motor

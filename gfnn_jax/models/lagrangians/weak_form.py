@@ -21,7 +21,7 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import LINEAR, Friction, Terms, functions_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
-from gfnn_jax.models.lagrangians.libraries import SINE
+from gfnn_jax.models.lagrangians.libraries import FEW, SINE
 from gfnn_jax.models.lagrangians.structure import (
     Key,
     Loss,
@@ -41,8 +41,8 @@ class WeakOptions:
     apart: ratio of the weights of coordinates, at most, since a wrong library would make one of
     them all. rounding: residual of a coordinate to the sizes of its terms, below which a law
     without mass and force solves the equations. many: terms of a library, of which the ``kept``
-    that explain most are tried, found ``block`` by block; imitated: share of what one does that
-    those of the law do not, below which it explains nothing.
+    that explain most are tried, ``block`` by block; imitated: share of what one does that those of
+    the law do not, below which it explains nothing.
     """
 
     lengths: tuple[float, ...] = (0.5, 1.0)
@@ -151,7 +151,7 @@ def weak_start(
     Raises FitError where a coordinate without mass and force solves the equations.
     """
     keys, X, Y, keep, masses, _ = _Equations.of(structure, problem, equal)
-    fixed, significant = protected(structure), problem.options.evidence.significant
+    fixed, evidence = protected(structure), problem.options.evidence
     weight = np.ones(structure.dim)
     while True:
         for _ in range(2):  # each coordinate's rows in units of their own residual
@@ -168,9 +168,12 @@ def weak_start(
             np.inf if keys[k] in fixed else abs(value) / e
             for k, value, e in zip(keep, c, error, strict=True)
         ]
-        if not prune or not z or min(z) > significant:
+        if not prune or not z or min(z) > evidence.significant:
             break
-        del keep[int(np.argmin(z))]
+        gone = {keep[int(np.argmin(z))]}
+        if structure.dim > FEW:  # whose terms are many
+            gone |= {k for k, size in zip(keep, z, strict=True) if size < evidence.nothing}
+        keep = [k for k in keep if k not in gone]
     kept = {keys[k]: float(value) for k, value in zip(keep, c, strict=True)}
     kept |= {keys[k]: 0.5 for k in masses}
     return structure.without({k for k in keys if k not in kept}), kept
