@@ -57,15 +57,16 @@ def test_kinds_that_are_asked_for_are_taken_and_odds_are_those_against_sets_that
 def test_what_is_seen_by_the_number_of_residuals_and_their_correlation():
     """z² > log n, of n = 600 residuals, or of those that are independent."""
     made, subset = table(5), [0, 4]
-    sizes, z = made.judged(subset).sizes, made.significance(subset)
+    judged = made.judged(subset)
+    sizes, z = judged.sizes, judged.significance
     np.testing.assert_allclose(sizes, z / np.sqrt(np.log(600)))
     correlated = table(5, correlation=4.0)
-    np.testing.assert_allclose(correlated.significance(subset), z / 2)
+    np.testing.assert_allclose(correlated.judged(subset).significance, z / 2)
     np.testing.assert_allclose(
         correlated.judged(subset).sizes, z / 2 / np.sqrt(np.log(150)), rtol=1e-12
     )
     rounded = Table(CANDIDATES, made.rows, 1.0, rounding=100.0)
-    assert rounded.significance(subset).max() < 1
+    assert rounded.judged(subset).significance.max() < 1
 
 
 def test_coefficients_of_friction_in_standard_errors():
@@ -78,7 +79,7 @@ def test_coefficients_of_friction_in_standard_errors():
     errors = np.sqrt(variance * np.diag(np.linalg.inv(columns.T @ columns)))
     expected = np.maximum(solved / errors, 0)[8:]
     assert expected.min() > 0  # else the bound ρ ≥ 0 would act
-    np.testing.assert_allclose(made.significance(subset), expected, rtol=1e-8)
+    np.testing.assert_allclose(made.judged(subset).significance, expected, rtol=1e-8)
 
 
 def test_friction_kept_against_odds_is_said_to_be_that_of_fewest_kinds():

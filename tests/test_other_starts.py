@@ -111,6 +111,23 @@ def test_two_pendulums_in_one_file_have_their_laws():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("turns", [True, False])
+def test_five_bodies_with_springs_between_neighbours(turns):
+    """Pendulums, or bodies on quartic springs, of which two at a time are in a term."""
+
+    def acceleration(q, v):
+        between = np.diff(np.sin(np.diff(q)) if turns else np.diff(q), prepend=0, append=0)
+        return (-4 * np.sin(q) if turns else -q - 0.3 * q**3) + 0.8 * between - 0.05 * v
+
+    names, start = list("abcde"), [0.1, 1.0, -0.5, 0.4, 0.8, 0, 0, 0, 0, 0]
+    fit = gfnn.fit(recorded(acceleration, start, names, 24.0, 600, angles=names if turns else ()))
+    found = coefficients(fit.lagrangian)
+    assert len(found) == 14 + 5 * (not turns)
+    assert found["cos(a - b)" if turns else "a*b"] == pytest.approx(0.8, rel=0.01)
+    assert found["cos(e)" if turns else "e**4"] == pytest.approx(4.0 if turns else -0.075, rel=0.02)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [[0.2, 0.1, 0.1, 0.3], [0.2, 0.25, 0, 0]], ids=["turns", "rest"])
 def test_henon_and_heiles_potential_from_positions(start):
     """From rest the motion is nearly along a line, of which a law with couplings alone makes

@@ -196,9 +196,8 @@ class _Judged:
         return criterion(rest, table.independent, len(self.subset))
 
     @functools.cached_property
-    def sizes(self) -> np.ndarray:
-        """Each ρ from all arcs, divided by the least that counts as seen, √log n of its standard
-        errors."""
+    def significance(self) -> np.ndarray:
+        """Each ρ from all arcs, in standard errors."""
         table, columns = self.table, list(self.subset)
         own = table.own[-1]
         if len(own) <= len(columns):
@@ -207,8 +206,12 @@ class _Judged:
         inverse = np.linalg.pinv(own[:, columns] / norms, rcond=OPTIONS.rank)
         noise = table.variance(table.rest(self._of_all)) + table.rounding**2
         errors = np.linalg.norm(inverse, axis=1) * np.sqrt(table.correlation * noise)
-        z = self._of_all[columns] * norms / np.maximum(errors, 1e-300)
-        return z / np.sqrt(np.log(table.independent))
+        return self._of_all[columns] * norms / np.maximum(errors, 1e-300)
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """The same, divided by the least that counts as seen, √log n."""
+        return self.significance / np.sqrt(np.log(self.table.independent))
 
     @property
     def is_seen(self) -> bool:
