@@ -289,7 +289,9 @@ class _Screen:
         rows = _largest(two.max(axis=1, initial=0.0), 2 * OPTIONS.screened)
         i, j = np.divmod(_largest(two[rows].ravel(), 2 * OPTIONS.screened), max(len(some), 1))
         pairs = {(min(one), max(one)) for one in zip(rows[i], j, strict=True) if np.ptp(one)}
-        return {pair: two[pair] for pair in sorted(pairs, key=lambda pair: (-two[pair], pair))}
+        return {
+            pair: float(two[pair]) for pair in sorted(pairs, key=lambda pair: (-two[pair], pair))
+        }
 
     def _solved(self, places: frozenset[int]) -> tuple[np.ndarray, float]:
         """Coefficients of these places, in their order, and the sum of squares that they leave."""

@@ -28,7 +28,7 @@ class MotionOptions:
     further: of the largest deflections of the record. highest: radians, that an angle is let go.
     imitated: share of what a term does that others do not, below which it is hardly identifiable.
     most_terms: that are looked at: of larger libraries the first alone, of many coordinates the
-    textbook's. most: motions.
+    textbook's. most: motions. largest: derivative of a residual, whose square is finite.
     """
 
     further: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 4.0)
@@ -36,6 +36,7 @@ class MotionOptions:
     imitated: float = 0.1
     most_terms: int = 40
     most: int = 3
+    largest: float = 1e100
 
 
 OPTIONS = MotionOptions()
@@ -77,6 +78,8 @@ def next_motions(fit: LawFit) -> list[Motion]:
     found = []
     for arcs in _followed(fit, _starts(fit)):
         there = without_inputs.linearised(looked_at, fit, arcs).among(places_of)
+        if not np.abs(there.columns).max() < OPTIONS.largest:
+            continue  # along which a small change grows without bound
         less = here.sharpened_by(there)
         order = np.argsort(-less)
         found.append(Motion(arcs.x[0, 0, :d], {named[k]: float(less[k]) for k in order}))
