@@ -333,7 +333,7 @@ class Table:
 
     @functools.cached_property
     def own(self) -> list[np.ndarray]:
-        """Of the same the triangles of the candidates, other coefficients at their best."""
+        """Triangles of the candidates, other coefficients at their best, of the same arcs."""
         return [triangle[self.width :, self.width :] for triangle in self.triangles]
 
     @functools.cached_property
@@ -361,7 +361,7 @@ class Table:
         return losses
 
     def judged(self, subset: Sequence[int]) -> _Judged:
-        """These candidates, judged by the thirds that no coefficient is from."""
+        """Judge these candidates by the thirds that no coefficient is from."""
         losses = np.array([self.solve(own, subset) for own in self.own[:-1]])
         return _Judged(self, tuple(subset), losses)
 
