@@ -37,9 +37,7 @@ class Dilations:
     def of(cls, bracket: Bracket) -> Dilations:
         """Find all that are diagonal where L z has the bracket's standard constants; none of a
         bracket that is neither constant nor a Lie algebra."""
-        n, rows = bracket.size, []
-        basis = getattr(bracket, "basis", None)
-        basis = np.eye(n) if basis is None else np.asarray(basis)
+        n, rows, basis = bracket.size, [], _basis(bracket)
         eye = np.eye(n + 1)
         if isinstance(bracket, Constant):  # e_i + e_j = λ
             rows = [eye[i] + eye[j] - eye[n] for i, j in np.argwhere(bracket.form)]
@@ -61,6 +59,11 @@ class Dilations:
         """Keep these of the motions alone."""
         return dataclasses.replace(self, patterns=self.patterns[rows], rates=self.rates[rows])
 
+    def about(self, bracket: Bracket) -> Dilations:
+        """Motions of the same patterns in the basis of another bracket."""
+        basis = _basis(bracket)
+        return dataclasses.replace(self, basis=basis, inverse=np.linalg.inv(basis))
+
     def grown(self, c, z, time):
         """e^(Eτ) z (..., n) of coefficients c (1, K), states (..., n) and times (..., 1)."""
         factors = namespace(c, z, time).exp(as_row(matmul(c, self.patterns), time) * time)
@@ -74,6 +77,11 @@ class Dilations:
         """e^(Eᵀτ) g of covectors (..., n)."""
         factors = namespace(c, g, time).exp(as_row(matmul(c, self.patterns), time) * time)
         return matmul(matmul(g, self.inverse) * factors, self.basis)
+
+
+def _basis(bracket: Bracket) -> np.ndarray:
+    """L (n, n) where L z has standard constants."""
+    return np.asarray(getattr(bracket, "basis", np.eye(bracket.size)))
 
 
 @pytree()

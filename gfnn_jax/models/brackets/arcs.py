@@ -1,5 +1,5 @@
-"""ż = B(z)∇H(z) fitted to sequences with noise: arcs whose states are latent, the coefficients of H
-and the constants of the bracket together (`solve.latent_arcs`). NumPy."""
+"""ż = B(z)∇H(z) − Ez fitted to sequences with noise: arcs whose states are latent, the coefficients
+of H and of friction and the constants of the bracket together (`solve.latent_arcs`). NumPy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.brackets import Bracket, standard_constants
-from gfnn_jax.families.terms import Terms
 from gfnn_jax.models.brackets.algebra import changed
 from gfnn_jax.models.brackets.poisson_field import PoissonField
 from gfnn_jax.solve.latent_arcs import (
@@ -84,8 +83,8 @@ class FreeBracket:
         form[i, j], form[j, i] = values, -values
         return dataclasses.replace(self.bracket, form=form)
 
-    def columns(self, z: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """∂(B∇H)/∂values (N, n, K)."""
+    def columns(self, z: np.ndarray, gradient: np.ndarray, damping: np.ndarray) -> np.ndarray:
+        """∂(B∇H − Ez)/∂values (N, n, K), E (n, n) diagonal where L z has standard constants."""
         out = np.zeros((*z.shape, len(self.places)))
         for k, (i, j) in enumerate(self.places):
             if hasattr(self.bracket, "basis"):
@@ -94,6 +93,8 @@ class FreeBracket:
                 standard = standard_constants(self.bracket.blocks)
                 slope = np.imag(changed(standard, np.linalg.inv(basis))) / 1e-30
                 out[..., k] = np.einsum("abc,nc,nb->na", slope, z, gradient, optimize=True)
+                column = np.linalg.inv(self.bracket.basis)[:, i]  # dE = [E, L⁻¹ dL]
+                out[..., k] += np.outer(z @ damping[j], column) - np.outer(z[:, j], damping @ column)
             else:
                 log = self.bracket.name == "log-canonical"
                 unit = z[:, i] * z[:, j] if log else 1.0
@@ -106,7 +107,7 @@ class PoissonArcs:
     """The law as `Readings.fit` wants it: p is (c, values of the bracket). dt: between nodes, a
     number or (A, L − 1). substeps: Runge–Kutta steps of order 4 between nodes."""
 
-    library: Terms
+    field: PoissonField
     free: FreeBracket
     dt: Any
     substeps: int
@@ -123,17 +124,16 @@ class PoissonArcs:
         """Ends of the steps from all nodes but the last, less the next nodes."""
         arcs, length, m = x.shape
         h = np.reshape(np.broadcast_to(self.dt, (arcs, length - 1)), (-1, 1))
-        count = self.library.num_parameters
-        bracket = self.free.moved(p[count:])
-        field, free = PoissonField(bracket, self.library), FreeBracket(bracket, self.free.places)
-        c = p[:count]
+        count = self.field.num
+        c, field = p[:count], self.field.with_bracket(self.free.moved(p[count:]))
+        free = FreeBracket(field.bracket, self.free.places)
 
         def rates(z, slope):
-            gradient = self.library.gradient(c, z)
+            gradient = field.library.gradient(field.of_h(c), z)
             moving = field.jacobian(c, z) @ slope
             moving[..., m : m + count] += field.columns(z)
-            moving[..., m + count :] += free.columns(z, gradient)
-            return np.einsum("nij,nj->ni", bracket.matrix(z), gradient), moving
+            moving[..., m + count :] += free.columns(z, gradient, field.damping(c))
+            return field.rate(c, z), moving
 
         return flow_defects(rates, x, h, len(p), self.substeps)
 
@@ -152,42 +152,42 @@ class ArcsFit(NamedTuple):
 def fit_arcs(
     field: PoissonField, c: np.ndarray, y: np.ndarray, dt: float, sigma: np.ndarray
 ) -> ArcsFit:
-    """Fit H and the bracket's constants to arcs y (A, L, n), dt between nodes. Terms below four
+    """Fit H, friction and the bracket's constants to arcs y (A, L, n), dt between nodes. Terms below four
     standard errors are dropped, the weaker half of them at a time, for terms that are alike hide
     one another; constants that may be whole numbers are. sigma: (n,) noise to start from."""
     some = y.reshape(-1, y.shape[2])[:: max(1, y[..., 0].size // OPTIONS.states)]
     rate = np.quantile(np.abs(field.jacobian(c, some)).sum(axis=2).max(axis=1), 0.99)
     substeps = int(np.clip(np.ceil(rate * dt / OPTIONS.rate), 1, OPTIONS.most_substeps))
 
-    def fitted_to(library: Terms, free: FreeBracket, p: np.ndarray, x: np.ndarray) -> Fitted:
-        model = PoissonArcs(library, free, dt, substeps)
+    def fitted_to(field: PoissonField, free: FreeBracket, p: np.ndarray, x: np.ndarray) -> Fitted:
+        model = PoissonArcs(field, free, dt, substeps)
         return Readings(model, y, sigma).fit(p, x, sigma, least=OPTIONS.least * sigma)
 
-    library, free = field.library, FreeBracket.of(field.bracket)
-    fitted = fitted_to(library, free, np.concatenate([c, free.values]), y)
+    free = FreeBracket.of(field.bracket)
+    fitted = fitted_to(field, free, np.concatenate([c, free.values]), y)
     for _ in range(OPTIONS.rounds):
-        count = library.num_parameters
+        count = field.num
         errors = np.sqrt(np.sum(_root(fitted)[:, :count] ** 2, axis=0))
         strength = np.abs(fitted.p[:count]) / np.maximum(errors, 1e-300)
         weak = np.sum(strength <= OPTIONS.significant)
         kept = np.sort(np.argsort(strength)[(weak + 1) // 2 :])
-        if len(kept) in (0, count):
+        if len(kept) == count or not np.any(kept < field.library.num_parameters):
             break
-        library = library.take(kept.tolist())
+        field = field.take(kept.tolist())
         p = np.concatenate([fitted.p[:count][kept], fitted.p[count:]])
-        fitted = fitted_to(library, free, p, fitted.x)
-    count = library.num_parameters
+        fitted = fitted_to(field, free, p, fitted.x)
+    count = field.num
     values = fitted.p[count:]
     whole = np.abs(values - np.round(values)) <= OPTIONS.near
     if whole.any():
         bracket = free.moved(np.where(whole, np.round(values), values))
         fixed = FreeBracket(bracket, free.places[~whole])
         p = np.concatenate([fitted.p[:count], values[~whole]])
-        tried = fitted_to(library, fixed, p, fitted.x)
+        tried = fitted_to(field, fixed, p, fitted.x)
         sizes = [np.sum(one.residuals**2 * (one.sigma / sigma) ** 2) for one in (tried, fitted)]
         if sizes[0] - sizes[1] <= OPTIONS.whole * whole.sum():
             free, fitted = fixed, tried
-    found = PoissonField(free.moved(fitted.p[count:]), library)
+    found = field.with_bracket(free.moved(fitted.p[count:]))
     left = fitted.sigma * np.sqrt(np.mean(fitted.residuals.reshape(-1, y.shape[2]) ** 2, axis=0))
     return ArcsFit(found, fitted.p[:count], _root(fitted)[:, :count], fitted.sigma, left)
 

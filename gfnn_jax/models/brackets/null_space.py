@@ -27,6 +27,9 @@ class Options:
     # standard errors of L_f B by the field's own covariance, that a null vector may have
     errors: float = 3.0
     draws: int = 12  # of the field's coefficients, that tell this error
+    # of f', what L_f B − λB of noisy sequences may leave at all, and the steps that refine λ
+    shrinking: float = 0.05
+    refined: int = 4
 
 
 OPTIONS = Options()
@@ -145,31 +148,39 @@ def null_spaces(
         yield NullSpace(tensors, vectors, values, rate)
 
 
-def shrinking(z: np.ndarray, f: np.ndarray, slope: np.ndarray) -> list[float]:
-    """All λ ≠ 0 of L_f B = λB to roundoff, by which uniform friction shrinks a constant or affine
-    bracket, those of a higher rank first: the null space as an eigenvalue problem.
+def shrinking(z: np.ndarray, f: np.ndarray, slope: np.ndarray, clean: bool) -> list[float]:
+    """All λ ≠ 0 of L_f B = λB, by which uniform friction shrinks a constant or affine bracket,
+    those of a higher rank first: the null space as an eigenvalue problem.
 
-    z: (N, n) states. f, slope: the field and its derivative there.
+    z: (N, n) states. f, slope: the field and its derivative there. clean: it holds to roundoff;
+    else λ is that of least ‖L_f B − λB‖ near an eigenvalue, and what is left may be noise.
     """
     scale = np.sqrt(np.mean(z**2, axis=0))
     y, (f, slope) = z / scale, _in_units(f, slope, scale)
     size, n = np.sqrt(np.mean(np.sum(slope**2, axis=(1, 2)))), z.shape[1]
-    known: list[tuple[int, float]] = []
+    limit = OPTIONS.null if clean else OPTIONS.shrinking
+    known: list[tuple[int, float, float]] = []
     for kind in (CONSTANT, LINEAR):
         tensors = Tensors(kind, n)
         lie, every = tensors.lie(y, f, slope).reshape(-1, tensors.num), tensors.values(y)
         eigen = np.linalg.eig(np.linalg.lstsq(every, lie, rcond=None)[0])
-        for rate, vector in zip(eigen[0], np.transpose(eigen[1]), strict=True):
-            found, bracket = float(np.real(rate)), every @ np.real(vector)
-            left = np.linalg.norm(lie @ np.real(vector) - found * bracket)
-            own = left <= OPTIONS.null * size * np.linalg.norm(bracket)
-            seen = any(abs(found - other) <= OPTIONS.null * size for _, other in known)
-            if own and not seen and abs(found) > OPTIONS.null * size:
+        for rate, vector in zip(eigen[0], np.real(eigen[1].T), strict=True):
+            found = float(np.real(rate))
+            for _ in range(0 if clean else OPTIONS.refined):
+                shifted = lie - found * every
+                vector = np.linalg.eigh(shifted.T @ shifted)[1][:, 0]
+                bracket = every @ vector
+                found = float(bracket @ (lie @ vector) / (bracket @ bracket))
+            bracket = every @ vector
+            left = float(np.linalg.norm(lie @ vector - found * bracket) / np.linalg.norm(bracket))
+            seen = any(abs(found - other) <= limit * size for *_, other in known)
+            if left <= limit * size and not seen and abs(found) > OPTIONS.null * size:
                 form = np.zeros((n, n))
                 form[tuple(np.transpose(tensors.places))] = bracket[: len(tensors.places)]
-                rank = np.linalg.matrix_rank(form - form.T, tol=1e-6 * np.abs(form).max())
-                known.append((-int(rank), found))
-    return [rate for _, rate in sorted(known)]
+                least = max(1e-6, limit) * np.abs(form).max()
+                rank = int(np.linalg.matrix_rank(form - form.T, tol=least))
+                known.append((-rank, 0.0 if clean else left, found))
+    return [rate for *_, rate in sorted(known)]
 
 
 def _in_units(f, slope, scale):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linprog
@@ -56,6 +56,11 @@ class PoissonField:
         kept = [row - count for row in rows if row >= count]
         friction = self.friction.take(kept) if self.friction is not None and kept else None
         return PoissonField(self.bracket, library, friction)
+
+    def with_bracket(self, bracket: Any) -> PoissonField:
+        """The same H, and friction, of another bracket of the same kind."""
+        friction = self.friction and self.friction.about(bracket)
+        return PoissonField(bracket, self.library, friction)
 
     def of_h(self, c) -> np.ndarray:
         """Select the coefficients of H."""

@@ -13,6 +13,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.integrate import cumulative_simpson
 
 from gfnn_jax.brackets import Bracket, canonical
 from gfnn_jax.errors import FitError
@@ -162,14 +163,23 @@ def law_of(
     else:
         law = _of_bracket(bracket, train, held, terms, on_progress)
     if not train.beside.names and law.field.friction is None and _one_level(law, train.z0):
-        law = law._replace(several=ONE_LEVEL)
+        level = ONE_LEVEL.replace("H has", "H + a Casimir has", bool(law.bracket.casimirs))
+        law = law._replace(several=level)
     return law
 
 
 def _one_level(law: PoissonLaw, z: np.ndarray) -> bool:
-    """Return whether H has the same value at all states z (N, n), to their noise."""
+    """Return whether H, with Casimirs added, has the same value at all states z (N, n), to their
+    noise."""
     h, by_noise = _energies(law, z)
-    return on_one_level(h, by_noise, law.field.library.gradient(law.fit.c, z), sizes(z))
+    slopes, casimirs = law.field.library.gradient(law.fit.c, z), law.bracket.casimirs
+    if casimirs:
+        values = np.stack([c(z) for c in casimirs], axis=1)
+        weights = np.linalg.lstsq(values - values.mean(axis=0), h - h.mean(), rcond=1e-9)[0]
+        h = h - values @ weights
+        parts = (w * c.gradient(z) for w, c in zip(weights, casimirs, strict=True))
+        by_noise = np.sqrt(np.sum(((slopes - sum(parts)) * law.noise_of(z)) ** 2, axis=1))
+    return on_one_level(h, by_noise, slopes, sizes(z))
 
 
 def on_one_level(
@@ -183,7 +193,7 @@ def on_one_level(
 
 def _energies(law: PoissonLaw, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """H (N,) at states z (N, n), and what their noise makes of it."""
-    library, c = law.field.library, law.fit.c
+    library, c = law.field.library, law.field.of_h(law.fit.c)
     return library.value(c, z), of_noise(*library.gradient_and_hessian(c, z), law.noise_of(z))
 
 
@@ -234,10 +244,10 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
     shrunk: list[str] = []
     for null in _nulls(some[:, :n], f, slope, draws, noisy is None):
         kind = null.tensors.kind
-        if null.rate:
-            shrunk.append(f"{null.rate:.8g}")
-        else:
+        if not null.rate:
             nearest[kind] = null.nearest
+        elif len(null.vectors):
+            shrunk.append(f"{null.rate:.4g}")
         on_progress(f"{kind} brackets: {len(null.vectors)}, the nearest at {null.nearest:.1e}")
         if not len(null.vectors) or (null.rate and kind == LOG):
             continue
@@ -259,9 +269,7 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
             "act, or more runs are needed",
             "no law: no H of a bracket leaves noise alone",
         )
-    more = ""
-    if noisy is not None:
-        more = ". With noise more runs may show one; friction is found without noise alone"
+    more = "" if noisy is None else ". With noise more runs may show one"
     if shrunk:
         more = (
             f". Bivectors shrink at the rates {', '.join(dict.fromkeys(shrunk))}, as by uniform "
@@ -277,9 +285,9 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
 
 
 def _nulls(z, f, slope, draws, clean: bool) -> Iterator[NullSpace]:
-    """Null spaces of L_f, and of pairs without noise those of uniform friction."""
+    """Null spaces of L_f, and those of uniform friction."""
     yield from null_spaces(z, f, slope, draws)
-    for rate in shrinking(z, f, slope) if clean else ():
+    for rate in shrinking(z, f, slope, clean):
         yield from null_spaces(z, f, slope, draws, rate)
 
 
@@ -419,31 +427,53 @@ def _of_populations(train: Data, held: Data, names, sigma, error: float) -> Pois
 
 def _leaves_noise(law: PoissonLaw, sigma: np.ndarray, train: Data, held: Data) -> bool:
     """Return whether a law leaves no more than the noise (n,) of the states, and has the same H in
-    all parts of a run, to the errors of its coefficients. Arcs tell no drift of H, as by
-    friction: each has an H of its own."""
+    all parts of a run, to the errors of its coefficients, with what its friction took added. Arcs
+    tell no drift of H: each has an H of its own."""
     if law.sigma is None or (law.sigma > OPTIONS.grown * sigma).any():
         return False
     z, run, place = (
         np.concatenate([getattr(data, key) for data in (train, held)])
         for key in ("z0", "run", "place")
     )
-    total, count = 0.0, 0
-    library, c = law.field.library, law.fit.c[: law.field.library.num_parameters]
-    root = law.fit.root[:, : len(c)]
+    total, count, damped = 0.0, 0, law.field.friction is not None
     for own in (run == r for r in np.unique(run)):
-        states = z[own][np.argsort(place[own])]
-        _, errors = _energies(law, states)
-        parts = np.array_split(np.arange(len(states)), min(OPTIONS.parts, len(states)))
-        weights = [errors[part] ** -2.0 for part in parts]
-        terms = [library.term_values(states[part]) for part in parts]
-        means = np.array([np.average(t, 0, w) for t, w in zip(terms, weights, strict=True)])
-        by_law = (means - means.mean(axis=0)) @ root.T
-        covariance = np.diag([1 / np.sum(w) for w in weights]) + by_law @ by_law.T
-        both = np.stack([means @ c, np.ones(len(parts))], axis=1)
-        h, one = np.linalg.solve(np.linalg.cholesky(covariance), both).T
-        total += h @ h - (h @ one) ** 2 / (one @ one)
-        count += len(parts) - 1
+        order = np.argsort(place[own])
+        states, breaks = z[own][order], np.flatnonzero(np.diff(place[own][order]) != 1) + 1
+        for stretch in np.split(states, breaks) if damped else (states,):
+            if len(stretch) < 2 * OPTIONS.parts * damped:
+                continue
+            _, errors = _energies(law, stretch)
+            parts = np.array_split(np.arange(len(stretch)), min(OPTIONS.parts, len(stretch)))
+            weights = [errors[part] ** -2.0 for part in parts]
+            terms, kept = _kept(law, stretch, train.dt)
+            means = np.array(
+                [np.average(terms[i], 0, w) for i, w in zip(parts, weights, strict=True)]
+            )
+            by_law = (means - means.mean(axis=0)) @ law.fit.root[:, : terms.shape[1]].T
+            covariance = np.diag([1 / np.sum(w) for w in weights]) + by_law @ by_law.T
+            both = np.stack([means @ kept, np.ones(len(parts))], axis=1)
+            h, one = np.linalg.solve(np.linalg.cholesky(covariance), both).T
+            total += h @ h - (h @ one) ** 2 / (one @ one)
+            count += len(parts) - 1
     return total <= OPTIONS.uneven * max(count, 1)
+
+
+def _kept(law: PoissonLaw, z: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """H and what friction took since the first of states z (N, n), as terms (N, J) and their
+    coefficients (J,): c_j (φ_j + ∫ ∇φ_j·Ez dt), and ∫ ∇H·E_k z dt whose coefficients are 0, for it
+    is in the others."""
+    field, c = law.field, law.fit.c
+    library, own = field.library, field.of_h(c)
+    terms = library.term_values(z)
+    if field.friction is None:
+        return terms, own
+    forces = -field.columns(z)[..., len(own) :]  # E_k z
+    slopes = library.term_gradients(z)
+    lost = np.einsum("nij,nik,k->nj", slopes, forces, c[len(own) :])
+    by_rate = np.einsum("nij,j,nik->nk", slopes, own, forces)
+    taken = cumulative_simpson(np.hstack([lost, by_rate]), dx=dt, axis=0, initial=0.0)
+    terms = np.hstack([terms, np.zeros_like(by_rate)]) + taken
+    return terms, np.append(own, np.zeros(by_rate.shape[1]))
 
 
 def _too_few_runs(missing: int, degree: int, runs: int) -> FitError:
@@ -495,16 +525,17 @@ def _richer(law: PoissonLaw, noisy: _Noisy, train: Data, held: Data) -> PoissonL
     bracket, own = law.bracket, law.field.library
     degree = max(map(sum, own.powers))
     library = library_of(_kind_of(bracket), bracket.labels, degree + 1, None)
-    if bracket.casimirs or library.num_parameters > OPTIONS.most_terms or law.field.friction:
+    if bracket.casimirs or library.num_parameters > OPTIONS.most_terms:
         return law
     places = dict(zip(library.term_names, range(library.num_parameters), strict=True))
     if not set(own.term_names) <= set(places):
         return law
-    c = np.zeros(library.num_parameters)
-    c[[places[name] for name in own.term_names]] = law.fit.c
-    arcs = equal_arcs(noisy.sequences)
-    rich = fit_arcs(PoissonField(bracket, library), c, arcs, train.dt, noisy.sigma)
-    more = rich.field.num - own.num_parameters
+    field = PoissonField(bracket, library, law.field.friction)
+    c, arcs = np.zeros(field.num), equal_arcs(noisy.sequences)
+    kept = [*(places[name] for name in own.term_names), *range(len(places), field.num)]
+    c[kept] = law.fit.c
+    rich = fit_arcs(field, c, arcs, train.dt, noisy.sigma)
+    more = rich.field.num - law.field.num
     gain = arcs.shape[0] * arcs.shape[1] * np.sum(np.log(law.sigma / rich.sigma))
     if gain <= 0.5 * max(more, 1) * np.log(arcs.size) + np.log(len(c)):
         return law
