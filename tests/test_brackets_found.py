@@ -181,6 +181,18 @@ def test_uniform_friction(field, width, tmp_path):
     np.testing.assert_array_equal(again.step(data.z0)[0], images)
 
 
+def test_uniform_friction_of_noisy_sequences():
+    def field(w):
+        return top(w) - 0.08 * w
+
+    rng = np.random.default_rng(0)
+    law, _ = learned(field, rng.normal(size=(6, 3)), dt=0.1, steps=150, noise=1e-3)
+    assert (law.name, law.field.friction.rates) == ("so(3)", 1.0)
+    std = np.linalg.norm(law.fit.root[:, -1])
+    assert abs(law.fit.c[-1] - 0.08) < 4 * std < 2e-3
+    assert field_error(law, field, rng.normal(size=(50, 3))) < 4e-3
+
+
 def test_too_few_runs_are_refused():
     data = runs_of(top, np.array([[1.0, 0.5, -0.3]]), 0.2, 80)
     with pytest.raises(FitError, match="2 functions of degree 2 are constant"):

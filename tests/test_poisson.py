@@ -123,6 +123,8 @@ def test_exact_runs_that_are_too_few_to_bound_the_error_say_how_many_more_are_ne
     assert fit.verdict.endswith(
         "for 2 runs of 20 pairs are too few to bound it: add 4 or more such runs"
     )
+    long = gfnn.fit(pairs_of(runs_of(top, starts[:2], 0.2, 80)))  # C and H differ alike
+    assert long.verdict.startswith("one of several: H + a Casimir has one value along all runs")
     assert gfnn.fit(pairs_of(runs_of(top, starts, 0.2, 20))).met
 
 
@@ -311,6 +313,7 @@ def test_no_law_has_a_verdict():
     with pytest.raises(FitError) as raised:
         gfnn.fit(pairs_of(runs_of(lorenz, starts, 0.1, 20)))
     assert raised.value.verdict.startswith("no law: no bracket")
+    assert str(raised.value).endswith("bracket=gfnn.Bracket.so3()))")
 
 
 @pytest.mark.slow

@@ -81,7 +81,8 @@ class Dilations:
 
 def _basis(bracket: Bracket) -> np.ndarray:
     """L (n, n) where L z has standard constants."""
-    return np.asarray(getattr(bracket, "basis", np.eye(bracket.size)))
+    named = getattr(bracket, "blocks", ())
+    return np.asarray(bracket.basis) if named else np.eye(bracket.size)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @pytree()

@@ -204,13 +204,11 @@ def fit_states(
         try:
             fitted = learn_fit(recording, options=asked, on_progress=progress.line)
         except FitError as error:
-            if not error.verdict.startswith("no law: no "):
-                raise
             typed = ["gfnn", "fit", *data, "--positions", ",".join(names), "--out", output.out]
             for name in ("time", "dt"):
                 typed += [f"--{name}", columns[name]] if name in columns else []
-            command = shlex.join(map(str, typed))
-            raise FitError(f"{error}. If these are positions: {command}", error.verdict) from error
+            message = str(error).replace("gfnn.fit(recording)", shlex.join(map(str, typed)))
+            raise FitError(message, error.verdict) from error
     result = fitted.report(seed=asked.seed, data={"source": recording.source, "states": names})
     own = parameters_of(recording)
     job = {**_job(recording, columns, asked), "states": names, "parameters": own}

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.brackets import Bracket, Log, Magnetic, added
+from gfnn_jax.brackets import Bracket, Constant, LieAlgebra, Log, Magnetic, added
 from gfnn_jax.candidates.assemble import Candidate, block_of, stepped
 from gfnn_jax.coordinates import CARTESIAN, LOG
 from gfnn_jax.data.recording import Recording, args_of, parameters_of
-from gfnn_jax.data.roles import symbols
+from gfnn_jax.data.roles import is_rate_of_turning, symbols
 from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.dataset.split import enough_to_state, split_rows
@@ -30,7 +30,9 @@ from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.brackets.algebra import analysed
 from gfnn_jax.models.brackets.beside import Beside
+from gfnn_jax.models.brackets.find import sized
 from gfnn_jax.models.brackets.lie_maps import fit_lie_map
 from gfnn_jax.models.brackets.search import Data, PoissonLaw, law_of
 from gfnn_jax.models.hamiltonians.fitted_law import Term, formula
@@ -61,6 +63,7 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
     check_varied(pairs)
     n = _checked(pairs, bracket)
     names = pairs.names or (bracket.labels if bracket else tuple(f"z{i + 1}" for i in range(n)))
+    given = pairs  # whose rows messages name
     pairs, left_out = without_constants(identified(pairs).pairs)
     split, every = split_rows(pairs, options.seed), _data_of(pairs)
     dt: Any = np.asarray(pairs.dt) if np.ndim(pairs.dt) else float(pairs.dt)
@@ -73,8 +76,10 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         try:
             law = law_of(train, held, names, bracket=bracket, terms=terms, on_progress=report)
         except FitError as error:
-            raise FitError(f"{error}{_next(data, error.verdict)}", error.verdict) from error
+            more = _next(data, given, error.verdict)
+            raise FitError(f"{error}{more}", error.verdict) from error
         learned = _of_law(law, every, float(np.median(dt)))
+        left_out = [*left_out, *_without_own_step(law, given)]
     seconds, map_, law = time.perf_counter() - started, learned.map_, learned.law
     watch.on_progress(f"compiling the step of {learned.label}")
     test = split.test if len(split.test) else split.validation
@@ -152,20 +157,39 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
     return Fit(map_, choice)
 
 
-def _next(data: Pairs | Recording, verdict: str) -> str:
-    """Say what to type after pairs had no bracket: without states that logarithms have not, or as
-    (q, p) where the number of columns is even."""
-    if isinstance(data, Recording) or not verdict.startswith("no law: no "):
+def _next(data: Pairs | Recording, pairs: Pairs, verdict: str) -> str:
+    """Say what to type after states had no bracket: without those that logarithms have not; as
+    positions, or as (q, p) where the number of columns is even; with a bracket that is known."""
+    if not verdict.startswith("no law: no "):
         return ""
-    below = np.mean((np.minimum(data.z0, data.z1) <= 0).any(axis=1))
-    if 0 < below <= FEW:
-        kept = "(pairs.z0 > 0).all(axis=1) & (pairs.z1 > 0).all(axis=1)"
+    below = (np.minimum(pairs.z0, pairs.z1) <= 0).any(axis=1)
+    if 0 < below.mean() <= FEW:
+        call = "gfnn.fit(pairs.take((pairs.z0 > 0).all(axis=1) & (pairs.z1 > 0).all(axis=1)))"
+        if isinstance(data, Recording):
+            call = "the same command, once these cells are empty"
         return (
-            f". Logarithms were not tried, for {below:.2g} of the pairs have a coordinate that is "
-            f"not above 0. Without them: gfnn.fit(pairs.take({kept}))"
+            f". Logarithms were not tried, for in {_rows(below)} a coordinate is not above 0. "
+            f"Without them: {call}"
         )
-    if data.z0.shape[1] % 2:
-        return ""
+    if isinstance(data, Recording):
+        if not all(map(is_rate_of_turning, data.positions)):
+            return ". If these are positions: gfnn.fit(recording)"
+        times = np.concatenate([data.times(run) for run in data.runs])
+        first, last = np.quantile(times, [0.25, 0.75])
+        return (
+            ". A body has a law with a bracket while no hand, motor or dry friction turns it. Take "
+            f"that part of the runs, such as --from {first:.6g} --to {last:.6g}"
+        )
+    n = pairs.z0.shape[1]
+    if n % 2:
+        spins = n // 3
+        known = f"so3({spins if spins > 1 else ''})"
+        if n % 3:
+            known = f"lie({('so3',) * spins + ('centre',) * (n % 3)})"
+        return (
+            ". H of a bracket that you know, for example: "
+            f"gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=gfnn.Bracket.{known}))"
+        )
     call = "gfnn.fit(gfnn.Pairs(pairs.z0, pairs.z1, pairs.dt, run=pairs.run))"
     return f". As positions and momenta, with friction of any kind: {call}"
 
@@ -235,15 +259,37 @@ def _checked(pairs: Any, bracket: Bracket | None) -> int:
                 f"the bracket is one of {bracket.size} coordinates, the states have "
                 f"{states[0].shape[1]}"
             )
-        outside = np.flatnonzero(bracket.outside(states[0]) | bracket.outside(states[1]))
-        if len(outside):
-            rows = f"[{', '.join(map(str, outside[:5]))}{', …' * (len(outside) > 5)}]"
+        outside = bracket.outside(states[0]) | bracket.outside(states[1])
+        if outside.any():
             raise FitError(
-                f"{bracket.undefined} in {len(outside)} of {len(states[0])} pairs, rows {rows}. "
-                "Without them: gfnn.fit(pairs.take(~(bracket.outside(pairs.z0) | "
+                f"{bracket.undefined} in {_rows(outside)}. Without them: "
+                "gfnn.fit(pairs.take(~(bracket.outside(pairs.z0) | "
                 "bracket.outside(pairs.z1))), bracket=bracket)"
             )
     return states[0].shape[1]
+
+
+def _rows(wrong: np.ndarray) -> str:
+    """Text of pairs (N,), with the first of their rows."""
+    rows = np.flatnonzero(wrong)
+    named = f"[{', '.join(map(str, rows[:5]))}{', …' * (len(rows) > 5)}]"
+    return f"{len(rows)} of {len(wrong)} pairs, rows {named}"
+
+
+def _without_own_step(law: PoissonLaw, pairs: Pairs) -> list[str]:
+    """A line about states at which the step of the law's algebra is not defined."""
+    bracket = law.bracket
+    if not isinstance(bracket, LieAlgebra) or bracket.blocks:
+        return []
+    own = analysed(np.asarray(bracket.constants))
+    if own.lifted is None:
+        return []
+    known = Bracket.lie(own.blocks, sized(own, np.asarray(pairs.z0)))
+    outside = known.outside(pairs.z0) | known.outside(pairs.z1)
+    return [
+        f"{known.undefined} in {_rows(outside)}, where {known.name} has no step of its own: the "
+        "slower one of any Lie algebra was taken"
+    ]
 
 
 def _given(terms, names: tuple[str, ...]) -> Terms | None:
@@ -371,10 +417,23 @@ def other_bracket(pairs: Pairs) -> list[str]:
         return []
     if law.error > EXACT or law.field.friction is not None:
         return []
-    what = "states with another bracket"
-    if law.bracket.name == "constant":
-        what = "(q, p) in another order or scale"
-    elif isinstance(law.bracket, Magnetic):
-        what = "positions and velocities in a magnetic field"
-    learn = 'gfnn.fit(dataclasses.replace(pairs, structure="poisson"))'
+    what, learn = _told_apart(law.bracket)
     return [f"the columns are {what}: {law.bracket}. Learn them with {learn}"]
+
+
+def _told_apart(bracket: Bracket) -> tuple[str, str]:
+    """Say what columns with a bracket are, that were taken for (q, p), and how to learn them."""
+    learn = 'gfnn.fit(dataclasses.replace(pairs, structure="poisson"))'
+    if isinstance(bracket, Magnetic):
+        return "positions and velocities in a magnetic field", learn
+    if not isinstance(bracket, Constant):
+        return "states with another bracket than that of (q, p)", learn
+    form, d = np.round(np.asarray(bracket.form), 9), bracket.size // 2
+    first, second = np.nonzero(form == 1)
+    if d and len(first) == d and np.count_nonzero(form) == 2 * d:
+        order = [*first.tolist(), *second.tolist()]
+        moved = f"pairs.z0[:, {order}], pairs.z1[:, {order}], pairs.dt, run=pairs.run"
+        return "(q, p) in another order", f"gfnn.fit(gfnn.Pairs({moved}))"
+    if not form[:d, :d].any() and not form[d:, d:].any():
+        return "(q, v), velocities in place of momenta, with {q, v} = M⁻¹ and p = M v", learn
+    return "(q, p) in another order or scale", learn

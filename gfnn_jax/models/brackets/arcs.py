@@ -93,8 +93,8 @@ class FreeBracket:
                 standard = standard_constants(self.bracket.blocks)
                 slope = np.imag(changed(standard, np.linalg.inv(basis))) / 1e-30
                 out[..., k] = np.einsum("abc,nc,nb->na", slope, z, gradient, optimize=True)
-                column = np.linalg.inv(self.bracket.basis)[:, i]  # dE = [E, L⁻¹ dL]
-                out[..., k] += np.outer(z @ damping[j], column) - np.outer(z[:, j], damping @ column)
+                own = np.linalg.inv(self.bracket.basis)[:, i]  # dE = [E, L⁻¹ dL]
+                out[..., k] += np.outer(z @ damping[j], own) - np.outer(z[:, j], damping @ own)
             else:
                 log = self.bracket.name == "log-canonical"
                 unit = z[:, i] * z[:, j] if log else 1.0
@@ -152,9 +152,10 @@ class ArcsFit(NamedTuple):
 def fit_arcs(
     field: PoissonField, c: np.ndarray, y: np.ndarray, dt: float, sigma: np.ndarray
 ) -> ArcsFit:
-    """Fit H, friction and the bracket's constants to arcs y (A, L, n), dt between nodes. Terms below four
-    standard errors are dropped, the weaker half of them at a time, for terms that are alike hide
-    one another; constants that may be whole numbers are. sigma: (n,) noise to start from."""
+    """Fit H, friction and the bracket's constants to arcs y (A, L, n), dt between nodes. Terms
+    below four standard errors are dropped, the weaker half of them at a time, for terms that are
+    alike hide one another; constants that may be whole numbers are. sigma: (n,) noise to start
+    from."""
     some = y.reshape(-1, y.shape[2])[:: max(1, y[..., 0].size // OPTIONS.states)]
     rate = np.quantile(np.abs(field.jacobian(c, some)).sum(axis=2).max(axis=1), 0.99)
     substeps = int(np.clip(np.ceil(rate * dt / OPTIONS.rate), 1, OPTIONS.most_substeps))

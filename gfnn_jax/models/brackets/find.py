@@ -243,19 +243,20 @@ def _made(
     form, raw = _constants(null, vector)
     c = np.where(np.abs(raw) > zero * np.abs(raw).max(), raw, 0.0)
     if np.abs(form).max() > OPTIONS.snapped * zero * np.abs(vector).max():
-        magnetic = _magnetic(form, c, names, zero)
-        if magnetic is not None:
-            yield magnetic, "canonical after p = v + A(x)"
+        with contextlib.suppress(FitError, np.linalg.LinAlgError):  # not one of a charge
+            magnetic = _magnetic(form, c, names, zero)
+            if magnetic is not None:
+                yield magnetic, "canonical after p = v + A(x)"
         return
     # what is zero of a Killing form is less certain than constants are
     tried = [analysed(c, min(factor * zero, 0.1)) for factor in (10.0, 100.0)]
     algebra = next((a for a in tried if a.lifted is not None), tried[0])
     if algebra.lifted is not None:
-        basis, inside = _sized(algebra, z), False
+        basis, inside = sized(algebra, z), False
         bases = [(basis, OPTIONS.snapped * zero), (basis, zero)]
         exact = analysed(raw, min(100 * zero, 0.1)) if noise > OPTIONS.zero else algebra
         if exact is not algebra and exact.blocks == algebra.blocks:
-            bases.append((_sized(exact, z), OPTIONS.zero))  # constants that are small, and no noise
+            bases.append((sized(exact, z), OPTIONS.zero))  # constants that are small, and no noise
         for basis, by in bases:
             with contextlib.suppress(FitError):  # rounded to a singular one
                 bracket = Bracket.lie(algebra.blocks, _rounded(basis, by), names)
@@ -264,12 +265,12 @@ def _made(
                     yield bracket, algebra.name
         if inside:
             return
-    c = _rounded(c / np.abs(c).max(), zero)
-    if jacobi_failure(c) <= 1e-10:
+    c = _rounded(c / (np.abs(c).max() or 1.0), zero)
+    if c.any() and jacobi_failure(c) <= 1e-10:
         yield Bracket.from_constants(c, names), algebra.name
 
 
-def _sized(algebra: Algebra, z: np.ndarray) -> np.ndarray:
+def sized(algebra: Algebra, z: np.ndarray) -> np.ndarray:
     """L of an algebra, y = Lz as large as z: B is known but for a factor, which H has the inverse
     of."""
     basis = np.array(algebra.lifted)

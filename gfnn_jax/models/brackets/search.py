@@ -72,6 +72,7 @@ class Options:
     level: float = 1e-4
     uneven: float = 4.0
     most_terms: int = 40  # of a richer H, that arcs with noise are asked about
+    dependent: float = 1e-3  # singular value of unit gradients: of functions of one another
     hidden: float = 2.0  # times what noise makes of a relation: one that noise may hide
     standard: int = 1  # brackets of which H is looked for among shapes
     # times the error of the free field, that a Poisson field may leave
@@ -326,7 +327,8 @@ def _free_field(train, held, names, terms, on_progress):
         if len(missing):
             if best is not None and best[2] <= OPTIONS.partly:
                 break
-            raise _too_few_runs(len(relations), degree, len(np.unique(train.run)))
+            functions = _independent(library, relations, train.z0)
+            raise _too_few_runs(functions, degree, len(np.unique(train.run)))
         on_progress(f"a field of degree {degree}, {field.num} coefficients")
         try:
             fit = fit_field(field, *train[:3])
@@ -486,6 +488,15 @@ def _too_few_runs(missing: int, degree: int, runs: int) -> FitError:
     )
 
 
+def _independent(library: Terms, relations: np.ndarray, z: np.ndarray) -> int:
+    """Number of independent functions among relations (m, K) of the library at states z (N, n)."""
+    some = z[:: max(1, len(z) // OPTIONS.states)]
+    slopes = library.term_gradients(some) @ relations.T * sizes(z)[:, None]
+    slopes = slopes / np.linalg.norm(slopes, axis=1, keepdims=True)
+    ranks = np.linalg.matrix_rank(slopes, tol=OPTIONS.dependent)
+    return int(np.median(ranks))
+
+
 class _Noisy(NamedTuple):
     """Sequences with noise: their states, the pairs that lie several steps apart, the free field of
     these, and the noise (n,)."""
@@ -572,10 +583,11 @@ def _through_flow(
         )
     if field.friction is not None:
         shrinks = float(fit.c[field.library.num_parameters :] @ field.friction.rates)
+        rate = f"{shrinks:.8g}" if noisy is None else f"{shrinks:.3g}"
         notes = (
             *notes,
-            f"uniform friction: the flow multiplies the bracket by exp(−{shrinks:.8g} t), t in the "
-            "unit of dt; Casimirs, which friction alone moves, change too",
+            f"uniform friction: the flow multiplies the bracket by exp(−{rate} t), t in the unit of "
+            "dt; Casimirs, which friction alone moves, change too",
         )
     return PoissonLaw(field, fit, error_on(field, fit.c, held), found.name, notes, sigma)
 
