@@ -586,8 +586,8 @@ def _through_flow(
         rate = f"{shrinks:.8g}" if noisy is None else f"{shrinks:.3g}"
         notes = (
             *notes,
-            f"uniform friction: the flow multiplies the bracket by exp(−{rate} t), t in the unit of "
-            "dt; Casimirs, which friction alone moves, change too",
+            f"uniform friction: the flow multiplies the bracket by exp(−{rate} t), t in the unit "
+            "of dt; Casimirs, which friction alone moves, change too",
         )
     return PoissonLaw(field, fit, error_on(field, fit.c, held), found.name, notes, sigma)
 
