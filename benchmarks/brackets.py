@@ -393,6 +393,35 @@ def damped(quick: bool) -> Numbers:
     return found
 
 
+def damped_noisy(quick: bool) -> Numbers:
+    """Uniform friction of sequences with noise of 1e-3: tops of random inertia and rate."""
+    found = {}
+    for seed in range(1 if quick else 5):
+        rng = np.random.default_rng(seed)
+        turn, rate = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.uniform(0.02, 0.15)
+        inertia = turn @ np.diag(rng.uniform(1, 2.5, 3)) @ turn.T
+
+        def field(w, inertia=inertia, rate=rate):
+            return np.linalg.inv(inertia) @ np.cross(inertia @ w, w) - rate * w
+
+        runs = [orbit(field, rng.normal(size=3), 0.05, 400) for _ in range(6)]
+        runs = [r + 1e-3 * rng.normal(size=r.shape) for r in runs]
+        fit, seconds = learned(pairs_of(runs, 0.05))
+        assert fit.bracket is not None
+        fresh = rng.normal(size=(20, 3))
+        last = np.array([orbit(field, z, 0.05, 100)[-1] for z in fresh])
+        off = np.linalg.norm(np.asarray(fit.map.rollout(fresh, 100)[0])[:, -1] - last, axis=1)
+        own = -float(np.log(float(fit.map.multiplier() or 1.0))) / 0.05
+        found[f"free top, seed {seed}"] = {
+            "found": fit.bracket.name,
+            "verdict": fit.verdict,
+            "rate_off": abs(own / rate - 1),
+            "step_100": float(np.sqrt(np.mean(off**2))),
+            "cpu_seconds": seconds,
+        }
+    return found
+
+
 def varied_top(of_moment: bool) -> Field:
     """A heavy top whose third moment, or whose gravity, is the last state, and stays."""
 
@@ -458,6 +487,7 @@ def piece_of(name: str) -> str:
 
 PIECES = {piece_of(name): partial(of_system, name) for name in SYSTEMS}
 PIECES |= {"without": without, "damped": damped, "varied": varied, "noisy": noisy}
+PIECES |= {"damped-noisy": damped_noisy}
 
 
 def tables() -> None:
@@ -546,6 +576,14 @@ def tables() -> None:
             "CPU s",
         )
         text += "\n\n" + markdown(heads, said)
+    if "damped-noisy" in found:
+        keys = ("rate_off", "step_100", "cpu_seconds")
+        said = [
+            [name, m["found"], m["verdict"].partition(":")[0], *(number(m[key]) for key in keys)]
+            for name, m in found["damped-noisy"]["measured"].items()
+        ]
+        heads = ("friction, σ 10⁻³", "bracket", "verdict", "λ off by, relative", "step 100, RMS")
+        text += "\n\n" + markdown((*heads, "CPU s"), said)
     between_markers(TABLES, "brackets", f"{text}\n\n{provenance(found)}")
 
 

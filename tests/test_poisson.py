@@ -14,6 +14,7 @@ import gfnn_jax as gfnn
 from gfnn_jax import cli, cli_parser
 from gfnn_jax.data.text_files import to_text
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.learn.poisson import _told_apart, _without_own_step
 
 
 def pairs_of(data, **more):
@@ -293,6 +294,26 @@ def test_a_gyroscope_on_the_command_line(tmp_path, capsys):
     predict = f"predict {tmp_path}/m --initial {wrong} --num-steps 5 --out {tmp_path}/q.npz"
     assert cli.main(predict.split()) == 2
     assert "expected states Gyroscope_x, Gyroscope_y, Gyroscope_z" in capsys.readouterr().err
+
+
+def test_constant_brackets_are_told_apart():
+    """(q1, p1, q2, p2) get their order, (q, v) their masses; states of se(3) without a step their
+    rows."""
+    order = np.array([0, 2, 1, 3])
+    form = gfnn.Bracket.constant(np.kron(np.eye(2), [[0.0, 1.0], [-1.0, 0.0]]))
+    what, command = _told_apart(form)
+    assert what == "(q, p) in another order"
+    pairs = SimpleNamespace(z0=np.arange(8.0).reshape(2, 4), z1=np.zeros((2, 4)), dt=0.1, run=None)
+    told = SimpleNamespace(Pairs=lambda z0, z1, dt, run: z0, fit=lambda z0: z0)
+    assert np.array_equal(eval(command, {"gfnn": told, "pairs": pairs}), pairs.z0[:, order])
+    masses = np.block(
+        [[np.zeros((2, 2)), np.diag([1, 0.5])], [np.diag([-1, -0.5]), np.zeros((2, 2))]]
+    )
+    assert _told_apart(gfnn.Bracket.constant(masses))[0].startswith("(q, v), velocities")
+    law = SimpleNamespace(bracket=gfnn.Bracket.from_constants(gfnn.Bracket.se3().constants))
+    z = np.ones((4, 6)) * np.array([[1], [1], [0], [1]])
+    (line,) = _without_own_step(law, SimpleNamespace(z0=z, z1=z))
+    assert "in 1 of 4 pairs, rows [2], where se(3) has no step" in line
 
 
 def test_three_columns_say_what_to_type():
