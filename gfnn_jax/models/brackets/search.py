@@ -206,10 +206,11 @@ def of_noise(slopes: np.ndarray, bends: np.ndarray, sigma: np.ndarray) -> np.nda
     return np.sqrt(first + second)
 
 
-def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) -> PoissonLaw:
-    """The law of a field whose bracket is found."""
+def _of_field(train: Data, held: Data, names, terms, on_progress, least: int = 1) -> PoissonLaw:
+    """The law of a field whose bracket is found. least: degree of the field, which noise of one
+    step hides: where there is no bracket, the next is tried too."""
     n, more = len(names), train.beside.names
-    field, fit, error, notes, factors = _free_field(train, held, names, terms, on_progress)
+    field, fit, error, notes, factors = _free_field(train, held, names, terms, on_progress, least)
     degree = _degree(field, n)
     if error > OPTIONS.printed and more:
         raise FitError(
@@ -263,6 +264,9 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
             close = law.error <= max(OPTIONS.worse * error, OPTIONS.exact)
             if close and (noisy is None or _leaves_noise(law, noisy.sigma, train, held)):
                 return law
+    if noisy is not None and terms is None and least == 1 and degree < OPTIONS.degrees[-1]:
+        with contextlib.suppress(FitError):
+            return _of_field(train, held, names, terms, on_progress, degree + 1)
     if missed:
         raise FitError(
             f"no law: within its errors the field has a bracket ({', '.join(dict.fromkeys(missed))}"
@@ -304,7 +308,7 @@ def _degree(field: FreeField, n: int) -> int:
     return 1 if isinstance(own, Partials) else max(sum(row[:n]) for row in own.powers)
 
 
-def _free_field(train, held, names, terms, on_progress):
+def _free_field(train, held, names, terms, on_progress, least: int):
     """(field, its fit, its error on held-out pairs, notes, functions of what is beside the state):
     of the smallest degree that a higher one does not beat."""
     best, notes = None, ()
@@ -315,7 +319,8 @@ def _free_field(train, held, names, terms, on_progress):
         if best[2] <= OPTIONS.exact:
             return (*best, (), None)
     kept = None
-    for degree, factors in product(OPTIONS.degrees, tuple(train.beside.factors(names))):
+    degrees = [degree for degree in OPTIONS.degrees if degree >= least]
+    for degree, factors in product(degrees, tuple(train.beside.factors(names))):
         library = polynomials(names, degree, constant=True, factors=factors)
         if library.num_parameters * OPTIONS.rows_per_term > len(train.z0):
             continue
