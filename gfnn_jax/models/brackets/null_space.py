@@ -15,6 +15,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,9 +28,7 @@ class Options:
     # standard errors of L_f B by the field's own covariance, that a null vector may have
     errors: float = 3.0
     draws: int = 12  # of the field's coefficients, that tell this error
-    # of f', what L_f B − λB of noisy sequences may leave at all, and the steps that refine λ
-    shrinking: float = 0.05
-    refined: int = 4
+    shrinking: float = 0.05  # of f', what L_f B − λB of noisy sequences may leave at all
 
 
 OPTIONS = Options()
@@ -166,11 +165,16 @@ def shrinking(z: np.ndarray, f: np.ndarray, slope: np.ndarray, clean: bool) -> l
         eigen = np.linalg.eig(np.linalg.lstsq(every, lie, rcond=None)[0])
         for rate, vector in zip(eigen[0], np.real(eigen[1].T), strict=True):
             found = float(np.real(rate))
-            for _ in range(0 if clean else OPTIONS.refined):
-                shifted = lie - found * every
-                vector = np.linalg.eigh(shifted.T @ shifted)[1][:, 0]
-                bracket = every @ vector
-                found = float(bracket @ (lie @ vector) / (bracket @ bracket))
+            if not clean:
+
+                def gram(rate: float, lie=lie, every=every) -> np.ndarray:
+                    shifted = lie - rate * every
+                    return shifted.T @ shifted
+
+                near = (found, found + limit * size)
+                least = minimize_scalar(lambda rate: np.linalg.eigvalsh(gram(rate))[0], near)
+                found = float(least.x)
+                vector = np.linalg.eigh(gram(found))[1][:, 0]
             bracket = every @ vector
             left = float(np.linalg.norm(lie @ vector - found * bracket) / np.linalg.norm(bracket))
             seen = any(abs(found - other) <= limit * size for *_, other in known)

@@ -206,11 +206,10 @@ def of_noise(slopes: np.ndarray, bends: np.ndarray, sigma: np.ndarray) -> np.nda
     return np.sqrt(first + second)
 
 
-def _of_field(train: Data, held: Data, names, terms, on_progress, least: int = 1) -> PoissonLaw:
-    """The law of a field whose bracket is found. least: degree of the field, which noise of one
-    step hides: where there is no bracket, the next is tried too."""
+def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) -> PoissonLaw:
+    """The law of a field whose bracket is found."""
     n, more = len(names), train.beside.names
-    field, fit, error, notes, factors = _free_field(train, held, names, terms, on_progress, least)
+    field, fit, error, notes, factors = _free_field(train, held, names, terms, on_progress)
     degree = _degree(field, n)
     if error > OPTIONS.printed and more:
         raise FitError(
@@ -229,6 +228,14 @@ def _of_field(train: Data, held: Data, names, terms, on_progress, least: int = 1
         if hidden:
             raise _too_few_runs(hidden + 1, 2, len(np.unique(train.run)))
     noisy = None if more else _noise(field, fit, error, train)
+    free = terms is None and not more and error > OPTIONS.exact
+    while free and noisy is None and degree < OPTIONS.degrees[-1]:
+        try:  # terms that one step does not show
+            higher = _free_field(train, held, names, None, on_progress, degree + 1)
+        except FitError:
+            break
+        degree, noisy = _degree(higher[0], n), _noise(*higher[:3], train)
+        field, fit, error, notes, _ = higher if noisy else (field, fit, error, notes, None)
     fit = fit if noisy is None else noisy.fit
     if noisy is None and error > OPTIONS.exact and terms is None and not more:
         law = _without_polynomials(train, held, names, on_progress)
@@ -264,9 +271,6 @@ def _of_field(train: Data, held: Data, names, terms, on_progress, least: int = 1
             close = law.error <= max(OPTIONS.worse * error, OPTIONS.exact)
             if close and (noisy is None or _leaves_noise(law, noisy.sigma, train, held)):
                 return law
-    if noisy is not None and terms is None and least == 1 and degree < OPTIONS.degrees[-1]:
-        with contextlib.suppress(FitError):
-            return _of_field(train, held, names, terms, on_progress, degree + 1)
     if missed:
         raise FitError(
             f"no law: within its errors the field has a bracket ({', '.join(dict.fromkeys(missed))}"
@@ -308,9 +312,9 @@ def _degree(field: FreeField, n: int) -> int:
     return 1 if isinstance(own, Partials) else max(sum(row[:n]) for row in own.powers)
 
 
-def _free_field(train, held, names, terms, on_progress, least: int):
+def _free_field(train, held, names, terms, on_progress, least: int = 1):
     """(field, its fit, its error on held-out pairs, notes, functions of what is beside the state):
-    of the smallest degree that a higher one does not beat."""
+    of the smallest degree from ``least`` on that a higher one does not beat."""
     best, notes = None, ()
     if terms is not None:
         field = FreeField(Partials.of(terms, train.z0))
