@@ -310,9 +310,9 @@ def test_constant_brackets_are_told_apart():
         [[np.zeros((2, 2)), np.diag([1, 0.5])], [np.diag([-1, -0.5]), np.zeros((2, 2))]]
     )
     assert _told_apart(gfnn.Bracket.constant(masses))[0].startswith("(q, v), velocities")
-    law = SimpleNamespace(bracket=gfnn.Bracket.from_constants(gfnn.Bracket.se3().constants))
+    found = gfnn.Bracket.from_constants(gfnn.Bracket.se3().constants)
     z = np.ones((4, 6)) * np.array([[1], [1], [0], [1]])
-    (line,) = _without_own_step(law, SimpleNamespace(z0=z, z1=z))
+    (line,) = _without_own_step(found, gfnn.Pairs(z, z, 0.1, structure="poisson"))
     assert "in 1 of 4 pairs, rows [2], where se(3) has no step" in line
 
 

@@ -79,7 +79,7 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
             more = _next(data, given, error.verdict)
             raise FitError(f"{error}{more}", error.verdict) from error
         learned = _of_law(law, every, float(np.median(dt)))
-        left_out = [*left_out, *_without_own_step(law, given)]
+        left_out = [*left_out, *_without_own_step(law.bracket, given)]
     seconds, map_, law = time.perf_counter() - started, learned.map_, learned.law
     watch.on_progress(f"compiling the step of {learned.label}")
     test = split.test if len(split.test) else split.validation
@@ -276,9 +276,8 @@ def _rows(wrong: np.ndarray) -> str:
     return f"{len(rows)} of {len(wrong)} pairs, rows {named}"
 
 
-def _without_own_step(law: PoissonLaw, pairs: Pairs) -> list[str]:
-    """A line about states at which the step of the law's algebra is not defined."""
-    bracket = law.bracket
+def _without_own_step(bracket: Bracket, pairs: Pairs) -> list[str]:
+    """A line about states at which the step of a found algebra is not defined."""
     if not isinstance(bracket, LieAlgebra) or bracket.blocks:
         return []
     own = analysed(np.asarray(bracket.constants))
