@@ -308,6 +308,16 @@ def exports() -> dict[str, Export]:
         "one column": Export(
             text("one.csv", "x\n" + rows(SWING)), ((T, {"x": SWING}),), 1e-6, {"dt": 0.02}
         ),
+        "oscilloscope that counts its rows": Export(
+            text(
+                "counted.csv",
+                "Model,DS1000Z\nX,CH1,CH2,Start,Increment\nSequence,Volt,Volt,-4.0e-01,2.0e-02\n"
+                + "".join(f"{k},{x:.6f},{3.3 * (k > 9)},,\n" for k, x in enumerate(SWING)),
+            ),
+            ((T, {"CH1": SWING}),),
+            1e-6,
+            {"dt": 0.02},
+        ),
         "a name of time of its own": Export(
             text("own.csv", "lap [s],x\n" + rows(T, SWING)),
             ((T, {"x": SWING}),),

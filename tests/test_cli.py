@@ -23,7 +23,7 @@ from command_line import (
     predict,
 )
 
-from gfnn_jax import cli, cli_summary, scenes
+from gfnn_jax import cli, cli_summary, compiling, scenes
 from gfnn_jax.budget import Budget
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
@@ -440,6 +440,22 @@ def test_silence_is_never_long(capsys, monkeypatch):
     lines = [line.split("] ")[1] for line in capsys.readouterr().err.splitlines()]
     assert lines[:2] == ["factorising", "a candidate, error 1e-3"]
     assert lines[2] == "not shown: too soon … 0 s so far"
+
+
+def test_what_is_compiled_is_shown_until_it_is_done(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "LONGEST_SILENCE", 0.2)
+    with progress.on_stderr() as shown:
+        shown.line("learning")
+        compiling.say("compiling the motion (about 9 s)")
+        time.sleep(0.4)
+        compiling.say("")
+        shown.line("a law")
+        time.sleep(0.4)
+    lines = [line.split("] ")[1] for line in capsys.readouterr().err.splitlines()]
+    assert any(line.startswith("compiling the motion") and "s left" in line for line in lines)
+    assert lines[-1] == "a law … 0 s so far"
+    compiling.say("compiling the motion (about 9 s)")
+    assert capsys.readouterr().err == "gfnn_jax: compiling the motion (about 9 s)\n"
 
 
 def test_parts_tell_the_time_left():

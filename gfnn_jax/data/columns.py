@@ -52,6 +52,8 @@ class _Options:
     parts: int = 8
     told_apart: float = 3e-3
     invariant: float = 0.05
+    levels: int = 3  # values of a column that only switches
+    rows: int = 10  # that a column numbers, at least
     runs: int = 3
     most: int = 20_000
 
@@ -112,7 +114,9 @@ def roles_of(
                 f"{source}: expected one role of each column, got {', '.join(twice)} twice"
             )
         return given, []
-    roles, notes = by_name(names), []
+    counts = [name for name in names if _is_count(runs, name)]
+    names = [name for name in names if name not in counts] or names
+    roles, notes = by_name(names), [f"{name} counts the rows, and is put aside" for name in counts]
     rest = [name for name in names if not any(name in roles[role] for role in ROLES)]
     varied = _varied(runs, rest)
     if varied:
@@ -142,6 +146,12 @@ def roles_of(
                 f"--{role}, in one order"
             )
     return roles, notes
+
+
+def _is_count(runs: Runs, name: str) -> bool:
+    """Return whether a column numbers the rows of each run."""
+    columns = [values[name] for _, values in runs.values()]
+    return all(len(x) > _OPTIONS.rows and np.all(np.diff(x) == 1) for x in columns)
 
 
 def _varied(runs: Runs, names: Sequence[str]) -> tuple[str, ...]:
@@ -178,9 +188,8 @@ def _by_data(
         raise InputError(f"{source}: none of the columns {', '.join(names)} varies")
     sizes = noise(times, np.stack([columns[name] for name in moving]))
     still = [n for n, s in zip(moving, sizes, strict=True) if _is_noise(columns[n], s)]
-    still += [n for n in moving if n not in still and np.all(np.diff(columns[n]) == 1)]
     moving = [name for name in moving if name not in still] or moving
-    notes = [f"{name} holds noise or a count alone, and is put aside" for name in still]
+    notes = [f"{name} holds noise alone, and is put aside" for name in still]
     pairs = _pairs(times, {name: columns[name] for name in moving})
     if pairs:
         paired = ", ".join(v for _, v in pairs), ", ".join(x for x, _ in pairs)
@@ -190,6 +199,12 @@ def _by_data(
     turning = turning or [n for n in rest if is_rate_of_turning(n)]
     if turning and not pairs:
         raise _of_rates(source, turning, np.stack([columns[name] for name in turning]), len(runs))
+    switches = [n for n in rest if len(np.unique(columns[n])) <= _OPTIONS.levels]
+    rest = [n for n in rest if n not in switches] or rest
+    if switches and rest[0] not in switches:
+        notes.append(f"{', '.join(switches)} only switches, and is taken as an input")
+    else:
+        switches = []
     inputs = [n for n in rest if _OF_DRIVES.fullmatch(units.get(n, ""))]
     lengths = [n for n in rest if _OF_LENGTHS.fullmatch(units.get(n, "").lower())]
     unclear = [n for n in rest if n not in (*inputs, *lengths)]
@@ -206,7 +221,7 @@ def _by_data(
     return {
         "positions": (*(x for x, _ in pairs), *lengths),
         "velocities": tuple(v for _, v in pairs),
-        "inputs": tuple(inputs),
+        "inputs": (*inputs, *switches),
     }, notes
 
 
@@ -258,7 +273,7 @@ def _unclear(
             {"structure": "poisson", "states": tuple(moving)},
         )
     return Undecided(
-        f"{source}: the names {', '.join(columns)} do not show what was measured, and "
+        f"{source}: the names {', '.join(moving)} do not show what was measured, and "
         f"{', '.join(shown)} may be motion or what drives it. Name them: --positions {typed}, or "
         "some of them and --inputs",
         {"positions": tuple(moving)},

@@ -19,7 +19,7 @@ TIMES = (
 )
 OF_CALENDAR = {"jd": "d", "jdtdb": "d", "jdut": "d", "mjd": "d"}
 OF_CALENDAR |= dict.fromkeys(("year", "years", "jahr", "annee", "ano"), "year")
-RUNS = ("run", "trial", "sequence", "seq", "episode", "experiment", "trajectory")
+RUNS = ("run", "trial", "sequence", "seq", "episode", "experiment", "trajectory", "lauf", "essai")
 
 _GREEK = {letter: unicodedata.name(letter).split()[3].lower() for letter in "αβγθφψωτ"}
 _GREEK |= {"ϕ": "phi", "ϑ": "theta"}

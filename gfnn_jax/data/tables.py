@@ -26,7 +26,8 @@ class Table:
 
     units: by column name, as a header or a row of units gave them. text: names of columns that hold
     no numbers. notes: what reading had to decide. locate: says where a row stands, for a message.
-    time: the column of times, where its name does not tell.
+    time: the column of times, where its name does not tell. step: the time between rows in s that
+    the file gives beside its columns, and what it calls it.
     """
 
     columns: dict[str, np.ndarray]
@@ -36,6 +37,7 @@ class Table:
     notes: tuple[str, ...] = ()
     locate: Callable[[int], str] = lambda row: f"row {row + 1}"
     time: str | None = None
+    step: tuple[str, float] | None = None
 
     @property
     def times(self) -> list[str]:
@@ -222,11 +224,13 @@ def _parts(
     column = _run_column(table)
     time = next(iter(table.times), None)
     if time is None and dt is None:
-        rising = [n for n, x in table.columns.items() if n != column and np.all(np.diff(x) > 0)]
+        ways = {n: np.diff(x) for n, x in table.columns.items() if n != column}
+        rising = [n for n, way in ways.items() if np.all(way > 0) and not np.all(way == 1)]
         named = f"--time {shlex.quote(rising[0])} if that is it, or " if rising else ""
+        step = f" {table.step[1]:g}, its {table.step[0]}" if table.step else ""
         raise InputError(
             f"{table.source}: expected a column t or time, found {', '.join(table.columns)}; give "
-            f"{named}the time between rows: --dt"
+            f"{named}the time between rows: --dt{step}"
         )
     if column is not None:
         labels, first, inverse = np.unique(

@@ -52,6 +52,9 @@ _OPTIONS = _Options()
 # What begins as dates and times of day do: 2024-05-01, 5/7/2021, 7.5.2021, 09:33:31.
 _DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}(\D|$)|\d{1,2}:\d{2}(:\d|$)")
 _DAY = 86_400.0
+# Names of the time between rows, and of its inverse, in what instruments write above a table.
+_STEP = re.compile(r"(?i)(sampl\w+ |horizontal )?(interval|increment|period)|xincr|delta ?t|dt")
+_RATE = re.compile(r"(?i)sampl\w+ (rate|frequency)")
 
 
 class TextFile:
@@ -116,6 +119,7 @@ class TextFile:
                 f"{path}: line {of_file[first][0]}: {len(above[-1])} columns expected "
                 f"({', '.join(above[-1])[:60]}), {width} found"
             )
+        self.step = self._step(cells[:first])
         self.runs: dict[str, tuple[str, str]] = {}
         self.names, self.units = self._header(above, width, columns)
         known = [[row[i] for row in rows if i < len(row)] for i in range(width)]
@@ -160,6 +164,20 @@ class TextFile:
             return rows[0] if rows else None
         words = [k for k in range(whole) if not self._numbers(cells[k])]
         return next(k for k in rows if k > max(words, default=-1))
+
+    def _step(self, above: list[list[str]]) -> tuple[str, float] | None:
+        """The time between rows that the lines above a table give behind or below its name."""
+        for row, below in itertools.pairwise([*above, []]):
+            for i, cell in enumerate(row):
+                name = split_unit(cell.rstrip(": "))[0]
+                kinds = [k for k, of in enumerate((_STEP, _RATE)) if of.fullmatch(name)]
+                for told in (*row[i + 1 : i + 2], *below[i : i + 1]) if kinds else ():
+                    if (
+                        self._numbers([told])
+                        and (value := float(told.replace(self._decimal, "."))) > 0
+                    ):
+                        return name, 1 / value if kinds[0] else value
+        return None
 
     def _header(
         self, above: list[list[str]], width: int, columns: Sequence[str]
@@ -454,6 +472,7 @@ def from_text(
         (*text.notes, *_put_aside(text)),
         lambda row: text.locate(int(row_numbers[row])),
         next(iter(text.times), None),
+        text.step,
     )
 
 

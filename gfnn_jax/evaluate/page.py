@@ -212,7 +212,7 @@ def _of_law(
         rows=[
             (
                 ", ".join(f"{n} = {q:.3g} {m.units[n]}".rstrip() for n, q in m.start.items()),
-                f"{m.apart:.0f} standard deviations between this law and its nearest rival"
+                f"{m.apart:.2g} standard deviations between this law and its nearest rival"
                 if m.apart
                 else "standard errors smaller, "
                 + ", ".join(

@@ -418,11 +418,11 @@ def _of_swings(swings: Swings, system: _System) -> list[Quantity]:
     against = f"{100 * drift:+.2g} % against small swings" if abs(drift) > 1e-6 else "as small ones"
     found = [
         Quantity(
-            f"{at}: frequency",
+            f"{at}, without friction: frequency",
             float(swings.frequency[-1]),
             float(swings.frequency_std[-1]),
             "Hz",
-            f"without friction, {against}",
+            against,
         )
     ]
     if np.isfinite(swings.quality[-1]):

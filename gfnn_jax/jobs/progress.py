@@ -32,36 +32,26 @@ SILENT = Progress()
 
 @contextlib.contextmanager
 def on_stderr() -> Iterator[Progress]:
-    """Show a status line on a terminal; elsewhere a line now and then, every 5 s at least. What is
-    compiled meanwhile is a status too, until it is done."""
-    current = ["working"]
-
-    def status(message: str) -> None:
-        current[0] = message
-        shown.status(message)
-
-    with _shown() as shown, compiling.shown_by(lambda line: shown.status(line or current[0])):
-        yield shown._replace(status=status)
-
-
-@contextlib.contextmanager
-def _shown() -> Iterator[Progress]:
+    """Show a status line on a terminal; elsewhere a line now and then, every 5 s at least."""
     if not sys.stderr.isatty():
         lines = _Lines()
-        try:
-            yield Progress(lines.status, lines.line)
-        finally:
-            lines.stop()
+        with compiling.shown_by(lines.meanwhile):
+            try:
+                yield Progress(lines.status, lines.line)
+            finally:
+                lines.stop()
         return
     from rich.console import Console
     from rich.markup import escape
 
     console = Console(stderr=True)
-    with console.status("working") as status:
-        yield Progress(
-            lambda message: status.update(escape(message)),
-            lambda message: console.print(escape(message), highlight=False),
-        )
+
+    def line(message: str) -> None:
+        if message:
+            console.print(escape(message), highlight=False)
+
+    with console.status("working") as status, compiling.shown_by(line):
+        yield Progress(lambda message: status.update(escape(message)), line)
 
 
 _PART = re.compile(r"(.*) \((\d+) of (\d+)\)$")  # a message about the k-th of n equal parts
@@ -103,6 +93,7 @@ class _Lines:
         self._last = self._started - BETWEEN  # the first line comes at once
         self._message, self._has_status = "starting", False
         self._since, self._left = self._started, _Left()
+        self._waits = self._message, self._has_status, self._since
         self._lock, self._stopped = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._repeat, daemon=True)
         self._thread.start()
@@ -118,6 +109,15 @@ class _Lines:
             if not self._has_status:
                 self._take(message.strip(), False)
             self._print(message + self._left.of(message, time.perf_counter()))
+
+    def meanwhile(self, message: str) -> None:
+        """Show what is compiled while the work waits, until a message of "" goes back to that."""
+        with self._lock:
+            if message:
+                self._waits = self._message, self._has_status, self._since
+                self._take(message, True)
+            else:
+                self._message, self._has_status, self._since = self._waits
 
     def _take(self, message: str, has_status: bool) -> None:
         """Note what is being done, and since when."""

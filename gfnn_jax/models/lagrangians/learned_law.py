@@ -52,7 +52,7 @@ class NextMotion(NamedTuple):
         at = ", ".join(f"{name} = {_of(q, self.units[name])}" for name, q in self.start.items())
         if self.apart:
             return (
-                f"release from rest at {at}. Its readings together put {self.apart:.0f} standard "
+                f"release from rest at {at}. Its readings together put {self.apart:.2g} standard "
                 "deviations between the law and its nearest rival"
             )
         best = ", ".join(f"of {t} {min(g, 1000):.3g}×" for t, g in [*self.gains.items()][:3])
