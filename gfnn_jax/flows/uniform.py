@@ -76,19 +76,19 @@ class Uniform(WithForces):
 
     def gradient(self, params, w, args=None):
         """(∂H/∂q + γp, ∂H/∂p), shape (..., 2d)."""
-        return self.family.gradient(params[:-1], w, args) + params[-1] * _momenta(w)
+        return self.family.gradient(params[:-1], w, args) + params[-1] * momenta(w)
 
     def gradient_and_hessian(self, params, w, args=None):
         """Field and its derivative (..., 2d, 2d), which is not symmetric."""
         gradient, hessian = self.family.gradient_and_hessian(params[:-1], w, args)
         more = np.eye(2 * self.dim, k=self.dim, dtype=hessian.dtype)  # of (p, 0) in (q, p)
-        field = gradient + params[-1] * _momenta(w)
+        field = gradient + params[-1] * momenta(w)
         return field, hessian + params[-1] * as_row(more, hessian)
 
     def term_gradients(self, w, args=None):
         """The field of every term, γ's with them, shape (..., 2d, m + 1). NumPy."""
         own = self.family.term_gradients(w, args)
-        return np.concatenate([own, _momenta(w)[..., None]], axis=-1)
+        return np.concatenate([own, momenta(w)[..., None]], axis=-1)
 
     def begun(self, args, lanes):
         """(family, args) of H̃ as a step begins from states ``lanes`` (B, 2d)."""
@@ -217,7 +217,7 @@ class CaldirolaKanai:
         return growth, inner, args[..., :-1] if args.shape[-1] > 1 else None
 
 
-def _momenta(w):
+def momenta(w):
     """(p, 0) of states (..., 2d): the field that friction adds, for γ = 1."""
     _, p = split(w)
     return namespace(w).concatenate([p, namespace(w).zeros_like(p)], axis=-1)

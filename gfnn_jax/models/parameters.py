@@ -72,7 +72,10 @@ def states_and_functions(
     angles, plain = angles_and_others(data)
     if angles and features is None:
         basis = Modes(dim, angles, plain)
-        found = [basis.terms(basis.box(*size)) for size in OPTIONS.boxes]
+        # A torque that the args say, −∂H/∂θ of θ f(args), is one for all turns of θ.
+        names = tuple(coordinate_names(dim)[i] for i in angles)
+        turned = Terms(dim, names, tuple(map(tuple, np.eye(len(names), dtype=int).tolist())))
+        found = [joined(basis.terms(basis.box(*size)), turned) for size in OPTIONS.boxes]
     else:
         degrees = OPTIONS.polynomials if features is None else OPTIONS.features
         cyclic = data.coordinates.cyclic

@@ -27,6 +27,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.fitting.evidence import EVIDENCE, Rival
 from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_with_constants
 from gfnn_jax.flows.collocation import Steps, operations
+from gfnn_jax.flows.uniform import Uniform, momenta
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw, PartialLaw, Term
 from gfnn_jax.models.hamiltonians.fitted_law import formula as formula_of
 from gfnn_jax.models.hamiltonians.problem import LawProblem
@@ -92,26 +93,25 @@ _STEPS = Steps(6, 1)
 
 
 def law_of_physics(problem: LawProblem) -> FittedLaw | None:
-    """The law, or None where none is found, or the pairs are of no autonomous flow of a few degrees
-    of freedom in plain coordinates and angles. ``partly`` is called with the three laws that come
-    closest, where none is exact."""
+    """The law, with uniform friction where that explains what laws without leave over, or None
+    where none is found, or the pairs are of no autonomous flow of a few degrees of freedom in plain
+    coordinates and angles. ``partly`` is called with the three laws that come closest, where none
+    is exact."""
     data, rows, work = problem.data, problem.data.training, problem.work
     if not problem.simple or data.dim > CLEAN.most_dim or len(rows) < OPTIONS.fewest:
         return None
     allowance = dataclasses.replace(problem.flows.allowance, cap=None)
     own = dataclasses.replace(problem.flows, allowance=allowance)  # no part of what libraries take
-    angles = tuple(a for a in data.coordinates.angles if a < data.dim)
-    cyclic = data.coordinates.cyclic
-    search = Textbook(own, rows, angles=angles, cyclic=cyclic, on_progress=problem.on_progress)
-    law = None
-    for name, contents, allowed in OPTIONS.dictionaries:
-        if law is not None or not allowed[data.dim - 1]:
-            continue
-        searched = False
-        with work.optional(name), work.budget.unit(name, MATCHING, allowed[data.dim - 1]):
-            law, searched = search.law(**dict.fromkeys(contents, True)), True
-        if not searched:
-            return None
+    of_z = {
+        "angles": tuple(a for a in data.coordinates.angles if a < data.dim),
+        "cyclic": data.coordinates.cyclic,
+        "on_progress": problem.on_progress,
+    }
+    search = Textbook(own, rows, **of_z)
+    law = _searched(problem, search, OPTIONS.dictionaries)
+    if law is None and search.asks_for(momenta):
+        damped = Textbook(own, rows, forces=Uniform, **of_z)
+        law = _searched(problem, damped, OPTIONS.dictionaries[:1])
     if law is None:
         for partial in search.partial:
             family, c = _without_nothing(partial, data.y0[rows], data.scale)
@@ -126,6 +126,19 @@ def law_of_physics(problem: LawProblem) -> FittedLaw | None:
         found = problem.fitted(family, start, rows, rounds=False)
         if problem.met_by(found) and found.error.relative <= OPTIONS.exact:
             return found._replace(null=search.null, undetermined=search.null)
+    return None
+
+
+def _searched(problem: LawProblem, search: Textbook, dictionaries) -> Law | None:
+    """The law that a search finds in these dictionaries, in turn, as far as the budget goes."""
+    for name, contents, allowed in dictionaries:
+        operations, law, searched = allowed[problem.data.dim - 1], None, False
+        if not operations:
+            continue
+        with problem.work.optional(name), problem.budget.unit(name, MATCHING, operations):
+            law, searched = search.law(**dict.fromkeys(contents, True)), True
+        if law is not None or not searched:
+            return law
     return None
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain, combinations, combinations_with_replacement, permutations, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from gfnn_jax.models.textbook.atoms import (
     powers_of,
     value_of,
 )
-from gfnn_jax.models.textbook.shapes import COSH, Kind, constants_for, has_constant, values
+from gfnn_jax.models.textbook.shapes import COSH, POLE, Kind, constants_for, has_constant, values
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +68,8 @@ class Setting:
     """The states at which laws are looked at, and the rows that gradients of H make there.
 
     states: (N, 2d). angles, cyclic: indices of z. average: makes the rows (…, R, 2d) of gradients
-    (…, N, 2d) at the states, where they are not these themselves. arguments: at the states. null:
+    (…, N, 2d) at the states, where they are not these themselves. forces: makes a family of H one
+    with forces, linear in their coefficients. arguments: at the states. null:
     the coordinates and products of two that the states do not tell from those before. base: the
     others, which are in every law; spanned: (rows, n) orthonormal columns of them. weight: (2d,),
     or of each row, by which gradients are multiplied.
@@ -81,9 +82,10 @@ class Setting:
         angles: Sequence[int] = (),
         cyclic: Sequence[int] = (),
         average: Callable[[np.ndarray], np.ndarray] = np.asarray,
+        forces: Callable[[Terms], Any] = lambda h: h,
     ):
         self.states, self.angles, self.cyclic = states, tuple(angles), tuple(cyclic)
-        self.average, self.dim = average, states.shape[1] // 2
+        self.average, self.forces, self.dim = average, forces, states.shape[1] // 2
         self.arguments = arguments_of(states, self.angles, self.cyclic)
         every = polynomial_terms(self.dim, 2, cyclic=(*angles, *cyclic))
         kept, null = null_terms(every, states)
@@ -93,7 +95,7 @@ class Setting:
     def take(self, base: Terms, weight: np.ndarray) -> None:
         """Take this base, and these weights."""
         self.base, self.weight = base, weight
-        self.spanned = orthonormal(self.columns(base))
+        self.spanned = orthonormal(self.columns(self.forces(base)))
 
     @property
     def degree(self) -> int:
@@ -105,7 +107,7 @@ class Setting:
         """(rows,) of a gradient (N, 2d) at the states."""
         return (self.average(gradient) * self.weight).ravel()
 
-    def columns(self, family: Terms) -> np.ndarray:
+    def columns(self, family) -> np.ndarray:
         """(rows, terms): the weighted gradients of a family's terms."""
         gradients = np.moveaxis(family.term_gradients(self.states), -1, 0)
         return (self.average(gradients) * self.weight).reshape(family.num_parameters, -1).T
@@ -120,9 +122,10 @@ class Setting:
         names = polynomial_terms(self.dim, 1).variables
         return joined(self.base, Terms(self.dim, names, tuple(products))), others
 
-    def family(self, atoms: Sequence[Atom]) -> Terms:
-        """Terms of the base and these atoms. Raises InputError for a constant that has run away."""
-        return beside(*self.plain(atoms), self.arguments)
+    def family(self, atoms: Sequence[Atom]) -> Any:
+        """Terms of the base and these atoms, and the forces. Raises InputError for a constant that
+        has run away."""
+        return self.forces(beside(*self.plain(atoms), self.arguments))
 
     def dictionary(
         self,
@@ -196,8 +199,8 @@ class Setting:
         return found
 
     def curved(self) -> list[tuple[Atom, ...]]:
-        """p_r²/r and 1/r², which motion around a heavy body has beside other functions of r:
-        neither explains much without the others."""
+        """p_r²/r and 1/r², which motion around a heavy body has beside other functions of r, and
+        with them 1/(r + θ), that of its horizon: none explains much without the others."""
         found = []
         for place, argument in enumerate(self.arguments):
             if argument.circular or ("power", -2.0) not in argument.kinds:
@@ -205,7 +208,10 @@ class Setting:
             for k, other in enumerate(self.arguments):
                 if argument.index >= 0 and other.index == argument.index + self.dim:
                     square, pole = Factor(k, ("power", 2.0)), Factor(place, ("power", -1.0))
-                    found.append(((square, pole), (Factor(place, ("power", -2.0)),)))
+                    both: list[Atom] = [(square, pole), (Factor(place, ("power", -2.0)),)]
+                    horizons = constants_for(POLE, argument.value)[:: OPTIONS.coarse].tolist()
+                    found.append(tuple(both))
+                    found += [(*both, (Factor(place, POLE, theta),)) for theta in horizons]
         return found
 
     def _of_one(self) -> _Group:

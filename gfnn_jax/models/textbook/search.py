@@ -72,9 +72,10 @@ OPTIONS = TextbookOptions()
 
 
 class Law(NamedTuple):
-    """A family of terms of H, their coefficients, and the RMS of Φ(z₀) − z₁ ÷ scale."""
+    """A family of terms of H, and forces where there are such, their coefficients, and the RMS of
+    Φ(z₀) − z₁ ÷ scale."""
 
-    family: Terms
+    family: Any
     coefficients: np.ndarray
     left: float
 
@@ -90,7 +91,7 @@ class _State(NamedTuple):
 class Textbook:
     """The search for the law of these rows of a problem's pairs, which have no args.
 
-    angles, cyclic: indices of z. Raises ValueError for more degrees of freedom than
+    angles, cyclic: indices of z. forces: of `Setting`. Raises ValueError for more degrees of freedom than
     ``OPTIONS.most_dim``.
     """
 
@@ -101,6 +102,7 @@ class Textbook:
         *,
         angles: Sequence[int] = (),
         cyclic: Sequence[int] = (),
+        forces: Callable[[Terms], Any] = lambda h: h,
         on_progress: Callable[[str], Any] = lambda message: None,
     ):
         dim = problem.z0.shape[1] // 2
@@ -114,7 +116,7 @@ class Textbook:
         dt = of_lanes(problem.dt, self._rows)
         self._h = dt[:, None] if np.ndim(dt) else dt
         self._middle, weight = 0.5 * (z0 + self._z1), 1.0 / np.roll(problem.scale, dim)
-        self._setting = Setting(self._middle, weight, angles, cyclic)
+        self._setting = Setting(self._middle, weight, angles, cyclic, forces=forces)
         self.null = self._setting.null
         self._tried = 0  # atoms of the dictionary before
         self._target = -apply_j(self._z1 - z0) / self._h
@@ -145,6 +147,17 @@ class Textbook:
             kind = tuple(sorted(tuple(f.form for f in a) for a in state.match.atoms))
             kinds.setdefault(kind, state)
         return [state.law for state in list(kinds.values())[:3]]
+
+    def asks_for(self, field: Callable[[np.ndarray], np.ndarray]) -> bool:
+        """Return whether this field (N, 2d) of states explains more of what the closest law leaves
+        over than it would of noise."""
+        closest = min(self._partial, key=lambda s: s.law.left, default=None)
+        if closest is None:
+            return False
+        column, spanned = self._setting.flat(field(self._middle)), self._setting.spanned
+        column -= spanned @ (spanned.T @ column)
+        own = Dictionary([], column[:, None] / np.linalg.norm(column))
+        return self._certain(self._matching(closest.target).gains(closest.match, own), 1)
 
     def _matching(self, target: np.ndarray) -> Matching:
         return Matching(self._setting, (target * self._setting.weight).ravel())
@@ -202,9 +215,14 @@ class Textbook:
 
     def _explains_nothing(self, state: _State, dictionary: Dictionary) -> bool:
         """Return whether no atom explains more of what is left over than it would of noise."""
-        gain = self._matching(state.target).gains(state.match, dictionary).max(initial=0.0)
-        chance = 2 * np.log(len(dictionary.atoms)) + OPTIONS.certain
-        return bool(-self._middle.size * np.log1p(-min(gain, 1 - 1e-12)) < chance)
+        gains = self._matching(state.target).gains(state.match, dictionary)
+        return not self._certain(gains, len(dictionary.atoms))
+
+    def _certain(self, gains: np.ndarray, tried: int) -> bool:
+        """Return whether the largest gain of so many atoms tried is no chance."""
+        gain = min(gains.max(initial=0.0), 1 - 1e-12)
+        chance = 2 * np.log(tried) + OPTIONS.certain
+        return bool(-self._middle.size * np.log1p(-gain) >= chance)
 
     def _converged(self, match: Match, target: np.ndarray) -> _State | None:
         """The match with coefficients and constants as far as corrections lead; None where its
@@ -268,9 +286,10 @@ class Textbook:
         for atoms in _shorter(state.match.atoms):
             if complexity_of(atoms) >= state.match.complexity:
                 continue
-            if not self._as_well(matching.residual_of(atoms), state):
+            match = matching.refined(atoms)  # spare atoms put the others' constants off
+            if not self._as_well(match.left, state):
                 continue
-            found = self._converged(matching.refined(atoms), state.target)
+            found = self._converged(match, state.target)
             if found is not None and found.law.left <= bound:
                 return self._fewer(found, bound)
         return state
