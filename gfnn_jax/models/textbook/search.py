@@ -44,7 +44,8 @@ class TextbookOptions:
     pairs whose flow may fail. most_dim: degrees of freedom, beyond which the dictionary is too
     large. rows_per_term: that all products of coordinates need together. certain: twice the
     logarithm of the odds that what an atom explains is no chance. rounded: of a constant, that may
-    be rounded away where the law stays as exact. matched: of gradients, a match at roundoff;
+    be rounded away where the law stays as exact; shown: digits that it may then have, those of
+    round numbers, and as many as keep roundoff. matched: of gradients, a match at roundoff;
     as_well: times what a match leaves over, below it a simpler one is looked at.
     """
 
@@ -64,6 +65,7 @@ class TextbookOptions:
     rows_per_term: float = 1.6
     certain: float = 10.0
     rounded: float = 1e-8
+    shown: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 13)
     matched: float = 1e-14
     as_well: float = 1e3
 
@@ -91,8 +93,8 @@ class _State(NamedTuple):
 class Textbook:
     """The search for the law of these rows of a problem's pairs, which have no args.
 
-    angles, cyclic: indices of z. forces: of `Setting`. Raises ValueError for more degrees of freedom than
-    ``OPTIONS.most_dim``.
+    angles, cyclic: indices of z. forces: of `Setting`. Raises ValueError for more degrees of
+    freedom than ``OPTIONS.most_dim``.
     """
 
     def __init__(
@@ -320,7 +322,7 @@ def _of_few_digits(constant: float) -> Iterator[float]:
     """Numbers near the constant, those of fewest digits first."""
     if abs(constant) < OPTIONS.rounded:
         yield 0.0
-    for digits in range(1, 13):
+    for digits in OPTIONS.shown:
         rounded = float(f"{constant:.{digits}g}")
         if abs(rounded - constant) <= OPTIONS.rounded * abs(constant):
             yield rounded
