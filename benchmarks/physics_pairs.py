@@ -6,9 +6,9 @@
 
 A kind is H as text, with numbers that are drawn, 400 states in a box or on orbits, and their images
 by SciPy at tolerances of 1e-13. Given are the pairs, which coordinates are angles, and the input of
-each pair; not that there is friction. A law is *exact* that has as many terms as the truth, the rate
-of its friction to 1e-8, and whose steps from 100 states that no fit has seen err by less than 1e-9
-of their spread, at a tolerance of 1e-10.
+each pair; not that there is friction. A law is *exact* that has as many terms as the truth, the
+rate of its friction to 1e-8, and whose steps from 100 states that no fit has seen err by less than
+1e-9 of their spread, at a tolerance of 1e-10.
 """
 
 from __future__ import annotations

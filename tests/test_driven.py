@@ -52,6 +52,15 @@ def after(z, t0, steps):
     return z
 
 
+def test_a_torque_on_an_angle_is_found_from_pairs():
+    law, rng = given_terms(1, ["p**2/2", "cos(q)", "q*u"], ("u",)), np.random.default_rng(0)
+    z0, u = rng.uniform(-3, 3, (300, 2)), rng.uniform(-1, 1, 300)
+    z1 = images(law, np.array([1.0, -2.0, -0.7]), z0, 0.1, FINE, args=u[:, None]).states
+    fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.1, args={"u": u}), angles=(0,), tolerance=1e-10)
+    found = {term.term: term.coefficient for term in fit.hamiltonian.terms}
+    assert found == pytest.approx({"p1²": 0.5, "cos(q1)": -2.0, "q1 u": -0.7}, abs=1e-10)
+
+
 @pytest.fixture(scope="module")
 def learned():
     z, t0 = states(300)

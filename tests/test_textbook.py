@@ -15,6 +15,8 @@ import gfnn_jax as gfnn
 from gfnn_jax.evaluate.report import assemble
 from gfnn_jax.families.terms import given_terms, polynomial_terms
 from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.flows.collocation import Steps, images
+from gfnn_jax.flows.uniform import Uniform
 from gfnn_jax.models.textbook.atoms import (
     Factor,
     arguments_of,
@@ -264,7 +266,7 @@ def test_a_mass_that_depends_on_the_distance_is_found_beside_a_pole():
         return np.stack([p**2 / r**2 - 16 / r**3 + beyond**2, (1 - 2 / r) * p], axis=1)
 
     rng = np.random.default_rng(0)
-    z0 = np.stack([rng.uniform(6, 20, 200), rng.uniform(-0.3, 0.3, 200)], axis=1)
+    z0 = np.stack([rng.uniform(8, 20, 200), rng.uniform(-0.3, 0.3, 200)], axis=1)
     pairs = pairs_of(gradient, z0, dt=1.0)
     problem = Problem(pairs.z0, pairs.z1, pairs.dt, sizes(pairs.z0))
     found = read(Textbook(problem, np.arange(200)).law(products=True))
@@ -341,6 +343,19 @@ def test_noise_is_no_formula():
 
 
 # In a fit
+
+
+def test_friction_is_found_beside_a_law_of_physics():
+    law, c = given_terms(1, ["p**2/2", "exp(-1.3*q)", "exp(-2.6*q)"]), [1.0, -2.0, 1.0, 0.08]
+    rng = np.random.default_rng(0)
+    z0 = np.column_stack([rng.uniform(-0.4, 1.5, 200), rng.uniform(-0.8, 0.8, 200)])
+    z1 = images(Uniform(law), np.array(c), z0, 0.1, Steps(6, 2)).states
+    fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.1), tolerance=1e-10)
+    found = {term.term: term.coefficient for term in fit.hamiltonian.terms}
+    assert found == pytest.approx(
+        {"p1²": 0.5, "exp(-1.3*q1)": -2.0, "exp(-2.6*q1)": 1.0}, abs=1e-10
+    )
+    assert fit.friction.terms[0].coefficient == pytest.approx(0.08, abs=1e-10)
 
 
 def test_a_law_is_found_where_sums_with_spare_atoms_leave_roundoff_too():
