@@ -350,7 +350,7 @@ def test_friction_is_found_beside_a_law_of_physics():
     rng = np.random.default_rng(0)
     z0 = np.column_stack([rng.uniform(-0.4, 1.5, 200), rng.uniform(-0.8, 0.8, 200)])
     z1 = images(Uniform(law), np.array(c), z0, 0.1, Steps(6, 2)).states
-    fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.1), tolerance=1e-10)
+    fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.1), tolerance=1e-10, learn="hamiltonian")
     found = {term.term: term.coefficient for term in fit.hamiltonian.terms}
     assert found == pytest.approx(
         {"p1²": 0.5, "exp(-1.3*q1)": -2.0, "exp(-2.6*q1)": 1.0}, abs=1e-10
