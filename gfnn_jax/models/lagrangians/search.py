@@ -430,12 +430,13 @@ def with_a_spring(fit: LawFit, angle: int) -> LawFit:
 
 
 def frictions_tried(dim: int, options: SearchOptions) -> tuple[Loss, ...]:
-    """Friction of all the kinds that are asked for, in every direction."""
+    """Friction of all the kinds that are asked for, in every direction; of many coordinates, where
+    there is a choice, no rare kind, and of two speeds none of their sum."""
     kinds = tuple(libraries.KINDS[libraries.FRICTIONS.index(k)] for k in options.frictions)
     if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
         kinds = tuple(kind for kind in kinds if kind != UNIFORM)
     rows = libraries.losses(dim, kinds, 0.0)
-    if dim > libraries.FEW:
+    if dim > libraries.FEW and options.choose_friction:
         return tuple(row for row in rows if row[1] not in libraries.RARE)
     turned = [one for one in map(libraries.opposite, rows) if one is not None]
     return tuple(sorted((*rows, *turned), key=lambda row: row[1] == UNIFORM))
