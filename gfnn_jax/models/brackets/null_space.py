@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -172,7 +172,7 @@ def shrinking(z: np.ndarray, f: np.ndarray, slope: np.ndarray, clean: bool) -> l
                     return shifted.T @ shifted
 
                 near = (found, found + limit * size)
-                least = minimize_scalar(lambda rate: np.linalg.eigvalsh(gram(rate))[0], near)
+                least: Any = minimize_scalar(lambda rate: np.linalg.eigvalsh(gram(rate))[0], near)
                 found = float(least.x)
                 vector = np.linalg.eigh(gram(found))[1][:, 0]
             bracket = every @ vector
