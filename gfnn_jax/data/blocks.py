@@ -167,7 +167,8 @@ def check_width(path, name: str, shape: tuple[int, ...]) -> int:
     if width == 0 or width % 2:
         raise InputError(
             f"{path}: {name} of shape {shape} must have an even last dimension 2d (q first, then "
-            f"p), found {width}"
+            f"p), found {width}. Of states with another bracket, as angular velocities, in Python: "
+            'gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))'
         )
     return width // 2
 

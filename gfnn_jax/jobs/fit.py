@@ -193,9 +193,15 @@ def fit_states(
     data: Sequence[Path], output: Output, *, columns: dict[str, Any], **options: Any
 ) -> Ran:
     """Learn the law and the bracket of states in files, and write them with their report into the
-    model folder. columns: keywords of `gfnn_jax.read`, the states as its positions; without them
-    the files hold trajectories, of any number of coordinates. options: `FitOptions`."""
+    model folder. columns: keywords of `gfnn_jax.read`, the states as its positions. options:
+    `FitOptions`. Raises InputError for arrays whose columns have no names."""
     progress = output.progress
+    for path in () if columns.get("positions") or columns.get("columns") else data:
+        if Path(path).suffix in (".npy", ".npz"):
+            raise InputError(
+                f"{path}: expected columns with names, --states A,B. Of arrays, in Python: "
+                'gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))'
+            )
     with refusals():
         asked = FitOptions(**{**options, "structure": "poisson"})
     recording = read(list(data), **columns)

@@ -228,7 +228,8 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
         if hidden:
             raise _too_few_runs(hidden + 1, 2, len(np.unique(train.run)))
     noisy = None if more else _noise(field, fit, error, train)
-    free = terms is None and not more and error > OPTIONS.exact
+    free = terms is None and not more and error > OPTIONS.exact and not np.ndim(train.dt)
+    free = free and _several_steps(field, fit, train) >= OPTIONS.fewest
     while free and noisy is None and degree < OPTIONS.degrees[-1]:
         try:  # terms that one step does not show
             higher = _free_field(train, held, names, None, on_progress, degree + 1)
@@ -255,7 +256,7 @@ def _of_field(train: Data, held: Data, names, terms: Terms | None, on_progress) 
         kind = null.tensors.kind
         if not null.rate:
             nearest[kind] = null.nearest
-        elif len(null.vectors):
+        elif len(null.vectors) and null.rate > 0:
             shrunk.append(f"{null.rate:.4g}")
         on_progress(f"{kind} brackets: {len(null.vectors)}, the nearest at {null.nearest:.1e}")
         if not len(null.vectors) or (null.rate and kind == LOG):
@@ -522,9 +523,7 @@ def _noise(field: FreeField, fit: FieldFit, error: float, train: Data) -> _Noisy
     if error <= OPTIONS.exact or np.ndim(train.dt):
         return None
     sequences = arcs_of(train.z0, train.z1, train.run, train.place)
-    some = train.z0[:: max(1, len(train.z0) // OPTIONS.states)]
-    rates = np.abs(field.jacobian(fit.c, some)).sum(axis=2).max(axis=1) * train.dt
-    steps = max(2, int(OPTIONS.long / np.median(rates)))
+    steps = _several_steps(field, fit, train)
     sequences = [s for s in sequences if len(s) >= OPTIONS.fewest]
     steps = min(steps, max(map(len, sequences), default=4) // 2)
     if not sequences:
@@ -536,6 +535,13 @@ def _noise(field: FreeField, fit: FieldFit, error: float, train: Data) -> _Noisy
         return None
     sigma = np.sqrt(np.mean(fit.residual**2, axis=0) / 2)
     return _Noisy(sequences, long, again, sigma)
+
+
+def _several_steps(field: FreeField, fit: FieldFit, train: Data) -> int:
+    """Number of steps over which the field is fitted to states with noise."""
+    some = train.z0[:: max(1, len(train.z0) // OPTIONS.states)]
+    rates = np.abs(field.jacobian(fit.c, some)).sum(axis=2).max(axis=1) * train.dt
+    return max(2, int(OPTIONS.long / np.median(rates)))
 
 
 def _richer(law: PoissonLaw, noisy: _Noisy, train: Data, held: Data) -> PoissonLaw:
