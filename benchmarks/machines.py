@@ -2,7 +2,7 @@
 
     python benchmarks/machines.py                 pieces without a result, then the table
     python benchmarks/machines.py --only pendulum --overwrite
-    python benchmarks/machines.py --robot FILE    robot_arm.csv to MuJoCo too
+    python benchmarks/machines.py --robot FILE    robot_arm.csv to MuJoCo, and swung up, too
     python benchmarks/machines.py --quick         few states, into runs/machines, no table
 
 Every law is drawn with coefficients at random within a few percent. Its flow is made by collocation
@@ -32,7 +32,17 @@ from pathlib import Path
 from typing import Any
 
 # Sets float64, so it comes before all of JAX.
-from harness import SEED, TABLES, Numbers, between_markers, markdown, number, provenance, results
+from harness import (
+    HERE,
+    SEED,
+    TABLES,
+    Numbers,
+    between_markers,
+    markdown,
+    number,
+    provenance,
+    results,
+)
 from harness import main as run_pieces
 
 # isort: split
@@ -135,6 +145,8 @@ TERMS = [
     "R: omega1**2",
     "R: (omega1 - omega2)**2",
 ]
+LIMIT, PERIOD, LONG = 6.0, 0.01, 10.0  # N m; s, of a torque and of what is followed
+SWINGS = {"pendubot": (0, 2.0), "acrobot": (1, 3.0)}  # the joint that has a motor, s of its plan
 TRAINED, WINDOW, AHEAD = 4, 0.3, 0.5  # runs; s of samples before a start, s followed
 CHAINS = ("pendulum", "double-pendulum")
 NEEDED = {"c": "cc", "c-taylor": "cc", "js": "node", "casadi": "casadi", "fmu": "fmpy"}
@@ -392,6 +404,54 @@ def _beside_mujoco(fit: gfnn.Fit, record: gfnn.Recording, starts: np.ndarray) ->
     }
 
 
+def swing_up(quick: bool, path: Path) -> Numbers:
+    """Controllers of the robot arm's law, of one joint each (`notebooks/swing_up.py`): how many
+    draws of its posterior come up and stay, and the designers' plant."""
+    sys.path.insert(0, str(HERE.parent / "notebooks"))
+    own: Any = importlib.import_module("swing_up")
+    (fit, _), draws, found = of_robot(path, quick), 10 if quick else 100, {}
+    for name, (joint, seconds) in SWINGS.items():
+        begun = time.process_time()
+        of, by, _ = own.controller(fit, joint, PERIOD, seconds, LIMIT)
+        found[name] = {"seconds": time.process_time() - begun}
+        plants = {
+            "draws": (own.draws_of(fit, joint, PERIOD, draws, seed=2), draws),
+            "published": (own.designers(joint, PERIOD, True), 1),
+            "leaderboard": (own.designers(joint, PERIOD, False), 1),
+        }
+        for key, (plant, count) in plants.items():
+            x, u = own.followed(by, of, plant, count, LONG, LIMIT)
+            since = own.up_from(x, PERIOD)
+            is_up = np.isfinite(since)
+            found[name][key] = {
+                "plants": count,
+                "up": int(is_up.sum()),
+                "from": float(np.median(since[is_up])) if is_up.any() else None,
+                "score": _scored(x[:, is_up], u[:, is_up], since[is_up], joint)
+                if is_up.any()
+                else None,
+            }
+    return found
+
+
+def _scored(x: np.ndarray, u: np.ndarray, since: np.ndarray, joint: int) -> float:
+    """The median score of motions that come up, of 1 at most, as `analysis/leaderboard.py` of the
+    designers has it for simulations (version 2; torques every 2 ms)."""
+    q, v = (np.stack([a[..., 0], a[..., 1] - a[..., 0]], axis=-1) for a in (x[..., :2], x[..., 2:]))
+    turned = np.abs(np.diff(q, axis=0)).max(
+        axis=-1
+    )  # of the joint that moves more: at least its own
+    changes = np.diff(np.repeat(u, round(PERIOD / 2e-3), axis=0), axis=0).std(axis=0)
+    criteria = [
+        (since, 20.0),
+        ((turned * np.abs(u)).sum(axis=0), 60.0),
+        (PERIOD * (u**2).sum(axis=0), 20.0),
+        (changes, 0.1),
+        (PERIOD * (v[:-1] ** 2).sum(axis=(0, 2)), 400.0),
+    ]
+    return float(np.median(1 - np.mean([np.tanh(np.pi * c / n) for c, n in criteria], axis=0)))
+
+
 PIECES = {name: functools.partial(measured, name=name) for name in LAWS}
 RECORDED = {"robot-arm": "a robot arm, torques", "swings": "a double pendulum, free"}
 
@@ -410,6 +470,23 @@ def tables() -> None:
     heads = ["record", "starts", "MuJoCo from the law, median / largest", "law", "MuJoCo"]
     heads[3:] = [f"{own} from what was measured, median" for own in heads[3:]]
     between_markers(TABLES, "machines-robot", f"{markdown(heads, rows)}\n\n{provenance(arm)}")
+    for result in (swung := results({"swing-up": swings}, "machines")).values():
+        rows = [
+            [
+                name,
+                f"{m['draws']['up']} of {m['draws']['plants']}",
+                number(m["draws"]["from"]),
+                number(m["draws"]["score"]),
+                *("yes" if m[key]["up"] else "no" for key in ("published", "leaderboard")),
+                number(m["seconds"]),
+            ]
+            for name, m in result["measured"].items()
+        ]
+        heads = ["machine", "draws that come up and stay", "up after, s", "score"]
+        heads += ["published plant", "the same without friction", "plan and regulator, CPU s"]
+        between_markers(
+            TABLES, "machines-swing-up", f"{markdown(heads, rows)}\n\n{provenance(swung)}"
+        )
     found = results(PIECES, "machines")
     if not found:
         return
@@ -432,7 +509,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     pieces: dict[str, Any] = {**PIECES, "swings": swings}
     if ROBOT in arguments:
         at = arguments.index(ROBOT)
-        pieces["robot-arm"] = functools.partial(robot, path=Path(arguments[at + 1]))
+        for name, piece in (("robot-arm", robot), ("swing-up", swing_up)):
+            pieces[name] = functools.partial(piece, path=Path(arguments[at + 1]))
         del arguments[at : at + 2]
     run_pieces(__doc__ or "", pieces, "machines", tables, arguments)
 
