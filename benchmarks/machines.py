@@ -2,7 +2,7 @@
 
     python benchmarks/machines.py                 pieces without a result, then the table
     python benchmarks/machines.py --only pendulum --overwrite
-    python benchmarks/machines.py --robot FILE    robot_arm.csv to MuJoCo, and swung up, too
+    python benchmarks/machines.py --robot FILE    robot_arm.csv to MuJoCo too
     python benchmarks/machines.py --quick         few states, into runs/machines, no table
 
 Every law is drawn with coefficients at random within a few percent. Its flow is made by collocation
@@ -10,8 +10,9 @@ of 8 stages in 8 substeps, to roundoff: 10⁴ independent single steps, and 100 
 states. MuJoCo follows chains of links for 1 s by steps of 1 ms. FILE is the record of an arm of two
 links moved by motors (Wiebe et al., IEEE RA-L 2024), in absolute angles: its law, of four runs, is
 written as MJCF, and MuJoCo moved by the torques of the last run for 0.5 s from its states; the same
-of the double pendulum that comes with the package, which moves freely. A piece's result is one JSON
-file, machines-*.json in benchmarks/results; formats whose tool is not installed are left out.
+of the double pendulum that comes with the package, which moves freely. swing-up is of one run of
+that arm (`notebooks`). A piece's result is one JSON file, machines-*.json in benchmarks/results;
+formats whose tool is not installed are left out.
 """
 
 from __future__ import annotations
@@ -133,6 +134,7 @@ LAWS = {
 ROBOT = "--robot"
 JOINTS, TORQUES = ["theta1", "theta2"], ["tau1", "tau2"]
 ROLES: dict[str, Any] = {"positions": JOINTS, "angles": JOINTS, "inputs": TORQUES}
+VISCOUS = ["R: omega1**2", "R: (omega1 - omega2)**2"]
 TERMS = [
     "omega1**2",
     "omega2**2",
@@ -142,8 +144,7 @@ TERMS = [
     "V: cos(theta2)",
     "R: abs(omega1)",
     "R: abs(omega1 - omega2)",
-    "R: omega1**2",
-    "R: (omega1 - omega2)**2",
+    *VISCOUS,
 ]
 LIMIT, PERIOD, LONG = 6.0, 0.01, 10.0  # N m; s, of a torque and of what is followed
 SWINGS = {"pendubot": (0, 2.0), "acrobot": (1, 3.0)}  # the joint that has a motor, s of its plan
@@ -327,20 +328,15 @@ def _by_mujoco(path: Path, map_: SymplecticMap, z: np.ndarray) -> float:
     return off
 
 
-@functools.cache
-def of_robot(path: Path, quick: bool) -> tuple[gfnn.Fit, pd.DataFrame]:
-    """The law of the robot arm's first runs, in absolute angles, and the table of its last run."""
+def robot(quick: bool, path: Path) -> Numbers:
+    """A law of the robot arm's first runs, in absolute angles, as MJCF: how far MuJoCo's motion is
+    from the law's own, under the torques of its last run."""
     table: Any = pd.read_csv(path)
     table["theta2"] += table["theta1"]
     table = table[["run", "t", *JOINTS, *TORQUES]]
     training = table[table["run"] < (1 if quick else TRAINED)]
     fit = gfnn.fit(gfnn.Recording(training, **ROLES), terms=TERMS)
-    return fit, table[table["run"] == table["run"].max()].drop(columns="run")
-
-
-def robot(quick: bool, path: Path) -> Numbers:
-    """A law of the robot arm as MJCF: how far MuJoCo's motion is from the law's own."""
-    fit, last = of_robot(path, quick)
+    last = table[table["run"] == table["run"].max()].drop(columns="run")
     return _beside_mujoco(fit, gfnn.Recording(last, **ROLES), np.arange(2.0, 9.0, 0.35))
 
 
@@ -404,12 +400,16 @@ def _beside_mujoco(fit: gfnn.Fit, record: gfnn.Recording, starts: np.ndarray) ->
     }
 
 
-def swing_up(quick: bool, path: Path) -> Numbers:
-    """Controllers of the robot arm's law, of one joint each (`notebooks/swing_up.py`): how many
-    draws of its posterior come up and stay, and the designers' plant."""
+def swing_up(quick: bool) -> Numbers:
+    """Controllers of the law of one run of the robot arm, of one joint each: how many draws of its
+    posterior come up and stay, and the designers' plant (`notebooks/swing_up.py`)."""
     sys.path.insert(0, str(HERE.parent / "notebooks"))
     own: Any = importlib.import_module("swing_up")
-    (fit, _), draws, found = of_robot(path, quick), 10 if quick else 100, {}
+    table = pd.read_csv(own.RECORD)
+    table["theta2"] += table["theta1"]
+    record = gfnn.Recording(table, **ROLES)
+    fit = gfnn.fit(record, terms=[t for t in TERMS if t not in VISCOUS], input_hold="linear")
+    draws, found = 10 if quick else 100, {}
     for name, (joint, seconds) in SWINGS.items():
         begun = time.process_time()
         of, by, _ = own.controller(fit, joint, PERIOD, seconds, LIMIT)
@@ -506,11 +506,10 @@ def tables() -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     arguments = list(sys.argv[1:] if argv is None else argv)
-    pieces: dict[str, Any] = {**PIECES, "swings": swings}
+    pieces: dict[str, Any] = {**PIECES, "swings": swings, "swing-up": swing_up}
     if ROBOT in arguments:
         at = arguments.index(ROBOT)
-        for name, piece in (("robot-arm", robot), ("swing-up", swing_up)):
-            pieces[name] = functools.partial(piece, path=Path(arguments[at + 1]))
+        pieces["robot-arm"] = functools.partial(robot, path=Path(arguments[at + 1]))
         del arguments[at : at + 2]
     run_pieces(__doc__ or "", pieces, "machines", tables, arguments)
 
