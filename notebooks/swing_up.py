@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 import casadi
 import numpy as np
 from scipy.linalg import solve_discrete_are
-from scipy.optimize import root
 
 import gfnn_jax as gfnn
 from gfnn_jax.maps.estimates import law_of, substeps_of
@@ -31,8 +30,9 @@ from gfnn_jax.maps.laws import law_of_map, map_of_law, sticking
 
 RECORD = Path(__file__).with_name("robot_arm.csv")
 LENGTHS = np.array([0.2, 0.3])  # m
+UP = np.array([np.pi, np.pi, 0.0, 0.0])
 WIDTH = 0.3  # rad/s, over which a plan smooths dry friction: its derivatives have no jumps
-STATE, TORQUE = 0.1, 1.0  # weights of a plan: of the distance² ÷ sizes², and of the torque²
+STATE, TORQUE = 0.1, 1.0  # weights of a plan: of (z − UP)² ÷ sizes², and of the torque²
 FAR, EFFORT = (10.0, 10.0, 0.1, 0.1), 30.0  # of a regulator: of q², v² off the plan, and torque²
 RHYTHMS, DRAWS, ENOUGH, PLANNED = (5.0, 6.0), 50, 0.9, 0.7  # rad/s; of `controller`
 WARM, MOST = 40, 100  # iterations by Gauss and Newton, then by the exact Hessian
@@ -65,11 +65,10 @@ class Regulator(NamedTuple):
 
 
 class Motor(NamedTuple):
-    """A learned law with the torque of one joint alone, its equilibrium ``up`` (4,), where it
-    stands, and its step over h seconds in CasADi, z, u -> Z; sizes (4,) of z."""
+    """A learned law with the torque of one joint alone, and its step over h seconds in CasADi, z, u
+    -> Z; sizes (4,) of z."""
 
     law: Any
-    up: np.ndarray
     step: casadi.Function
     sizes: np.ndarray
     h: float
@@ -85,11 +84,9 @@ def motor(fit: gfnn.Fit, joint: int, h: float) -> Motor:
     z = np.concatenate([q, law.momentum(q, v)], axis=1)
     torques = {"signals": Signals(("torque",)), "inputs": rng.uniform(-6, 6, (200, 1))}
     map_ = map_of_law(law, z, h, angles=(0, 1), tolerance=1e-3, **torques)
-    stands = root(lambda q: law.acceleration(q, np.zeros(2)), [np.pi, np.pi]).x
     with tempfile.TemporaryDirectory() as folder:
         path = gfnn.export(map_, "casadi", Path(folder) / "step.casadi")
-        step = casadi.Function.load(str(path))
-    return Motor(law, np.append(stands, [0.0, 0.0]), step, np.asarray(map_.scale), h)
+        return Motor(law, casadi.Function.load(str(path)), np.asarray(map_.scale), h)
 
 
 def plan(of: Motor, steps: int, limit: float, rhythm: float) -> Plan:
@@ -105,7 +102,7 @@ def plan(of: Motor, steps: int, limit: float, rhythm: float) -> Plan:
     z, u = table[:4, :], table[4, :-1]
     gaps = (of.step.map(steps)(z=z[:, :-1], u=u)["Z"] - z[:, 1:]) / of.sizes
     weights = np.tile([STATE] * 4 + [TORQUE], steps + 1)[:count]
-    far = (z - of.up) / of.sizes
+    far = (z - UP) / of.sizes
     cost = 0.5 * (STATE * casadi.sumsqr(far) + TORQUE * casadi.sumsqr(u))
     given = [casadi.MX.sym(name, n) for name, n in (("p", 0), ("f", 1), ("g", 4 * steps))]
     plain = casadi.Function(
@@ -117,11 +114,11 @@ def plan(of: Motor, steps: int, limit: float, rhythm: float) -> Plan:
     )
     line = np.linspace(0, 1, steps + 1)[:, None]
     guess, low = np.zeros((steps + 1, width)), np.full((steps + 1, width), -np.inf)
-    guess[:, :4], guess[:, 4] = of.up / of.sizes * line, np.sin(rhythm * of.h * steps * line[:, 0])
+    guess[:, :4], guess[:, 4] = UP / of.sizes * line, np.sin(rhythm * of.h * steps * line[:, 0])
     high = -low
     low[:, 4], high[:, 4] = -limit, limit
     low[0, :4] = high[0, :4] = 0.0
-    low[-1, :4] = high[-1, :4] = of.up / of.sizes
+    low[-1, :4] = high[-1, :4] = UP / of.sizes
     bounds = {"lbx": low.ravel()[:count], "ubx": high.ravel()[:count], "lbg": 0, "ubg": 0}
     found: Any = {"x": guess.ravel()[:count]}
     for most, own in ((WARM, {"hess_lag": plain}), (MOST, {})):
@@ -140,7 +137,7 @@ def plan(of: Motor, steps: int, limit: float, rhythm: float) -> Plan:
 def regulator(of: Motor, plan: Plan) -> Regulator:
     """The time-varying LQR about a plan, and the LQR at its end."""
     back = np.eye(4)
-    back[2:, 2:] = np.linalg.inv(of.law.masses(of.up[None, :2])[0])
+    back[2:, 2:] = np.linalg.inv(of.law.masses(UP[None, :2])[0])
     Q = back.T @ np.diag(FAR) @ back  # of momenta
     slopes = of.step.factory("slopes", ["z", "u", "h"], ["jac:Z:z", "jac:Z:u"])
 
@@ -150,7 +147,7 @@ def regulator(of: Motor, plan: Plan) -> Regulator:
     def gain(A, B, P):
         return np.linalg.solve(EFFORT + B.T @ P @ B, B.T @ P @ A)
 
-    A, B = at(of.up, 0.0)
+    A, B = at(UP, 0.0)
     P = solve_discrete_are(A, B, Q, [[EFFORT]])
     last, gains = gain(A, B, P)[0], []
     for z, u in zip(plan.z[-2::-1], plan.u[::-1], strict=True):

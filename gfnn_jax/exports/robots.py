@@ -27,7 +27,7 @@ import numpy as np
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian
-from gfnn_jax.families.rigid_bodies import BASE, PER_LINK
+from gfnn_jax.families.rigid_bodies import BASE, pseudo_inertias
 from gfnn_jax.flows.bodies import BodiesLaw
 from gfnn_jax.maps.laws import bodies_of_map, is_of_law, law_of_map
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -288,12 +288,11 @@ def _of_arm(map_: SymplecticMap, law: BodiesLaw) -> Robot:
     from scipy.spatial.transform import Rotation
 
     bodies, links = law.bodies, []
-    for i, name in enumerate(bodies.names):
-        m, *rest = np.asarray(law.parameters)[PER_LINK * i : PER_LINK * (i + 1)]
-        centre, about = np.array(rest[:3]) / m, np.zeros((3, 3))
-        about[np.triu_indices(3)] = rest[3:]
-        about = about + np.triu(about, 1).T
-        about = about - m * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    inertias = pseudo_inertias(np.asarray(law.parameters))
+    for i, (name, J) in enumerate(zip(bodies.names, inertias, strict=True)):
+        m, centre = J[3, 3], J[:3, 3] / J[3, 3]
+        second = J[:3, :3] - m * np.outer(centre, centre)
+        about = np.trace(second) * np.eye(3) - second
         links.append(
             Link(
                 name,

@@ -113,12 +113,9 @@ class LearnedArm:
     def table(self) -> str:
         """Base parameters, friction and residuals, a line each."""
         lines = [self.line, "base parameters (kg, m):"]
-        rows = zip(
-            self.base.names, self.base.values, self.base.errors, self.base.determined, strict=True
-        )
-        for name, value, error, determined in rows:
-            told = f"{value:.4g} ± {error:.2g}" if determined else "not determined"
-            lines.append(f"  {name}: {told}")
+        for one in self.report()["base_parameters"]:
+            told = f"{one['value']:.4g} ± {one['std']:.2g}"
+            lines.append(f"  {one['name']}: {told if one['determined'] else 'not determined'}")
         lines.append("joints:")
         for name, kinds in self.frictions.items():
             parts = [f"{kind} {c:.3g} ± {s:.1g}" for kind, (c, s) in kinds.items()]
