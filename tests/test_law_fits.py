@@ -618,6 +618,13 @@ def test_a_band_of_whole_trajectories_holds_them(swing):
     np.testing.assert_allclose(
         found.upper["theta"] + found.lower["theta"], 2 * found.values["theta"]
     )
+    sensors = fit.map.sensors
+    for by, factor in ((1e-3, 1.0), (1e3, 1e3)):  # no narrower than the law's own, and as scored
+        other = dataclasses.replace(sensors, scores=by * sensors.scores)
+        scored = dataclasses.replace(fit.map, sensors=other)
+        scored = scored.forecast(past, times, coverage=0.9, simultaneous=True)
+        ratio = np.max(scored.band["theta"] / found.band["theta"])
+        assert 0.5 * factor < ratio < 1.5 * factor
     again = fit.forecast(times, after=past, coverage=0.9, simultaneous=True)
     np.testing.assert_array_equal(again.upper["theta"], found.upper["theta"])
     assert fit.map.forecast(past, times).lower is None
@@ -632,7 +639,10 @@ def test_the_largest_of_independent_errors_is_that_of_their_number():
     orbits = Orbits(still, still, still, np.zeros((1, 50, 2, 0)), np.array([1.0, 3.0]))
     count = 2 * np.arange(1, 51)
     exact = norm.ppf((1 + 0.95 ** (1 / count)) / 2)
-    np.testing.assert_allclose(orbits.largest(0.95)[0], exact, rtol=0.08)
+    times = np.arange(50.0)[None]
+    np.testing.assert_allclose(orbits.largest(0.95, times)[0], exact, rtol=0.08)
+    twice = orbits.largest(0.95, times // 2)[0]  # each reading two times
+    np.testing.assert_allclose(twice[1::2], exact[:25], rtol=0.08)
 
 
 def test_a_forecast_says_where_it_leaves_the_motion_that_was_learned(swing):

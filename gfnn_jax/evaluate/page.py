@@ -211,7 +211,7 @@ def _of_law(
         heads=("release from rest at", "what it tells"),
         rows=[
             (
-                ", ".join(f"{n} = {q:.3g} {m.units[n]}".rstrip() for n, q in m.start.items()),
+                m.start_text,
                 f"{m.apart:.2g} standard deviations between this law and its nearest rival"
                 if m.apart
                 else "standard errors smaller, "

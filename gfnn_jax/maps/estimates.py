@@ -206,10 +206,12 @@ def forecast(
     beyond = _beyond(map_, [laws[k] for k in which], recording, times, orbits.states)
     tubes = np.full(len(windows), np.nan)
     if whole is not None:
-        ahead = times[-1] - last
-        wider = np.array([sensors.widening(seconds, whole) for seconds in ahead])
-        tubes = wider * orbits.largest(TUBE)[:, -1]
-        beyond += _uncertified(sensors, recording, ahead)
+        far = times[-1] - last
+        wider = np.array([sensors.widening(seconds, whole) for seconds in far])
+        # That readings of a record err by less than its law says is no promise of others.
+        of_law, held_out = (orbits.largest(one, ahead)[:, -1] for one in (whole, TUBE))
+        tubes = np.maximum(of_law, wider * held_out)
+        beyond += _uncertified(sensors, recording, far)
     return values, std, outside + beyond, tubes
 
 
@@ -547,14 +549,17 @@ class Orbits(NamedTuple):
         own = misfit[..., None] * np.eye(misfit.shape[-1])
         return self._replace(modes=np.concatenate([self.modes, own], axis=-1))
 
-    def largest(self, coverage: float) -> np.ndarray:
+    def largest(self, coverage: float, at: np.ndarray) -> np.ndarray:
         """Multiples (B, n) of the standard deviations that no channel exceeds from the first time
-        until each, with the probability ``coverage``, were all errors Gaussian."""
+        until each, with the probability ``coverage``, were all errors Gaussian. at: (B, n) the
+        times; where two are the same they show one reading."""
         lanes, times, count, rank = self.modes.shape
         rng, found = np.random.default_rng(0), np.empty((lanes, times))
-        for lane, (modes, std) in enumerate(zip(self.modes, self.std, strict=True)):
+        for lane, (modes, std, t) in enumerate(zip(self.modes, self.std, at, strict=True)):
             drawn = modes @ rng.normal(size=(rank, _OPTIONS.draws))
-            drawn += self.noise[:, None] * rng.normal(size=(times, count, _OPTIONS.draws))
+            readings, which = np.unique(t, return_inverse=True)
+            noise = rng.normal(size=(len(readings), count, _OPTIONS.draws))
+            drawn += self.noise[:, None] * noise[which]
             largest = np.max(np.abs(drawn) / std[..., None], axis=1)
             running = np.maximum.accumulate(largest, axis=0)
             found[lane] = np.quantile(running, coverage, axis=1)

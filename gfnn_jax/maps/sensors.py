@@ -14,6 +14,8 @@ from gfnn_jax.maps.observation import Observation
 from gfnn_jax.solve.noise import Wander
 
 TUBE = 0.95  # of trajectories lie in the tube that scores are multiples of
+_LEAST = 1e-9  # score: of errors that are roundoff
+_BEYOND = 1.5  # times the largest score seen: a further one is no larger
 _PHASES = 3.0  # starts of forecasts within their length that tell something of their own
 
 
@@ -135,12 +137,16 @@ class Sensors:
 
         A prediction interval of the scores' logarithms, by Student's t: of held-out forecasts that
         overlap, each stretch as long as their lead counts as ``_PHASES``. Those of the farthest
-        lead where none went so far, 1 where none was held out.
+        lead where none went so far, 1 where none was held out. It is not far beyond the largest
+        score: those of bodies at rest are near 0, and their logarithms not normal.
         """
         if not self.held_out:
             return 1.0
         lead = min(int(np.searchsorted(self.leads, ahead)), self.held_out - 1)
-        logs = np.log(self.scores[np.isfinite(self.scores[:, lead]), lead])
+        scores = self.scores[np.isfinite(self.scores[:, lead]), lead]
+        logs = np.log(np.maximum(scores, _LEAST))
         count = np.clip(_PHASES * self.observed / self.leads[lead], 2, len(logs))
+        std = logs.std() * np.sqrt(count / (count - 1))
         reach = stdtrit(count - 1, coverage) * np.sqrt(1 + 1 / count)
-        return float(np.exp(logs.mean() + reach * logs.std(ddof=1)))
+        far = min(logs.mean() + reach * std, logs.max() + np.log(_BEYOND))
+        return float(np.exp(far))

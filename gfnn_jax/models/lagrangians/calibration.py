@@ -147,7 +147,7 @@ def calibrated(
     )
     leads = leads[leads <= 0.9 * longest]
     windows = np.where(np.arange(len(starts)) % 2, short, best)
-    own, orbits, x = _forecasts(thirds, found, starts, windows, leads)
+    own, orbits, x, times = _forecasts(thirds, found, starts, windows, leads)
     errors, deviations = _shared(own), _shared(orbits.std)
     sensors, large = _with_size(law.sensors, x, errors, deviations)
     enough = np.isfinite(errors).all(axis=-1).sum(axis=0) >= OPTIONS.fewest
@@ -155,14 +155,24 @@ def calibrated(
     own, orbits = own[:, enough], orbits._replace(modes=orbits.modes[:, enough])
     if not len(leads):
         return _unknown(law, spread)
-    missed = np.nanquantile((errors**2 / 4 - deviations**2) / large**2, OPTIONS.inside, axis=0)
-    misfit = np.sqrt(np.maximum(missed, 0.0))
+    part = np.arange(len(starts)) * OPTIONS.parts // len(starts)
+    every = np.tile(part, len(errors) // len(part))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # times of one part alone
+        missed = (errors**2 / 4 - deviations**2) / large**2
+        misfit, *others = (
+            np.sqrt(np.maximum(np.nanquantile(missed[every != k], OPTIONS.inside, axis=0), 0.0))
+            for k in range(-1, OPTIONS.parts)
+        )
+        sizes = np.abs(errors) / spread
+        median, *parts = (np.nanmedian(sizes[every != k], axis=0) for k in range(-1, OPTIONS.parts))
+    unseen = np.where(np.isfinite(others), others, misfit)[part]  # by a part's own scores
     sensors = dataclasses.replace(
         sensors,
         window=best,
         leads=leads,
         misfit=misfit,
-        scores=_scores(own, orbits.with_misfit(misfit * large[: len(x)])),
+        scores=_scores(own, orbits.with_misfit(unseen * large[: len(x)]), times[:, enough]),
         observed=float(sum(s.t[-1] - s.t[0] for s in found)),
     )
     bands = np.where(np.isfinite(errors), 2 * np.hypot(deviations, misfit * large), np.nan)
@@ -172,13 +182,7 @@ def calibrated(
         Horizon(f, _passed(measured, leads, f), _passed(predicted, leads, f))
         for f in OPTIONS.fractions
     ]
-    sizes = np.abs(errors) / spread
-    part = np.tile(np.arange(len(starts)) * OPTIONS.parts // len(starts), len(sizes) // len(starts))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # times of one part alone
-        parts = np.stack([np.nanmedian(sizes[part != k], axis=0) for k in range(OPTIONS.parts)])
-    median = np.nanmedian(sizes, axis=0)
-    return Calibration(law._replace(sensors=sensors), horizons, median, parts)
+    return Calibration(law._replace(sensors=sensors), horizons, median, np.stack(parts))
 
 
 def level_of_friction(thirds: Thirds, found: Sequence[Stretch], scales: Scales) -> float:
@@ -222,12 +226,12 @@ def _with_size(
     return chosen
 
 
-def _scores(errors: np.ndarray, orbits: Orbits) -> np.ndarray:
+def _scores(errors: np.ndarray, orbits: Orbits, times: np.ndarray) -> np.ndarray:
     """The largest errors (B, n) of any channel from the start of a forecast to each lead, in
-    standard deviations, as multiples of the tube of Gaussian errors of this law; NaN
-    where the record ends before."""
+    standard deviations, as multiples of the tube of Gaussian errors of this law at these times
+    (B, n); NaN where the record ends before."""
     sizes = np.max(np.abs(errors) / orbits.std, axis=2)
-    return np.maximum.accumulate(sizes, axis=1) / orbits.largest(TUBE)
+    return np.maximum.accumulate(sizes, axis=1) / orbits.largest(TUBE, times)
 
 
 def _shared(values: np.ndarray) -> np.ndarray:
@@ -266,9 +270,9 @@ def _forecasts(
     starts: Sequence[tuple[int, int]],
     windows: np.ndarray,
     leads: np.ndarray,
-) -> tuple[np.ndarray, Orbits, np.ndarray]:
+) -> tuple[np.ndarray, Orbits, np.ndarray, np.ndarray]:
     """Errors (B, n, k) of forecasts by the law without the third in which they start, NaN where the
-    record ends before, the forecasts, and the states (B, 2d) they start from; times are
+    record ends before, the forecasts, the states (B, 2d) they start from, and the times (B, n),
     those of the samples nearest to the leads. windows: (B,) seconds from which each state is
     estimated."""
     cut, times, measured = [], [], []
@@ -291,4 +295,4 @@ def _forecasts(
     x, covariance = (np.stack(part) for part in zip(*states, strict=True))
     orbits = propagate(laws, which, cut, x, covariance, last, np.array(times))
     d = thirds.laws[0].form.dim
-    return orbits.values - np.array(measured), orbits, x[:, : 2 * d]
+    return orbits.values - np.array(measured), orbits, x[:, : 2 * d], np.array(times)

@@ -346,7 +346,12 @@ def named_motions(motions: Sequence[Motion], recording: Recording) -> tuple[Next
         }
         units = {name: recording.unit(name) for name in start}
         gains = {word_of(k, names): g for k, g in motion.gains.items()}
-        named.append(NextMotion(start, gains, units, motion.apart))
+        drive = None
+        if motion.drive is not None:
+            name = recording.inputs[motion.drive.place]
+            ends = np.array(motion.drive[1:3]) / recording.factors.get(name, 1.0)
+            drive = name, *ends.tolist(), motion.drive.period
+        named.append(NextMotion(start, gains, units, motion.apart, drive))
     return tuple(named)
 
 

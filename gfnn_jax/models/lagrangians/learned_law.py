@@ -41,15 +41,29 @@ def _of(value: float, unit: str) -> str:
 class NextMotion(NamedTuple):
     """A motion to record: where to let go, at rest, and by how much that makes the standard errors
     of terms smaller, the most improved first. units: of the coordinates, "" where not known. apart:
-    standard deviations of its readings together between the law and its nearest rival."""
+    standard deviations of its readings together between the law and its nearest rival. drive: an
+    input that is switched meanwhile, its two values, the first one first, and the period, s."""
 
     start: dict[str, float]
     gains: dict[str, float]
     units: dict[str, str]
     apart: float = 0.0
+    drive: tuple[str, float, float, float] | None = None
+
+    @property
+    def start_text(self) -> str:
+        """The start, and the input that drives it, as text."""
+        at = ", ".join(f"{name} = {_of(q, self.units[name])}" for name, q in self.start.items())
+        if self.drive is None:
+            return at
+        name, first, second, period = self.drive
+        return (
+            f"{at}, and drive {name} at {first:.3g} for {period / 4:.3g} s, then in turn at "
+            f"{second:.3g} and {first:.3g} for {period / 2:.3g} s each"
+        )
 
     def __str__(self) -> str:
-        at = ", ".join(f"{name} = {_of(q, self.units[name])}" for name, q in self.start.items())
+        at = self.start_text
         if self.apart:
             return (
                 f"release from rest at {at}. Its readings together put {self.apart:.2g} standard "

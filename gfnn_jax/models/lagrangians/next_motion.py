@@ -1,8 +1,9 @@
 """Motion to record next: one that would tell the coefficients that this record hardly does.
 
-A motion from rest is followed by the law. With J its sensitivities, its own first state eliminated,
-a record of it turns the information RᵀR of the coefficients into RᵀR + JᵀJ (Fedorov, Theory of
-Optimal Experiments, 1972). Beside the law's own coefficients count those of terms that it lacks and
+A motion from rest, let go or driven by an input, is followed by the law. With J its sensitivities,
+its own first state eliminated, a record of it turns the information RᵀR of the coefficients into
+RᵀR + JᵀJ (Fedorov, Theory of Optimal Experiments, 1972). The best is the one after which forecasts
+of all motions that are compared err least. Told are also the gains of terms that the law lacks and
 that its own imitate where the record was.
 """
 
@@ -16,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs
+from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import LawFit, places
 from gfnn_jax.models.lagrangians.structure import Key
@@ -28,7 +30,8 @@ class MotionOptions:
     further: of the largest deflections of the record. highest: radians, that an angle is let go.
     imitated: share of what a term does that others do not, below which it is hardly identifiable.
     most_terms: that are looked at: of larger libraries the first alone, of many coordinates the
-    textbook's. most: motions. largest: derivative of a residual, whose square is finite.
+    textbook's. most: motions. largest: derivative of a residual, whose square is finite. turns:
+    periods of a square wave of an input, between its ends in the record, in a motion.
     """
 
     further: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 4.0)
@@ -37,23 +40,42 @@ class MotionOptions:
     most_terms: int = 40
     most: int = 3
     largest: float = 1e100
+    turns: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 
 
 OPTIONS = MotionOptions()
 
 
+class Drive(NamedTuple):
+    """A square wave of an input, by its place among them, its two values, the first one first, and
+    its period in seconds, of which it begins in the middle of a half: motions stay where they
+    began."""
+
+    place: int
+    first: float
+    second: float
+    period: float
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Values (n,) at times since its start."""
+        turned = (t / self.period + 0.25) % 1.0
+        return np.where(turned < 0.5, self.first, self.second)
+
+
 class Motion(NamedTuple):
     """A start from rest (d,), by how much it makes the standard errors of coefficients (by their
-    keys) smaller, the most improved first, and by how many standard deviations of its
-    readings together the nearest of rivals is apart."""
+    keys) smaller, the most improved first, by how many standard deviations of its readings
+    together the nearest of rivals is apart, and what drives it."""
 
     start: np.ndarray
     gains: dict[Key, float]
     apart: float = 0.0
+    drive: Drive | None = None
 
 
-def next_motions(fit: LawFit) -> list[Motion]:
-    """The best motions to record next, the best first; each as long as an arc of the fit."""
+def next_motions(fit: LawFit, steered: Sequence[int] = ()) -> list[Motion]:
+    """The best motions to record next, the best first; each as long as an arc of the fit. steered:
+    places of inputs that can be chosen; motions that they drive stay as near as other starts."""
     structure, d, problem = fit.structure, fit.form.dim, fit.problem
     rows, more = (library(d, problem.angles) for library in (libraries.first, libraries.more))
     rows = [*rows, *more] if len(rows) + len(more) <= OPTIONS.most_terms else rows
@@ -71,20 +93,45 @@ def next_motions(fit: LawFit) -> list[Motion]:
     if not here.columns.any():
         return []  # the law moves no residual, nor would it elsewhere
     named = [keys[k] for k in kept]
+    of_law = [n for n, k in enumerate(kept) if k in own]
     looked_at = larger.without(set(keys) - set(named))
     places_of = [looked_at.keys().index(key) for key in named]
-    still = np.zeros((1, *problem.inputs(fit.arcs).shape[1:]))
-    without_inputs = dataclasses.replace(problem, inputs=lambda arcs: still)
+    free = [(start, None) for start in _starts(fit)]
+    middle, reach = _middle(fit)
+    reach = max(OPTIONS.further) * reach
+    driven = [(middle, drive) for drive in _drives(fit, steered)]
     found = []
-    for arcs in _followed(fit, _starts(fit)):
-        there = without_inputs.linearised(looked_at, fit, arcs).among(places_of)
+    begun = [*free, *driven]
+    lanes, inputs, h = _lanes(fit, begun)
+    for (start, drive), lane, u in zip(begun, lanes, inputs, strict=True):
+        if not np.isfinite(lane).all() or (drive and np.any(abs(lane[:, :d] - middle) > reach)):
+            continue
+        y = problem.observation(lane[None]).values
+        home, t = ((fit.arcs.home[0][0], 0, len(lane)),), h * np.arange(len(lane))[None]
+        arcs = Arcs(t, y, lane[None], np.ones(y.shape), home)
+        acted = dataclasses.replace(problem, inputs=lambda arcs, own=u[None]: own)
+        there = acted.linearised(looked_at, fit, arcs).among(places_of)
         if not np.abs(there.columns).max() < OPTIONS.largest:
             continue  # along which a small change grows without bound
         less = here.sharpened_by(there)
-        order = np.argsort(-less)
-        found.append(Motion(arcs.x[0, 0, :d], {named[k]: float(less[k]) for k in order}))
-    found.sort(key=lambda motion: -sum(np.log(list(motion.gains.values()))))
-    return found[: OPTIONS.most]
+        gains = {named[k]: float(less[k]) for k in np.argsort(-less)}
+        found.append((Motion(start, gains, drive=drive), there.among(of_law)))
+    if not found:
+        return []
+    motions, each = zip(*found, strict=True)
+    return [motions[k] for k in np.argsort(_left(here.among(of_law), each))[: OPTIONS.most]]
+
+
+def _left(here: Linearised, each: Sequence[Linearised]) -> np.ndarray:
+    """The logarithms (S,) of errors of forecasts after each motion was recorded beside what is
+    here, of all these motions, in the mean."""
+    scale = np.linalg.norm(here.columns, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    known, slopes = here.columns / scale, np.stack([one.columns for one in each]) / scale
+    information = known.T @ known + slopes.swapaxes(1, 2) @ slopes
+    inverse = np.linalg.pinv(information, hermitian=True)
+    left = np.einsum("cij,sjk,cik->sc", slopes, inverse, slopes)
+    return np.mean(np.log(np.maximum(left, 1e-300)), axis=1)
 
 
 def parting(fit: LawFit, others: Sequence[LawFit]) -> list[Motion]:
@@ -92,7 +139,8 @@ def parting(fit: LawFit, others: Sequence[LawFit]) -> list[Motion]:
     all leave for far away."""
     starts = _starts(fit)
     own, *theirs = (
-        one.problem.observation(_lanes(one, starts)[0]).values / fit.sigma for one in (fit, *others)
+        one.problem.observation(_lanes(one, [(q, None) for q in starts])[0]).values / fit.sigma
+        for one in (fit, *others)
     )
     apart = np.min([np.sqrt(np.sum((y - own) ** 2, axis=(1, 2))) for y in theirs], axis=0)
     if not np.isfinite(apart).any():
@@ -105,8 +153,7 @@ def _starts(fit: LawFit) -> list[np.ndarray]:
     """One coordinate, or all of them with either sign, let go from rest at some deflections; of
     more than three with one sign, or with signs in turn."""
     d, angles = fit.form.dim, list(fit.problem.angles)
-    middle = np.median(fit.problem.gauge, axis=0)
-    reach = np.max(np.abs(fit.problem.gauge - middle), axis=0)
+    middle, reach = _middle(fit)
     shapes = [np.eye(d)[i] for i in range(d)]
     if d > 3:
         shapes += [np.ones(d), (-1.0) ** np.arange(d)]
@@ -121,35 +168,44 @@ def _starts(fit: LawFit) -> list[np.ndarray]:
     return starts
 
 
-def _followed(fit: LawFit, starts: Sequence[np.ndarray]) -> list[Arcs]:
-    """The motions from these starts as arcs; those that leave for far away are left out."""
-    lanes, h = _lanes(fit, starts)
-    length = lanes.shape[1]
-    home, t = ((fit.arcs.home[0][0], 0, length),), h * np.arange(length)[None]
-    arcs = []
-    for lane in lanes[np.isfinite(lanes).all(axis=(1, 2))]:
-        y = fit.problem.observation(lane[None]).values
-        arcs.append(Arcs(t, y, lane[None], np.ones(y.shape), home))
-    return arcs
+def _middle(fit: LawFit) -> tuple[np.ndarray, np.ndarray]:
+    """The middle (d,) of the recorded positions, and how far (d,) they went from it."""
+    middle = np.median(fit.problem.gauge, axis=0)
+    return middle, np.max(np.abs(fit.problem.gauge - middle), axis=0)
 
 
-def _lanes(fit: LawFit, starts: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
-    """States (S, n, 2d) of the motions from these starts, without inputs, NaN of those that leave
-    for far away, and the time between them."""
+def _drives(fit: LawFit, steered: Sequence[int]) -> list[Drive]:
+    """Square waves of each input that can be chosen, between the ends of what it was."""
+    u = np.concatenate([n.stretch.u for n in fit.problem.nodes])
+    high, low = np.nanmax(u, axis=0), np.nanmin(u, axis=0)
+    long = float(np.max(fit.arcs.t[:, -1] - fit.arcs.t[:, 0]))
+    return [
+        Drive(i, float(high[i]), float(low[i]), long / n) for i in steered for n in OPTIONS.turns
+    ]
+
+
+def _lanes(
+    fit: LawFit, begun: Sequence[tuple[np.ndarray, Drive | None]]
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """States (S, n, 2d) of the motions from starts at rest, driven or free, NaN of those that leave
+    for far away, their inputs (S, n − 1, substeps, 6, k), and the time between states."""
     d, length, problem = fit.form.dim, fit.arcs.t.shape[1], fit.problem
     steps = np.diff(fit.arcs.t, axis=1)
-    h = np.full((len(starts), length - 1), np.median(steps[steps > 0]))
-    still = np.zeros((*h.shape, *problem.inputs(fit.arcs).shape[2:]))
+    h = np.full((len(begun), length - 1), np.median(steps[steps > 0]))
+    u = np.zeros((*h.shape, *problem.inputs(fit.arcs).shape[2:]))
+    for k, (_, drive) in enumerate(begun):
+        if drive:
+            u[k, ..., drive.place] = drive.at(h[0, 0] * np.arange(length - 1))[:, None, None]
     form, coefficients = fit.form, fit.p[: fit.form.count]
     if form.powers is not None and problem.systems.names:  # of the first arc's system
         args = problem.systems.of_nodes[[fit.arcs.home[0][0]]]
         form, each, _ = form.in_systems(coefficients, args)
         coefficients = each[0]
-    first = np.array(starts)
-    x = np.concatenate([first, np.zeros((len(starts), d))], axis=1)
-    followed = form.follow(coefficients, x, h, still, order=0).states
+    first = np.array([start for start, _ in begun])
+    x = np.concatenate([first, np.zeros(first.shape)], axis=1)
+    followed = form.follow(coefficients, x, h, u, order=0).states
     states = np.concatenate([x[:, None], followed], axis=1)
     off = np.abs(states[..., :d] - first[:, None])
     far = 10 * (np.ptp(problem.gauge, axis=0) + np.abs(first))
     near = np.all(off < far[:, None], axis=(1, 2))  # no NaN either
-    return np.where(near[:, None, None], states, np.nan), float(h[0, 0])
+    return np.where(near[:, None, None], states, np.nan), u, float(h[0, 0])

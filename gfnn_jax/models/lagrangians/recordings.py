@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.data.recording import Recording, channels_of, parameters_of
-from gfnn_jax.data.roles import by_name, symbols, wave_names
+from gfnn_jax.data.roles import by_name, is_wave, symbols, wave_names
 from gfnn_jax.data.traits import without_wrong_values
 from gfnn_jax.dataset.stretches import Moving, Stretch, measure, nodes_of, stretches, without_rests
 from gfnn_jax.errors import FitError, InputError
@@ -339,7 +339,7 @@ def _findings(
     findings = Findings(
         _map(data, best),
         traces_of(recording, best.fit.along_periods, best.law),
-        next_motions(best.fit),
+        next_motions(best.fit, [i for i, name in enumerate(recording.inputs) if not is_wave(name)]),
         measured,
         model,
         messages,
