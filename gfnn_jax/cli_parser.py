@@ -531,15 +531,20 @@ def _pairs(text: str) -> list[str]:
     return [part.removeprefix(",") for part in re.findall(r"[^=]*=[^,]*|.+", text)]
 
 
-def _numbers(text: str) -> list[tuple[str, float]]:
+def _guesses(text: str, least: float = -math.inf) -> list[tuple[str, float]]:
+    """Names and finite numbers, above the least."""
     pairs = []
     for part in _pairs(text):
-        name, equals, number = part.partition("=")
-        value = _float(number)
-        if not (name.strip() and equals and math.isfinite(value) and value > 0):
-            raise argparse.ArgumentTypeError(f"expected NAME=NUMBER above 0, got '{part}'")
-        pairs.append((name.strip(), value))
+        name, _, number = part.partition("=")
+        if not (name.strip() and least < _float(number) < math.inf):
+            above = f" above {least:g}" * math.isfinite(least)
+            raise argparse.ArgumentTypeError(f"expected NAME=NUMBER{above}, got '{part}'")
+        pairs.append((name.strip(), float(number)))
     return pairs
+
+
+def _numbers(text: str) -> list[tuple[str, float]]:
+    return _guesses(text, 0.0)
 
 
 def _sigmas(text: str) -> list[tuple[str, float | str]]:
@@ -551,13 +556,6 @@ def _sigmas(text: str) -> list[tuple[str, float | str]]:
         else _numbers(f"{name}{equals}{column}")[0]
         for name, equals, column in named
     ]
-
-
-def _guesses(text: str) -> list[tuple[str, float]]:
-    pairs = [part.partition("=") for part in _pairs(text)]
-    if not all(name.strip() and math.isfinite(_float(number)) for name, _, number in pairs):
-        raise argparse.ArgumentTypeError(f"expected NAME=NUMBER, got '{text}'")
-    return [(name.strip(), float(number)) for name, _, number in pairs]
 
 
 def _formula(text: str) -> list[tuple[str, str]]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any
@@ -17,27 +16,16 @@ _SOONER = {"xla_cpu_use_fusion_emitters": False}
 _SOONEST = {**_SOONER, "xla_backend_optimization_level": 0}
 
 
-def _printed(message: str) -> None:
-    if message:
-        print(f"gfnn_jax: {message}", file=sys.stderr, flush=True)
-
-
-_told: list[Callable[[str], object]] = [_printed]
+# Who is told what is compiled now, the last of them: a job that shows its progress.
+told: list[Callable[[str], object]] = []
 
 
 def say(message: str) -> None:
-    """Say what is compiled now, "" when it is done: on standard error, or where `shown_by` says."""
-    _told[-1](message)
-
-
-@contextlib.contextmanager
-def shown_by(told: Callable[[str], object]) -> Iterator[None]:
-    """Hand what `say` says to a function, in place of standard error."""
-    _told.append(told)
-    try:
-        yield
-    finally:
-        _told.remove(told)
+    """Say what is compiled now, "" when it is done: on standard error where nobody is `told`."""
+    if told:
+        told[-1](message)
+    elif message:
+        print(f"gfnn_jax: {message}", file=sys.stderr, flush=True)
 
 
 def enable_compile_cache(folder: str | Path | None = None) -> Path:

@@ -200,11 +200,9 @@ def _by_data(
     if turning and not pairs:
         raise _of_rates(source, turning, np.stack([columns[name] for name in turning]), len(runs))
     switches = [n for n in rest if len(np.unique(columns[n])) <= _OPTIONS.levels]
-    rest = [n for n in rest if n not in switches] or rest
-    if switches and rest[0] not in switches:
-        notes.append(f"{', '.join(switches)} only switches, and is taken as an input")
-    else:
-        switches = []
+    switches = switches if len(switches) < len(rest) else []
+    rest = [n for n in rest if n not in switches]
+    notes += [f"{name} only switches, and is taken as an input" for name in switches]
     inputs = [n for n in rest if _OF_DRIVES.fullmatch(units.get(n, ""))]
     lengths = [n for n in rest if _OF_LENGTHS.fullmatch(units.get(n, "").lower())]
     unclear = [n for n in rest if n not in (*inputs, *lengths)]

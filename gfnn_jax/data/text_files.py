@@ -170,13 +170,11 @@ class TextFile:
         for row, below in itertools.pairwise([*above, []]):
             for i, cell in enumerate(row):
                 name = split_unit(cell.rstrip(": "))[0]
-                kinds = [k for k, of in enumerate((_STEP, _RATE)) if of.fullmatch(name)]
-                for told in (*row[i + 1 : i + 2], *below[i : i + 1]) if kinds else ():
-                    if (
-                        self._numbers([told])
-                        and (value := float(told.replace(self._decimal, "."))) > 0
-                    ):
-                        return name, 1 / value if kinds[0] else value
+                power = 1 if _STEP.fullmatch(name) else -1 if _RATE.fullmatch(name) else 0
+                for told in (*row[i + 1 : i + 2], *below[i : i + 1]) if power else ():
+                    number = told.replace(self._decimal, ".") if self._numbers([told]) else "0"
+                    if float(number) > 0:
+                        return name, float(number) ** power
         return None
 
     def _header(

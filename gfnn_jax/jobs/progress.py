@@ -35,11 +35,12 @@ def on_stderr() -> Iterator[Progress]:
     """Show a status line on a terminal; elsewhere a line now and then, every 5 s at least."""
     if not sys.stderr.isatty():
         lines = _Lines()
-        with compiling.shown_by(lines.meanwhile):
-            try:
-                yield Progress(lines.status, lines.line)
-            finally:
-                lines.stop()
+        compiling.told.append(lines.meanwhile)
+        try:
+            yield Progress(lines.status, lines.line)
+        finally:
+            compiling.told.remove(lines.meanwhile)
+            lines.stop()
         return
     from rich.console import Console
     from rich.markup import escape
@@ -50,8 +51,12 @@ def on_stderr() -> Iterator[Progress]:
         if message:
             console.print(escape(message), highlight=False)
 
-    with console.status("working") as status, compiling.shown_by(line):
-        yield Progress(lambda message: status.update(escape(message)), line)
+    with console.status("working") as status:
+        compiling.told.append(line)
+        try:
+            yield Progress(lambda message: status.update(escape(message)), line)
+        finally:
+            compiling.told.remove(line)
 
 
 _PART = re.compile(r"(.*) \((\d+) of (\d+)\)$")  # a message about the k-th of n equal parts
