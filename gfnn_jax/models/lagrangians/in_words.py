@@ -49,7 +49,8 @@ class WarningOptions:
     of parameters in a term, of which laws of physics have fewer. followed: % of a channel's
     variation, of which a law that explains it follows more. beyond: times the noise, above which
     correlated residuals are motion that the law lacks, unless it follows ``nearly`` all, in %:
-    there they may be a series that a library ends. complete: %, above which what is left is no
+    there they may be a series that a library ends. missed: of the spread, what correlated residuals
+    have beside the noise, above which they are such motion too. complete: %, above which what is left is no
     energy that is gained. alike: correlation of two coefficients that the
     record cannot tell apart. energies: range of the energy, as a share of the largest kinetic one,
     below which a motion of one coordinate shows M and V together only. hides: noise of an angle, in
@@ -62,6 +63,7 @@ class WarningOptions:
     many: int = 3
     followed: float = 90.0
     beyond: float = 3.0
+    missed: float = 0.02
     energies: float = 0.1
     nearly: float = 99.99
     complete: float = 99.999
@@ -218,15 +220,16 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
         for name, one in found.items()
         if one.fit_percent < OPTIONS.followed and not one.white
     }
-    times = best.fit.along_periods.rms() / best.fit.problem.scales.sigma
+    rms, noise = best.fit.along_periods.rms(), best.fit.problem.scales.sigma
+    missed = np.sqrt(np.maximum(rms**2 - noise**2, 0.0)) / best.fit.spread
     flaws |= {
         f"the residuals of {name} are {loud:.2g} times its noise and correlated, "
         f"{one.fit_percent:.1f} % of its variation is followed": "a force, an input or a term is "
         "missing. law.png (fit.traces) shows when"
-        for (name, one), loud in zip(found.items(), times, strict=True)
+        for (name, one), loud, share in zip(found.items(), rms / noise, missed, strict=True)
         if not one.white
         and OPTIONS.followed <= one.fit_percent < OPTIONS.nearly
-        and loud > OPTIONS.beyond
+        and (loud > OPTIONS.beyond or share > OPTIONS.missed)
     }
     least = np.min(best.calibration.median, axis=0, initial=np.inf)
     beyond = np.isfinite(least) & (least > OPTIONS.lost)
