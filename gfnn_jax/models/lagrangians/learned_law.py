@@ -12,7 +12,7 @@ from gfnn_jax.exports import symbolic
 from gfnn_jax.exports.symbolic import Equation, Formula, equations_of_motion
 from gfnn_jax.families.lagrangian import DRY, Lagrangian
 from gfnn_jax.families.text import Term, measured
-from gfnn_jax.fitting.evidence import Rival
+from gfnn_jax.fitting.evidence import EVIDENCE, Rival
 from gfnn_jax.maps.laws import law_of_map
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.calibration import Horizon
@@ -169,6 +169,11 @@ class LearnedLaw:
         together = [names for names in self.alike if names.endswith(ONLY_TOGETHER)]
         if together:
             return f"one of several: {'; '.join(together)}"
+        open_ = [
+            t.term for t in self.lagrangian.terms if abs(t.coefficient) < EVIDENCE.chance * t.std
+        ]
+        if open_:
+            return f"one of several: none of {', '.join(open_)} is significant beside the others"
         return "identified"
 
     def _repr_latex_(self) -> str:
