@@ -86,7 +86,9 @@ CASES = {
     "torsion_rad.csv": dataclasses.replace(TORSION, says=("--from", "moves the body")),
     "torsion_rad_released.csv": TORSION,
     "voltage_called_v.csv": Case(
-        {"z_dot**2": 0.5, "phi_dot**2": 0.5, "cos(phi)": 30.0}, None, {"v": 9.0}
+        {"z_dot**2": 0.5, "phi_dot**2": 0.5, "cos(phi)": 30.0, "z_dot*phi_dot*cos(phi)": 3.0},
+        None,
+        {"v": 9.0},
     ),
     # No mechanical law: populations, of first order. 10 % of noise leaves coefficients open.
     "predator_prey.csv": Case(

@@ -154,6 +154,7 @@ SERIES = (
 )
 
 
+@np.errstate(all="ignore")  # laws that run away are part of the search
 def fit_recording(
     recording: Recording,
     *,
