@@ -50,9 +50,9 @@ class WarningOptions:
     variation, of which a law that explains it follows more. beyond: times the noise, above which
     correlated residuals are motion that the law lacks, unless it follows ``nearly`` all, in %:
     there they may be a series that a library ends. missed: of the spread, what correlated residuals
-    have beside the noise, above which they are such motion too. complete: %, above which what is left is no
-    energy that is gained. alike: correlation of two coefficients that the
-    record cannot tell apart. energies: range of the energy, as a share of the largest kinetic one,
+    have beside the noise, above which they are such motion too. complete: %, above which what is
+    left is no energy that is gained. alike: correlation of two coefficients that the record cannot
+    tell apart. energies: range of the energy, as a share of the largest kinetic one,
     below which a motion of one coordinate shows M and V together only. hides: noise of an angle, in
     radians, above which other laws follow the record as well. lost: of the spread, by which half of
     the forecasts of held-out parts err, however short, of a law that fits its own record alone; of
