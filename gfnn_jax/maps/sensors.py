@@ -14,9 +14,22 @@ from gfnn_jax.maps.observation import Observation
 from gfnn_jax.solve.noise import Wander
 
 TUBE = 0.95  # of trajectories lie in the tube that scores are multiples of
-_LEAST = 1e-9  # score: of errors that are roundoff
-_BEYOND = 1.5  # times the largest score seen: a further one is no larger
-_PHASES = 3.0  # starts of forecasts within their length that tell something of their own
+
+
+@dataclasses.dataclass(frozen=True)
+class TubeOptions:
+    """Scores of forecasts whose tubes hold whole trajectories (`benchmarks/certificates.py`).
+
+    least: a score, of errors that are roundoff. beyond: times the largest score seen: a further one
+    is no larger. phases: starts of forecasts within their length that tell something of their own.
+    """
+
+    least: float = 1e-9
+    beyond: float = 1.5
+    phases: float = 3.0
+
+
+OPTIONS = TubeOptions()
 
 
 class OtherLaw(NamedTuple):
@@ -136,7 +149,7 @@ class Sensors:
         that it holds the whole of a further trajectory with the probability ``coverage``.
 
         A prediction interval of the scores' logarithms, by Student's t: of held-out forecasts that
-        overlap, each stretch as long as their lead counts as ``_PHASES``. Those of the farthest
+        overlap, each stretch as long as their lead counts as ``OPTIONS.phases``. Those of the farthest
         lead where none went so far, 1 where none was held out. It is not far beyond the largest
         score: those of bodies at rest are near 0, and their logarithms not normal.
         """
@@ -144,9 +157,9 @@ class Sensors:
             return 1.0
         lead = min(int(np.searchsorted(self.leads, ahead)), self.held_out - 1)
         scores = self.scores[np.isfinite(self.scores[:, lead]), lead]
-        logs = np.log(np.maximum(scores, _LEAST))
-        count = np.clip(_PHASES * self.observed / self.leads[lead], 2, len(logs))
+        logs = np.log(np.maximum(scores, OPTIONS.least))
+        count = np.clip(OPTIONS.phases * self.observed / self.leads[lead], 2, len(logs))
         std = logs.std() * np.sqrt(count / (count - 1))
         reach = stdtrit(count - 1, coverage) * np.sqrt(1 + 1 / count)
-        far = min(logs.mean() + reach * std, logs.max() + np.log(_BEYOND))
+        far = min(logs.mean() + reach * std, logs.max() + np.log(OPTIONS.beyond))
         return float(np.exp(far))

@@ -21,7 +21,7 @@ from gfnn_jax.models.textbook.atoms import (
     powers_of,
     value_of,
 )
-from gfnn_jax.models.textbook.shapes import COSH, POLE, Kind, constants_for, has_constant, values
+from gfnn_jax.models.textbook.shapes import COSH, Kind, constants_for, has_constant, values
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,9 +209,10 @@ class Setting:
                 if argument.index >= 0 and other.index == argument.index + self.dim:
                     square, pole = Factor(k, ("power", 2.0)), Factor(place, ("power", -1.0))
                     both: list[Atom] = [(square, pole), (Factor(place, ("power", -2.0)),)]
-                    horizons = constants_for(POLE, argument.value)[:: OPTIONS.coarse].tolist()
+                    horizon: Kind = ("pole", 0.0)
+                    radii = constants_for(horizon, argument.value)[:: OPTIONS.coarse].tolist()
                     found.append(tuple(both))
-                    found += [(*both, (Factor(place, POLE, theta),)) for theta in horizons]
+                    found += [(*both, (Factor(place, horizon, theta),)) for theta in radii]
         return found
 
     def _of_one(self) -> _Group:

@@ -11,7 +11,6 @@ import numpy as np
 
 Kind = tuple[str, float]  # name and exponent n
 COSH: Kind = ("cosh", 0.0)
-POLE: Kind = ("pole", 0.0)
 
 
 def values(kind: Kind, x, theta):
@@ -77,7 +76,7 @@ def kinds_for(x: np.ndarray, *, distance: bool = False, circular: bool = False) 
         found += [("log", 0.0), ("exp", -2.0), ("exp", -1.0)]
     if not distance:
         found += [("sin", 0.0), ("cos", 0.0)]
-    found += [("exp", 0.0), ("exp", 1.0), ("root", 1.0), ("root", -1.0), POLE]
+    found += [("exp", 0.0), ("exp", 1.0), ("root", 1.0), ("root", -1.0), ("pole", 0.0)]
     return [*found, ("softened", 0.0), ("lorentz", 0.0), ("gauss", 0.0)]
 
 
