@@ -149,7 +149,7 @@ class Sensors:
         that it holds the whole of a further trajectory with the probability ``coverage``.
 
         A prediction interval of the scores' logarithms, by Student's t: of held-out forecasts that
-        overlap, each stretch as long as their lead counts as ``OPTIONS.phases``. Those of the farthest
+        overlap, each stretch as long as their lead counts as ``phases``. Those of the farthest
         lead where none went so far, 1 where none was held out. It is not far beyond the largest
         score: those of bodies at rest are near 0, and their logarithms not normal.
         """
