@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from harness import Numbers
 from rings.lattice import AMPLITUDE, Ring, ellipsoid, ring
@@ -26,7 +28,7 @@ def tune(signal, near: float | None = None) -> float:
         lines[np.abs(frequencies_ - near) > 0.02] = 0.0
     coarse = frequencies_[np.argmax(lines)]
     width = 1 / len(signal)
-    found = minimize_scalar(
+    found: Any = minimize_scalar(
         power, bounds=(coarse - width, coarse + width), method="bounded", options={"xatol": 1e-12}
     )
     return float(found.x % 1.0)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -75,7 +76,7 @@ def hidden_frequency(problem: ArcProblem, stiff: bool) -> float | None:
     best = float(tried[np.argmin(shares)])
     beside = shares[np.abs(tried - best) > OPTIONS.width * turn]
     ends = best - OPTIONS.spacing * turn, best + OPTIONS.spacing * turn
-    found = minimize_scalar(left, bounds=ends, method="bounded")
+    found: Any = minimize_scalar(left, bounds=ends, method="bounded")
     gain, others = (
         -np.log(max(float(share), 1e-300)) for share in (found.fun, min(beside, default=1.0))
     )

@@ -12,7 +12,7 @@ import contextlib
 import dataclasses
 from collections.abc import Sequence
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -261,7 +261,7 @@ class _Starts:
             """The nearest half of a whole number, and what the weak form prefers."""
             best = min(OPTIONS.exponents, key=lambda e: share(e, others))
             ends = best - OPTIONS.beside, best + OPTIONS.beside
-            found = minimize_scalar(share, bounds=ends, method="bounded", args=(others,))
+            found: Any = minimize_scalar(share, bounds=ends, method="bounded", args=(others,))
             return float(np.round(2 * found.x) / 2), float(f"{found.x:.4g}")
 
         masses = [row for row in textbook if any(row[0])]
