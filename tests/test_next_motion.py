@@ -1,10 +1,16 @@
 """Which motion to record next, against the standard errors after it was recorded."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from test_law_fits import pendulum
 
 import gfnn_jax as gfnn
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
+from random_recordings import SYSTEMS, record
 
 TERMS = ["V: cos(theta) + cos(2*theta)", "R: omega**2"]
 
@@ -28,6 +34,14 @@ def test_a_wider_swing_tells_what_a_small_one_cannot():
     before, after = (f.lagrangian.terms[2].std for f in (fit, both))
     # What is foretold counts terms of higher modes too, which this law has not.
     assert 1 / 3 < before / after / best.gains["cos(2*theta)"] < 3
+
+
+@pytest.mark.slow
+def test_pendulums_that_nothing_couples_have_scales_of_their_own():
+    """Terms of the library that a motion tells couple them, and then one mass is free."""
+    fit = gfnn.fit(record(SYSTEMS["two pendulums"], np.random.default_rng([3, 6])).recording)
+    assert len(fit.lagrangian.terms) == 4
+    assert fit.next_motions
 
 
 @pytest.mark.slow
