@@ -1,6 +1,9 @@
 """Verdicts of data that no law follows, and what `gfnn.fit` refuses, in one line each."""
 
+import dataclasses
 import pickle
+import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -9,7 +12,12 @@ from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import measure, stretches
+from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.models.lagrangians.nature import nature
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
+from certificates import NOISES
+from random_recordings import SYSTEMS, record
 
 TIMES = np.arange(400) * 0.05
 
@@ -26,6 +34,25 @@ def test_a_self_sustained_oscillator_is_not_identified():
         fit = gfnn.fit(t, found.y[0] + noise)
     assert fit.verdict.startswith("partly: ")
     assert fit.found.whiteness["x1"].fit_percent > 95
+
+
+def test_correlated_residuals_beside_much_noise_are_a_law_that_lacks_something():
+    """Five periods of two carts whose coupling the search refuses: 1.8 times the noise is left."""
+    rng = np.random.default_rng([27_182_818, 300])  # of certificates.py
+    drawn = record(SYSTEMS["carts"], rng, (6.0, 40.0), (5.0, 40.0), NOISES, 6.0)
+    fit = gfnn.fit(drawn.recording)
+    assert fit.verdict.startswith("partly: ") or drawn.right(drawn.error(fit))
+
+
+def test_terms_none_of_which_is_significant_leave_several_laws():
+    t = np.arange(300) * 0.05
+    noise = 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    law = gfnn.fit(t, np.cos(2 * t) * np.exp(-0.05 * t) + noise).found
+    first, second = law.lagrangian.terms
+    assert law.verdict == "identified"
+    unsure = (first, second._replace(std=abs(second.coefficient)))
+    law = dataclasses.replace(law, lagrangian=Formula(unsure))
+    assert law.verdict.startswith(f"one of several: none of {second.term} is significant")
 
 
 def test_noise_has_no_law(tmp_path):
