@@ -118,12 +118,12 @@ def best_start(problem: ArcProblem) -> LawFit:
     some.add_richer([*textbook.rows, *pulls], 1)
     if not (many and some.are_noise):
         some.add(_Library(first, 2))
+    some.add_central(textbook.rows, 3, across=False)
     for degree in (3, 4):
         some.add_bodies(degree)
     if inputs := problem.num_inputs:
         driven = libraries.driven(d, angles, inputs, problem.squares)
         some.add_richer([*textbook.rows, *driven], 3)
-    some.add_central(textbook.rows, 3, across=False)
     some.add_richer([*first, *libraries.gyroscopic(d, angles, 1)], 3)
     if not some.followed and (zero := some.far_zeros()).any():
         some.add(textbook, zero)
