@@ -128,6 +128,7 @@ class SearchOptions:
     noise scales that needs no second fit. least_left: of the squares of residuals, that an added
     term may leave. imitated: share of what a term changes, below which the fitted ones imitate it.
     least: noise of a channel, of its spread; rounding, truncation and printed digits are below it.
+    singular: eigenvalue of M, its diagonal 1, of motion with no inertia to speak of.
     frictions: kinds that are tried; choose_friction: by held-out arcs, else all of these.
     """
 
@@ -142,6 +143,7 @@ class SearchOptions:
     least_left: float = 1e-4
     imitated: float = 0.03
     least: float = 1e-7
+    singular: float = 1e-5
     frictions: tuple[str, ...] = FRICTIONS
     choose_friction: bool = True
 
@@ -395,14 +397,18 @@ class LawFit:
 
     @functools.cached_property
     def is_definite(self) -> bool:
-        """Return whether M is positive definite at all states: else there is no least energy."""
+        """Return whether M is positive definite at all states, and not nearly singular: else there
+        is no least energy, or motion with no inertia, which terms that are told only together
+        make."""
         law, d = self.form.lagrangian(self.p[: self.form.count]), self.form.dim
         if not np.all(np.isfinite(self.p)):
             return False
         masses = law.at(self.problem.args).masses(self.problem.states[:, :d])
         leads = np.isin(np.arange(d), self.structure.leaders)
         masses = np.where(leads[:, None] == leads, masses, 0.0)
-        return bool(np.linalg.eigvalsh(masses).min() > 0)
+        own = np.sqrt(np.diagonal(masses, axis1=-2, axis2=-1).clip(1e-300))
+        scaled = masses / (own[..., :, None] * own[..., None, :])
+        return bool(np.linalg.eigvalsh(scaled).min() > self.problem.options.singular)
 
     @property
     def followed(self) -> Arcs:
