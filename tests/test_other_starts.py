@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import sympy as sp
 from analytic import motion
+from numpy.testing import assert_allclose
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
-from gfnn_jax.models.lagrangians.structure import Structure
+from gfnn_jax.models.lagrangians.structure import SINE, Structure
 from gfnn_jax.solve.latent_arcs import Fitted
 
 
@@ -244,3 +245,18 @@ def test_a_state_whose_derivatives_overflow_is_not_known():
     known, unknown = fitted.last_covariance()
     np.testing.assert_allclose(known, np.diag([0.25, 0.0625]))
     np.testing.assert_array_equal(unknown, 1e100 * np.eye(2))
+
+
+def test_the_zero_of_an_angle_takes_the_place_of_its_sine():
+    """−9.8 cos q + 1.3 sin q in another gauge is one cosine about its zero: forces agree."""
+    none, one = (0,), (1,)
+    mass, cosine, sine = ((2,), none, none, 0.0), (none, none, one, 0.0), (none, none, one, SINE)
+    third = (none, none, (3,), SINE)
+    structure = Structure(1, (mass, cosine, sine, third))
+    known = {("term", cosine): -9.8, ("term", sine): 1.3, ("term", third): 0.0}
+    other, told = structure.with_sines_as_zeros(known, (0,))
+    assert other.terms == (mass, cosine, third)
+    assert not other.may_have(("term", sine))
+    q, zero = np.linspace(-3, 3, 9), told["zero", 0]
+    assert_allclose(told["term", cosine] * np.cos(q - zero), -9.8 * np.cos(q) + 1.3 * np.sin(q))
+    assert structure.may_have(("term", sine))  # without a zero nothing else tells it

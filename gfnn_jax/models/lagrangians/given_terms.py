@@ -44,8 +44,7 @@ from gfnn_jax.families.lagrangian import (
     coordinates_in,
 )
 from gfnn_jax.families.told import told_of
-from gfnn_jax.models.lagrangians.libraries import SINE
-from gfnn_jax.models.lagrangians.structure import Loss, Row, with_powers
+from gfnn_jax.models.lagrangians.structure import SINE, Loss, Row, with_powers
 
 
 class Told(NamedTuple):

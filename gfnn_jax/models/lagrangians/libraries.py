@@ -12,8 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import combinations, combinations_with_replacement, permutations
 
-import numpy as np
-
 from gfnn_jax.families.expressions import parse, product_of, to_text
 from gfnn_jax.families.lagrangian import (
     DRY,
@@ -25,9 +23,8 @@ from gfnn_jax.families.lagrangian import (
     UNIFORM,
     tree_of,
 )
-from gfnn_jax.models.lagrangians.structure import Loss, Row
+from gfnn_jax.models.lagrangians.structure import SINE, Loss, Row
 
-SINE = -np.pi / 2
 KINDS = (LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED)
 FRICTIONS = ("linear", "quadratic", "dry", "uniform", "cubic", "one-sided")  # their names
 RARE = (POWER, ONE_SIDED)  # taken only where they explain a record much better than the others do

@@ -189,9 +189,8 @@ class _Starts:
         except FitError:
             return
         zeros = structure.with_a_zero(problem.turned)
-        structure = structure.plus(
-            [("loss", row) for row in self.always] + [("zero", i) for i in zeros]
-        )
+        structure, known = structure.with_sines_as_zeros(known, zeros)
+        structure = structure.plus([("loss", row) for row in self.always])
         if zero is not None:
             known = known | {("zero", i): float(zero[i]) for i in zeros}
         elif any(_is_of(other, structure) for other in self.fits):

@@ -36,6 +36,7 @@ from gfnn_jax.flows.motion import Form
 Row = tuple[Any, ...]  # (k, n, m, φ), then a shape where it has one, and powers of parameters
 Loss = tuple[Any, ...]  # (c, kind, ε), or (c, kind, ε, powers of parameters)
 Key = tuple[Any, ...]
+SINE = -np.pi / 2  # phase
 
 
 def with_powers(row: Row | Loss, powers: tuple[int, ...]) -> Row | Loss:
@@ -52,6 +53,13 @@ def powers_of(row: Row | Loss, count: int) -> tuple[int, ...]:
 def is_constant(row: Row) -> bool:
     """Return whether a term depends on no coordinate, but on velocities at most."""
     return not any(coordinates_in(row))
+
+
+def cosine_of(row: Row) -> Row | None:
+    """cos q_i where a term is sin q_i of one coordinate, else None."""
+    speeds, powers, wave, phase, *more = row
+    alone = sum(wave) == sum(map(abs, wave)) == 1 and not (any(speeds) or any(powers))
+    return (*row[:3], 0.0, *more) if alone and phase == SINE else None
 
 
 def _touched(row: Row) -> list[bool]:
@@ -160,8 +168,10 @@ class Structure:
         return any(moved[i] for i in part)
 
     def may_have(self, key: Key) -> bool:
-        """Return whether a coefficient may belong to it: no friction of the relative speed of
-        coordinates that drive and are driven."""
+        """Return whether a coefficient may belong to it: no sine of an angle beside its cosine and
+        its zero, and no friction of the relative speed of coordinates that drive and are driven."""
+        if key[0] == "term" and (cosine := cosine_of(key[1])) is not None:
+            return cosine not in self.terms or not any(key[1][2][i] for i in self.zeros)
         if key[0] != "loss" or not self.leaders:
             return True
         moved = np.flatnonzero(key[1][0])
@@ -228,6 +238,23 @@ class Structure:
             by = 1 / mean if mean > 0 else 1.0
             known = {k: by * c if self._moves(k, part) else c for k, c in known.items()}
         return known
+
+    def with_sines_as_zeros(
+        self, known: Mapping[Key, float], zeros: Sequence[int]
+    ) -> tuple[Structure, dict[Key, float]]:
+        """The structure with these zeros of angles in place of sines beside cosines of one angle
+        alone, and what is known: a cos q + b sin q = ±√(a² + b²) cos(q − zero)."""
+        known, gone = dict(known), set()
+        for row in self.terms:
+            cosine = cosine_of(row)
+            if cosine not in self.terms or not (moved := [i for i in zeros if row[2][i]]):
+                continue
+            keys = ("term", cosine), ("term", row)
+            a, b = (known.get(key, 0.0) for key in keys)
+            turned = np.arctan(b / a) if a else np.pi / 2
+            known |= {keys[0]: float(np.copysign(np.hypot(a, b), a)), ("zero", moved[0]): turned}
+            gone.add(keys[1])
+        return self.without(gone).plus([("zero", i) for i in zeros]), known
 
     def without(self, keys: set[Key]) -> Structure:
         return dataclasses.replace(

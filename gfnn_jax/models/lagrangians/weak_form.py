@@ -21,12 +21,14 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.lagrangian import LINEAR, Friction, Terms, functions_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
-from gfnn_jax.models.lagrangians.libraries import FEW, SINE
+from gfnn_jax.models.lagrangians.libraries import FEW
 from gfnn_jax.models.lagrangians.structure import (
+    SINE,
     Key,
     Loss,
     Row,
     Structure,
+    cosine_of,
     is_constant,
 )
 
@@ -236,13 +238,10 @@ def zeros_of_angles(
     structure = Structure(problem.dim, (*terms, *sines), tuple(friction), (), problem.num_inputs)
     known = weak_start(structure, problem, prune=False)[1]
     zeros = np.zeros(structure.dim)
-    for row in terms:
-        speeds, powers, wave, phase = row
-        if any(speeds) or any(powers) or sum(map(abs, wave)) != 1:
-            continue
-        own = known.get(("term", row), 0.0), known.get(("term", (*row[:3], phase + SINE)), 0.0)
-        if any(own):
-            zeros[list(map(abs, wave)).index(1)] = np.arctan2(own[1], own[0])
+    for row in sines:
+        if (cosine := cosine_of(row)) is not None:
+            a, b = (known.get(("term", one), 0.0) for one in (cosine, row))
+            zeros[row[2].index(1)] = np.arctan2(b, a)
     return np.where(np.abs(zeros) > np.pi / 2, zeros - np.pi * np.sign(zeros), zeros)
 
 
