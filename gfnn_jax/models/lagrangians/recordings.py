@@ -20,7 +20,15 @@ import numpy as np
 from gfnn_jax.data.recording import Recording, channels_of, parameters_of
 from gfnn_jax.data.roles import by_name, is_wave, symbols, wave_names
 from gfnn_jax.data.traits import without_wrong_values
-from gfnn_jax.dataset.stretches import Moving, Stretch, measure, nodes_of, stretches, without_rests
+from gfnn_jax.dataset.stretches import (
+    Moving,
+    Stretch,
+    arcs_of,
+    measure,
+    nodes_of,
+    stretches,
+    without_rests,
+)
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import INPUTS, Lagrangian, shape_of
 from gfnn_jax.families.text import measured
@@ -653,9 +661,12 @@ def _with_hidden_drive(
     for stiff in (False, True) if searches else ():
         if (omega := hidden_frequency(problem, stiff)) is None:
             continue
+        driven = recording.driven_by(wave_names(omega))
+        if found is not None and not stiff and _louder_with(found.fit, driven, loud):
+            continue
         problem.on_progress(f"a drive that was not recorded: {omega:.5g} rad/s")
         with contextlib.suppress(FitError):
-            _, law = searched(recording.driven_by(wave_names(omega)), "band")
+            _, law = searched(driven, "band")
             if _loudest(law.fit) < OPTIONS.explained * loud:
                 _, omega, error = with_frequency(law.fit, omega)
                 driven, law = searched(recording.driven_by(wave_names(omega)), "band")
@@ -664,6 +675,15 @@ def _with_hidden_drive(
     if data is None or found is None:
         raise missed
     return data, found, ()
+
+
+def _louder_with(fit: LawFit, driven: Recording, loud: float) -> bool:
+    """Return whether a law leaves much of what it left by itself with the forces of a drive too."""
+    problem = samples_of(driven).problem.by_rule("band")
+    structure = dataclasses.replace(fit.structure, num_inputs=problem.num_inputs)
+    arcs = arcs_of(problem.nodes, fit.arcs.t.shape[1])
+    more = problem.fit(structure, fit.values, arcs, fit.sigma)
+    return not _loudest(more) < OPTIONS.explained * loud
 
 
 def _loudest(fit: LawFit) -> float:
