@@ -58,12 +58,14 @@ EVIDENCE = Evidence()
 
 
 class Rival(NamedTuple):
-    """Another law that the data allow, the odds of the one that was taken against it, and its terms
-    beside those of that one, "" where they are not told: "with x⁴ in place of x⁶"."""
+    """Another law that the data allow, the odds of the one that was taken against it, its terms
+    beside those of that one, "" where they are not told: "with x⁴ in place of x⁶", and whether it
+    leaves open which law it is: it is likelier, or as plain."""
 
     formula: str
     odds: float
     terms: str = ""
+    leaves_open: bool = True
 
 
 class Comparison(NamedTuple):

@@ -22,11 +22,15 @@ class TubeOptions:
 
     least: a score, of errors that are roundoff. beyond: times the largest score seen: a further one
     is no larger. phases: starts of forecasts within their length that tell something of their own.
+    usual: standard deviation of the logarithms of scores, of most laws, which counts as ``known``
+    scores do: a record of few times a length has few scores, which hardly tell their own.
     """
 
     least: float = 1e-9
     beyond: float = 1.5
     phases: float = 3.0
+    usual: float = 0.3
+    known: float = 4.0
 
 
 OPTIONS = TubeOptions()
@@ -148,7 +152,8 @@ class Sensors:
         """Factor by which a tube over a time ahead has to be wider than the law by itself says, so
         that it holds the whole of a further trajectory with the probability ``coverage``.
 
-        A prediction interval of the scores' logarithms, by Student's t: of held-out forecasts that
+        A prediction interval of the scores' logarithms, by Student's t, their variance with that of
+        most laws (Gelman et al., Bayesian Data Analysis, §2.6): of held-out forecasts that
         overlap, each stretch as long as their lead counts as ``phases``. Those of the farthest
         lead where none went so far, 1 where none was held out. It is not far beyond the largest
         score: those of bodies at rest are near 0, and their logarithms not normal.
@@ -159,7 +164,8 @@ class Sensors:
         scores = self.scores[np.isfinite(self.scores[:, lead]), lead]
         logs = np.log(np.maximum(scores, OPTIONS.least))
         count = np.clip(OPTIONS.phases * self.observed / self.leads[lead], 2, len(logs))
-        std = logs.std() * np.sqrt(count / (count - 1))
-        reach = stdtrit(count - 1, coverage) * np.sqrt(1 + 1 / count)
-        far = min(logs.mean() + reach * std, logs.max() + np.log(OPTIONS.beyond))
+        free = count - 1 + OPTIONS.known
+        variance = (count * logs.var() + OPTIONS.known * OPTIONS.usual**2) / free
+        reach = stdtrit(free, coverage) * np.sqrt(variance * (1 + 1 / count))
+        far = min(logs.mean() + reach, logs.max() + np.log(OPTIONS.beyond))
         return float(np.exp(far))

@@ -7,14 +7,18 @@ arcs. A law with fewer terms is likely too where what leaves is not significant:
 terms that are not there stands three standard errors from zero. The plainest of those that are
 likely takes the place of the fit; those that are as likely as the law in the end are its *rivals*.
 A rival is lean: it holds no smaller rival as a special case, nor the law itself with terms beside
-which its coefficients are as well known.
+which its coefficients are as well known. It is another law: where a law with fewer terms, that the
+sums of either hold, is likelier than both, as (v₁ + v₂)² + (v₁ − v₂)² is 2 v₁² + 2 v₂², they are
+the same.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
 from itertools import combinations
+from operator import le
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +27,9 @@ from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.families.text import in_letters
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians.fit import LawFit
+from gfnn_jax.models.lagrangians.friction_choice import is_coupled, kinds_of
 from gfnn_jax.models.lagrangians.libraries import FEW, RARE
-from gfnn_jax.models.lagrangians.structure import Structure, is_constant
+from gfnn_jax.models.lagrangians.structure import Loss, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import promising, protected
 
 
@@ -45,7 +50,7 @@ class ExchangeOptions:
 
     most: int = 2
     imitated: float = 1e-3
-    same: float = 1e-6
+    same: float = 3e-5
     vague: float = 0.05
     vaguer: float = 3.0
     screened: int = 20
@@ -143,6 +148,24 @@ def rivals(fit: LawFit, every: Structure) -> list[Exchanged]:
     return sorted(found, key=lambda one: one.above)[: OPTIONS.listed]
 
 
+def leaves_open(fit: LawFit, rival: Exchanged) -> bool:
+    """Return whether a rival leaves open which law it is: it is likelier than the law, or its
+    friction is as plain and terms that it has more are as far from zero as chance does not make
+    them. Less plain is friction of more kinds, of a rare kind, or of several speeds, which odds
+    that decide are needed for (`friction_choice`)."""
+    more = len(rival.fit.p) - len(fit.p)
+    unlikely = rival.above + more * _for_fewer(fit, len(fit.p) - more)
+    kinds, others = (_oddness(one.structure.friction) for one in (fit, rival.fit))
+    plain = all(map(le, others, kinds)) and unlikely < fit.problem.options.evidence.deciding
+    return plain or rival.above < 0
+
+
+def _oddness(friction: Sequence[Loss]) -> tuple[int, ...]:
+    """The number of kinds of friction, of rare ones, and of those of several speeds."""
+    rare, coupled = ([row[1] in RARE for row in friction], [is_coupled(row) for row in friction])
+    return len(kinds_of(friction)), sum(rare), sum(coupled)
+
+
 def may_be_chosen(fit: LawFit) -> bool:
     """Return whether the friction does not drive, and is not both linear and uniform."""
     losses = [value for key, value in fit.values.items() if key[0] == "loss"]
@@ -184,7 +207,7 @@ def _near(fit: LawFit, every: Structure) -> list[Exchanged]:
     for some in (fewer, about):
         tried = 0
         for places in some:
-            if screen.adds_little(places) or any(one <= places for one in smaller):
+            if any(one <= places for one in smaller) or screen.is_the_same(places):
                 continue
             tried, other = tried + 1, screen.fitted(places)
             if other is not None:
@@ -319,6 +342,21 @@ class _Screen:
         gone = self.columns[:, sorted(self.own - places)]
         basis = np.linalg.qr(self.columns[:, sorted(places)])[0]
         return bool(np.all(np.linalg.norm(gone - basis @ (basis.T @ gone), axis=0) < OPTIONS.same))
+
+    def is_the_same(self, places: frozenset[int]) -> bool:
+        """Return whether these terms add little to the law; or a law of fewer terms, which is a sum
+        of these as of those of the fit, is likelier than either."""
+        if self.adds_little(places):
+            return True
+        own, other = (np.linalg.qr(self.columns[:, sorted(some)])[0] for some in (self.own, places))
+        turn, cosines, _ = np.linalg.svd(own.T @ other)
+        both = own @ turn[:, : np.count_nonzero(cosines > 1 - OPTIONS.same**2)]
+        if both.shape[1] >= min(len(self.own), len(places)):
+            return False
+        left = float(np.sum((self.target - both @ (both.T @ self.target)) ** 2))
+        shared = criterion(left, self.count, both.shape[1])
+        some = (self.own, places)
+        return all(shared < self._criterion(one, self._solved(one)[1]) for one in some)
 
     def adds_little(self, places: frozenset[int]) -> bool:
         """Return whether these terms hold the law, and leave the coefficients that both have about

@@ -140,7 +140,7 @@ def kinds_of(rows: Sequence[Loss]) -> tuple[int, ...]:
     return tuple(sorted({row[1] for row in rows}))
 
 
-def _is_coupled(row: Loss) -> bool:
+def is_coupled(row: Loss) -> bool:
     """Return whether a friction is of the speeds of several coordinates."""
     return sum(map(bool, row[0])) > 1
 
@@ -388,9 +388,9 @@ class Table:
             here = here if here.is_seen else other
         elif here.criterion - other.criterion > 2 * np.log(EVIDENCE.decided):
             here = other
-        if not any(_is_coupled(row) for row in here.rows):
+        if not any(is_coupled(row) for row in here.rows):
             return here
-        single = [k for k in of_kinds if not _is_coupled(self.candidates[k])]
+        single = [k for k in of_kinds if not is_coupled(self.candidates[k])]
         alone = self._lean(self._not_below_zero(single), False, judged)
         worse = alone.criterion - here.criterion > 2 * np.log(EVIDENCE.decided)
         as_good = alone.kinds == kinds and alone.is_seen >= here.is_seen and not worse

@@ -14,7 +14,6 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.lagrangian import Powers
 from gfnn_jax.families.text import Term
-from gfnn_jax.fitting.evidence import Rival
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.first_order import rival
@@ -151,11 +150,10 @@ def line_of(recording: Recording, found: GaugedLaw) -> str:
     return f"L = {lagrangian}; R = {friction}"
 
 
-def rival_of(recording: Recording, found: GaugedLaw, odds: float, terms: str) -> Rival:
-    """A law against which that of the recording has these odds, as Python writes it, and its terms
-    beside those of that law."""
+def formula_of(recording: Recording, found: GaugedLaw) -> str:
+    """L and R of a law, as Python writes them."""
     lagrangian, friction = _expressions(found, Names.of(recording))
-    return Rival(f"L = {lagrangian.formula}; R = {friction.formula}", odds, terms)
+    return f"L = {lagrangian.formula}; R = {friction.formula}"
 
 
 def _standard_errors(

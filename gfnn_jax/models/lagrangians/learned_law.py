@@ -163,8 +163,8 @@ class LearnedLaw:
             return f"partly: {'; '.join((*self.flaws, *filter(None, [self.nature])))}"
         if self.rival:
             return f"one of several: {self.rival}"
-        if self.rivals:
-            told = ", or one ".join(one.terms for one in self.rivals[:_TOLD])
+        if rivals := [one.terms for one in self.rivals if one.leaves_open]:
+            told = ", or one ".join(rivals[:_TOLD])
             return f"one of several: a law {told} fits the record as well"
         together = [names for names in self.alike if names.endswith(ONLY_TOGETHER)]
         if together:

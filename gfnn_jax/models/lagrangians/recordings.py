@@ -32,6 +32,7 @@ from gfnn_jax.dataset.stretches import (
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.lagrangian import INPUTS, Lagrangian, shape_of
 from gfnn_jax.families.text import measured
+from gfnn_jax.fitting.evidence import Rival
 from gfnn_jax.flows.dormand_prince import WEIGHTS
 from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import map_of_law, smoothed
@@ -40,7 +41,7 @@ from gfnn_jax.maps.sensors import OtherLaw
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.lagrangians.dependence import search_of_systems
 from gfnn_jax.models.lagrangians.drives import hidden_frequency, with_frequency
-from gfnn_jax.models.lagrangians.exchange import other_terms, rivals
+from gfnn_jax.models.lagrangians.exchange import leaves_open, other_terms, rivals
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
 from gfnn_jax.models.lagrangians.first_order import plain_field
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
@@ -50,10 +51,10 @@ from gfnn_jax.models.lagrangians.hidden import no_hidden_law, search_hidden, wit
 from gfnn_jax.models.lagrangians.in_use import CalibratedLaw, GaugedLaw, RecordingData, best_in_use
 from gfnn_jax.models.lagrangians.in_words import (
     Findings,
+    formula_of,
     in_words,
     line_of,
     named_motions,
-    rival_of,
 )
 from gfnn_jax.models.lagrangians.input_rules import RULES, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
@@ -268,17 +269,22 @@ def _with_rivals(
     found = [] if fit.problem.parameters else rivals(fit, every)
     if not found:
         return law
-    laws = [GaugedLaw.of(data, other) for other, _ in found]
-    logs = np.array([0.0, *(-above / 2 for _, above in found)])
+    laws = [GaugedLaw.of(data, one.fit) for one in found]
+    logs = np.array([0.0, *(-one.above / 2 for one in found)])
     shares = np.exp(logs - np.logaddexp.reduce(logs))
     listed = tuple(
-        rival_of(recording, one, float(np.exp(-log)), other_terms(fit, one.fit))
-        for one, log in zip(laws, logs[1:], strict=True)
+        Rival(
+            formula_of(recording, other),
+            float(np.exp(one.above / 2)),
+            other_terms(fit, other.fit),
+            leaves_open(fit, one),
+        )
+        for other, one in zip(laws, found, strict=True)
     )
     others = tuple(map(OtherLaw, (one.law for one in laws), shares[1:].tolist()))
     map_: Any = law.map
     map_ = dataclasses.replace(map_, sensors=dataclasses.replace(map_.sensors, rivals=others))
-    motions = named_motions(parting(fit, [other for other, _ in found]), recording)
+    motions = named_motions(parting(fit, [one.fit for one in found]), recording)
     motions = (*motions, *law.next_motions)
     return dataclasses.replace(law, map=map_, rivals=listed, next_motions=motions)
 
