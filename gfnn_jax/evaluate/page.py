@@ -306,8 +306,8 @@ def _rivals(law: LearnedLaw) -> Iterator[tuple[str, str, str]]:
     for name, odds in sorted(law.which_friction.odds.items(), key=lambda pair: pair[1])[:8]:
         note = "as likely" if odds < EVIDENCE.decided else ""
         yield f"friction {name.replace('+', ' + ')}", odds_text(odds), note
-    rivals = ((in_letters(one.formula), odds_text(one.odds), "as likely") for one in law.rivals)
-    yield from rivals
+    for one in law.rivals:
+        yield in_letters(one.formula), odds_text(one.odds), "as likely" * one.leaves_open
     for rule, cost in law.input_rules.items():
         yield f"inputs between samples: {rule}", "", f"held-out cost {cost:.4g} × that of this law"
 
