@@ -82,6 +82,10 @@ def van_der_pol():
     return orbit(lambda _, z: [z[1], 2 * (1 - z[0] ** 2) * z[1] - 4 * z[0]], [1.0, 0.0])[:, :1]
 
 
+def growing_to_its_cycle():
+    return orbit(lambda _, z: [z[1], 0.5 * (1 - z[0] ** 2) * z[1] - z[0]], [0.5, 0.0])[:, :1]
+
+
 def ball_between_walls():
     def rates(_, z):
         over = max(z[0] - 0.5, 0.0) - max(-z[0] - 0.5, 0.0)
@@ -133,6 +137,7 @@ def held():
         (walk, "not mechanical: chance"),
         (prey_and_predators, "not mechanical: first order"),
         (van_der_pol, "not mechanical: self-excited"),
+        (growing_to_its_cycle, "not mechanical: self-excited"),
         (ball_between_walls, "no law: impacts"),
         (pushed_at_random, "no law: unrecorded"),
     ],
@@ -225,3 +230,13 @@ def test_a_fit_of_pairs_can_be_pickled():
 
 def test_the_package_lists_public_names():
     assert set(dir(gfnn)) == {*gfnn.__all__, "__version__"}
+
+
+@pytest.mark.slow
+def test_a_pendulum_whose_gravity_grows_is_named_so():
+    """By a fifth of its mean: the law found has no plainer one beside it."""
+    x = orbit(lambda t, z: [z[1], -4 * np.sin(z[0]) * (1 + 0.006 * t)], [1.0, 0.0])[:, 0]
+    table = {"t": np.arange(2_000) * 0.02, "theta": x}
+    with pytest.warns(gfnn.FitWarning):
+        fit = gfnn.fit(gfnn.Recording(table, positions=["theta"], angles=["theta"]))
+    assert "cos(theta) may change along the record, by +2" in fit.verdict

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.data.recording import Recording, args_of, parameters_of
+from gfnn_jax.dataset.stretches import nodes_of
 from gfnn_jax.errors import FitError
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.lagrangian import Powers
@@ -269,24 +270,27 @@ def _hidden(fit: LawFit, coordinates: Sequence[str], channels: Sequence[str]) ->
 
 
 def _trend(fit: LawFit) -> dict[str, str]:
-    """A plainer law with a coefficient that changes in time, which explains the motion as the terms
-    do that it lacks: with an amplitude that dies down these imitate what ages."""
+    """A law or a plainer one with a coefficient that changes in time, which explains the motion as
+    the terms do that it lacks: with an amplitude that dies down these imitate what ages."""
     problem, structure = fit.problem, fit.structure
+    parts = {id(n.stretch): n.stretch for n in problem.nodes}  # whose states no law has bent
+    problem = dataclasses.replace(problem, nodes=nodes_of([*parts.values()], problem.scales))
     constant = [row for row in structure.terms if sum(row[0]) < 2 or is_constant(row)]
     textbook = libraries.textbook(structure.dim, problem.angles)
     for rows in map(tuple, (textbook, constant)):
-        if len(rows) >= len(structure.terms) or problem.parameters:
+        if len(rows) > len(structure.terms) or problem.parameters:
             continue
         plain = Structure(structure.dim, rows, structure.friction, (), structure.num_inputs)
         with contextlib.suppress(FitError):
             found = trend(plain, problem)
             if found is not None and found[2] < OPTIONS.left:
-                word = problem.word(found[0])
-                return {
-                    f"{word} may change along the record, by {found[1]:+.1%} of it, with fewer "
-                    "terms": "a system that ages, or a clock that drifts, looks so. Fit its parts "
-                    "one by one (--from, --to), and compare"
-                }
+                word, fewer = problem.word(found[0]), len(rows) < len(structure.terms)
+                flaw = f"{word} may change along the record, by {found[1]:+.1%} of it"
+                why = (
+                    "a system that ages, or a clock that drifts, looks so. Fit its parts one by "
+                    "one (--from, --to), and compare"
+                )
+                return {flaw + ", with fewer terms" * fewer: why}
     return {}
 
 

@@ -8,8 +8,8 @@ one is ruled out:
   a random walk, as τ^(2/3) in turbulence, and not at all in white noise.
 - *First order*: the velocities are functions of the positions.
 - *Impacts*: peaks of second differences as narrow as a few samples hold most of their squares.
-- *Self-excited*: polynomials of positions and velocities leave no more of the accelerations than
-  noise, and friction is negative where motion is slow.
+- *Self-excited*: polynomials of positions and velocities explain the accelerations, neither memory
+  nor a state that was not recorded does more, and friction is negative at rest in the middle.
 - *Memory*: plays between position and force leave much less of the accelerations than these
   polynomials, and than the same with as many of the past positions, as of a hidden coordinate.
 - *Unrecorded*: states that nearly coincide have accelerations that differ. What the nearest states
@@ -144,14 +144,16 @@ def nature(
             f"impacts: {100 * jumps:.0f} % of the squares of the accelerations are in peaks of a "
             f"few samples, velocities jump, as at {when:.4g} s. Cut them off (--from, --to)",
         )
+    rate = _rate_at_rest(state, a / v.std(axis=0), state.shape[1] - v.shape[1] - u.shape[1])
+    excited = plain > OPTIONS.mostly and rate > OPTIONS.excited * scales.omega
+    self_excited = Nature(
+        "not mechanical",
+        "self-excited: friction is negative where motion is slow, or small, "
+        f"{rate:.2g} 1/s, and feeds the energy that faster or larger motion loses",
+    )
     if 1 - plain < OPTIONS.closed * max(1 - real, OPTIONS.bias):
-        rate = _rate_at_rest(state, a / v.std(axis=0), state.shape[1] - v.shape[1] - u.shape[1])
-        if rate > OPTIONS.excited * scales.omega:
-            return Nature(
-                "not mechanical",
-                "self-excited: friction is negative where motion is slow, "
-                f"{rate:.2g} 1/s, and feeds the energy that faster motion loses",
-            )
+        if excited:
+            return self_excited
         return Nature(
             "no law",
             f"positions and velocities explain the accelerations to the noise, {100 * plain:.2f} "
@@ -183,6 +185,8 @@ def nature(
             f"is missing (--inputs), or a coordinate{hidden}",
             mostly=mostly,
         )
+    if excited:
+        return self_excited
     return Nature(
         "no law",
         f"no certain cause: {shares}, and no states come so close that they tell more. A force of "
