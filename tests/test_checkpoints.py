@@ -4,11 +4,9 @@ import json
 import os
 import random
 import textwrap
-import time
 import warnings
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
@@ -27,7 +25,7 @@ ARRAYS = {
     "degrees": np.arange(6, dtype=np.int16).reshape(2, 3),
     "count": np.float64(0.1),
     "mask": np.array([True, False]),
-    "small": jnp.ones(3, jnp.bfloat16),
+    "pairs": ([np.ones(2), None], (np.zeros(3, np.float32),)),
     "strided": RNG.normal(size=(6, 4)).T[::2],
     "no terms": np.zeros((0, 4)),
     "bias": None,
@@ -45,8 +43,8 @@ def assert_same(a, b):
         assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
 
 
-def latest(saved, like=None):
-    found = saved.latest(like)
+def latest(saved):
+    found = saved.latest()
     assert found is not None
     return found
 
@@ -77,8 +75,9 @@ def test_failed_save_changes_nothing(model, monkeypatch):
     before = {p: p.read_bytes() for p in model.rglob("*") if p.is_file()}
     with pytest.raises(TypeError, match="mlp/name"):
         save_model(model, {"mlp": {"name": "x"}}, {})
-    with pytest.raises(TypeError, match="key_data"):
-        save_model(model, {"key": jax.random.key(0)}, {})
+    for tree in ({"key": jax.random.key(0)}, {1: np.ones(2)}, {"a": optax.EmptyState()}):
+        with pytest.raises(TypeError):
+            save_model(model, tree, {})
     with pytest.raises(TypeError, match="object"):
         save_model(model, {"a": np.array([None])}, {})
     with pytest.raises(TypeError, match="JSON"):
@@ -173,53 +172,19 @@ def test_float64_needs_x64(model):
 # ---------------------------------------------------------------------------------------------
 
 
-def training_tree(seed):
-    params = {"w": jax.random.normal(jax.random.key(seed), (20, 3)), "b": jnp.zeros(3, jnp.float32)}
-    return {
-        "params": params,
-        "optimiser": optax.adam(1e-3).init(params),
-        "best": (np.float32(0.5), [np.arange(seed + 1), None]),
-        "epoch": seed,
-        "loss": 0.1 + seed,
-        "stopped": False,
-    }
-
-
 def test_checkpoints_round_trip(tmp_path):
     saved = TrainingCheckpoints(tmp_path / "c", {"data": "d", "seed": 1})
     assert saved.latest() is None
+    tree = {"theta": RNG.normal(size=20), "epoch": 3, "loss": 0.1, "stopped": False}
     for step in (5, 10, 15):
-        saved.save(step, training_tree(3))
+        saved.save(step, tree)
     assert sorted(os.listdir(tmp_path / "c")) == ["step_000000000010", "step_000000000015"]
-    again = TrainingCheckpoints(tmp_path / "c", {"seed": 1, "data": "d"})
-    step, tree = latest(again, training_tree(3))
+    step, found = latest(TrainingCheckpoints(tmp_path / "c", {"seed": 1, "data": "d"}))
     assert step == 15
-    assert_same(tree, training_tree(3))
-    assert isinstance(tree["params"]["w"], jax.Array)
-    assert isinstance(tree["best"][1][0], np.ndarray)
-    assert (type(tree["epoch"]), type(tree["loss"]), tree["stopped"]) == (int, float, False)
-    with pytest.raises(InputError, match="pass a tree like it"):
-        saved.latest()
-    plain = {"a": (1, [2.5, np.ones(2)]), "b": None}
-    saved.save(20, plain)
-    assert_same(latest(saved)[1], plain)
-
-
-def test_checkpoints_refuse_another_training(tmp_path):
-    saved = TrainingCheckpoints(tmp_path, {"data": "d"})
-    saved.save(1, {"w": jnp.ones(3)})
+    assert_same(found, tree)
+    assert (type(found["epoch"]), type(found["loss"]), found["stopped"]) == (int, float, False)
     with pytest.raises(InputError, match=r"data"):
-        TrainingCheckpoints(tmp_path, {"data": "e"}).latest()
-    for like, message in [
-        ({"w": jnp.ones(4)}, "expected w with shape"),
-        ({"w": jnp.ones(3, jnp.float32)}, "expected w with dtype float32, found w with dtype"),
-        ({"v": jnp.ones(3)}, "expected v with name v, found w"),
-        ({"w": jnp.ones(3), "x": 1}, "expected 2 leaves, found 1"),
-    ]:
-        with pytest.raises(InputError, match=message):
-            saved.latest(like)
-    with jax.enable_x64(False), pytest.raises(InputError, match="w is float64"):
-        saved.latest()
+        TrainingCheckpoints(tmp_path / "c", {"seed": 1, "data": "e"}).latest()
 
 
 def test_damaged_checkpoint_is_passed_over(tmp_path):
@@ -241,17 +206,6 @@ def test_damaged_checkpoint_is_passed_over(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert latest(saved)[1]["w"][0] == 20
-
-
-def test_save_is_quick(tmp_path):
-    saved = TrainingCheckpoints(tmp_path, {})
-    tree = training_tree(0)
-    seconds = []
-    for step in range(6):
-        start = time.perf_counter()
-        saved.save(step, tree)
-        seconds.append(time.perf_counter() - start)
-    assert min(seconds) < 0.5  # 0.1 s on two cores where nothing else runs
 
 
 WORKER = textwrap.dedent(

@@ -2,8 +2,8 @@
 
 A folder holds
 
-- ``arrays.npz``: the arrays, under their names in the tree; of a checkpoint, and of a model that
-  0.3 saved, ``arrays/``, by Orbax;
+- ``arrays.npz``: the arrays, under their names in the tree; of a model that 0.3 saved, ``arrays/``,
+  by Orbax;
 - ``model.json``: everything else in plain text, with shape, dtype and SHA-256 of every array;
 - ``SHA256SUMS``: the digest of every file (``sha256sum -c SHA256SUMS`` checks it too).
 
@@ -31,12 +31,10 @@ from gfnn_jax.storage.outputs import (
     atomic_folder,
     failures_as_work_errors,
     restore_interrupted,
-    uninterrupted,
 )
 
-# Formats of folders: 0.3 and checkpoints have their arrays by Orbax, models since 0.4 in one .npz.
-BY_ORBAX, AS_NPZ = 2, 3
-_ARRAYS = {BY_ORBAX: "arrays", AS_NPZ: "arrays.npz"}
+# Formats of folders, with where their arrays are: that of 0.3, read only, and that of 0.4.
+_FORMAT, _ARRAYS = 3, {2: "arrays", 3: "arrays.npz"}
 _SUMS = "SHA256SUMS"
 _JSON = "model.json"
 
@@ -47,7 +45,7 @@ def save_model(folder, arrays: dict[str, Any], description: dict[str, Any]) -> N
     An existing ``folder`` is replaced; `outputs.ensure_new` checks first. Raises WorkError if
     writing fails; an existing folder is then unchanged.
     """
-    _write(Path(folder), arrays, {"format": AS_NPZ, "description": description})
+    _write(Path(folder), arrays, {"description": description})
 
 
 def load_model(folder) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -57,7 +55,8 @@ def load_model(folder) -> tuple[dict[str, Any], dict[str, Any]]:
     where the arrays are float64 while JAX's x64 mode is off, which would round them.
     """
     tree, record = _read(Path(folder))
-    wide = [leaf.dtype for leaf in jax.tree.leaves(tree) if _would_be_rounded(leaf)]
+    dtypes = [leaf.dtype for leaf in jax.tree.leaves(tree) if isinstance(leaf, np.ndarray)]
+    wide = [dtype for dtype in dtypes if jax.dtypes.canonicalize_dtype(dtype) != dtype]
     if wide:
         raise InputError(
             f"{folder}: holds {wide[0]} arrays: switch on JAX's float64 first "
@@ -72,9 +71,8 @@ class TrainingCheckpoints:
     identity: a JSON-able dict that says which training this is (digests of data and settings);
     `latest` refuses the checkpoints of another one.
 
-    A tree is made of dicts, lists, tuples and None, or of any registered PyTree node (an
-    optimiser's state), with NumPy or JAX arrays, Python numbers and booleans as leaves. Keys of
-    ``jax.random.key`` are saved as ``jax.random.key_data``.
+    A tree is made of dicts, lists, tuples and None, with arrays, Python numbers and booleans as
+    leaves.
     """
 
     def __init__(self, folder, identity: dict[str, Any]):
@@ -83,8 +81,7 @@ class TrainingCheckpoints:
 
     def save(self, step: int, tree: Any) -> None:
         """Save the tree of ``step``; it and the checkpoint before it remain. Raises WorkError."""
-        about = {"format": BY_ORBAX, "step": int(step), "identity": self.identity}
-        _write(self._path(step), tree, about)
+        _write(self._path(step), tree, {"step": int(step), "identity": self.identity})
         before = [old for old in self._steps() if old < step]
         # Later steps are damaged ones that were passed over; a kill leaves hidden folders.
         unused = [
@@ -93,43 +90,26 @@ class TrainingCheckpoints:
         for path in [*unused, *self.folder.glob(".step_*")]:
             shutil.rmtree(path, ignore_errors=True)
 
-    def latest(self, like: Any = None) -> tuple[int, Any] | None:
+    def latest(self) -> tuple[int, Any] | None:
         """Load the newest undamaged checkpoint as (step, tree), or None.
 
-        Leaves come back bit for bit as they were saved: NumPy as NumPy, JAX as JAX, numbers as
-        numbers. ``like`` is a tree of the same structure, shapes and dtypes, needed where the tree
-        has nodes other than dicts, lists and tuples. A damaged checkpoint is passed over with a
-        warning. Raises InputError where the checkpoint is of another training, or differs from
-        ``like``, or is float64 while JAX's x64 mode is off.
+        Arrays come back as NumPy's, bit for bit as they were saved. A damaged checkpoint is passed
+        over with a warning. Raises InputError where the checkpoint is of another training.
         """
         for step in reversed(self._steps()):
             path = self._path(step)
             try:
-                tree, record = _read(path, like)
+                tree, record = _read(path)
             except Damaged as error:
                 warnings.warn(f"{error}: the checkpoint before it is used", stacklevel=2)
                 continue
-            self._check(path, record)
-            kinds = [leaf["kind"] for leaf in record["leaves"]]
-            leaves, structure = jax.tree.flatten(tree)
-            for leaf, kind, entry in zip(leaves, kinds, record["leaves"], strict=True):
-                if kind == "jax" and _would_be_rounded(leaf):
-                    raise InputError(
-                        f"{path}: {entry['name']} is {leaf.dtype}: switch on JAX's x64 mode first"
-                    )
-            leaves = [
-                jax.numpy.asarray(leaf) if kind == "jax" else leaf
-                for leaf, kind in zip(leaves, kinds, strict=True)
-            ]
-            return step, jax.tree.unflatten(structure, leaves)
-        return None
-
-    def _check(self, path: Path, record: dict[str, Any]) -> None:
-        identity = record.get("identity", {})
-        if identity != self.identity:
+            identity = record.get("identity", {})
             keys = {**identity, **self.identity}
             other = [k for k in keys if identity.get(k) != self.identity.get(k)]
-            raise InputError(f"{path}: belongs to another training ({', '.join(other)} differ)")
+            if other:
+                raise InputError(f"{path}: belongs to another training ({', '.join(other)} differ)")
+            return step, tree
+        return None
 
     def _path(self, step: int) -> Path:
         return self.folder / f"step_{step:012d}"
@@ -157,23 +137,13 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
         # The number keeps apart names that are equal once other characters are gone.
         if array is not None and array.size:
             entry["key"] = f"{number:04d}.{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
-            if (
-                record["format"] == AS_NPZ and array.dtype.kind == "V"
-            ):  # bfloat16 has no code in .npz
-                array = np.frombuffer(array.tobytes(), np.uint8)
             stored[entry["key"]] = array
-    record = {
-        **record,
-        "leaves": leaves,
-        "structure": _structure(tree, iter(range(len(leaves)))),
-    }
+    structure = _structure(tree, iter(range(len(leaves))))
+    record = {"format": _FORMAT, **record, "leaves": leaves, "structure": structure}
     text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
-    # Orbax writes in threads of its own, which would go on in a folder that is gone.
-    with uninterrupted(), atomic_folder(folder) as new:
-        if stored and record["format"] == AS_NPZ:
-            np.savez(new / _ARRAYS[AS_NPZ], allow_pickle=False, **stored)
-        elif stored:
-            _orbax().save((new / _ARRAYS[BY_ORBAX]).absolute(), stored)
+    with atomic_folder(folder) as new:
+        if stored:
+            np.savez(new / _ARRAYS[_FORMAT], allow_pickle=False, **stored)
         (new / _JSON).write_text(text, encoding="utf-8")
         sums = [
             f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(new).as_posix()}\n"
@@ -183,7 +153,7 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
         (new / _SUMS).write_text("".join(sums), encoding="utf-8")
 
 
-def _read(folder: Path, like: Any = None) -> tuple[Any, dict[str, Any]]:
+def _read(folder: Path) -> tuple[Any, dict[str, Any]]:
     """Read the tree, with NumPy leaves, and the content of ``model.json``; verify both."""
     with failures_as_work_errors(folder):
         restore_interrupted(folder)
@@ -205,19 +175,14 @@ def _read(folder: Path, like: Any = None) -> tuple[Any, dict[str, Any]]:
     _verify_files(folder)
     record = json.loads((folder / _JSON).read_bytes())
     try:
-        stored = _stored(folder / _ARRAYS[version]) if _any_stored(record) else {}
+        any_stored = any("key" in entry for entry in record["leaves"])
+        stored = _stored(folder / _ARRAYS[version]) if any_stored else {}
         leaves = [_restored(folder, entry, stored) for entry in record["leaves"]]
-        if like is None:
-            return _rebuild(folder, record["structure"], leaves), record
+        return _rebuild(record["structure"], leaves), record
     except InputError:
         raise
     except Exception as error:
         raise Damaged(f"{folder}: cannot be restored ({str(error)[:200]})") from error
-    return _as_like(folder, like, record["leaves"], leaves), record
-
-
-def _any_stored(record: dict[str, Any]) -> bool:
-    return any("key" in entry for entry in record["leaves"])
 
 
 def _stored(path: Path) -> dict[str, Any]:
@@ -267,16 +232,14 @@ def _describe(name: str, leaf: Any) -> tuple[dict[str, Any], np.ndarray | None]:
     """Make the entry of a leaf in ``model.json``, and the array to store or None."""
     if isinstance(leaf, (bool, int, float)) and not isinstance(leaf, np.generic):
         return {"name": name, "kind": "number", "value": leaf}, None
-    if isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        raise TypeError(f"{name}: save jax.random.key_data of a key")
     if not isinstance(leaf, (jax.Array, np.ndarray, np.generic)):
         raise TypeError(f"{name}: a leaf must be an array or a number, got {type(leaf).__name__}")
-    array = np.ascontiguousarray(leaf).reshape(np.shape(leaf))
-    if array.dtype.kind not in "fiubcV" or array.dtype.hasobject or array.dtype.names:
+    array = np.ascontiguousarray(leaf).reshape(np.shape(leaf))  # raises TypeError for a random key
+    if array.dtype.kind not in "fiubc":
         raise TypeError(f"{name}: a leaf must hold numbers, got dtype {array.dtype}")
     return {
         "name": name,
-        "kind": "jax" if isinstance(leaf, jax.Array) else "numpy",
+        "kind": "numpy",
         "shape": list(array.shape),
         "dtype": str(array.dtype),
         "sha256": hashlib.sha256(array.tobytes()).hexdigest(),
@@ -289,8 +252,6 @@ def _restored(folder: Path, entry: dict[str, Any], stored: dict[str, Any]) -> An
         return entry["value"]
     shape, dtype = tuple(entry["shape"]), np.dtype(entry["dtype"])
     array = np.asarray(stored[entry["key"]]) if "key" in entry else np.empty(shape, dtype)
-    if dtype.kind == "V" and array.dtype == np.uint8:
-        array = np.frombuffer(array.tobytes(), dtype).reshape(shape)
     if array.shape != shape or array.dtype != dtype:
         raise Damaged(
             f"{folder}: {name} should be {dtype} of shape {shape}, found {array.dtype} of shape "
@@ -301,70 +262,34 @@ def _restored(folder: Path, entry: dict[str, Any], stored: dict[str, Any]) -> An
     return array
 
 
-def _would_be_rounded(leaf: Any) -> bool:
-    """Return whether JAX, as configured, would change the dtype of this array."""
-    return isinstance(leaf, np.ndarray) and jax.dtypes.canonicalize_dtype(leaf.dtype) != leaf.dtype
-
-
 def _structure(tree: Any, numbers) -> Any:
-    """Write the tree as JSON, each leaf as its number, a registered node as {"node": type}."""
+    """Write the tree as JSON, each leaf as its number. Raises TypeError for other nodes."""
     if tree is None:
         return None
     if type(tree) is dict and all(type(key) is str for key in tree):
         return {"dict": {key: _structure(tree[key], numbers) for key in sorted(tree)}}
     if type(tree) in (list, tuple):
         return {type(tree).__name__: [_structure(item, numbers) for item in tree]}
-    if jax.tree_util.all_leaves([tree]):
-        return next(numbers)
-    for _ in jax.tree.leaves(tree):
-        next(numbers)
-    return {"node": type(tree).__name__}
+    if not jax.tree_util.all_leaves([tree]):
+        raise TypeError(f"expected dicts by text, lists and tuples, got a {type(tree).__name__}")
+    return next(numbers)
 
 
-def _rebuild(folder: Path, structure: Any, leaves: list[Any]) -> Any:
-    if structure is None:
-        return None
-    if isinstance(structure, int):
-        return leaves[structure]
+def _rebuild(structure: Any, leaves: list[Any]) -> Any:
+    if structure is None or isinstance(structure, int):
+        return None if structure is None else leaves[structure]
     ((kind, content),) = structure.items()
-    if kind == "node":
-        raise InputError(
-            f"{folder}: holds a {content}, which JSON cannot describe: pass a tree like it"
-        )
     if kind == "dict":
-        return {key: _rebuild(folder, item, leaves) for key, item in content.items()}
-    items = [_rebuild(folder, item, leaves) for item in content]
+        return {key: _rebuild(item, leaves) for key, item in content.items()}
+    items = [_rebuild(item, leaves) for item in content]
     return tuple(items) if kind == "tuple" else items
-
-
-def _as_like(folder: Path, like: Any, entries: list[dict[str, Any]], leaves: list[Any]) -> Any:
-    """Put the leaves into the structure of ``like``. Raises InputError where they differ in name,
-    shape or dtype."""
-    named, structure = jax.tree_util.tree_flatten_with_path(like)
-    expected = [
-        _describe(jax.tree_util.keystr(path, simple=True, separator="/"), leaf)[0]
-        for path, leaf in named
-    ]
-    for want, have in zip(expected, entries, strict=False):
-        for what in ("name", "shape", "dtype"):
-            if want.get(what) != have.get(what):
-                raise InputError(
-                    f"{folder}: expected {want['name']} with {what} {want.get(what)}, found "
-                    f"{have['name']} with {what} {have.get(what)}"
-                )
-    if len(expected) != len(entries):
-        raise InputError(f"{folder}: expected {len(expected)} leaves, found {len(entries)}")
-    return jax.tree.unflatten(structure, leaves)
-
-
-FACTORS = "factors"
 
 
 class KeptFactors:
     """Store of pairs of factors by name, in ``folder/factors``. A damaged one counts as missing."""
 
     def __init__(self, folder):
-        self.folder = Path(folder) / FACTORS
+        self.folder = Path(folder) / "factors"
 
     def load(self, name: str) -> dict[str, np.ndarray] | None:
         """Load the arrays that were saved under this name; None where there are none."""

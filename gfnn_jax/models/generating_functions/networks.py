@@ -98,7 +98,7 @@ class NetworkSweep(Generates):
                 f"validation {state.validation_rms:.2e} of the data's spread"
             )
 
-        resume = self._checkpoints.latest(self._like()) if self._checkpoints else None
+        resume = self._checkpoints.latest() if self._checkpoints else None
         reports: list[Callable[[LMState], None]] = [report]
         if self._checkpoints is not None:
             reports.append(_every_few_seconds(self._checkpoints))
@@ -114,7 +114,7 @@ class NetworkSweep(Generates):
             validation=held,
             weight=self._weight,
             limits=limits,
-            resume=resume[1] if resume else None,
+            resume=LMState(**resume[1]) if resume else None,
         )
         error = estimated_error(self.data, self.tolerance, result.validation_rms)
         return Candidate.of(
@@ -127,11 +127,6 @@ class NetworkSweep(Generates):
             train_rms=result.train_rms,
             fit_seconds=result.seconds,
         )
-
-    def _like(self) -> LMState:
-        """A state whose structure is that of this training's."""
-        theta = np.zeros(self.sizes[0].family.num_parameters)
-        return LMState(theta, theta, 0.0)
 
     def _trained(self, **options: Any) -> LMResult:
         """The training; its params are then those of the sweep."""
@@ -159,7 +154,7 @@ def _every_few_seconds(checkpoints) -> Callable[[LMState], None]:
     def save(state: LMState) -> None:
         nonlocal last
         if time.monotonic() - last > _CHECKPOINT_SECONDS:
-            checkpoints.save(state.iteration, state)
+            checkpoints.save(state.iteration, state._asdict())
             last = time.monotonic()
 
     return save
@@ -193,11 +188,6 @@ class EnsembleSweep(NetworkSweep):
     def _take(self, members) -> None:
         family = Ensemble(self._network, jax.tree.map(np.asarray, members))
         self.sizes = [Size(family, family, 0.0)]
-
-    def _like(self) -> LMState:
-        one = super()._like()
-        theta = np.zeros((len(self._starts), self._network.num_parameters))
-        return one._replace(theta=theta, best_theta=theta, damping=theta[:, 0])
 
     def _trained(self, **options: Any) -> LMResult:
         count, pairs = len(self._starts), len(self._train[0])
