@@ -15,6 +15,7 @@ of z (R. I. McLachlan, K. Modin & O. Verdier, "Collective symplectic integrators
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,22 @@ from gfnn_jax.phase_space import split
 
 # Coordinates of a block, and half those of its lift.
 _SIZES = {"so3": (3, 2), "se3": (6, 4), "aff": (2, 1), "centre": (1, 1)}
+# π of a block: z_k = Σ value w_a w_b of the entries (k, a, b, value), w = (q, p) of the block.
+_PRODUCTS: dict[str, list[tuple[int, int, int, float]]] = {
+    "so3": [
+        *((0, 0, 1, 0.5), (0, 2, 3, 0.5), (1, 0, 3, 0.5), (1, 1, 2, -0.5)),
+        *((2, 0, 0, 0.25), (2, 2, 2, 0.25), (2, 1, 1, -0.25), (2, 3, 3, -0.25)),
+    ],
+    "se3": [
+        *((0, 0, 5, -0.5), (0, 1, 4, 0.5), (0, 2, 7, 0.5), (0, 3, 6, -0.5)),
+        *((1, 0, 6, -0.5), (1, 2, 4, 0.5), (1, 3, 5, 0.5), (1, 1, 7, -0.5)),
+        *((2, 0, 7, -0.5), (2, 3, 4, 0.5), (2, 1, 6, 0.5), (2, 2, 5, -0.5)),
+        *((3, 0, 2, -2.0), (3, 1, 3, 2.0), (4, 0, 1, 2.0), (4, 2, 3, 2.0)),
+        *((5, 0, 0, 1.0), (5, 3, 3, 1.0), (5, 1, 1, -1.0), (5, 2, 2, -1.0)),
+    ],
+    "aff": [(0, 0, 0, 1.0), (1, 0, 1, 0.5)],
+    "centre": [(0, 0, 1, 1.0)],
+}
 
 
 def lift_of(bracket: Bracket) -> Any:
@@ -131,8 +148,12 @@ class Quadratic(Lift):
 
     def up(self, z):
         """A state w (..., N) of z (..., n): any of its fibre, for all make the same steps."""
-        parts = self._split(matmul(z, self.basis.T), 0)
-        return self._halves(_UP[block](part) for block, part in parts)
+        y, at, halves = matmul(z, self.basis.T), 0, []
+        for block in self.blocks:
+            halves.append(_UP[block](y[..., at : at + _SIZES[block][0]]))
+            at += _SIZES[block][0]
+        q, p = zip(*halves, strict=True)
+        return namespace(z).concatenate([*q, *p], axis=-1)
 
     def down(self, w):
         """The state z (..., n) of w (..., N)."""
@@ -144,14 +165,13 @@ class Quadratic(Lift):
 
     def product(self, u, w):
         """The symmetric bilinear form (..., n) whose value at (w, w) is π(w)."""
-        pairs = zip(self._states(u), self._states(w), strict=True)
-        found = [_flat(_PRODUCTS[block](a, b)) for (block, a), (_, b) in pairs]
-        return matmul(namespace(u, w).concatenate(found, axis=-1), self.inverse.T)
+        (_, a, b), into, _ = _table(self.blocks)
+        return matmul(matmul(u[..., a] * w[..., b], _like(into, w)), self.inverse.T)
 
     def pulled(self, w, g):
         """(∂π/∂w)ᵀ g (..., N) of covectors g (..., n)."""
-        pairs = zip(self._states(w), self._split(matmul(g, self.inverse), 0), strict=True)
-        return self._halves(_PULLED[block](state, own) for (block, state), (_, own) in pairs)
+        (k, _, b), _, back = _table(self.blocks)
+        return matmul(matmul(g, self.inverse)[..., k] * w[..., b], _like(back, w))
 
     def pulled_twice(self, w, g, hessian):
         """Hessian of H∘π (..., N, N): π'ᵀ H'' π' + Σ g_k π_k''."""
@@ -196,36 +216,6 @@ class Quadratic(Lift):
         starts = zip(self.blocks, ends, strict=False)
         some = ((block, at) for block, at in starts if block in ("se3", "centre"))
         return [(at, ends[-1] + at, block == "se3") for block, at in some]
-
-    def _groups(self):
-        """(block, how many follow each other)."""
-        n = 0
-        while n < len(self.blocks):
-            count = 1
-            while self.blocks[n : n + count + 1] == self.blocks[n : n + 1] * (count + 1):
-                count += 1
-            yield self.blocks[n], count
-            n += count
-
-    def _split(self, y, which: int):
-        """(block, (..., count, size)) of coordinates (..., n), or of one half (..., N / 2)."""
-        at = 0
-        for block, count in self._groups():
-            size = _SIZES[block][which]
-            yield block, y[..., at : at + count * size].reshape(*y.shape[:-1], count, size)
-            at += count * size
-
-    def _states(self, w):
-        """(block, ((..., count, half) q, p))."""
-        middle = w.shape[-1] // 2
-        halves = self._split(w[..., :middle], 1), self._split(w[..., middle:], 1)
-        for (block, q), (_, p) in zip(*halves, strict=True):
-            yield block, (q, p)
-
-    def _halves(self, states):
-        """w (..., N) of the (q, p) of each block."""
-        q, p = zip(*states, strict=True)
-        return namespace(q[0]).concatenate([_flat(half) for half in (*q, *p)], axis=-1)
 
 
 @pytree()
@@ -309,7 +299,30 @@ def _shear(bracket: Magnetic) -> Shear:
     return Shear(terms, potentials, bracket.mass, np.linalg.inv(bracket.mass))
 
 
-# Each block has a state (q, p) of an image, the bilinear form, and pulled-back covectors.
+@cache
+def _table(blocks: tuple[str, ...]) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
+    """Entries of π of a sum of blocks, those of (a, b) and of (b, a): the places (k, a, b), (E,)
+    each, and what sums products of w_a and w_b up to z (E, n), and of g_k and w_b to ∂/∂w (E, N).
+    """
+    half, at, first, rows = sum(_SIZES[block][1] for block in blocks), 0, 0, []
+    for block in blocks:
+        n, own = _SIZES[block]
+        of = [*range(at, at + own), *range(half + at, half + at + own)]
+        for k, a, b, value in _PRODUCTS[block]:
+            pairs = {(a, b), (b, a)}
+            rows += [(first + k, of[i], of[j], value / len(pairs)) for i, j in sorted(pairs)]
+        first, at = first + n, at + own
+    *places, values = (np.array(column) for column in zip(*rows, strict=True))
+    into = values[:, None] * np.eye(first)[places[0]]
+    return tuple(places), into, 2.0 * values[:, None] * np.eye(2 * half)[places[1]]
+
+
+def _like(table: np.ndarray, w) -> np.ndarray:
+    """A table of the precision of states."""
+    return table if w.dtype == object else table.astype(w.dtype)
+
+
+# A state (q, p) of an image of each block.
 
 
 def _up_spin(y):
@@ -323,27 +336,6 @@ def _up_spin(y):
     q = xp.where(north[..., None], xp.stack([large, real], -1), xp.stack([real, large], -1))
     p = xp.stack([xp.where(north, zero, -imaginary), xp.where(north, imaginary, zero)], -1)
     return q, p
-
-
-def _spin(u, w):
-    """Bilinear form (..., 3) of states (q, p) of R⁴."""
-    (q, p), (r, s) = u, w
-    a, b, c, e = (q[..., 0], p[..., 0], r[..., 0], s[..., 0])
-    f, g, h, k = (q[..., 1], p[..., 1], r[..., 1], s[..., 1])
-    x = a * h + c * f + b * k + e * g
-    y = a * k + c * g - b * h - e * f
-    z = a * c + b * e - f * h - g * k
-    return 0.25 * namespace(q, r).stack([x, y, z], axis=-1)
-
-
-def _pulled_spin(w, g):
-    """Covector (..., 2) of q and of p."""
-    (q, p), xp = w, namespace(w[0], g)
-    x, y, z = (0.5 * g[..., k] for k in range(3))
-    a, f, b, h = (q[..., 0], q[..., 1], p[..., 0], p[..., 1])
-    of_q = xp.stack([x * f + y * h + z * a, x * a - y * b - z * f], axis=-1)
-    of_p = xp.stack([x * h - y * f + z * b, x * b + y * a - z * h], axis=-1)
-    return of_q, of_p
 
 
 def _up_top(y):
@@ -360,24 +352,9 @@ def _up_top(y):
     return q, _times(q, momentum) * (-2.0 / length)[..., None]
 
 
-def _top(u, w):
-    """Bilinear form (..., 6) of states (q, p) of T*ℍ."""
-    (q, p), (r, s) = u, w
-    momentum = -0.25 * (_imaginary(q, s) + _imaginary(r, p))
-    return namespace(q, r).concatenate([momentum, _imaginary(q, _turned(r))], axis=-1)
-
-
-def _pulled_top(w, g):
-    """Covector (..., 4) of q and of p."""
-    q, p = w
-    momentum, axis = g[..., :3], g[..., 3:]
-    of_q = 0.5 * _times(p, momentum) - 2.0 * _turned(_times(q, axis))
-    return of_q, -0.5 * _times(q, momentum)
-
-
 def _times(q, a):
     """Quaternions q a (..., 4) of q (..., 4) and imaginary a (..., 3)."""
-    (q0, q1, q2, q3), (a1, a2, a3) = _entries(q), _entries(a)
+    (q0, q1, q2, q3), (a1, a2, a3) = ([x[..., k] for k in range(x.shape[-1])] for x in (q, a))
     return namespace(q, a).stack(
         [
             -q1 * a1 - q2 * a2 - q3 * a3,
@@ -387,34 +364,6 @@ def _times(q, a):
         ],
         axis=-1,
     )
-
-
-def _imaginary(q, r):
-    """Im(q̄ r) (..., 3) of quaternions (..., 4)."""
-    (q0, q1, q2, q3), (r0, r1, r2, r3) = _entries(q), _entries(r)
-    return namespace(q, r).stack(
-        [
-            q0 * r1 - r0 * q1 - q2 * r3 + q3 * r2,
-            q0 * r2 - r0 * q2 - q3 * r1 + q1 * r3,
-            q0 * r3 - r0 * q3 - q1 * r2 + q2 * r1,
-        ],
-        axis=-1,
-    )
-
-
-def _turned(q):
-    """Quaternions k q (..., 4)."""
-    q0, q1, q2, q3 = _entries(q)
-    return namespace(q).stack([-q3, -q2, q1, q0], axis=-1)
-
-
-def _entries(array):
-    return (array[..., k] for k in range(array.shape[-1]))
-
-
-def _flat(array):
-    """(..., count, size) as (..., count · size)."""
-    return array.reshape(*array.shape[:-2], -1)
 
 
 def _diagonal(values):
@@ -428,33 +377,9 @@ def _up_scaled(y):
     return q, 2.0 * y[..., 1:] / q
 
 
-def _scaled(u, w):
-    """Bilinear form (..., 2) of states (q, p)."""
-    (q, p), (r, s) = u, w
-    return namespace(q, r).concatenate([q * r, 0.25 * (q * s + p * r)], axis=-1)
-
-
-def _pulled_scaled(w, g):
-    """Covector (..., 1) of q and of p."""
-    q, p = w
-    return 2.0 * q * g[..., :1] + 0.5 * p * g[..., 1:], 0.5 * q * g[..., 1:]
-
-
 def _up_still(y):
     """(q, p) = (y, 1) of a Casimir y = q p (..., 1)."""
     return y, namespace(y).ones_like(y)
 
 
-def _still(u, w):
-    """Bilinear form (..., 1) of states (q, p)."""
-    return 0.5 * (u[0] * w[1] + w[0] * u[1])
-
-
-def _pulled_still(w, g):
-    """Covector (..., 1) of q and of p."""
-    return g * w[1], g * w[0]
-
-
 _UP = {"so3": _up_spin, "se3": _up_top, "aff": _up_scaled, "centre": _up_still}
-_PRODUCTS = {"so3": _spin, "se3": _top, "aff": _scaled, "centre": _still}
-_PULLED = {"so3": _pulled_spin, "se3": _pulled_top, "aff": _pulled_scaled, "centre": _pulled_still}
