@@ -87,7 +87,7 @@ def export(
     """
     if to not in SUFFIXES:
         raise InputError(f"expected one of {', '.join(SUFFIXES)} to export to, got '{to}'")
-    law = getattr(map_, "law", None)
+    law: Any = getattr(map_, "law", None)
     if to == "latex" and law is None:
         raise InputError("a formula is that of a fit with a law: gfnn.export(gfnn.load(...), …)")
     map_ = getattr(map_, "map", map_)  # a fit
@@ -99,7 +99,12 @@ def export(
         raise InputError(f"{out}: is written as {SUFFIXES[to]}, got the suffix '{out.suffix}'")
     ensure_new(out, overwrite)
     if to == "latex":
-        atomic_write(out, _latex(law))
+        if hasattr(law, "lagrangian"):
+            text = f"L = {law.lagrangian.latex()}\n"
+            text += f"R = {law.friction.latex()}\n" if law.friction.terms else ""
+        else:
+            text = f"H = {law.latex()}\n"
+        atomic_write(out, text)
         return out
     map_ = map_ if isinstance(map_, SymplecticMap) else saved.load(map_)
     about = _about(folder)
@@ -112,7 +117,12 @@ def export(
             * of_law
         )
     if to in _PRINTERS:
-        atomic_write(out, _PRINTERS[to](map_, _identifier(out), about))
+        name = out.stem
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or _KEYWORDS_OF_C.fullmatch(name):
+            raise InputError(
+                f"{out}: expected a name of letters, digits and _: functions are named after it"
+            )
+        atomic_write(out, _PRINTERS[to](map_, name, about))
     else:
         known = {"dim": map_.dim, "dt": float(np.asarray(map_.dt))}
         names = map_.parameters.names if map_.parameters is not None else ()
@@ -120,27 +130,10 @@ def export(
     return out
 
 
-def _latex(law: Any) -> str:
-    """Formulas of a law in LaTeX: H; or L, and R where there is friction."""
-    if not hasattr(law, "lagrangian"):
-        return f"H = {law.latex()}\n"
-    friction = f"\nR = {law.friction.latex()}" if law.friction.terms else ""
-    return f"L = {law.lagrangian.latex()}{friction}\n"
-
-
 def default_out(folder: Path, to: str) -> Path:
     """Path of the file beside a model's folder, of the folder's name."""
     folder = folder.absolute()
     return folder.with_name(folder.name + SUFFIXES[to])
-
-
-def _identifier(out: Path) -> str:
-    name = out.stem
-    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or _KEYWORDS_OF_C.fullmatch(name):
-        raise InputError(
-            f"{out}: expected a name of letters, digits and _: functions are named after it"
-        )
-    return name
 
 
 def _about(folder: Path | None) -> dict[str, Any]:

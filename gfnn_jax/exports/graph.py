@@ -126,7 +126,8 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
     if reason is not None:
         raise InputError(f"this law cannot be written as formulas: {reason}")
     dim, params = map_.dim, np.asarray(piece.params)
-    base, inputs, degree = _arguments(map_)
+    base = map_.parameters.names if map_.parameters is not None else ()
+    inputs, degree = ((), 0) if map_.signals is None else (map_.signals.names, map_.signals.degree)
     tape = Tape()
     z, u = tape.inputs("z", map_.width), tape.inputs("u", len(base) + len(inputs))
     plain = params.ndim == 1
@@ -148,7 +149,10 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
     series += [
         tuple(len(base) + order * count + j for order in range(degree + 1)) for j in range(count)
     ]
-    time = len(base) - 1 if _advances(piece.family, len(base) + count) else None
+    none = np.zeros(len(base) + count)
+    # Whether the family depends on time, the last of its args but for the inputs.
+    advances = none.size and np.any(at_time(_held(piece.family), none, 1.0) != none)
+    time = len(base) - 1 if advances else None
     return LawGraph(
         tape,
         list(rates),
@@ -183,14 +187,6 @@ def _of_bracket(bracket: Bracket, piece: Any, p, z, args) -> list[Any]:
     return rates
 
 
-def _arguments(map_: SymplecticMap) -> tuple[tuple[str, ...], tuple[str, ...], int]:
-    """Names of parameters (the time of a drive the last) and of inputs, whose polynomials in time
-    have this degree."""
-    base = map_.parameters.names if map_.parameters is not None else ()
-    signals = map_.signals
-    return (base, (), 0) if signals is None else (base, signals.names, signals.degree)
-
-
 def _held(family: Any) -> Any:
     """The family whose inputs are their values alone: a printer has its own series of them."""
     if isinstance(family, Forced):
@@ -199,14 +195,6 @@ def _held(family: Any) -> Any:
     if inner is None or without_forces(family) is family:
         return family
     return dataclasses.replace(family, family=_held(inner))
-
-
-def _advances(family: Any, count: int) -> bool:
-    """Return whether the family depends on time, the last of its args but for the inputs."""
-    if not count:
-        return False
-    none = np.zeros(count)
-    return bool(np.any(at_time(_held(family), none, 1.0) != none))
 
 
 def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:

@@ -50,7 +50,9 @@ def jax_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     graph, piece = graph_of(map_, sharp=False), map_.pieces[0]
     tape, found = rates_on_tape(graph)
     lines = tape.lines({f"r{i}": rate for i, rate in enumerate(found)})
-    body = "\n".join(f"    {_in_python(line)}" for line in lines)
+    lines = (line.removeprefix("const double ").removesuffix(";") for line in lines)
+    named = (re.sub(r"\b([a-z]+)\(", lambda n: f"jnp.{FUNCTIONS[n[1]]}(", line) for line in lines)
+    body = "\n".join(f"    {line}" for line in named)
     rule = gauss(piece.stages)
     comment = "\n".join(f"{key}: {value}" for key, value in about.items())
     tables = {
@@ -131,9 +133,3 @@ def step(z, u=(), p=COEFFICIENTS, h=DT):
     count = jnp.arange(SUBSTEPS, dtype=z.dtype)
     return jax.lax.scan(lambda z, n: (substep(n, z), None), z, count)[0]
 '''
-
-
-def _in_python(line: str) -> str:
-    """A line of C in Python's notation."""
-    line = line.removeprefix("const double ").removesuffix(";")
-    return re.sub(r"\b([a-z]+)\(", lambda found: f"jnp.{FUNCTIONS[found[1]]}(", line)

@@ -488,7 +488,11 @@ class _Rows:
                 self.varies.add(s.number)
             if s.operation != "input" or s.operands[0][0] == "u":
                 self.rows.setdefault(s.number, self.width + self.count + len(self.rows) - len(z))
-        sums = sum(s.number in self.varies and not self._is_sum_free(s) for s in self.made)
+        sums = 0  # coefficients that are sums over products of others
+        for s in self.made:
+            linear = s.operation in ("+", "-", "negative", "input")
+            one = s.operation == "*" and sum(map(self.varying, s.operands)) == 1
+            sums += s.number in self.varies and not (linear or one)
         few = sums <= OPTIONS.unrolled and not self.count
         self.unrolled = few if unrolled is None else unrolled
 
@@ -510,13 +514,6 @@ class _Rows:
                 if s.operation == "atan":
                     ahead.append(1.0 + s.operands[0] * s.operands[0])
         return [s for s in self.tape.made_so_far if s.number in used]
-
-    def _is_sum_free(self, s: Symbol) -> bool:
-        """Return whether a coefficient takes no sum over products of others."""
-        moving = sum(self.varying(o) for o in s.operands)
-        return s.operation in ("+", "-", "negative", "input") or (
-            s.operation == "*" and moving == 1
-        )
 
     def varying(self, value: Any) -> bool:
         return isinstance(value, Symbol) and value.number in self.varies
@@ -543,17 +540,15 @@ class _Rows:
         for s in self.made:
             if s.operation == "input" or (k != 0 and s.number not in self.varies):
                 continue
-            made = self._zeroth(s) if k == 0 else self._later(s, k)
+            texts = [self.at(o, 0) for o in s.operands]
+            if k != 0:
+                made = self._later(s, k)
+            elif s.operation in ("+", "-", "*", "/"):
+                made = f" {s.operation} ".join(texts)
+            else:
+                made = f"{s.operation.replace('negative', '-')}({', '.join(texts)})"
             lines.append(f"{declared}{self.at(s, k)} = {made};")
         return lines
-
-    def _zeroth(self, s: Symbol) -> str:
-        texts = [self.at(o, 0) for o in s.operands]
-        if s.operation == "negative":
-            return f"-{texts[0]}"
-        if s.operation in ("+", "-", "*", "/"):
-            return f" {s.operation} ".join(texts)
-        return f"{s.operation}({', '.join(texts)})"
 
     def _later(self, s: Symbol, k: int | str) -> str:
         operation, own = s.operation, s.operands
@@ -665,8 +660,15 @@ def c_of_flow(graph: LawGraph, coefficients: bool = False, unrolled: bool | None
     )
     parts += [text for name, text in SUMS.items() if re.search(rf"\b{name}\(T,", operations)]
     parts += [MOVED, _given(rows), operations]
-    parts += [_limits(rows), WITH_FRICTION] if rows.count else [SERIES, SMOOTH]
-    return "\n".join(parts)
+    if not rows.count:
+        return "\n".join([*parts, SERIES, SMOOTH])
+    texts = enumerate(rows.at(limit, 0) for limit in rows.limits)
+    chosen = "".join(f"j == {j} ? {text} : " for j, text in texts)
+    parts.append(
+        "static double limit(const double *T, const double *p, int j)\n{\n"
+        f"    (void)(T), (void)(p);\n    return {chosen}0.0;\n}}\n\n"
+    )
+    return "\n".join([*parts, WITH_FRICTION])
 
 
 def _indented(lines: Sequence[str]) -> list[str]:
@@ -704,16 +706,6 @@ def _given(rows: _Rows) -> str:
     moving = any(len(places) > 1 for places in graph.series) or graph.time is not None
     unused = ([] if moving else ["t"]) + ([] if lines else ["T", "u"])
     return _function("given(double *T, const double *u, double t)", lines, unused)
-
-
-def _limits(rows: _Rows) -> str:
-    """Write the function of the forces that friction holds."""
-    texts = [rows.at(limit, 0) for limit in rows.limits]
-    chosen = "".join(f"j == {j} ? {text} : " for j, text in enumerate(texts))
-    return (
-        "static double limit(const double *T, const double *p, int j)\n{\n"
-        f"    (void)(T), (void)(p);\n    return {chosen}0.0;\n}}\n\n"
-    )
 
 
 def _written_out(rows: _Rows) -> str:

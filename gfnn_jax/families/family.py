@@ -183,13 +183,13 @@ class DifferentiatedByJax(CalledAsValue):
     def gradient(self, params, w, args=None):
         """Gradient ∂f/∂w (..., 2d), by one reverse sweep of the batch."""
         if namespace(w) is np:
-            return np.asarray(_compiled_gradient(self, params, w, args))
+            return np.asarray(_compiled("gradient", self, params, w, args))
         return jax.grad(lambda v: jnp.sum(self.value(params, v, args)))(w)
 
     def gradient_and_hessian(self, params, w, args=None) -> tuple[Any, Any]:
         """Gradient ∂f/∂w and Hessian ∂²f/∂w², by a tangent of the reverse sweep per entry of w."""
         if namespace(w) is np:
-            gradient, hessian = _compiled_hessian(self, params, w, args)
+            gradient, hessian = _compiled("gradient_and_hessian", self, params, w, args)
             return np.asarray(gradient), np.asarray(hessian)
         gradient, tangent = jax.linearize(lambda v: self.gradient(params, v, args), w)
         units = jnp.eye(w.shape[-1], dtype=w.dtype)
@@ -197,14 +197,9 @@ class DifferentiatedByJax(CalledAsValue):
         return gradient, along(units)
 
 
-@jax.jit
-def _compiled_gradient(family, params, w, args):
-    return family.gradient(params, w, args)
-
-
-@jax.jit
-def _compiled_hessian(family, params, w, args):
-    return family.gradient_and_hessian(params, w, args)
+@partial(jax.jit, static_argnums=0)
+def _compiled(method, family, params, w, args):
+    return getattr(family, method)(params, w, args)
 
 
 @pytree()

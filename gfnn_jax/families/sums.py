@@ -101,7 +101,8 @@ class Windows:
 
         def of_site(found) -> str:
             ahead, field = divmod(int(found[2]) - 1, self.fields)
-            return f"{found[1]}{field + 1 if self.fields > 1 else ''}_{_site(ahead)}"
+            site = f"{{i+{ahead}}}" if ahead else "i"
+            return f"{found[1]}{field + 1 if self.fields > 1 else ''}_{site}"
 
         return re.sub(r"\b([qp])([0-9]+)", of_site, text)
 
@@ -197,10 +198,6 @@ def distance(space: int) -> str:
     """Write |q − q'| of two bodies as text."""
     squares = (f"(q{k} - q{k + space})**2" for k in range(1, space + 1))
     return f"sqrt({' + '.join(squares)})"
-
-
-def _site(ahead: int) -> str:
-    return f"{{i+{ahead}}}" if ahead else "i"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -342,12 +339,18 @@ def site_terms(
     variables = (*(f"q{k}" for k in own), *(f"p{k}" for k in own), *ahead)
     rows = exponents(len(variables), degree)
     rows.sort(key=lambda row: sum(a > 0 for a in row) > 1)
+
+    def furthest(row: tuple[int, ...]) -> int:
+        return max(max((k for k, a in enumerate(row) if a), default=0) // fields - 1, 0)
+
     functions = [term for text in functions for term in window_terms(text)]
-    reaches = [_reach_of(text, fields) for text in functions]
+    longest = _LONGEST * fields
+    used = (depends_on(parse(text, longest)) for text in functions)
+    reaches = [max((i % longest // fields for i in own), default=0) for own in used]
     parts = []
     for near in range(max([reach, *reaches]) + 1):
         width = (near + 2) * fields
-        mine = [row[:width] for row in rows if _furthest(row, fields) == near]
+        mine = [row[:width] for row in rows if furthest(row) == near]
         terms = Terms((near + 1) * fields, variables[:width], tuple(mine))
         given = [t for t, r in zip(functions, reaches, strict=True) if r == near]
         if given:
@@ -413,16 +416,3 @@ def body_terms(
             over = Groups(tuple(members), bodies, space, key if species else "")
             parts.append(Part(terms, over))
     return Sums(bodies * space, tuple(parts))
-
-
-def _furthest(row: tuple[int, ...], fields: int) -> int:
-    """Distance in sites of the furthest variable in a product of a site's terms."""
-    last = max((k for k, a in enumerate(row) if a), default=0)
-    return max(last // fields - 1, 0)
-
-
-def _reach_of(text: str, fields: int) -> int:
-    """Distance in sites of the furthest coordinate in a function of a site and the next ones."""
-    longest = _LONGEST * fields
-    used = depends_on(parse(text, longest))
-    return max((i % longest // fields for i in used), default=0)

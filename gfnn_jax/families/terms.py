@@ -39,17 +39,15 @@ _MOST_WRITTEN_OUT = 400
 
 
 class _Plan:
-    """Order of computation of the products of powers (N, k) and of their derivatives.
+    """Order of computation of the products of powers, N rows of k, and of their derivatives.
 
     The set of products is closed under division by a variable, and each one is an earlier product
     times a variable. still: variables that depend on no coordinate and have no derivatives.
     """
 
-    def __init__(self, powers: np.ndarray, still: tuple[int, ...] = ()):
-        self.powers = powers
-        variables = powers.shape[1]
+    def __init__(self, terms: tuple[tuple[int, ...], ...], still: tuple[int, ...]):
+        variables = len(terms[0])
         closed: set[tuple[int, ...]] = {(0,) * variables}
-        terms = [tuple(row) for row in powers.tolist()]
         ahead = list(terms)
         while ahead:
             row = ahead.pop()
@@ -120,9 +118,7 @@ def _columns(entries: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array(j, dtype=int), np.array(i, dtype=int), np.array(f, dtype=float)
 
 
-@cache
-def _plan_of(powers: tuple[tuple[int, ...], ...], still: tuple[int, ...]) -> _Plan:
-    return _Plan(np.array(powers, dtype=int), still)
+_plan_of = cache(_Plan)
 
 
 @pytree("dim", "variables", "powers", "parameters", "names", eq=True)

@@ -173,18 +173,18 @@ def residuals(train: Triangle, held: Triangle, sizes: Sequence[int]) -> list[tup
     Of the plain solution, by one triangular solve, where the training rows determine it well; else
     as `solve` has them, which costs an SVD.
     """
-    return [_residual(train, held, size) for size in sizes]
-
-
-def _residual(train: Triangle, held: Triangle, size: int) -> tuple[float, float]:
-    a, b = train.leading(size)
-    diagonal = np.abs(np.diagonal(a))
-    well_conditioned = (diagonal > OPTIONS.well_conditioned * np.linalg.norm(a, axis=0)).all()
-    if not well_conditioned or train.rows < OPTIONS.well_determined * size:
-        fit = solve(train, held, size)
-        return fit.train_rms, fit.validation_rms
-    c = scipy.linalg.solve_triangular(a, b, check_finite=False)
-    return _rms(train.residual_norm(size), train), _rms(held.missed(c), held)
+    found = []
+    for size in sizes:
+        a, b = train.leading(size)
+        diagonal = np.abs(np.diagonal(a))
+        well_conditioned = (diagonal > OPTIONS.well_conditioned * np.linalg.norm(a, axis=0)).all()
+        if not well_conditioned or train.rows < OPTIONS.well_determined * size:
+            fit = solve(train, held, size)
+            found.append((fit.train_rms, fit.validation_rms))
+        else:
+            c = scipy.linalg.solve_triangular(a, b, check_finite=False)
+            found.append((_rms(train.residual_norm(size), train), _rms(held.missed(c), held)))
+    return found
 
 
 def _rms(norm: Any, of: Triangle) -> float:

@@ -52,11 +52,6 @@ class Uniform(WithForces):
         """Return whether the field is affine."""
         return self.family.quadratic
 
-    @property
-    def operations(self) -> tuple[int, int]:
-        """Operations of H; friction adds a few."""
-        return self.family.operations
-
     def take(self, rows) -> Any:
         """The family of these terms alone; without γ the one without friction."""
         last = self.family.num_parameters

@@ -128,24 +128,19 @@ class Generated:
             guess = guess + self.predictor.forward(z, args)
         shared, lanes = self._shared_and_lanes(z, known, args)
         equation = ImplicitStep(self.chart)
-        if matrix_free(self.family):
-            x, gradient, info = self._by_fixed_point(equation, shared, lanes, guess, unrolled)
-        elif unrolled:
-            most = MOST_UPDATES if unrolled is True else unrolled
-            x, gradient, info = newton.iterate(
-                equation, shared, lanes, guess, most=most, gather=False
-            )
-        else:
-            x, gradient, info = newton.root(
-                equation, shared, lanes, jax.lax.stop_gradient(guess), MOST_UPDATES
-            )
-        return self.chart.complete(known, x), gradient, info
-
-    def _by_fixed_point(self, equation, shared, lanes, guess, unrolled: bool | int):
+        given, free = (equation, shared, lanes), matrix_free(self.family)
         if unrolled:
-            most = fixed_point.MOST if unrolled is True else unrolled
-            return fixed_point.iterate(equation, shared, lanes, guess, most=most)
-        return fixed_point.root(equation, shared, lanes, jax.lax.stop_gradient(guess))
+            usual = fixed_point.MOST if free else MOST_UPDATES
+            most = usual if unrolled is True else unrolled
+            if free:
+                x, gradient, info = fixed_point.iterate(*given, guess, most=most)
+            else:
+                x, gradient, info = newton.iterate(*given, guess, most=most, gather=False)
+        elif free:
+            x, gradient, info = fixed_point.root(*given, jax.lax.stop_gradient(guess))
+        else:
+            x, gradient, info = newton.root(*given, jax.lax.stop_gradient(guess), MOST_UPDATES)
+        return self.chart.complete(known, x), gradient, info
 
     def step(self, z, args=None, *, unrolled: bool | int = False):
         """Step the states z (B, 2d): (Z, Info), by JAX."""

@@ -52,6 +52,9 @@ def _followed(stepper, map_, lanes: Lanes, args, saving: Saving) -> tuple[Any, R
     num, count, done = len(lanes.y), saving.blocks * saving.every, 0
     saved = np.full((num, saving.blocks, lanes.y.shape[1]), np.nan)
     turns = np.full((num, saving.blocks, lanes.winding.shape[1]), 0.0)
+    of_runs = getattr(args, "params", args)  # by which the domain is judged: (B, 1, k)
+    if map_.parameters is not None and of_runs.ndim > 1:
+        of_runs = of_runs[:, None]
     going = lanes.status <= LEFT_DOMAIN
     lost = np.where(going[:, None], lanes.compensation, np.nan)
     now, winding = stepper.begun(lanes.y, lost), lanes.winding.astype(float)
@@ -66,7 +69,7 @@ def _followed(stepper, map_, lanes: Lanes, args, saving: Saving) -> tuple[Any, R
         whole = numbers % saving.every == 0
         states = stepper.down(task.out[:, whole])
         y = states if whole.all() else stepper.lift.down(task.out[:, :, 0])  # to tell the domain
-        outside = ~contains(map_, y, _of_runs(map_, args)) & (np.arange(steps) < ended[:, None])
+        outside = ~contains(map_, y, of_runs) & (np.arange(steps) < ended[:, None])
         left, first = outside.any(axis=1) & going, outside.argmax(axis=1)
         left_at = np.where(left & (left_at < 0), done + 1 + first, left_at)
         failed = np.where(task.most == stepper.MOST, NOT_CONVERGED, NON_FINITE)
@@ -82,12 +85,6 @@ def _followed(stepper, map_, lanes: Lanes, args, saving: Saving) -> tuple[Any, R
         now[0][~going], winding, done = np.nan, own[:, -1], done + steps
     states = _outside(map_, saved, turns)
     return states, RolloutInfo(status.astype(np.int32), left_at, most)
-
-
-def _of_runs(map_, args) -> Any:
-    """Args (B, 1, k) of all steps, by which the domain is judged."""
-    args = getattr(args, "params", args)
-    return args if map_.parameters is None or args.ndim < 2 else args[:, None]
 
 
 def _args(map_, args, num: int, numbers: np.ndarray) -> Any:

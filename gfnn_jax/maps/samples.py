@@ -157,17 +157,14 @@ def sampled(map_: Any, key, num: int) -> Samples:
     if num < 1:
         raise ValueError(f"expected a number of samples above 0, got {num}")
     piece, root = map_.pieces[map_.posterior.piece], np.asarray(map_.posterior.root)
-    drawn = _generator(key).normal(size=(num, len(root))) @ root
+    # NumPy's generator draws without compiling.
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
+    drawn = rng.normal(size=(num, len(root))) @ root
     if hasattr(piece, "family"):
         drawn = piece.family.unflatten(drawn)
     params = np.asarray(piece.params) + drawn
     bare = dataclasses.replace(map_, posterior=None)
     return Samples(bare, jax.device_put(params.astype(map_.scale.dtype)), map_.posterior.piece)
-
-
-def _generator(key) -> np.random.Generator:
-    """Make NumPy's generator of a key of ``jax.random``, which draws without compiling."""
-    return np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
 
 
 def _stacked(found: list[Any]) -> Any:

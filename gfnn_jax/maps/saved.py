@@ -287,15 +287,10 @@ def versions() -> dict[str, str | None]:
     return found
 
 
-def _features(map_: SymplecticMap) -> list:
-    """Feature functions of the map's families."""
-    inputs = jax.tree.leaves(map_, is_leaf=lambda node: isinstance(node, Inputs))
-    return [i.features for i in inputs if isinstance(i, Inputs) and i.features is not None]
-
-
 def _lender(map_: SymplecticMap, scene: Scene | None) -> str | None:
     """Name of the scene that lends the map its functions; None where it needs none."""
-    features = _features(map_)
+    inputs = jax.tree.leaves(map_, is_leaf=lambda node: isinstance(node, Inputs))
+    features = [i.features for i in inputs if isinstance(i, Inputs) and i.features is not None]
     changed = map_.coordinates.forward not in (CARTESIAN.forward, LOG.forward)
     if not (features or changed):
         return None
@@ -335,7 +330,9 @@ def _encode(value: Any) -> tuple[Any, Any]:
         if items.get("features") is not None:
             items["features"] = _OF_SCENE  # _lender has found whose they are
         return _encode_all(items, {"type": _NAMES[type(value)]})
-    if isinstance(value, tuple) and any(map(_has_parts, value)):
+    if isinstance(value, tuple) and any(
+        type(item) in _NAMES or isinstance(item, dict) or _is_array(item) for item in value
+    ):  # items that need places of their own among the arrays
         return _encode_all({str(i): item for i, item in enumerate(value)}, {"type": "tuple"})
     if isinstance(value, tuple):
         return [_encode(item)[0] for item in value], None
@@ -346,11 +343,6 @@ def _encode(value: Any) -> tuple[Any, Any]:
         f"a map that holds a {kind} of your own cannot be saved: gfnn_jax.register makes a "
         "dataclass known"
     )
-
-
-def _has_parts(item: Any) -> bool:
-    """Return whether an item of a tuple needs a place of its own among the arrays."""
-    return type(item) in _NAMES or isinstance(item, (dict, jax.Array, np.ndarray))
 
 
 def _is_array(value: Any) -> bool:

@@ -92,7 +92,8 @@ def loss(fits: LocalFits, angles: Sequence[bool], inputs: np.ndarray, period: fl
     if linear.explained < _OPTIONS.balanced:
         return None
     power = np.nanmean(speeds**2, axis=1)
-    kinetic = np.nanmean(stored[: _kinetic(dim, angles)], axis=1)
+    both = sum(angles[i] and angles[j] for i, j in itertools.combinations(range(dim), 2))
+    kinetic = np.nanmean(stored[: dim + dim * (dim - 1) // 2 + 5 * both], axis=1)
 
     def per_period(c: np.ndarray) -> float:
         friction = c[len(stored) - 1 : len(stored) - 1 + dim]
@@ -146,14 +147,8 @@ def _kind(found: dict[str, _Balance]) -> str | None:
     return best
 
 
-def _kinetic(dim: int, angles: Sequence[bool]) -> int:
-    """The number of functions of `_stored` that hold speeds; they come first."""
-    both = sum(angles[i] and angles[j] for i, j in itertools.combinations(range(dim), 2))
-    return dim + dim * (dim - 1) // 2 + 5 * both
-
-
 def _stored(fits: LocalFits, angles: Sequence[bool]) -> np.ndarray:
-    """The functions e_j at the centres (J, W), v₁²/2 first."""
+    """The functions e_j at the centres (J, W), those that hold speeds first, first v₁²/2."""
     v = fits.slopes
     middle = np.nanmean(fits.values, axis=1, keepdims=True)
     spread = np.nanstd(fits.values, axis=1, keepdims=True)

@@ -64,7 +64,7 @@ def analysed(c: np.ndarray, zero: float = OPTIONS.zero) -> Algebra:
     plus, minus = (int(np.sum(s * values > zero * largest)) for s in (1, -1))
     n = len(c)
     if largest <= zero * max(np.abs(c).max() ** 2, 1e-300):
-        return Algebra(f"{'nilpotent' if _nilpotent(c, zero) else 'solvable'}, n = {n}")
+        return Algebra(f"{'nilpotent' if _ends(c, np.eye(n), zero) else 'solvable'}, n = {n}")
     if minus == n and n % 3 == 0:
         lifted = _rotations(c, form)
         if lifted is not None:  # once more, from where the algebra is nearly standard
@@ -81,7 +81,7 @@ def analysed(c: np.ndarray, zero: float = OPTIONS.zero) -> Algebra:
     scaled = _scalings(c, zero)
     if scaled is not None:
         return scaled
-    if _solvable(c, zero):
+    if _ends(c, None, zero):
         return Algebra(f"solvable, n = {n}")
     kind = "semisimple" if plus + minus == n else "with a radical"
     return Algebra(f"{kind}, Killing signature ({plus}, {minus}), n = {n}")
@@ -98,17 +98,12 @@ def _derived(c: np.ndarray, first: np.ndarray, second: np.ndarray, zero: float) 
     return vt[s > np.sqrt(zero) * max(np.abs(c).max(), 1e-300)]
 
 
-def _solvable(c: np.ndarray, zero: float) -> bool:
+def _ends(c: np.ndarray, whole: np.ndarray | None, zero: float) -> bool:
+    """Return whether brackets of the whole algebra, or None: of what is left, with what is left of
+    it end at 0: it is nilpotent, or solvable."""
     space = np.eye(len(c))
     for _ in range(len(c)):
-        space = _derived(c, space, space, zero)
-    return not len(space)
-
-
-def _nilpotent(c: np.ndarray, zero: float) -> bool:
-    whole = space = np.eye(len(c))
-    for _ in range(len(c)):
-        space = _derived(c, whole, space, zero)
+        space = _derived(c, space if whole is None else whole, space, zero)
     return not len(space)
 
 

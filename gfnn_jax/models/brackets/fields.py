@@ -126,17 +126,10 @@ class Partials:
         for k in range(z.shape[1]):
             moved = z.astype(complex)
             moved[:, k] += 1e-30j
-            gradients = _complex_gradients(self.terms, moved).reshape(len(z), -1)
-            out[:, k] = np.imag(gradients[:, list(self.places)]) / 1e-30
+            each = (self.terms.take([j]) for j in range(self.terms.num_parameters))
+            gradients = np.stack([one.gradient(np.ones(1), moved) for one in each], axis=-1)
+            out[:, k] = np.imag(gradients.reshape(len(z), -1)[:, list(self.places)]) / 1e-30
         return out
-
-
-def _complex_gradients(terms: Terms, z: np.ndarray) -> np.ndarray:
-    """Gradients (N, n, K) of terms at complex states."""
-    out = np.zeros((*z.shape, terms.num_parameters), complex)
-    for j in range(terms.num_parameters):
-        out[..., j] = terms.take([j]).gradient(np.ones(1), z)
-    return out
 
 
 @dataclasses.dataclass(frozen=True)
@@ -266,7 +259,11 @@ def fit_field(
     z₁. Raises FitError where no field of the family has a flow over dt.
     """
     h, spread = np.reshape(dt, (-1, 1)), sizes(np.concatenate([z0, z1]))
-    at: np.ndarray = np.array(_along_line(field, z0, z1, h, spread) if c is None else c)
+    if c is None:
+        rule = gauss(OPTIONS.stages)
+        straight = z0 + rule.nodes[:, None, None] * (z1 - z0)
+        c = _least(_columns(field, straight, rule.weights, h), z1 - z0, spread)[0]
+    at = np.array(c)
     here = path_of(field, at, z0, z1, dt, spread)
     for _ in range(OPTIONS.most_halvings):
         if here.relative < np.inf:
@@ -292,13 +289,6 @@ def fit_field(
     root = _least(_columns(field, here.nodes, here.weights, h), here.residual, spread)[1]
     sigma = np.sqrt(np.sum((here.residual / spread) ** 2) / free)
     return FieldFit(at, here.residual, here.relative, max(sigma, 1e-16) * root, iterations, field)
-
-
-def _along_line(field: Field, z0, z1, h, spread) -> np.ndarray:
-    """c (J,) of the field along the straight lines between the states."""
-    rule = gauss(OPTIONS.stages)
-    straight = z0 + rule.nodes[:, None, None] * (z1 - z0)
-    return _least(_columns(field, straight, rule.weights, h), z1 - z0, spread)[0]
 
 
 def _step(

@@ -668,21 +668,15 @@ def _of_shapes(bracket, train: Data, held: Data, on_progress) -> PoissonLaw | No
         return None
 
 
-def _standard(names: tuple[str, ...]) -> list[Bracket]:
-    """Brackets in standard form of so many coordinates: of bodies and spins, and of (q, p)."""
-    n, found = len(names), []
-    if n % 3 == 0:
-        found.append(Bracket.so3(n // 3, names=names))
-    if n == 6:
-        found.append(Bracket.se3(names=names))
-    return found if n % 2 else [*found, canonical(n // 2).named(names)]
-
-
 def _without_polynomials(train, held, names, on_progress) -> PoissonLaw | None:
     """The law of a standard bracket whose H is no polynomial: of the bracket whose quadratic H
     misses least. None where no H is exact."""
     tried = []
-    for bracket in _standard(names):
+    n = len(names)
+    standard: list[Bracket] = [Bracket.so3(n // 3, names=names)] if n % 3 == 0 else []
+    standard += [Bracket.se3(names=names)] if n == 6 else []
+    standard += [] if n % 2 else [canonical(n // 2).named(names)]
+    for bracket in standard:
         base = library_of(_kind_of(bracket), names, 2, None)
         with contextlib.suppress(FitError):
             tried.append((_of_library(bracket, base, train, held).error, bracket))
