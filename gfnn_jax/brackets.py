@@ -41,6 +41,7 @@ class Bracket:
 
     names: tuple[str, ...] = ()
     note: str = ""
+    _kind = "a Lie algebra"
 
     @staticmethod
     def constant(matrix, names: Sequence[str] = ()) -> Constant:
@@ -145,7 +146,7 @@ class Bracket:
     @property
     def name(self) -> str:
         """Kind of bracket in a word or two."""
-        raise NotImplementedError
+        return self._kind
 
     def matrix(self, z):
         """B(z) (..., n, n) at states z (..., n), NumPy, JAX or lists."""
@@ -205,10 +206,7 @@ class Constant(Bracket):
     names: tuple[str, ...] = ()
     note: str = ""
 
-    @property
-    def name(self) -> str:
-        """Kind of bracket."""
-        return "constant"
+    _kind = "constant"
 
     @property
     def size(self) -> int:
@@ -236,12 +234,8 @@ class Log(Bracket):
     names: tuple[str, ...] = ()
     note: str = ""
 
+    _kind = "log-canonical"
     undefined = "a coordinate is not above 0"
-
-    @property
-    def name(self) -> str:
-        """Kind of bracket."""
-        return "log-canonical"
 
     @property
     def size(self) -> int:
@@ -286,7 +280,7 @@ class LieAlgebra(Bracket):
     def name(self) -> str:
         """Name of the algebra, such as so(3)² + R."""
         if not self.blocks:
-            return "a Lie algebra"
+            return self._kind
         counts = {block: self.blocks.count(block) for block in dict.fromkeys(self.blocks)}
         powers = {b: str(n).translate(_SUPERSCRIPTS) if n > 1 else "" for b, n in counts.items()}
         return " + ".join(_NAMES[block] + powers[block] for block in counts)
@@ -356,10 +350,7 @@ class Magnetic(Bracket):
     names: tuple[str, ...] = ()
     note: str = ""
 
-    @property
-    def name(self) -> str:
-        """Kind of bracket."""
-        return "canonical by p = m v + A(x)"
+    _kind = "canonical by p = m v + A(x)"
 
     @cached_property
     def casimirs(self) -> tuple[Casimir, ...]:

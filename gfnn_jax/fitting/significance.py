@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -14,18 +13,6 @@ from gfnn_jax.fitting.triangle import Triangle
 # in 16,000); what a message states as certain is larger than the second (once in 1.7 million).
 ABOVE_NOISE, CERTAIN = 4.0, 5.0
 NULL = 1e-10  # of a term's size; one closer to the span of those before it is not known apart
-
-
-@runtime_checkable
-class Solved(Protocol):
-    """Fit at whose coefficients the triangle of its problem is known."""
-
-    @property
-    def coefficients(self) -> np.ndarray: ...
-    @property
-    def rms(self) -> float: ...
-    @property
-    def triangle(self) -> Triangle: ...
 
 
 def null_terms(family, z, tolerance: float = NULL, *, args=None) -> tuple[list[int], list[int]]:
@@ -48,16 +35,11 @@ def null_terms(family, z, tolerance: float = NULL, *, args=None) -> tuple[list[i
     return kept, sorted(set(range(scaled.shape[1])) - set(kept))
 
 
-def significant_terms(fit: Solved, threshold: float) -> np.ndarray:
-    """The terms that are left when those below ``threshold`` standard errors go, the others solved
-    for again (in the linearised problem), until none is below."""
-    return significant(fit.triangle, fit.coefficients, threshold, fit.rms)[0]
-
-
 def significant(
     triangle: Triangle, coefficients, threshold: float, rms: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(kept, their coefficients) of the linearised problem of [∂r/∂c, r], as `significant_terms`.
+    """(kept, their coefficients) of the linearised problem of [∂r/∂c, r], when the terms below
+    ``threshold`` standard errors go, the others solved for again, until none is below.
 
     rms: of what the terms do not explain; None: of what all of them leave over.
     """
@@ -94,7 +76,7 @@ def terms_with_constants(
     triangle: Triangle, p: np.ndarray, threshold: float, inside: Sequence[Sequence[int]]
 ) -> list[int]:
     """The terms that are left when those below ``threshold`` standard errors go, as
-    `significant_terms`, each with the constants inside it: ``inside`` has their places among the
+    `significant`, each with the constants inside it: ``inside`` has their places among the
     numbers p (n,), the coefficients first, of each term."""
     limit, every = threshold * _noise(triangle, len(p), None), np.arange(len(inside))
     return _eliminated(triangle.rebased(p), every, p, limit, inside)[0].tolist()

@@ -10,9 +10,9 @@ import numpy as np
 from jax.core import Tracer
 
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.maps.lanes import Lanes, RolloutInfo, Saving, start_lanes
+from gfnn_jax.maps.lanes import Lanes, RolloutInfo, Saving, judged, start_lanes
 from gfnn_jax.maps.programs import after, contains, outer, parts_of_two_pi
-from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, STOPPED_AT_EDGE
+from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED
 
 # Fewer steps of all lanes are done before compiled code is loaded; more lanes a GPU steps together.
 _FEWEST, _MOST_LANES = 10_000, 16
@@ -58,33 +58,27 @@ def _followed(stepper, map_, lanes: Lanes, args, saving: Saving) -> tuple[Any, R
     going = lanes.status <= LEFT_DOMAIN
     lost = np.where(going[:, None], lanes.compensation, np.nan)
     now, winding = stepper.begun(lanes.y, lost), lanes.winding.astype(float)
-    status, left_at, most = lanes.status.copy(), lanes.left_at.copy(), lanes.iterations.copy()
     while done < count and going.any():
         steps = min(count - done, max(1, _AT_ONCE // num))
         numbers = done + 1 + np.arange(steps)
         task = stepper.steps(now, steps, _args(map_, args, num, numbers - 1))
-        most = np.maximum(most, task.most).astype(most.dtype)
+        most = np.maximum(lanes.iterations, task.most).astype(lanes.iterations.dtype)
         own = winding[:, None] + np.cumsum(task.turns, axis=1)
-        ended = task.fine
         whole = numbers % saving.every == 0
         states = stepper.down(task.out[:, whole])
         y = states if whole.all() else stepper.lift.down(task.out[:, :, 0])  # to tell the domain
-        outside = ~contains(map_, y, of_runs) & (np.arange(steps) < ended[:, None])
-        left, first = outside.any(axis=1) & going, outside.argmax(axis=1)
-        left_at = np.where(left & (left_at < 0), done + 1 + first, left_at)
+        fine = going & (np.arange(steps)[:, None] < task.fine)
         failed = np.where(task.most == stepper.MOST, NOT_CONVERGED, NON_FINITE)
-        status = np.where(left, np.maximum(status, LEFT_DOMAIN), status)
-        status = np.where(going & (ended < steps), failed, status)
-        if saving.stop_outside:
-            status = np.where(left, STOPPED_AT_EDGE, status)
-            ended = np.where(left, first, ended)
-        states[~going[:, None] | (np.flatnonzero(whole) >= ended[:, None])] = np.nan
+        inside = contains(map_, y, of_runs).T
+        lanes, over = judged(lanes, fine, inside, failed, saving.stop_outside)
+        lanes = lanes._replace(iterations=most)
+        states[over[whole].T] = np.nan
         block = numbers[whole] // saving.every - 1
         saved[:, block], turns[:, block] = states, own[:, whole]
-        going = status <= LEFT_DOMAIN
+        going = lanes.status <= LEFT_DOMAIN
         now[0][~going], winding, done = np.nan, own[:, -1], done + steps
     states = _outside(map_, saved, turns)
-    return states, RolloutInfo(status.astype(np.int32), left_at, most)
+    return states, RolloutInfo(lanes.status, lanes.left_at, lanes.iterations)
 
 
 def _args(map_, args, num: int, numbers: np.ndarray) -> Any:

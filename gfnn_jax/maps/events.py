@@ -22,17 +22,11 @@ from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.schedules import of_polynomials
 from gfnn_jax.maps.estimates import Law, substeps_of
 from gfnn_jax.maps.inputs import Scheduled
-from gfnn_jax.maps.lanes import Lanes, RolloutInfo, Saving, start_lanes
+from gfnn_jax.maps.lanes import Lanes, RolloutInfo, Saving, judged, start_lanes
 from gfnn_jax.maps.laws import is_of_law, law_of_map
 from gfnn_jax.maps.programs import contains, parts_of_two_pi
 from gfnn_jax.phase_space import split
-from gfnn_jax.solve.status import (
-    LEFT_DOMAIN,
-    NON_FINITE,
-    NOT_CONVERGED,
-    STOPPED_AT_EDGE,
-    Info,
-)
+from gfnn_jax.solve.status import LEFT_DOMAIN, NON_FINITE, NOT_CONVERGED, Info
 
 _AT_ONCE = 65_536  # states that are followed together
 _REST = 1e-12  # of the speeds, that rounding leaves of one that is 0
@@ -68,6 +62,8 @@ class Followed:
         return jax.device_put(self._advanced(lanes, args, saving))
 
     def _advanced(self, lanes: Lanes, args, saving: Saving) -> tuple[Lanes, np.ndarray]:
+        from gfnn_jax.flows import kernel  # loads numba: not before a law is followed
+
         args, coefficients = jax.tree.map(np.asarray, self._split(args))
         form, p = self.law.form, self.law.p
         law = form.lagrangian(p)
@@ -94,7 +90,9 @@ class Followed:
             y, winding = z.copy(), lanes.winding.astype(z.dtype)
             turns = np.round((z[..., angles] - self.map.angle_centre) / TWO_PI)
             y[..., angles] = (z[..., angles] - turns * near) - turns * beyond
-            lanes, over = self._judged(lanes, y, step.status, args, saving.stop_outside)
+            inside, finite = contains(self.map, y, args), np.isfinite(y).all(axis=-1)
+            failed = np.where(step.status == kernel.UNFINISHED, NOT_CONVERGED, NON_FINITE)
+            lanes, over = judged(lanes, finite, inside, failed, saving.stop_outside)
             z[..., angles] = (z[..., angles] + winding * beyond) + winding * near
             z[over] = y[over] = np.nan
             done = saving.blocks * saving.every - left
@@ -105,27 +103,6 @@ class Followed:
             left -= count
         lanes = lanes._replace(compensation=np.zeros_like(lanes.y))
         return lanes, np.swapaxes(np.concatenate(saved), 0, 1)
-
-    def _judged(self, lanes: Lanes, y, of_kernel, args, stop: bool) -> tuple[Lanes, np.ndarray]:
-        """The lanes after states y (M, B, 2d) of M steps, but for their states; and where these
-        (M, B) come after a lane's end."""
-        from gfnn_jax.flows import kernel  # loads numba: not before a law is followed
-
-        finite = np.isfinite(y).all(axis=-1)
-        leaves = finite & ~contains(self.map, y, args)
-        ended = leaves | ~finite if stop else ~finite
-        going, leaving = lanes.status <= LEFT_DOMAIN, leaves.any(axis=0)
-        lost = ~finite[ended.argmax(axis=0), np.arange(len(going))]
-        failed = np.where(of_kernel == kernel.UNFINISHED, NOT_CONVERGED, NON_FINITE)
-        status = np.where(leaving, LEFT_DOMAIN, lanes.status)
-        status = np.where(ended.any(axis=0), np.where(lost, failed, STOPPED_AT_EDGE), status)
-        new = going & leaving & (lanes.left_at < 0)
-        after = lanes._replace(
-            status=np.where(going, status, lanes.status).astype(np.int32),
-            left_at=np.where(new, lanes.steps + 1 + leaves.argmax(axis=0), lanes.left_at),
-            steps=lanes.steps + len(y),
-        )
-        return after, np.logical_or.accumulate(ended, axis=0)
 
     def _split(self, args) -> tuple[Any, Any]:
         """The parameters (…, k), or None, and the inputs of steps, `Scheduled`, or None."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from gfnn_jax.compiling import compiled_sooner
 from gfnn_jax.maps.posterior import Bands
@@ -57,6 +58,28 @@ def _by_domain(status, inside, stop_outside: bool):
     """Update the status by the domain; only lanes that have not ended can change."""
     outside = STOPPED_AT_EDGE if stop_outside else LEFT_DOMAIN
     return jnp.where((status <= LEFT_DOMAIN) & ~inside, outside, status)
+
+
+def judged(lanes: Lanes, finite, inside, failed, stop_outside: bool) -> tuple[Lanes, Any]:
+    """The lanes after states of M steps on numbers, but for their states; and where these (M, B)
+    come after a lane's end.
+
+    finite, inside: (M, B) of each state. failed: (B,) the status of a lane that ceases to be
+    finite.
+    """
+    leaves = finite & ~inside
+    ended = leaves | ~finite if stop_outside else ~finite
+    going, leaving = lanes.status <= LEFT_DOMAIN, leaves.any(axis=0)
+    lost = ~finite[ended.argmax(axis=0), np.arange(len(going))]
+    status = np.where(leaving, LEFT_DOMAIN, lanes.status)
+    status = np.where(ended.any(axis=0), np.where(lost, failed, STOPPED_AT_EDGE), status)
+    new = going & leaving & (lanes.left_at < 0)
+    then = lanes._replace(
+        status=np.where(going, status, lanes.status).astype(np.int32),
+        left_at=np.where(new, lanes.steps + 1 + leaves.argmax(axis=0), lanes.left_at),
+        steps=lanes.steps + len(finite),
+    )
+    return then, np.logical_or.accumulate(ended, axis=0)
 
 
 def require_no_inputs_backwards(inputs) -> None:

@@ -26,7 +26,7 @@ from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.families.told import Constrained
 from gfnn_jax.fitting.linear_starts import backwards, tangent, turns
-from gfnn_jax.fitting.significance import ABOVE_NOISE, significant_terms, terms_above_noise
+from gfnn_jax.fitting.significance import ABOVE_NOISE, significant, terms_above_noise
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.models.hamiltonians.covariance import covariance_root
 from gfnn_jax.models.hamiltonians.dictionary import law_of_physics, law_of_sequences
@@ -252,18 +252,17 @@ def sparse(problem: LawProblem, full: FittedLaw) -> FittedLaw:
     options, count, before = problem.options, full.family.num_parameters, full.error.relative
     tried: set[tuple[int, ...]] = set()
     thresholds = options.thresholds if full.thresholds is None else full.thresholds
+    fit = full.fit
     for threshold in thresholds:
-        kept = tuple(significant_terms(full.fit, threshold).tolist())
+        kept = tuple(significant(fit.triangle, fit.coefficients, threshold, fit.rms)[0].tolist())
         if len(kept) == count:
             break
         if not kept or kept in tried:
             continue
         tried.add(kept)
         problem.on_progress(f"H: {len(kept)} of {count} terms")
-        start = full.fit.coefficients[list(kept)]
-        few = problem.fitted(
-            full.family.take(kept), start, full.fit.used, rounds=False, steps=full.fit.steps
-        )
+        start, family = fit.coefficients[list(kept)], full.family.take(kept)
+        few = problem.fitted(family, start, fit.used, rounds=False, steps=fit.steps)
         after = few.error.relative
         if after <= max(options.rise * before, options.rounding):
             dropped = Dropped(count - len(kept), before, after)
