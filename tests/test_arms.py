@@ -1,6 +1,7 @@
 """Arms: inertias, friction and possible bodies from a log of known kinematics."""
 
 import importlib.util
+from typing import Any
 
 import numpy as np
 import pytest
@@ -168,17 +169,50 @@ def test_map_moves_as_its_forces_say(arm, tmp_path):
 def test_what_a_motion_does_not_tell_is_said():
     fit = gfnn.fit(log(np.random.default_rng(1), moving=(1, 1, 0)), model=gfnn.Arm(axes=AXES))
     assert str(fit.verdict).startswith("partly")
-    assert "swings of q3" in str(fit.verdict)
-    assert "Iyy3: not determined" in str(fit.law) or "rotor q3: not determined" in str(fit.law)
+    assert "log swings of q3 too" in str(fit.verdict)
+    assert "rotor q3: not determined" in str(fit.law)
+    assert "q3: offset not determined, linear not determined" in str(fit.law)
+    report = fit.report()
+    assert all(report["friction"]["q3"][kind] is None for kind in ("linear", "dry"))
+    np.testing.assert_allclose(report["friction"]["q2"]["linear"]["value"], VISCOUS[1], rtol=0.05)
+    named = {one["name"]: one["value"] for one in report["base_parameters"]}
+    assert named["rotor q3"] is None
+    with pytest.raises(gfnn.InputError, match=r"no joint moves .* log a motion of all joints"):
+        gfnn.fit(log(np.random.default_rng(1), moving=(0, 0, 0)), model=gfnn.Arm(axes=AXES))
 
 
-def test_forces_that_do_not_go_with_the_motion_are_refused():
-    with pytest.raises(gfnn.FitError, match="forces of q2 take energy"):
-        gfnn.fit(log(np.random.default_rng(0)), model=gfnn.Arm(axes=AXES, gains=(1, -1, 1)))
-    with pytest.raises(gfnn.InputError, match="inputs=\\["):
-        gfnn.fit(log(np.random.default_rng(0), inputs=["tau1"]), model=gfnn.Arm(axes=AXES))
+@pytest.mark.parametrize(
+    ("inputs", "gains", "said"),
+    [
+        ((1, 2, 3), (1, -1, 1), r"of q2 .* -1 times .*gains=\(1, 1, 1\)"),
+        ((1, 2, 3), (-1, -1, -1), r"take energy .*gains=\(1, 1, 1\)"),
+        ((1, 2, 3), (1, 1e3, 1), r"q2 are 1e\+03 times .*gains=\(1, 1, 1\)"),
+        ((1, 3, 2), (1, 1, 1), r"exchanged.*inputs=\['tau1', 'tau2', 'tau3'\]"),
+        ((1,), None, r"inputs=\["),
+    ],
+)
+def test_forces_that_do_not_go_with_the_motion_are_refused(inputs, gains, said):
+    """What the message names mends it."""
+    record = log(np.random.default_rng(0), inputs=[f"tau{i}" for i in inputs])
+    with pytest.raises(ValueError if gains is None else gfnn.FitError, match=said):
+        gfnn.fit(record, model=gfnn.Arm(axes=AXES, gains=gains))
+
+
+def test_largest_forces_are_left_out_and_columns_have_to_be_the_joints():
+    record = log(np.random.default_rng(0))
+    table = {
+        name: record.values(name, record.runs[0]) for name in (*record.positions, *record.inputs)
+    }
+    largest = np.quantile(np.abs(table["tau2"]), 0.9)
+    table |= {"t": record.times(record.runs[0]), "tau2": np.clip(table["tau2"], -largest, largest)}
+    roles = {"positions": record.positions, "inputs": record.inputs, "angles": ()}
+    with pytest.warns(gfnn.FitWarning, match=r"largest force were left out: q2 9\.1%$"):
+        fit: Any = gfnn.fit(gfnn.Recording(table, **roles), model=gfnn.Arm(axes=AXES))
+    np.testing.assert_allclose(fit.law.frictions["q2"]["linear"][0], VISCOUS[1], rtol=0.05)
     with pytest.raises(gfnn.InputError, match="positions=\\["):
-        gfnn.fit(log(np.random.default_rng(0)), model=gfnn.Arm(axes=AXES[:2]))
+        gfnn.fit(record, model=gfnn.Arm(axes=AXES[:2]))
+    with pytest.raises(gfnn.InputError, match=r"positions=\['q1', 'q2', 'q3'\]"):
+        from_axes(AXES).in_order(("q2", "b", "c"), "log.csv")
     with pytest.raises(gfnn.InputError, match="one of urdf, axes and dh"):
         gfnn.Arm()
 

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.data.recording import Recording
-from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.rigid_bodies import EARTH, PER_LINK, of_pseudo_inertia, pseudo_inertias
+from gfnn_jax.errors import InputError
+from gfnn_jax.families.rigid_bodies import EARTH, of_pseudo_inertia, pseudo_inertias
+from gfnn_jax.models.arms.checks import check_forces, limited, size_of_forces
 from gfnn_jax.models.arms.identify import (
     KINDS,
     OPTIONS,
@@ -22,7 +23,6 @@ from gfnn_jax.models.arms.identify import (
     Motion,
     Prior,
     base_parameters,
-    best_swing,
     identified,
 )
 from gfnn_jax.models.arms.kinematics import Kinematics, from_axes, from_dh, from_urdf
@@ -30,8 +30,7 @@ from gfnn_jax.models.arms.learned_arm import LearnedArm, map_of_arm
 from gfnn_jax.signals.splines import FEWEST, splines
 
 _EDGE = FEWEST  # samples at the ends of a run, where a spline's accelerations are poor
-_FED = 0.3  # share of a joint's power that friction may seem to bring
-_UNITS = 3.0  # factor between forces and those of a CAD model beyond which units are asked about
+_STILL = 6.0  # range of a joint's positions, in their noise, below which it does not move
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,23 +98,30 @@ class Arm:
         gains = self._gains(names)
         report("smoothing the positions of the joints")
         motion, states = motion_of(recording, gains)
-        limited = np.abs(motion.force) >= OPTIONS.saturated * kinematics.limits
-        motion = motion.without(limited)
         notes = []
-        if limited.any():
-            at = [f"{n} {m:.1%}" for n, m in zip(names, limited.mean(axis=0), strict=True) if m]
-            notes.append(f"samples at the largest force were left out: {', '.join(at)}")
         columns = Columns(kinematics.bodies, self.kinds, np.zeros(len(names)))
-        kinematics = _with_checked_forces(kinematics, motion, columns)
+        saturated, beyond = limited(motion, kinematics.limits)
+        for title, shares in (
+            ("samples at the largest force were left out", saturated.mean(axis=0)),
+            ("forces go beyond the effort limits of the URDF, which were not used", beyond),
+        ):
+            if shares.any():
+                at = [f"{n} {m:.1%}" for n, m in zip(names, shares, strict=True) if m]
+                notes.append(f"{title}: {', '.join(at)}")
+        motion = motion.without(saturated)
+        factor = size_of_forces(kinematics, motion, columns)
+        if not kinematics.known:  # links as heavy as the forces need
+            kinematics = kinematics._replace(prior=kinematics.prior * abs(factor))
         prior, start = prior_of(kinematics, motion, columns)
         rms = np.sqrt(np.mean(motion.v**2, axis=0))
         moving = rms * min(OPTIONS.widths)
         found = identified(columns, motion.without(np.abs(motion.v) < moving), prior, start, report)
-        base = base_parameters(found)
-        swing = best_swing(found, base)
+        check_forces(found, motion, recording.inputs, gains, factor if kinematics.known else 1.0)
+        base, swing = base_parameters(found, motion)
         dt = float(np.median(np.concatenate([np.diff(recording.times(r)) for r in recording.runs])))
         map_ = map_of_arm(found, states, dt, recording.inputs, gains)
-        shares = 1 - (found.residual / np.nanstd(motion.force, axis=0)) ** 2
+        spread = np.std(np.nan_to_num(motion.force), axis=0) + 1e-300
+        shares = np.where(motion.heard, 1 - (found.residual / spread) ** 2, 0.0)
         return LearnedArm(
             map_,
             base,
@@ -140,7 +146,8 @@ class Arm:
 
 def motion_of(recording: Recording, gains: np.ndarray) -> tuple[Motion, np.ndarray]:
     """The motion of a recording's joints by splines, without the ends of runs, and its states
-    (n, 2k) = (q, v). gains: (k,) force for a unit of input."""
+    (n, 2k) = (q, v). A joint that does not move has no forces: friction holds it by any.
+    gains: (k,) force for a unit of input. Raises InputError where none moves."""
     runs = []
     for run in recording.runs:
         q = np.stack([recording.unwrapped(n, run) for n in recording.positions], axis=1)
@@ -158,7 +165,14 @@ def motion_of(recording: Recording, gains: np.ndarray) -> tuple[Motion, np.ndarr
         parts.append([x[inside] for x in (smooth.q, smooth.v, smooth.a, u * gains)])
         lengths.append(len(t) - 2 * _EDGE)
     q, v, a, force = (np.concatenate(x) for x in zip(*parts, strict=True))
-    motion = Motion(q, v, a, force, tuple(lengths))
+    still = np.ptp(q, axis=0) < _STILL * curves.sigma
+    if still.all():
+        raise InputError(
+            f"{recording.source}: no joint moves beyond the noise of its positions, so forces tell "
+            "no inertia: log a motion of all joints"
+        )
+    q, v, a = np.where(still, q.mean(axis=0), q), np.where(still, 0.0, v), np.where(still, 0.0, a)
+    motion = Motion(q, v, a, np.where(still, np.nan, force), tuple(lengths))
     return motion, np.concatenate([motion.q, motion.v], axis=1)
 
 
@@ -172,45 +186,9 @@ def prior_of(kinematics: Kinematics, motion: Motion, columns: Columns) -> tuple[
     pi = np.concatenate([of_pseudo_inertia(J) for J in inertias])
     some = motion.q[:: max(1, len(motion.q) // 50)]
     felt = np.mean(np.diagonal(bodies.masses(pi, some), axis1=1, axis2=2), axis=0)
-    force = np.nanstd(motion.force, axis=0) + 1e-300
-    speed = np.sqrt(np.mean(motion.v**2, axis=0)) + 1e-300
+    force = np.where(motion.heard, np.std(np.nan_to_num(motion.force), axis=0), 1.0) + 1e-300
+    speed = np.where(motion.heard, np.sqrt(np.mean(motion.v**2, axis=0)), 1.0) + 1e-300
     lost = [force / speed ** {"linear": 1, "quadratic": 2, "dry": 0}[k] for k in columns.kinds]
     sizes = OPTIONS.reflected * np.concatenate([felt, *lost])
     start = np.concatenate([pi, sizes[: bodies.dim], np.zeros(bodies.dim), sizes[bodies.dim :]])
     return Prior(inertias, sizes), start
-
-
-def _with_checked_forces(kinematics: Kinematics, motion: Motion, columns: Columns) -> Kinematics:
-    """The kinematics, guessed links as heavy as the forces need. Raises FitError where forces are
-    not those of the motion: where friction would feed a joint, or with a CAD model where they are
-    of another size."""
-    rows = np.concatenate([rows for rows, _ in columns.blocks(motion)])
-    known, names = np.isfinite(motion.force), kinematics.bodies.names
-    size = np.linalg.norm(rows[known], axis=0)
-    size[size == 0] = 1.0
-    x = np.linalg.lstsq(rows[known] / size, motion.force[known], rcond=OPTIONS.dependent)[0] / size
-    losses = x[columns.count - len(columns.kinds) * len(names) :]
-    _, slope, _ = columns.friction.tables(motion.v)
-    lost = (slope * losses).reshape(len(slope), -1, len(names)).sum(axis=1)
-    power = np.nanmean(lost * motion.v, axis=0)
-    fed = power < -_FED * np.nanmean(np.abs(motion.force * motion.v), axis=0)
-    if fed.any():
-        wrong = ", ".join(name for name, is_fed in zip(names, fed, strict=True) if is_fed)
-        raise FitError(
-            f"the forces of {wrong} take energy from the motion, beside friction: their sign or "
-            "the order of columns is wrong. Give gains=, -1 for another sign, or inputs in the "
-            "order of the joints"
-        )
-    rigid = PER_LINK * len(names)
-    expected = (rows[..., :rigid] @ kinematics.prior.ravel())[known]
-    others = np.column_stack([expected, rows[known][:, rigid + len(names) :]])
-    factor = np.linalg.lstsq(others, motion.force[known], rcond=None)[0][0]
-    if not kinematics.known:
-        return kinematics._replace(prior=kinematics.prior * abs(factor))
-    if not 1 / _UNITS < factor < _UNITS:
-        raise FitError(
-            f"the forces are {factor:.2g} of those that the inertias of the URDF need: are they "
-            "currents, in other units, or of other joints? Give gains=, the force for a unit of "
-            "each input"
-        )
-    return kinematics

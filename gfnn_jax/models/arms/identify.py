@@ -34,22 +34,31 @@ class IdentifyOptions:
 
     prior: weight γ of the prior, in independent residuals. reflected: a rotor's inertia that is
     expected, as a share of the mass that its joint feels. rounds: of noise and parameters in turn.
-    widths: of Coulomb friction that are tried, as shares of a joint's rms speed. resting: share of
-    the width below which a joint may stick, whose force then says nothing. block: samples whose
-    rows are made together. saturated: share of a joint's largest force from which it is at its
-    limit. converged: Newton's decrement at which it ends. structure: random motions that tell the
-    base parameters. dependent: share of a column's norm below which it depends on others.
-    sharpened: a parameter's standard error has to be below this share of the parameter, or of what
-    the prior expects. most: steps of Newton's method.
+    widths: of Coulomb friction that are tried, as shares of a joint's rms speed. block: samples
+    whose rows are made together. saturated: share of a joint's largest force from which it is at
+    its limit; plateau: share of samples at one largest force that are such a limit. explained:
+    share of a joint's force below which its law does not explain it, or less than parameters of
+    that joint alone by ``apart``; mended: error of a joint alone, as a share of its force, to which
+    others are compared. fed: share of a joint's power that friction may seem to bring. units:
+    factor between forces and those of a CAD model beyond which units are asked about. converged:
+    Newton's decrement at which it ends. structure: random motions that tell the base parameters.
+    dependent: share of a column's norm below which it depends on others. sharpened: a parameter's
+    standard error has to be below this share of the parameter, or of what the prior expects. most:
+    steps of Newton's method.
     """
 
     prior: float = 0.1
     reflected: float = 0.1
     rounds: int = 4
     widths: tuple[float, ...] = (3e-4, 1e-3, 3e-3, 0.01, 0.02, 0.05, 0.1, 0.2)
-    resting: float = 0.1
     block: int = 2_000
     saturated: float = 0.99
+    plateau: float = 0.01
+    explained: float = 0.5
+    apart: float = 0.2
+    mended: float = 0.1
+    fed: float = 0.3
+    units: float = 3.0
     converged: float = 1e-9
     structure: int = 200
     dependent: float = 1e-8
@@ -71,6 +80,11 @@ class Motion:
     a: np.ndarray
     force: np.ndarray
     lengths: tuple[int, ...]
+
+    @property
+    def heard(self) -> np.ndarray:
+        """Mask (k,) of joints whose forces say something."""
+        return np.asarray(np.isfinite(self.force).any(axis=0))
 
     def without(self, rows: np.ndarray) -> Motion:
         """The motion without these forces (n, k)."""
@@ -171,6 +185,7 @@ def minimum(
     rigid, positive = PER_LINK * columns.bodies.dim, columns.positive
     along = np.einsum("kij,pji->kp", prior.inverse, PSEUDO).ravel()
     normal, target = A.T @ A, A.T @ b
+    normal[np.diag_indices_from(normal)] += np.diag(normal) == 0  # of what no row has
 
     def cost(x: np.ndarray) -> float:
         if np.any(x[positive] <= 0):
@@ -216,10 +231,10 @@ def widths_of(columns: Columns, motion: Motion) -> np.ndarray:
     found = columns.widths.copy()
     for i in range(k):
         known = np.isfinite(motion.force[:, i])
+        if not known.any():
+            continue
         own, v = rows[known, i], motion.v[known, i]
         rms = np.sqrt(np.mean(v**2))
-        if not known.any() or rms == 0:
-            continue
         sizes = np.linalg.norm(own, axis=0)
         u, s, _ = np.linalg.svd(own[:, sizes > 0] / sizes[sizes > 0], full_matrices=False)
         u = u[:, s > OPTIONS.dependent * s[0]]
@@ -231,7 +246,7 @@ def widths_of(columns: Columns, motion: Motion) -> np.ndarray:
             shape = shape - u @ (u.T @ shape)
             gains.append((shape @ force) ** 2 / (shape @ shape))
         found[i] = rms * OPTIONS.widths[int(np.argmax(gains))]
-    return found
+    return np.where(motion.heard, found, found.max())
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -254,14 +269,16 @@ def identified(
     """The parameters of an arm by a motion. start: a possible x."""
     if "dry" in columns.kinds:
         columns = dataclasses.replace(columns, widths=widths_of(columns, motion))
-    size = np.sqrt(np.nanmean(motion.force**2, axis=0)) + 1e-300
+    known = np.maximum(np.isfinite(motion.force).sum(axis=0), 1)
+    size = np.sqrt(np.nansum(motion.force**2, axis=0) / known)
+    size[size == 0] = 1.0
     sigma, x = size.copy(), start
     for number in range(OPTIONS.rounds):
         report(f"parameters of the arm, round {number + 1}")
         triangle = columns.triangle(motion, sigma)
         x, hessian = minimum(triangle, columns, prior, x)
         left = columns.residuals(motion, x)
-        residual = np.sqrt(np.nanmean(left**2, axis=0))
+        residual = np.sqrt(np.nansum(left**2, axis=0) / known)
         runs = np.split(left, np.cumsum(motion.lengths)[:-1])
         longest = max(motion.lengths)
         padded = np.stack(
@@ -296,8 +313,9 @@ class BaseParameters:
         return self.errors < OPTIONS.sharpened * np.maximum(self.expected, np.abs(self.values))
 
 
-def base_parameters(found: Identified) -> BaseParameters:
-    """The base parameters of an arm, and which of them the motion determines.
+def base_parameters(found: Identified, motion: Motion) -> tuple[BaseParameters, str | None]:
+    """The base parameters of an arm, which of them a motion determines, and the joint whose swings,
+    from poses of the motion, would determine most of the others; None where there are none.
 
     Random motions tell the sums: a parameter whose column depends on those before it, of links
     nearer the base, is added to them (Gautier, J. Robot. Syst. 8 (1991) 485).
@@ -327,19 +345,32 @@ def base_parameters(found: Identified) -> BaseParameters:
     # The data's rows depend on base parameters and friction alone: those columns are theirs.
     kept = [*(some[j] for j in own), *range(rigid.count, columns.count)]
     A = found.triangle.leading(columns.count)[0][:, kept]
-    scale = np.linalg.norm(A, axis=0)
-    scale[scale == 0] = 1.0
-    _, s, vt = np.linalg.svd(A / scale, full_matrices=False)
-    with np.errstate(divide="ignore"):
-        inverse = np.where(s > OPTIONS.dependent * s[0], 1 / s, np.inf)
-    with np.errstate(invalid="ignore"):
-        parts = np.where(np.abs(vt.T) > OPTIONS.dependent, vt.T * inverse, 0.0)
-    errors = np.linalg.norm(parts, axis=1)[: len(own)] / scale[: len(own)]
-    errors[np.linalg.norm(A, axis=0)[: len(own)] == 0] = np.inf
     spread = turn @ found.prior.variances(columns)
     expected = np.sqrt(np.einsum("ij,ij->i", spread, turn))
     expected[-k:] = found.residual  # of offsets
-    return BaseParameters(texts, turn, turn @ found.x, errors, expected)
+    base = BaseParameters(texts, turn, turn @ found.x, _errors(A)[: len(own)], expected)
+    if base.determined.all():
+        return base, None
+    noise = np.where(found.residual > 0, found.residual, found.residual.max() or 1.0)[:, None]
+    poses, told = motion.q[rng.integers(len(motion.q), size=OPTIONS.structure)], []
+    for unit in np.eye(k):
+        swing, v, a = rng.uniform(-np.pi, np.pi, (3, len(poses), 1)) * unit
+        q = np.where(unit, swing, poses)
+        swings = (columns.rows(q, v, a) / noise)[:, motion.heard | (unit > 0)][..., kept]
+        errors = _errors(np.concatenate([A, swings.reshape(-1, len(kept))]))[: len(own)]
+        told.append(dataclasses.replace(base, errors=errors).determined.sum())
+    return base, bodies.names[int(np.argmax(told))]
+
+
+def _errors(A: np.ndarray) -> np.ndarray:
+    """Standard errors of parameters with rows A in units of noise, inf where they say nothing."""
+    scale = np.linalg.norm(A, axis=0)
+    empty, scale = scale == 0, np.where(scale == 0, 1.0, scale)
+    _, s, vt = np.linalg.svd(A / scale, full_matrices=False)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(s > OPTIONS.dependent * s[0], 1 / s, np.inf)
+        parts = np.where(np.abs(vt.T) > OPTIONS.dependent, vt.T * inverse, 0.0)
+    return np.where(empty, np.inf, np.linalg.norm(parts, axis=1) / scale)
 
 
 def _sum(row: np.ndarray, names: list[str]) -> str:
@@ -351,23 +382,3 @@ def _sum(row: np.ndarray, names: list[str]) -> str:
         sign = "-" if row[j] < 0 else "+"
         text += f" {sign} {size}{names[j]}" if text else f"{size}{names[j]}"
     return text
-
-
-def best_swing(found: Identified, base: BaseParameters) -> str | None:
-    """The joint whose swing alone, among random poses, shows most of what is not determined."""
-    lacking = np.flatnonzero(~base.determined)
-    if not len(lacking):
-        return None
-    columns, rng = found.columns, np.random.default_rng(1)
-    k, shown = columns.bodies.dim, []
-    # Changes of the parameters that move one base parameter alone, each by what was expected.
-    moves = np.linalg.pinv(base.turn)[:, lacking] * base.expected[lacking]
-    q = rng.uniform(-np.pi, np.pi, (OPTIONS.structure, k))
-    for joint in range(k):
-        v = np.zeros_like(q)
-        v[:, joint] = rng.normal(size=len(q))
-        a = np.zeros_like(q)
-        a[:, joint] = rng.normal(size=len(q))
-        forces = columns.rows(q, v, a) @ moves
-        shown.append(np.sum((forces / found.residual[:, None]) ** 2))
-    return columns.bodies.names[int(np.argmax(shown))]

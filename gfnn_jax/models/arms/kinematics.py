@@ -39,12 +39,14 @@ class Kinematics(NamedTuple):
             raise InputError(
                 f"the arm has {len(own)} joints ({', '.join(own)}), and {source} has positions "
                 f"{', '.join(names)}: name those of its joints, from the base outwards, "
-                f"gfnn.read(FILE, positions=[…])"
+                "gfnn.read(FILE, positions=[…]). A joint of a URDF that is not in the log and does "
+                'not move is type="fixed" there'
             )
-        if set(own) == set(names) and own != tuple(names):
+        if own != tuple(names) and set(own) & set(names):
             raise InputError(
-                f"expected the positions in the order of the joints: gfnn.read(FILE, positions="
-                f"[{', '.join(map(repr, own))}])"
+                f"the arm's joints are {', '.join(own)}, and {source} has positions "
+                f"{', '.join(names)}: gfnn.read(FILE, positions=[{', '.join(map(repr, own))}]), or "
+                "columns that have none of these names, in the order of the joints"
             )
         return self._replace(bodies=dataclasses.replace(self.bodies, names=tuple(names)))
 
@@ -127,7 +129,8 @@ def from_urdf(path: Any, gravity: Sequence[float] = EARTH) -> Kinematics:
     if strange:
         raise InputError(
             f"{path}: {', '.join(strange)} follow other joints (mimic), or have more than one "
-            "degree of freedom: give the arm without them"
+            'degree of freedom: make them type="fixed" in the file, or give axes= of the joints in '
+            "the log"
         )
     order = [name for name in links if name not in joints]
     for name in order:  # breadth first, in the order of the file; the list grows as it is walked

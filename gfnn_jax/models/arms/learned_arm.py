@@ -19,7 +19,7 @@ from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import stiffness
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.arms.identify import BaseParameters, Identified
+from gfnn_jax.models.arms.identify import OPTIONS, BaseParameters, Identified
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.solve.linear import covariance_root
 
@@ -34,7 +34,7 @@ class LearnedArm:
     map: its flow, with `inverse_dynamics`, `mass_matrix` and `linearise`. base: what the forces
     depend on, with standard errors, and what the motion determined. found: all parameters and their
     covariance. residual: joint -> rms of its force that is left, explained: the share of its
-    variance that is not. swing: the joint whose motion would tell most of what is not determined.
+    variance that is not. swing: the joint whose swings would determine most of the others.
     """
 
     map: SymplecticMap
@@ -70,16 +70,18 @@ class LearnedArm:
 
     @property
     def frictions(self) -> dict[str, dict[str, tuple[float, float]]]:
-        """Joint -> kind of friction -> coefficient and its standard error; "offset" is a constant
-        force."""
-        k, columns = len(self.names), self.found.columns
-        errors = np.sqrt(np.diag(self.found.covariance))
-        first = (PER_LINK + 1) * k
+        """Joint -> kind of friction -> coefficient and its standard error, NaN where the log does
+        not determine it; "offset" is a constant force."""
+        k, found = len(self.names), self.found
+        rows = found.x[(PER_LINK + 1) * k :].reshape(-1, k)
+        errors = np.sqrt(np.diag(found.covariance)[(PER_LINK + 1) * k :]).reshape(-1, k)
+        expected = np.abs(rows)
+        expected[1:] = np.maximum(expected[1:], found.prior.sizes[k:].reshape(-1, k))
+        expected[0] = np.maximum(expected[0], self.base.expected[-k:])
+        told = np.where(errors < OPTIONS.sharpened * expected, [rows, errors], np.nan)
+        kinds = ("offset", *found.columns.kinds)
         return {
-            name: {
-                kind: (float(self.found.x[first + k * m + i]), float(errors[first + k * m + i]))
-                for m, kind in enumerate(("offset", *columns.kinds))
-            }
+            name: dict(zip(kinds, map(tuple, told[:, :, i].T.tolist()), strict=True))
             for i, name in enumerate(self.names)
         }
 
@@ -92,7 +94,7 @@ class LearnedArm:
         shown = "; ".join(lacking[:3]) + ("; …" if len(lacking) > 3 else "")
         return (
             f"partly: {len(lacking)} of {len(self.base.names)} base parameters are not determined "
-            f"by this motion ({shown}); swings of {self.swing} would determine most of them"
+            f"by this motion ({shown}): log swings of {self.swing} too, which would determine most"
         )
 
     @property
@@ -105,21 +107,26 @@ class LearnedArm:
 
     @property
     def formula(self) -> str:
-        """Base parameters with their values, as text."""
-        pairs = zip(self.base.names, self.base.values, strict=True)
-        return "; ".join(f"{name} = {value:.6g}" for name, value in pairs)
+        """Base parameters with their values, as text, of those that the log determines."""
+        rows = zip(self.base.names, self.base.values, self.base.determined, strict=True)
+        return "; ".join(f"{name} = {value:.6g}" for name, value, told in rows if told)
 
     @property
     def table(self) -> str:
         """Base parameters, friction and residuals, a line each."""
         lines = [self.line, "base parameters (kg, m):"]
         for one in self.report()["base_parameters"]:
-            told = f"{one['value']:.4g} ± {one['std']:.2g}"
-            lines.append(f"  {one['name']}: {told if one['determined'] else 'not determined'}")
+            told = (
+                "not determined" if one["std"] is None else f"{one['value']:.4g} ± {one['std']:.2g}"
+            )
+            lines.append(f"  {one['name']}: {told}")
         lines.append("joints:")
         for name, kinds in self.frictions.items():
-            parts = [f"{kind} {c:.3g} ± {s:.1g}" for kind, (c, s) in kinds.items()]
-            parts += [f"rotor {self.rotors[name]:.3g}", f"residual {self.residual[name]:.3g}"]
+            parts = [
+                f"{kind} {c:.3g} ± {s:.1g}" if c == c else f"{kind} not determined"
+                for kind, (c, s) in kinds.items()
+            ]
+            parts += [f"residual {self.residual[name]:.3g}"]
             lines.append(f"  {name}: {', '.join(parts)} ({self.explained[name]:.1%} explained)")
         return "\n".join([*lines, *self.messages])
 
@@ -142,13 +149,18 @@ class LearnedArm:
             "verdict": self.verdict,
             "data": {"num_samples": self.num_samples},
             "base_parameters": [
-                {"name": n, "value": float(v), "std": float(e), "determined": bool(d)}
+                {"name": n, "value": float(v), "std": float(e)}
+                if d
+                else {"name": n, "value": None, "std": None}
                 for n, v, e, d in base
             ],
             "links": self.inertias,
             "rotors": self.rotors,
             "friction": {
-                name: {kind: {"value": c, "std": s} for kind, (c, s) in kinds.items()}
+                name: {
+                    kind: {"value": c, "std": s} if c == c else None
+                    for kind, (c, s) in kinds.items()
+                }
                 for name, kinds in self.frictions.items()
             },
             "residual": self.residual,

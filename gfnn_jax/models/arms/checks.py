@@ -1,0 +1,132 @@
+"""Checks of a log of an arm: limits of forces, and forces that do not go with the motion.
+
+Where a joint's forces follow from parameters of its own, and not from those of a possible arm, a
+force has another unit, sign or joint. Which one, is what mends it: a free gain of one joint, which
+the coupling of the joints determines, or two inputs in each other's place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from gfnn_jax.errors import FitError
+from gfnn_jax.families.rigid_bodies import PER_LINK
+from gfnn_jax.models.arms.identify import OPTIONS, Columns, Identified, Motion
+from gfnn_jax.models.arms.kinematics import Kinematics
+
+
+def limited(motion: Motion, limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mask (n, k) of forces at a joint's limit, and mask (k,) of limits that are not those of the
+    forces, which go beyond them. limits: (k,), inf where not known; a largest force that many
+    samples share, and no other one, is a limit too."""
+    size, beyond = np.abs(motion.force), np.zeros(len(limits), bool)
+    at = size >= OPTIONS.saturated * limits
+    for i, own in enumerate(size.T):
+        beyond[i] = at[:, i].any() and np.median(own[at[:, i]]) > limits[i] / OPTIONS.saturated
+        top = own >= (1 - 1e-9) * own.max()
+        _, counts = np.unique(own[~top & (own > 0)], return_counts=True)
+        if top.sum() > max(OPTIONS.plateau * len(own), 10 * counts.max(initial=1)):
+            at[:, i] |= top
+    return at & ~beyond, beyond
+
+
+def check_forces(
+    found: Identified, motion: Motion, inputs: Sequence[str], gains: np.ndarray, factor: float
+) -> None:
+    """Raise FitError where the law leaves most of a joint's forces unexplained, which parameters of
+    that joint alone explain, with what mends it; or where forces are far from ``factor`` = 1 times
+    those that the inertias of a CAD model need."""
+    columns, given = found.columns, np.flatnonzero(motion.heard).tolist()
+    names, k = np.array(columns.bodies.names), columns.bodies.dim
+    known = np.flatnonzero(np.isfinite(motion.force[:, given]).all(axis=1))
+    known = known[:: 1 + len(known) // OPTIONS.block]
+    rows = columns.rows(motion.q[known], motion.v[known], motion.a[known])
+    force = np.nan_to_num(motion.force[known])
+    scale = np.where(motion.heard, np.std(force, axis=0), 1.0) + 1e-300
+    size = np.linalg.norm(rows, axis=(0, 1))
+    size[size == 0] = 1.0
+    tables = [
+        np.asarray(np.linalg.qr(np.hstack([rows[:, i] / size, force / scale]), mode="r"))
+        for i in given
+    ]
+
+    def solved(own: Sequence[int], of: Sequence[int], free: int | None = None) -> tuple[Any, Any]:
+        """Parameters of these joints by the inputs ``of``, that of ``free`` with a gain, which is
+        last; and the share of each force that is left, of its standard deviation."""
+        A = np.concatenate([tables[given.index(i)][:, :-k] / scale[of[i]] for i in own])
+        b = np.concatenate([tables[given.index(i)][:, of[i] - k] for i in own])
+        at = np.repeat(np.array(own) == free, len(tables[0]))
+        if free is not None:
+            A, b = np.column_stack([A, np.where(at, -b, 0.0)]), np.where(at, 0.0, b)
+        x = np.linalg.lstsq(A, b, rcond=OPTIONS.dependent)[0]
+        left = np.linalg.norm((A @ x - b).reshape(len(own), -1), axis=1) / np.sqrt(len(known))
+        return x, left / np.where(at[:: len(tables[0])], abs(x[-1]) + 1e-300, 1.0)
+
+    order = list(range(k))
+    alone = np.array([solved([i], order)[1][0] for i in given])
+    left = (found.residual / scale)[given]
+    noise = np.nanstd(np.diff(motion.force[:, given], 2, axis=0), axis=0) / np.sqrt(6)
+    explained = np.maximum(OPTIONS.explained, 1 - alone**2 - OPTIONS.apart)
+    poor = (1 - left**2 < explained) & (left > 3 * noise / scale[given])
+    sized = (
+        f"the forces are {factor:.2g} times those that the inertias of the URDF need: currents, or "
+        "other units? gfnn.Arm(…, gains=[…]), the force for a unit of each input"
+        if not 1 / OPTIONS.units < factor < OPTIONS.units
+        else ""
+    )
+    if not poor.any():
+        if sized:
+            raise FitError(sized)
+        return
+    x, together = solved(given, order)
+    x = x / size
+    _, slope, _ = columns.friction.tables(motion.v[known])
+    lost = slope * x[columns.count - len(columns.kinds) * k :]
+    power = np.mean(lost.reshape(len(slope), -1, k).sum(axis=1) * motion.v[known], axis=0)
+    fed = power < -OPTIONS.fed * np.mean(np.abs(force * motion.v[known]), axis=0)
+    said = f"the forces of {', '.join(names[given][poor])} do not go with the motion"
+    trials: list[tuple[list[int], int | None]] = [(order, j) for j in given if len(given) > 1]
+    for i, j in combinations(given, 2):
+        turned = [*order]
+        turned[i], turned[j] = j, i
+        trials.append((turned, None))
+    tried = [solved(given, of, free) for of, free in trials]
+    worse = [float(np.max(rest / (alone + OPTIONS.mended))) for _, rest in tried]
+    if fed[given].all():
+        said += f": they take energy from it. Their sign is wrong: {_gains(-gains)}"
+    elif min(worse, default=np.inf) < 0.5 * np.max(together / (alone + OPTIONS.mended)):
+        best = int(np.argmin(worse))
+        (of, free), gain = trials[best], tried[best][0][-1]
+        if free is None:
+            listed = ", ".join(repr(inputs[i]) for i in of)
+            said += f": two inputs are exchanged. gfnn.read(FILE, inputs=[{listed}])"
+        else:
+            said += f": those of {names[free]} are {1 / gain:.2g} times what the others need. "
+            near = np.sign(gain) * 10.0 ** np.round(np.log10(abs(gain)))
+            gain = near if abs(gain / near - 1) < OPTIONS.apart else gain
+            said += _gains(gains * np.where(np.arange(k) == free, gain, 1.0))
+    elif sized:
+        said = sized
+    else:
+        said += (
+            ". Are positions in degrees (gfnn.read(FILE, degrees=[…])), inputs in the order of the "
+            "joints and in N m (gains=[…]), or joints held by friction?"
+        )
+    raise FitError(said)
+
+
+def _gains(gains: np.ndarray) -> str:
+    return f"gfnn.Arm(…, gains=({', '.join(f'{g:.3g}' for g in gains)}))"
+
+
+def size_of_forces(kinematics: Kinematics, motion: Motion, columns: Columns) -> float:
+    """Factor between the forces and those that the prior's inertias need."""
+    rows = np.concatenate([rows for rows, _ in columns.blocks(motion)])
+    known, rigid = np.isfinite(motion.force), PER_LINK * columns.bodies.dim
+    expected = (rows[..., :rigid] @ kinematics.prior.ravel())[known]
+    others = np.column_stack([expected, rows[known][:, rigid + columns.bodies.dim :]])
+    return float(np.linalg.lstsq(others, motion.force[known], rcond=None)[0][0])
