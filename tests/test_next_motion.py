@@ -1,16 +1,10 @@
 """Which motion to record next, against the standard errors after it was recorded."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from test_law_fits import pendulum
 
 import gfnn_jax as gfnn
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
-from random_recordings import SYSTEMS, record
 
 TERMS = ["V: cos(theta) + cos(2*theta)", "R: omega**2"]
 
@@ -32,16 +26,7 @@ def test_a_wider_swing_tells_what_a_small_one_cannot():
     assert f"release from rest at theta = {best.start['theta']:.3g} rad. Standard" in fit.table
     both = gfnn.fit(recorded(0.3, best.start["theta"]), terms=TERMS)
     before, after = (f.lagrangian.terms[2].std for f in (fit, both))
-    # What is foretold counts terms of higher modes too, which this law has not.
-    assert 1 / 3 < before / after / best.gains["cos(2*theta)"] < 3
-
-
-@pytest.mark.slow
-def test_pendulums_that_nothing_couples_have_scales_of_their_own():
-    """Terms of the library that a motion tells couple them, and then one mass is free."""
-    fit = gfnn.fit(record(SYSTEMS["two pendulums"], np.random.default_rng([3, 6])).recording)
-    assert len(fit.lagrangian.terms) == 4
-    assert fit.next_motions
+    assert 1 / 2 < before / after / best.gains["cos(2*theta)"] < 2
 
 
 @pytest.mark.slow

@@ -3,8 +3,7 @@
 A motion from rest, let go or driven by an input, is followed by the law. With J its sensitivities,
 its own first state eliminated, a record of it turns the information RᵀR of the coefficients into
 RᵀR + JᵀJ (Fedorov, Theory of Optimal Experiments, 1972). The best is the one after which forecasts
-of all motions that are compared err least. Told are also the gains of terms that the law lacks and
-that its own imitate where the record was.
+of all motions that are compared err least.
 """
 
 from __future__ import annotations
@@ -18,8 +17,7 @@ import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs
 from gfnn_jax.fitting.linearised import Linearised
-from gfnn_jax.models.lagrangians import libraries
-from gfnn_jax.models.lagrangians.fit import LawFit, places
+from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.structure import Key
 
 
@@ -28,16 +26,12 @@ class MotionOptions:
     """Options of the motions that are compared (`tests/test_next_motion.py`).
 
     further: of the largest deflections of the record. highest: radians, that an angle is let go.
-    imitated: share of what a term does that others do not, below which it is hardly identifiable.
-    most_terms: that are looked at: of larger libraries the first alone, of many coordinates the
-    textbook's. most: motions. largest: derivative of a residual, whose square is finite. turns:
-    periods of a square wave of an input, between its ends in the record, in a motion.
+    most: motions. largest: derivative of a residual, whose square is finite. turns: periods of a
+    square wave of an input, between its ends in the record, in a motion.
     """
 
     further: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 4.0)
     highest: float = 3.0
-    imitated: float = 0.1
-    most_terms: int = 40
     most: int = 3
     largest: float = 1e100
     turns: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
@@ -77,33 +71,16 @@ def next_motions(fit: LawFit, steered: Sequence[int] = ()) -> list[Motion]:
     """The best motions to record next, the best first; each as long as an arc of the fit. steered:
     places of inputs that can be chosen; motions that they drive stay as near as other starts."""
     structure, d, problem = fit.structure, fit.form.dim, fit.problem
-    rows, more = (library(d, problem.angles) for library in (libraries.first, libraries.more))
-    rows = [*rows, *more] if len(rows) + len(more) <= OPTIONS.most_terms else rows
-    rows = rows if d <= libraries.FEW else libraries.textbook(d, problem.angles)
-    library = libraries.without_forces(rows, problem.observation.shifts())
-    lacking = [("term", row) for row in library if row not in structure.terms]
-    larger = structure.plus(lacking)
-    keys, whole = larger.keys(), problem.linearised(larger, fit)
-    own, others = places(larger, structure, lacking)
-    own = [k for k in own if keys[k][0] != "sensor"]
-    share = whole.added(own, others).share
-    hardly = {k for k, one in zip(others, share, strict=True) if one < OPTIONS.imitated}
-    kept = [k for k in range(len(keys)) if k in own or k in hardly]
-    here = whole.among(kept)
+    own = [k for k, key in enumerate(structure.keys()) if key[0] != "sensor"]
+    here = problem.linearised(structure, fit).among(own)
     if not here.columns.any():
         return []  # the law moves no residual, nor would it elsewhere
-    named = [keys[k] for k in kept]
-    of_law = [n for n, k in enumerate(kept) if k in own]
-    looked_at = larger.without(set(keys) - set(named))
-    if not set(named) <= set(looked_at.keys()):  # that nothing couples have scales of their own
-        looked_at = larger
-    places_of = [looked_at.keys().index(key) for key in named]
-    free = [(start, None) for start in _starts(fit)]
+    named = [structure.keys()[k] for k in own]
     middle, reach = _middle(fit)
     reach = max(OPTIONS.further) * reach
-    driven = [(middle, drive) for drive in _drives(fit, steered)]
+    begun = [(start, None) for start in _starts(fit)]
+    begun += [(middle, drive) for drive in _drives(fit, steered)]
     found = []
-    begun = [*free, *driven]
     lanes, inputs, h = _lanes(fit, begun)
     for (start, drive), lane, u in zip(begun, lanes, inputs, strict=True):
         if not np.isfinite(lane).all() or (drive and np.any(abs(lane[:, :d] - middle) > reach)):
@@ -112,16 +89,16 @@ def next_motions(fit: LawFit, steered: Sequence[int] = ()) -> list[Motion]:
         home, t = ((fit.arcs.home[0][0], 0, len(lane)),), h * np.arange(len(lane))[None]
         arcs = Arcs(t, y, lane[None], np.ones(y.shape), home)
         acted = dataclasses.replace(problem, inputs=lambda arcs, own=u[None]: own)
-        there = acted.linearised(looked_at, fit, arcs).among(places_of)
+        there = acted.linearised(structure, fit, arcs).among(own)
         if not np.abs(there.columns).max() < OPTIONS.largest:
             continue  # along which a small change grows without bound
         less = here.sharpened_by(there)
         gains = {named[k]: float(less[k]) for k in np.argsort(-less)}
-        found.append((Motion(start, gains, drive=drive), there.among(of_law)))
+        found.append((Motion(start, gains, drive=drive), there))
     if not found:
         return []
     motions, each = zip(*found, strict=True)
-    return [motions[k] for k in np.argsort(_left(here.among(of_law), each))[: OPTIONS.most]]
+    return [motions[k] for k in np.argsort(_left(here, each))[: OPTIONS.most]]
 
 
 def _left(here: Linearised, each: Sequence[Linearised]) -> np.ndarray:
