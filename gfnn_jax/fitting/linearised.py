@@ -216,13 +216,6 @@ class Linearised:
         whole = Triangle(Triangle.of(factor).factor, self.triangle.rows)
         return Linearised(np.zeros(turn.shape[1]), whole, self.variance)
 
-    def without(self, others: Sequence[int]) -> Linearised:
-        """The problem of the other coefficients, these at their best for each value of those."""
-        kept = [k for k in range(len(self.p)) if k not in set(others)]
-        R = np.asarray(np.linalg.qr(self.triangle.factor[:, [*others, *kept, -1]], mode="r"))
-        rest = Triangle.of(R[len(others) :, len(others) :]).factor
-        return Linearised(self.p[kept], Triangle(rest, self.triangle.rows), self.variance)
-
     def added(self, fitted: Sequence[int], omitted: Sequence[int]) -> Added:
         """Each of the ``omitted`` coefficients (m) alone beside those that are ``fitted``."""
         A, rest = self.columns, self.triangle.factor
