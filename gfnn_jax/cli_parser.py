@@ -386,7 +386,7 @@ def _export(command: _Command) -> None:
     command.add("model", "folder that `gfnn fit` wrote", "MODEL", type=Path)
     command.add(
         "--to",
-        "c: C99 for one state at a time; of a law c-taylor: C to roundoff, friction that sticks, "
+        "c: C99 for one state at a time; of a law c-taylor: the same, "
         "js: JavaScript, jax, casadi, fmu: FMI 3.0, mjcf and urdf: a chain of links, latex; "
         "stablehlo: batches by jax.export, of any map",
         choices=EXPORTS,

@@ -19,6 +19,9 @@ from test_exports import (
     pushed,
     with_length,
 )
+from test_exports import (
+    two_rods as attracting,
+)
 
 import gfnn_jax as gfnn
 from gfnn_jax import cli, cli_parser
@@ -123,10 +126,10 @@ def by_javascript(path, calls):
 
 
 @needs_cc
-@pytest.mark.parametrize("kind", SMOOTH)
+@pytest.mark.parametrize("kind", [*SMOOTH, "bobs that attract"])
 def test_a_taylor_series_in_c_is_the_flow(kind, tmp_path):
-    map_, z, args = SMOOTH[kind]()
-    library = compiled(gfnn.export(map_, "c-taylor", tmp_path / "own.c"))
+    map_, z, args = SMOOTH[kind]() if kind in SMOOTH else (*attracting(), None)
+    library = compiled(gfnn.export(map_, "c", tmp_path / "own.c"))
     for function, own in (
         (library.own_step, map_),
         (library.own_inverse, map_.reversed() if args is None else None),

@@ -53,10 +53,9 @@ def test_a_saved_law_is_the_same(heavy_top, tmp_path):
     assert again.verdict == fit.verdict
     one, other = (np.asarray(f.map.step(starts)[0]) for f in (fit, again))
     assert np.array_equal(one, other)
-    for to, suffix in (("c", "c"), ("js", "js")):
-        told = rf"bracket of its own, se\(3\), of which to=.{to}. .*to=.c-taylor.*to=.latex"
-        with pytest.raises(InputError, match=told):
-            gfnn.export(fit, to, tmp_path / f"top.{suffix}")
+    told = r"bracket of its own, se\(3\), of which to=.js. .*to=.c-taylor.*to=.latex"
+    with pytest.raises(InputError, match=told):
+        gfnn.export(fit, "js", tmp_path / "top.js")
     assert gfnn.export(fit, "latex", tmp_path / "top.tex").read_text().startswith("H = ")
 
 

@@ -1,7 +1,5 @@
-"""C code that is the same for every map: solvers of one lane, line by line those of ``solve/``.
-
-`solve.newton.iterate` and `flows.flow._fixed_point` explain the algorithms. A file contains the
-solvers that it needs, with the constants of these modules.
+"""C code that is the same for every map: Newton's method of one lane, line by line that of
+`solve.newton`, whose `iterate` explains it, with that module's constants.
 """
 
 from __future__ import annotations
@@ -10,7 +8,6 @@ import numpy as np
 
 from gfnn_jax.coordinates import TWO_PI
 from gfnn_jax.exports.symbols import literal
-from gfnn_jax.flows import flow
 from gfnn_jax.generating.generated import MOST_UPDATES
 from gfnn_jax.maps.programs import parts_of_two_pi
 from gfnn_jax.solve import newton
@@ -261,72 +258,4 @@ static double eliminated(int n, const double *matrix, const double *rhs, double 
     }
     return sign;
 }
-"""
-
-
-def fixed_point_solver(width: int, stages: int, more: int = 0) -> str:
-    """Write Gauss collocation by fixed point in C, for at most ``stages`` stages.
-
-    States have ``width`` entries, and at most ``more`` args follow them.
-    """
-    return f"""\
-enum {{ MOST_STAGES = {stages}, STATE = {width}, ARGS = {more} }};
-
-/* weights: h b_i; times: h c_i; later: the args a time after, NULL where they do not change. */
-struct flow {{
-    int stages, args;
-    const double *coupling, *weights, *times, *scale;
-    void (*gradient)(const double *w, double *g);
-    void (*later)(const double *args, const double *after, double *later);
-}};
-
-/* L_i = h b_i J grad H(z + sum_j mu_ij L_j), moved: sum_i L_i. */
-static int collocated(const struct flow *of, const double *z, double *moved)
-{{
-    const int stages = of->stages;
-    double slopes[MOST_STAGES][STATE], fresh[MOST_STAGES][STATE], g[STATE];
-    double inside[MOST_STAGES][STATE + ARGS], change = INFINITY;
-    of->gradient(z, g);
-    for (int i = 0; i < stages; i++) {{
-        if (of->later)
-            of->later(z + STATE, of->times + i, inside[i] + STATE);
-        else
-            memcpy(inside[i] + STATE, z + STATE, of->args*sizeof *z);
-        for (int a = 0; a < STATE; a++)
-            slopes[i][a] = of->weights[i]*(a < STATE/2 ? g[a + STATE/2] : -g[a - STATE/2]);
-    }}
-    for (int iterations = 1; ; iterations++) {{
-        double most = 0.0;
-        for (int i = 0; i < stages; i++) {{
-            for (int a = 0; a < STATE; a++) {{
-                double sum = 0.0;
-                for (int j = 0; j < stages; j++)
-                    sum += of->coupling[i*stages + j]*slopes[j][a];
-                inside[i][a] = z[a] + sum;
-            }}
-            of->gradient(inside[i], g);
-            for (int a = 0; a < STATE; a++) {{
-                fresh[i][a] = of->weights[i]*(a < STATE/2 ? g[a + STATE/2] : -g[a - STATE/2]);
-                const double size = (fabs(z[a]) + of->scale[a])/stages;
-                const double part = fabs(fresh[i][a] - slopes[i][a])/size;
-                if (part > most || isnan(part))
-                    most = isnan(most) ? most : part;
-            }}
-        }}
-        const int settled = most <= {literal(_EPS**flow._SETTLED)} && most > 0.5*change;
-        change = most;
-        memcpy(slopes, fresh, sizeof slopes);
-        if (most <= {literal(flow._FLOOR_EPS * _EPS)} || settled || !isfinite(most)
-            || iterations == {flow._MOST})
-            break;
-    }}
-    for (int a = 0; a < STATE; a++) {{
-        moved[a] = 0.0;
-        for (int i = 0; i < stages; i++)
-            moved[a] += slopes[i][a];
-    }}
-    if (change <= {literal(_EPS**flow._SETTLED)})
-        return OK;
-    return isfinite(change) ? NOT_CONVERGED : NON_FINITE;
-}}
 """

@@ -1,8 +1,7 @@
 """Pieces of a map in C: ``int PIECE_step(double *z)``, and ``PIECE_back``, its inverse.
 
 The args follow the state in z and in w: parameters, the time of a drive, coefficients of inputs. A
-piece does not change them; it moves copies of them to the times of its stages. Polynomials of many
-terms are arranged by Horner's scheme.
+piece does not change them. Polynomials of many terms are arranged by Horner's scheme.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.exports.symbols import Tape, literal, table
+from gfnn_jax.exports.symbols import Tape, table
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.inputs import Inputs
@@ -27,10 +26,9 @@ from gfnn_jax.families.terms import Terms
 from gfnn_jax.families.traced import traced
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
-from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.systems import OfSystems
-from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform, without_forces
+from gfnn_jax.flows.uniform import Uniform, without_forces
 from gfnn_jax.generating.generated import Generated, ImplicitStep
 from gfnn_jax.generating.predictor import PolynomialModel
 from gfnn_jax.maps.domain import Domain
@@ -149,8 +147,6 @@ def why_not_piece(piece: Any) -> str | None:
         return f"its Legendre transform has more than {COFACTORS_UP_TO} degrees of freedom"
     if not isinstance(inner, (Products, Terms, Legendre)):
         return f"the map is one of {getattr(family, 'label', type(family).__name__)}"
-    if isinstance(piece, Flow) and piece.newton:
-        return "the stages of the flow are solved by Newton's method"
     try:
         on_symbols(family)
     except InputError as error:
@@ -171,8 +167,6 @@ def piece_functions(name: str, piece: Any, back: Any, width: int, more: int = 0)
         ways = (("step", piece), ("back", back))
         return [part for way, one in ways for part in _explicit(f"{name}_{way}", one, width, more)]
     family, params = on_symbols(piece.family), np.asarray(piece.params)
-    if isinstance(piece, Flow):
-        return _flow(name, piece, back, width, more)
     tape = Tape()
     w, args = _with_args(tape, "w", width, more)
     parts = [tape.function(f"{name}_gradient", {"g": family.gradient(params, w, args)})]
@@ -324,10 +318,10 @@ static int {name}(double *z)
 
 def moves_args(piece: Any, more: int) -> bool:
     """Return whether what a piece depends on changes during a step."""
-    return isinstance(piece, Flow) and _later("", on_symbols(piece.family), more) is not None
+    return isinstance(piece, Flow) and args_later("", on_symbols(piece.family), more) is not None
 
 
-def _later(name: str, family: Any, more: int) -> str | None:
+def args_later(name: str, family: Any, more: int) -> str | None:
     """Write the args of a family a time ``after`` later; None where they stay as they are."""
     if not more:
         return None
@@ -337,75 +331,6 @@ def _later(name: str, family: Any, more: int) -> str | None:
     if all(a is b for a, b in zip(np.ravel(args), np.ravel(later), strict=True)):
         return None
     return tape.function(name, {"later": later})
-
-
-def _flow(name: str, piece: Flow, back: Flow, width: int, more: int) -> list[str]:
-    """Write Gauss collocation by fixed point. With uniform friction its variables are (q, p~) of
-    `flows.uniform`, and the time since the substep began is one arg more."""
-    family, params = on_symbols(piece.family), np.asarray(piece.params)
-    uniform = isinstance(family, Uniform)
-    staged, inside = (CaldirolaKanai(family.family), more + 1) if uniform else (family, more)
-    tape = Tape()
-    w, args = _with_args(tape, "w", width, inside)
-    parts = [tape.function(f"{name}_gradient", {"g": staged.gradient(params, w, args)})]
-    of_substeps, of_stages = _later(f"{name}_later", family, more), "NULL"
-    if of_substeps is not None:
-        parts.append(of_substeps)
-        of_stages = f"{name}_later"
-    if uniform:
-        of_stages = f"{name}_stage"
-        parts.append(_later(of_stages, staged, inside) or "")
-    rule, stages = gauss(piece.stages), piece.stages
-    parts.append(
-        f"static const double {name}_coupling[{stages * stages}] = {table(rule.coupling)};\n"
-        f"static const double {name}_scale[] = {table(piece.scale)};\n"
-    )
-    for way, one in (("step", piece), ("back", back)):
-        h = float(np.asarray(one.dt)) / one.substeps
-        tape = Tape()
-        z, moved = tape.inputs("z", width), tape.inputs("moved", width)
-        image = z + (family.moved(params, z, moved, h) if uniform else moved)
-        parts.append(tape.function(f"{name}_{way}_image", {"Z": image}))
-        begin = [f"memcpy(begun, z, {width if of_substeps else width + more}*sizeof *z);"]
-        if of_substeps:
-            begin += [
-                f"const double after = i*{literal(h)};",
-                f"{name}_later(z + {width}, &after, begun + {width});",
-            ]
-        if uniform:
-            begin.append(f"begun[{width + more}] = 0.0;")
-        lines = "\n".join(f"        {line}" for line in begin)
-        parts.append(f"""\
-static int {name}_{way}(double *z)
-{{
-    static const double weights[{stages}] = {table(rule.weights * h)};
-    static const double times[{stages}] = {table(rule.nodes * h)};
-    static const struct flow of = {{{stages}, {inside}, {name}_coupling, weights, times,
-                                   {name}_scale, {name}_gradient, {of_stages}}};
-    double begun[{width + inside}], moved[{width}];
-    int status = OK;
-    for (int i = 0; i < {one.substeps}; i++) {{
-{lines}
-        status = worse(status, collocated(&of, begun, moved));
-        {name}_{way}_image(begun, moved, z);
-    }}
-    return status;
-}}
-""")
-    return parts
-
-
-def flow_piece(name: str, piece: Flow, flow: str, width: int, inputs: int) -> list[str]:
-    """Write a piece in C whose ``flow`` over any time is there; ``inputs`` of the args are those of
-    inputs, which an inverse needs at the step's end."""
-    dt = float(np.asarray(piece.dt))
-    later = _later(f"{name}_later", on_symbols(piece.family), inputs)
-    ways = (("step", dt), ("back", -dt))
-    return [flow, *([later] if later else [])] + [
-        f"static int {name}_{way}(double *z)\n{{\n"
-        f"    return flow(z, {literal(h)}, z + {width}, NULL);\n}}\n"
-        for way, h in ways
-    ]
 
 
 _NARROWEST = 1e-150  # width of dry friction that no speed is below, and whose square is a number
@@ -454,7 +379,7 @@ def on_symbols(family: Any) -> Any:
         widths = np.maximum(family.friction.widths, _NARROWEST)
         friction = dataclasses.replace(family.friction, widths=widths)
         family = dataclasses.replace(family, friction=friction)
-    if isinstance(family, (OfDisplacement, Forced, OfSystems, Uniform, CaldirolaKanai)):
+    if isinstance(family, (OfDisplacement, Forced, OfSystems, Uniform)):
         return dataclasses.replace(family, family=on_symbols(family.family))
     if not isinstance(family, Products) or family.inputs.features is None:
         return family

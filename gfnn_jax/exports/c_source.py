@@ -1,12 +1,14 @@
 """Export of a map as one C99 file: step, inverse and status, of one state at a time.
 
-All formulas come from the package's own lines, run on symbols; the solvers are those of `c_parts`.
-The code allocates nothing and keeps no state, so that several threads may call it at once.
+All formulas come from the package's own lines, run on symbols. S is solved by Newton's method
+(`c_parts`), and the flow of a law is a Taylor series (`taylor`). The code allocates nothing and
+keeps no state, so that several threads may call it at once.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,18 +19,21 @@ from gfnn_jax.coordinates import CARTESIAN, LOG, polar
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports import c_parts
 from gfnn_jax.exports.c_pieces import (
+    args_later,
     christoffel,
-    flow_piece,
     moves_args,
+    on_symbols,
     piece_functions,
     unknowns,
     why_not_piece,
 )
-from gfnn_jax.exports.graph import graph_of
+from gfnn_jax.exports.graph import LawGraph, graph_of
 from gfnn_jax.exports.symbols import Tape, literal, table
 from gfnn_jax.exports.taylor import c_of_flow
 from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.flows.damped import DampedFlow
 from gfnn_jax.flows.flow import Flow
+from gfnn_jax.flows.lie import LieFlow
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.domain import Domain
 from gfnn_jax.maps.inputs import Signals
@@ -50,30 +55,31 @@ def why_not(map_: SymplecticMap) -> str | None:
     return next((why for piece in pieces if (why := why_not_piece(piece))), None)
 
 
-def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any], taylor: bool = False) -> str:
+def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     """Write a map as C: ``int NAME_step(const double z[2d], double Z[2d])`` and ``NAME_inverse``.
 
     For a map with parameters, a drive or inputs both take ``const double args[k]`` after z; where
     inputs change during a step, ``NAME_inputs`` makes their part of the args of samples. about:
-    entries of the comment at the top, name -> text. taylor: whether a law's flow is made by Taylor
-    series to roundoff, instead of by the map's own collocation. Raises InputError, in one line, for
-    a map that cannot be written in C.
+    entries of the comment at the top, name -> text. The flow of a law is made to roundoff. Raises
+    InputError, in one line, for a map that cannot be written in C.
     """
-    graph = graph_of(map_) if taylor else None
-    if graph is not None and map_.bracket is None:  # stiff friction needs no Newton's method
-        map_ = dataclasses.replace(
-            map_, pieces=(dataclasses.replace(map_.pieces[0], newton=False),)
-        )
     if (reason := why_not(map_)) is not None:
         raise InputError(
             f"this map cannot be written in C: {reason}. C takes polynomials, Fourier harmonics "
             "and formulas: use --to stablehlo"
         )
+    inner = dataclasses.replace(map_, coordinates=CARTESIAN)  # what pieces move
+    graphs = [
+        graph_of(dataclasses.replace(inner, pieces=(piece,)))
+        if isinstance(piece, (Flow, LieFlow, DampedFlow))
+        else None
+        for piece in map_.pieces
+    ]
+    sticks = any(graph is not None and graph.sticks for graph in graphs)
     map_ = jax.tree.map(np.asarray, map_)
     pieces, width, domain = map_.pieces, map_.width, map_.domain
     more = num_args(map_)
     assert isinstance(domain, Domain)
-    sticks = graph is not None and graph.sticks
     parts = [_comment(map_, name, about, sticks), c_parts.INCLUDES, c_parts.COMMON]
     if map_.coordinates.angles:
         parts.append(c_parts.ANGLES)
@@ -86,20 +92,16 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any], taylor: b
         parts.append(c_parts.newton_solver(most, width))
     if most > COFACTORS_UP_TO:
         parts.append(c_parts.ELIMINATION)
-    stages = max((p.stages for p in pieces if isinstance(p, Flow)), default=0)
-    if stages and graph is None:
-        parts.append(c_parts.fixed_point_solver(width, stages, more + 1))  # 1: a piece's own
     if domain.keep:
         tape = Tape()
         y = tape.inputs("y", width)
         parts.append(tape.function("christoffel", {"kappa": christoffel(domain, y[0])}))
-    if graph is not None:
-        parts += flow_piece(
-            "piece0", pieces[0], c_of_flow(graph), width, 0 if map_.signals is None else more
-        )
-        pieces = ()
-    for i, (piece, back) in enumerate(zip(pieces, map_.reversed().pieces[::-1], strict=not taylor)):
-        parts += piece_functions(f"piece{i}", piece, back, width, more)
+    for i, piece in enumerate(pieces):
+        graph, back = graphs[i], map_.reversed().pieces[-1 - i]
+        if graph is None:
+            parts += piece_functions(f"piece{i}", piece, back, width, more)
+        else:
+            parts += _flow(f"piece{i}", piece, graph, width, 0 if map_.signals is None else more)
     order = range(len(map_.pieces))
     ahead = args_after(map_)
     parts.append(_whole(map_, f"{name}_step", [f"piece{i}_step" for i in order], []))
@@ -109,6 +111,24 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any], taylor: b
     if of_samples(map_):
         parts.append(inputs_of_samples(map_, name))
     return "\n".join(parts)
+
+
+def _flow(name: str, piece: Any, graph: LawGraph, width: int, inputs: int) -> list[str]:
+    """Write the flow of a law as a Taylor series. ``inputs`` of the args are those of inputs, which
+    an inverse needs at the step's end."""
+    dt = float(np.asarray(piece.dt))
+    flow = c_of_flow(graph)
+    # Names that no other piece has.
+    own = re.findall(r"^static (?:const )?\w+ (\w+)\W", flow, re.M)
+    own += re.findall(r"(\w+) = \d", flow.partition("\n")[0])
+    flow = re.sub(rf"\b({'|'.join(own)})\b", rf"{name}_\1", flow)
+    later = args_later(f"{name}_later", on_symbols(piece.family), inputs)
+    ways = (("step", dt), ("back", -dt))
+    return [flow, *([later] if later else [])] + [
+        f"static int {name}_{way}(double *z)\n{{\n"
+        f"    return {name}_flow(z, {literal(h)}, z + {width}, NULL);\n}}\n"
+        for way, h in ways
+    ]
 
 
 def _signature(map_: SymplecticMap, name: str) -> str:

@@ -7,7 +7,6 @@ import json
 import re
 import zipfile
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.exports.c_source import c_source
 from gfnn_jax.exports.casadi_function import casadi_function
 from gfnn_jax.exports.fmu import fmu
+from gfnn_jax.exports.graph import graph_of
 from gfnn_jax.exports.javascript import javascript
 from gfnn_jax.exports.jax_source import jax_source
 from gfnn_jax.exports.robots import mjcf, urdf
@@ -42,9 +42,17 @@ SUFFIXES = {
     "latex": ".tex",
     "stablehlo": ".zip",
 }
+
+
+def _c_of_law(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
+    """Write the C of a map that is the flow of a law. Raises InputError for another."""
+    graph_of(map_)
+    return c_source(map_, name, about)
+
+
 _PRINTERS: dict[str, Callable[[SymplecticMap, str, Mapping[str, Any]], str | bytes]] = {
     "c": c_source,
-    "c-taylor": partial(c_source, taylor=True),
+    "c-taylor": _c_of_law,
     "js": javascript,
     "jax": jax_source,
     "casadi": casadi_function,
@@ -72,8 +80,9 @@ def export(
     to:   a format, of docs/export.md:
           "c": a C99 file with ``int NAME_step(const double z[2d], double Z[2d])`` and
           ``NAME_inverse``, NAME that of the file; for float64 maps whose functions are polynomials,
-          Fourier harmonics or formulas.
-          "c-taylor": the same of a law, by Taylor series to roundoff, with events of dry friction.
+          Fourier harmonics or formulas. The flow of a law is a Taylor series to roundoff, with
+          events of dry friction.
+          "c-taylor": the same of a law alone.
           "js": a law as JavaScript, "jax": as a plain JAX function, "casadi": as a CasADi function,
           "fmu": as an FMU of FMI 3.0, all with inputs and coefficients as arguments.
           "mjcf", "urdf": an arm, or a law that is a planar chain of links, for robotics.
@@ -109,7 +118,7 @@ def export(
     map_ = map_ if isinstance(map_, SymplecticMap) else saved.load(map_)
     about = _about(folder)
     of_law = isinstance(map_.pieces[0], (Flow, LieFlow, DampedFlow))
-    if to in _PRINTERS and map_.bracket is not None and (to != "c-taylor" or not of_law):
+    if to in _PRINTERS and map_.bracket is not None and (to not in ("c", "c-taylor") or not of_law):
         raise InputError(
             f"this map has a bracket of its own, {map_.bracket.name}, of which --to {to} makes no "
             "step: use --to stablehlo"

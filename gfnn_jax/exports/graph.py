@@ -122,7 +122,7 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
     sensors = map_.sensors
     map_ = jax.tree.map(np.asarray, map_)  # drops the sensors
     piece: Any = map_.pieces[0]
-    reason = why_not_piece(dataclasses.replace(piece, newton=False)) if bracket is None else None
+    reason = why_not_piece(piece) if bracket is None else None
     if reason is not None:
         raise InputError(f"this law cannot be written as formulas: {reason}")
     dim, params = map_.dim, np.asarray(piece.params)

@@ -400,11 +400,8 @@ class Options:
 OPTIONS = Options()
 
 
-def _refused(name: str) -> Any:
-    def refuse(*_: Any) -> Any:
-        raise InputError(f"this law has no Taylor series: {name} is not analytic; use --to c")
-
-    return refuse
+def _refused(_: Any) -> Any:
+    raise InputError("this law has no Taylor series: abs is not analytic; use --to stablehlo")
 
 
 def _whole_power(u: Any, exponent: float) -> Any:
@@ -441,8 +438,7 @@ _FUNCTIONS = {
     "tanh": lambda u: _FUNCTIONS["sinh"](u) / _FUNCTIONS["cosh"](u),
     "atan": _arctan,
     "pow": _whole_power,
-    "fabs": _refused("abs"),
-    "clip": _refused("a clipped number"),
+    "fabs": _refused,
 }
 
 
@@ -703,8 +699,12 @@ def _given(rows: _Rows) -> str:
                 f"for (int k = {degree + 1}; k < SIZE; k++)",
                 f"    T[{begin} + k] = 0.0;",
             ]
+    for rate in rows.rates:
+        if not (rows.unrolled or rows.varying(rate)):  # no operation writes its later terms
+            lines += ["for (int k = 1; k < SIZE; k++)", f"    T[{rows.begin(rate)} + k] = 0.0;"]
     moving = any(len(places) > 1 for places in graph.series) or graph.time is not None
-    unused = ([] if moving else ["t"]) + ([] if lines else ["T", "u"])
+    text = "".join(lines)
+    unused = [name for name in ("T", "u") if f"{name}[" not in text] + ([] if moving else ["t"])
     return _function("given(double *T, const double *u, double t)", lines, unused)
 
 
