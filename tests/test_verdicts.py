@@ -44,6 +44,16 @@ def test_correlated_residuals_beside_much_noise_are_a_law_that_lacks_something()
     assert fit.verdict.startswith("partly: ") or drawn.right(drawn.error(fit))
 
 
+@pytest.mark.slow
+def test_sums_of_terms_that_meet_in_a_likelier_law_are_no_rivals():
+    """Friction as strong in both joints: (v1 + v2)² + (v1 − v2)² is 2 v1² + 2 v2²."""
+    rng = np.random.default_rng([777, 8, 6])
+    drawn = record(SYSTEMS["double pendulum"], rng, (10.0, 40.0), (10.0, 40.0), NOISES[:-1], 6.0)
+    fit = gfnn.fit(drawn.recording)
+    assert drawn.kind == "linear"
+    assert (fit.verdict, fit.law.rivals) == ("identified", ())
+
+
 def test_terms_none_of_which_is_significant_leave_several_laws():
     t = np.arange(300) * 0.05
     noise = 1e-3 * np.random.default_rng(0).normal(size=len(t))
