@@ -14,8 +14,6 @@ states that are latent eliminated. The `Triangle` R of [A r] holds all that this
 - Without some of the rows one Gauss–Newton step leads from p to the fit of the others (Rad &
   Maleki, J. R. Stat. Soc. B 82, 2020).
 - A *null direction* is a change of p that moves no residual.
-- Rows of a motion that has yet to be recorded turn AᵀA into AᵀA + BᵀB (Fedorov, Theory of Optimal
-  Experiments, 1972).
 """
 
 from __future__ import annotations
@@ -37,14 +35,12 @@ class LinearisedOptions:
 
     rank: singular value of scaled columns, to the largest, of a combination that is not determined.
     null: the same of a combination that does nothing. part: of the largest entry of a null
-    direction, of coefficients that are part of it. known: information, to the largest, that is
-    taken for what a motion which tells nothing has.
+    direction, of coefficients that are part of it.
     """
 
     rank: float = 1e-10
     null: float = 1e-9
     part: float = 1e-3
-    known: float = 1e-9
 
 
 OPTIONS = LinearisedOptions()
@@ -190,18 +186,6 @@ class Linearised:
         residuals are those of ``other``, as by shorter steps of the integrator."""
         change = other.step(rank) - self.step(rank)
         return float(np.linalg.norm(self.columns @ change) / np.sqrt(self.variance))
-
-    def sharpened_by(self, other: Linearised, options: LinearisedOptions = OPTIONS) -> np.ndarray:
-        """Standard errors (n,) over those that the rows of ``other`` too would give."""
-        scale = np.linalg.norm(self.columns, axis=0)
-        scale = np.where(scale > 0, scale, 1.0)
-        one, two = (A.T @ A for A in (self.columns / scale, other.columns / scale))
-
-        def variances(information: np.ndarray) -> np.ndarray:
-            least = options.known * np.linalg.eigvalsh(information)[-1]
-            return np.diag(np.linalg.inv(information + least * np.eye(len(scale))))
-
-        return np.sqrt(variances(one) / variances(one + two))
 
     # Other columns.
 

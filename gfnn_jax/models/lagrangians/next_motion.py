@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs
-from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.structure import Key
 
@@ -27,7 +26,8 @@ class MotionOptions:
 
     further: of the largest deflections of the record. highest: radians, that an angle is let go.
     most: motions. largest: derivative of a residual, whose square is finite. turns: periods of a
-    square wave of an input, between its ends in the record, in a motion.
+    square wave of an input, between its ends in the record, in a motion. known: information, to the
+    largest, that is taken for what a record which tells nothing has.
     """
 
     further: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 4.0)
@@ -35,6 +35,7 @@ class MotionOptions:
     most: int = 3
     largest: float = 1e100
     turns: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+    known: float = 1e-9
 
 
 OPTIONS = MotionOptions()
@@ -75,7 +76,6 @@ def next_motions(fit: LawFit, steered: Sequence[int] = ()) -> list[Motion]:
     here = problem.linearised(structure, fit).among(own)
     if not here.columns.any():
         return []  # the law moves no residual, nor would it elsewhere
-    named = [structure.keys()[k] for k in own]
     middle, reach = _middle(fit)
     reach = max(OPTIONS.further) * reach
     begun = [(start, None) for start in _starts(fit)]
@@ -92,25 +92,29 @@ def next_motions(fit: LawFit, steered: Sequence[int] = ()) -> list[Motion]:
         there = acted.linearised(structure, fit, arcs).among(own)
         if not np.abs(there.columns).max() < OPTIONS.largest:
             continue  # along which a small change grows without bound
-        less = here.sharpened_by(there)
-        gains = {named[k]: float(less[k]) for k in np.argsort(-less)}
-        found.append((Motion(start, gains, drive=drive), there))
+        found.append((Motion(start, {}, drive=drive), there.columns))
     if not found:
         return []
     motions, each = zip(*found, strict=True)
-    return [motions[k] for k in np.argsort(_left(here, each))[: OPTIONS.most]]
+    left, gains = _after(here.columns, np.stack(each))
+    named = [structure.keys()[k] for k in own]
+    gained = [{named[j]: float(row[j]) for j in np.argsort(-row)} for row in gains]
+    return [motions[k]._replace(gains=gained[k]) for k in np.argsort(left)[: OPTIONS.most]]
 
 
-def _left(here: Linearised, each: Sequence[Linearised]) -> np.ndarray:
-    """The logarithms (S,) of errors of forecasts after each motion was recorded beside what is
-    here, of all these motions, in the mean."""
-    scale = np.linalg.norm(here.columns, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    known, slopes = here.columns / scale, np.stack([one.columns for one in each]) / scale
-    information = known.T @ known + slopes.swapaxes(1, 2) @ slopes
-    inverse = np.linalg.pinv(information, hermitian=True)
-    left = np.einsum("cij,sjk,cik->sc", slopes, inverse, slopes)
-    return np.mean(np.log(np.maximum(left, 1e-300)), axis=1)
+def _after(here: np.ndarray, each: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """After each motion, of derivatives ``each`` (S, m, n), was recorded beside what is ``here``
+    (l, n): the logarithms (S,) of errors of forecasts of all these motions, in the mean, and
+    by how much (S, n) standard errors of the coefficients are smaller."""
+    scale = np.linalg.norm(here, axis=0)
+    here, each = (columns / np.where(scale > 0, scale, 1.0) for columns in (here, each))
+    known = here.T @ here
+    least = OPTIONS.known * np.linalg.eigvalsh(known)[-1] * np.eye(len(known))
+    before = np.linalg.inv(known + least)
+    after = np.linalg.inv(known + least + each.swapaxes(1, 2) @ each)
+    left = np.einsum("cij,sjk,cik->sc", each, after, each)
+    gains = np.sqrt(np.diag(before) / np.diagonal(after, axis1=1, axis2=2))
+    return np.mean(np.log(np.maximum(left, 1e-300)), axis=1), gains
 
 
 def parting(fit: LawFit, others: Sequence[LawFit]) -> list[Motion]:
