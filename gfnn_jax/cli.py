@@ -188,8 +188,13 @@ def _run_file(arguments: argparse.Namespace) -> None:
     data, columns = _record_named(Path(arguments.scene))
     given = column_options(arguments)
     if not are_recordings(data, with_roles=names_roles(given)):
-        arguments.data = [data]
-        return _run_states(arguments)
+        options: dict[str, Any] = fit_options(arguments) | {"angles": _as_indices(given)}
+        with _output(arguments) as output:
+            from gfnn_jax.jobs.fit import fit
+
+            fitted = fit([data], output, dt=arguments.dt, command=arguments.typed, **options)
+        print_summary(fitted, arguments.out)
+        return _show(arguments)
     others = tuple(name for name in (*_OF_MAPS, "learn", "quick") if name != "scene")
     _refuse_given(arguments, others, "not for the law of a recording")
     columns |= given | ({"dt": arguments.dt} if arguments.dt is not None else {})
@@ -203,18 +208,6 @@ def _run_file(arguments: argparse.Namespace) -> None:
         finally:
             _show(arguments)
     print_record(ran, arguments.out)
-
-
-def _run_states(arguments: argparse.Namespace) -> None:
-    """The map of states q, p, into a folder with its report."""
-    options: dict[str, Any] = fit_options(arguments)
-    options["angles"] = _as_indices(column_options(arguments))
-    with _output(arguments) as output:
-        from gfnn_jax.jobs.fit import fit
-
-        ran = fit(arguments.data, output, dt=arguments.dt, command=arguments.typed, **options)
-    print_summary(ran, arguments.out)
-    _show(arguments)
 
 
 def _show(arguments: argparse.Namespace) -> None:
@@ -276,9 +269,10 @@ def _fit(arguments: argparse.Namespace) -> None:
     for path in arguments.data:
         _check_exists(path)
     columns = column_options(arguments)
-    if arguments.states or options.get("structure") == "poisson":
-        return _fit_states(arguments, columns, options)
-    if are_recordings(arguments.data, with_roles=names_roles(columns)):
+    if arguments.states:
+        columns["positions"], options["structure"] = arguments.states, "poisson"
+    of_states = options.get("structure") == "poisson"
+    if of_states or are_recordings(arguments.data, with_roles=names_roles(columns)):
         return _fit_recording(arguments, columns, options)
     if options.get("learn") == "lagrangian":
         raise InputError(
@@ -314,26 +308,11 @@ def _print_next(arguments: argparse.Namespace, options: str) -> None:
     print(f"next: gfnn predict {arguments.out} --initial {arguments.data[0]}{options}")
 
 
-def _fit_states(
-    arguments: argparse.Namespace, columns: dict[str, Any], options: dict[str, Any]
-) -> None:
-    """Learn the law of columns that are no positions, with their bracket."""
-    if arguments.states:
-        columns["positions"] = arguments.states
-    if arguments.dt is not None:
-        columns["dt"] = arguments.dt
-    with _output(arguments) as output:
-        from gfnn_jax.jobs.fit import fit_states
-
-        ran: Any = fit_states(arguments.data, output, columns=columns, **options)
-    _print_fitted(arguments, ran)
-
-
 def _fit_recording(
     arguments: argparse.Namespace, columns: dict[str, Any], options: dict[str, Any]
 ) -> None:
-    """Learn the law of a recording, or the map of its positions."""
-    is_law = options.get("learn") != "map"
+    """Learn the law of a recording, the map of its positions, or the bracket of states."""
+    is_law = options.get("learn") != "map" and options.get("structure") != "poisson"
     if arguments.dt is not None:
         columns["dt"] = arguments.dt
     if is_law:

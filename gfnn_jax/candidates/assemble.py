@@ -11,7 +11,6 @@ import jax
 import numpy as np
 
 from gfnn_jax.budget import COMPILE, Budget, within
-from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.dataset.rows import inputs_of
@@ -254,10 +253,8 @@ def validated(
 ) -> Candidate:
     """The candidate with its error measured by steps on the validation rows."""
     images, solved = refined_images(data, chart, family, params, data.validation)
-    images = np.where(solved[:, None], images, np.nan)
-    images = data.whole_image(images, data.validation)
-    error = measured_error(data, tolerance, to_user(data.coordinates, images))
-    return with_error(candidate, error)
+    images = data.users_image(images, solved, data.validation)
+    return with_error(candidate, measured_error(data, tolerance, images))
 
 
 def with_error(candidate: Candidate, error: OneStepError) -> Candidate:

@@ -18,7 +18,7 @@ from gfnn_jax.data.roles import OF_CALENDAR, ROLES, by_name, is_angle, is_rate_o
 from gfnn_jax.data.tables import Table
 from gfnn_jax.errors import InputError
 from gfnn_jax.signals.derivatives import derivatives, window
-from gfnn_jax.signals.noise import Noise, noise
+from gfnn_jax.signals.noise import noise
 
 # Units of time by what one is in the clock of the laws: seconds, or days and years as they are,
 # for an orbit in au and days has velocities in au/d.
@@ -114,7 +114,12 @@ def roles_of(
                 f"{source}: expected one role of each column, got {', '.join(twice)} twice"
             )
         return given, []
-    counts = [name for name in names if _is_count(runs, name)]
+    every = {name: [values[name] for _, values in runs.values()] for name in names}
+    counts = [
+        name
+        for name, columns in every.items()
+        if all(len(x) > _OPTIONS.rows and np.all(np.diff(x) == 1) for x in columns)
+    ]
     names = [name for name in names if name not in counts] or names
     roles, notes = by_name(names), [f"{name} counts the rows, and is put aside" for name in counts]
     rest = [name for name in names if not any(name in roles[role] for role in ROLES)]
@@ -146,12 +151,6 @@ def roles_of(
                 f"--{role}, in one order"
             )
     return roles, notes
-
-
-def _is_count(runs: Runs, name: str) -> bool:
-    """Return whether a column numbers the rows of each run."""
-    columns = [values[name] for _, values in runs.values()]
-    return all(len(x) > _OPTIONS.rows and np.all(np.diff(x) == 1) for x in columns)
 
 
 def _varied(runs: Runs, names: Sequence[str]) -> tuple[str, ...]:
@@ -187,7 +186,13 @@ def _by_data(
     if not moving:
         raise InputError(f"{source}: none of the columns {', '.join(names)} varies")
     sizes = noise(times, np.stack([columns[name] for name in moving]))
-    still = [n for n, s in zip(moving, sizes, strict=True) if _is_noise(columns[n], s)]
+    still = [  # a constant and noise alone
+        name
+        for name, size in zip(moving, sizes, strict=True)
+        if size.white
+        and size.sigma is not None
+        and float(np.nanstd(columns[name])) < _OPTIONS.alone * size.sigma
+    ]
     moving = [name for name in moving if name not in still] or moving
     notes = [f"{name} holds noise alone, and is put aside" for name in still]
     pairs = _pairs(times, {name: columns[name] for name in moving})
@@ -221,12 +226,6 @@ def _by_data(
         "velocities": tuple(v for _, v in pairs),
         "inputs": (*inputs, *switches),
     }, notes
-
-
-def _is_noise(column: np.ndarray, size: Noise) -> bool:
-    """Return whether a column holds a constant and noise alone."""
-    spread = float(np.nanstd(column))
-    return size.white and size.sigma is not None and spread < _OPTIONS.alone * size.sigma
 
 
 def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int) -> Undecided:

@@ -153,7 +153,8 @@ class _StatesInText:
             if not self.each_row:
                 self._check_constant(values, sequence, begin)
             begins = np.append(last[0], sequence[:-1]) != sequence
-            place = _places(begins, count)
+            row = np.arange(length)  # along its sequence; the first row may go on with one
+            place = row - np.maximum.accumulate(np.where(begins, row, -count))
             last, count = (sequence[-1], time[-1]), int(place[-1]) + 1
             passed += length
             yield Block(
@@ -202,13 +203,6 @@ def _first_dt(states: _StatesInText, table: dict[str, np.ndarray]) -> float | No
     states._check_times_rise(*before, 0)
     # The median ignores a gap; where every step agrees with it, the mean is more accurate.
     return float(np.mean(steps)) if _even(*before, float(np.median(steps))) else np.nan
-
-
-def _places(begins: np.ndarray, first: int) -> np.ndarray:
-    """The number (n,) of each row along its sequence, which begins at some of the rows; the first
-    row has the number ``first`` if its sequence has begun before it."""
-    row = np.arange(len(begins))
-    return row - np.maximum.accumulate(np.where(begins, row, -first))
 
 
 def _even(time: np.ndarray, sequence: np.ndarray, dt: float) -> bool:

@@ -100,19 +100,12 @@ def _states(traits: Traits) -> Iterator[Fault]:
 # Points that a rod or a string holds.
 
 
-@dataclasses.dataclass(frozen=True)
-class _Circle:
-    """A circle of a radius about a centre (2,), and the angle (n,) of each point from straight
-    down."""
-
-    centre: np.ndarray
-    radius: float
-    angle: np.ndarray
-
-
-def _circle(x: np.ndarray, y: np.ndarray, sigma: float, fixed: bool) -> _Circle | None:
-    """The circle that points (n,) lie on to their noise, about the origin where ``fixed``; None
-    where they do not, where they lie on a line, and where an orbit may have led them."""
+def _circle(
+    x: np.ndarray, y: np.ndarray, sigma: float, fixed: bool
+) -> tuple[np.ndarray, float] | None:
+    """Centre (2,) and radius of the circle that points (n,) lie on to their noise, about the origin
+    where ``fixed``; None where they do not, where they lie on a line, and where an orbit may have
+    led them."""
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
     if len(x) < 10:
@@ -134,11 +127,10 @@ def _circle(x: np.ndarray, y: np.ndarray, sigma: float, fixed: bool) -> _Circle 
     centre, radius = (np.zeros(2) if fixed else c[:2]), float(abs(c[-1]))
     if rms > _OPTIONS.round * sigma or line < _OPTIONS.bent * max(rms, sigma):
         return None
-    angle = np.unwrap(np.arctan2(x - centre[0], centre[1] - y))
-    ways = np.diff(angle)
+    ways = np.diff(np.unwrap(np.arctan2(x - centre[0], centre[1] - y)))
     if abs(ways.mean()) > 0 and ways.std() < _OPTIONS.even * abs(ways.mean()):
         return None
-    return _Circle(centre, radius, angle)
+    return centre, radius
 
 
 def _circles(traits: Traits) -> Iterator[Fault]:
@@ -166,13 +158,13 @@ def _circles(traits: Traits) -> Iterator[Fault]:
             )
         if found is None:
             return
+        centre, guess[f"l{mark}"] = found
         if before is None:
-            guess |= {"x0": float(found.centre[0]), "y0": float(found.centre[1])}
-        guess[f"l{mark}"] = found.radius
+            guess |= {"x0": float(centre[0]), "y0": float(centre[1])}
         shows[pair[0]] = f"{base[0]} + l{mark}*sin({angle})"
         shows[pair[1]] = f"{base[1]} - l{mark}*cos({angle})"
         about = ", ".join(before) if before else f"({guess['x0']:.4g}, {guess['y0']:.4g})"
-        told.append(f"{', '.join(pair)} lie on a circle of {found.radius:.4g} about {about}")
+        told.append(f"{', '.join(pair)} lie on a circle of {found[1]:.4g} about {about}")
         before = pair
     guess = {name: float(f"{value:.4g}") for name, value in guess.items()}
     options = {"coordinates": tuple(angles), "observe": shows, "guess": guess}
@@ -244,18 +236,21 @@ def _left(known: Accelerations, now: list[bool], k: int, angle: bool, factor: fl
 # The begin and the end of a free motion.
 
 
+def _undriven(traits: Traits) -> Iterator[tuple[np.ndarray, float]]:
+    """The positions (n,) of a single run without inputs, as far as they are complete, and how far
+    each goes at rest."""
+    recording = traits.recording
+    for name in () if len(recording.runs) > 1 or recording.inputs else recording.positions:
+        x, sigma = traits.columns[name], traits.noise[name].sigma
+        if name in recording.explained or not sigma or not np.isfinite(x).all():
+            return
+        yield x, max(sigma, traits.resolution[name] or 0.0)
+
+
 def _let_go(traits: Traits) -> float | None:
     """The time at which a motion that began at rest is free: that of its largest deflection; None
     where it did not begin so."""
-    recording = traits.recording
-    if len(recording.runs) > 1 or recording.inputs or not recording.positions:
-        return None
-    times = traits.times[0]
-    for name in recording.positions:
-        x, sigma = traits.columns[name], traits.noise[name].sigma
-        if name in recording.explained or not sigma or not np.isfinite(x).all():
-            return None
-        sigma = max(sigma, traits.resolution[name] or 0.0)
+    for x, sigma in _undriven(traits):
         off = x - np.median(x[: _OPTIONS.still])
         largest = int(np.argmax(np.abs(off)))
         away = np.abs(off[: largest + 1]) > _OPTIONS.at_rest * sigma
@@ -272,21 +267,14 @@ def _let_go(traits: Traits) -> float | None:
             and np.sum(np.diff(wide) != 0) < _OPTIONS.most_ways
         )
         if good:
-            return float(times[largest])
+            return float(traits.times[0][largest])
     return None
 
 
 def _caught(traits: Traits) -> float | None:
     """The time of the last free swing of a motion that ends at rest at once; None where it does not
     end so."""
-    recording = traits.recording
-    if len(recording.runs) > 1 or recording.inputs or not recording.positions:
-        return None
-    for name in recording.positions:
-        x, sigma = traits.columns[name], traits.noise[name].sigma
-        if name in recording.explained or not sigma or not np.isfinite(x).all():
-            return None
-        sigma = max(sigma, traits.resolution[name] or 0.0)
+    for x, sigma in _undriven(traits):
         off = x - np.median(x[-_OPTIONS.still :])
         away = np.flatnonzero(np.abs(off) > _OPTIONS.at_rest * sigma)
         if not len(away) or len(x) - away[-1] <= _OPTIONS.still:

@@ -17,7 +17,7 @@ from rich.text import Text
 from gfnn_jax.data.faults import WRONG, Fault
 from gfnn_jax.data.proposals import findings, mistakes
 from gfnn_jax.data.roles import ROLES
-from gfnn_jax.data.traits import Traits, WrongValues, of_rows, traits
+from gfnn_jax.data.traits import Traits, of_rows, traits
 from gfnn_jax.errors import InputError, said
 from gfnn_jax.signals import energy
 from gfnn_jax.signals.steps import dominant_frequencies, gaps
@@ -211,6 +211,8 @@ def summarise(
     period, loss = _motion(known, doubted)
     typed = _options(found, options or {})
     files = " ".join(shlex.quote(path) for path in recording.source.split(", "))
+    windows = [known.noise[name].size for name in recording.positions]
+    coarsest = known.step * max(min(windows) // _SHOWN.window, 1) if windows else None
     return RecordingSummary(
         recording.source,
         counts,
@@ -218,7 +220,7 @@ def summarise(
         tuple((recording.runs[r], a, b) for r, a, b in holes),
         tuple(_column(known, name, doubted) for name in known.columns),
         period,
-        _coarsest(known),
+        coarsest,
         loss,
         bool(recording.inputs),
         found,
@@ -270,12 +272,6 @@ def _motion(known: Traits, doubted: frozenset[str]) -> tuple[float | None, energ
     return period, energy.loss(fits, angles, inputs, stretch)
 
 
-def _coarsest(known: Traits) -> float | None:
-    """The step, in s, at which a window that the noise allows still has enough samples."""
-    sizes = [known.noise[name].size for name in known.recording.positions]
-    return known.step * max(min(sizes) // _SHOWN.window, 1) if sizes else None
-
-
 def _column(known: Traits, name: str, doubted: frozenset[str]) -> Column:
     recording, values = known.recording, known.columns[name]
     factor = recording.factors[name]
@@ -288,7 +284,10 @@ def _column(known: Traits, name: str, doubted: frozenset[str]) -> Column:
     sigma = given if given is not None else noise.sigma if noise else None
     moves = have and np.nanmin(values) < np.nanmax(values)
     sigma = sigma if moves else None
-    shown = values if name in doubted else _turning(known, name)
+    turns = name in {*recording.angles} - doubted and np.ptp(known.range(name)) > 2 * np.pi
+    shown = np.sin(values) if turns else values  # whose spectrum tells frequencies
+    wrong = known.wrong.get(name, ())
+    stuck = [sum(len(w.rows) for w in wrong if (w.off is None) == held) for held in (False, True)]
     return Column(
         name,
         role,
@@ -304,21 +303,8 @@ def _column(known: Traits, name: str, doubted: frozenset[str]) -> Column:
         None if relation is None else relation.lag,
         tuple(dominant_frequencies(known.times, shown)) if noise and moves else (),
         int(np.sum(~np.isfinite(values))),
-        *_counts(known.wrong.get(name, ())),
+        *stuck,
     )
-
-
-def _counts(wrong: Sequence[WrongValues]) -> tuple[int, int]:
-    """(samples far from those around them, samples of a sensor that was stuck)."""
-    sizes = [[len(w.rows) for w in wrong if (w.off is None) == held] for held in (False, True)]
-    return sum(sizes[0]), sum(sizes[1])
-
-
-def _turning(known: Traits, name: str) -> np.ndarray:
-    """A column whose spectrum tells frequencies: of an angle that turns round its sine."""
-    values = known.columns[name]
-    turns = name in known.recording.angles and np.nanmax(values) - np.nanmin(values) > 2 * np.pi
-    return np.sin(values) if turns else values
 
 
 def _derivative_of(known: Traits, name: str):
@@ -344,10 +330,6 @@ def _options(found: tuple[Fault, ...], given: Mapping[str, Any]) -> dict[str, An
     return typed
 
 
-def _short(value: Any) -> str:
-    return value if isinstance(value, str) else f"{value:g}"
-
-
 def _as_code(value: Any) -> str:
     return repr(list(value) if isinstance(value, tuple) else value)
 
@@ -362,7 +344,8 @@ def as_typed(options: Mapping[str, Any]) -> str:
             parts += [f" --{name} {shlex.quote(f'{c} = {f}')}" for c, f in value.items()]
             continue
         if isinstance(value, Mapping):
-            value = ",".join(f"{name}={_short(number)}" for name, number in value.items())
+            number = {n: x if isinstance(x, str) else f"{x:g}" for n, x in value.items()}
+            value = ",".join(f"{name}={text}" for name, text in number.items())
         elif isinstance(value, (tuple, list)):
             value = ",".join(map(str, value)) or "none"
         parts.append(f" --{words.get(option, option)} {shlex.quote(str(value))}")

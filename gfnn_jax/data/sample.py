@@ -50,7 +50,9 @@ def read_sample(
     found, checksum, count, extremes = None, np.zeros(1, np.uint64), 0, [np.inf, 0.0]
     for pairs in iterate_pairs(paths, BLOCK_ROWS, dt=dt, share=group.share):
         new = _table(pairs, seed)
-        checksum, count = checksum + _content(new).sum(), count + len(pairs)
+        args = [column for name, column in new.items() if name.startswith(_ARG)]
+        numbers = [*new["pairs"].reshape(len(pairs), -1).T, new["dt"], *args]
+        checksum, count = checksum + _mixed(0, numbers).sum(), count + len(pairs)
         extremes = [min(extremes[0], new["dt"].min()), max(extremes[1], new["dt"].max())]
         found = _smallest(_both(found, new), num_pairs)
     of_process = {"count": [count], "hash": checksum, "low": [extremes[0]], "high": [extremes[1]]}
@@ -103,13 +105,6 @@ def _table(pairs: Any, seed: int) -> dict[str, np.ndarray]:
     key = _mixed(seed, [pairs.run, pairs.place // ARC])
     own = {"run": pairs.run, "place": pairs.place, "key": key}
     return {"pairs": rows, "dt": each, **own, **args}
-
-
-def _content(table: dict[str, np.ndarray]) -> np.ndarray:
-    """A hash (N,) of all numbers of each pair."""
-    args = [column for name, column in table.items() if name.startswith(_ARG)]
-    rows = table["pairs"]
-    return _mixed(0, [*rows.reshape(len(rows), -1).T, table["dt"], *args])
 
 
 def _mixed(seed: int, columns) -> np.ndarray:

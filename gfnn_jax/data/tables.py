@@ -208,7 +208,10 @@ def runs_of(
                 name = str(len(found))
             nothing = np.full(len(rows), np.nan)
             values = {n: table.columns[n][rows] if n in table.columns else nothing for n in names}
-            _check_finite(table, rows, values)
+            for n, column in values.items():
+                if np.isinf(column).any():
+                    row = int(rows[np.argmax(np.isinf(column))])
+                    raise InputError(f"{table.source}: {table.locate(row)}, {n}: infinite")
             found[name] = (times, values)
     return found
 
@@ -309,10 +312,3 @@ def _check_times(table: Table, name: str, rows: np.ndarray, times: np.ndarray) -
             f"{table.source}: {table.locate(row)}: {name} = {times[at + 1]:.9g} {what} "
             f"{times[at]:.9g} before it ({len(falls)} such rows): {remedy}"
         )
-
-
-def _check_finite(table: Table, rows: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
-    for name, column in values.items():
-        if np.isinf(column).any():
-            row = int(rows[np.argmax(np.isinf(column))])
-            raise InputError(f"{table.source}: {table.locate(row)}, {name}: infinite")

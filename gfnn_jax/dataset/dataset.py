@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.coordinates import CARTESIAN, Coordinates, lift, lift_sites, to_inner
+from gfnn_jax.coordinates import CARTESIAN, Coordinates, lift, lift_sites, to_inner, to_user
 from gfnn_jax.dataset.split import Split, split_rows
 from gfnn_jax.dataset.structures import Structure
 from gfnn_jax.errors import FitError
@@ -266,6 +266,11 @@ class Dataset:
         for piece in self.after:
             y = piece.image(y, of_lanes(self.args, rows))
         return y
+
+    def users_image(self, y: np.ndarray, known: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """The same in the user's coordinates, NaN where an image is not ``known`` (n,)."""
+        images = self.whole_image(np.where(known[:, None], y, np.nan), rows)
+        return to_user(self.coordinates, images)
 
     def _measured(self) -> Dataset:
         """Measure sizes and domain of these rows."""

@@ -59,6 +59,8 @@ TITLES = {name: method.title for name, method in METHODS.items()} | {
     OURS: "GFNN (ours)",
 }
 _NUM_DEFECTS = 200
+_MODEL = ("learns", "family", "label", "chart", "num_parameters")
+_NO_MAP = {"chart_determinant_min": None, "newton_iterations_max": None}
 
 
 def learn_and_roll(
@@ -75,35 +77,40 @@ def learn_and_roll(
     if method == OURS:
         return _ours(data, headed)
     budget = Budget(data.key(list(TITLES).index(method) + 100), cap, headed.status)
-    if method == PAPER_GFNN:
-        return _papers(data, budget)
-    return _baseline(method, data, budget)
-
-
-def _baseline(method: str, data: SharedData, budget: Budget) -> tuple[dict[str, Any], Rollouts]:
-    chosen = METHODS[method]
-    sequences = data.sequences(chosen.length)
-    learned = chosen.learn(sequences, budget)
-    budget.on_progress("rollouts")
-    fresh = data.fresh
-    defects = symplecticity_defect(
-        np.asarray(_jacobians(learned.step, fresh.z0[:_NUM_DEFECTS])),
-        sizes(fresh.z0),
-    )
+    chosen, z = METHODS.get(method), data.fresh.z0
+    length = 2 if chosen is None else chosen.length
+    sequences = data.sequences(length)
+    if chosen is None:  # the paper's own
+        learned = paper_gfnn(sequences, budget)
+        family, map_ = learned.family, learned.map
+        model = "map", "mlp", family.label, "type2", family.num_parameters
+        images, about, roll = map_.step(z)[0], _map_part(map_, data), partial(map_rollouts, map_)
+    else:
+        learned = chosen.learn(sequences, budget)
+        budget.on_progress("rollouts")
+        model = "map", method, learned.label, None, learned.num_parameters
+        jacobians = np.asarray(_jacobians(learned.step, z[:_NUM_DEFECTS]))
+        defect = float(symplecticity_defect(jacobians, sizes(z)).max())
+        about = {**_NO_MAP, "symplecticity_defect": defect}
+        images, roll = _steps(learned.step, z), partial(step_rollouts, learned.step)
+    training = learned.training
     part = {
-        "model": _model("map", method, learned.label, None, learned.num_parameters),
-        "data": {"num_pairs": sequences.num_pairs, "sequence_length": chosen.length},
-        "fit": {
-            **_training(learned.training, budget.cap),
-            "validation_rms": _rms(data, _steps(learned.step, fresh.z0)),
+        "model": dict(zip(_MODEL, model, strict=True)),
+        "data": {"num_pairs": sequences.num_pairs, "sequence_length": length},
+        "fit": {  # its errors are those of the method's own loss
+            "seconds": training.seconds,
+            "compile_seconds": training.compile_seconds,
+            "train_rms": training.train_rms,
+            "loss_rms": training.validation_rms,
+            "cap": budget.cap,
+            "operations": training.operations * training.epochs,
+            "capped": "cap" in training.stopped_because,
+            "stopped_because": training.stopped_because,
+            "validation_rms": _rms(data, images),
         },
-        "map": {
-            "symplecticity_defect": float(defects.max()),
-            "chart_determinant_min": None,
-            "newton_iterations_max": None,
-        },
+        "map": about,
     }
-    return part, step_rollouts(learned.step, data.z0, data.num_steps)
+    return part, roll(data.z0, data.num_steps)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -116,49 +123,6 @@ def _jacobians(step, z):
 def _steps(step, z):
     """Images (B, 2d) of z (B, 2d) under a plain step."""
     return jax.vmap(step)(z)
-
-
-def _model(
-    learns: str, family: str, label: str, chart: str | None, num_parameters: int
-) -> dict[str, Any]:
-    """Report's part on a model."""
-    return {
-        "learns": learns,
-        "family": family,
-        "label": label,
-        "chart": chart,
-        "num_parameters": num_parameters,
-    }
-
-
-def _training(training: Any, cap: float | None) -> dict[str, Any]:
-    """Report's part on an Adam training. Its errors are those of the method's own loss."""
-    return {
-        "seconds": training.seconds,
-        "compile_seconds": training.compile_seconds,
-        "train_rms": training.train_rms,
-        "loss_rms": training.validation_rms,
-        "cap": cap,
-        "operations": training.operations * training.epochs,
-        "capped": "cap" in training.stopped_because,
-        "stopped_because": training.stopped_because,
-    }
-
-
-def _papers(data: SharedData, budget: Budget) -> tuple[dict[str, Any], Rollouts]:
-    pairs = data.sequences(2)
-    learned = paper_gfnn(pairs, budget)
-    family = learned.family
-    part = {
-        "model": _model("map", "mlp", family.label, "type2", family.num_parameters),
-        "data": {"num_pairs": pairs.num_pairs, "sequence_length": 2},
-        "fit": {
-            **_training(learned.training, budget.cap),
-            "validation_rms": _rms(data, learned.map.step(data.fresh.z0)[0]),
-        },
-        "map": _map_part(learned.map, data),
-    }
-    return part, map_rollouts(learned.map, data.z0, data.num_steps)
 
 
 def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollouts]:
@@ -176,9 +140,7 @@ def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollout
         )
     chosen = fit.chosen
     part = {
-        "model": _model(
-            chosen.learns, chosen.family, chosen.label, chosen.chart, chosen.num_parameters
-        ),
+        "model": {name: getattr(chosen, name) for name in _MODEL},
         "data": {"num_pairs": fit.num_pairs, "sequence_length": 2},
         "fit": {
             "seconds": chosen.fit_seconds,

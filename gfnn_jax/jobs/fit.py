@@ -12,7 +12,7 @@ import numpy as np
 
 from gfnn_jax.budget import READING
 from gfnn_jax.data.files import iterate_pairs, read_trajectories, summary
-from gfnn_jax.data.recording import Recording, parameters_of, read
+from gfnn_jax.data.recording import parameters_of, read
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.errors import FitError, InputError, OutOfTime, WorkError
@@ -44,7 +44,7 @@ from gfnn_jax.learn.refit import (
 )
 from gfnn_jax.learn.request import FEWEST
 from gfnn_jax.maps.sharded import local_devices
-from gfnn_jax.phase_space import Pairs
+from gfnn_jax.phase_space import POISSON, Pairs
 from gfnn_jax.processes import Group, Share
 from gfnn_jax.storage.outputs import atomic_folder
 
@@ -189,46 +189,6 @@ def _range(values) -> list[float]:
     return [float(np.min(values)), float(np.max(values))]
 
 
-def fit_states(
-    data: Sequence[Path], output: Output, *, columns: dict[str, Any], **options: Any
-) -> Ran:
-    """Learn the law and the bracket of states in files, and write them with their report into the
-    model folder. columns: keywords of `gfnn_jax.read`, the states as its positions. options:
-    `FitOptions`. Raises InputError for arrays whose columns have no names."""
-    progress = output.progress
-    for path in () if columns.get("positions") or columns.get("columns") else data:
-        if Path(path).suffix in (".npy", ".npz"):
-            raise InputError(
-                f"{path}: expected columns with names, --states A,B. Of arrays, in Python: "
-                'gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))'
-            )
-    with refusals():
-        asked = FitOptions(**{**options, "structure": "poisson"})
-    recording = read(list(data), **columns)
-    names = list(recording.positions)
-    with refusals(), failures_of_arithmetic():
-        try:
-            fitted = learn_fit(recording, options=asked, on_progress=progress.line)
-        except FitError as error:
-            typed = ["gfnn", "fit", *data, "--positions", ",".join(names), "--out", output.out]
-            for name in ("time", "dt"):
-                typed += [f"--{name}", columns[name]] if name in columns else []
-            message = str(error).replace("gfnn.fit(recording)", shlex.join(map(str, typed)))
-            raise FitError(message, error.verdict) from error
-    result = fitted.report(seed=asked.seed, data={"source": recording.source, "states": names})
-    own = parameters_of(recording)
-    job = {**_job(recording, columns, asked), "states": names, "parameters": own}
-    with atomic_folder(output.out) as folder:
-        write(folder, folder, fitted, result, job)
-    return Ran(fitted, output.out, result)
-
-
-def _job(recording: Recording, columns: dict[str, Any], asked: FitOptions) -> dict[str, Any]:
-    """Record of a job by which another recording is read as this one was."""
-    job = {"command": "fit", "data": recording.source, **asked.deciding, **units_of(recording)}
-    return job | {"reading": {n: columns[n] for n in ("columns", "dt", "time") if n in columns}}
-
-
 def fit_recording(
     data: Sequence[Path],
     output: Output,
@@ -238,21 +198,34 @@ def fit_recording(
     keep: bool = False,
     **options: Any,
 ) -> Ran:
-    """Learn the law of recordings (files), or with ``learn="map"`` the map of their positions, and
-    write it with its report into the model folder.
+    """Learn the law of recordings (files), with ``learn="map"`` the map of their positions, or with
+    ``structure="poisson"`` the law and the bracket of states, and write it with its report into the
+    model folder.
 
-    columns: keywords of `gfnn_jax.read`. despite: kinds of mistakes that the files may show.
+    columns: keywords of `gfnn_jax.read`, states as its positions. despite: kinds of mistakes that
+    the files may show.
     keep: whether a law that misses most of the motion is written before the error is raised.
-    options: `FitOptions`. Raises InputError where `gfnn look` finds a mistake; WorkError where no
-    law follows the recording, or the arithmetic fails.
+    options: `FitOptions`. Raises InputError where `gfnn look` finds a mistake, and for arrays of
+    states whose columns have no names; WorkError where no law follows the recording, or the
+    arithmetic fails.
     """
-    progress = output.progress
+    progress, of_states = output.progress, options.get("structure") == POISSON
+    named = not of_states or columns.get("positions") or columns.get("columns")
+    for path in () if named else data:
+        if Path(path).suffix in (".npy", ".npz"):
+            raise InputError(
+                f"{path}: expected columns with names, --states A,B. Of arrays, in Python: "
+                'gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))'
+            )
     with refusals():
         asked = FitOptions(**options)
     recording = read(list(data), **columns)
-    refuse_mistakes(recording, despite)
-    job = _job(recording, columns, asked)
-    is_law = asked.learn != "map"
+    if not of_states:
+        refuse_mistakes(recording, despite)
+    # By this record another recording is read as this one was.
+    job = {"command": "fit", "data": recording.source, **asked.deciding, **units_of(recording)}
+    job["reading"] = {n: columns[n] for n in ("columns", "dt", "time") if n in columns}
+    is_law, names = asked.learn != "map" and not of_states, list(recording.positions)
     refused: FitError | None = None
     progress.line(f"learning from {recording.source}")
     with refusals(), failures_of_arithmetic():
@@ -260,10 +233,16 @@ def fit_recording(
             fitted = learn_fit(
                 recording,
                 options=asked,
-                on_progress=progress.line if is_law else progress.status,
+                on_progress=progress.status if asked.learn == "map" else progress.line,
                 on_candidate=lambda candidate: progress.line(line(candidate)),
             )
         except FitError as error:
+            if of_states:
+                typed = ["gfnn", "fit", *data, "--positions", ",".join(names), "--out", output.out]
+                for name in ("time", "dt"):
+                    typed += [f"--{name}", columns[name]] if name in columns else []
+                message = str(error).replace("gfnn.fit(recording)", shlex.join(map(str, typed)))
+                raise FitError(message, error.verdict) from error
             if not keep or error.fit is None:
                 raise
             fitted, refused = error.fit, error
@@ -271,10 +250,10 @@ def fit_recording(
         result = fitted.report(source=recording.source, seed=asked.seed)
     else:
         progress.status("the report: the derivative of a step")
-        fitted, positions = fitted.settled(), list(recording.positions)
-        about = {"source": recording.source, "positions": positions}
-        result = fitted.report(seed=asked.seed, data=about)
-        job |= {"positions": positions, "angles": list(recording.angles)}
+        fitted, own = fitted.settled(), {"states" if of_states else "positions": names}
+        result = fitted.report(seed=asked.seed, data={"source": recording.source, **own})
+        job |= {**own, "angles": list(recording.angles)}
+        job |= {"parameters": parameters_of(recording)} if of_states else {}
     with atomic_folder(output.out) as folder:
         write(folder, folder, fitted, result, job)
         if is_law:

@@ -15,10 +15,9 @@ from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.evaluate import report
 from gfnn_jax.evaluate.forecasts import Forecasts, end_of_part, forecasts_of
 from gfnn_jax.evaluate.report import About
-from gfnn_jax.jobs.fit import fit_recording, fit_states
+from gfnn_jax.jobs.fit import fit_recording
 from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.output import Ran as Learned
-from gfnn_jax.phase_space import POISSON
 from gfnn_jax.storage.outputs import atomic_folder
 
 FIGURE = "forecasts.png"
@@ -55,16 +54,9 @@ def run_record(
     about = About(command, tuple(taken))
     with atomic_folder(output.out) as folder:
         try:
+            model = Output(folder / "model", progress=output.progress)
             asked |= options
-            of_states = asked.get("structure") == POISSON
-            if of_states:
-                asked = {n: value for n, value in asked.items() if n not in ("mass", "despite")}
-            learned = (fit_states if of_states else fit_recording)(
-                [data],
-                Output(folder / "model", progress=output.progress),
-                columns={**columns, "stop": stop},
-                **asked,
-            )
+            learned = fit_recording([data], model, columns={**columns, "stop": stop}, **asked)
         except (InputError, WorkError) as error:
             from gfnn_jax.evaluate.page import write_refusal
 

@@ -123,10 +123,11 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     """
     budget, on_progress, bound = request.budget, request.watch.on_progress, request.tolerance.bound
     compile_seconds, tried = 0.0, []
-    first = ranking[0]
-    larger = (
-        _larger(first, budget, on_progress) if first.candidate.validation_bound <= bound else ()
-    )
+    first, larger = ranking[0], iter(())
+    if first.candidate.validation_bound <= bound:
+        sweep, sizes = first.sweep, first.sweep.sizes
+        more = sizes[sizes.index(first.size) + 1 :]
+        larger = _validated(sweep, more, budget, on_progress)
     smaller = _smaller(tried, budget, on_progress)
     for entry in itertools.chain([first], larger, ranking[1:], smaller):
         step = f"{entry.candidate.chart} {entry.candidate.label}"
@@ -144,12 +145,6 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
         tried, key=lambda t: (t[0].validation_bound > bound, t[0].validation_bound, t[1])
     )
     return Chosen(candidate, entry.sweep.data, compile_seconds, entry)
-
-
-def _larger(entry: Entry, budget: Budget, on_progress) -> Iterator[Entry]:
-    """The larger sizes of an entry's sweep, validated by steps, as far as the budget goes."""
-    sizes = entry.sweep.sizes
-    return _validated(entry.sweep, sizes[sizes.index(entry.size) + 1 :], budget, on_progress)
 
 
 def _smaller(
@@ -217,11 +212,10 @@ def stated(
     """The choice with its error on the test rows, or by cross-validation over runs where
     these are of few runs, or over blocks of time where all pairs are."""
     data = found.data
-    if count_of_runs(data, data.test) >= FEWEST_RUNS_TESTED:
-        return _stated(chosen, found, "test", data.test, _images_of(chosen, found, data.test))
     everyone = np.concatenate([data.training, data.validation, data.test])
     by_runs = count_of_runs(data, everyone) >= FEWEST_RUNS
-    if by_runs or not len(data.test):
+    enough = count_of_runs(data, data.test) >= FEWEST_RUNS_TESTED
+    if not enough and (by_runs or not len(data.test)):
         cluster = data.run if by_runs else data.split.stretch
         known = _by_folds(chosen, found, everyone, cluster, budget, on_progress)
         # A fit without some runs may have no image of them; that says nothing of the whole one.
@@ -334,9 +328,7 @@ def _images_of(chosen: Chosen, found: Searched, rows: np.ndarray) -> np.ndarray:
     sweep = None if entry is None else entry.sweep
     own = sweep is not None and sweep.data.pairs is found.data.pairs
     if candidate.microseconds_per_step is None and entry is not None and own:
-        images, solved = entry.sweep.images(entry.size, rows)
-        images = data.whole_image(np.where(solved[:, None], images, np.nan), rows)
-        return to_user(data.coordinates, images)
+        return data.users_image(*entry.sweep.images(entry.size, rows), rows)
     steps = stepped(candidate.map, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
     return np.where(steps.failed[:, None], np.nan, steps.images)
 
@@ -408,7 +400,7 @@ def with_test_rows(chosen: Chosen, found: Searched, budget: Budget) -> Chosen:
     again = within(last, lambda: sweep.with_test_rows(size))
     if again is None:  # told with what else was left out
         return chosen
-    before = sweep.solve(size, Budget(), lambda message: None)[0]
+    before = sweep.solve(size)[0]
     if not again.validation_rms <= before.validation_rms:
         return chosen
     params = jax.tree.map(np.asarray, size.family.unflatten(again.coefficients))

@@ -10,7 +10,6 @@ import numpy as np
 from gfnn_jax.budget import SOLVE, Budget, within
 from gfnn_jax.candidates.assemble import Candidate, stepped
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
-from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.residuals import (
     differs_between_sequences,
@@ -20,6 +19,7 @@ from gfnn_jax.diagnosis.residuals import (
     state_noise,
     volume_change,
 )
+from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.fitting.significance import CERTAIN
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.request import Request, not_radians, proposed, wrapped
@@ -220,12 +220,22 @@ def _residuals_of_sample(
     searched: Searched,
     most: int = OPTIONS.residual_pairs,
 ) -> _Sample:
-    """The residuals of the entry's map, or of the candidate's where there is none."""
+    """The residuals of the steps that were solved: of the entry's map in inner coordinates, or of
+    the candidate's, where there is none, in the user's."""
     data = searched.data if entry is None else entry.sweep.data
     rows = np.sort(data.training)[:most]
-    y0, image, residual, solved = _residuals(candidate, entry, data, rows)
+    if entry is not None:
+        y0, scale = data.y0[rows], data.scale
+        image, solved = entry.sweep.images(entry.size, rows)
+        residual = data.y1[rows] - image
+    else:
+        pairs, scale = data.pairs.take(rows), data.spread
+        y0 = np.asarray(pairs.z0)
+        steps = stepped(candidate.map, y0, pairs.dt, pairs.args, timed=False)
+        image = steps.images
+        residual = nearest_image(np.asarray(pairs.z1) - image, data.user_angles)
+        solved = ~steps.failed & np.isfinite(residual).all(axis=1)
     rows, y0, image, residual = rows[solved], y0[solved], image[solved], residual[solved]
-    scale = data.spread if entry is None else data.scale
     place = np.asarray(data.pairs.place)[rows]
     return _Sample(rows, y0, image, residual, scale, data.run[rows], place)
 
@@ -308,10 +318,8 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     known_noise = data.noise_of_channels
     if known_noise is not None:
         return _beside_known(noise, known_noise)
-    own, sizes_of_noise = (
-        "",
-        ", ".join(f"{s:.1e} ({n})" for n, s in zip(_names(len(noise)), noise, strict=True)),
-    )
+    own, names = "", coordinate_names(data.dim)
+    sizes_of_noise = ", ".join(f"{s:.1e} ({n})" for n, s in zip(names, noise, strict=True))
     if candidate.learns == "map" and entry is not None and entry.sweep.linear:
         part = entry.sweep.error_by_noise(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))
         if part > OPTIONS.own_error:
@@ -340,17 +348,13 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     return _LeftOver(noise, [message], reason)
 
 
-def _names(width: int) -> list[str]:
-    return [f"{letter}{i + 1}" for letter in "qp" for i in range(width // 2)]
-
-
 def _beside_known(found: np.ndarray, known: np.ndarray) -> _LeftOver:
     """Noise (2d,) that was given, beside what the residuals suggest (2d,)."""
     ratio = float(np.max(found / known))
     if ratio <= OPTIONS.known:
         reason = "the residuals are the noise that was given"
         return _LeftOver(known, [f"larger models are no more accurate: {reason}"], reason)
-    name = _names(len(found))[int(np.argmax(found / known))]
+    name = coordinate_names(len(found) // 2)[int(np.argmax(found / known))]
     message = (
         f"larger models are no more accurate, and the residuals are up to {ratio:.2g} times the "
         f"noise that was given ({name}): std is too small, or the terms tried cannot represent "
@@ -373,23 +377,6 @@ def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOv
         "(give known ones: --terms)"
     )
     return _LeftOver(noise, [message])
-
-
-def _residuals(
-    chosen: Candidate, entry: Entry | None, data: Dataset, rows
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """States, predicted images and residuals (N, 2d) of these pairs, and which of them were
-    predicted (N,): as inner ones where S was learned, in the user's coordinates where only a law
-    was."""
-    if entry is not None:
-        images, solved = entry.sweep.images(entry.size, rows)
-        return data.y0[rows], images, data.y1[rows] - images, solved
-    pairs, coordinates = data.pairs.take(rows), chosen.map.coordinates
-    angles = coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
-    z0 = np.asarray(pairs.z0)
-    steps = stepped(chosen.map, z0, pairs.dt, pairs.args, timed=False)
-    residual = nearest_image(np.asarray(pairs.z1) - steps.images, angles)
-    return z0, steps.images, residual, ~steps.failed & np.isfinite(residual).all(axis=1)
 
 
 def not_met(chosen: Candidate, tolerance: Tolerance, ended: str) -> str:

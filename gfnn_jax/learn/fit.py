@@ -41,7 +41,7 @@ from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.models.lagrangians.recordings import fit_recording
 from gfnn_jax.models.maps_of_laws.law_maps import Drawing, drawn
-from gfnn_jax.phase_space import POISSON, Pairs, require_x64
+from gfnn_jax.phase_space import POISSON, Pairs, require_x64, sizes
 from gfnn_jax.threads import one_thread
 
 
@@ -86,8 +86,8 @@ def fit(
     require_x64("a fit")
     watch = Watch.taken_from(changes)
     _refuse_others(changes)
-    positions = scene if _is_array(scene) else None
-    scene = None if positions is not None else scene
+    is_array = hasattr(scene, "__array__") or isinstance(scene, (list, tuple))
+    scene, positions = (None, scene) if is_array else (scene, None)
     pairs, proposed = as_pairs_or_recording(data, positions)
     if proposed is not None:
         changes = {**proposed.asked, **changes}
@@ -299,10 +299,6 @@ def _of_arrays(t: Any, x: Any) -> Recording:
     return Recording({"t": times, **named}, positions=list(named))
 
 
-def _is_array(value: Any) -> bool:
-    return hasattr(value, "__array__") or isinstance(value, (list, tuple))
-
-
 def _devices(devices: int | str | None) -> tuple[Any, ...]:
     """JAX's devices of this process that were asked for; none where nobody asked."""
     try:
@@ -364,13 +360,14 @@ def accelerated(
     dt = float(np.asarray(fitted.map.dt)) if dt is None else dt
     if not (isinstance(dt, (int, float)) and 0 < dt < np.inf):
         raise FitError(f"expected a time step that is finite and above 0, got {dt!r}")
-    how = Drawing(num_pairs, seed, region)
-    pairs = drawn(flow, coordinates, fitted.pairs.z0, dt, how)
+    z0, asked = fitted.pairs.z0, fitted.asked
+    pairs = drawn(flow, coordinates, z0, dt, Drawing(num_pairs, seed, region))
+    relative = asked.bound if asked.relative else asked.bound / float(np.max(sizes(z0)))
     return fit(
         pairs,
         fitted.scene,
         learn="map",
         seed=seed,
         angles=() if fitted.scene is not None else coordinates.angles,
-        **{"tolerance": fitted.relative_tolerance, **options},
+        **{"tolerance": relative, **options},
     )

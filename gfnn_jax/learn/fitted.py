@@ -33,7 +33,7 @@ from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.maps_of_laws.law_maps import NUM_PAIRS
-from gfnn_jax.phase_space import Pairs, sizes
+from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes.scene import Scene
 
 STATES_MEASURED = 200  # states at which the chosen map's defect and determinant are taken
@@ -113,16 +113,16 @@ class Choice:
     asked: Tolerance
     num_pairs: int
     validation_pairs: Pairs | None
-    determinants: dict[str, ChartDeterminant]
-    data_defect: float
-    base_map: bool
-    noise: np.ndarray | None
     messages: tuple[str, ...]
     ended: str
     seconds: float
     compile_seconds: float
     test_states: np.ndarray
-    model_determinant_min: float
+    determinants: dict[str, ChartDeterminant] = dataclasses.field(default_factory=dict)
+    data_defect: float = float("nan")
+    base_map: bool = False
+    noise: np.ndarray | None = None
+    model_determinant_min: float = float("nan")
     test_args: dict[str, np.ndarray] | None = None
     hamiltonian: LearnedHamiltonian | None = None
     pairs: Pairs | None = None
@@ -220,14 +220,6 @@ class Choice:
         that were done."""
         asked = None if self.budget is None else self.budget.max_operations
         return self.operations if asked is None else asked
-
-    @property
-    def relative_tolerance(self) -> float:
-        """The tolerance as a part of the spread, whichever way it was asked for."""
-        if self.asked.relative:
-            return self.asked.bound
-        assert self.pairs is not None
-        return self.asked.bound / float(np.max(sizes(self.pairs.z0)))
 
     @property
     def formula(self) -> str | None:

@@ -20,7 +20,6 @@ import numpy as np
 
 from gfnn_jax.budget import FLOW
 from gfnn_jax.candidates.assemble import Candidate, stepped
-from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import error_of_each
 from gfnn_jax.diagnosis.outliers import OPTIONS as SCREEN
 from gfnn_jax.diagnosis.outliers import around, named
@@ -93,11 +92,14 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
         try:
             with request.budget.unit(_WHAT, FLOW, left.work):
                 size = left.sizes()
-            far = _far(size)
-            if not len(far):
+            middle = np.median(size)
+            known = len(size) > SCREEN.neighbours and middle > 0
+            far = np.flatnonzero(size > OPTIONS.beyond * middle)
+            if not (known and len(far)):
                 break
             # A search without them is followed by another look at the residuals.
-            work = _work_of_neighbours(found.data, far)
+            width = found.data.y0.shape[1]
+            work = OPTIONS.of_trees * len(size) + OPTIONS.of_neighbours * width**2 * len(far)
             with request.budget.unit(_WHAT, FLOW, work, then=(FLOW, left.work)):
                 near = around(found.data, found.data.scale, size, far, OPTIONS.but)
         except OutOfTime:
@@ -232,18 +234,6 @@ def _follows(found: Searched, again: Searched, rows: np.ndarray) -> bool:
     error = error_of_each(found.data, found.tolerance, images, rows)
     before = found.found.ranking[0].candidate.validation_bound
     return bool(np.sum(error**2) <= len(found.data) * before**2)
-
-
-def _far(size: np.ndarray) -> np.ndarray:
-    """The rows whose residual is far beyond the median."""
-    middle = np.median(size)
-    known = len(size) > SCREEN.neighbours and middle > 0
-    return np.flatnonzero(size > OPTIONS.beyond * middle) if known else np.zeros(0, int)
-
-
-def _work_of_neighbours(data: Dataset, far: np.ndarray) -> float:
-    """Operations of `around`."""
-    return OPTIONS.of_trees * len(data) + OPTIONS.of_neighbours * data.y0.shape[1] ** 2 * len(far)
 
 
 def _standing_alone(

@@ -181,7 +181,7 @@ class NoisySweep(LinearSweep):
     def __init__(self, plain: LinearSweep, near: LinearSweep, size: Size, deviations: np.ndarray):
         self.__dict__.update(plain.__dict__)
         self.plain, self._kept, self._factors, self._solved = plain, None, {}, {}
-        data, coefficients = self.data, near.solve(size, Budget(), _quiet)[0].coefficients
+        data, coefficients = self.data, near.solve(size)[0].coefficients
 
         def nearest(rows) -> NearestArcs:
             rows = np.sort(rows)
@@ -253,8 +253,8 @@ class NoisySweep(LinearSweep):
 
     def root(self, size: Size) -> np.ndarray:
         """Root of the covariance, as the sweep's own, of rows that are independent."""
-        train, count = self.factors(size.group, Budget(), _quiet).train, size.family.num_parameters
-        solved, larger = self.solve(size, Budget(), _quiet)[0], self._larger(size)
+        train, count = self.factors(size.group).train, size.family.num_parameters
+        solved, larger = self.solve(size)[0], self._larger(size)
         most = size.family if larger is None else larger.family
         sample = self._part(SAMPLE_ROWS * most.num_parameters)
         blocks = list(sample.rows(most))
@@ -293,7 +293,3 @@ def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
         z0[:, angles] += lifted
         z1[:, angles] += lifted
     return z0, z1, LONGEST, steps
-
-
-def _quiet(message: str) -> None:
-    """Say nothing of what is known already."""

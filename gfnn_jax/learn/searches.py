@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.budget import Budget
 from gfnn_jax.candidates.assemble import Candidate, composed
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
@@ -22,7 +21,7 @@ from gfnn_jax.models.generating_functions.linear_map import linear_map
 from gfnn_jax.models.generating_functions.map_of_terms import LearnedMap, SumOfTerms
 from gfnn_jax.models.generating_functions.model_sweep import ModelSweep
 from gfnn_jax.models.generating_functions.networks import EnsembleSweep, NetworkSweep
-from gfnn_jax.models.generating_functions.sweeps import sweep_of_dt, sweeps_for
+from gfnn_jax.models.generating_functions.sweeps import sweeps_for
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.networks import learn_network
 from gfnn_jax.models.hamiltonians.problem import LawProblem
@@ -71,7 +70,9 @@ def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
     better = _Better(on_better) if on_better is not None else None
     given = tolerance.bound, budget, on_progress, on_candidate, better
     # Small sizes first: a map is then there, however long the search for H.
-    early = not _of_terms(data) or options.model is not None
+    # S is a sum of terms of pairs with parameters, and over sites.
+    sites = isinstance(data.structure, Sites) and data.own_dt is None
+    early = not (sites or data.args is not None) or options.model is not None
     climb = Search(_sweeps(request, data, diagnosis) if early else [], *given)
     climb.climb(most=_SMALL)
     # H with friction that depends on args is not learned.
@@ -97,8 +98,14 @@ def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
             of_terms = SumOfTerms(
                 diagnosis.data, tolerance, scene, options.chart, budget, on_progress
             ).beside(law)
-            if of_terms is not None and law is not None and _no_better(of_terms, law, tolerance):
-                of_terms = None
+            if of_terms is not None and law is not None:  # which misses the tolerance
+                no_better = (
+                    preferred(law.candidate, of_terms.candidate, tolerance)
+                    if of_terms.data.structure is None
+                    else of_terms.candidate.validation_bound
+                    >= _BETTER * law.candidate.validation_bound
+                )
+                of_terms = None if no_better else of_terms
         except FitError as error:
             failed = error
     if wanted and data.args is not None and not _met(of_terms, tolerance):
@@ -128,7 +135,9 @@ def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
         elif known:
             linear = None
     if not known and linear is None:
-        raise failed or FitError(_nothing_found(len(data), budget))
+        why = f"more pairs: {len(data)} are too few for the smallest model of this kind"
+        larger = f"a larger budget, for {budget.ended}"
+        raise failed or FitError(f"expected {larger if budget.over else why}")
     if of_terms is not None and found.ranking and not _met(of_terms, tolerance):
         best = found.ranking[0].candidate
         if best.validation_bound < of_terms.candidate.validation_bound:
@@ -137,21 +146,8 @@ def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
     return Searched(law, of_terms, found, swept, charts, data, tolerance, taken, linear)
 
 
-def _no_better(of_terms: LearnedMap, law: LearnedHamiltonian, tolerance: Tolerance) -> bool:
-    """Return whether the law that misses the tolerance is taken in the place of this S."""
-    if of_terms.data.structure is None:
-        return preferred(law.candidate, of_terms.candidate, tolerance)
-    return of_terms.candidate.validation_bound >= _BETTER * law.candidate.validation_bound
-
-
 def _met(found: LearnedMap | None, tolerance: Tolerance) -> bool:
     return found is not None and tolerance.met_by(found.candidate)
-
-
-def _of_terms(data: Dataset) -> bool:
-    """Return whether S, where it is learned, is a sum of terms: with parameters, or over sites."""
-    sites = isinstance(data.structure, Sites) and data.own_dt is None
-    return sites or data.args is not None
 
 
 def _law(
@@ -181,9 +177,8 @@ def _sweeps(request: Request, taken: Dataset, diagnosis: Diagnosis) -> list[Any]
         return [ModelSweep(options.model, taken, tolerance)]
     if options.learn == "hamiltonian" or data.period is not None:
         return []
-    if data.own_dt is not None:
-        alone = data.structure is None and data.args is None
-        return [sweep_of_dt(data, tolerance, request.scene, request.watch.factors)] if alone else []
+    if data.own_dt is not None and not (data.structure is None and data.args is None):
+        return []
     if options.family == "mlp":
         given = (
             data,
@@ -198,12 +193,6 @@ def _sweeps(request: Request, taken: Dataset, diagnosis: Diagnosis) -> list[Any]
     return list(
         sweeps_for(options.family, charts, data, tolerance, request.scene, request.watch.factors)
     )
-
-
-def _nothing_found(num_pairs: int, budget: Budget) -> str:
-    if budget.over:
-        return f"expected a larger budget, for {budget.ended}"
-    return f"expected more pairs: {num_pairs} are too few for the smallest model of this kind"
 
 
 class _Better:

@@ -17,7 +17,6 @@ import numpy as np
 
 from gfnn_jax.budget import ROWS, Budget, within
 from gfnn_jax.candidates.assemble import Assembled, Candidate, composed, measured
-from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.diagnosis.local_jacobians import SINGULAR
@@ -251,10 +250,8 @@ def _validated(piece: Generated, data: Dataset, tolerance: Tolerance) -> _Tried:
     if not matrix_free(family):
         determinant = piece.determinant(data.y0[rows], data.y1[rows], args)
         folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
-    bad = ~(off < OPTIONS.solved) | folds
-    images = np.where(bad[:, None], np.nan, images)
-    images = data.whole_image(images, rows)
-    error = measured_error(data, tolerance, to_user(data.coordinates, images))
+    images = data.users_image(images, (off < OPTIONS.solved) & (not folds), rows)
+    error = measured_error(data, tolerance, images)
     w, target, args = _data(piece.chart, family, data, data.training)
     left = (family.gradient(params, w, args) - target) * _weight(data)
     return _Tried(piece, error, float(np.sqrt(np.mean(left**2))))

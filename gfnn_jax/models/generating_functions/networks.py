@@ -32,7 +32,14 @@ from gfnn_jax.fitting.levenberg_marquardt import (
     LMResult,
     LMState,
 )
-from gfnn_jax.models.generating_functions.sweeps import OF_STEPS, Generates, Size, trial_residual
+from gfnn_jax.models.generating_functions.sweeps import (
+    FREE,
+    OF_STEPS,
+    Generates,
+    Size,
+    quiet,
+    trial_residual,
+)
 
 # The network of the second-order fit: three small layers beat one wide, gelu beats tanh.
 _MLP_HIDDEN, _MLP_ACTIVATION, _MLP_PAIRS = (16, 16, 16), "gelu", 4_000
@@ -142,7 +149,7 @@ class NetworkSweep(Generates):
             estimated, self.data, self.tolerance, self.chart, size.family, self._params
         )
 
-    def solve(self, size: Size, budget: Budget, on_progress) -> tuple[Any, Any]:
+    def solve(self, size: Size, budget: Budget = FREE, on_progress=quiet) -> tuple[Any, Any]:
         """The params of the trained network."""
         return None, self._params
 

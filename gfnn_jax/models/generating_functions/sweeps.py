@@ -23,7 +23,6 @@ import numpy as np
 
 from gfnn_jax.budget import Budget
 from gfnn_jax.candidates.assemble import Candidate, refined_images, validated, with_predictor
-from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
 from gfnn_jax.dataset.rows import inputs_of, of_pairs, of_rows, rows_of, weighted_rows_of
@@ -43,6 +42,13 @@ from gfnn_jax.maps.piece import Affine, Damping
 
 # Operations of singular values, ÷ terms³; and of a step in NumPy, in units that take as long.
 OF_SOLVE, OF_STEPS = 22.0, 20.0
+
+
+FREE = Budget()  # of what a search has paid for
+
+
+def quiet(message: str) -> None:
+    """Say nothing of what is known already."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +74,7 @@ class Generates:
     chart: AnyChart
     tolerance: Tolerance
 
-    def solve(self, size: Size, budget: Budget, on_progress) -> tuple[Any, Any]:
+    def solve(self, size: Size, budget: Budget = FREE, on_progress=quiet) -> tuple[Any, Any]:
         """Solve for the params of the size's family; with them what is known of the solution."""
         raise NotImplementedError
 
@@ -84,7 +90,7 @@ class Generates:
         return refined_images(self.data, self.chart, size.family, params, rows)
 
     def _params_of(self, size: Size) -> Any:
-        return self.solve(size, Budget(), lambda message: None)[1]
+        return self.solve(size)[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,6 +177,8 @@ def sweeps_for(
         return
     features = scene.features if scene is not None else None
     polynomials = request in ("auto", "polynomial")
+    if data.own_dt is not None:  # S(w; dt²)
+        charts, polynomials, features = [MIDPOINT], True, None
     for chart in charts:
         # Only the midpoint S inherits the reversor.
         reversor = scene.reversor if scene is not None and chart == MIDPOINT else None
@@ -180,14 +188,8 @@ def sweeps_for(
             yield LinearSweep(
                 data, tolerance, chart, Linear("features", features, reversor), factors
             )
-        if request == "sines" or (request == "auto" and data.dim > 2):
+        if request == "sines" or (request == "auto" and data.dim > 2 and data.own_dt is None):
             yield LinearSweep(data, tolerance, chart, Linear("sines"), factors)
-
-
-def sweep_of_dt(data: Dataset, tolerance: Tolerance, scene, factors=None) -> LinearSweep:
-    """The sweep of S(w; dt²), where each pair has its own dt."""
-    reversor = scene.reversor if scene is not None else None
-    return LinearSweep(data, tolerance, MIDPOINT, Linear("polynomial", None, reversor), factors)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,9 +226,9 @@ class LinearSweep(Generates):
         self._held, _ = weighted_rows_of(data, chart, data.validation)
         free = (*data.coordinates.cyclic, *data.whole)
         self._outermost = outermost(data.y0[data.training], free)
-        w, made, args = self._train[0], Products, data.given(data.training)[1]
+        w, args = self._train[0], data.given(data.training)[1]
         if data.own_dt is not None:
-            made, args = _of_time_step, data.own_dt[data.training, None] ** 2
+            args = data.own_dt[data.training, None] ** 2
         inputs = inputs_of(data, w, features=of.features, reversor=reversor, args=args)
         signs = None
         if kind != "sines" and own is None and reversor is not None:
@@ -237,7 +239,8 @@ class LinearSweep(Generates):
                 return ([family] for family in own(inputs))
             if kind == "sines":
                 return ([Sines(inputs, count)] for count in OPTIONS.sines)
-            return ((made(inputs, degree, signs) for degree in g) for g in OPTIONS.degrees)
+            products = ((Products(inputs, n, signs) for n in g) for g in OPTIONS.degrees)
+            return products if data.own_dt is None else (map(OfTimeStep, g) for g in products)
 
         counted = kind == "sines" or own is not None
         known = len(OPTIONS.sines) if counted else sum(map(len, OPTIONS.degrees))
@@ -285,7 +288,16 @@ class LinearSweep(Generates):
         train, held = self.factors(size.group, budget, on_progress)[:2]
         count = size.family.num_parameters
         ((train_rms, held_rms),) = least_squares.residuals(train, held, [count])
-        return self._candidate(size, train_rms, held_rms, time.perf_counter() - started)
+        return Candidate.of(
+            estimated_error(self.data, self.tolerance, held_rms),
+            label=f"{size.family.label}",
+            family=self.kind,
+            chart=self.chart.name,
+            num_parameters=count,
+            operations=size.operations,
+            train_rms=train_rms,
+            fit_seconds=time.perf_counter() - started,
+        )
 
     def validate(self, size: Size, estimated: Candidate, budget: Budget, on_progress) -> Candidate:
         """The estimated size solved, and its error measured by steps."""
@@ -330,7 +342,7 @@ class LinearSweep(Generates):
         return f"{label} ({terms:,} terms{most}; about {pairs:,} pairs)"
 
     def solve(
-        self, size: Size, budget: Budget, on_progress
+        self, size: Size, budget: Budget = FREE, on_progress=quiet
     ) -> tuple[least_squares.LeastSquaresFit, Any]:
         """The coefficients of this size, and the params of its family: solved for once."""
         count = size.family.num_parameters
@@ -352,8 +364,7 @@ class LinearSweep(Generates):
     def with_test_rows(self, size: Size) -> least_squares.LeastSquaresFit:
         """Solution of this size with the test rows among those that train. The validation rows
         choose the ridge, as before."""
-        quiet = Budget(), lambda message: None
-        train, held = self.factors(size.group, *quiet)[:2]
+        train, held = self.factors(size.group)[:2]
         test, _ = weighted_rows_of(self.data, self.chart, self.data.test)
         more = least_squares.reduce(self.in_rows(size.group), [test], self._weight)
         return least_squares.solve(train.merge(more), held, size.family.num_parameters)
@@ -375,12 +386,11 @@ class LinearSweep(Generates):
         solved = least_squares.solve(train, held, size.family.num_parameters)
         params = size.family.unflatten(solved.coefficients)
         images, known = refined_images(data, self.chart, size.family, params, rows)
-        images = data.whole_image(np.where(known[:, None], images, np.nan), rows)
-        return to_user(data.coordinates, images)
+        return data.users_image(images, known, rows)
 
     def residuals(self, size: Size) -> np.ndarray:
         """(N, 2d): what the size leaves of ∇S of every pair, unit-free as train_rms."""
-        _, params = self.solve(size, Budget(), lambda message: None)
+        _, params = self.solve(size)
         (w, target, *args), weight = rows_of(self.data, self.chart, slice(None))
         gradient = np.asarray(size.family.gradient(params, w, *args))
         if self.data.own_dt is not None:
@@ -413,7 +423,7 @@ class LinearSweep(Generates):
             further += [Size(f, f, _extent(f)) for f in itertools.islice(beyond, 2 - len(further))]
         return further[-1] if further else None
 
-    def factors(self, group, budget: Budget, on_progress) -> Factors:
+    def factors(self, group, budget: Budget = FREE, on_progress=quiet) -> Factors:
         """Factors of a group's largest family, which answer for all of its sizes."""
         if group not in self._factors:
             self._factors[group] = self._known(group) or self._computed(group, budget, on_progress)
@@ -446,15 +456,10 @@ class LinearSweep(Generates):
             )
         )
         if self._kept is not None and time.perf_counter() - started > OPTIONS.worth_keeping:
-            self._kept.save(
-                self._named(group),
-                inner=inner.factor,
-                inner_rows=inner.rows,
-                outer=outer.factor,
-                outer_rows=outer.rows,
-                held=held.factor,
-                held_rows=held.rows,
-            )
+            parts = {"inner": inner, "outer": outer, "held": held}
+            rows = {f"{name}_rows": part.rows for name, part in parts.items()}
+            factors = {name: part.factor for name, part in parts.items()}
+            self._kept.save(self._named(group), **factors, **rows)
         return Factors.of(inner, outer, held)
 
     def posterior(self, size: Size) -> Callable[[], np.ndarray]:
@@ -466,8 +471,8 @@ class LinearSweep(Generates):
 
         What of the residual is noise, a larger size tells: it leaves that too.
         """
-        train = self.factors(size.group, Budget(), lambda message: None).train
-        family, solved = size.family, self.solve(size, Budget(), lambda message: None)[0]
+        train = self.factors(size.group).train
+        family, solved = size.family, self.solve(size)[0]
         larger = self._larger(size)
         most = family if larger is None else larger.family
         data, goes_on = self._sample(-(-SAMPLE_ROWS * most.num_parameters // self._width))
@@ -493,7 +498,7 @@ class LinearSweep(Generates):
         """Error of the size's ∇S by noise, in the measure of train_rms: half of the
         difference between the fits to either half of the training pairs, blocks in time."""
         half = self.data.training // OPTIONS.halves_block % 2
-        train, held = self.factors(size.group, Budget(), lambda message: None)[:2]
+        train, held = self.factors(size.group)[:2]
         count = size.family.num_parameters
         one, other = (
             least_squares.solve(
@@ -513,7 +518,7 @@ class LinearSweep(Generates):
         """(2d,) standard deviation of each coordinate's noise, ÷ its scale, from what this size
         leaves of a sample of the training pairs."""
         (w, target, *args), goes_on = self._sample(OPTIONS.noise_pairs)
-        solved, params = self.solve(size, Budget(), lambda message: None)
+        solved, params = self.solve(size)
         slopes = self._slopes(size.family, w, *args)
         residual = slopes @ solved.coefficients - target * self._weight
         first, second = self.by_states(size.family, params, w, *args)
@@ -527,7 +532,7 @@ class LinearSweep(Generates):
         (w, target, *args), goes_on = self._sample(-(-SAMPLE_ROWS * max(counts) // self._width))
         if not goes_on.any() or not self.moved_by_states:
             return [float(count) for count in counts]
-        solved, params = self.solve(near, Budget(), lambda message: None)
+        solved, params = self.solve(near)
         larger = max(near, most, key=lambda size: size.family.num_parameters)
         slopes = self._slopes(larger.family, w, *args)
         residual = slopes[..., : len(solved.coefficients)] @ solved.coefficients
@@ -624,19 +629,6 @@ class LinearSweep(Generates):
     def _named(self, group) -> str:
         return f"{self.chart.name} {self.kind} {group.num_parameters}"
 
-    def _candidate(self, size: Size, train_rms, held_rms, seconds) -> Candidate:
-        error = estimated_error(self.data, self.tolerance, held_rms)
-        return Candidate.of(
-            error,
-            label=f"{size.family.label}",
-            family=self.kind,
-            chart=self.chart.name,
-            num_parameters=size.family.num_parameters,
-            operations=size.operations,
-            train_rms=train_rms,
-            fit_seconds=seconds,
-        )
-
 
 def _extent(family) -> float:
     """The degree of products, or log₂ of the number of terms."""
@@ -661,10 +653,6 @@ def trial_residual(data: Dataset) -> float:
     )
     ((_, residual),) = least_squares.residuals(train, held, [family.num_parameters])
     return residual
-
-
-def _of_time_step(inputs, degree: int, signs=None) -> OfTimeStep:
-    return OfTimeStep(Products(inputs, degree, signs))
 
 
 def _determined(groups: Iterable[Iterable[Any]], rows: int, each: float) -> Iterator[list[Any]]:
