@@ -80,20 +80,11 @@ class Dataset:
         y0, y1, centres, covered = lifted(before, after, coordinates)
         whole = tuple(i for i, c in zip(coordinates.angles, covered, strict=True) if c)
         nowhere = covering(y0[:0], ignore=tuple(range(y0.shape[1])))
-        row = np.arange(len(pairs)) if row is None else row
-        return cls(
-            pairs,
-            row,
-            y0,
-            y1,
-            Split.of_training(np.arange(len(pairs)), len(pairs)),
-            np.ones(y0.shape[1]),
-            nowhere,
-            coordinates,
-            centres,
-            whole,
-            structure=structure,
-        )._measured()
+        every, size = np.arange(len(pairs)), np.ones(y0.shape[1])
+        row, split = every if row is None else row, Split(every, every[:0], every[:0], every)
+        inner = coordinates, centres, whole
+        found = cls(pairs, row, y0, y1, split, size, nowhere, *inner, structure=structure)
+        return found._measured()
 
     def __len__(self) -> int:
         return len(self.y0)

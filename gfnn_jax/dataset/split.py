@@ -51,12 +51,6 @@ class Split(NamedTuple):
     test: np.ndarray
     stretch: np.ndarray
 
-    @classmethod
-    def of_training(cls, rows: np.ndarray, count: int) -> Split:
-        """Split in which these of ``count`` rows train, and nothing is kept apart; each errs
-        independently."""
-        return cls(rows, np.zeros(0, int), np.zeros(0, int), np.arange(count))
-
     def take(self, rows: np.ndarray) -> Split:
         """The split of these rows alone, (n,) of the N rows, each in its part."""
         place = np.full(len(self.stretch), -1)

@@ -249,7 +249,9 @@ def stretches(
         t, u = recording.times(run), recording.array("inputs", run)
         y, noise = channels_of(recording, names, run)
         if between:
-            t, y, u, noise = _with_places(t, y, u, noise, between)
+            s = Stretch(run, t, y, u, y, noise, np.zeros(0))
+            s = s.filled(float(np.median(np.diff(t))) / between)
+            t, y, u, noise = s.t, s.y, s.u, s.noise
         q = y if coordinates_of is None else coordinates_of(y, t)
         lifted = {*recording.angles} - {*names}  # angles that no column shows: columns are lifted
         turns = [i for i, n in enumerate(recording.coordinates) if n in lifted]
@@ -275,16 +277,6 @@ def stretches(
     return found
 
 
-def _with_places(
-    t: np.ndarray, y: np.ndarray, u: np.ndarray, noise: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Times, channels, inputs and noise with ``count`` places between two samples that are as far
-    apart as most."""
-    whole = Stretch("", t, y, u, y, noise, np.zeros(0))
-    s = whole.filled(float(np.median(np.diff(t))) / count)
-    return s.t, s.y, s.u, s.noise
-
-
 def _readings(found: Sequence[Stretch]) -> int:
     return sum(int(np.isfinite(s.y).sum()) for s in found)
 
@@ -301,7 +293,8 @@ def measure(found: Sequence[Stretch]) -> Scales:
         half = splines([(s.t, s.q, np.ones(s.q.shape)) for s in found])
         sigma = half.sigma
         smooths = [half.smooth(s.t, s.q, _inside(s.t)[::every]) for s in found]
-        dt = _usual_step(found)
+        apart = np.concatenate([np.diff(s.t) for s in found])
+        dt = float(np.mean(apart[apart <= 10 * np.median(apart)]))  # of steps that are no gap
     speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
     if not np.all(speed > 0):
         still = ", ".join(str(i + 1) for i in np.flatnonzero(~(speed > 0)))
@@ -318,7 +311,13 @@ def measure(found: Sequence[Stretch]) -> Scales:
     systems: dict[tuple[float, ...], list[Smooth]] = {}
     for stretch, own in zip(found, smooths, strict=True):
         systems.setdefault(tuple(stretch.args.tolist()), []).append(own)
-    omega = max(_frequency(own, OPTIONS.slow * speed) for own in systems.values())
+    omega = 0.0  # the largest ratio of rms acceleration to rms speed; of slow ones noise moves
+    for own in systems.values():
+        v, a = (
+            np.sqrt(np.mean(np.concatenate([getattr(s, name) for s in own]) ** 2, axis=0))
+            for name in "va"
+        )
+        omega = max(omega, float(np.max(a / np.maximum(v, OPTIONS.slow * speed))))
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
     stride = np.divide(size, spread, out=np.full(len(size), omega * dt), where=spread > 0)
     longest = max(float(np.ptp(s.t)) for s in found)
@@ -329,20 +328,6 @@ def _inside(t: np.ndarray) -> np.ndarray:
     """Times but for the ends of a run, where a curve's derivatives are those of its noise."""
     edge = max(1, len(t) // 20)
     return t[edge:-edge]
-
-
-def _usual_step(found: Sequence[Stretch]) -> float:
-    """The mean time between samples, of steps that are no gap."""
-    steps = np.concatenate([np.diff(s.t) for s in found])
-    return float(np.mean(steps[steps <= 10 * np.median(steps)]))
-
-
-def _frequency(smooths: Sequence[Smooth], slow: np.ndarray) -> float:
-    """The largest ratio of the rms acceleration of a coordinate to its rms speed, or to that which
-    is ``slow`` (d,): below it noise moves."""
-    speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
-    acceleration = np.sqrt(np.mean(np.concatenate([s.a for s in smooths]) ** 2, axis=0))
-    return float(np.max(acceleration / np.maximum(speed, slow)))
 
 
 def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:

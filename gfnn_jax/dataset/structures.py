@@ -135,7 +135,11 @@ class Sites:
         bonds = () if self.angles else tuple(f"q{k + self.fields} - q{k}" for k in fields)
         parts = tuple(
             Part(
-                Terms((k + 1) * self.fields, names, _units(len(names))),
+                Terms(
+                    (k + 1) * self.fields,
+                    names,
+                    tuple(map(tuple, np.eye(len(names), dtype=int).tolist())),
+                ),
                 Windows(ends, k, self.fields),
             )
             for k, names in enumerate((alone, bonds))
@@ -176,10 +180,6 @@ class Bodies:
     def domain(self, z: np.ndarray, uses_positions: bool = True) -> Ranges:
         """Domain of the states z (N, 2d): each body's |p|² and each pair's distance."""
         return ranges_of(body_terms(self.count, self.space, (1,), alike=False), z)
-
-
-def _units(count: int) -> tuple[tuple[int, ...], ...]:
-    return tuple(tuple(int(k == j) for k in range(count)) for j in range(count))
 
 
 Structure = Sites | Bodies

@@ -125,7 +125,8 @@ def without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
     if period is not None:
         args[TIME] = np.mod(args[TIME], period)
         still = [name for name in still if name != TIME]
-        if not np.ndim(one) and _same_phase(args[TIME], period):
+        apart = np.mod(args[TIME] - args[TIME][0] + 0.5 * period, period) - 0.5 * period
+        if not np.ndim(one) and np.ptp(apart) <= _OPTIONS.same * period:
             own_time = [_one_phase(args.pop(TIME)[0], one, period)]
             period = None
     kept = {name: v for name, v in args.items() if name not in still}
@@ -136,12 +137,6 @@ def without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
     ]
     varied = dataclasses.replace(pairs, dt=one, args=kept or None, t0=None, period=period)
     return varied, own_time + messages
-
-
-def _same_phase(t0: np.ndarray, period: float) -> bool:
-    """Return whether all these times of a drive are one, but for whole periods."""
-    apart = np.mod(t0 - t0[0] + 0.5 * period, period) - 0.5 * period
-    return bool(np.ptp(apart) <= _OPTIONS.same * period)
 
 
 def _one_phase(t0: float, dt: float, period: float) -> str:

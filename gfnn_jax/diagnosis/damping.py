@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -330,9 +330,19 @@ class _Problem:
                 return _Fitted(factor, unknown, self._drift(shift), np.inf, spread)
             undamped = self._undamped(b, c)
             terms, target = self._design(family, undamped, self.data.training)
-            solved = _solved(terms, target)
+            # By a pivoted QR, which takes a quarter of the time of singular values.
+            solved: Any = scipy.linalg.lstsq(
+                terms, target, lapack_driver="gelsy", check_finite=False
+            )
+            solved = solved[0]
             columns = self._columns(family, solved, undamped, spread, (b, c, values))
-            change, root = _last_unknowns(np.column_stack([terms, columns, target]), terms.shape[1])
+            # The unknowns of b and c, and a root of their covariance for independent residuals.
+            rows = np.column_stack([terms, columns, target])
+            triangle = np.asarray(np.linalg.qr(rows, mode="r"))
+            own = triangle[terms.shape[1] :, terms.shape[1] :]
+            inverse = np.linalg.pinv(own[:-1, :-1])
+            deviation = abs(own[-1, -1]) / np.sqrt(max(1, len(rows) - len(triangle) + 1))
+            change, root = inverse @ own[:-1, -1], deviation * inverse
             least = np.maximum(OPTIONS.close * np.linalg.norm(root, axis=1), OPTIONS.changed)
             if not (np.abs(change) > least).any():
                 break
@@ -395,22 +405,6 @@ class _Problem:
         """The pairs of the symplectic part, without its base map."""
         found = self.data.without(None, Damping(b, c))
         return found if self.half is None else found.without(self.half, self.half)
-
-
-def _solved(design: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Least squares by a pivoted QR: a quarter of the time of singular values."""
-    found = scipy.linalg.lstsq(design, target, lapack_driver="gelsy", check_finite=False)
-    assert found is not None
-    return found[0]
-
-
-def _last_unknowns(rows: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
-    """Solve the least-squares problem [A b], (n, m + 1), for the unknowns from ``first`` on, with a
-    root (m − first, m − first) of their covariance, that of independent residuals."""
-    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
-    inverse = np.linalg.pinv(triangle[first:-1, first:-1])
-    deviation = abs(triangle[-1, -1]) / np.sqrt(max(1, len(rows) - len(triangle) + 1))
-    return inverse @ triangle[first:-1, -1], deviation * inverse
 
 
 def _momenta(spread, factor) -> np.ndarray:

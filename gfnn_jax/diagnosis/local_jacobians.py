@@ -131,7 +131,12 @@ def local_jacobians(y0, y1, scale, given=None, *, seed: int = 0) -> tuple[np.nda
     # How far neighbours reach in the direction where they differ least, apart from what the other
     # columns tell of it: along a curve or a torus the rest of the map is anybody's guess.
     reach = 1 / (np.sqrt(count) * spread.max(axis=1) * np.sqrt(np.mean(offset**2, axis=(1, 2))))
-    filled = _full_rank(design) & (reach > OPTIONS.filled)
+    if terms <= MANY_TERMS:
+        apart = np.linalg.matrix_rank(design, rtol=OPTIONS.spanned) == terms
+    else:
+        squares = np.linalg.eigvalsh(np.swapaxes(design, 1, 2) @ design)
+        apart = squares[:, 0] > _SPANNED_OF_GRAM**2 * squares[:, -1]
+    filled = apart & (reach > OPTIONS.filled)
     known = float(error + 0.5 * count * error**2) if np.mean(filled) > 0.5 else np.inf
     return slope * scale[:, None] / scale[None, :], known
 
@@ -162,16 +167,6 @@ def pseudo_inverse(design):
     ridge = _SPANNED_OF_GRAM**2 * np.trace(gram, axis1=1, axis2=2)
     inverse = np.linalg.inv(gram + ridge[:, None, None] * np.eye(gram.shape[-1])) @ across
     return 2 * inverse - (inverse @ design) @ inverse  # a step of Newton's takes the ridge back
-
-
-def _full_rank(design):
-    """Return whether the neighbours of each local design (n, neighbours, terms) tell all terms
-    apart."""
-    terms = design.shape[-1]
-    if terms <= MANY_TERMS:
-        return np.linalg.matrix_rank(design, rtol=OPTIONS.spanned) == terms
-    squares = np.linalg.eigvalsh(np.swapaxes(design, 1, 2) @ design)
-    return squares[:, 0] > _SPANNED_OF_GRAM**2 * squares[:, -1]
 
 
 def chart_determinant(chart: AnyChart, jacobians, scale) -> ChartDeterminant:

@@ -284,14 +284,6 @@ def _without(term: tuple[int, ...], i: int) -> tuple[int, ...]:
     return term[:place] + term[place + 1 :]
 
 
-def _in_local_units(z: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Residuals (N, 2d) ÷ their root mean square among the neighbours of z (N, 2d)."""
-    count = min(len(z), OPTIONS.nearby)
-    _, near = cKDTree(z).query(z, k=count)
-    size = np.sqrt(np.mean(residual[near.reshape(len(z), count)] ** 2, axis=1))
-    return residual / np.where(size > 0, size, 1.0)
-
-
 def differs_between_sequences(z, residual, sequence) -> bool:
     """Return whether what a fit left over agrees within a sequence and differs between sequences:
     then something that the states do not hold, a parameter, differs between them.
@@ -304,8 +296,10 @@ def differs_between_sequences(z, residual, sequence) -> bool:
     their size nearby: a step magnifies the noise of the states, in close passages a hundred times,
     and a few of these would stand for all.
     """
-    z = np.asarray(z)
-    residual = _in_local_units(z, np.asarray(residual))
+    z, residual, count = np.asarray(z), np.asarray(residual), min(len(z), OPTIONS.nearby)
+    near = cKDTree(z).query(z, k=count)[1].reshape(len(z), count)
+    size = np.sqrt(np.mean(residual[near] ** 2, axis=1))
+    residual = residual / np.where(size > 0, size, 1.0)
     total, within, rows = 0.0, 0.0, []
     for number in np.unique(sequence):
         own = np.flatnonzero(sequence == number)
@@ -337,7 +331,9 @@ def misfit(family, data: Dataset, chart: AnyChart) -> float:
     """Part of the held-out target gradients that a family, linear in its parameters, leaves over:
     the median over pairs, of the forces or of the velocities, whichever is larger; infinite where
     its functions overflow. data: without args."""
-    rows = _quiet_pairs(data)
+    rows = data.training[: 2 * OPTIONS.pairs_of_misfit]
+    moved = np.abs((data.y1[rows] - data.y0[rows]) / data.scale).max(axis=1)
+    rows = rows[moved <= np.quantile(moved, OPTIONS.quiet)]  # close passages move most
     y0, y1 = data.y0[rows], data.y1[rows]
     half = len(rows) // 2
     w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, data.dt)
@@ -352,10 +348,3 @@ def misfit(family, data: Dataset, chart: AnyChart) -> float:
     )
     part = float(np.max(left / np.maximum(whole, np.finfo(float).tiny)))
     return part if np.isfinite(part) else np.inf
-
-
-def _quiet_pairs(data: Dataset) -> np.ndarray:
-    """A sample of the training pairs without those that move most, as close passages do."""
-    rows = data.training[: 2 * OPTIONS.pairs_of_misfit]
-    moved = np.abs((data.y1[rows] - data.y0[rows]) / data.scale).max(axis=1)
-    return rows[moved <= np.quantile(moved, OPTIONS.quiet)]

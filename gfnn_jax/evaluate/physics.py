@@ -219,7 +219,12 @@ class _System(NamedTuple):
     def at_rest(self, q: np.ndarray, stable: bool, several: bool) -> list[Quantity]:
         """The rest position and, where it is stable, the modes of small oscillations about it."""
         d = self.law.dim
-        values, std = self.with_errors(lambda other: _else_nan(other.rest_from(q), d))
+
+        def rest(other: _System) -> np.ndarray:
+            found = other.rest_from(q)
+            return np.full(d, np.nan) if found is None else found
+
+        values, std = self.with_errors(rest)
         std = np.hypot(std, self.zeros)
         values, std = (np.where(np.abs(x) < 1e-9 * self.size, 0.0, x) for x in (values, std))
         kind = "rest position" if stable else "unstable rest position"
@@ -376,10 +381,6 @@ class _System(NamedTuple):
 
 def _count(law: Lagrangian) -> int:
     return law.terms.count + law.friction.count + law.gains.size
-
-
-def _else_nan(q: np.ndarray | None, dim: int) -> np.ndarray:
-    return np.full(dim, np.nan) if q is None else q
 
 
 def _mode(

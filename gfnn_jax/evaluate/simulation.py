@@ -62,7 +62,8 @@ def simulation(law: LearnedLaw, recording: Recording, begin: float) -> str | Non
     rows = rows[:: max(1, len(rows) // OPTIONS.points)]
     if len(rows) < 2:
         return None
-    d, args = law.map.dim, _parameters(law, recording, run)
+    names = () if law.map.parameters is None else law.map.parameters.names
+    d, args = law.map.dim, [float(recording.values(name, run)[0]) for name in names]
     v = velocities_of(law.map, z, np.array([args]) if args else None)
     known = len(sensors.positions)
     shown = {
@@ -99,11 +100,6 @@ def _channel(recording: Recording, run: str, place: int, rows: Any, start: float
     }
 
 
-def _parameters(law: LearnedLaw, recording: Recording, run: str) -> list[float]:
-    names = () if law.map.parameters is None else law.map.parameters.names
-    return [float(recording.values(name, run)[0]) for name in names]
-
-
 def _inputs(
     law: LearnedLaw, recording: Recording, run: str, t: np.ndarray, args: list[float]
 ) -> list[list[float]]:
@@ -128,22 +124,17 @@ def _sliders(law: LearnedLaw) -> list[Slider]:
     std = np.zeros(len(values))
     if posterior is not None:
         std = np.sqrt(np.sum(np.asarray(posterior.root) ** 2, axis=0))
-    found = []
+    own, found = law_of_map(law.map), []
+    first, gains = own.terms.count, own.gains.size  # frictions are terms and gains of no drive
+    losses = first + own.friction.count
     for place, (value, error) in enumerate(zip(values.tolist(), std.tolist(), strict=True)):
         if error > 0 and value != 0:
             reach = max(OPTIONS.errors * error, OPTIONS.share * abs(value))
-            low = max(value - reach, 0.0) if _is_friction(law, place) else value - reach
+            friction = first <= place < losses or place >= losses + gains
+            low = max(value - reach, 0.0) if friction else value - reach
             label = _label(law, piece.family.term_names[place])
             found.append(Slider(place, label, low, value + reach))
     return found
-
-
-def _is_friction(law: LearnedLaw, place: int) -> bool:
-    """Return whether a coefficient is one of friction, which is no drive."""
-    own = law_of_map(law.map)
-    first, gains = own.terms.count, own.gains.size
-    losses = first + own.friction.count
-    return first <= place < losses or place >= losses + gains
 
 
 def _label(law: LearnedLaw, term: str) -> str:

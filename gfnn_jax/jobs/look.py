@@ -13,6 +13,7 @@ from gfnn_jax.data.proposed import summarised
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.recording_summary import RecordingSummary, summarise
 from gfnn_jax.errors import InputError
+from gfnn_jax.families.expressions import coordinate_names
 
 
 def look(
@@ -22,7 +23,8 @@ def look(
 
     options: keywords of `gfnn_jax.read`, and ``mass``, which only goes into the command to type.
     """
-    if _hold_states(paths):
+    is_array = all(path.suffix.lower() in (".npz", ".npy") for path in paths)
+    if is_array and not are_recordings(paths):  # of canonical states
         recording = _of_states(paths, {n: value for n, value in options.items() if n != "mass"})
         summary = summarise(recording, options)
     else:
@@ -34,12 +36,6 @@ def look(
         figure.parent.mkdir(parents=True, exist_ok=True)
         save(recording_figure(recording, summary), figure, dpi=110)
     return summary
-
-
-def _hold_states(paths: Sequence[Path]) -> bool:
-    """Return whether the files are arrays of canonical states (q, p)."""
-    is_array = all(path.suffix.lower() in (".npz", ".npy") for path in paths)
-    return is_array and not are_recordings(paths)
 
 
 def _of_states(paths: Sequence[Path], options: Mapping[str, Any]) -> Recording:
@@ -54,5 +50,5 @@ def _of_states(paths: Sequence[Path], options: Mapping[str, Any]) -> Recording:
         raise InputError(f"{paths[0]}: expected runs of states at one time step, got pairs")
     steps = np.concatenate([np.arange(length) for length in data.lengths])
     columns = {"run": np.repeat(np.arange(len(data.lengths)), data.lengths), "t": data.dt * steps}
-    names = [f"{letter}{i + 1}" for letter in "qp" for i in range(data.dim)]
+    names = coordinate_names(data.dim)
     return Recording(columns | dict(zip(names, data.states.T, strict=True)))

@@ -144,17 +144,13 @@ def refuse_other_units(recording: Recording, job: dict[str, Any]) -> None:
     learned from; degrees and radians are one, as both are read in radians."""
     for name, known in job.get("units", {}).items():
         own = recording.unit(name) if name in recording.columns else ""
-        if own and known and own != known and not _are_angles(own, known):
+        angles = all(unit.strip().lower().startswith(_ANGLES) for unit in (own, known))
+        same = angles and own.partition("/")[2] == known.partition("/")[2]
+        if own and known and own != known and not same:
             raise InputError(
                 f"{recording.source}: expected {name} in {known}, in which the model was learned, "
                 f"got {own}"
             )
-
-
-def _are_angles(*units: str) -> bool:
-    """Return whether these are units of angles, or of their rates over the same time."""
-    angles = all(unit.strip().lower().startswith(_ANGLES) for unit in units)
-    return angles and len({unit.partition("/")[2] for unit in units}) == 1
 
 
 BEST = "best"
@@ -201,18 +197,11 @@ def _keep(
 
     A resumed fit goes through its small sizes again, which are worse than what it had kept.
     """
-    if _error_of(folder) <= candidate.validation_relative:
-        return
+    with contextlib.suppress(InputError, KeyError):  # none can be read
+        if float(saved.record(folder)["validation_relative"]) <= candidate.validation_relative:
+            return
     record = {"unfinished": job, "validation_relative": candidate.validation_relative}
     saved.save(map_, folder, scene=scene, record=record, overwrite=True)
-
-
-def _error_of(folder: Path) -> float:
-    """Error of the map that was kept in the folder; infinite where none can be read."""
-    try:
-        return float(saved.record(folder)["validation_relative"])
-    except (InputError, KeyError):
-        return float("inf")
 
 
 def line(candidate: Candidate) -> str:

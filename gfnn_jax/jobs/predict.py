@@ -346,7 +346,10 @@ class _Prediction:
             if drawn is not None:
                 of_samples = Lanes(**{name: carry[_OF_SAMPLES + name] for name in Lanes._fields})
                 passed = writer.carry["horizon"]
-        chunk = _chunk_length(z0.shape[0] * (1 + (asked.samples or 0)), z0.shape[1], asked)
+        # Saved states per chunk are a function of the job alone: a resumed job has the same.
+        num_lanes, width = z0.shape[0] * (1 + (asked.samples or 0)), z0.shape[1]
+        by_operations = _CHUNK_LANE_STEPS // (num_lanes * asked.save_every)
+        chunk = max(1, min(_CHUNK_BYTES // (8 * num_lanes * width), by_operations))
         options["save_every"] = asked.save_every
         started, begun = time.perf_counter(), writer.saved
         while writer.saved < writer.total:
@@ -379,10 +382,3 @@ def _carry(lanes: Lanes, of_samples: Lanes | None, passed) -> dict[str, Any]:
         return lanes._asdict()
     others = {_OF_SAMPLES + name: value for name, value in of_samples._asdict().items()}
     return {**lanes._asdict(), **others, "horizon": passed}
-
-
-def _chunk_length(num_lanes: int, width: int, asked: Steps) -> int:
-    """Number of saved states per chunk, a function of the job alone: a resumed job has the same."""
-    by_memory = _CHUNK_BYTES // (8 * num_lanes * width)
-    by_operations = _CHUNK_LANE_STEPS // (num_lanes * asked.save_every)
-    return max(1, min(by_memory, by_operations))

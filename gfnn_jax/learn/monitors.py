@@ -159,7 +159,10 @@ def _of_latent_readings(
         [Linear(matrix @ np.linalg.inv(read)), *pieces[:own]],
         [*pieces[own + 1 :], Linear(read)],
     )
-    turns = [run for q in runs for run in _without_gaps(np.concatenate(_ends(q, 1 - k), axis=1))]
+    turns = []  # without a missing value
+    for y in (np.concatenate(_ends(q, 1 - k), axis=1) for q in runs):
+        parts = np.split(y, np.flatnonzero(np.diff(np.isfinite(y).all(axis=1))) + 1)
+        turns += [part for part in parts if np.isfinite(part).all() and len(part)]
     found = latent_readings(pieces[own], ends, turns)
     if found is None:
         return None
@@ -168,13 +171,6 @@ def _of_latent_readings(
     leaves = jax.tree.map(jax.device_put, (*pieces[:own], found.piece, *pieces[own + 1 :]))
     posterior = Posterior(own, found.root)
     return dataclasses.replace(map_, pieces=leaves, posterior=posterior), noise
-
-
-def _without_gaps(y: np.ndarray) -> list[np.ndarray]:
-    """Stretches of rows (n, 2d) without a missing value."""
-    known = np.isfinite(y).all(axis=1)
-    cuts = np.flatnonzero(np.diff(known)) + 1
-    return [part for part in np.split(y, cuts) if np.isfinite(part).all() and len(part)]
 
 
 def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:

@@ -451,15 +451,11 @@ def _best(data: Dataset) -> tuple[str, float]:
     """The structure that leaves least of a sample's forces and velocities over, and that part."""
     if data.dim < PROPOSALS.fewest_dim or data.varied or data.coordinates.angles:
         return "", np.inf
-    left = {text: _misfit(text, data) for text in _possible(data.dim)}
+    counts = [data.dim // k for k in (3, 2, 1) if data.dim % k == 0 and data.dim // k > 1]
+    possible = ("ring", "chain", *(f"bodies:{count}" for count in counts))
+    left = {text: _misfit(text, data) for text in possible}
     best = min(left, key=lambda text: left[text])
     return best, left[best]
-
-
-def _possible(dim: int) -> Iterator[str]:
-    """The structures that so many degrees of freedom may have."""
-    yield from ("ring", "chain")
-    yield from (f"bodies:{dim // k}" for k in (3, 2, 1) if dim % k == 0 and dim // k > 1)
 
 
 def _misfit(text: str, data: Dataset) -> float:

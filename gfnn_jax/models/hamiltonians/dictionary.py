@@ -344,6 +344,10 @@ def _law(problem: LawProblem, formula: Formula, fitted: Fitted) -> FittedLaw:
     inner = tuple(map(Term, names, constants, deviations[terms:].tolist()))
     fit = problem.flows.fit(family, c, data.training, rounds=False)
     fit = fit._replace(coefficients=c, standard_errors=deviations[:terms])
+    # Of the coefficients with the constants as they are, times (m + k)/m.
+    own, across = covariance[:terms, :terms], covariance[:terms, terms:]
+    own = own - across @ np.linalg.pinv(covariance[terms:, terms:], hermitian=True) @ across.T
+    root = np.sqrt(len(covariance) / terms) * covariance_root(own)
     return FittedLaw(
         family,
         fit,
@@ -351,19 +355,10 @@ def _law(problem: LawProblem, formula: Formula, fitted: Fitted) -> FittedLaw:
         problem.error_of(family, fit),
         noisy=True,
         stalled=True,
-        whole=summary_of(fitted, _covariance_root_of_coefficients(covariance, terms)),
+        whole=summary_of(fitted, root),
         constants=inner,
         symmetries=known.symmetries,
     )
-
-
-def _covariance_root_of_coefficients(covariance: np.ndarray, terms: int) -> np.ndarray:
-    """(terms, terms), rootᵀ root that of the coefficients with the constants as they are, times
-    (m + k)/m. The covariance may be singular."""
-    own, across = covariance[:terms, :terms], covariance[:terms, terms:]
-    inverse = np.linalg.pinv(covariance[terms:, terms:], hermitian=True)
-    more = len(covariance) / terms
-    return np.sqrt(more) * covariance_root(own - across @ inverse @ across.T)
 
 
 def _readable(constant: float, deviation: float) -> float:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import FLOW
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.measured_error import FEW, OneStepError, measured_error
 from gfnn_jax.dataset.structures import Bodies
@@ -481,7 +482,7 @@ def _grown(problem: LawProblem, basis: Modes) -> FittedLaw:
     try:
         while True:
             before = work.made()
-            with work.round("growth of H", expected):
+            with work.budget.unit("growth of H", FLOW, expected, made=work.made):
                 further = next(rounds, None)
             if further is None:
                 break
@@ -571,7 +572,12 @@ def fitted_library(problem: LawProblem, family, last: FittedLaw | None) -> Fitte
     enough = z[: max(least, -(-4 * family.num_parameters // z.shape[1]))]
     args = data.given(data.training[: len(enough)])[1]
     kept, null = null_terms(family, enough, args=args)
-    elsewhere = null_terms(family, _scattered(enough), args=args)[0] if null else []
+    elsewhere = []
+    if null:  # by states of all directions around these
+        size = enough.std(axis=0)
+        size = np.where(size > 0, size, np.maximum(np.abs(enough).max(axis=0), size.max()))
+        moved = size * np.random.default_rng(0).normal(size=enough.shape)
+        elsewhere = null_terms(family, enough + moved, args=args)[0]
     undetermined = tuple(names[j] for j in null if j in elsewhere)
     family = family.take(kept)
     count = int(np.ceil(options.rows_compared * family.num_parameters / z.shape[1]))
@@ -589,13 +595,6 @@ def fitted_library(problem: LawProblem, family, last: FittedLaw | None) -> Fitte
     return _best(problem, fitted)._replace(
         null=tuple(names[j] for j in null), undetermined=undetermined
     )
-
-
-def _scattered(z) -> np.ndarray:
-    """States of all directions around the states z."""
-    size = z.std(axis=0)
-    size = np.where(size > 0, size, np.maximum(np.abs(z).max(axis=0), size.max()))
-    return z + size * np.random.default_rng(0).normal(size=z.shape)
 
 
 def _starts(problem: LawProblem, family, rows, last: FittedLaw | None) -> Iterator[np.ndarray]:

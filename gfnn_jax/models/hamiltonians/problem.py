@@ -233,10 +233,6 @@ class LawWork:
         except np.linalg.LinAlgError as error:
             self.budget.leave_out(what, f"its linear algebra failed: {error}")
 
-    def round(self, name: str, expected: float):
-        """A unit of so many operations."""
-        return self.budget.unit(name, FLOW, expected, made=self.made)
-
     @contextlib.contextmanager
     def _without_clock(self, bare: bool) -> Iterator[None]:
         """Flows that, where ``bare``, look at the cap alone."""

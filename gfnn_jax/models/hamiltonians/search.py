@@ -74,7 +74,7 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
             return found
     everywhere, arcs = data, arcs_of(data)
     if arcs is not None:
-        everywhere, length = arcs.data, arcs.length
+        everywhere, length = arcs
         problem.on_progress(f"H: fitting arcs of {length} steps, for single steps are too noisy")
     problem = problem.beginning(everywhere, most)
     free = (*everywhere.coordinates.cyclic, *everywhere.whole)
@@ -84,7 +84,12 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
         outer = np.zeros(len(everywhere.training), bool)
     inner = problem.on(everywhere.trained_on(everywhere.training[~outer]))
     best = _best_law(inner, basis)
-    _check_resolved(inner, best)
+    everyone = np.arange(len(inner.data)) if is_smooth(best.family) else best.rows
+    if inner.flows.substeps_for(best.family, best.fit.coefficients, everyone) >= MOST_SUBSTEPS:
+        raise FitError(
+            f"the H found is too fast: one dt needs {MOST_SUBSTEPS} substeps or more. Use a "
+            "smaller dt; if the pairs are of a map without a flow, use --learn map"
+        )
     best, outside = _simplified(inner, everywhere, everywhere.training[outer], best)
     ended, of_arcs = problem.work.ended, None
     problem.flows.allowance = UNBOUNDED
@@ -98,7 +103,13 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
     if best.noisy or arcs is not None:
         of_steps, best = best, _along_sequences(problem, best)
         best = of_steps if breaks_bounds(problem, best) else best
-    best, told = _with_symmetries(best, data), best.family
+    clean = isinstance(best.family, Terms) and best.error.relative <= OPTIONS.roundoff
+    if clean and data.args is None:  # symmetries to roundoff hold to the last bit
+        c, deviations = best.fit.coefficients, best.fit.standard_errors
+        z, angles = data.y0[data.validation], data.coordinates.angles
+        c = imposed(best.family, c, deviations, z, angles)
+        best = best._replace(fit=best.fit._replace(coefficients=c))
+    told = best.family
     if isinstance(told, Constrained):
         root = of_arcs or partial(covariance_root, best, problem.flows, data, best.fit.steps)
         best, of_arcs = unbound(best), lambda: root_of_all(told, root())
@@ -134,17 +145,6 @@ def _best_law(problem: LawProblem, basis: Modes | None) -> FittedLaw:
         if with_masses is not None and with_masses.error.relative <= best.error.relative:
             best = with_masses._replace(noisy=True, thresholds=best.thresholds)
     return best
-
-
-def _check_resolved(problem: LawProblem, best: FittedLaw) -> None:
-    """Raise FitError where one dt of this law takes more substeps than a flow may have."""
-    everyone = np.arange(len(problem.data)) if is_smooth(best.family) else best.rows
-    found = problem.flows.substeps_for(best.family, best.fit.coefficients, everyone)
-    if found >= MOST_SUBSTEPS:
-        raise FitError(
-            f"the H found is too fast: one dt needs {MOST_SUBSTEPS} substeps or more. Use a "
-            "smaller dt; if the pairs are of a map without a flow, use --learn map"
-        )
 
 
 def _simplified(
@@ -195,17 +195,6 @@ def _along_sequences(problem: LawProblem, best: FittedLaw) -> FittedLaw:
         found, rise = fitted_to_sequences(problem, best), problem.options.rise
         better = found is not None and found.error.relative <= rise * best.error.relative
         return found if found is not None and better else best
-    return best
-
-
-def _with_symmetries(best: FittedLaw, data: Dataset) -> FittedLaw:
-    """The law with the symmetries that it has to roundoff imposed to the last bit."""
-    clean = isinstance(best.family, Terms) and best.error.relative <= OPTIONS.roundoff
-    if clean and data.args is None:
-        c, deviations = best.fit.coefficients, best.fit.standard_errors
-        z = data.y0[data.validation]
-        c = imposed(best.family, c, deviations, z, data.coordinates.angles)
-        best = best._replace(fit=best.fit._replace(coefficients=c))
     return best
 
 

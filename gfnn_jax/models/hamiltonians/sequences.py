@@ -12,7 +12,7 @@ the noise is the same. Terms of H are then looked for in the pairs (z_i, z_{i+k}
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -90,17 +90,10 @@ class SequenceOptions:
 OPTIONS, BIWEIGHT = SequenceOptions(), Biweight()
 
 
-class LongPairs(NamedTuple):
-    """The arcs as a data set, in chains whose images are the states of the next, and k."""
-
-    data: Dataset
-    length: int
-
-
-def arcs_of(data: Dataset) -> LongPairs | None:
-    """The arcs that H is to be learned from; None where the pairs themselves serve: where no
-    sequences are, where a step is long against its noise, and for pairs of many dt or parameters,
-    or of a structure."""
+def arcs_of(data: Dataset) -> tuple[Dataset, int] | None:
+    """The arcs that H is to be learned from, in chains whose images are the states of the next, and
+    their length in steps; None where the pairs themselves serve: where no sequences are, where a
+    step is long against its noise, and for pairs of many dt or parameters, or of a structure."""
     if data.varied or data.structure is not None:
         return None
     starts, lengths = _runs(data.pairs)
@@ -126,7 +119,7 @@ def _runs(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
     return starts, np.diff(np.append(starts, len(pairs)))
 
 
-def _strided(data: Dataset, starts, lengths, length: int) -> LongPairs | None:
+def _strided(data: Dataset, starts, lengths, length: int) -> tuple[Dataset, int] | None:
     """The arcs of so many steps that are wholly in the training pairs, or in those held out."""
     first = np.concatenate(
         [
@@ -160,7 +153,7 @@ def _strided(data: Dataset, starts, lengths, length: int) -> LongPairs | None:
         return None
     split = Split(rows[0], rows[1], np.zeros(0, int), np.arange(len(first)))
     arcs = dataclasses.replace(data, pairs=strided, row=data.row[first], y0=y0, y1=y1, split=split)
-    return LongPairs(arcs, length)
+    return arcs, length
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
