@@ -44,7 +44,7 @@ from systems import bounded_states
 
 import gfnn_jax as gfnn
 from gfnn_jax.baselines import Budget, Sequences
-from gfnn_jax.baselines.paper_gfnn import paper_gfnn
+from gfnn_jax.baselines.learned import paper_gfnn
 from gfnn_jax.coordinates import TWO_PI
 from gfnn_jax.evaluate import figures, metrics, report
 from gfnn_jax.maps.symplectic_map import SymplecticMap

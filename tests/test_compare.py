@@ -8,7 +8,7 @@ import pytest
 
 from gfnn_jax import cli, scenes
 from gfnn_jax.baselines import Budget
-from gfnn_jax.baselines.paper_gfnn import paper_gfnn
+from gfnn_jax.baselines.learned import paper_gfnn
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs import compare as comparison
 from gfnn_jax.jobs.compare import SharedData, separable

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -30,10 +29,11 @@ from gfnn_jax.evaluate.simulation import simulation
 from gfnn_jax.exports.symbolic import as_mathml, defines
 from gfnn_jax.families.text import in_letters, measured
 from gfnn_jax.fitting.evidence import EVIDENCE
-from gfnn_jax.learn.fitted import Choice, Fit
+from gfnn_jax.learn.fitted import Choice, Fit, candidate_cells
 from gfnn_jax.maps.saved import versions
 from gfnn_jax.models.lagrangians.friction_choice import odds_text
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
+from gfnn_jax.storage.outputs import atomic_write
 
 _MEANING = {
     "identified": "The data determine this law: no other one that was tried explains them as well.",
@@ -115,13 +115,13 @@ def summary(fit: Fit) -> str:
 
 def write_page(fit: Fit, path: str | os.PathLike[str], **options: Any) -> None:
     """Write the page, whole or not at all. options: of `page`."""
-    _write(page(fit, **options), Path(path))
+    atomic_write(path, page(fit, **options))
 
 
 def write_reports(fit: Fit, folder: Path, about: About) -> None:
     """Write the report as page and as JSON into a folder, which is made where there is none."""
     write_page(fit, folder / PAGE, about=about)
-    _write(to_json(fit.report()), folder / REPORT)
+    atomic_write(folder / REPORT, to_json(fit.report()))
 
 
 def write_refusal(recording: Recording, error: Exception, folder: Path, about: About) -> None:
@@ -146,18 +146,8 @@ def write_refusal(recording: Recording, error: Exception, folder: Path, about: A
         Section("To do next", lines=[summary.command]),
         _made(float("nan"), about.command),
     ]
-    _write(_rendered(_title(recording), verdict, sections), folder / PAGE)
-    _write(to_json(result), folder / REPORT)
-
-
-def _write(text: str, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(
-        "w", encoding="utf-8", dir=path.parent, suffix=path.suffix, delete=False
-    ) as file:
-        file.write(text)
-    Path(file.name).chmod(0o644)
-    Path(file.name).replace(path)
+    atomic_write(folder / PAGE, _rendered(_title(recording), verdict, sections))
+    atomic_write(folder / REPORT, to_json(result))
 
 
 def _source(fit: Fit) -> str:
@@ -332,23 +322,18 @@ def _faults(fit: Fit, law: LearnedLaw) -> Iterator[str]:
 # Of pairs.
 
 
-def _bracket(fit: Fit) -> list[str]:
-    """Lines on a bracket that is not that of (q, p)."""
-    if fit.bracket is None:
-        return []
-    casimirs = "; ".join(casimir.formula for casimir in fit.casimirs) or "none"
-    return [f"Bracket: {fit.bracket}.", f"Casimirs: {casimirs}."]
-
-
 def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
-    law = found.law
+    law, bracket = found.law, []
+    if fit.bracket is not None:
+        casimirs = "; ".join(casimir.formula for casimir in fit.casimirs) or "none"
+        bracket = [f"Bracket: {fit.bracket}.", f"Casimirs: {casimirs}."]
     if law is not None and law.formula:
         with_formula = "Lagrangian" not in law.formula
         shown = as_mathml(law.formula) if with_formula else f"<mtext>{escape(law.formula)}</mtext>"
         yield Section(
             "Law",
             formulas=[("Hamiltonian", f"{defines('H')} <math><mrow>{shown}</mrow></math>")],
-            lines=[*_bracket(fit), *law.notes],
+            lines=[*bracket, *law.notes],
             heads=("term", "coefficient"),
             rows=[(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms],
         )
@@ -377,30 +362,8 @@ def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
             ),
         ],
     )
-    yield Section(
-        "Candidates",
-        heads=(
-            "",
-            "chart",
-            "family",
-            "parameters",
-            "error ÷ spread",
-            "95 % bound",
-            "kflop per step",
-        ),
-        rows=[
-            (
-                "→" if c.chosen else "",
-                c.chart,
-                c.label,
-                f"{c.num_parameters:,}",
-                f"{'' if c.validated else '~'}{c.validation_relative:.2e}",
-                f"{'' if c.validated else '~'}{c.validation_bound:.2e}",
-                f"{c.operations / 1e3:.1f}",
-            )
-            for c in found.candidates
-        ],
-    )
+    heads, rows = candidate_cells(found)
+    yield Section("Candidates", heads=heads, rows=rows)
     null = law.null_terms if law is not None else ()
     yield Section(
         "Not identified", lines=[f"The pairs do not distinguish {', '.join(null)}."] if null else []

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.baselines import METHODS, Budget, Sequences
-from gfnn_jax.baselines.paper_gfnn import paper_gfnn
+from gfnn_jax.baselines.learned import paper_gfnn
 from gfnn_jax.errors import FitWarning, InputError, WorkError
 from gfnn_jax.evaluate import figures, metrics, report
 from gfnn_jax.evaluate.metrics import one_step_rms

@@ -21,7 +21,7 @@ from gfnn_jax.data.files import are_recordings, read_trajectories
 from gfnn_jax.data.proposed import Proposed, as_proposed
 from gfnn_jax.data.recording import ReadOptions, Recording
 from gfnn_jax.dataset.runs import identified
-from gfnn_jax.diagnosis.diagnosis import NOT_SYMPLECTIC
+from gfnn_jax.diagnosis.damping import NOT_SYMPLECTIC
 from gfnn_jax.diagnosis.outliers import clean, looked_for_errors
 from gfnn_jax.diagnosis.symmetries import symmetries_of_pairs
 from gfnn_jax.errors import FitError, FitWarning, InputError, said, unexpected

@@ -531,38 +531,42 @@ class Fit:
         return float(np.max(np.asarray(defects)))
 
 
-def candidates_table(fit: Choice | Fit):
-    """The candidates of a fit as a ``rich`` table, by rising operations; the chosen one is marked.
+def candidate_cells(found: Choice | Fit) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Heads and rows of a table of the candidates, by rising operations; the chosen one is marked.
 
     An error with ~ before it is an estimate: the gradient's residual, which was told as a first
     estimate, times the ratio that measured steps of the same sweep have shown, if any were. The
     others were measured by steps. Outside: the error at the outermost twentieth of the states, of a
     fit without them.
     """
-    from rich.table import Table  # loaded when first used
-
-    def number(value, form):
-        return "–" if value is None else format(value, form)
-
-    table = Table(title=f"candidates for tolerance {fit.tolerance:g} ({fit.num_pairs} pairs)")
-    for head in ("", "chart", "family"):
-        table.add_column(head)
-    bound = "95 % bound" if fit.asked.relative else "95 % bound (absolute)"
+    bound = "95 % bound" if found.asked.relative else "95 % bound (absolute)"
     numbers = ("parameters", "error ÷ spread", bound, "outside", "kflop/step", "µs/step", "fit s")
-    for head in numbers:
-        table.add_column(head, justify="right")
-    for c in fit.candidates:
-        sign = "" if c.validated else "~"
-        table.add_row(
+    rows = [
+        (
             "→" if c.chosen else "",
             c.chart,
             c.label,
-            str(c.num_parameters),
-            f"{sign}{c.validation_relative:.2e}",
-            f"{sign}{c.validation_bound:.2e}",
-            number(c.outside, ".1e"),
+            f"{c.num_parameters:,}",
+            f"{'' if c.validated else '~'}{c.validation_relative:.2e}",
+            f"{'' if c.validated else '~'}{c.validation_bound:.2e}",
+            "–" if c.outside is None else f"{c.outside:.1e}",
             f"{c.operations / 1e3:.1f}",
-            number(c.microseconds_per_step, ".2f"),
+            "–" if c.microseconds_per_step is None else f"{c.microseconds_per_step:.2f}",
             f"{c.fit_seconds:.2f}",
         )
+        for c in found.candidates
+    ]
+    return ("", "chart", "family", *numbers), rows
+
+
+def candidates_table(found: Choice | Fit):
+    """The candidates of a fit as a ``rich`` table, as of `candidate_cells`."""
+    from rich.table import Table  # loaded when first used
+
+    table = Table(title=f"candidates for tolerance {found.tolerance:g} ({found.num_pairs} pairs)")
+    heads, rows = candidate_cells(found)
+    for place, head in enumerate(heads):
+        table.add_column(head, justify="left" if place < 3 else "right")
+    for row in rows:
+        table.add_row(*row)
     return table

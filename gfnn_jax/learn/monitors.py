@@ -30,7 +30,7 @@ from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.piece import Affine
 from gfnn_jax.maps.posterior import Posterior
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.generating_functions.latent_monitors import Linear, latent_readings
+from gfnn_jax.models.generating_functions.map_arcs import Linear, latent_readings
 from gfnn_jax.phase_space import Pairs, sizes, symplectic_form
 
 

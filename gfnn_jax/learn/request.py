@@ -23,7 +23,7 @@ from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import Identified, sampled
 from gfnn_jax.dataset.structures import Structure, fields_of, structure_of
 from gfnn_jax.dataset.varied import as_varied, check_varied
-from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed, lossy, undiagnosed
+from gfnn_jax.diagnosis.damping import Diagnosis, diagnosed, lossy, undiagnosed
 from gfnn_jax.diagnosis.local_jacobians import check_number
 from gfnn_jax.diagnosis.residuals import misfit
 from gfnn_jax.errors import FitError, InputError

@@ -12,7 +12,7 @@ from gfnn_jax.budget import FLOW
 from gfnn_jax.candidates.assemble import Candidate
 from gfnn_jax.coordinates import Coordinates, to_inner, to_user
 from gfnn_jax.dataset.dataset import Dataset
-from gfnn_jax.diagnosis.diagnosis import Diagnosis, diagnosed
+from gfnn_jax.diagnosis.damping import Diagnosis, diagnosed
 from gfnn_jax.diagnosis.local_jacobians import Charts
 from gfnn_jax.errors import FitError, InputError, OutOfTime
 from gfnn_jax.families.terms import Terms
