@@ -41,6 +41,7 @@ class Options:
     shortest_arc: int = 5
     slow: float = 0.1  # of the rms speed: less of it, in one of several systems, tells no frequency
     still: float = 1.5  # of the noise: the standard deviation up to which a coordinate stands still
+    creeping: float = 0.05  # of a coordinate's standard deviation: what creeps varies by less
     kept: float = 0.25  # periods of a rest that stay, in which the body comes to a stop or starts
     even: float = 0.95  # of the readings, that even stretches have to hold
     gap: float = 0.25  # periods without a reading, over which a state is not predictable yet
@@ -444,14 +445,15 @@ class Moving(NamedTuple):
 
 
 def without_rests(found: Sequence[Stretch], scales: Scales) -> Moving:
-    """Take the rests out of stretches of plain positions; where no motion would be left, or where
-    sampling is uneven, none."""
+    """Take the rests out of stretches of plain positions, and the end where a body creeps; where no
+    motion would be left, or where sampling is uneven, none."""
     if scales.uneven:
         return Moving(list(found), 0.0, 0.0)
     window = max(9, round(scales.period / scales.dt))
     kept, resting, short = [], 0.0, 0.0
     for stretch in found:
-        at_rest = _shrunk(_still(stretch, scales.sigma, window), round(OPTIONS.kept * window))
+        at_rest = _still(stretch, scales.sigma, window) | _creeps(stretch, scales.sigma, window)
+        at_rest = _shrunk(at_rest, round(OPTIONS.kept * window))
         resting += sum(float(stretch.t[b - 1] - stretch.t[a]) for a, b in _runs(at_rest))
         for a, b in _runs(~at_rest):
             if b - a >= window:
@@ -471,6 +473,21 @@ def _still(stretch: Stretch, sigma: np.ndarray, window: int) -> np.ndarray:
     begun = np.concatenate([np.cumsum(quiet), np.full(window - 1, np.sum(quiet))])
     ended = np.concatenate([np.zeros(window, int), np.cumsum(quiet)[:-1]])[: len(q)]
     return begun > ended
+
+
+def _creeps(stretch: Stretch, sigma: np.ndarray, window: int) -> np.ndarray:
+    """Samples (n,) from which on, to the end, each coordinate varies little in each window, and
+    oscillates in none: friction holds the body. What springs back turns within a window, by the
+    means of its quarters."""
+    q, part = stretch.q, window // 4
+    views = np.lib.stride_tricks.sliding_window_view(q, 4 * part, axis=0)
+    change = np.diff(views.reshape(*views.shape[:2], 4, part).mean(axis=-1), axis=-1)
+    noise = 5 * sigma[: q.shape[1], None] * np.sqrt(2 / part)
+    one_way = (change > -noise).all(axis=-1) | (change < noise).all(axis=-1)
+    little = views.std(axis=-1) < OPTIONS.creeping * np.std(q, axis=0)
+    moves = np.flatnonzero(~(one_way & little).all(axis=1))
+    begins = moves[-1] + 1 if len(moves) else 0
+    return (np.arange(len(q)) >= begins) & (begins < len(views))
 
 
 def _shrunk(mask: np.ndarray, by: int) -> np.ndarray:

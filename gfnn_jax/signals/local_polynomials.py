@@ -100,11 +100,13 @@ def _windows(times: Sequence[np.ndarray], size: int) -> tuple[np.ndarray, np.nda
 @dataclasses.dataclass(frozen=True)
 class _Options:
     """halves: windows, samples on either side. samples: where the errors of a window are measured.
-    tolerance: of the leave-one-out error, against the best window's."""
+    tolerance: of the leave-one-out error, against the best window's. rounding: of a channel's range,
+    below which an error is that of a constant."""
 
     halves: tuple[int, ...] = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 64, 80)
     samples: int = 2_000
     tolerance: float = 1.05
+    rounding: float = 1e-13
 
 
 _OPTIONS = _Options()
@@ -144,6 +146,7 @@ def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np
     and the noise σ (d,) of the channels: the smallest leave-one-out error, less the cubic's own
     part."""
     total = sum(len(t) for t, _ in stretches)
+    rounding = _OPTIONS.rounding * np.max([np.ptp(y, axis=0) for _, y in stretches], axis=0)
     every = max(1, total // _OPTIONS.samples)
     halves = [h for h in _OPTIONS.halves if any(len(t) >= 2 * h + 1 for t, _ in stretches)]
     errors, sigmas = [], []
@@ -154,7 +157,9 @@ def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np
             if len(t) >= 2 * half + 1
         ]
         squares = np.concatenate(left_out) ** 2
-        variance = np.median(squares, axis=0) / 0.4549  # the median of χ² with one degree is 0.4549
+        squares[squares < rounding**2] = np.nan  # a sensor's step hides the noise of what rests
+        squares[:, np.isnan(squares).all(axis=0)] = 0.0
+        variance = np.nanmedian(squares, axis=0) / 0.4549  # that of χ² with one degree is 0.4549
         errors.append(np.sqrt(variance))
         sigmas.append(np.sqrt(variance / (1 + 9 / (4 * (2 * half + 1)))))
     relative = np.array(errors) / np.maximum(np.min(errors, axis=0), 1e-300)

@@ -19,7 +19,7 @@ from scipy.optimize import minimize_scalar
 
 from gfnn_jax.dataset.stretches import Scales
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC
+from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC
 from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
@@ -75,13 +75,15 @@ class _Library(NamedTuple):
     """Terms of a start. rank: among libraries, the plainest first. apart: without friction between
     coordinates, which with masses below zero imitates a force at right angles to the motion. equal:
     with equal masses of all coordinates, for the weak form makes the equation of one as small as it
-    likes. leaders: coordinates that drive the others and are not moved by them."""
+    likes. leaders: coordinates that drive the others and are not moved by them. dry: with dry
+    friction of each coordinate."""
 
     rows: Sequence[Row]
     rank: int = 0
     apart: bool = False
     equal: bool = False
     leaders: tuple[int, ...] = ()
+    dry: bool = False
 
 
 def best_start(problem: ArcProblem) -> LawFit:
@@ -121,6 +123,7 @@ def best_start(problem: ArcProblem) -> LawFit:
     some.add_central(textbook.rows, 3, across=False)
     for degree in (3, 4):
         some.add_bodies(degree)
+    some.add_dry([textbook, _Library(first, 2)])
     if inputs := problem.num_inputs:
         driven = libraries.driven(d, angles, inputs, problem.squares)
         some.add_richer([*textbook.rows, *driven], 3)
@@ -176,6 +179,9 @@ class _Starts:
         zero: (d,) of angles, from which the fit begins."""
         problem, d = self.problem, self.problem.dim
         friction = tuple(self.linear[:d] if library.apart else self.linear)
+        if library.dry:
+            friction = tuple(libraries.losses(d, (LINEAR, DRY), 0.0))
+            friction = tuple(row for row in friction if sum(map(abs, row[0])) == 1)
         terms = libraries.without_forces(library.rows, problem.observation.shifts())
         seen = problem
         if zero is not None:
@@ -193,7 +199,7 @@ class _Starts:
         structure = structure.plus([("loss", row) for row in self.always])
         if zero is not None:
             known = known | {("zero", i): float(zero[i]) for i in zeros}
-        elif any(_is_of(other, structure) for other in self.fits):
+        elif not library.dry and any(_is_of(other, structure) for other in self.fits):
             return
         periods = problem.options.periods[0]
         rule = choose_rule(problem, structure, known, problem.arcs(periods), problem.scales.sigma)
@@ -223,6 +229,16 @@ class _Starts:
         if d > 1 and not (self.problem.angles or self.one_valued or self.least < OPTIONS.white):
             of = libraries.bodies if d <= libraries.FEW else libraries.side_by_side
             self.add(_Library(of(d, (), degree), 2, apart=True, equal=True))
+
+    def add_dry(self, some: Sequence[_Library]) -> None:
+        """Start from plain libraries beside dry friction where the residuals of all starts are more
+        than noise: what stops a body, and holds it, many terms imitate."""
+        d = self.problem.dim
+        if d > 1 and not self.problem.angles:
+            some = [*some, _Library(libraries.bodies(d, (), 3), 2, apart=True, equal=True)]
+        for library in some:
+            if not self.are_noise and not self.one_valued:
+                self.add(library._replace(dry=True))
 
     def add_led(self, rows: Sequence[Row], rank: int) -> None:
         """Start from coordinates that drive others and are not moved by them, as a cart whose motor
