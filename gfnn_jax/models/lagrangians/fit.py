@@ -429,14 +429,13 @@ class LawFit:
 
     @property
     def values(self) -> dict[Key, float]:
-        """The coefficients, and those that the gauge gives of parts which nothing couples with the
-        first coordinate."""
+        """The coefficients, with those that are held, and that the gauge gives of parts which nothing
+        couples with the first coordinate."""
         structure, form = self.structure, self.form
         values = dict(zip(structure.keys(), map(float, self.p), strict=True))
-        if structure.given[1:]:
-            theta = form.lagrangian(self.p[: form.count]).coefficients
-            values |= {("term", structure.terms[k]): float(theta[k]) for k in structure.given[1:]}
-        return values
+        theta = form.lagrangian(self.p[: form.count]).coefficients.tolist()
+        others = dict(zip(structure.terms[1:], theta[1:], strict=True))
+        return values | {("term", row): c for row, c in others.items() if ("term", row) not in values}
 
     @functools.cached_property
     def linearised(self) -> Linearised:

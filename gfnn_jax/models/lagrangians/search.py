@@ -305,7 +305,7 @@ class TermSearch:
         do not lose; and, unless ``friction`` has been chosen, without that which would drive.
         First, of terms that the record determines only together, without one."""
         refused: set[Key] = set()
-        fit, evidence = without_degeneracies(fit), fit.problem.options.evidence
+        fit, evidence = with_known_masses(without_degeneracies(fit)), fit.problem.options.evidence
         costs = None
         while True:
             z = fit.significance
@@ -468,6 +468,33 @@ def without_degeneracies(fit: LawFit) -> LawFit:
         others = ", ".join(fit.problem.word(key) for key in open_[1:])
         _dropped(fit, gone, f"determined only together with {others}")
         fit = without
+
+
+def with_known_masses(fit: LawFit) -> LawFit:
+    """The fit with each mass of a length that the record hardly determines held at that of the
+    first, where that costs nothing, and with those that it determines free: bodies that little
+    couples, or that swing together, move alike whatever the ratio of their masses."""
+    problem, least = fit.problem, fit.problem.options.evidence.significant
+    if problem.angles or problem.parameters or not fit.follows:
+        return fit
+    free = fit.structure
+    if free.held:
+        free = dataclasses.replace(free, held=())
+        released = fit.again(free)
+        masses = [("term", one.row) for one in fit.structure.held]
+        if not (released.is_definite and min(map(released.significance.__getitem__, masses)) > least):
+            return fit
+        fit = released
+    z, masses = fit.significance, protected(free)
+    held = tuple(Held(k[1], 0.5) for k in z if k in masses and z[k] < least)
+    if not held:
+        return fit
+    equal = fit.again(dataclasses.replace(free, held=held))
+    if equal.fitted.cost - fit.fitted.cost > least**2 * fit.correlation:
+        return fit
+    for one in held:
+        problem.on_progress(f"  {problem.word(('term', one.row))}: hardly determined, held at 0.5")
+    return equal
 
 
 def without_drives(fit: LawFit) -> LawFit:

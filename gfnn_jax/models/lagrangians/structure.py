@@ -209,6 +209,8 @@ class Structure:
         basis = np.eye(terms.count)[:, self._free]
         for row, value, of, _ in sorted(self.held, key=lambda one: one.of is not None):
             k = self.terms.index(row)
+            if k in self.given:
+                continue
             if of is None:
                 fixed[k] = value
             else:
