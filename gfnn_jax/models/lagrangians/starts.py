@@ -140,7 +140,7 @@ def best_start(problem: ArcProblem) -> LawFit:
     some.add_led([*first, *libraries.couplings(d, angles)], 7)
     if not some.fits or (some.one_valued and not some.followed):
         raise no_law(problem.scales)
-    return some.likeliest() if some.least < OPTIONS.white else some.plainest()
+    return some.best_along(some.likeliest() if some.least < OPTIONS.white else some.plainest())
 
 
 def misfit(fit: LawFit) -> float:
@@ -148,6 +148,12 @@ def misfit(fit: LawFit) -> float:
     if not (fit.follows and fit.is_definite):
         return np.inf
     return float(np.max(fit.rms() / fit.problem.scales.sigma))
+
+
+def _criteria(fits: Sequence[LawFit]) -> list[float]:
+    """Schwarz's criterion of fits of the same arcs, by the residuals that the best leaves."""
+    count = min(fits, key=misfit).independent
+    return [criterion(misfit(fit) ** 2, count, len(fit.p)) for fit in fits]
 
 
 def leading(problem: ArcProblem) -> list[tuple[int, ...]]:
@@ -222,11 +228,13 @@ class _Starts:
         if not self.are_noise:
             self.add(_Library(rows, rank, apart=True))
 
-    def add_bodies(self, degree: int) -> None:
+    def add_bodies(self, degree: int, always: bool = False) -> None:
         """Start from equal masses in a potential of lengths up to a degree, where some start leaves
         more than noise: along a straight orbit masses are told only together with forces."""
         d = self.problem.dim
-        if d > 1 and not (self.problem.angles or self.one_valued or self.least < OPTIONS.white):
+        if self.least < OPTIONS.white and not always:
+            return
+        if d > 1 and not (self.problem.angles or self.one_valued):
             of = libraries.bodies if d <= libraries.FEW else libraries.side_by_side
             self.add(_Library(of(d, (), degree), 2, apart=True, equal=True))
 
@@ -319,12 +327,28 @@ class _Starts:
 
     def likeliest(self) -> LawFit:
         """The likeliest by Schwarz's criterion, which asks for residuals that are noise."""
-        count = min(self.fits, key=misfit).independent
+        return self.fits[int(np.argmin(_criteria(self.fits)))]
 
-        def of(fit: LawFit) -> float:
-            return criterion(misfit(fit) ** 2, count, len(fit.p))
-
-        return min(self.fits, key=of)
+    def best_along(self, taken: LawFit) -> LawFit:
+        """The start that was taken, or of those that leave noise the one that is likelier by odds
+        along longer arcs: noise hides along short ones what a law lacks. Where all of them lack
+        something, bodies in a richer potential are tried too."""
+        near = [fit for fit in self.fits if misfit(fit) < OPTIONS.noise]
+        if taken not in near:
+            return taken
+        longer = near
+        for periods in self.problem.options.periods[1:3]:
+            longer = [fit.again(arcs=fit.problem.arcs(periods)) for fit in longer]
+        if min(map(misfit, longer)) > OPTIONS.white:
+            count = len(self.fits)
+            for degree in (3, 4):
+                self.add_bodies(degree, always=True)
+            if len(self.fits) > count:
+                return self.best_along(taken)
+        above = _criteria(longer)
+        best = int(np.argmin(above))
+        deciding = self.problem.options.evidence.deciding
+        return near[best] if above[best] < above[near.index(taken)] - deciding else taken
 
     @property
     def least(self) -> float:
