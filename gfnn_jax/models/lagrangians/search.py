@@ -267,6 +267,7 @@ class TermSearch:
                 fit = with_constant(fit)
             if self.frictions is not None and not fit.problem.parameters:
                 fit, choice = self._exchanged(fit, choice)
+            fit = with_equal_masses(fit, fit.problem.options.evidence.significant)
         return SearchResult(with_delay(fit), choice)
 
     def _exchanged(self, fit: LawFit, choice: FrictionChoice) -> tuple[LawFit, FrictionChoice]:
@@ -305,7 +306,7 @@ class TermSearch:
         do not lose; and, unless ``friction`` has been chosen, without that which would drive.
         First, of terms that the record determines only together, without one."""
         refused: set[Key] = set()
-        fit, evidence = with_known_masses(without_degeneracies(fit)), fit.problem.options.evidence
+        fit, evidence = with_equal_masses(without_degeneracies(fit)), fit.problem.options.evidence
         costs = None
         while True:
             z = fit.significance
@@ -323,8 +324,7 @@ class TermSearch:
                     refused.add(key)
                     continue
             less = fit.again(smaller)
-            rise = np.max(np.log(np.maximum(less.rms(), 1e-300) / np.maximum(fit.rms(), 1e-300)))
-            if not 2 * fit.independent * rise < 2 * evidence.significant**2:
+            if not _leaves_little_more(less, fit):
                 refused.add(key)  # the others take no orbit to where they would make up for it
                 continue
             _dropped(fit, key, f"{z[key]:.1f} standard errors")
@@ -470,31 +470,28 @@ def without_degeneracies(fit: LawFit) -> LawFit:
         fit = without
 
 
-def with_known_masses(fit: LawFit) -> LawFit:
-    """The fit with each mass of a length that the record hardly determines held at that of the
-    first, where that costs nothing, and with those that it determines free: bodies that little
-    couples, or that swing together, move alike whatever the ratio of their masses."""
-    problem, least = fit.problem, fit.problem.options.evidence.significant
-    if problem.angles or problem.parameters or not fit.follows:
+def _leaves_little_more(less: LawFit, fit: LawFit) -> bool:
+    """Return whether a fit of fewer coefficients leaves little more than one."""
+    rise = np.max(np.log(np.maximum(less.rms(), 1e-300) / np.maximum(fit.rms(), 1e-300)))
+    return bool(fit.independent * rise < fit.problem.options.evidence.significant**2)
+
+
+def with_equal_masses(fit: LawFit, least: float = np.inf) -> LawFit:
+    """The fit with the masses of lengths that stand less than ``least`` standard errors from zero
+    held at that of the first, where that leaves little more, and with the others free: bodies that
+    little couples, or that swing together, move alike whatever the ratio of their masses."""
+    if fit.problem.angles or fit.problem.parameters or not fit.follows:
         return fit
-    free = fit.structure
-    if free.held:
-        free = dataclasses.replace(free, held=())
-        released = fit.again(free)
-        masses = [("term", one.row) for one in fit.structure.held]
-        if not (released.is_definite and min(map(released.significance.__getitem__, masses)) > least):
-            return fit
-        fit = released
-    z, masses = fit.significance, protected(free)
+    free = dataclasses.replace(fit.structure, held=())
+    free = fit.again(free, fit.values) if fit.structure.held else fit
+    if not (free.follows and free.is_definite):
+        free = fit
+    z, masses = free.significance, protected(free.structure)
     held = tuple(Held(k[1], 0.5) for k in z if k in masses and z[k] < least)
     if not held:
-        return fit
-    equal = fit.again(dataclasses.replace(free, held=held))
-    if equal.fitted.cost - fit.fitted.cost > least**2 * fit.correlation:
-        return fit
-    for one in held:
-        problem.on_progress(f"  {problem.word(('term', one.row))}: hardly determined, held at 0.5")
-    return equal
+        return free
+    equal = free.again(dataclasses.replace(free.structure, held=held))
+    return equal if _leaves_little_more(equal, free) or not free.is_definite else free
 
 
 def without_drives(fit: LawFit) -> LawFit:
