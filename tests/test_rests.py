@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import measure, stretches, without_rests
@@ -58,6 +59,26 @@ def test_what_moves_is_kept():
     np.testing.assert_array_equal(parts[0].t, found[0].t)
 
 
+def test_what_creeps_at_the_end_is_left_out():
+    """A body that friction holds creeps by more than the noise, and turns no more; one that swings
+    as little is kept."""
+    t = np.arange(0, 60, DT)
+    dies = np.where(t < 20, np.cos(t), 0) * (1 - t / 25)
+    creeps, swings = 0.05 * np.exp(-t / 40), 0.002 * np.cos(t)
+    for end, left in ((creeps, 35), (creeps + swings, 0)):
+        x = dies + end + 1e-6 * np.random.default_rng(0).normal(size=len(t))
+        found = stretches(gfnn.Recording({"t": t, "x": x}, positions=["x"]))
+        assert without_rests(found, measure(found)).resting == pytest.approx(left, abs=5)
+
+
+def test_noise_is_that_of_what_moves():
+    """A sensor's steps hide the noise of a body at rest."""
+    t = np.arange(0, 60, DT)
+    x = 0.01 * np.round(100 * np.where(t < 20, np.cos(t), np.cos(20)))
+    found = stretches(gfnn.Recording({"t": t, "x": x}, positions=["x"]))
+    assert measure(found).sigma[0] == pytest.approx(0.01 / np.sqrt(12), rel=0.3)
+
+
 def test_parts_shorter_than_a_period_are_no_rests():
     t = np.concatenate([np.arange(0, 40, DT), np.arange(45, 48, DT)])
     x = np.sin(t) + NOISE * np.random.default_rng(0).normal(size=len(t))
@@ -76,3 +97,23 @@ def test_dry_friction_of_a_record_that_rests_half_its_time():
     assert abs(dry.coefficient - HELD) < 3 * dry.std
     assert dry.std < 1e-4
     assert any("at rest" in message for message in fit.messages)
+
+
+@pytest.mark.slow
+def test_coupled_coordinates_that_dry_friction_stops():
+    """One coordinate is at rest long before the other, and both creep in the end, where the law
+    without inertia leads; the coupling is seen in a few periods."""
+
+    def rates(t, z):
+        x, y, *v = z
+        dry = 0.008 * np.tanh(np.array(v) / 1e-3)
+        return [*v, *(np.array([-x - 2 * x * y, -y - x * x + y * y]) - dry)]
+
+    t = np.arange(0, 90, 0.15)
+    q = solve_ivp(rates, (0, 90), [0.15, 0.25, 0, 0], t_eval=t, rtol=1e-9, atol=1e-11).y[:2].T
+    q = q + 1e-5 * np.random.default_rng(0).normal(size=q.shape)
+    fit = gfnn.fit(gfnn.Recording({"t": t, "x": q[:, 0], "y": q[:, 1]}, positions=["x", "y"]))
+    found = {term.term: term.coefficient for term in fit.lagrangian.terms}
+    exact = {"x**2": -0.5, "y**2": -0.5, "x**2*y": -1.0, "y**3": 1 / 3}
+    assert {name: found[name] for name in exact} == pytest.approx(exact, rel=0.05)
+    assert fit.which_friction.kinds == ("dry",)

@@ -480,6 +480,8 @@ def _creeps(stretch: Stretch, sigma: np.ndarray, window: int) -> np.ndarray:
     oscillates in none: friction holds the body. What springs back turns within a window, by the
     means of its quarters."""
     q, part = stretch.q, window // 4
+    if len(q) < 4 * part:
+        return np.zeros(len(q), bool)
     views = np.lib.stride_tricks.sliding_window_view(q, 4 * part, axis=0)
     change = np.diff(views.reshape(*views.shape[:2], 4, part).mean(axis=-1), axis=-1)
     noise = 5 * sigma[: q.shape[1], None] * np.sqrt(2 / part)

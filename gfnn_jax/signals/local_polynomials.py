@@ -100,8 +100,8 @@ def _windows(times: Sequence[np.ndarray], size: int) -> tuple[np.ndarray, np.nda
 @dataclasses.dataclass(frozen=True)
 class _Options:
     """halves: windows, samples on either side. samples: where the errors of a window are measured.
-    tolerance: of the leave-one-out error, against the best window's. rounding: of a channel's range,
-    below which an error is that of a constant."""
+    tolerance: of the leave-one-out error, against the best window's. rounding: of a channel's
+    range, below which an error is that of a constant."""
 
     halves: tuple[int, ...] = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 64, 80)
     samples: int = 2_000

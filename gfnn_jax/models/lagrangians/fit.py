@@ -429,13 +429,15 @@ class LawFit:
 
     @property
     def values(self) -> dict[Key, float]:
-        """The coefficients, with those that are held, and that the gauge gives of parts which nothing
-        couples with the first coordinate."""
+        """The coefficients, those that are held, and those that the gauge gives of parts which
+        nothing couples with the first coordinate."""
         structure, form = self.structure, self.form
         values = dict(zip(structure.keys(), map(float, self.p), strict=True))
-        theta = form.lagrangian(self.p[: form.count]).coefficients.tolist()
-        others = dict(zip(structure.terms[1:], theta[1:], strict=True))
-        return values | {("term", row): c for row, c in others.items() if ("term", row) not in values}
+        if structure.given[1:] or structure.held:
+            theta = form.lagrangian(self.p[: form.count]).coefficients.tolist()
+            own = zip(structure.terms[1:], theta[1:], strict=True)
+            values |= {("term", row): value for row, value in own}
+        return values
 
     @functools.cached_property
     def linearised(self) -> Linearised:
