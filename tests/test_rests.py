@@ -1,5 +1,7 @@
 """Rests of a recording: where dry friction holds a body, its samples are no equation of motion."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -90,7 +92,7 @@ def test_parts_shorter_than_a_period_are_no_rests():
 
 @pytest.mark.slow
 def test_dry_friction_of_a_record_that_rests_half_its_time():
-    fit = gfnn.fit(record())
+    fit: Any = gfnn.fit(record())
     assert fit.which_friction.kinds == ("dry",)
     spring, dry = fit.lagrangian.terms[1], fit.friction.terms[0]
     assert abs(spring.coefficient + 0.5) < 3 * spring.std
@@ -112,7 +114,7 @@ def test_coupled_coordinates_that_dry_friction_stops():
     t = np.arange(0, 90, 0.15)
     q = solve_ivp(rates, (0, 90), [0.15, 0.25, 0, 0], t_eval=t, rtol=1e-9, atol=1e-11).y[:2].T
     q = q + 1e-5 * np.random.default_rng(0).normal(size=q.shape)
-    fit = gfnn.fit(gfnn.Recording({"t": t, "x": q[:, 0], "y": q[:, 1]}, positions=["x", "y"]))
+    fit: Any = gfnn.fit(gfnn.Recording({"t": t, "x": q[:, 0], "y": q[:, 1]}, positions=["x", "y"]))
     found = {term.term: term.coefficient for term in fit.lagrangian.terms}
     exact = {"x**2": -0.5, "y**2": -0.5, "x**2*y": -1.0, "y**3": 1 / 3}
     assert {name: found[name] for name in exact} == pytest.approx(exact, rel=0.05)

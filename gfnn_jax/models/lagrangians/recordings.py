@@ -561,7 +561,10 @@ def _left_out(moving: Moving) -> tuple[str, ...]:
     """A line on what does not move, and one on what moves for less than a period."""
     lines = []
     if moving.resting:
-        lines.append(f"{moving.resting:.3g} s at rest left out: a body at rest shows no dynamics")
+        lines.append(
+            f"{moving.resting:.3g} s at rest, or creeping to it, left out: what friction holds "
+            "shows no dynamics"
+        )
     if moving.short:
         lines.append(
             f"{moving.short:.3g} s in parts shorter than a period left out: they tell little more "
@@ -636,13 +639,9 @@ def _scale(data: RecordingData, told: bool) -> float:
 
 
 def _held(fit: LawFit) -> list[str]:
-    """Messages about coefficients that are held at a bound."""
-    return [
-        f"{fit.problem.word(('term', one.row))} is held at its bound: the record alone would put "
-        "its coefficient beyond"
-        for one in fit.structure.held
-        if one.is_bound
-    ]
+    """Messages about coefficients that are held at a bound, or as of equal masses."""
+    held = fit.structure.held
+    return [f"{fit.problem.word(('term', one.row))} {one.why}" for one in held if one.why]
 
 
 def _with_hidden_drive(

@@ -29,7 +29,16 @@ from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.rivals import with_a_shape, with_constant, with_likeliest_power
 from gfnn_jax.models.lagrangians.starts import OPTIONS, best_start, leading, misfit
-from gfnn_jax.models.lagrangians.structure import Held, Key, Loss, Row, Structure, is_constant
+from gfnn_jax.models.lagrangians.structure import (
+    AS_EQUAL,
+    AT_BOUND,
+    Held,
+    Key,
+    Loss,
+    Row,
+    Structure,
+    is_constant,
+)
 from gfnn_jax.models.lagrangians.weak_form import promising, protected, weak_start
 from gfnn_jax.models.lagrangians.zeros import with_zeros_of_runs
 
@@ -159,7 +168,8 @@ def passed(fit: LawFit, bounds: Mapping[Row, tuple[float, float]]) -> list[Held]
     out = (p < ends[0]) | (p > ends[1])
     side = np.where(change != 0, change, np.where(out, np.sign(p - ends[1]), 0))
     return [
-        Held(keys[k][1], float(ends[int(side[k] > 0)][k]), None, True) for k in np.flatnonzero(side)
+        Held(keys[k][1], float(ends[int(side[k] > 0)][k]), None, AT_BOUND)
+        for k in np.flatnonzero(side)
     ]
 
 
@@ -487,7 +497,7 @@ def with_equal_masses(fit: LawFit, least: float = np.inf) -> LawFit:
     if not (free.follows and free.is_definite):
         free = fit
     z, masses = free.significance, protected(free.structure)
-    held = tuple(Held(k[1], 0.5) for k in z if k in masses and z[k] < least)
+    held = tuple(Held(k[1], 0.5, None, AS_EQUAL) for k in z if k in masses and z[k] < least)
     if not held:
         return free
     equal = free.again(dataclasses.replace(free.structure, held=held))

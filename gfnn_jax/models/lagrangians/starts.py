@@ -164,9 +164,12 @@ def leading(problem: ArcProblem) -> list[tuple[int, ...]]:
 
 
 def _is_of(fit: LawFit, structure: Structure) -> bool:
-    """Return whether a fit has the terms of a structure."""
-    own = fit.structure
-    return (own.terms, own.leaders) == (structure.terms, structure.leaders)
+    """Return whether a fit has the terms and the dry friction of a structure."""
+    parts = (
+        (one.terms, one.leaders, *(row for row in one.friction if row[1] == DRY))
+        for one in (fit.structure, structure)
+    )
+    return len(set(parts)) == 1
 
 
 class _Starts:
@@ -205,7 +208,7 @@ class _Starts:
         structure = structure.plus([("loss", row) for row in self.always])
         if zero is not None:
             known = known | {("zero", i): float(zero[i]) for i in zeros}
-        elif not library.dry and any(_is_of(other, structure) for other in self.fits):
+        elif any(_is_of(other, structure) for other in self.fits):
             return
         periods = problem.options.periods[0]
         rule = choose_rule(problem, structure, known, problem.arcs(periods), problem.scales.sigma)

@@ -67,14 +67,18 @@ def _touched(row: Row) -> list[bool]:
     return [bool(k or f) for k, f in zip(row[0], coordinates_in(row), strict=True)]
 
 
+AT_BOUND = "is held at its bound: the record alone would put its coefficient beyond"
+AS_EQUAL = "is hardly determined: it has the coefficient of equal masses"
+
+
 class Held(NamedTuple):
     """A term whose coefficient is no free one: ``value``, or that many times the one of another
-    term. is_bound: whether the value is a bound, which the data alone would pass."""
+    term. why: it is not as told: AT_BOUND or AS_EQUAL."""
 
     row: Row
     value: float
     of: Row | None = None
-    is_bound: bool = False
+    why: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
