@@ -260,3 +260,21 @@ def test_the_zero_of_an_angle_takes_the_place_of_its_sine():
     q, zero = np.linspace(-3, 3, 9), told["zero", 0]
     assert_allclose(told["term", cosine] * np.cos(q - zero), -9.8 * np.cos(q) + 1.3 * np.sin(q))
     assert structure.may_have(("term", sine))  # without a zero nothing else tells it
+
+
+def test_an_angle_about_a_center_has_no_mass_of_its_own():
+    """L = ½(r² θ̇² + ṙ²) + 9.8 r cos θ − 15 (r − 1)², whichever coordinate comes first."""
+
+    def acceleration(q, v):
+        (angle, r), (turn, out) = q, v
+        sideways = (-2 * turn * out - 9.8 * np.sin(angle)) / r
+        return [sideways, r * turn**2 + 9.8 * np.cos(angle) - 30 * (r - 1)]
+
+    start, names = [0.8, 1.4, 0.0, 0.0], ("theta", "r")
+    found = recorded(acceleration, start, names, end=15.0, angles=["theta"])
+    fit = gfnn.fit(found)
+    assert fit.verdict == "identified"
+    own = coefficients(fit.lagrangian)
+    assert_allclose(own["theta_dot**2*r**2"], 0.5)
+    assert_allclose(own["r_dot**2"], 0.5, rtol=1e-3)
+    assert "theta_dot**2" not in own

@@ -171,7 +171,7 @@ def _left_of(problem: ArcProblem, stiff: bool) -> tuple[Callable[[float], float]
 
     def left(omega: float) -> float:
         waves = np.stack([np.cos(omega * t), np.sin(omega * t)], axis=1)[..., None]
-        both = weights @ (waves * factors).reshape(len(t), many)
+        both: Any = weights @ (waves * factors).reshape(len(t), many)
         A = (both[:, None, None, :] * np.eye(d)[:, :, None]).reshape(len(y), many * d)
         A = A - Q @ (Q.T @ A)
         c = np.linalg.lstsq(A, y, rcond=OPTIONS.rank)[0]

@@ -19,7 +19,7 @@ from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
-from gfnn_jax.models.lagrangians.structure import Key, Structure
+from gfnn_jax.models.lagrangians.structure import Key, Structure, is_constant
 from gfnn_jax.models.lagrangians.text import Names, word_of
 from gfnn_jax.solve.latent_arcs import Defects, Fitted, Observed, Readings
 from gfnn_jax.solve.noise import Wander
@@ -429,13 +429,14 @@ class LawFit:
 
     @property
     def values(self) -> dict[Key, float]:
-        """The coefficients, those that are held, and those that the gauge gives of parts which
-        nothing couples with the first coordinate."""
+        """The coefficients, those that are held, and those that the gauge gives, but for the
+        constant mass of the first coordinate."""
         structure, form = self.structure, self.form
         values = dict(zip(structure.keys(), map(float, self.p), strict=True))
-        if structure.given[1:] or structure.held:
+        begin = int(is_constant(structure.terms[0]))
+        if structure.given[begin:] or structure.held:
             theta = form.lagrangian(self.p[: form.count]).coefficients.tolist()
-            own = zip(structure.terms[1:], theta[1:], strict=True)
+            own = zip(structure.terms[begin:], theta[begin:], strict=True)
             values |= {("term", row): value for row, value in own}
         return values
 

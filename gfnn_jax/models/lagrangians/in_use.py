@@ -28,6 +28,7 @@ from gfnn_jax.models.lagrangians.calibration import (
 from gfnn_jax.models.lagrangians.fit import FOLDS, ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.learned_law import in_columns, scaled
+from gfnn_jax.models.lagrangians.structure import is_constant
 from gfnn_jax.models.lagrangians.zeros import wander_of, wander_of_runs
 from gfnn_jax.solve.latent_arcs import SOFT_L1
 from gfnn_jax.solve.linear import covariance_root
@@ -139,9 +140,14 @@ def _in_gauge(data: RecordingData, fit: LawFit) -> tuple[Lagrangian, np.ndarray,
     """The law and its covariance in the columns' units, the factor of L, and what fixes it."""
     law, covariance = in_columns(fit)
     names, scale = data.recording.coordinates, 1.0
+    fixed = f"the mean inertia M11 (of {names[0]}) over the data is 1"
+    if not (data.mass or is_constant(fit.structure.terms[0])):  # as r² of an angle
+        scale = 0.5 / float(law.coefficients[0])
+        law, covariance = scaled(law, covariance, scale)
+        fixed = f"the coefficient of {fit.problem.word(('term', fit.structure.terms[0]))} is ½"
     gauge = (
-        f"the mean inertia M11 (of {names[0]}) over the data is 1, the unit of L, R, gains and "
-        f"energies; for units of their own: --mass {shlex.quote(f'{names[0]}=VALUE')}"
+        f"{fixed}, the unit of L, R, gains and energies; for units of their own: "
+        f"--mass {shlex.quote(f'{names[0]}=VALUE')}"
     )
     for name, value in data.mass.items():
         q, i = fit.problem.states[:, : fit.form.dim], names.index(name)

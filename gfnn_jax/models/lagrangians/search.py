@@ -322,10 +322,10 @@ class TermSearch:
             z = fit.significance
             stays = {k for k in z if k[0] in ("gain", "sensor")}
             stays |= set() if friction else {k for k in z if k[0] == "loss"}
-            fixed = protected(fit.structure) | refused | stays
+            fixed = protected(fit.structure, others=True) | refused | stays
             z = {k: size for k, size in z.items() if k not in fixed and size < evidence.significant}
             if not z:
-                return fit
+                return without_first_mass(fit)
             key: Key = min(z.items(), key=lambda item: item[1])[0]
             smaller = fit.structure.without({key})
             if z[key] > evidence.nothing or (key[0] == "loss" and z[key] >= 0):
@@ -502,6 +502,22 @@ def with_equal_masses(fit: LawFit, least: float = np.inf) -> LawFit:
         return free
     equal = free.again(dataclasses.replace(free.structure, held=held))
     return equal if _leaves_little_more(equal, free) or not free.is_definite else free
+
+
+def without_first_mass(fit: LawFit) -> LawFit:
+    """The fit without the constant mass of the first coordinate where one that depends on position
+    does by itself, as of an angle about a center: likelier by Schwarz's criterion."""
+    first, *rest = fit.structure.terms
+    others = [row for row in rest if row[0] == first[0]]
+    if not (is_constant(first) and others) or fit.problem.parameters:
+        return fit
+    terms = (others[0], *(row for row in rest if row != others[0]))
+    other = fit.again(dataclasses.replace(fit.structure, terms=terms), fit.values, rescale=False)
+    before, after = (criterion(f.fitted.cost, fit.independent, len(f.p)) for f in (fit, other))
+    if not (other.follows and other.is_definite and after < before):
+        return fit
+    _dropped(fit, ("term", first), "it is not significant")
+    return other
 
 
 def without_drives(fit: LawFit) -> LawFit:

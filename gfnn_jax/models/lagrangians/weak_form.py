@@ -64,12 +64,13 @@ class WeakOptions:
 OPTIONS = WeakOptions()
 
 
-def protected(structure: Structure) -> set[Key]:
+def protected(structure: Structure, others: bool = False) -> set[Key]:
     """Constant masses of each coordinate, without which there would be no motion; of several that
-    depend on parameters of the system none alone."""
-    masses = [row for row in structure.terms if max(row[0]) == 2 and is_constant(row)]
+    depend on parameters of the system none alone. Beside ``others`` none where a mass that depends
+    on position does as well."""
+    masses = [row for row in structure.terms if max(row[0]) == 2 and (others or is_constant(row))]
     alone = [row for row in masses if sum(other[0] == row[0] for other in masses) == 1]
-    return {("term", row) for row in alone}
+    return {("term", row) for row in alone if is_constant(row)}
 
 
 class _Equations(NamedTuple):
