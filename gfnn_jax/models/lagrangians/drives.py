@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.sparse import csr_array
+from scipy.sparse import block_diag, vstack
 
 from gfnn_jax.families.lagrangian import LINEAR
 from gfnn_jax.fitting.evidence import EVIDENCE
@@ -27,7 +27,7 @@ from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.input_rules import correction
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.weak_form import OPTIONS as WEAK
-from gfnn_jax.models.lagrangians.weak_form import bumps, weak_rows
+from gfnn_jax.models.lagrangians.weak_form import Bumps, summed, weak_rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,21 +157,15 @@ def _left_of(problem: ArcProblem, stiff: bool) -> tuple[Callable[[float], float]
     U, s, _ = np.linalg.svd(X / np.linalg.norm(X, axis=0), full_matrices=False)
     Q = U[:, s > OPTIONS.rank * np.max(s, initial=0.0)]
     y = y - Q @ (Q.T @ y)
-    begun, windows, bump = 0, [np.zeros(0, int)], [np.zeros(0)]
-    for n in problem.nodes:
-        for place, phi, _ in (one for length in lengths for one in bumps(n.t, length)):
-            windows.append(begun + np.arange(place.start, place.stop))
-            bump.append(phi)
-        begun += len(n.t)
     t, q = np.concatenate([n.t for n in problem.nodes]), problem.states[:, :d]
-    sizes, shape = np.cumsum([len(one) for one in windows]), (len(windows) - 1, begun)
-    weights = csr_array((np.concatenate(bump), np.concatenate(windows), sizes), shape)
+    bumps = [vstack([Bumps.of(n.t, length).phi for length in lengths]) for n in problem.nodes]
+    weights = block_diag(bumps, format="csr")
     factors = _factors(q, angles, stiff).T[:, None]  # (n, 1, m)
     many = 2 * factors.shape[-1]
 
     def left(omega: float) -> float:
         waves = np.stack([np.cos(omega * t), np.sin(omega * t)], axis=1)[..., None]
-        both: Any = weights @ (waves * factors).reshape(len(t), many)
+        both = summed(weights, waves * factors).reshape(-1, many)
         A = (both[:, None, None, :] * np.eye(d)[:, :, None]).reshape(len(y), many * d)
         A = A - Q @ (Q.T @ A)
         c = np.linalg.lstsq(A, y, rcond=OPTIONS.rank)[0]

@@ -11,10 +11,11 @@ parts. Terms are eliminated until all are seen.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from gfnn_jax.dataset.stretches import Nodes
 from gfnn_jax.errors import FitError
@@ -101,14 +102,14 @@ class _Equations(NamedTuple):
             for length in lengths
         ]
         rows, targets = zip(*(weak_rows(form, *window) for window in windows), strict=True)
-        t = [np.mean(n.t[place]) for n, length in windows for place, *_ in bumps(n.t, length)]
+        t = np.concatenate([Bumps.of(n.t, length).t for n, length in windows])
         X, Y = np.concatenate(rows), -np.concatenate(targets)
         keys = structure.keys()[: form.count]
         keep = [k for k in range(form.count) if np.any(X[..., k])]
         masses = [k for k in keep if equal and keys[k] in protected(structure)]
         keep = [k for k in keep if k not in masses]
         Y = Y - 0.5 * X[..., masses].sum(axis=-1)
-        return cls(keys, X, Y, keep, masses, np.array(t))
+        return cls(keys, X, Y, keep, masses, t)
 
 
 def weak_share(structure: Structure, problem: ArcProblem) -> float:
@@ -259,34 +260,53 @@ def weak_rows(form: Form, node: Nodes, length: float) -> tuple[np.ndarray, np.nd
     g, dg = terms.motion(v)
     momentum = terms.acting(dg * f[..., None]).swapaxes(1, 2)  # (n, d, P)
     force = terms.acting(df * g[..., None]).swapaxes(1, 2)
-    lost = form.friction.residuals(v).swapaxes(1, 2)
-    columns, targets = [], []
-    for place, phi, slope in bumps(t, length):
-        of_terms = -np.tensordot(slope, momentum[place], 1) - np.tensordot(phi, force[place], 1)
-        of_terms = of_terms * weights[: terms.count]
-        row = [of_terms @ form.basis, np.tensordot(phi, lost[place], 1) * weights[terms.count :]]
-        if form.num_inputs:
-            push = -np.tensordot(phi, u[place], 1)
-            row.append((push[None, None, :] * np.eye(d)[:, :, None]).reshape(d, -1))
-        columns.append(np.concatenate(row, axis=1))
-        targets.append(of_terms @ form.fixed)
-    if not columns:
-        return np.zeros((0, d, form.count)), np.zeros((0, d))
-    return np.array(columns), np.array(targets)
+    bumps = Bumps.of(t, length)
+    of_terms = -summed(bumps.slope, momentum) - summed(bumps.phi, force)
+    of_terms = of_terms * weights[: terms.count]
+    lost = summed(bumps.phi, form.friction.residuals(v).swapaxes(1, 2))
+    rows = [of_terms @ form.basis, lost * weights[terms.count :]]
+    if form.num_inputs:
+        push = -summed(bumps.phi, u[:, None])
+        rows.append(
+            (push[:, :, None] * np.eye(d)[:, :, None]).reshape(len(push), d, d * u.shape[1])
+        )
+    return np.concatenate(rows, axis=2), of_terms @ form.fixed
 
 
-def bumps(t: np.ndarray, length: float) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-    """Windows of this length along times t (n,): the places of their samples, and φ dt and φ̇ dt
-    there, in units of the noise that v brings."""
-    for start in np.arange(t[0], t[-1] - length, OPTIONS.spacing * length):
-        i, j = np.searchsorted(t, (start, start + length))
-        if j - i < OPTIONS.fewest:
-            continue
-        s = (t[i:j] - start) / length
-        weight, bump = np.gradient(t[i:j]), s * (1 - s)
+def summed(weights: csr_array, values: np.ndarray) -> np.ndarray:
+    """Sums (windows, ...) of values (n, ...) by the weights of windows."""
+    shape = (weights.shape[0], *values.shape[1:])
+    return np.asarray(weights @ values.reshape(len(values), -1)).reshape(shape)
+
+
+class Bumps(NamedTuple):
+    """φ dt and φ̇ dt, each (windows, n), at times t (n,), in units of the noise that v brings; and
+    the mean time (windows,) of each window."""
+
+    phi: csr_array
+    slope: csr_array
+    t: np.ndarray
+
+    @classmethod
+    def of(cls, t: np.ndarray, length: float) -> Bumps:
+        """Make windows of this length along the times."""
+        starts = np.arange(t[0], t[-1] - length, OPTIONS.spacing * length)
+        first, last = np.searchsorted(t, starts), np.searchsorted(t, starts + length)
+        keep = last - first >= OPTIONS.fewest
+        starts, first, last = starts[keep], first[keep], last[keep]
+        ends = np.cumsum([0, *(last - first)])
+        window = np.repeat(np.arange(len(starts)), last - first)
+        at = np.arange(ends[-1]) + (first - ends[:-1])[window]
+        s, weight = (t[at] - starts[window]) / length, np.gradient(t)[at]
+        weight[ends[:-1]] = t[first + 1] - t[first]
+        weight[ends[1:] - 1] = t[last - 1] - t[last - 2]
+        bump = s * (1 - s)
         phi, slope = bump**3 * weight, 3 * bump**2 * (1 - 2 * s) / length * weight
-        norm = np.sqrt(np.sum(slope**2))
-        yield slice(i, j), phi / norm, slope / norm
+        norm = np.sqrt(np.bincount(window, slope**2, len(starts)))[window]
+        mean = np.bincount(window, t[at], len(starts)) / (last - first)
+        shape = (len(starts), len(t))
+        phi, slope = (csr_array((x / norm, at, ends), shape) for x in (phi, slope))
+        return cls(phi, slope, mean)
 
 
 def _solve(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
