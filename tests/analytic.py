@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.families import from_function
+from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -40,6 +41,21 @@ def folding(strength, w):
 def exact_oscillator(dt):
     """The strength with which ``oscillator`` turns by dt, the exact flow."""
     return 2 / dt * np.tan(dt / 2)
+
+
+def mechanics(rows, losses=(), uniform=0.0, gains=None, powers=None):
+    """L of rows (speeds, powers, modes, phase, coefficient, perhaps a formula), and R of rows
+    (direction, kind, width, coefficient)."""
+    dim = len(rows[0][0])
+    return Lagrangian(
+        Terms.of([(*row[:4], *row[5:]) for row in rows], dim),
+        np.array([row[4] for row in rows], float),
+        Friction.of([row[:3] for row in losses], dim),
+        np.array([row[3] for row in losses], float),
+        uniform,
+        np.zeros((dim, 0)) if gains is None else np.array(gains, float),
+        powers,
+    )
 
 
 def generated(family, params, chart, dt, dim=1):

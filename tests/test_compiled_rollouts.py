@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from analytic import mechanics
 
 from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC, Friction, Lagrangian, Terms
 from gfnn_jax.flows.compiled_steps import CONSTANT, INVERSE, JOINED, SIN, Stepper, program
@@ -56,11 +57,7 @@ def test_steps_are_those_of_jax(kind, driven):
 @pytest.mark.slow
 def test_energy_stays_and_many_turns_cost_no_digit():
     """A pendulum that turns over, 1e5 steps: the orbit of the step is closed to roundoff."""
-    rows = [((2,), (0,), (0,), 0.0), ((0,), (0,), (1,), 0.0)]
-    none = np.zeros(0)
-    law = Lagrangian(
-        Terms.of(rows, 1), np.array([0.5, 1.0]), Friction.of([], 1), none, 0.0, none.reshape(1, 0)
-    )
+    law = mechanics([((2,), (0,), (0,), 0.0, 0.5), ((0,), (0,), (1,), 0.0, 1.0)])
     z = np.random.default_rng(0).normal(size=(50, 2)) + np.array([0.0, 2.0])
     map_ = map_of_law(law, z, 0.1, angles=(0,), tolerance=1e-15)
     states, _ = map_.rollout(np.array([0.0, 2.5]), 100_000, save_every=100)

@@ -12,7 +12,7 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from analytic import generated, map_of, oscillator
+from analytic import generated, map_of, mechanics, oscillator
 from jax import export as jax_export
 from scipy.linalg import expm
 
@@ -121,25 +121,15 @@ def in_polar():
 def two_rods():
     """A double pendulum by its Lagrangian, whose bobs attract each other, and its states."""
     none = (0, 0)
-    terms = lagrangian.Terms.of(
-        [
-            ((2, 0), none, none, 0.0),
-            ((0, 2), none, none, 0.0),
-            ((1, 1), none, (1, -1), 0.0),
-            (none, none, (1, 0), 0.0),
-            (none, (0, 2), none, 0.0),
-            (none, none, none, 0.0, "1/sqrt(4 + (q1 - q2)**2)"),
-        ],
-        2,
-    )
-    law = lagrangian.Lagrangian(
-        terms,
-        np.array([1.0, 0.5, 1.0, 2.0, -0.5, 0.7]),
-        lagrangian.Friction.of([], 2),
-        np.zeros(0),
-        0.0,
-        np.zeros((2, 0)),
-    )
+    rows = [
+        ((2, 0), none, none, 0.0, 1.0),
+        ((0, 2), none, none, 0.0, 0.5),
+        ((1, 1), none, (1, -1), 0.0, 1.0),
+        (none, none, (1, 0), 0.0, 2.0),
+        (none, (0, 2), none, 0.0, -0.5),
+        (none, none, none, 0.0, 0.7, "1/sqrt(4 + (q1 - q2)**2)"),
+    ]
+    law = mechanics(rows)
     z = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 4))
     return map_of_law(law, z, 0.05, tolerance=1e-13), z
 
@@ -256,16 +246,9 @@ def with_length(kind):
     z, lengths = 0.5 * states(1), np.random.default_rng(2).uniform(0.5, 2, (300, 1))
     unit, names = np.ones(2), ("l",)
     if kind == "Lagrangian":
-        none = (0,)
-        law = lagrangian.Lagrangian(
-            lagrangian.Terms.of([((2,), none, none, 0.0), (none, none, (1,), 0.0)], 1),
-            np.array([0.5, 1.0]),
-            lagrangian.Friction.of([((1,), lagrangian.LINEAR, 0.0)], 1),
-            np.array([0.1]),
-            0.0,
-            np.zeros((1, 0)),
-            ((0,), (-1,), (1,)),
-        )
+        rows = [((2,), (0,), (0,), 0.0, 0.5), ((0,), (0,), (1,), 0.0, 1.0)]
+        losses = [((1,), lagrangian.LINEAR, 0.0, 0.1)]
+        law = mechanics(rows, losses, powers=((0,), (-1,), (1,)))
         return map_of_law(law, z, DT, parameters=names, args=lengths), z, lengths
     if kind == "law":
         family = given_terms(1, ["p1**2/l**2", "l*cos(q1)", "T3(q1)*l"], names)
@@ -345,30 +328,19 @@ def pushed(hold, delay=0.0, uniform=0.0):
 
     hold: the rule between samples."""
     none = (0, 0)
-    terms = lagrangian.Terms.of(
-        [
-            ((2, 0), none, none, 0.0),
-            ((0, 2), none, none, 0.0),
-            ((1, 1), none, (1, -1), 0.0),
-            (none, none, (1, 0), 0.0),
-            (none, (0, 2), none, 0.0),
-        ],
-        2,
-    )
     rows = [
-        ((1, 0), lagrangian.LINEAR, 0.0),
-        ((1, -1), lagrangian.QUADRATIC, 0.0),
-        ((0, 1), lagrangian.DRY, 0.3),
+        ((2, 0), none, none, 0.0, 1.0),
+        ((0, 2), none, none, 0.0, 0.5),
+        ((1, 1), none, (1, -1), 0.0, 1.0),
+        (none, none, (1, 0), 0.0, 2.0),
+        (none, (0, 2), none, 0.0, -0.5),
     ]
-    friction = lagrangian.Friction.of(rows, 2)
-    law = lagrangian.Lagrangian(
-        terms,
-        np.array([1.0, 0.5, 1.0, 2.0, -0.5]),
-        friction,
-        np.array([0.1, 0.2, 0.05]),
-        uniform,
-        np.array([[1.0], [0.5]]),
-    )
+    losses = [
+        ((1, 0), lagrangian.LINEAR, 0.0, 0.1),
+        ((1, -1), lagrangian.QUADRATIC, 0.0, 0.2),
+        ((0, 1), lagrangian.DRY, 0.3, 0.05),
+    ]
+    law = mechanics(rows, losses, uniform, [[1.0], [0.5]])
     z = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 4))
     signals = Signals(("F",), hold, delay)
     return map_of_law(law, z, 0.05, tolerance=1e-12, signals=signals), z

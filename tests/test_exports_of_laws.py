@@ -8,6 +8,7 @@ import subprocess
 import jax
 import numpy as np
 import pytest
+from analytic import mechanics
 from test_exports import (
     by_c,
     by_c_pointer,
@@ -36,25 +37,18 @@ from gfnn_jax.solve.status import LEFT_DOMAIN, NOT_CONVERGED
 needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="no node to run JavaScript")
 
 
-def two_rods(friction, losses, gain=False):
+def two_rods(losses, gain=False):
     """A double pendulum with friction, pushed on its first angle where there is a ``gain``; its
     dry friction sticks. And its states."""
     none = (0, 0)
     rows = [
-        ((2, 0), none, none, 0.0),
-        ((0, 2), none, none, 0.0),
-        ((1, 1), none, (1, -1), 0.0),
-        (none, none, (1, 0), 0.0),
-        (none, none, (0, 1), 0.0),
+        ((2, 0), none, none, 0.0, 1.0),
+        ((0, 2), none, none, 0.0, 0.5),
+        ((1, 1), none, (1, -1), 0.0, 1.0),
+        (none, none, (1, 0), 0.0, 9.0),
+        (none, none, (0, 1), 0.0, 4.0),
     ]
-    own = lagrangian.Lagrangian(
-        lagrangian.Terms.of(rows, 2),
-        np.array([1.0, 0.5, 1.0, 9.0, 4.0]),
-        lagrangian.Friction.of(friction, 2),
-        np.array(losses),
-        0.0,
-        np.array([[1.0], [0.0]]) if gain else np.zeros((2, 0)),
-    )
+    own = mechanics(rows, losses, gains=[[1.0], [0.0]] if gain else None)
     z = np.random.default_rng(0).uniform(-1, 1, (400, 4)) * [1, 1, 2, 2]
     signals = Signals(("F",)) if gain else None
     map_ = map_of_law(own, z, 0.02, tolerance=1e-9, signals=signals)
@@ -67,21 +61,21 @@ def two_rods(friction, losses, gain=False):
 
 def viscous():
     linear = lagrangian.LINEAR
-    rows = [((1, 0), linear, 0.0), ((-1, 1), linear, 0.0), ((0, 1), lagrangian.POWER, 3.0)]
-    return two_rods(rows, [0.1, 0.05, 0.02])
+    rows = [((1, 0), linear, 0.0, 0.1), ((-1, 1), linear, 0.0, 0.05)]
+    return two_rods([*rows, ((0, 1), lagrangian.POWER, 3.0, 0.02)])
 
 
 def sticking():
     """Dry friction of each joint and of the second rod, and a quadratic one: held bodies, some
     twice."""
     rows = [
-        ((1, 0), lagrangian.DRY, 1e-4),
-        ((0, 1), lagrangian.DRY, 1e-4),
-        ((-1, 1), lagrangian.DRY, 1e-4),
-        ((0, 1), lagrangian.QUADRATIC, 0.0),
-        ((1, 0), lagrangian.ONE_SIDED, 0.0),
+        ((1, 0), lagrangian.DRY, 1e-4, 0.6),
+        ((0, 1), lagrangian.DRY, 1e-4, 0.4),
+        ((-1, 1), lagrangian.DRY, 1e-4, 0.4),
+        ((0, 1), lagrangian.QUADRATIC, 0.0, 0.1),
+        ((1, 0), lagrangian.ONE_SIDED, 0.0, 0.3),
     ]
-    return two_rods(rows, [0.6, 0.4, 0.4, 0.1, 0.3], gain=True)
+    return two_rods(rows, gain=True)
 
 
 def exactly(map_):
@@ -165,12 +159,8 @@ def test_javascript_is_the_flow(kind, tmp_path):
 @needs_node
 def test_a_body_without_a_force_and_one_that_falls_in_javascript(tmp_path):
     none = (0, 0)
-    rows = [((2, 0), none, none, 0.0), ((0, 2), none, none, 0.0), (none, (0, 1), none, 0.0)]
-    friction = lagrangian.Friction.of([], 2)
-    coefficients = np.array([0.5, 0.5, -9.8])
-    own = lagrangian.Lagrangian(
-        lagrangian.Terms.of(rows, 2), coefficients, friction, np.zeros(0), 0.0, np.zeros((2, 0))
-    )
+    rows = [((2, 0), none, none, 0.0, 0.5), ((0, 2), none, none, 0.0, 0.5)]
+    own = mechanics([*rows, (none, (0, 1), none, 0.0, -9.8)])
     z = np.random.default_rng(0).uniform(-1, 1, (20, 4))
     path = gfnn.export(map_of_law(own, z, 0.02, tolerance=1e-9), "js", tmp_path / "own.js")
     q, p = z[:, :2], z[:, 2:]
@@ -305,15 +295,8 @@ def chain(relative=False):
             (none, none, (0, 1), 0.0, weights[1]),
         ]
     second = (0, 1) if relative else (-1, 1)
-    friction = [((1, 0), lagrangian.LINEAR, 0.0), (second, lagrangian.LINEAR, 0.0)]
-    own = lagrangian.Lagrangian(
-        lagrangian.Terms.of([row[:4] for row in rows], 2),
-        np.array([row[4] for row in rows]),
-        lagrangian.Friction.of(friction, 2),
-        np.array([0.02, 0.01]),
-        0.0,
-        np.array([[0.0], [1.0]] if relative else [[-1.0], [1.0]]),
-    )
+    losses = [((1, 0), lagrangian.LINEAR, 0.0, 0.02), (second, lagrangian.LINEAR, 0.0, 0.01)]
+    own = mechanics(rows, losses, gains=[[0.0], [1.0]] if relative else [[-1.0], [1.0]])
     z = np.random.default_rng(0).uniform(-1, 1, (300, 4)) * [1, 1, 0.3, 0.1]
     return map_of_law(own, z, 0.01, tolerance=1e-12, signals=Signals(("F",))), z
 
@@ -345,16 +328,8 @@ def test_mujoco_moves_a_chain_of_links_as_its_law_does(relative, to, tmp_path):
 @pytest.mark.slow
 def test_friction_holds_a_link_in_mujoco_as_in_the_law(tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="MuJoCo is an extra")
-    rows = [((2,), (0,), (0,), 0.0), ((0,), (0,), (1,), 0.0)]
-    friction = lagrangian.Friction.of([((1,), lagrangian.DRY, 1e-4)], 1)
-    own = lagrangian.Lagrangian(
-        lagrangian.Terms.of(rows, 1),
-        np.array([0.5, 9.0]),
-        friction,
-        np.array([6.0]),
-        0.0,
-        np.zeros((1, 0)),
-    )
+    rows = [((2,), (0,), (0,), 0.0, 0.5), ((0,), (0,), (1,), 0.0, 9.0)]
+    own = mechanics(rows, [((1,), lagrangian.DRY, 1e-4, 6.0)])
     z = np.array([[0.4, 2.0]])
     map_ = map_of_law(own, np.random.default_rng(0).uniform(-2, 2, (300, 2)), 0.01, tolerance=1e-9)
     none, one = np.zeros((1, 1)), np.ones(1)
@@ -387,7 +362,7 @@ def test_forces_of_a_motion_make_it():
 
 
 def test_a_law_that_is_no_chain_has_no_links(tmp_path):
-    rods, _ = two_rods([((1, 0), lagrangian.LINEAR, 0.0)], [0.1])
+    rods, _ = two_rods([((1, 0), lagrangian.LINEAR, 0.0, 0.1)])
     terms = rods.pieces[0].family.family.terms
     springs = dataclasses.replace(terms, powers=np.array([[0, 0]] * 3 + [[2, 0], [0, 2]]))
     family = dataclasses.replace(

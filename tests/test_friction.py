@@ -4,9 +4,9 @@ quadratic or dry."""
 import numpy as np
 import pytest
 import scipy.integrate
+from analytic import mechanics
 
 import gfnn_jax as gfnn
-from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
 
 
 def pairs_of(field, z, dt):
@@ -174,24 +174,14 @@ def double_pendulum(gamma, count=200, dt=0.2):
     """Pairs of two equal rods, from the accelerations of their Lagrangian."""
     z0 = np.random.default_rng(0).uniform(-1, 1, (count, 4)) * [1.5, 1.5, 0.7, 0.7]
     none = (0, 0)
-    terms = Terms.of(
-        [
-            ((2, 0), none, none, 0.0),
-            ((0, 2), none, none, 0.0),
-            ((1, 1), none, (1, -1), 0.0),
-            (none, none, (1, 0), 0.0),
-            (none, none, (0, 1), 0.0),
-        ],
-        2,
-    )
-    law = Lagrangian(
-        terms,
-        np.array([1.0, 0.5, 1.0, 2.0, 1.0]),
-        Friction.of([], 2),
-        np.zeros(0),
-        gamma,
-        np.zeros((2, 0)),
-    )
+    rows = [
+        ((2, 0), none, none, 0.0, 1.0),
+        ((0, 2), none, none, 0.0, 0.5),
+        ((1, 1), none, (1, -1), 0.0, 1.0),
+        (none, none, (1, 0), 0.0, 2.0),
+        (none, none, (0, 1), 0.0, 1.0),
+    ]
+    law = mechanics(rows, uniform=gamma)
 
     def field(_, y):
         return np.concatenate([y[2:], law.acceleration(y[None, :2], y[None, 2:])[0]])

@@ -7,7 +7,7 @@ import re
 import jax
 import numpy as np
 import pytest
-from analytic import motion
+from analytic import mechanics, motion
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.stats import norm
@@ -21,7 +21,6 @@ from gfnn_jax.families.lagrangian import (
     QUADRATIC,
     UNIFORM,
     Friction,
-    Lagrangian,
     Terms,
 )
 from gfnn_jax.fitting.evidence import Comparison
@@ -700,14 +699,7 @@ def test_a_known_mass_scales_the_law():
 
 
 def test_a_lagrangian_of_the_search_is_a_pytree():
-    law = Lagrangian(
-        Terms.of([((2,), (0,), (0,), 0.0)], 1),
-        np.ones(1),
-        Friction.of([], 1),
-        np.zeros(0),
-        0.0,
-        np.zeros((1, 0)),
-    )
+    law = mechanics([((2,), (0,), (0,), 0.0, 1.0)])
     assert jax.tree.map(np.shape, law).coefficients == (1,)
 
 

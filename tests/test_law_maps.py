@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from analytic import mechanics
 
 import gfnn_jax as gfnn
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import DRY, LINEAR
 from gfnn_jax.maps.energy import ledger
 from gfnn_jax.maps.estimates import Window, law_in_use, propagate
 from gfnn_jax.maps.inputs import Signals
@@ -17,15 +18,8 @@ from gfnn_jax.maps.laws import law_of_map, map_of_law, states_of, sticking, velo
 from gfnn_jax.maps.sensors import Sensors
 
 # A pendulum whose pivot is driven by a motor.
-TERMS = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (0,), (1,), 0.0)], 1)
-LAW = Lagrangian(
-    TERMS,
-    np.array([0.5, 9.0]),
-    Friction.of([((1,), LINEAR, 0.0), ((1,), DRY, 0.3)], 1),
-    np.array([0.2, 0.1]),
-    0.0,
-    np.array([[1.5]]),
-)
+ROWS = [((2,), (0,), (0,), 0.0, 0.5), ((0,), (0,), (1,), 0.0, 9.0)]
+LAW = mechanics(ROWS, [((1,), LINEAR, 0.0, 0.2), ((1,), DRY, 0.3, 0.1)], gains=[[1.5]])
 DT, STEPS = 0.05, 30
 RNG = np.random.default_rng(0)
 Z = np.stack([RNG.uniform(-1, 1, 200), RNG.normal(size=200)], axis=1)
@@ -156,9 +150,7 @@ def test_the_ledger_closes():
 
 
 def test_uniform_friction_of_a_law_is_conformal():
-    law = Lagrangian(
-        TERMS, LAW.coefficients, Friction.of([], 1), np.zeros(0), 0.3, np.zeros((1, 0))
-    )
+    law = mechanics(ROWS, uniform=0.3)
     map_ = map_of_law(law, Z, DT)
     assert map_.multiplier() == pytest.approx(np.exp(-0.3 * DT), rel=1e-15)
     assert np.asarray(map_.defect(Z[:20])).max() < 1e-15
@@ -186,7 +178,10 @@ def test_signals_that_are_not_the_laws():
         Signals(("u",), "cubic")
 
 
-SPRING = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (2,), (0,), 0.0)], 1)
+def on_a_spring(friction, width):
+    """A body on a spring with dry friction of this width."""
+    rows = [((2,), (0,), (0,), 0.0, 0.5), ((0,), (2,), (0,), 0.0, -0.5)]
+    return mechanics(rows, [((1,), DRY, width, friction)])
 
 
 def block(turn, friction, time):
@@ -206,14 +201,7 @@ def test_a_forecast_and_its_band_across_a_stop():
     """A block that comes to rest, of a start and a friction known to a part in some hundreds: where
     it stops, and how sure that is, are those of the exact motion."""
     time, turn, friction, errors = 0.1 * np.arange(201), 0.42, 0.05, np.array([2e-3, 3e-4])
-    law = Lagrangian(
-        SPRING,
-        np.array([0.5, -0.5]),
-        Friction.of([((1,), DRY, 1e-6)], 1),
-        np.array([friction]),
-        0.0,
-        np.zeros((1, 0)),
-    )
+    law = on_a_spring(friction, 1e-6)
     sigma, ends = np.array([1e-5]), np.array([20.0])
     sensors = Sensors(
         ("x",), (), (), sigma, 1.0, 1.0, "hold", 0.0, ends, np.zeros((1, 1)), creep=1e-6
@@ -244,14 +232,7 @@ CREEP = 1e-4
 def learned_block(friction=0.05):
     """The map of the block, as a recording's: dry friction that is smoothed over what no sensor
     sees."""
-    law = Lagrangian(
-        SPRING,
-        np.array([0.5, -0.5]),
-        Friction.of([((1,), DRY, CREEP)], 1),
-        np.array([friction]),
-        0.0,
-        np.zeros((1, 0)),
-    )
+    law = on_a_spring(friction, CREEP)
     z = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
     map_ = map_of_law(law, z, 0.1, root=np.diag([0.0, 0.0, 1e-3]))
     return dataclasses.replace(map_, sensors=sensors_of(("x",), 1.0))
@@ -332,14 +313,10 @@ def test_rollouts_with_events_that_end():
 def test_bodies_that_stick_to_each_other():
     """Two bodies on springs with friction between them: lanes go on from their states as from their
     modes, and lose energy."""
-    rows = [((2, 0), (0, 0), (0, 0), 0.0), ((0, 2), (0, 0), (0, 0), 0.0)]
-    rows += [((0, 0), (2, 0), (0, 0), 0.0), ((0, 0), (0, 2), (0, 0), 0.0)]
-    rows += [((1, 1), (0, 0), (0, 0), 0.0)]
-    friction = Friction.of([((1, 0), DRY, CREEP), ((-1, 1), DRY, CREEP)], 2)
-    coefficients = np.array([0.5, 0.3, -0.5, -0.9, 0.1])
-    law = Lagrangian(
-        Terms.of(rows, 2), coefficients, friction, np.array([0.02, 0.2]), 0.0, np.zeros((2, 0))
-    )
+    rows = [((2, 0), (0, 0), (0, 0), 0.0, 0.5), ((0, 2), (0, 0), (0, 0), 0.0, 0.3)]
+    rows += [((0, 0), (2, 0), (0, 0), 0.0, -0.5), ((0, 0), (0, 2), (0, 0), 0.0, -0.9)]
+    rows += [((1, 1), (0, 0), (0, 0), 0.0, 0.1)]
+    law = mechanics(rows, [((1, 0), DRY, CREEP, 0.02), ((-1, 1), DRY, CREEP, 0.2)])
     z = np.random.default_rng(0).normal(size=(40, 4))
     map_ = dataclasses.replace(map_of_law(law, z, 0.05), sensors=sensors_of(("x", "y"), 2.0))
     states, _ = map_.rollout(z, 200)
@@ -374,9 +351,9 @@ def test_samples_of_a_law_that_sticks():
 def test_a_rollout_with_inputs_and_turns(hold):
     """A pendulum with dry friction that a motor turns over: what JAX's steps of a narrower width
     tend to, angles counted, inputs by their rule, with parameters of the system."""
-    friction = Friction.of([((1,), DRY, CREEP)], 1)
+    losses = [((1,), DRY, CREEP, 0.1)]
     powers = ((0,), (0,), (0,), (1,))  # the gain of the motor is in proportion to a parameter
-    law = Lagrangian(TERMS, np.array([0.5, 9.0]), friction, np.array([0.1]), 0.0, np.eye(1), powers)
+    law = mechanics(ROWS, losses, gains=[[1.0]], powers=powers)
     args = np.random.default_rng(1).uniform(1.0, 2.0, (200, 1))
     signals = Signals(("torque",), hold)
     map_ = map_of_law(
@@ -401,14 +378,7 @@ def test_a_rollout_with_inputs_and_turns(hold):
 def test_a_forecast_across_a_stop():
     """Against the exact motion, with the map of the narrow law."""
     friction, dt, count = 0.05, 0.1, 300
-    wide = Lagrangian(
-        SPRING,
-        np.array([0.5, -0.5]),
-        Friction.of([((1,), DRY, 0.05)], 1),
-        np.array([friction]),
-        0.0,
-        np.zeros((1, 0)),
-    )
+    wide = on_a_spring(friction, 0.05)
     law = sticking(wide, noise=1e-3, duration=dt * count)
     z = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
     map_ = map_of_law(law, z, dt)

@@ -4,10 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from analytic import mechanics
 from test_law_fits import pendulum
 
 import gfnn_jax as gfnn
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Lagrangian, Terms
+from gfnn_jax.families.lagrangian import DRY, LINEAR
 from gfnn_jax.maps.estimates import Window, estimate_states, law_in_use, propagate
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.maps.sensors import Sensors
@@ -46,14 +47,7 @@ def test_whitened_noise_is_white(rng):
 
 def free_body(sigma, wander):
     """A law without forces, known exactly, q = q0 + v t; residuals of any size count in full."""
-    law = Lagrangian(
-        Terms.of([((2,), (0,), (0,), 0.0)], 1),
-        np.array([0.5]),
-        Friction.of([], 1),
-        np.zeros(0),
-        0.0,
-        np.zeros((1, 0)),
-    )
+    law = mechanics([((2,), (0,), (0,), 0.0, 0.5)])
     sensors = Sensors(
         ("x",),
         (),
@@ -100,14 +94,8 @@ def test_a_state_and_its_zero_are_those_of_the_normal_distribution(rng, size):
 
 def sliding_body(level, friction, sigma=1e-4):
     """A body, driven, with dry and viscous friction that are known but for their level."""
-    law = Lagrangian(
-        Terms.of([((2,), (0,), (0,), 0.0)], 1),
-        np.array([0.5]),
-        Friction.of([((1,), LINEAR, 0.0), ((1,), DRY, 0.0)], 1),
-        np.array(friction),
-        0.0,
-        np.ones((1, 1)),
-    )
+    losses = [((1,), kind, 0.0, c) for kind, c in zip((LINEAR, DRY), friction, strict=True)]
+    law = mechanics([((2,), (0,), (0,), 0.0, 0.5)], losses, gains=[[1.0]])
     own = free_body(sigma, None).sensors
     return law_in_use(law, None, dataclasses.replace(own, inputs=("F",), level=level, window=2.0))
 
