@@ -8,6 +8,7 @@ from analytic import states_in_motion
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
+from gfnn_jax.signals.splines import with_rates
 
 
 def swing(end=16.0, dt=0.04):
@@ -65,6 +66,32 @@ def test_others_are_not(record, made, what):
     if what != "colour":
         right = {"scale": 0.97, "lag": 0.02, "bias": 0.05}[what]
         assert abs(getattr(of, what)[0] - right) < 5 * getattr(of, what)[1]
+
+
+@pytest.fixture(scope="module")
+def driven_round():
+    """A pendulum that a torque drives round: its angle is read to 0.3 rad, its velocity to 0.05."""
+    t, rng = np.arange(0, 12, 0.02), np.random.default_rng(5)
+    x, v = states_in_motion(lambda q, v: 1.5 - np.sin(q) - 0.5 * v, [1.3, 0.0], t)
+    noise = np.array([0.3, 0.05]) * rng.normal(size=(len(t), 2))
+    return x, {"t": t, "x": x + noise[:, 0], "v": v + noise[:, 1]}
+
+
+def test_positions_by_their_rates(driven_round):
+    x, table = driven_round
+    readings = np.stack([table["x"], table["v"]], axis=1)
+    found = with_rates(table["t"], readings, np.tile([0.3, 0.05], (len(x), 1)))
+    assert np.std(found - x) < 0.03  # readings of x alone tell it to 0.3
+
+
+@pytest.mark.slow
+def test_velocities_make_up_for_positions_that_noise_hides(driven_round):
+    table = gfnn.Recording(driven_round[1], positions=["x"], velocities=["v"], angles=["x"])
+    fit = gfnn.fit(table)
+    assert not fit.verdict.startswith("partly")
+    found = {term.term: term for term in fit.lagrangian.terms}
+    for name, true in (("cos(x)", 1.0), ("x", 1.5)):
+        assert abs(found[name].coefficient - true) < 4 * found[name].std, fit.formula
 
 
 def test_a_file_without_the_velocity_is_forecast_all_the_same(record, tmp_path, monkeypatch):

@@ -23,7 +23,7 @@ import numpy as np
 from gfnn_jax.data.recording import Recording, args_of, channels_of
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.signals.local_polynomials import Smooth, choose_half, smooth
-from gfnn_jax.signals.splines import FEWEST, Splines, splines
+from gfnn_jax.signals.splines import FEWEST, Splines, splines, with_rates
 
 GAP = 3.5  # median steps: a longer one ends a stretch, where sampling is even or inputs act
 PER_PERIOD = 40  # nodes
@@ -47,6 +47,7 @@ class Options:
     gap: float = 0.25  # periods without a reading, over which a state is not predictable yet
     apart: float = 0.7  # of the time between nodes, after which a channel is looked at again
     empty: float = 100.0  # median steps: no spline leads over a longer one
+    exact: float = 1e-6  # of a channel's spread: noise that weighs a reading at the least
 
 
 OPTIONS = Options()
@@ -280,6 +281,24 @@ def stretches(
 
 def _readings(found: Sequence[Stretch]) -> int:
     return sum(int(np.isfinite(s.y).sum()) for s in found)
+
+
+def by_rates(
+    found: Sequence[Stretch], pairs: Mapping[int, tuple[int, int]], given: np.ndarray
+) -> list[Stretch]:
+    """The stretches, each of these coordinates by the readings of both channels that show it: of
+    the coordinate itself, and of its velocity. given: noise σ (k,) of the channels, or NaN."""
+    sigma = np.where(given > 0, given, _noise_of_channels(found))
+    joined = []
+    for s in found:
+        q = s.q.copy()
+        for i, channels in pairs.items():
+            both = np.isfinite(s.y[:, channels]).all(1)
+            y, own = s.y[both][:, channels], (sigma * s.noise[both])[:, channels]
+            if both.sum() >= FEWEST:
+                q[both, i] = with_rates(s.t[both], y, own + OPTIONS.exact * np.std(y, axis=0))
+        joined.append(dataclasses.replace(s, q=q))
+    return joined
 
 
 def measure(found: Sequence[Stretch]) -> Scales:

@@ -550,6 +550,13 @@ class Observation:
         )
 
     @property
+    def rated(self) -> dict[int, tuple[int, int]]:
+        """Coordinate -> the channels that show it and its velocity as they are."""
+        code = symbols((*self.coordinates, *self.speeds))[self.dim :]
+        pairs = {i: (k, code[i]) for i, k in self.direct.items() if code[i] in self.formulas}
+        return {i: (k, self.formulas.index(name)) for i, (k, name) in pairs.items()}
+
+    @property
     def needed(self) -> tuple[str, ...]:
         """Channels without which the coordinates are not told: those that show no velocity."""
         if self.unseen:

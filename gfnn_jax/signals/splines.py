@@ -12,7 +12,7 @@ runs is largest,
     (N − 5R) log(|y − B α|² + λ |D α|²) + log |BᵀB + λ DᵀD| − (M − 5R) log λ  →  min
 
 of N readings, M coefficients, R runs. Every matrix is a band. Where a run has fewer readings than
-its own noise needs, the other runs determine it.
+its own noise needs, the other runs determine it. Readings of dy/dt are rows B' α.
 """
 
 from __future__ import annotations
@@ -104,6 +104,17 @@ def splines(
     return Splines(step, stiffness, sigma)
 
 
+def with_rates(t: np.ndarray, y: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """The values (n,) at times t (n,) of the spline through readings of it and of its rate, y (n,
+    2), each with its noise (n, 2).
+
+        with_rates(t, np.stack([np.sin(t) + rough, np.cos(t)], 1), np.tile([0.1, 0.01], (n, 1)))
+    """
+    run = np.tile(t, 2), y.T.ravel(), noise.T.ravel(), np.repeat([0, 1], len(t))
+    problem = _Problem.of([run], float(np.median(np.diff(t))))
+    return problem.curve(problem.likeliest()[0])(t)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Problem:
     """The bands (6, M) of BᵀB and DᵀD below their diagonals, Bᵀy (M,), B and y with each row in
@@ -119,19 +130,27 @@ class _Problem:
     counts: tuple[int, ...]
 
     @classmethod
-    def of(cls, runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], step: float) -> _Problem:
+    def of(cls, runs: Sequence[tuple[np.ndarray, ...]], step: float) -> _Problem:
+        """Of runs (t, y, noise), and with the order (n,) of the derivative that each y shows."""
         from scipy import sparse  # loaded when first used
         from scipy.interpolate import BSpline
 
         k = _OPTIONS.degree
         signs = np.diff(np.eye(_OPTIONS.order + 1), _OPTIONS.order, axis=0)[0]
         designs, roughs, begins, counts = [], [], [], []
-        for t, _, noise in runs:
-            spans = max(1, int(np.ceil((t[-1] - t[0]) / step * (1 + 1e-12))))
-            begin = t[0] - 0.5 * (spans * step - (t[-1] - t[0]))  # the knots' middle is the run's
+        for t, _, noise, *orders in runs:
+            length = float(np.ptp(t))
+            spans = max(1, int(np.ceil(length / step * (1 + 1e-12))))
+            begin = t.min() - 0.5 * (spans * step - length)  # the knots' middle is the run's
             knots = begin + step * np.arange(-k, spans + k + 1)
             inside = np.clip(t, knots[k], knots[-k - 1])
             own = BSpline.design_matrix(inside, knots, k)
+            for order in orders:
+                slopes = BSpline.design_matrix(inside, knots[1:-1], k - 1)
+                differences = sparse.eye_array(spans + k - 1, spans + k, k=1)
+                differences = (differences - sparse.eye_array(spans + k - 1, spans + k)) / step
+                of_rates = sparse.diags_array(1.0 * order)
+                own = own - of_rates @ own + of_rates @ slopes @ differences
             designs.append(sparse.diags_array(1 / noise) @ own)
             size = spans + k - _OPTIONS.order
             of_order = [np.full(size, sign) for sign in signs]
@@ -141,7 +160,7 @@ class _Problem:
             counts.append(spans + k)
         B = sparse.block_diag(designs, format="csr")
         D = sparse.block_diag(roughs, format="csr")
-        y = np.concatenate([y / noise for _, y, noise in runs])
+        y = np.concatenate([y / noise for _, y, noise, *_ in runs])
         return cls(
             step, _band(B.T @ B), _band(D.T @ D), B.T @ y, B, y, tuple(begins), tuple(counts)
         )

@@ -253,6 +253,9 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
     return flaws | _trend(best.fit)
 
 
+HIDES = "hides what another law would leave"  # of noise
+
+
 def _hidden(fit: LawFit, coordinates: Sequence[str], channels: Sequence[str]) -> str:
     """Reason why other laws follow the record as well: hidden coordinates that are modes, noise
     that is a large part of a radian, or what is left of other channels, a large part of them."""
@@ -263,7 +266,7 @@ def _hidden(fit: LawFit, coordinates: Sequence[str], channels: Sequence[str]) ->
     shares = zip(channels, problem.scales.sigma, fit.rms() / fit.spread, strict=True)
     return "; ".join(
         f"noise of {f'{noise:.2g} rad in' if name in angles else f'{share:.0%} of the spread of'} "
-        f"{name} hides what another law would leave"
+        f"{name} {HIDES}"
         for name, noise, share in shares
         if (noise > OPTIONS.hides if name in angles else share > OPTIONS.lost / 2)
     )

@@ -24,6 +24,7 @@ from gfnn_jax.dataset.stretches import (
     Moving,
     Stretch,
     arcs_of,
+    by_rates,
     measure,
     nodes_of,
     stretches,
@@ -50,6 +51,7 @@ from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.hidden import no_hidden_law, search_hidden, with_hidden
 from gfnn_jax.models.lagrangians.in_use import CalibratedLaw, GaugedLaw, RecordingData, best_in_use
 from gfnn_jax.models.lagrangians.in_words import (
+    HIDES,
     Findings,
     formula_of,
     in_words,
@@ -72,7 +74,12 @@ from gfnn_jax.models.lagrangians.search import (
 )
 from gfnn_jax.models.lagrangians.starts import no_law
 from gfnn_jax.models.lagrangians.text import Names, speed_names
-from gfnn_jax.models.lagrangians.velocities import Velocity, velocities, with_channels
+from gfnn_jax.models.lagrangians.velocities import (
+    Velocity,
+    read_from_the_start,
+    velocities,
+    with_channels,
+)
 from gfnn_jax.solve.noise import Loss
 
 
@@ -186,6 +193,46 @@ def fit_recording(
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found; its ``fit`` is then the `LearnedLaw` that misses most of the motion, where there is one.
     """
+    find = partial(
+        _fit_recording,
+        friction=friction,
+        input_hold=input_hold,
+        mass=mass,
+        terms=terms,
+        loss=loss,
+        hidden=hidden,
+        on_progress=on_progress,
+    )
+    law, missed = None, None
+    try:
+        law = find(recording)
+    except FitError as error:
+        missed = error
+    sure = law is not None and not law.flaws and HIDES not in law.rival
+    with contextlib.suppress(FitError):
+        wider = None if sure or hidden else read_from_the_start(recording)
+        if wider is not None:
+            on_progress("once more, with measured velocities from the start")
+            better = find(wider)
+            law = law if better.flaws else better
+    if law is None:
+        assert missed is not None
+        raise missed
+    return law
+
+
+def _fit_recording(
+    recording: Recording,
+    *,
+    friction: str,
+    input_hold: str,
+    mass: Mapping[str, float] | None,
+    terms: Sequence[Any],
+    loss: Loss | None,
+    hidden: int,
+    on_progress: Callable[[str], Any],
+) -> LearnedLaw:
+    """The law by the columns as they are read."""
     started = time.process_time()
     options = _options(friction)
     _check(recording, input_hold, mass)
@@ -519,6 +566,9 @@ def samples_of(
             np.where(np.isin(range(observation.dim), offset), middle, 0.0)
         )
         found = _segments(recording, observation, angles, parameters)
+    given = np.array([recording.std[name] or np.nan for name in observation.channels])
+    if observation.rated:
+        found = by_rates(found, observation.rated, given)
     scales, messages = measure(found), ()
     if observation.is_plain:
         moving = without_rests(found, scales)
@@ -527,7 +577,6 @@ def samples_of(
             on_progress(line)
         if messages:
             found, scales = moving.stretches, measure(moving.stretches)
-    given = np.array([recording.std[name] or np.nan for name in observation.channels])
     scales = dataclasses.replace(scales, sigma=np.where(given > 0, given, scales.sigma))
     if not np.all(scales.sigma > 0):
         name = observation.channels[int(np.argmin(scales.sigma))]

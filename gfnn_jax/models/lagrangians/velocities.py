@@ -8,6 +8,10 @@ is far smoother than either,
 
 tells the scale 1 + a, the lag −τ and the bias b. Only velocities of which this is next to nothing,
 and whose noise is white, tell a fit something that positions did not.
+
+Where no law is found from positions, or noise hides what another would leave, velocities that are
+less noisy than the slopes of the positions are read *from the start*, as sensors; they stay where
+the law then has no flaw.
 """
 
 from __future__ import annotations
@@ -19,11 +23,13 @@ from typing import NamedTuple
 import numpy as np
 
 from gfnn_jax.data.recording import Recording, channels_of
-from gfnn_jax.dataset.stretches import Arcs, Nodes, Stretch
+from gfnn_jax.data.roles import symbols
+from gfnn_jax.dataset.stretches import Arcs, Nodes, Stretch, stretches
 from gfnn_jax.fitting.evidence import correlation_time
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.signals.derivatives import difference
+from gfnn_jax.signals.local_polynomials import choose_half
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,6 +126,26 @@ def velocities(recording: Recording, fit: LawFit) -> dict[str, Velocity]:
             bool(white and share < allowed),
         )
     return found
+
+
+def read_from_the_start(recording: Recording) -> Recording | None:
+    """The recording whose velocities are read like positions; None where one is noisier than the
+    slopes of its position, both of local cubics, or where sensors are given."""
+    d = len(recording.positions)
+    if recording.explained or not d or len(recording.velocities) != d or recording.sensors:
+        return None
+    speeds = symbols((*recording.positions, *recording.velocities))[d:]
+    both = stretches(recording, (*recording.positions, *recording.velocities), lambda y, _: y)
+    if not all(s.even and np.isfinite(s.y).all() for s in both):
+        return None
+    half, sigma = choose_half([(s.t, s.y[:, :d]) for s in both])
+    noise = choose_half([(s.t, s.y[:, d:]) for s in both])[1]
+    # Variances of the slope and of the value of a cubic through many samples, times their number
+    slopes = sigma * np.sqrt(75 / 4) / (half * np.median(np.diff(both[0].t)))
+    copied = any(_copied(recording, i, name) for i, name in enumerate(recording.velocities))
+    if copied or np.any(1.5 * noise > slopes):
+        return None
+    return recording._with(observe=dict(zip(recording.velocities, speeds, strict=True)))
 
 
 def _colour(left: np.ndarray) -> float:
