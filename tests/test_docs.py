@@ -132,6 +132,20 @@ def test_numbers_in_prose_are_what_the_results_hold():
     assert named > 10
 
 
+def test_times_in_prose_come_from_results():
+    """Numbers of seconds are measured, and so have a marker; one page estimates."""
+    unmarked = re.compile(r"(?<![\w.`])[\d.,]*\d\s(?:s|ms|µs|seconds|minutes|hours)\b")
+    for page in PAGES:
+        text = re.sub(
+            r"^```.*?^```$|<!-- (\w+) -->.*?<!-- /\1 -->",
+            "",
+            page.read_text("utf-8"),
+            flags=re.S | re.M,
+        )
+        if page.stem != "scaling-costs":
+            assert not unmarked.findall(re.sub(r"`[^`]*`|\S+<!--.*?-->", "", text)), page.name
+
+
 def test_the_ten_lines_are_what_the_results_hold():
     import summary
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import re
 import shlex
 import time
@@ -170,6 +171,30 @@ SERIES = (
 )
 
 
+def _or_by_velocities(find: Callable[..., LearnedLaw]) -> Callable[..., LearnedLaw]:
+    """``find``, once more with measured velocities read from the start where that helps."""
+
+    @functools.wraps(find)
+    def found(recording: Recording, **options: Any) -> LearnedLaw:
+        law, missed = None, None
+        try:
+            law = find(recording, **options)
+        except FitError as error:
+            missed = error
+        sure = law is not None and not law.flaws and HIDES not in law.rival
+        with contextlib.suppress(FitError):
+            wider = None if sure or options.get("hidden") else read_from_the_start(recording)
+            better = None if wider is None else find(wider, **options)
+            law = law if better is None or better.flaws else better
+        if law is None:
+            assert missed is not None
+            raise missed
+        return law
+
+    return found
+
+
+@_or_by_velocities
 @np.errstate(all="ignore")  # laws that run away are part of the search
 def fit_recording(
     recording: Recording,
@@ -193,46 +218,6 @@ def fit_recording(
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found; its ``fit`` is then the `LearnedLaw` that misses most of the motion, where there is one.
     """
-    find = partial(
-        _fit_recording,
-        friction=friction,
-        input_hold=input_hold,
-        mass=mass,
-        terms=terms,
-        loss=loss,
-        hidden=hidden,
-        on_progress=on_progress,
-    )
-    law, missed = None, None
-    try:
-        law = find(recording)
-    except FitError as error:
-        missed = error
-    sure = law is not None and not law.flaws and HIDES not in law.rival
-    with contextlib.suppress(FitError):
-        wider = None if sure or hidden else read_from_the_start(recording)
-        if wider is not None:
-            on_progress("once more, with measured velocities from the start")
-            better = find(wider)
-            law = law if better.flaws else better
-    if law is None:
-        assert missed is not None
-        raise missed
-    return law
-
-
-def _fit_recording(
-    recording: Recording,
-    *,
-    friction: str,
-    input_hold: str,
-    mass: Mapping[str, float] | None,
-    terms: Sequence[Any],
-    loss: Loss | None,
-    hidden: int,
-    on_progress: Callable[[str], Any],
-) -> LearnedLaw:
-    """The law by the columns as they are read."""
     started = time.process_time()
     options = _options(friction)
     _check(recording, input_hold, mass)
