@@ -137,7 +137,7 @@ def test_times_in_prose_come_from_results():
     unmarked = re.compile(r"(?<![\w.`])[\d.,]*\d\s(?:s|ms|µs|seconds|minutes|hours)\b")
     for page in PAGES:
         text = re.sub(
-            r"^```.*?^```$|<!-- (\w+) -->.*?<!-- /\1 -->",
+            r"^```.*?^```$|<!-- ([\w-]+) -->.*?<!-- /\1 -->",
             "",
             page.read_text("utf-8"),
             flags=re.S | re.M,

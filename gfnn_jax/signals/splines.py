@@ -131,7 +131,7 @@ class _Problem:
 
     @classmethod
     def of(cls, runs: Sequence[tuple[np.ndarray, ...]], step: float) -> _Problem:
-        """Of runs (t, y, noise), and with the order (n,) of the derivative that each y shows."""
+        """Make it of runs (t, y, noise), and of the order (n,) of the derivative that y shows."""
         from scipy import sparse  # loaded when first used
         from scipy.interpolate import BSpline
 

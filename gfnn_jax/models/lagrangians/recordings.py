@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import re
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import partial, wraps
 from typing import Any
 
 import numpy as np
@@ -174,7 +173,7 @@ SERIES = (
 def _or_by_velocities(find: Callable[..., LearnedLaw]) -> Callable[..., LearnedLaw]:
     """``find``, once more with measured velocities read from the start where that helps."""
 
-    @functools.wraps(find)
+    @wraps(find)
     def found(recording: Recording, **options: Any) -> LearnedLaw:
         law, missed = None, None
         try:
