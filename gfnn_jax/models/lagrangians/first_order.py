@@ -20,6 +20,7 @@ from gfnn_jax.dataset.stretches import Arcs
 from gfnn_jax.families.text import added, digits, power
 from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.fitting.linearised import Linearised
+from gfnn_jax.fitting.significance import significant
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.nature import told_by_positions
 from gfnn_jax.solve.latent_arcs import Defects, Fitted, Readings, flow_defects, observed_whole
@@ -196,24 +197,12 @@ def _fitted(
 
 
 def _pruned(found: FirstOrder, arcs: Arcs, sigma: np.ndarray, most: np.ndarray) -> FirstOrder:
-    """The field without terms that are not significant, the least first, close to the fit."""
+    """The field without terms that are not significant, close to the fit."""
     while True:
         model, near = found.model, Linearised.of_arcs(found.fitted)
-        triangle = near.triangle.rebased(near.p)
-        target, kept = triangle.factor[:, -1], list(range(len(near.p)))
-        while len(kept) > 1:
-            A = near.columns[:, kept]
-            size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-            u, s, vt = np.linalg.svd(A / size, full_matrices=False)
-            inverse = (vt.T / np.maximum(s, 1e-12 * s[0])).T
-            p = inverse.T @ (u.T @ target)
-            z = np.abs(p) / np.linalg.norm(inverse, axis=0)
-            if z.min() > OPTIONS.significant:
-                break
-            del kept[int(np.argmin(z))]
-        if len(kept) == len(near.p):
+        kept, p = significant(near.triangle, near.p, OPTIONS.significant, 1.0)
+        if not 0 < len(kept) < len(near.p):
             return found
-        p = np.linalg.lstsq(near.columns[:, kept], target, rcond=None)[0]
         smaller = dataclasses.replace(model, places=model.places[kept])
         other = _fitted(smaller, p, arcs, found.fitted.x, sigma)
         if other is None or np.any(other.rms > most):
