@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 
 from gfnn_jax.dataset.stretches import Nodes
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.lagrangian import LINEAR, Friction, Terms, functions_of
+from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Terms, functions_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.libraries import FEW
@@ -56,6 +56,8 @@ class WeakOptions:
     apart: float = 100.0
     rounding: float = 1e-9
     rank: float = 1e-12
+    slow: float = 0.03
+    held: float = 0.25
     many: int = 400
     kept: int = 120
     block: int = 300
@@ -102,8 +104,16 @@ class _Equations(NamedTuple):
             for length in lengths
         ]
         rows, targets = zip(*(weak_rows(form, *window) for window in windows), strict=True)
-        t = np.concatenate([Bumps.of(n.t, length).t for n, length in windows])
+        bumps = [Bumps.of(n.t, length) for n, length in windows]
+        t = np.concatenate([one.t for one in bumps])
         X, Y = np.concatenate(rows), -np.concatenate(targets)
+        if any(row[1] == DRY for row in structure.friction):
+            least = OPTIONS.slow * np.sqrt(np.mean(problem.states[:, d:] ** 2, axis=0))
+            slow = [1.0 * (np.abs(n.x[:, d:]) < least) for n, _ in windows]
+            inside = [1.0 * (one.phi != 0) for one in bumps]
+            part = [W @ x / W.sum(axis=1)[:, None] for W, x in zip(inside, slow, strict=True)]
+            held = np.concatenate(part) > OPTIONS.held  # by any force up to that of sliding
+            X[held], Y[held] = 0.0, 0.0
         keys = structure.keys()[: form.count]
         keep = [k for k in range(form.count) if np.any(X[..., k])]
         masses = [k for k in keep if equal and keys[k] in protected(structure)]
