@@ -44,9 +44,9 @@ class WeakOptions:
     apart: ratio of the weights of coordinates, at most, since a wrong library would make one of
     them all. rounding: residual of a coordinate to the sizes of its terms, below which a law
     without mass and force solves the equations. slow: of the rms speed of a coordinate, below which
-    dry friction holds it. many: terms of a library, of which the ``kept`` that explain most are
-    tried, ``block`` by block; imitated: share of what one does that those of the law do not, below
-    which it explains nothing.
+    dry friction holds it; held: share of a window, above which it says nothing of the law. many:
+    terms of a library, of which the ``kept`` that explain most are tried, ``block`` by block;
+    imitated: share of what one does that those of the law do not, below which it explains nothing.
     """
 
     lengths: tuple[float, ...] = (0.5, 1.0)
