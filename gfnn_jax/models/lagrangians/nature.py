@@ -45,10 +45,11 @@ class NatureOptions:
     most: share of the squares of second differences in narrow peaks, which fall to a quarter within
     ``width`` samples. closed: squares of the accelerations that are left, in those of noise; bias:
     the share that these are at least, by the curves' own bias.
-    excited: negative friction, in ω. memory: share that plays explain; gains, beats: of what
-    polynomials and past positions leave, that they leave. near: rms distance of states, in
-    standard deviations, from which that to none is extrapolated; differ: share that they determine,
-    below which more acts. degree: of polynomials. samples: that are looked at. plays: widths, in
+    excited: negative friction, in ω. turns: passages through the mean of what oscillates; lasts:
+    ratio of its spreads, later and before, of what sustains itself. memory: share that plays
+    explain; gains, beats: of what polynomials and past positions leave, that they leave. near: rms
+    distance of states, in standard deviations, from which that to none is extrapolated; differ:
+    share that they determine, below which more acts. degree: of polynomials. samples: that are looked at. plays: widths, in
     amplitudes, and as many past positions within a period. blocks: of ``parts`` of the record.
     """
 
@@ -64,6 +65,8 @@ class NatureOptions:
     closed: float = 5.0
     bias: float = 1e-4
     excited: float = 0.1
+    turns: int = 4
+    lasts: float = 0.8
     memory: float = 0.9
     gains: float = 0.5
     beats: float = 0.75
@@ -145,7 +148,7 @@ def nature(
             f"few samples, velocities jump, as at {when:.4g} s. Cut them off (--from, --to)",
         )
     rate = _rate_at_rest(state, a / v.std(axis=0), state.shape[1] - v.shape[1] - u.shape[1])
-    excited = plain > OPTIONS.mostly and rate > OPTIONS.excited * scales.omega
+    excited = plain > OPTIONS.mostly and rate > OPTIONS.excited * scales.omega and _lasts(found)
     self_excited = Nature(
         "not mechanical",
         "self-excited: friction is negative where motion is slow, or small, "
@@ -315,6 +318,17 @@ def _rate_at_rest(state: np.ndarray, a: np.ndarray, first: int) -> float:
         low, high = _products(ends, OPTIONS.degree) @ c[:, i]
         rates.append((high - low) / 0.1)
     return float(max(rates))
+
+
+def _lasts(found: Sequence[Stretch]) -> bool:
+    """Return whether a position oscillates in some stretch, later about as widely as before."""
+    for s in found:
+        x = s.q - np.nanmean(s.q, axis=0)
+        early, late = np.array_split(x, 2)
+        turns = np.sum(np.diff(np.sign(x), axis=0) != 0, axis=0) >= OPTIONS.turns
+        if np.any(turns & (np.nanstd(late, axis=0) > OPTIONS.lasts * np.nanstd(early, axis=0))):
+            return True
+    return False
 
 
 def _jumps(found: Sequence[Stretch]) -> tuple[float, float]:
