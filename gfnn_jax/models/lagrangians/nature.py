@@ -49,8 +49,9 @@ class NatureOptions:
     ratio of its spreads, later and before, of what sustains itself. memory: share that plays
     explain; gains, beats: of what polynomials and past positions leave, that they leave. near: rms
     distance of states, in standard deviations, from which that to none is extrapolated; differ:
-    share that they determine, below which more acts. degree: of polynomials. samples: that are looked at. plays: widths, in
-    amplitudes, and as many past positions within a period. blocks: of ``parts`` of the record.
+    share that they determine, below which more acts. degree: of polynomials. samples: that are
+    looked at. plays: widths, in amplitudes, and as many past positions within a period. blocks: of
+    ``parts`` of the record.
     """
 
     still: float = 0.5
