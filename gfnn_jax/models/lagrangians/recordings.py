@@ -295,8 +295,7 @@ def _with_rivals(
 ) -> LearnedLaw:
     """The law with those that are one exchange of terms away and follow a record as well, and the
     motion that tells them apart as the first to record next."""
-    every = TermSearch.of(fit.problem).every
-    assert every is not None
+    every = TermSearch.of(fit.problem).every_beside(fit)
     found = [] if fit.problem.parameters else rivals(fit, every)
     if not found:
         return law

@@ -221,6 +221,13 @@ class TermSearch:
         inputs, sensors = problem.num_inputs, problem.sensors
         return cls(Structure(d, terms, frictions, problem.turned, inputs, sensors), frictions)
 
+    def every_beside(self, fit: LawFit) -> Structure:
+        """All terms that the law of a fit may come to: of angles of which it has powers, springs
+        too."""
+        assert self.every is not None
+        sprung = [i for i in fit.problem.within_a_turn if fit.structure.has_powers(i)]
+        return self.every.plus([("term", row) for row in libraries.springs(self.every.dim, sprung)])
+
     # From a fit to the law.
 
     def along(self, fit: LawFit, lengths: Sequence[float]) -> SearchResult:
@@ -282,8 +289,7 @@ class TermSearch:
 
     def _exchanged(self, fit: LawFit, choice: FrictionChoice) -> tuple[LawFit, FrictionChoice]:
         """The fit with other terms and friction where these are likelier, and the odds of these."""
-        assert self.every is not None
-        other = with_exchanges(fit, self.every)
+        other = with_exchanges(fit, self.every_beside(fit))
         if other is fit:
             return fit, choice
         other = self.prune(other, friction=False)
