@@ -222,13 +222,13 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
     rms, noise = best.fit.along_periods.rms(), best.fit.problem.scales.sigma
     missed = np.sqrt(np.maximum(rms**2 - noise**2, 0.0)) / best.fit.spread
     flaws |= {
-        f"the residuals of {name} are {loud:.2g} times its noise and correlated, "
-        f"{one.fit_percent:.1f} % of its variation is followed": "a force, an input or a term is "
-        "missing. law.png (fit.traces) shows when"
-        for (name, one), loud, share in zip(found.items(), rms / noise, missed, strict=True)
+        f"the residuals of {name} are correlated, {size:.2g} rms where its readings scatter by "
+        f"{sigma:.1g}, and {one.fit_percent:.1f} % of its variation is followed": "a force, an "
+        "input or a term is missing. law.png (fit.traces) shows when"
+        for (name, one), size, sigma, share in zip(found.items(), rms, noise, missed, strict=True)
         if not one.white
         and OPTIONS.followed <= one.fit_percent < OPTIONS.nearly
-        and (loud > OPTIONS.beyond or share > OPTIONS.missed)
+        and (size > OPTIONS.beyond * sigma or share > OPTIONS.missed)
     }
     least = np.min(best.calibration.median, axis=0, initial=np.inf)
     beyond = np.isfinite(least) & (least > OPTIONS.lost)
