@@ -14,7 +14,7 @@ from gfnn_jax.families.lagrangian import DRY, LINEAR
 from gfnn_jax.maps.energy import ledger
 from gfnn_jax.maps.estimates import Window, law_in_use, propagate
 from gfnn_jax.maps.inputs import Signals
-from gfnn_jax.maps.laws import law_of_map, map_of_law, states_of, sticking, velocities_of
+from gfnn_jax.maps.laws import law_of_map, map_of_law, smoothed, states_of, velocities_of
 from gfnn_jax.maps.sensors import Sensors
 
 # A pendulum whose pivot is driven by a motor.
@@ -379,7 +379,7 @@ def test_a_forecast_across_a_stop():
     """Against the exact motion, with the map of the narrow law."""
     friction, dt, count = 0.05, 0.1, 300
     wide = on_a_spring(friction, 0.05)
-    law = sticking(wide, noise=1e-3, duration=dt * count)
+    law = smoothed(on_a_spring(friction, 0.0), 1e-3 / (dt * count))
     z = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
     map_ = map_of_law(law, z, dt)
     found, info = map_.rollout(np.array([0.52, 0.0]), count)

@@ -106,18 +106,6 @@ def smoothed(law: Lagrangian, width: float) -> Lagrangian:
     return dataclasses.replace(law, friction=dataclasses.replace(friction, widths=widths))
 
 
-def sticking(law: Lagrangian, noise: float, duration: float) -> Lagrangian:
-    """The law with dry friction narrow enough for forecasts across a stop.
-
-    With |v| as √(v² + ε²) − ε a body that dry friction holds creeps at up to about ε. Over a
-    forecast of this duration it creeps by no more than ``noise``, in units of the positions, where
-    ε is noise ÷ duration: a smaller one would cost steps and tell nothing.
-    """
-    friction = law.friction
-    widths = np.where(friction.kinds == DRY, noise / duration, friction.widths)
-    return dataclasses.replace(law, friction=dataclasses.replace(friction, widths=widths))
-
-
 def conformal(law: Lagrangian, covariance: np.ndarray) -> tuple[Lagrangian, np.ndarray]:
     """The same law with its friction as uniform friction, where one degree of freedom has constant
     mass m and R = ½ρv² alone: γ = ρ/m; and the covariance (n, n) of (θ, γ), from that of (θ, ρ).

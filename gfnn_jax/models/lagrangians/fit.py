@@ -475,6 +475,11 @@ class LawFit:
         return np.sqrt(np.nanmean(left**2, axis=(0, 1))) * self.sigma
 
     @property
+    def loudest(self) -> float:
+        """The largest residual of a channel, in units of its noise."""
+        return float(np.max(self.rms() / self.problem.scales.sigma))
+
+    @property
     def spread(self) -> np.ndarray:
         """Standard deviation (k,) of the channels; of times of events the period."""
         spread = np.nanstd(self.arcs.y, axis=(0, 1))

@@ -690,7 +690,7 @@ def _with_hidden_drive(
     missed = FitError("")
     try:
         data, found = searched(recording, *rules)
-        problem, loud = data.problem, _loudest(found.fit)
+        problem, loud = data.problem, found.fit.loudest
     except FitError as error:
         missed, problem, loud = error, samples_of(recording).problem, np.inf
     seen = not recording.inputs and problem.observation.hidden is None
@@ -704,10 +704,10 @@ def _with_hidden_drive(
         problem.on_progress(f"a drive that was not recorded: {omega:.5g} rad/s")
         with contextlib.suppress(FitError):
             _, law = searched(driven, "band")
-            if _loudest(law.fit) < OPTIONS.explained * loud:
+            if law.fit.loudest < OPTIONS.explained * loud:
                 _, omega, error = with_frequency(law.fit, omega)
                 driven, law = searched(recording.driven_by(wave_names(omega)), "band")
-                if _loudest(law.fit) < min(OPTIONS.above_noise, OPTIONS.explained * loud):
+                if law.fit.loudest < min(OPTIONS.above_noise, OPTIONS.explained * loud):
                     return driven, law, (DRIVEN.format(measured(omega, error)),)
     if data is None or found is None:
         raise missed
@@ -720,12 +720,7 @@ def _louder_with(fit: LawFit, driven: Recording, loud: float) -> bool:
     structure = dataclasses.replace(fit.structure, num_inputs=problem.num_inputs)
     arcs = arcs_of(problem.nodes, fit.arcs.t.shape[1])
     more = problem.fit(structure, fit.values, arcs, fit.sigma)
-    return not _loudest(more) < OPTIONS.explained * loud
-
-
-def _loudest(fit: LawFit) -> float:
-    """The largest residual of a channel, in units of its noise."""
-    return float(np.max(fit.rms() / fit.problem.scales.sigma))
+    return not more.loudest < OPTIONS.explained * loud
 
 
 def _misses(fit: LawFit) -> bool:

@@ -210,7 +210,7 @@ def of_a_sensor(fit: LawFit) -> str:
     problem, seen, d = fit.problem, fit.problem.observation, fit.structure.dim
     terms = textbook(d, problem.angles)
     terms += springs(d, problem.within_a_turn) if d > 1 else []
-    is_noise = np.max(fit.rms() / problem.scales.sigma) < OPTIONS.noise
+    is_noise = fit.loudest < OPTIONS.noise
     is_plain = set(fit.structure.terms) <= set(terms)
     if not seen.is_plain or problem.parameters or (is_noise and is_plain):
         return ""
