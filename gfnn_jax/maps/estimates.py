@@ -249,7 +249,7 @@ def _beyond(
     """A line for each run whose forecast (q, v), of the states (runs, n, 2d), leaves the domain."""
     lines, d, angles = [], states.shape[-1] // 2, list(map_.coordinates.angles)
     for run, law, x in zip(recording.runs, laws, states, strict=True):
-        momenta = law.form.lagrangian(law.p).derivatives(x[:, :d], x[:, d:]).by_v
+        momenta = law.form.lagrangian(law.p).momentum(x[:, :d], x[:, d:])
         z = np.concatenate([x[:, :d], momenta], axis=1)
         turns = np.round((z[:, angles] - np.asarray(map_.angle_centre)) / (2 * np.pi))
         z[:, angles] -= 2 * np.pi * turns
@@ -323,6 +323,8 @@ def thinned(window: Window) -> Window:
     """The window with every so many of its samples, counted from the last one, of each set of
     channels that are read together: more tell no more."""
     every = -(-len(window.t) // _OPTIONS.most)
+    if every == 1:
+        return window
     which = np.unique(np.isfinite(window.y), axis=0, return_inverse=True)[1].ravel()
     kept = [np.flatnonzero(which == k)[::-every] for k in range(which.max() + 1)]
     keep = np.sort(np.concatenate(kept))
@@ -382,7 +384,8 @@ class _Windows:
         arcs, length, m = x.shape
         num, d = arcs * (length - 1), 2 * self.laws[0].form.dim
         u = self.u.reshape(num, *self.u.shape[2:])
-        start, level = np.split(x[:, :-1].reshape(num, m), [d], axis=1)
+        start = x[:, :-1].reshape(num, m)
+        start, level = start[:, :d], start[:, d:]
         order, which = 1 + level.shape[1], np.repeat(self.which, length - 1)
         form, p, friction = _side_by_side(self.laws, which, level)
         step = form.step(p, start, self.h.reshape(num), u, order=order)
@@ -398,7 +401,8 @@ class _Windows:
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         u = np.concatenate([self.u[:, :, 0, 0], self.u[:, -1:, -1, -1]], axis=1)
-        x, level = np.split(x, [2 * self.laws[0].form.dim], axis=2)
+        d = 2 * self.laws[0].form.dim
+        x, level = x[..., :d], x[..., d:]
         shown = _channels(self.laws, self.which, x, u)
         shown = shown._replace(by_coefficients=shown.by_coefficients[..., :0])
         if not level.shape[2]:
@@ -616,13 +620,14 @@ def _followed(
     """Orbits (B, M + 1, 2d) of the laws from states x (B, 2d), and levels of friction behind them,
     whose covariance is root rootᵀ, by steps h (B, M) with inputs u; and the roots (B, n, 2d, ·) of
     the covariances after the steps that are ``asked`` (n,), with that of the coefficients."""
-    x, level = np.split(x, [2 * laws[0].form.dim], axis=1)
+    d = 2 * laws[0].form.dim
+    x, level = x[:, :d], x[:, d:]
     form, p, friction = _side_by_side(laws, which, level)
     longest = max(len(law.root) for law in laws)
     roots = [np.pad(law.root, ((0, longest - len(law.root)), (0, 0))) for law in laws]
     roots = np.stack(roots)[which]
     size, count, modes = root.shape[-1], roots.shape[-1], None
-    root, of_level = np.split(root, [2 * form.dim], axis=1)
+    root, of_level = root[:, :d], root[:, d:]
     spread = np.concatenate([root, np.zeros((*x.shape, roots.shape[1]))], axis=2)
     orbit, spreads, most = [x[:, None]], [], max(1, _OPTIONS.at_once // len(x))
     for first in range(0, h.shape[1], most):

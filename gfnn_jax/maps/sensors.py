@@ -133,14 +133,18 @@ class Sensors:
         """The law's own error (..., k) at times ``ahead`` (...); beyond the last lead it grows on
         with the power of time by which it grew from half of that lead on, none to the first: errors
         of a driven, damped motion grow no more."""
+        columns = [np.interp(ahead, self.leads, column) for column in self.misfit.T]
+        beyond = np.maximum(1.0, ahead / self.leads[-1])
+        return np.stack(columns, axis=-1) * beyond[..., None] ** self._growth
+
+    @cached_property
+    def _growth(self) -> np.ndarray:
+        """The powers (k,) of time by which the misfit grows."""
         t, m = self.leads, np.maximum(self.misfit, 1e-300)
-        columns = [np.interp(ahead, t, column) for column in self.misfit.T]
         recent = t >= t[-1] / 2
-        slope = np.zeros(m.shape[1])
-        if np.sum(recent) > 1:
-            slope = np.polyfit(np.log(t[recent]), np.log(m[recent]), 1)[0]
-        beyond = np.maximum(1.0, ahead / t[-1])
-        return np.stack(columns, axis=-1) * beyond[..., None] ** np.clip(slope, 0.0, 1.0)
+        if np.sum(recent) < 2:
+            return np.zeros(m.shape[1])
+        return np.clip(np.polyfit(np.log(t[recent]), np.log(m[recent]), 1)[0], 0.0, 1.0)
 
     @cached_property
     def held_out(self) -> int:

@@ -22,6 +22,7 @@ Where it is not white, a *whitening* (`solve.noise`) mixes residuals along an ar
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import cached_property, partial
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -332,7 +333,7 @@ class _AtStates:
 
     def closed(self, at: _Iterate) -> bool:
         """True where arcs are orbits of the model."""
-        return at.gap <= float(OPTIONS.closed * np.sqrt(self.here.x.size))
+        return at.gap <= OPTIONS.closed * math.sqrt(self.here.x.size)
 
     def tried(self, damping: float, failures: int) -> Tried:
         """A step of p and x; each that failed halves the next. Where it fails, or arcs share no p,
@@ -342,10 +343,11 @@ class _AtStates:
             return Tried(here, -np.inf, damping, hopeless=True)
         dp, dx = _solve(self._rows, here.defects, damping)
         there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
-        stays = np.zeros(len(here.x), bool)
-        if (len(here.x) > 1 and not len(here.p)) or not self._decrease(there, share, stays) > 0:
+        decrease = self._decrease(there, share, np.zeros(len(here.x), bool))
+        if (len(here.x) > 1 and not len(here.p)) or not decrease > 0:
             there, stays = self._alone(there, share, dx)
-        return Tried(there, self._decrease(there, share, stays), damping)
+            decrease = self._decrease(there, share, stays)
+        return Tried(there, decrease, damping)
 
     def _decrease(self, there: _Iterate, share: float, stays: np.ndarray) -> float:
         """Decrease of the cost by this share of a step, or of the defects while they matter: of
@@ -596,11 +598,13 @@ def _solve(rows: _Rows, defects: Defects, damping: float) -> tuple[np.ndarray, n
     """δp (n,) and δx (A, L, m), with Levenberg and Marquardt's damping of δp."""
     m, R = rows.arcs.shape[1], rows.factor
     n = R.shape[1] - 1
-    scale = np.linalg.norm(R[:, :n], axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    matrix = np.concatenate([R[:, :n] / scale, np.sqrt(damping) * np.eye(n)])
-    target = np.concatenate([R[:, n], np.zeros(n)])
-    dp = np.linalg.lstsq(matrix, target, rcond=1e-13)[0] / scale
+    dp = np.zeros(n)
+    if n:
+        scale = np.linalg.norm(R[:, :n], axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        matrix = np.concatenate([R[:, :n] / scale, np.sqrt(damping) * np.eye(n)])
+        target = np.concatenate([R[:, n], np.zeros(n)])
+        dp = np.linalg.lstsq(matrix, target, rcond=1e-13)[0] / scale
     right = (rows.arcs[:, :, -1] - rows.arcs[:, :, m : m + n] @ dp)[..., None]
     own, moved = rows.arcs[:, :, :m], np.empty_like(right)
     sizes = np.linalg.norm(own, axis=1)
