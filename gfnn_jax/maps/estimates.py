@@ -472,7 +472,8 @@ def estimates_of(
     found = readings.fit(np.zeros(0), x, scale, tolerance=_OPTIONS.settled)
     if wander is None or white is None:
         return found.x[:, -1], found.last_covariance()
-    near = np.pad(wander.latest(t, noise_of_readings), ((0, 0), (0, 0), (0, y.shape[2] - count)))
+    near = np.zeros(y.shape)
+    near[..., :count] = wander.latest(t, noise_of_readings)
     near = white @ near.swapaxes(1, 2)[..., None]
     weights = np.sqrt(np.nan_to_num(loss.weights(found.whitened)))
     near = weights * near[..., 0].swapaxes(1, 2)
@@ -593,7 +594,6 @@ def propagate(
     u = _inputs(sensors, windows, ends, 1)
     x, own = np.concatenate([x, level], axis=1), 2 * d + level.shape[1]
     orbit, spread = _followed(laws, which, x, root[:, :own], np.diff(ends, axis=1), u, asked)
-    of_zeros = np.pad(root[:, own:], ((0, 0), (0, 0), (0, spread.shape[-1] - root.shape[-1])))
     orbit = orbit[:, asked]
     at = np.concatenate([u[:, :, 0, 0], u[:, -1:, -1, -1]], axis=1)[:, asked]
     channels, ahead = _channels(laws, which, orbit, at), times - last[:, None]
@@ -601,7 +601,7 @@ def propagate(
     if sensors.wander is not None:
         left = sensors.wander.fading(ahead)[..., None]
         values = values + left * zeros[:, None]
-        modes = modes + left[..., None] * of_zeros[:, None]
+        modes[..., : root.shape[-1]] += left[..., None] * root[:, None, own:]
     orbits = Orbits(values, orbit, spread @ spread.swapaxes(2, 3), modes, sensors.sigma)
     if sensors.wander is not None:
         orbits = orbits.with_misfit(sensors.wander.size * np.sqrt(1 - left**2) * sensors.sigma)
@@ -623,9 +623,10 @@ def _followed(
     d = 2 * laws[0].form.dim
     x, level = x[:, :d], x[:, d:]
     form, p, friction = _side_by_side(laws, which, level)
-    longest = max(len(law.root) for law in laws)
-    roots = [np.pad(law.root, ((0, longest - len(law.root)), (0, 0))) for law in laws]
-    roots = np.stack(roots)[which]
+    roots = np.zeros((len(laws), max(len(law.root) for law in laws), laws[0].root.shape[1]))
+    for padded, law in zip(roots, laws, strict=True):
+        padded[: len(law.root)] = law.root
+    roots = roots[which]
     size, count, modes = root.shape[-1], roots.shape[-1], None
     root, of_level = root[:, :d], root[:, d:]
     spread = np.concatenate([root, np.zeros((*x.shape, roots.shape[1]))], axis=2)

@@ -471,7 +471,7 @@ class _Iterate:
     def _size(self) -> tuple[float, float]:
         with np.errstate(all="ignore"):
             cost = float(np.sum(self.units.loss.of(self.white)))
-            gap = float(np.linalg.norm(self.defects.closing / self.units.state))
+            gap = math.sqrt(np.sum(self.gaps))
         return (cost, gap) if np.isfinite(cost + gap) else (np.inf, np.inf)
 
     @property
@@ -616,11 +616,9 @@ def _solve(rows: _Rows, defects: Defects, damping: float) -> tuple[np.ndarray, n
     if loose.any():
         inverse = np.linalg.pinv(own[loose] / units, rcond=OPTIONS.loose)
         moved[loose] = inverse @ right[loose] / units[:, None]
-    pushed = (defects.by_coefficients @ dp)[..., None]
+    pushed = (defects.by_coefficients @ dp + defects.closing)[..., None]
     dx = np.concatenate([moved[:, None], pushed], axis=1)
-    nodes, parts = dx.swapaxes(0, 1), (defects.by_state, defects.closing[..., None])
-    steps = zip(*(part.swapaxes(0, 1) for part in parts), nodes[:-1], nodes[1:], strict=True)
-    for by, closing, here, there in steps:
+    nodes, by_state = dx.swapaxes(0, 1), defects.by_state.swapaxes(0, 1)
+    for by, here, there in zip(by_state, nodes[:-1], nodes[1:], strict=True):
         there += by @ here
-        there += closing
     return dp, dx[..., 0]
