@@ -43,6 +43,11 @@ def test_whitened_noise_is_white(rng):
     covariance = np.cov(paths @ white.T, rowvar=False)
     expected = np.diag(np.arange(8) != 3).astype(float)
     np.testing.assert_allclose(covariance, expected, atol=0.08)
+    noisier = WANDER.whitening(t[None], np.concatenate([noise, 2 * noise], axis=2))
+    alike = WANDER.whitening(t[None], np.concatenate([noise, noise], axis=2))
+    np.testing.assert_array_equal(alike, np.broadcast_to(white, (1, 2, 8, 8)))
+    np.testing.assert_array_equal(noisier[0, 0], white)
+    assert np.abs(noisier[0, 1] - white).max() > 0.1
 
 
 def free_body(sigma, wander):

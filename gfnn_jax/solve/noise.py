@@ -20,7 +20,7 @@ import dataclasses
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg.lapack import dtrtri  # pyright: ignore[reportAttributeAccessIssue]
 
 _NORMAL = 1.4826  # a normal deviation over the median of its size
 
@@ -106,15 +106,15 @@ class Wander:
     def whitening(self, t: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """L⁻¹ (A, k, n, n) of values at times t (A, n) with relative noise (A, n, k), infinite
         where one was not seen."""
-        channels, scale = noise.shape[2], 1 / noise.swapaxes(1, 2)
+        scale = 1 / noise.swapaxes(1, 2)
+        whole = (*scale.shape, scale.shape[-1])
         if np.all(scale == scale[:, :1]):  # of all channels one
             scale = scale[:, :1]
         slow = self.covariance(t[:, :, None] - t[:, None, :])[:, None]
         slow = scale[..., :, None] * slow * scale[..., None, :]
         roots = np.linalg.cholesky(np.eye(t.shape[1]) + slow)
         found = [dtrtri(root.T)[0].T for root in roots.reshape(-1, *roots.shape[2:])]
-        found = np.reshape(found, roots.shape)
-        return np.broadcast_to(found, (len(found), channels, *found.shape[2:]))
+        return np.broadcast_to(np.reshape(found, roots.shape), whole)
 
     def latest(self, t: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Covariance (A, n, k) of each value, in units of its own noise, with b at the last time of
