@@ -19,9 +19,9 @@ or have friction that depends on position.
 
 Silverbox (Wigren & Schoukens, ECC 2013): the law of the multisine, and the free run of the arrow,
 which is the first 40,000 samples, from its first 20 on. A second row is told that one low-pass is
-before both channels, of phase ∝ f³ (a delay that both have shows nowhere): the multisine tells its
-one number, by the residuals of three fits of the first row's terms, and it is taken out of every
-column before the fit. Cascaded tanks (Schoukens & Noël, 2017):
+before both channels, whose phase is `PHASE` (f ÷ `CORNER`)³ (a delay that both have shows nowhere):
+the number with which the free run of the multisine errs least, by least squares with the seven of
+the law. It is taken out of every column before the fit. Cascaded tanks (Schoukens & Noël, 2017):
 the estimation record, of which there is no mechanical law.
 """
 
@@ -53,7 +53,7 @@ GAMMAS = (0.0, 0.05)  # γ, of the multiplicative noise
 RATE = 1e7 / 2**14  # Hz, of Silverbox
 ARROW, MULTISINE = slice(0, 40_000), slice(40_650, 105_712)  # samples
 SEEN = 20  # samples that a free run begins with
-CORNER, PHASES = 200.0, (0.0, 0.6, 1.2)  # Hz, and rad there, of a filter's phase
+CORNER, PHASE = 200.0, 0.866  # Hz, and rad there, of a filter's phase
 PAD = 2_000  # samples at either end of a column that is filtered
 RIGHT = 0.9  # R² of a trajectory that counts as right
 TRAINED, AHEAD, A_PERIOD = 1000, 200, 100  # samples
@@ -239,9 +239,9 @@ def silverbox(folder: Path, quick: bool) -> Numbers:
     return result
 
 
-def unfiltered(x: np.ndarray, phase: float) -> np.ndarray:
+def unfiltered(x: np.ndarray, phase: float = PHASE) -> np.ndarray:
     """A column (n,) before a low-pass that turns the frequency f by ``phase`` (f ÷ `CORNER`)³ rad;
-    with −phase, behind it."""
+    with −`PHASE`, behind it."""
     padded = np.pad(x, PAD, mode="edge")
     f = np.fft.rfftfreq(len(padded), 1 / RATE) / CORNER
     turned = np.fft.rfft(padded) * np.exp(1j * phase * f**3)
@@ -252,28 +252,18 @@ def without_filter(folder: Path, quick: bool) -> Numbers:
     """`silverbox` with columns before their filter; the free run goes through it again."""
     table = np.loadtxt(folder / "SNLS80mV.csv", delimiter=",")
 
-    def recording(rows: slice, phase: float) -> gfnn.Recording:
-        u, y = (unfiltered(column, phase) for column in table[rows].T)
+    def recording(rows: slice) -> gfnn.Recording:
+        u, y = map(unfiltered, table[rows].T)
         columns = {"t": np.arange(len(u)) / RATE, "u": u, "y": y}
         return gfnn.Recording(columns, positions=["y"], inputs=["u"], angles=[])
 
-    def left(phase: float) -> float:
-        terms = [*(f"V: y**{n}" for n in (1, 2, 3, 4)), "R: y_dot**2", "R: abs(y_dot)**3"]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            fit: Any = gfnn.fit(recording(MULTISINE, phase), terms=terms)
-        return fit.law.residual["y"] ** 2
-
-    bend, slope, _ = np.polyfit(PHASES, [left(phase) for phase in PHASES], 2)
-    phase = float(-slope / (2 * bend))
-    fit, result = fitted(lambda: gfnn.fit(recording(MULTISINE, phase)))
-    result["phase"] = phase
+    fit, result = fitted(lambda: gfnn.fit(recording(MULTISINE)))
     if fit is not None:
         rows = slice(0, 4_000) if quick else ARROW
-        arrow = recording(rows, phase)
+        arrow = recording(rows)
         t, y = arrow.times(arrow.runs[0]), arrow.values("y", arrow.runs[0])
         ahead = fit.map.forecast(arrow.slice(stop=t[SEEN - 1]), t[SEEN:], arrow).values["y"][0]
-        run = unfiltered(np.concatenate([y[:SEEN], ahead]), -phase)[SEEN:]
+        run = unfiltered(np.concatenate([y[:SEEN], ahead]), -PHASE)[SEEN:]
         missed = run - table[rows, 1][SEEN:]
         result["rms_millivolts"] = 1e3 * float(np.sqrt(np.mean(missed**2)))
         result["largest_millivolts"] = 1e3 * float(np.max(np.abs(missed)))

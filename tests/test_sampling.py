@@ -33,7 +33,7 @@ def test_splines_tell_the_noise_and_the_derivatives(count, noise):
     t = np.sort(rng.uniform(0, 16, count))
     y = np.stack([np.cos(3 * t), np.sin(2 * t)], axis=1)
     read = np.where(rng.uniform(size=y.shape) < 0.2, np.nan, y + noise * rng.normal(size=y.shape))
-    found = splines([(t, read, np.ones(y.shape))])
+    found = splines([(t, read)])
     np.testing.assert_allclose(found.sigma, noise, rtol=0.5 if count < 200 else 0.15)
     at = np.linspace(1, 15, 50)
     curves = found.smooth(t, read, at)
@@ -49,7 +49,7 @@ def test_runs_share_the_noise():
     for _ in range(60):
         t = 0.2 * np.arange(rng.integers(6, 11))
         y = np.cos(3 * t + rng.uniform(0, 6))[:, None]
-        runs.append((t, y + NOISE * rng.normal(size=y.shape), np.ones(y.shape)))
+        runs.append((t, y + NOISE * rng.normal(size=y.shape)))
     assert splines(runs).sigma[0] == pytest.approx(NOISE, rel=0.3)
 
 

@@ -310,7 +310,7 @@ def measure(found: Sequence[Stretch]) -> Scales:
         half, sigma = choose_half([(s.t, s.q) for s in found])
         smooths = [smooth(s.t, s.q, half, np.arange(0, len(s.t), every))[0] for s in found]
     else:
-        half = splines([(s.t, s.q, np.ones(s.q.shape)) for s in found])
+        half = splines([(s.t, s.q) for s in found])
         sigma = half.sigma
         smooths = [half.smooth(s.t, s.q, _inside(s.t)[::every]) for s in found]
         apart = np.concatenate([np.diff(s.t) for s in found])
@@ -365,7 +365,6 @@ def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
                 raise FitError(f"a column has no {OPTIONS.shortest} samples in a row: leave it out")
             sigma.append(float(choose_half(known)[1][0]))
         else:
-            known = [(t, y, np.ones(y.shape)) for t, y in known]
             sigma.append(float(splines(known).sigma[0]))
     return np.array(sigma)
 

@@ -515,7 +515,7 @@ def _started(sensors: Sensors, window: Window) -> tuple[Window, np.ndarray]:
         near = max(3, int(np.pi / 3 / sensors.omega / np.median(np.diff(t))))  # a sixth of a period
         start = smooth(t, own, min(len(t), near))[0]
     else:
-        start = splines([(t, own, np.ones(own.shape))]).smooth(t, own, t)
+        start = splines([(t, own)]).smooth(t, own, t)
     x = np.concatenate([start.q, start.v], axis=1)
     steps = np.diff(t)
     parts = np.ceil(steps / max(np.median(steps), _OPTIONS.fine / sensors.omega) - 1e-3).astype(int)

@@ -446,7 +446,7 @@ class Observation:
         """States (n, 2d) and accelerations (n, d) at times t (n,), of the unseen coordinates as
         integrals."""
         q = self._integrated(t, y)
-        found = splines([(t, q, np.ones(q.shape))]).smooth(t, q, t)
+        found = splines([(t, q)]).smooth(t, q, t)
         return np.concatenate(found[:2], axis=1), found.a
 
     def balanced(

@@ -83,8 +83,7 @@ def between_extremes(t: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
     known = np.isfinite(v)
     if known.sum() < FEWEST:
         return np.full(len(t), np.nan), 0.0
-    column, ones = v[:, None], np.ones((len(v), 1))
-    curve = splines([(t, column, ones)]).curve(t, v)
+    curve = splines([(t, v[:, None])]).curve(t, v)
     q = curve.antiderivative()(t)
     speed, rate = np.abs(curve(t)), curve(t, nu=1)
     at = np.flatnonzero((rate[1:] * rate[:-1] < 0) & (speed[1:] > OPTIONS.extreme * speed.max()))

@@ -49,20 +49,16 @@ class Splines(NamedTuple):
     stiffness: np.ndarray
     sigma: np.ndarray
 
-    def smooth(
-        self, t: np.ndarray, y: np.ndarray, at: np.ndarray, noise: np.ndarray | None = None
-    ) -> Smooth:
+    def smooth(self, t: np.ndarray, y: np.ndarray, at: np.ndarray) -> Smooth:
         """The curves of readings y (n, d) at times t (n,), NaN where nothing was read, with their
-        first and second derivatives, at times ``at`` (m,): (m, d) each. noise: (n, d) of each
-        reading, relative to the others. A column with fewer readings than a curve needs is NaN."""
-        noise = np.ones(y.shape) if noise is None else noise
+        first and second derivatives, at times ``at`` (m,): (m, d) each. A column with fewer
+        readings than a curve needs is NaN."""
         found = np.full((3, len(at), y.shape[1]), np.nan)
         for k, stiffness in enumerate(self.stiffness):
             have = np.isfinite(y[:, k])
             if have.sum() < FEWEST:
                 continue
-            runs = [(t[have], y[have, k], noise[have, k])]
-            curve = _Problem.of(runs, self.step).curve(float(stiffness))
+            curve = _Problem.of([(t[have], y[have, k])], self.step).curve(float(stiffness))
             for order in range(3):
                 found[order, :, k] = curve(np.clip(at, *t[have][[0, -1]]), nu=order)
         return Smooth(*found)
@@ -71,37 +67,28 @@ class Splines(NamedTuple):
         """The curve, a SciPy BSpline, of readings y (n,) of the first column, NaN where nothing was
         read."""
         have = np.isfinite(y)
-        runs = [(t[have], y[have], np.ones(have.sum()))]
-        return _Problem.of(runs, self.step).curve(float(self.stiffness[0]))
+        return _Problem.of([(t[have], y[have])], self.step).curve(float(self.stiffness[0]))
 
 
-def splines(
-    runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], step: float | None = None
-) -> Splines:
-    """The splines of runs (t (n,), y (n, d), relative noise (n, d)), NaN where nothing was read.
+def splines(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Splines:
+    """The splines of runs (t (n,), y (n, d)), NaN where nothing was read. Knots are as far apart as
+    most readings of the column that has most of them.
 
-    step: between knots, in units of t; the median of those between the readings of the column that
-    has most of them, unless given. Raises ValueError where no run has five readings of a column.
+    Raises ValueError where no run has five readings of a column.
     """
-    columns = runs[0][1].shape[1]
-    have = [[np.isfinite(y[:, k]) for _, y, _ in runs] for k in range(columns)]
-    if step is None:
-        steps = [
-            np.concatenate([np.diff(t[own]) for (t, _, _), own in zip(runs, every, strict=True)])
-            for every in have
-        ]
-        step = float(min(np.median(one) for one in steps if len(one)))
-    stiffness, sigma = np.zeros(columns), np.zeros(columns)
-    for k, every in enumerate(have):
-        own = [
-            (t[here], y[here, k], noise[here, k])
-            for (t, y, noise), here in zip(runs, every, strict=True)
-            if here.sum() >= FEWEST
-        ]
+    columns = [
+        [(t[have], y[have, k]) for t, y in runs for have in [np.isfinite(y[:, k])]]
+        for k in range(runs[0][1].shape[1])
+    ]
+    steps = [np.concatenate([np.diff(t) for t, _ in every]) for every in columns]
+    step = float(min(np.median(one) for one in steps if len(one)))
+    found = []
+    for k, every in enumerate(columns):
+        own = [run for run in every if len(run[0]) >= FEWEST]
         if not own:
             raise ValueError(f"expected a run with {FEWEST} readings of column {k}")
-        stiffness[k], sigma[k] = _Problem.of(own, step).likeliest()
-    return Splines(step, stiffness, sigma)
+        found.append(_Problem.of(own, step).likeliest())
+    return Splines(step, *np.array(found).T)
 
 
 def with_rates(t: np.ndarray, y: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -131,27 +118,31 @@ class _Problem:
 
     @classmethod
     def of(cls, runs: Sequence[tuple[np.ndarray, ...]], step: float) -> _Problem:
-        """Make it of runs (t, y, noise), and of the order (n,) of the derivative that y shows."""
+        """Make it of runs (t, y), or of these with the noise (n,) of y, relative to the others, and
+        the order (n,) of the derivative that it shows."""
         from scipy import sparse  # loaded when first used
         from scipy.interpolate import BSpline
 
         k = _OPTIONS.degree
         signs = np.diff(np.eye(_OPTIONS.order + 1), _OPTIONS.order, axis=0)[0]
-        designs, roughs, begins, counts = [], [], [], []
-        for t, _, noise, *orders in runs:
+        designs, roughs, begins, counts, targets = [], [], [], [], []
+        for t, y, *rated in runs:
             length = float(np.ptp(t))
             spans = max(1, int(np.ceil(length / step * (1 + 1e-12))))
             begin = t.min() - 0.5 * (spans * step - length)  # the knots' middle is the run's
             knots = begin + step * np.arange(-k, spans + k + 1)
             inside = np.clip(t, knots[k], knots[-k - 1])
             own = BSpline.design_matrix(inside, knots, k)
-            for order in orders:
+            if rated:
+                noise, order = rated
                 slopes = BSpline.design_matrix(inside, knots[1:-1], k - 1)
                 differences = sparse.eye_array(spans + k - 1, spans + k, k=1)
                 differences = (differences - sparse.eye_array(spans + k - 1, spans + k)) / step
                 of_rates = sparse.diags_array(1.0 * order)
                 own = own - of_rates @ own + of_rates @ slopes @ differences
-            designs.append(sparse.diags_array(1 / noise) @ own)
+                own, y = sparse.diags_array(1 / noise) @ own, y / noise
+            designs.append(own)
+            targets.append(y)
             size = spans + k - _OPTIONS.order
             of_order = [np.full(size, sign) for sign in signs]
             offsets: Any = range(_OPTIONS.order + 1)
@@ -160,7 +151,7 @@ class _Problem:
             counts.append(spans + k)
         B = sparse.block_diag(designs, format="csr")
         D = sparse.block_diag(roughs, format="csr")
-        y = np.concatenate([y / noise for _, y, noise, *_ in runs])
+        y = np.concatenate(targets)
         return cls(
             step, _band(B.T @ B), _band(D.T @ D), B.T @ y, B, y, tuple(begins), tuple(counts)
         )

@@ -155,7 +155,7 @@ def motion_of(recording: Recording, gains: np.ndarray) -> tuple[Motion, np.ndarr
         runs.append((recording.times(run), q, u))
     if not any(len(t) > 2 * _EDGE for t, _, _ in runs):
         raise InputError(f"{recording.source}: expected more than {2 * _EDGE} samples of a run")
-    curves = splines([(t, q, np.ones(q.shape)) for t, q, _ in runs])
+    curves = splines([(t, q) for t, q, _ in runs])
     parts, lengths = [], []
     for t, q, u in runs:
         if len(t) <= 2 * _EDGE:
