@@ -412,15 +412,15 @@ def swing_up(quick: bool) -> Numbers:
     draws, found = 10 if quick else 100, {}
     for name, (joint, seconds) in SWINGS.items():
         begun = time.process_time()
-        of, by, _ = own.controller(fit, joint, PERIOD, seconds, LIMIT)
-        found[name] = {"seconds": time.process_time() - begun}
+        _, by, margin = own.controller(fit, joint, PERIOD, seconds, LIMIT)
+        found[name] = {"seconds": time.process_time() - begun, "margin": margin}
         plants = {
             "draws": (own.draws_of(fit, joint, PERIOD, draws, seed=2), draws),
             "published": (own.designers(joint, PERIOD, True), 1),
             "leaderboard": (own.designers(joint, PERIOD, False), 1),
         }
         for key, (plant, count) in plants.items():
-            x, u = own.followed(by, of, plant, count, LONG, LIMIT)
+            x, u = own.followed(by, plant, count, LONG, LIMIT)
             since = own.up_from(x, PERIOD)
             is_up = np.isfinite(since)
             found[name][key] = {
