@@ -256,7 +256,7 @@ def _of_chain(map_: SymplecticMap, law: Lagrangian, chain: _Chain) -> Robot:
         notes.append(f"inputs act {map_.signals.delay:.3g} s later than their samples say")
     sensors = map_.sensors
     names = sensors.positions if sensors is not None else tuple(f"q{i + 1}" for i in range(dim))
-    notes.append("L is known up to a factor where no mass is: masses, inertias and torques have it")
+    notes.append("masses, inertias and torques are in the unit of L: kg where the fit had mass=…")
     notes.append("each link has the mass of a uniform rod, or less: L does not determine it")
     if not np.array_equal(joints, np.eye(dim)):
         rows = [" + ".join(f"joint{j + 1}" for j in range(dim) if row[j]) for row in joints.round()]
