@@ -160,7 +160,11 @@ class RecordingSummary:
         return f"gfnn.fit({', '.join([self.read_as, *words])})"
 
     def __rich__(self) -> Group:
-        return _screen(self)
+        told = filter(None, (_samples(self), _times(self), _moving(self)))
+        found = [_fault(fault) for fault in self.faults[: _SHOWN.most]]
+        more = len(self.faults) - _SHOWN.most
+        found += [Text(f"and {more} more")] if more > 0 else []
+        return Group(*(Text(said(line)) for line in told), _columns(self), *found)
 
     def _printed(self) -> Console:
         # A notebook would take it for its own display.
@@ -353,16 +357,6 @@ def as_typed(options: Mapping[str, Any]) -> str:
 
 
 # The screen.
-
-
-def _screen(summary: RecordingSummary) -> Group:
-    """Screen that `gfnn look` prints."""
-    told = filter(None, (_samples(summary), _times(summary), _moving(summary)))
-    lines = [Text(said(line)) for line in told]
-    found = [_fault(fault) for fault in summary.faults[: _SHOWN.most]]
-    more = len(summary.faults) - _SHOWN.most
-    found += [Text(f"and {more} more")] if more > 0 else []
-    return Group(*lines, _columns(summary), *found)
 
 
 def _samples(summary: RecordingSummary) -> str:

@@ -191,21 +191,14 @@ def by_name(names: Iterable[str]) -> dict[str, tuple[str, ...]]:
     columns = {role: [n for n in names if role_of(n) == role] for role in ROLES}
     positions = columns["positions"]
     for role in ("velocities", "momenta"):
-        columns[role] = _in_order(positions, columns[role])
+        mates = {name: _mate(positions, name) for name in columns[role]}
+        if None not in mates.values() and len({*mates.values()}) == len(mates):
+            columns[role].sort(key=lambda name: positions.index(str(_mate(positions, name))))
     paired = len(columns["velocities"])
     if 0 < paired < len(positions):  # those that have a velocity come first
         mates = {_mate(positions, v) for v in columns["velocities"]}
         columns["positions"] = sorted(positions, key=lambda n: n not in mates)
     return {role: tuple(of_role) for role, of_role in columns.items()}
-
-
-def _in_order(positions: list[str], others: list[str]) -> list[str]:
-    """The other columns in the order of the positions that they belong to; as they are where some
-    name no position."""
-    mates = [_mate(positions, name) for name in others]
-    if None in mates or len(set(mates)) < len(mates):
-        return others
-    return sorted(others, key=lambda name: positions.index(str(_mate(positions, name))))
 
 
 def _mate(positions: list[str], name: str) -> str | None:

@@ -74,7 +74,12 @@ def read_sample(
     found = _smallest(found, num_pairs)
     found = _taken(found, np.lexsort((found["place"], found["run"])))
     if of_pairs_alone:
-        found = {**found, **_joined_arcs(found)}
+        # In the order of the file, their arcs were cut at multiples of `ARC`.
+        number, pairs = found["run"] + found["place"], found["pairs"]
+        begins = np.ones(len(number), bool)
+        begins[1:] = (np.diff(number) != 1) | np.any(pairs[:-1, 1] != pairs[1:, 0], axis=1)
+        first = np.maximum.accumulate(np.where(begins, np.arange(len(number)), 0))
+        found = {**found, "run": number[first], "place": number - number[first]}
     alone = alone and len(listed(paths)) == 1
     digest = digest_of(listed(paths)[0]) if alone else f"{of_group['hash'].sum():016x}"
     same = of_group["low"].min() == of_group["high"].max()
@@ -145,13 +150,3 @@ def _smallest(table: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
     keys, lengths = np.unique(table["key"], return_counts=True)
     kept = np.searchsorted(np.cumsum(lengths), most, side="right")
     return _taken(table, table["key"] <= keys[max(kept, 1) - 1])
-
-
-def _joined_arcs(table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Run and place of single pairs in the order of the file, whose arcs were cut at multiples of
-    `ARC`: one run of those that go on with each other."""
-    number, pairs = table["run"] + table["place"], table["pairs"]
-    begins = np.ones(len(number), bool)
-    begins[1:] = (np.diff(number) != 1) | np.any(pairs[:-1, 1] != pairs[1:, 0], axis=1)
-    first = np.maximum.accumulate(np.where(begins, np.arange(len(number)), 0))
-    return {"run": number[first], "place": number - number[first]}

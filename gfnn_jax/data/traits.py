@@ -131,18 +131,13 @@ def wrong_values_of(recording: Recording) -> dict[str, tuple[WrongValues, ...]]:
         found[name] = wrong_values(times, parts, resolution(values))
         if name in recording.angles:  # one wrong value makes a wrapped angle seem lifted
             lifted = wrong_values(times, [_lifted(x) for x in parts], resolution(values))
-            found[name] = _joined(found[name], lifted)
+            known = {int(row) for wrong in found[name] for row in wrong.rows}
+            more = [wrong for wrong in lifted if known.isdisjoint(wrong.rows.tolist())]
+            found[name] = tuple(sorted([*found[name], *more], key=lambda wrong: wrong.rows[0]))
     for name in recording.inputs:
         parts = [recording.values(name, run) for run in recording.runs]
         found[name] = wrong_at_jumps(times, parts, resolution(np.concatenate(parts)))
     return found
-
-
-def _joined(one: Sequence[WrongValues], other: Sequence[WrongValues]) -> tuple[WrongValues, ...]:
-    """Both, without stretches of the second that share a sample with one of the first."""
-    known = {int(row) for wrong in one for row in wrong.rows}
-    more = [wrong for wrong in other if known.isdisjoint(wrong.rows.tolist())]
-    return tuple(sorted([*one, *more], key=lambda wrong: wrong.rows[0]))
 
 
 def _lifted(angle: np.ndarray) -> np.ndarray:

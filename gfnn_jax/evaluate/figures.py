@@ -56,12 +56,6 @@ def _look_of(place: int) -> dict[str, Any]:
     }
 
 
-def _curves(ax, curves: Mapping) -> None:
-    """Draw name -> (x (K,), y (K,)), each with the look of its place."""
-    for place, (name, (x, y)) in enumerate(curves.items()):
-        ax.plot(x, y, label=name, **_look_of(place))
-
-
 def _without_minor_ticks(*axes: Axes) -> None:
     """Leave out the minor ticks of logarithmic axes of three decades or more: they tell little
     there, and take half of the time of a figure."""
@@ -459,7 +453,8 @@ def work_precision(
 ) -> Axes:
     """Draw error against time: name -> (microseconds (K,), errors (K,)), compile time apart."""
     ax = _axes_or_new(ax)
-    _curves(ax, curves)
+    for place, (name, (x, y)) in enumerate(curves.items()):
+        ax.plot(x, y, label=name, **_look_of(place))
     ax.set(xlabel=xlabel, ylabel=ylabel, **_LOG_LOG)
     _costs_as_numbers(ax, np.concatenate([np.ravel(cost) for cost, _ in curves.values()]))
     _legend_above(ax)

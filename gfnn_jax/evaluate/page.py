@@ -179,7 +179,11 @@ def _of_law(
     )
     yield _physics(law, known)
     yield _forecasts(fit, _coming(fit, law), law.horizon_lines, forecasts)
-    yield _simulation(fit, law)
+    data = fit.data
+    if data is not None:  # the longest run after what was learned from, or its last third
+        own = data.slice(run=max(data.runs, key=lambda name: np.ptp(data.times(name))))
+        begin = figures.begin_of(own, fit.learned_to)
+        yield Section("Simulation", script=simulation(law, own, begin))
     if law.traces and fit.data is not None:
         yield Section(
             "Residuals",
@@ -270,15 +274,6 @@ def _forecasts(
         ],
         figures=[*drawn, _svg(figures.forecasts_figure(found, fit.held_out), caption)],
     )
-
-
-def _simulation(fit: Fit, law: LearnedLaw) -> Section:
-    """The longest run after the part that was learned from, or its last third."""
-    script, data = None, fit.data
-    if data is not None:
-        own = data.slice(run=max(data.runs, key=lambda name: np.ptp(data.times(name))))
-        script = simulation(law, own, figures.begin_of(own, fit.learned_to))
-    return Section("Simulation", script=script)
 
 
 def _not_identified(law: LearnedLaw) -> Iterator[str]:

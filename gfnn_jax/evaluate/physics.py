@@ -194,10 +194,12 @@ class _System(NamedTuple):
         along = np.linspace(-2.0, 2.0, count) if count > 1 else np.zeros(1)
         grid = np.stack(np.meshgrid(*[along] * self.law.dim), axis=-1).reshape(-1, self.law.dim)
         found: list[tuple[np.ndarray, bool]] = []
+        reach = np.array(self.size)
+        reach[list(self.angles)] = np.inf
         with np.errstate(all="ignore"):
             for start in self.middle + grid * self.size:
                 q = self.rest_from(start)
-                if q is None or np.any(np.abs(q - self.middle) > 2.5 * self._reach()):
+                if q is None or np.any(np.abs(q - self.middle) > 2.5 * reach):
                     continue
                 places = list(self.angles)
                 q[places] = nearest_image(q, self.angles)[places]
@@ -206,11 +208,6 @@ class _System(NamedTuple):
                     holds = bool(np.all(np.linalg.eigvalsh(-self._curvature(q)) > 0))
                     found.append((q, holds))
         return sorted(found, key=lambda one: (not one[1], *one[0]))
-
-    def _reach(self) -> np.ndarray:
-        reach = np.array(self.size)
-        reach[list(self.angles)] = np.inf
-        return reach
 
     def _curvature(self, q: np.ndarray) -> np.ndarray:
         """∂²L/∂q∂q (d, d) at rest."""

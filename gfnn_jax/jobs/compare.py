@@ -340,7 +340,12 @@ def compare(
                 "rollout": m.report,
                 "curve": _curve(m.error),
                 "kl": divergences(scene, m.predicted, data.reference),
-                "elements": _elements(scene, m.predicted, data.reference),
+                "elements": None
+                if scene.name != "two-body"
+                else {
+                    name: _curve(metrics.absolute_error(of(m.predicted), of(data.reference)))
+                    for name, of in metrics.ELEMENTS.items()
+                },
             }
         result = {
             "scene": name,
@@ -376,16 +381,6 @@ def chosen_methods(methods: Sequence[str], scene: Scene) -> tuple[str, ...]:
         return tuple(m for m in TITLES if m in methods)
     coupled = not separable(scene)
     return tuple(m for m in TITLES if m not in METHODS or coupled or not METHODS[m].only_coupled)
-
-
-def _elements(scene: Scene, predicted, reference) -> dict[str, Any] | None:
-    """Curves of the errors of semi-major axis and eccentricity; None but for two bodies."""
-    if scene.name != "two-body":
-        return None
-    return {
-        name: _curve(metrics.absolute_error(element(predicted), element(reference)))
-        for name, element in metrics.ELEMENTS.items()
-    }
 
 
 def _curve(error) -> dict[str, Any]:

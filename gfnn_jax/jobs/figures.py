@@ -51,7 +51,11 @@ def figures_of_run(
         points = {n: (z[..., 0], z[..., 1]) for n, z in both.items()}
         drawn["portrait"] = figures.sections(points, *plane_of(scene))[0].figure
     else:
-        some = _whole_lanes(reference, 3)
+        # At most three that stay finite, from the smallest positions to the largest.
+        whole = np.flatnonzero(np.isfinite(reference).all(axis=(1, 2)))
+        sizes = np.abs(reference[whole, :, : scene.dim]).max(axis=(1, 2))
+        few = np.linspace(0, len(whole) - 1, min(3, len(whole))).astype(int)
+        some = whole[np.argsort(sizes)][few].tolist()
         orbits = {n: (z[some, :, 0], z[some, :, 1]) for n, z in both.items()}
         portrait = figures.phase_portrait(orbits, ("$q_1$", "$q_2$"))
         portrait.set_aspect("equal", "datalim")  # an orbit in space
@@ -103,15 +107,6 @@ def _sections(shown: dict[str, Any]):
     """Draw (q₂, p₂) on the section q₁ = 0."""
     sections = {n: section_points(z) for n, z in shown.items()}
     return figures.sections({n: (z[:, 1], z[:, 3]) for n, z in sections.items()})[0].figure
-
-
-def _whole_lanes(states, most: int) -> list[int]:
-    """At most so many trajectories of (B, L, 2d) that stay finite, from those with the smallest
-    positions to those with the largest."""
-    whole = np.flatnonzero(np.isfinite(states).all(axis=(1, 2)))
-    half = states.shape[-1] // 2
-    order = whole[np.argsort(np.abs(states[whole, :, :half]).max(axis=(1, 2)))]
-    return order[np.linspace(0, len(order) - 1, min(most, len(order))).astype(int)].tolist()
 
 
 def _whole_lane(states) -> int:

@@ -119,7 +119,11 @@ def fit_monitors(
         )
     runs = [[_readings(recording, names, run) for names in places] for run in recording.runs]
     states = [_states(q, known) for q in runs]
-    dt = _turn_of(recording) / len(places)
+    steps = np.concatenate([np.diff(recording.times(run)) for run in recording.runs])
+    turn = float(np.median(steps)) if len(steps) else 1.0
+    if len(steps) and np.abs(steps - turn).max() > _OPTIONS.even * turn:
+        raise InputError(f"{recording.source}: expected a row for every turn, {turn:g} s apart")
+    dt = turn / len(places)
     fits: list[Fit | None] = []
     maps: list[SymplecticMap | None] = []
     for k, matrix in enumerate(known):
@@ -257,13 +261,3 @@ def _linear(matrix: np.ndarray | None, pairs: Pairs, like: SymplecticMap) -> Sym
         angle_centre=np.zeros(0),
         dt=pairs.dt,
     )
-
-
-def _turn_of(recording: Recording) -> float:
-    """The time of a turn. Raises InputError where turns are missing."""
-    steps = [np.diff(recording.times(run)) for run in recording.runs]
-    whole = np.concatenate(steps)
-    turn = float(np.median(whole)) if len(whole) else 1.0
-    if len(whole) and np.abs(whole - turn).max() > _OPTIONS.even * turn:
-        raise InputError(f"{recording.source}: expected a row for every turn, {turn:g} s apart")
-    return turn

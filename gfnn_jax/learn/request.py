@@ -143,16 +143,6 @@ def _check_told(structure: str | None, options: FitOptions, pairs: Pairs) -> Non
     Constrained.of(terms, told_terms(pairs.dim, options.terms))
 
 
-def check_moves(pairs: Pairs) -> None:
-    """Raises FitError where no state moves."""
-    z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
-    if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= OPTIONS.still:
-        raise FitError(
-            "expected states that move, got z1 = z0 in every pair: is H = 0, or are these the same "
-            "columns twice?"
-        )
-
-
 def _check_structured(
     structure: str, scene: Scene | None, options: FitOptions, pairs: Pairs
 ) -> None:
@@ -349,7 +339,12 @@ def checked(
         base=options.base,
         structure=structure,
     )
-    check_moves(pairs)
+    z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
+    if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= OPTIONS.still:
+        raise FitError(
+            "expected states that move, got z1 = z0 in every pair: is H = 0, or are these the same "
+            "columns twice?"
+        )
     if scene is not None and scene.features is not None and options.family in ("auto", "features"):
         messages += unlike_the_scene(pairs, scene)
     bound = Tolerance.of(options)

@@ -95,7 +95,12 @@ def beside_friction(problem: LawProblem, alone: FittedLaw, search: Search) -> Fi
     problem.work.capped(problem.options.max_operations)
     explains, what = False, "whether friction explains anything"
     with problem.work.optional(what), problem.work.again(what, alone.family, len(rows)):
-        explains = _explains(problem.flows, alone, rows)
+        c = np.append(alone.fit.coefficients, 0.0)  # γ, linearised about H alone
+        found = problem.flows.linearised(Uniform(alone.family), c, alone.fit.steps, rows)
+        if found.finite:
+            gamma = Linearised.of_derivatives(c, found).added(range(len(c) - 1), [len(c) - 1])
+            noise = gamma.left / np.sqrt(max(found.rows - len(c), 1))
+            explains = bool(np.all(gamma.value * gamma.size > CERTAIN * noise))
     if not explains:
         return alone
     for forces in (Uniform, linear_in_velocities)[: 1 if data.dim == 1 else 2]:
@@ -185,17 +190,6 @@ def _certain(law: FittedLaw) -> bool:
     of_h = without_forces(law.family).num_parameters
     rates, errors = law.fit.coefficients[of_h:], law.fit.standard_errors[of_h:]
     return bool(len(rates) and (rates > CERTAIN * errors).all())
-
-
-def _explains(flows: Problem, alone: FittedLaw, rows) -> bool:
-    """Return whether γ, in the problem linearised about H alone, is certain to be above 0."""
-    c = np.append(alone.fit.coefficients, 0.0)
-    found = flows.linearised(Uniform(alone.family), c, alone.fit.steps, rows)
-    if not found.finite:
-        return False
-    gamma = Linearised.of_derivatives(c, found).added(range(len(c) - 1), [len(c) - 1])
-    noise = gamma.left / np.sqrt(max(found.rows - len(c), 1))
-    return bool(np.all(gamma.value * gamma.size > CERTAIN * noise))
 
 
 def _alike(flows: Problem, law: FittedLaw, rows) -> bool:

@@ -191,7 +191,12 @@ def displacement(triples: Triples) -> np.ndarray:
 def solve(family: Any, triples: Triples) -> Solved:
     """S of these triples: least squares among the S of this mixed term, nearest to free motion."""
     triangle = _folded(family, triples)
-    free, mixed = _free_motion(family, triples), _mixed_terms(family, triples)
+    mixed, w = _mixed_terms(family, triples), _sample(triples)
+    # Coefficients of free motion, ½ |Q − q|² / h².
+    moves = (w[:, triples.dim :] - w[:, : triples.dim]) / triples.dt**2
+    target = np.concatenate([-moves, moves], axis=1)
+    rows = family.term_gradients(w).reshape(target.size, -1)
+    free = np.linalg.lstsq(rows, target.ravel(), rcond=OPTIONS.null)[0]
     free = free / (mixed @ free)
     # The changes of S that leave the mixed term as it is: all but the first column of Q.
     others = np.linalg.qr(np.column_stack([mixed, np.eye(len(mixed))]))[0][:, 1 : len(mixed)]
@@ -223,16 +228,6 @@ def _mixed_terms(family: Any, triples: Triples) -> np.ndarray:
         ahead, behind = (family.term_gradients(v)[:, dim + i] for v in (w + off, w - off))
         total += size[i] ** 2 * np.mean(ahead - behind, axis=0) / (2 * step)
     return -(triples.dt**2) * total / np.sum(size**2)
-
-
-def _free_motion(family: Any, triples: Triples) -> np.ndarray:
-    """Coefficients of ½ |Q − q|² / h²: (m,)."""
-    w = _sample(triples)
-    moves = (w[:, triples.dim :] - w[:, : triples.dim]) / triples.dt**2
-    gradients = family.term_gradients(w)
-    target = np.concatenate([-moves, moves], axis=1)
-    rows = gradients.reshape(target.size, -1)
-    return np.linalg.lstsq(rows, target.ravel(), rcond=OPTIONS.null)[0]
 
 
 def _sample(triples: Triples) -> np.ndarray:

@@ -172,8 +172,10 @@ class Textbook:
     ) -> _State | None:
         """The simplest law of these atoms that is exact. blocks: of atoms that laws have together,
         tried as a whole; starts: others, beside which the search looks for more."""
-        if self._closest is not None and self._explains_nothing(self._closest, dictionary):
-            return None  # what is left over is noise
+        if self._closest is not None:
+            gains = self._matching(self._closest.target).gains(self._closest.match, dictionary)
+            if not self._certain(gains, len(dictionary.atoms)):
+                return None  # what is left over is noise
         self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
         most = self._middle.size / OPTIONS.rows_per_term - self._setting.base.num_parameters
         blocks = [b for b in blocks if len(b) < most]
@@ -214,11 +216,6 @@ class Textbook:
         numbers = len(state.match.atoms) + sum(len(constants_of(a)) for a in others)
         digits = OPTIONS.digits + OPTIONS.digits_a_number * numbers
         return state.law.left <= 10.0**-digits
-
-    def _explains_nothing(self, state: _State, dictionary: Dictionary) -> bool:
-        """Return whether no atom explains more of what is left over than it would of noise."""
-        gains = self._matching(state.target).gains(state.match, dictionary)
-        return not self._certain(gains, len(dictionary.atoms))
 
     def _certain(self, gains: np.ndarray, tried: int) -> bool:
         """Return whether the largest gain of so many atoms tried is no chance."""
