@@ -467,7 +467,7 @@ def _compare(arguments: argparse.Namespace) -> None:
     if compared is None:
         print(f"{out}: already holds the result of this job")
         return
-    print_table(comparison_table(compared.report))
+    print_table(comparison_table(compared))
     print(f"written to {out}")
 
 

@@ -56,7 +56,7 @@ def test_an_interrupted_comparison_keeps_what_is_finished_and_reports_all(small,
     compared = compare(out, resume=True, progress=Progress(told.append))
     assert compared is not None
     report = json.loads((out / "report.json").read_text())
-    assert report == compared.report
+    assert report == compared
     assert list(report["methods"]) == ["hnn", "p-sympnet"]
     for part in report["methods"].values():
         assert {"model", "data", "fit", "map", "rollout"} <= set(part)
@@ -72,7 +72,7 @@ def test_an_interrupted_comparison_keeps_what_is_finished_and_reports_all(small,
     assert drawn == {"error", "energy", "elements", "coordinates"}
     assert not out.with_name("out.partial").exists()
     assert not any(line.startswith("HNN") for line in told)
-    assert compared.report["methods"]["hnn"]["fit"] == kept["fit"]
+    assert compared["methods"]["hnn"]["fit"] == kept["fit"]
     assert compare(out, resume=True) is None  # done, this very job
     with pytest.raises(InputError, match="exists already"):
         compare(out)

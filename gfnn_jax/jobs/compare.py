@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -263,13 +263,6 @@ RATE = 4e10  # counted operations of a training that a quiet core makes in a sec
 __all__ = ["CAP", "OURS", "PAPER_GFNN", "RATE", "TITLES", "compare"]
 
 
-class Compared(NamedTuple):
-    """Folder of a comparison, and its report."""
-
-    out: Path
-    report: dict[str, Any]
-
-
 def compare(
     name: str,
     output: Output,
@@ -278,7 +271,7 @@ def compare(
     quick: bool = False,
     seed: int = 0,
     cap: float | None = None,
-) -> Compared | None:
+) -> dict[str, Any] | None:
     """Learn a scene by these methods (with none named, all that apply), into a folder.
 
     cap: most training of each, in seconds that stand for RATE counted operations, whatever the
@@ -369,7 +362,7 @@ def compare(
             for file, figure in figures_of_comparison(scene, measured, data.reference).items():
                 figures.save(figure, folder / f"{file}.png")
             (folder / report.REPORT).write_text(report.to_json(result), encoding="utf-8")
-    return Compared(output.out, json.loads(report.to_json(result)))
+    return json.loads(report.to_json(result))
 
 
 def chosen_methods(methods: Sequence[str], scene: Scene) -> tuple[str, ...]:

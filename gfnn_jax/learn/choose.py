@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.budget import FLOW, ROWS, Budget, within
-from gfnn_jax.candidates.assemble import Candidate, measured, stepped, with_error
+from gfnn_jax.candidates.assemble import Candidate, composed, measured, stepped, with_error
 from gfnn_jax.coordinates import to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import (
@@ -39,7 +39,6 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.maps.posterior import Posterior
-from gfnn_jax.models.generating_functions.map_of_terms import assembled as map_assembled
 from gfnn_jax.models.hamiltonians.learned_law import assembled as flow_assembled
 from gfnn_jax.models.hamiltonians.problem import work_of_refit
 from gfnn_jax.models.hamiltonians.search import preferred
@@ -97,7 +96,8 @@ def choose(searched: Searched, request: Request) -> Chosen:
         return Chosen(searched.linear, data, 0.0)
     of_terms = searched.of_terms
     if of_terms is not None:
-        candidate, seconds, *_ = map_assembled(of_terms, request.tolerance, request.budget)
+        map_, own = composed(of_terms.piece, of_terms.data), (of_terms.data, *given[1:])
+        candidate, seconds, *_ = measured(of_terms.candidate, map_, *own)
         return Chosen(candidate, of_terms.data, seconds)
     ranking, bound = searched.found.ranking, request.tolerance.bound
     best = ranking[0].candidate if ranking else None
@@ -328,7 +328,8 @@ def _images_of(chosen: Chosen, found: Searched, rows: np.ndarray) -> np.ndarray:
     sweep = None if entry is None else entry.sweep
     own = sweep is not None and sweep.data.pairs is found.data.pairs
     if candidate.microseconds_per_step is None and entry is not None and own:
-        return data.users_image(*entry.sweep.images(entry.size, rows), rows)
+        images, known = entry.sweep.images(entry.size, rows)
+        return data.users_image(images, known, rows)
     steps = stepped(candidate.map, np.asarray(pairs.z0), pairs.dt, pairs.args, timed=False)
     return np.where(steps.failed[:, None], np.nan, steps.images)
 

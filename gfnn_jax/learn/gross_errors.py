@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -90,8 +89,9 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
         if left is None:
             break
         try:
-            with request.budget.unit(_WHAT, FLOW, left.work):
-                size = left.sizes()
+            sizes, work_of_look = left
+            with request.budget.unit(_WHAT, FLOW, work_of_look):
+                size = sizes()
             middle = np.median(size)
             known = len(size) > SCREEN.neighbours and middle > 0
             far = np.flatnonzero(size > OPTIONS.beyond * middle)
@@ -100,7 +100,7 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
             # A search without them is followed by another look at the residuals.
             width = found.data.y0.shape[1]
             work = OPTIONS.of_trees * len(size) + OPTIONS.of_neighbours * width**2 * len(far)
-            with request.budget.unit(_WHAT, FLOW, work, then=(FLOW, left.work)):
+            with request.budget.unit(_WHAT, FLOW, work, then=(FLOW, work_of_look)):
                 near = around(found.data, found.data.scale, size, far, OPTIONS.but)
         except OutOfTime:
             request.budget.leave_out(_WHAT, request.budget.ended)
@@ -120,8 +120,8 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
         again = searched(request, data, diagnose_request(request, data))
         left = _residuals(again)
         if left is not None:
-            with request.budget.free(FLOW, left.work):
-                rms = _rms(left.sizes())
+            with request.budget.free(FLOW, left[1]):
+                rms = _rms(left[0]())
             if not rms <= rise * _rms(size[others]):
                 break
         # These pairs are exact: without them the tolerance is to be met, and no more lost there.
@@ -153,17 +153,11 @@ def _rms(size) -> float:
     return float(np.sqrt(np.mean(size**2)))
 
 
-class _Residuals(NamedTuple):
-    """sizes: () -> (N,) what a map leaves of every pair. work: operations that this takes."""
-
-    sizes: Callable[[], np.ndarray]
-    work: float
-
-
-def _residuals(found: Searched) -> _Residuals | None:
-    """Residuals of every pair by the best map; of a law by its steps ÷ scale, of S in its
-    gradient, which has the same unit. None where it meets the tolerance, is neither, or has dry
-    friction: its steps are not smooth where a body turns, and no error of a measurement is."""
+def _residuals(found: Searched) -> tuple[Callable[[], np.ndarray], float] | None:
+    """The sizes (N,) of what the best map leaves of every pair, () -> sizes, and the operations
+    that these take; of a law by its steps ÷ scale, of S in its gradient, which has the same unit.
+    None where it meets the tolerance, is neither, or has dry friction: its steps are not smooth
+    where a body turns, and no error of a measurement is."""
     law, data, tolerance = found.law, found.data, found.tolerance
     best = _best(found)
     if best is None or tolerance.met_by(best) or best.validation_relative <= OPTIONS.roundoff:
@@ -173,13 +167,14 @@ def _residuals(found: Searched) -> _Residuals | None:
     work = len(data) * best.operations
     if law is not None and best is law.candidate:
         flow = law.flow
-        known = _Residuals(lambda: _sizes((flow.image(data.y0) - data.y1) / data.scale), work)
-        return None if law.widths else known
+        if law.widths:
+            return None
+        return lambda: _sizes((flow.image(data.y0) - data.y1) / data.scale), work
     swept = _swept(found)
     if swept is None:
         return None
     sweep, size = swept
-    return _Residuals(lambda: _sizes(sweep.residuals(size)), work)
+    return lambda: _sizes(sweep.residuals(size)), work
 
 
 def _best(found: Searched) -> Candidate | None:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.budget import ROWS, Budget, within
-from gfnn_jax.candidates.assemble import Assembled, Candidate, composed, measured
+from gfnn_jax.candidates.assemble import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
 from gfnn_jax.diagnosis.local_jacobians import SINGULAR
@@ -191,12 +191,6 @@ class SumOfTerms:
             bound=tolerance.bound,
             most=min(len(data.training) * 2 * data.dim / ROWS_PER_TERM, OPTIONS.most_terms),
         )
-
-
-def assembled(learned: LearnedMap, tolerance: Tolerance, budget: Budget) -> Assembled:
-    """The candidate's map, measured."""
-    map_ = composed(learned.piece, learned.data)
-    return measured(learned.candidate, map_, learned.data, tolerance, budget)
 
 
 def _work(family: Any, data: Dataset) -> float:
