@@ -265,7 +265,9 @@ class TermSearch:
         fit.problem.on_progress(
             f"arcs of {periods:.2g} periods determine more than longer ones: {shorter}"
         )
-        return found._replace(shorter=self._settled(*self.with_friction(shorter)))
+        other = self._settled(*self.with_friction(shorter))
+        is_law = other.follows and np.isfinite(other.fit.linearised.covariance).all()
+        return found._replace(shorter=other) if is_law else found
 
     def _settled(self, fit: LawFit, choice: FrictionChoice) -> SearchResult:
         """The law by arcs as long as those of the fit: terms that they do not tell are dropped, and
