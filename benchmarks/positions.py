@@ -21,11 +21,11 @@ from harness import main as run_pieces
 
 # isort: split
 import numpy as np
-from gauge import beside_flow
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import nearest_image
+from gfnn_jax.evaluate.gauge import beside_flow
 
 KICK, COUPLING_KICK, COUPLING, SITES = 0.6, 0.5, 0.1, 64
 NOISE = 1e-4

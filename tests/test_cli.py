@@ -24,6 +24,7 @@ from command_line import (
 )
 
 from gfnn_jax import cli, cli_summary, compiling, scenes
+from gfnn_jax.budget import Budget
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, FitWarning
@@ -451,12 +452,21 @@ def test_what_is_compiled_is_shown_until_it_is_done(capsys, monkeypatch):
         shown.line("a law")
         time.sleep(0.4)
     lines = [line.split("] ")[1] for line in capsys.readouterr().err.splitlines()]
-    assert any(
-        line.startswith("compiling the motion") and line.endswith("s so far") for line in lines
-    )
+    assert any(line.startswith("compiling the motion") and "s left" in line for line in lines)
     assert lines[-1] == "a law … 0 s so far"
     compiling.say("compiling the motion (about 9 s)")
     assert capsys.readouterr().err == "gfnn_jax: compiling the motion (about 9 s)\n"
+
+
+def test_parts_tell_the_time_left():
+    left = progress._Left()
+    assert left.of("bands (1 of 4)", 10.0) == ""
+    assert left.of("bands (2 of 4)", 16.0) == ", about 18 s left"
+    assert left.of("another step", 17.0) == ""
+    assert left.of("folds (1 of 2)", 20.0) == ""
+    assert progress._so_far("compiling (about 9 s)", 4.0).endswith("4 s so far, about 5 s left")
+    assert progress._so_far("compiling (about 9 s)", 9.0).endswith("9 s so far")
+    assert Budget(dim=1).compilation == " (about 3 s)"
 
 
 def test_failing_arithmetic_is_one_line(tmp_path, capsys, monkeypatch):

@@ -15,6 +15,7 @@ from gfnn_jax.coordinates import Coordinates, nearest_image
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.structures import structure_of
 from gfnn_jax.errors import InputError
+from gfnn_jax.evaluate.gauge import beside_flow
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
@@ -134,11 +135,8 @@ def flow_of_henon_heiles(number, steps, seed):
 
 
 @pytest.mark.slow
-def test_where_a_flow_exists_the_map_is_the_flow_but_for_a_factor_of_momenta(monkeypatch):
+def test_where_a_flow_exists_the_map_is_the_flow_but_for_a_factor_of_momenta():
     """A symmetric S leaves no f(Q) − f(q); the kicks of half a step make c unlike 1."""
-    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
-    from gauge import beside_flow
-
     recording = recorded(henon_heiles(1_200, 2, 0), ["x", "y"], dt=0.5)
     learned = gfnn.fit(recording, learn="map", tolerance=1e-6)
     assert learned.met

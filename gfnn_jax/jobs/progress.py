@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import sys
 import threading
 import time
@@ -58,6 +59,36 @@ def on_stderr() -> Iterator[Progress]:
             compiling.told.remove(line)
 
 
+_PART = re.compile(r"(.*) \((\d+) of (\d+)\)$")  # a message about the k-th of n equal parts
+_ABOUT = re.compile(r"\(about (\d+) s\)$")  # one that foretells how long its work takes
+
+
+class _Left:
+    """Estimate of the time left of work in equal parts, by the messages that begin them."""
+
+    def __init__(self):
+        self._what, self._began, self._first = "", 0.0, 1
+
+    def of(self, message: str, now: float) -> str:
+        """Words for behind a message, "" where nothing is known."""
+        found = _PART.match(message)
+        if found is None:
+            return ""
+        what, part, count = found[1], int(found[2]), int(found[3])
+        if what != self._what:
+            self._what, self._began, self._first = what, now, part
+        done = part - self._first
+        left = (now - self._began) / done * (count - part + 1) if done else 0.0
+        return f", about {left:.0f} s left" if left >= 1 else ""
+
+
+def _so_far(message: str, seconds: float) -> str:
+    """A message shown again after so many seconds, with those left where it foretells them."""
+    found = _ABOUT.search(message)
+    left = int(found[1]) - seconds if found else 0.0
+    return f"{message} … {seconds:.0f} s so far" + (f", about {left:.0f} s left" * (left >= 1))
+
+
 class _Lines:
     """Writer of lines with the seconds since the start; a thread repeats the last status, or the
     last line of a job that gives none, with the seconds that it has taken."""
@@ -66,7 +97,7 @@ class _Lines:
         self._started = time.perf_counter()
         self._last = self._started - BETWEEN  # the first line comes at once
         self._message, self._has_status = "starting", False
-        self._since = self._started
+        self._since, self._left = self._started, _Left()
         self._waits = self._message, self._has_status, self._since
         self._lock, self._stopped = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._repeat, daemon=True)
@@ -82,7 +113,7 @@ class _Lines:
         with self._lock:
             if not self._has_status:
                 self._take(message.strip(), False)
-            self._print(message)
+            self._print(message + self._left.of(message, time.perf_counter()))
 
     def meanwhile(self, message: str) -> None:
         """Show what is compiled while the work waits, until a message of "" goes back to that."""
@@ -95,8 +126,10 @@ class _Lines:
 
     def _take(self, message: str, has_status: bool) -> None:
         """Note what is being done, and since when."""
-        self._since = self._since if message == self._message else time.perf_counter()
-        self._message, self._has_status = message, has_status
+        now = time.perf_counter()
+        shown = message + self._left.of(message, now)
+        self._since = self._since if shown == self._message else now
+        self._message, self._has_status = shown, has_status
 
     def stop(self) -> None:
         self._stopped.set()
@@ -107,7 +140,7 @@ class _Lines:
             with self._lock:
                 now = time.perf_counter()
                 if now >= self._last + 0.8 * LONGEST_SILENCE:
-                    self._print(f"{self._message} … {now - self._since:.0f} s so far")
+                    self._print(_so_far(self._message, now - self._since))
 
     def _print(self, message: str) -> None:
         self._last = time.perf_counter()

@@ -17,8 +17,10 @@ from gfnn_jax.diagnosis.residuals import (
     is_noise,
     noise_of_sites,
     state_noise,
+    volume_change,
 )
 from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.fitting.significance import CERTAIN
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.request import Request, not_radians, proposed, wrapped
 from gfnn_jax.learn.searches import Searched
@@ -32,7 +34,6 @@ _NO_MORE = {
     False: "no larger set of terms promises to meet it",
     True: "the network's training gains no more",
 }
-_CHANGED = "phase-space volumes change by {:.2g} ± {:.1g} (relative) in a step, as by friction"
 _LOOK = "the test whether the residuals are noise"
 _WHITE = "the residuals of H are white, as noise is"
 
@@ -141,9 +142,11 @@ def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
     found = hidden_friction(sample.image, sample.residual, data.user_angles)
     if found is None:
         return []
+    change, error = found
     return [
-        f"{_CHANGED.format(*found)}. The map keeps volumes: it meets the tolerance of one step, "
-        "and long rollouts miss the decay. With a smaller --tolerance a fit looks for friction"
+        f"phase-space volumes change by {change:.2g} ± {error:.1g} (relative) in a step, as by "
+        "friction. The map keeps volumes: it meets the tolerance of one step, and long rollouts "
+        "miss the decay. With a smaller --tolerance a fit looks for friction"
     ]
 
 
@@ -239,7 +242,7 @@ def _residuals_of_sample(
 
 def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     """Describe these residuals, where they are something else than noise."""
-    _, y0, image, residual, scale, sequence, _ = sample
+    _, y0, _, residual, scale, sequence, _ = sample
     if differs_between_sequences(y0 / scale, residual / scale, sequence):
         message = (
             "the residuals are alike within a sequence and differ between sequences: a quantity "
@@ -251,18 +254,17 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
         )
     if not stalled:
         return _LeftOver(None, [])
-    some = slice(OPTIONS.friction_pairs)
-    friction = hidden_friction(image[some], residual[some])
+    change, error = volume_change(y0, residual)
     # Friction shrinks every coordinate by a part of what is left over of it.
     size = float(np.sqrt(np.mean((residual / scale) ** 2)))
-    if friction is not None and abs(friction[0]) > OPTIONS.share * residual.shape[1] * size:
+    if abs(change) > max(CERTAIN * error, OPTIONS.share * residual.shape[1] * size):
         message = (
-            f"the residuals are no noise: {_CHANGED.format(*friction)}, and a "
-            "symplectic map keeps them. The law of a recording of the positions has friction "
-            "(--positions, gfnn.Recording)"
+            f"the residuals are no noise: phase-space volumes change by {change:.2g} ± {error:.1g} "
+            "(relative) in a step, as by friction, and a symplectic map keeps them. The law of a "
+            "recording of the positions has friction (--positions, gfnn.Recording)"
         )
         return _LeftOver(None, [message], "volumes of phase space change, as by friction")
-    if _noise_by_neighbours(sample) is False:
+    if np.isfinite(error) or _noise_by_neighbours(sample) is False:
         message = (
             "the residuals are no noise: neighbouring pairs have similar ones. Either the terms "
             "tried cannot represent the motion (give known ones: --terms), or it is not "
