@@ -28,7 +28,8 @@ class PhysicsOptions:
     nodes: of the quadrature over a swing, whose integrand is smooth. amplitudes: that the curve of
     frequencies has. iterations: of Newton's method for a rest position. starts: in each coordinate,
     at most ``most`` in all. step: of derivatives of the acceleration, in sizes of the motion.
-    small: of the largest swing, which stands for none. gravity: m/s², of a simple pendulum.
+    small: of the largest swing, which stands for none; of smaller ones rounding of V would be seen.
+    gravity: m/s², of a simple pendulum.
     """
 
     nodes: int = 48
@@ -37,7 +38,7 @@ class PhysicsOptions:
     starts: int = 5
     most: int = 625
     step: float = 1e-5
-    small: float = 1e-3
+    small: float = 1e-2
     gravity: float = 9.80665
 
 
