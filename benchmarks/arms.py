@@ -72,7 +72,7 @@ class Log:
 
     def smooth(self) -> tuple[np.ndarray, ...]:
         """q, v, a (n, 6) by splines."""
-        curve = splines([(self.t, self.q, np.ones(self.q.shape))]).smooth(self.t, self.q, self.t)
+        curve = splines([(self.t, self.q)]).smooth(self.t, self.q, self.t)
         return curve.q, curve.v, curve.a
 
     def recording(self) -> gfnn.Recording:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -111,7 +111,7 @@ class _Equations(NamedTuple):
         if any(row[1] == DRY for row in structure.friction):
             least = OPTIONS.slow * np.sqrt(np.mean(problem.states[:, d:] ** 2, axis=0))
             slow = [1.0 * (np.abs(n.x[:, d:]) < least) for n, _ in windows]
-            inside = [1.0 * (one.phi != 0) for one in bumps]
+            inside: list[Any] = [1.0 * (one.phi != 0) for one in bumps]
             part = [W @ x / W.sum(axis=1)[:, None] for W, x in zip(inside, slow, strict=True)]
             held = np.concatenate(part) > OPTIONS.held  # by any force up to that of sliding
             X[held], Y[held] = 0.0, 0.0
@@ -284,8 +284,8 @@ def weak_rows(form: Form, node: Nodes, length: float) -> tuple[np.ndarray, np.nd
     return np.concatenate(rows, axis=2), of_terms @ form.fixed
 
 
-def summed(weights: csr_array, values: np.ndarray) -> np.ndarray:
-    """Sums (windows, ...) of values (n, ...) by the weights of windows."""
+def summed(weights: Any, values: np.ndarray) -> np.ndarray:
+    """Sums (windows, ...) of values (n, ...) by the weights of windows, a sparse array."""
     shape = (weights.shape[0], *values.shape[1:])
     return np.asarray(weights @ values.reshape(len(values), -1)).reshape(shape)
 
