@@ -509,7 +509,9 @@ def with_equal_masses(fit: LawFit, least: float = np.inf) -> LawFit:
     if not held:
         return free
     equal = free.again(dataclasses.replace(free.structure, held=held))
-    return equal if _leaves_little_more(equal, free) or not free.is_definite else free
+    stands = _leaves_little_more(equal, free)
+    stands |= equal.loudest < OPTIONS.noise and not free.is_definite
+    return equal if stands else free
 
 
 def without_first_mass(fit: LawFit) -> LawFit:
