@@ -250,3 +250,20 @@ def test_a_pendulum_whose_gravity_grows_is_named_so():
     with pytest.warns(gfnn.FitWarning):
         fit = gfnn.fit(gfnn.Recording(table, positions=["theta"], angles=["theta"]))
     assert "cos(theta) may change along the record, by +2" in fit.verdict
+
+
+def test_what_flies_by_is_not_self_excited():
+    """Balls with drag are never slow: polynomials told that friction is negative at rest there."""
+
+    def rates(_, z):
+        speed = np.hypot(z[2], z[3])
+        return [z[2], z[3], -0.08 * z[2] * speed, -9.8 - 0.08 * z[3] * speed]
+
+    rng, t, runs = np.random.default_rng(1), np.linspace(0, 2, 120), []
+    for _ in range(6):
+        start = [0, 0, *rng.uniform(5, 15, 2)]
+        ball = solve_ivp(rates, (0, 2), start, t_eval=t, rtol=1e-10).y[:2]
+        x, y = ball + 5e-3 * rng.normal(size=ball.shape)
+        runs.append({"t": t, "x": x, "y": y})
+    found = stretches(gfnn.Recording(runs, positions=["x", "y"]))
+    assert "self-excited" not in nature(found, measure(found), ()).verdict
