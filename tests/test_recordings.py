@@ -175,6 +175,15 @@ def test_roles_that_are_given_leave_the_other_columns_out():
     assert recording.angles == ()
 
 
+def test_an_input_that_is_given_leaves_the_motion_to_names_and_data():
+    columns = {"t": T, "x": THETA, "theta": OMEGA, "drive": T**2, "force": T}
+    found = gfnn.Recording(columns, inputs="drive")
+    assert (found.positions, found.inputs) == (("x", "theta"), ("drive",))
+    columns = {"t": T, "gyro": OMEGA, "x": THETA, "force": T}
+    rate = gfnn.Recording(columns, inputs="force", observe={"gyro": "omega + b"})
+    assert (rate.positions, rate.sensors, rate.inputs) == ((), ("gyro",), ("force",))
+
+
 def test_data_tell_roles_that_names_do_not():
     t = 0.01 * np.arange(600)
     noise = 1e-3 * np.random.default_rng(0).standard_normal((4, len(t)))

@@ -61,6 +61,7 @@ class _Options:
 _OPTIONS = _Options()
 
 _STD = "_std"  # end of the name of a column that holds the σ of another
+_OF_MOTION = ("positions", "velocities", "momenta", "sensors")  # roles of what shows the motion
 Names = Sequence[str] | str | None
 Runs = Mapping[str, tuple[np.ndarray, dict[str, np.ndarray]]]
 
@@ -98,7 +99,8 @@ def roles_of(
     units: Mapping[str, str],
 ) -> tuple[dict[str, tuple[str, ...]], list[str]]:
     """(the columns of each role, what had to be decided): those given, else by name, else by what
-    the columns hold and their units.
+    the columns hold and their units; where only inputs or parameters are given, those of the other
+    columns.
 
     Raises InputError where a name is unknown or has two roles, or where nothing tells.
     """
@@ -113,7 +115,11 @@ def roles_of(
             raise InputError(
                 f"{source}: expected one role of each column, got {', '.join(twice)} twice"
             )
-        return given, []
+        rest = [name for name in names if name not in wanted]
+        if any(given[role] for role in _OF_MOTION) or not rest:
+            return given, []
+        roles, notes = roles_of(source, rest, dict.fromkeys(ROLES, ()), runs, units)
+        return {role: given[role] or roles[role] for role in ROLES}, notes
     every = {name: [values[name] for _, values in runs.values()] for name in names}
     counts = [
         name

@@ -195,8 +195,9 @@ class Recording:
             coordinate_names = () if {*implied} & {*numbers} else implied
         if coordinate_names and not given["positions"]:
             given["positions"] = tuple(name for name in coordinate_names if name in numbers)
-        if coordinate_names and not any(given.values()):
-            given["sensors"] = tuple(observe)
+        if coordinate_names and not given["positions"]:
+            named = {name for of_role in given.values() for name in of_role}
+            given["sensors"] += tuple(name for name in observe if name not in named)
         roles, decided = roles_of(source, numbers, given, runs, units)
         others = [name for of_role in roles.values() for name in of_role]
         more = (name for name in observe if name not in others)
