@@ -181,13 +181,15 @@ def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
     T."""
     none = (0,) * dim
     lengths = [i for i in range(dim) if i not in angles]
+    of_masses = [
+        axes for degree in (1, 2) for axes in combinations_with_replacement(lengths, degree)
+    ]
     rows: list[Row] = []
     for pair in combinations_with_replacement(range(dim), 2):
         speeds = unit(dim, *pair)
         for m in modes(dim, angles, 2):
             rows += [(speeds, none, m, 0.0), (speeds, none, m, SINE)]
-        for i in lengths:
-            rows += [(speeds, unit(dim, *[i] * n), none, 0.0) for n in (1, 2)]
+        rows += [(speeds, unit(dim, *axes), none, 0.0) for axes in of_masses]
     for m in modes(dim, angles, 3):
         rows += [(none, none, m, 0.0), (none, none, m, SINE)]
     for degree in range(3, HIGHEST + 1):
