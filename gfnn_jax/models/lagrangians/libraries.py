@@ -176,6 +176,15 @@ def couplings(dim: int, angles: tuple[int, ...]) -> list[Row]:
     return [(k, none, m, phase) for k in speeds for m in twice for phase in (0.0, SINE)]
 
 
+def spun(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """The textbook's terms, and v_j² cos 2q_i: a body at an angle to an axis, about which it is
+    spun, has the inertia sin² q_i."""
+    spins = [
+        (unit(dim, j, j), (0,) * dim, unit(dim, i, i), 0.0) for i in angles for j in range(dim)
+    ]
+    return [*textbook(dim, angles), *(row for row in spins if row[0] != row[2])]
+
+
 def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """Modes up to |m| = 3 and their sines in V, up to 2 in T; powers of lengths up to 6 in V, 2 in
     T."""

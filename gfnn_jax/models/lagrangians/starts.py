@@ -118,6 +118,7 @@ def best_start(problem: ArcProblem) -> LawFit:
     if 1 < d == len(angles) and not (many and some.are_noise):
         some.add(_Library(libraries.relative(d, angles)))
     some.add_richer([*textbook.rows, *pulls], 1)
+    some.add_richer(libraries.spun(d, angles), 1)
     if not (many and some.are_noise):
         some.add(_Library(first, 2))
     some.add_central(textbook.rows, 3, across=False)
