@@ -295,6 +295,34 @@ def motor_arm(rng: np.random.Generator) -> System:
     return cart._replace(lagrangian=terms)
 
 
+def spherical_pendulum(rng: np.random.Generator) -> System:
+    weight = rng.uniform(0.8, 1.2)
+    return System(
+        {"v1**2": 0.5, "v2**2": 0.25, "v2**2*cos(2*x1)": -0.25, "cos(x1)": weight},
+        ((rng.uniform(0.6, 1.3), 0.0), (rng.uniform(-0.1, 0.1), rng.uniform(0.5, 1.0))),
+        (0, 1),
+    )
+
+
+def body_in_a_bowl(rng: np.random.Generator) -> System:
+    a, b = rng.uniform(0.3, 0.6), rng.uniform(0.8, 1.2)
+    terms = {**FREE, "v1**2*x1**2": a * a / 2, "v1*v2*x1*x2": a * b, "v2**2*x2**2": b * b / 2}
+    return System(
+        {**terms, "x1**2": -a, "x2**2": -b},
+        ((rng.uniform(0.5, 1), rng.uniform(0.5, 1)), (rng.uniform(-0.3, 0.3), 0.0)),
+        friction={"v1**2": 0.005, "v2**2": 0.005},
+    )
+
+
+def orbit_that_turns(rng: np.random.Generator) -> System:
+    r = "sqrt(x1**2+x2**2)"
+    return System(
+        {**FREE, f"{r}**(-1)": 1.0, f"{r}**(-2)": -rng.uniform(0.02, 0.05)},
+        ((1.0, 0.0), (0.0, rng.uniform(0.75, 0.9))),
+        period=4.0,
+    )
+
+
 SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
     f.__name__.replace("_", "-"): f
     for f in (
@@ -304,6 +332,7 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
         *(springs_between_angles, elastic_pendulum, relativistic),
         *(drive_not_recorded, drive_of_two_phases, cubic_drag, one_sided_friction),
         *(motor_cart, motor_arm, magnet_on_a_spring, parametric_drive),
+        *(spherical_pendulum, body_in_a_bowl, orbit_that_turns),
     )
 }
 

@@ -43,6 +43,44 @@ def within_errors(formula, exact, scale=1.0):
         assert abs(term.coefficient - scale * value) <= 4 * term.std + 1e-12, term
 
 
+def test_a_spherical_pendulum_is_a_law_of_its_two_angles():
+    def acceleration(q, v):
+        sine, cosine = np.sin(q[0]), np.cos(q[0])
+        return np.array([v[1] ** 2 * sine * cosine - sine, -2 * v[0] * v[1] * cosine / sine])
+
+    fit = gfnn.fit(recorded(acceleration, [0.9, 0.0, 0.1, 0.8], 50, angles=["x1", "x2"]))
+    exact = {"v1**2": 0.5, "v2**2": 0.25, "v2**2*cos(2*x1)": -0.25, "cos(x1)": 1.0}
+    within_errors(fit.lagrangian, exact)
+    assert fit.verdict == "identified"
+
+
+def test_a_body_in_a_bowl_has_the_inertia_of_its_surface():
+    bend = np.array([0.4, 1.1])
+
+    def acceleration(q, v):
+        slope = bend * q
+        return -slope * (1 + bend @ v**2) / (1 + slope @ slope)
+
+    fit = gfnn.fit(recorded(acceleration, [0.8, 0.6, 0.0, 0.2], 60))
+    exact = {"v1**2": 0.5, "v2**2": 0.5, "x1**2": -0.2, "x2**2": -0.55}
+    exact |= {"v1**2*x1**2": 0.08, "v2**2*x2**2": 0.605, "v1*v2*x1*x2": 0.44}
+    scale = next(t.coefficient for t in fit.lagrangian.terms if t.term == "x1**2") / -0.2
+    within_errors(fit.lagrangian, exact, scale)
+
+
+def test_an_orbit_that_turns_has_two_powers_of_the_distance():
+    def acceleration(q, v):
+        r = np.hypot(*q)
+        return q * (-(r**-3) + 0.08 * r**-4)
+
+    fit = gfnn.fit(recorded(acceleration, [1.0, 0.0, 0.0, 0.8], 40))
+    x, y = sp.symbols("x1 x2")
+    terms = {sp.sympify(t.term): t for t in fit.lagrangian.terms}
+    distance = sp.sqrt(x**2 + y**2)
+    assert set(terms) >= {1 / distance, distance**-2}
+    assert abs(terms[distance**-2].coefficient + 0.04) < 4 * terms[distance**-2].std
+
+
 def test_a_foucault_pendulum_has_its_field_and_its_hamiltonian():
     turn = 0.1
 

@@ -62,7 +62,7 @@ class WarningOptions:
     clear: float = 3.0
     many: int = 3
     followed: float = 90.0
-    beyond: float = 3.0
+    beyond: float = 1.5
     missed: float = 0.02
     energies: float = 0.1
     nearly: float = 99.99

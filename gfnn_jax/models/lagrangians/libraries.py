@@ -185,6 +185,14 @@ def spun(dim: int, angles: tuple[int, ...]) -> list[Row]:
     return [*textbook(dim, angles), *(row for row in spins if row[0] != row[2])]
 
 
+def on_a_surface(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """The textbook's terms, and v_i v_j q_i q_j of lengths: a body on a surface whose height is of
+    degree 2 in them moves up and down too."""
+    none, lengths = (0,) * dim, [i for i in range(dim) if i not in angles]
+    pairs = [unit(dim, *axes) for axes in combinations_with_replacement(lengths, 2)]
+    return [*textbook(dim, angles), *((two, two, none, 0.0) for two in pairs)]
+
+
 def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """Modes up to |m| = 3 and their sines in V, up to 2 in T; powers of lengths up to 6 in V, 2 in
     T."""

@@ -86,16 +86,17 @@ SENSORS = (  # of a position q with the velocity v
 
 
 def with_likeliest_power(fit: LawFit) -> LawFit:
-    """The fit with the likeliest power of the distance: with a whole one where that is as good."""
-    powers = _as_likely(fit)
-    if len(powers) < 2:
-        return fit
-    whole = {a: other for a, other in powers.items() if a.is_integer()} or powers
-    best = min(whole, key=lambda a: whole[a].fitted.cost)
-    if whole[best] is fit:
-        return fit
-    fit.problem.on_progress(f"  r**{best:g} in place of r**{_power(fit):g}: it is as likely")
-    return whole[best].again()
+    """The fit with the likeliest powers of the distance: with a whole one where that is as good."""
+    for own in _powers(fit):
+        powers = _as_likely(fit, own)
+        if len(powers) < 2:
+            continue
+        whole = {a: other for a, other in powers.items() if a.is_integer()} or powers
+        best = min(whole, key=lambda a: whole[a].fitted.cost)
+        if whole[best] is not fit:
+            fit.problem.on_progress(f"  r**{best:g} in place of r**{own:g}: it is as likely")
+            fit = whole[best].again()
+    return fit
 
 
 def with_a_shape(fit: LawFit) -> LawFit:
@@ -189,16 +190,20 @@ def _scaled(row: Row, by: float) -> Row:
 
 
 def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
-    """A line on the powers of the distance that follow a record as that of its law does; "" where
+    """A line on the powers of the distance that follow a record as those of its law do; "" where
     there are none."""
-    others = [a for a, other in _as_likely(fit).items() if other is not fit]
-    if not others:
+    squares, lines = " + ".join(f"{name}**2" for name in coordinates), []
+    for own in _powers(fit):
+        others = [a for a, other in _as_likely(fit, own).items() if other is not fit]
+        if others:
+            ends = sorted({min(others), max(others)})
+            named = " to ".join(f"r**{a:g}" for a in ends)
+            lines.append(f"r**{own:g} may be {named}")
+    if not lines:
         return ""
-    squares = " + ".join(f"{name}**2" for name in coordinates)
-    named = " or ".join(f"r**{a:g}" for a in sorted(others))
     return (
-        f"the power of the distance r = sqrt({squares}) may be {named} in place of "
-        f"r**{_power(fit):g}. A start farther out, or closer in, would decide"
+        f"of the distance r = sqrt({squares}) {', '.join(lines)}. A start farther out, or closer "
+        "in, would decide"
     )
 
 
@@ -242,22 +247,23 @@ def of_a_sensor(fit: LawFit) -> str:
     return best
 
 
-def _power(fit: LawFit) -> float | None:
-    """The power of the distance that a law has; None of a law without."""
+def _powers(fit: LawFit) -> list[float]:
+    """The powers of the distance that a law has."""
     d = fit.structure.dim
     distance = tree_of(shape_of(central(d, 1.0)[0]), d)
     found = (factors_of(tree_of(shape_of(row), d)) for row in fit.structure.terms)
-    return next((one[distance] for one in found if set(one) == {distance}), None)
+    return list(dict.fromkeys(float(one[distance]) for one in found if set(one) == {distance}))
 
 
-def _as_likely(fit: LawFit) -> dict[float, LawFit]:
-    """The law's own power of the distance, and neighbours of it -> fits: those against which the
-    best of them has no odds that decide. Empty of a law without such a power."""
-    own, evidence = _power(fit), fit.problem.options.evidence
-    if own is None or not fit.follows:
+def _as_likely(fit: LawFit, own: float) -> dict[float, LawFit]:
+    """A power of the distance that a law has, and neighbours of it -> fits: those against which the
+    best of them has no odds that decide."""
+    evidence = fit.problem.options.evidence
+    if not fit.follows:
         return {}
     springs = any(max(row[1]) == 2 and not any(row[0]) for row in fit.structure.terms)
     found = {own: fit}
+    taken = {0.0, *_powers(fit), *([2.0] if springs else [])}  # which the other terms are
 
     def odds(fit: LawFit) -> float:
         """Odds of the best so far over a fit."""
@@ -267,8 +273,8 @@ def _as_likely(fit: LawFit) -> dict[float, LawFit]:
     for step in (-0.5, 0.5):
         first = np.ceil(2 * own) / 2 if step < 0 else np.floor(2 * own) / 2
         for a in (first + step * np.arange(1, OPTIONS.most + 1)).tolist():
-            if a == 0 or (a == 2 and springs):
-                continue  # which the other terms are
+            if a in taken:
+                continue
             other = fit.again(_with_power(fit, own, a), rescale=False)
             if not other.follows or odds(other) > evidence.decided:
                 break

@@ -124,6 +124,7 @@ def best_start(problem: ArcProblem) -> LawFit:
     some.add_central(textbook.rows, 3, across=False)
     for degree in (3, 4):
         some.add_bodies(degree)
+    some.add_richer(libraries.on_a_surface(d, angles), 3)
     some.add_dry([textbook, _Library(first, 2)])
     if inputs := problem.num_inputs:
         driven = libraries.driven(d, angles, inputs, problem.squares)
@@ -320,6 +321,22 @@ class _Starts:
                     plain if abs(best - plain) < OPTIONS.rounded else float(f"{best:.4g}"), others
                 )
 
+    def add_two_powers(self) -> None:
+        """Start from equal masses and those two powers of the distance that the weak form
+        prefers, as of a force that is nearly one of them."""
+        problem, d = self.problem, self.problem.dim
+        if d == 1 or problem.angles:
+            return
+        masses = [row for row in libraries.textbook(d, ()) if any(row[0])]
+        pairs = combinations(OPTIONS.exponents, 2)
+        found = [[*masses, *(libraries.central(d, a)[0] for a in two)] for two in pairs]
+
+        def share(rows: Sequence[Row]) -> float:
+            friction = tuple(self.linear[:d])
+            return weak_share(Structure(d, tuple(rows), friction, (), problem.num_inputs), problem)
+
+        self.add(_Library(min(found, key=share), 4, apart=True, equal=True))
+
     def plainest(self) -> LawFit:
         """The plainest of those that leave little more than the best."""
         most = OPTIONS.plain * self.least
@@ -341,10 +358,12 @@ class _Starts:
         longer = near
         for periods in self.problem.options.periods[1:3]:
             longer = [fit.again(arcs=fit.problem.arcs(periods)) for fit in longer]
-        if min(map(misfit, longer)) > OPTIONS.white:
+        least = min(map(misfit, longer))
+        if least > min(OPTIONS.white, OPTIONS.noise * self.least):
             count = len(self.fits)
             for degree in (3, 4):
                 self.add_bodies(degree, always=True)
+            self.add_two_powers()
             if len(self.fits) > count:
                 return self.best_along(taken)
         above = _criteria(longer)
