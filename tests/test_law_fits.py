@@ -424,7 +424,7 @@ def test_a_power_of_the_distance_that_others_imitate_is_one_of_several():
     fit = problem.fit(half, known, problem.arcs(4.0), problem.scales.sigma)
     found = with_likeliest_power(fit)
     assert found.structure.terms[-1] == central(2, 4.0)[0]
-    assert re.search(r"r\*\*3.5 .* in place of r\*\*4\.", other_powers(found, ["x", "y"]))
+    assert "r**4 may be r**3.5 " in other_powers(found, ["x", "y"])
 
 
 @pytest.mark.slow
