@@ -1,8 +1,12 @@
-"""Gauss–Newton over arcs: how many evaluations of a model it takes."""
+"""Gauss–Newton over arcs: how many evaluations it takes, and arcs that are hard to close."""
 
 import numpy as np
 import pytest
 
+from gfnn_jax.families.lagrangian import DRY, Friction, Terms
+from gfnn_jax.flows.motion import Form
+from gfnn_jax.maps.observation import Observation
+from gfnn_jax.models.lagrangians.fit import LawOnArcs
 from gfnn_jax.solve.latent_arcs import Defects, Observed, Readings
 
 
@@ -114,3 +118,29 @@ def test_a_step_after_which_an_arc_that_stays_has_no_orbit_at_all_is_refused(mos
     assert fit.p[0] < most
     assert np.isfinite(fit.open[0])
     assert fit.iterations > 1
+
+
+def test_arcs_of_a_body_that_sticks_are_closed():
+    """A driven body on a spring with dry friction, at rest for a quarter of the time. States begin
+    at differences of noisy positions, which slide where the body sticks. Coefficients are within
+    three standard errors of the true ones."""
+    true, dt, count, length = np.array([-2.0, 1.0, 1.0]), 0.1, 12, 40
+    terms = Terms.of([((2,), (0,), (0,), 0.0), ((0,), (2,), (0,), 0.0)], 1)
+    friction = Friction.of([((1,), DRY, 0.0)], 1)
+    form = Form(terms, np.array([0.5, 0.0]), np.array([[0.0], [1.0]]), friction, 1)
+    t = dt * np.arange(count * (length - 1) + 1)
+    stages = t[:-1, None] + dt * np.array([0, 0.2, 0.3, 0.8, 8 / 9, 1])
+    u = (2.2 * np.sin(0.9 * stages) + 0.8 * np.sin(2.3 * stages))[:, None, :, None]
+    start, steps = np.array([[0.5, 0.0]]), np.full((1, len(t) - 1), dt)
+    orbit = np.concatenate([start, form.follow(true, start, steps, u[None], 0).states[0]])
+    assert np.mean(orbit[:, 1] == 0) > 0.2
+    y = orbit[:, :1] + 0.01 * np.random.default_rng(0).normal(size=(len(t), 1))
+    x = np.stack([y[:, 0], np.gradient(y[:, 0], dt)], axis=1)
+    nodes = np.arange(count)[:, None] * (length - 1) + np.arange(length)
+    h, p = np.full((count, length - 1), dt), np.array([-1.5, 0.6, 1.0])
+    law = LawOnArcs(form, Observation.plain(["x"]), (), h, u[nodes[:, :-1]], p, np.arange(3))
+    fit = Readings(law, y[nodes], np.array([0.01])).fit(p, x[nodes], np.array([0.01, 0.02]))
+    assert fit.converged
+    np.testing.assert_array_equal(fit.open, 0)
+    errors = np.sqrt(np.diag(np.linalg.inv(fit.triangle.T @ fit.triangle)))
+    assert np.all(np.abs(fit.p - true) < 3 * errors)

@@ -120,6 +120,15 @@ def evaluated(model: Model | Known, p: np.ndarray, x: np.ndarray) -> tuple[Defec
     )
 
 
+@runtime_checkable
+class Following(Protocol):
+    """A model that can be followed from one state on."""
+
+    def followed(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """The orbits (A, L, m) from the first states of x (A, L, m)."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Options of Gauss–Newton over latent arcs (benchmarks/random_recordings.py)."""
@@ -347,6 +356,9 @@ class _AtStates:
         if (len(here.x) > 1 and not len(here.p)) or not decrease > 0:
             there, stays = self._alone(there, share, dx)
             decrease = self._decrease(there, share, stays)
+            if not decrease > 0 and stays.any():
+                there, stays = self._begun_anew(there, stays)
+                decrease = self._decrease(there, share, stays)
         return Tried(there, decrease, damping)
 
     def _decrease(self, there: _Iterate, share: float, stays: np.ndarray) -> float:
@@ -382,6 +394,20 @@ class _AtStates:
             if of_gaps and part == 0:
                 stays[worse] = better & (left(other)[worse] <= OPTIONS.grown**2 * before[worse])
         return there, stays
+
+    def _begun_anew(self, there: _Iterate, stays: np.ndarray) -> tuple[_Iterate, np.ndarray]:
+        """The iterate with orbits of the model in place of arcs that stay (A,), from their first
+        states, where an orbit costs less than the arc's defects; and which arcs stay then. Where a
+        body sticks between two nodes, and slid, no step closes the defects."""
+        arcs = np.flatnonzero(stays)
+        model = self.data.model.take(arcs)
+        if not isinstance(model, Following):
+            return there, stays
+        other = self.data.moved(there, arcs, model.followed(there.p, there.x[arcs]))
+        better = arcs[other.merits[arcs] < there.merits[arcs]]
+        stays = stays.copy()
+        stays[better] = False
+        return self.data.mixed(there, other, better), stays
 
     def moved(self, there: _Iterate, damping: float) -> tuple[_AtStates, bool]:
         """The problem at the end of a step, in units of the noise that its residuals tell; settled

@@ -83,6 +83,12 @@ class LawOnArcs:
             by[..., self.free].reshape(*shape, len(self.free)),
         )
 
+    def followed(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """The orbits (A, L, 2d) of the law from the first states of x (A, L, 2d)."""
+        form, coefficients, _ = self._of_arcs(self.full(p))
+        states = form.follow(coefficients, x[:, 0], self.h, self.u, order=0).states
+        return np.concatenate([x[:, :1], states], axis=1)
+
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         whole, first = self.full(p), self.form.count
         last = first + len(self.zeros)
