@@ -35,7 +35,8 @@ from harness import (
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
-from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
+from gfnn_jax.families.friction import Friction
+from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.phase_space import apply_j
 

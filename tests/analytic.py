@@ -7,7 +7,8 @@ from scipy.integrate import solve_ivp
 
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.families import from_function
-from gfnn_jax.families.lagrangian import Friction, Lagrangian, Terms
+from gfnn_jax.families.friction import Friction
+from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.symplectic_map import SymplecticMap

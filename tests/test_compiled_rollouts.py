@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from analytic import mechanics
 
-from gfnn_jax.families.lagrangian import LINEAR, QUADRATIC, Friction, Lagrangian, Terms
+from gfnn_jax.families.friction import LINEAR, QUADRATIC, Friction
+from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.flows.compiled_steps import CONSTANT, INVERSE, JOINED, SIN, Stepper, program
 from gfnn_jax.maps import lanes
 from gfnn_jax.maps.inputs import Signals

@@ -5,7 +5,8 @@ import numpy as np
 import scipy.integrate
 import scipy.optimize
 
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Terms
+from gfnn_jax.families.friction import DRY, LINEAR, Friction
+from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.flows.dormand_prince import NODES
 from gfnn_jax.flows.motion import Form
 

@@ -22,7 +22,7 @@ from gfnn_jax.coordinates import CARTESIAN, Coordinates, polar, to_inner
 from gfnn_jax.exports import c_pieces
 from gfnn_jax.exports.export import SUFFIXES
 from gfnn_jax.exports.symbols import Tape
-from gfnn_jax.families import lagrangian
+from gfnn_jax.families import friction
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.expressions import parse
 from gfnn_jax.families.inputs import box_inputs
@@ -247,7 +247,7 @@ def with_length(kind):
     unit, names = np.ones(2), ("l",)
     if kind == "Lagrangian":
         rows = [((2,), (0,), (0,), 0.0, 0.5), ((0,), (0,), (1,), 0.0, 1.0)]
-        losses = [((1,), lagrangian.LINEAR, 0.0, 0.1)]
+        losses = [((1,), friction.LINEAR, 0.0, 0.1)]
         law = mechanics(rows, losses, powers=((0,), (-1,), (1,)))
         return map_of_law(law, z, DT, parameters=names, args=lengths), z, lengths
     if kind == "law":
@@ -336,9 +336,9 @@ def pushed(hold, delay=0.0, uniform=0.0):
         (none, (0, 2), none, 0.0, -0.5),
     ]
     losses = [
-        ((1, 0), lagrangian.LINEAR, 0.0, 0.1),
-        ((1, -1), lagrangian.QUADRATIC, 0.0, 0.2),
-        ((0, 1), lagrangian.DRY, 0.3, 0.05),
+        ((1, 0), friction.LINEAR, 0.0, 0.1),
+        ((1, -1), friction.QUADRATIC, 0.0, 0.2),
+        ((0, 1), friction.DRY, 0.3, 0.05),
     ]
     law = mechanics(rows, losses, uniform, [[1.0], [0.5]])
     z = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 4))

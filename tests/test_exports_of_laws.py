@@ -27,7 +27,7 @@ from test_exports import (
 import gfnn_jax as gfnn
 from gfnn_jax import cli, cli_parser
 from gfnn_jax.exports.export import SUFFIXES
-from gfnn_jax.families import lagrangian
+from gfnn_jax.families import friction
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import law_of_map, map_of_law, velocities_of
@@ -60,20 +60,21 @@ def two_rods(losses, gain=False):
 
 
 def viscous():
-    linear = lagrangian.LINEAR
+    linear = friction.LINEAR
     rows = [((1, 0), linear, 0.0, 0.1), ((-1, 1), linear, 0.0, 0.05)]
-    return two_rods([*rows, ((0, 1), lagrangian.POWER, 3.0, 0.02)])
+    drag = ((1, 1), friction.ISOTROPIC, 2.0, 0.03)
+    return two_rods([*rows, ((0, 1), friction.POWER, 3.0, 0.02), drag])
 
 
 def sticking():
     """Dry friction of each joint and of the second rod, and a quadratic one: held bodies, some
     twice."""
     rows = [
-        ((1, 0), lagrangian.DRY, 1e-4, 0.6),
-        ((0, 1), lagrangian.DRY, 1e-4, 0.4),
-        ((-1, 1), lagrangian.DRY, 1e-4, 0.4),
-        ((0, 1), lagrangian.QUADRATIC, 0.0, 0.1),
-        ((1, 0), lagrangian.ONE_SIDED, 0.0, 0.3),
+        ((1, 0), friction.DRY, 1e-4, 0.6),
+        ((0, 1), friction.DRY, 1e-4, 0.4),
+        ((-1, 1), friction.DRY, 1e-4, 0.4),
+        ((0, 1), friction.QUADRATIC, 0.0, 0.1),
+        ((1, 0), friction.ONE_SIDED, 0.0, 0.3),
     ]
     return two_rods(rows, gain=True)
 
@@ -295,7 +296,7 @@ def chain(relative=False):
             (none, none, (0, 1), 0.0, weights[1]),
         ]
     second = (0, 1) if relative else (-1, 1)
-    losses = [((1, 0), lagrangian.LINEAR, 0.0, 0.02), (second, lagrangian.LINEAR, 0.0, 0.01)]
+    losses = [((1, 0), friction.LINEAR, 0.0, 0.02), (second, friction.LINEAR, 0.0, 0.01)]
     own = mechanics(rows, losses, gains=[[0.0], [1.0]] if relative else [[-1.0], [1.0]])
     z = np.random.default_rng(0).uniform(-1, 1, (300, 4)) * [1, 1, 0.3, 0.1]
     return map_of_law(own, z, 0.01, tolerance=1e-12, signals=Signals(("F",))), z
@@ -329,7 +330,7 @@ def test_mujoco_moves_a_chain_of_links_as_its_law_does(relative, to, tmp_path):
 def test_friction_holds_a_link_in_mujoco_as_in_the_law(tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="MuJoCo is an extra")
     rows = [((2,), (0,), (0,), 0.0, 0.5), ((0,), (0,), (1,), 0.0, 9.0)]
-    own = mechanics(rows, [((1,), lagrangian.DRY, 1e-4, 6.0)])
+    own = mechanics(rows, [((1,), friction.DRY, 1e-4, 6.0)])
     z = np.array([[0.4, 2.0]])
     map_ = map_of_law(own, np.random.default_rng(0).uniform(-2, 2, (300, 2)), 0.01, tolerance=1e-9)
     none, one = np.zeros((1, 1)), np.ones(1)
@@ -362,7 +363,7 @@ def test_forces_of_a_motion_make_it():
 
 
 def test_a_law_that_is_no_chain_has_no_links(tmp_path):
-    rods, _ = two_rods([((1, 0), lagrangian.LINEAR, 0.0, 0.1)])
+    rods, _ = two_rods([((1, 0), friction.LINEAR, 0.0, 0.1)])
     terms = rods.pieces[0].family.family.terms
     springs = dataclasses.replace(terms, powers=np.array([[0, 0]] * 3 + [[2, 0], [0, 2]]))
     family = dataclasses.replace(

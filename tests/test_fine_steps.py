@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import arcs_of, nodes_of
-from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.families.friction import LINEAR
 from gfnn_jax.models.lagrangians import fine_steps, libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps

@@ -6,7 +6,7 @@ import pytest
 import scipy.integrate
 
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction
+from gfnn_jax.families.friction import DRY, LINEAR, Friction
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.flows.flow import Flow

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC
+from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC
 from gfnn_jax.models.lagrangians.friction_choice import Table, WhichFriction, chosen
 from gfnn_jax.models.lagrangians.search import likeliest, without_drives
 from gfnn_jax.models.lagrangians.structure import Structure

@@ -7,7 +7,8 @@ from test_law_fits import pendulum
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Terms
+from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC
+from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.models.lagrangians.given_terms import given_terms
 
 POSITIONS, SPEEDS = ("theta1", "theta2"), ("omega1", "omega2")

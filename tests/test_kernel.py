@@ -16,16 +16,17 @@ import own_module  # noqa: F401
 import pytest
 
 import gfnn_jax
-from gfnn_jax.families.lagrangian import (
+from gfnn_jax.families.friction import (
     DRY,
+    ISOTROPIC,
     LINEAR,
     ONE_SIDED,
     POWER,
     QUADRATIC,
     UNIFORM,
     Friction,
-    Terms,
 )
+from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.flows import kernel
 from gfnn_jax.flows.dormand_prince import STAGES, WEIGHTS
 from gfnn_jax.flows.motion import Form
@@ -168,10 +169,11 @@ def test_derivatives_are_finite_differences(leaders):
     that drive others."""
     (form, p), (x, h, u) = law_of(2, True, False, shapes=True), lanes_of(2, 20)
     more = [((1, 0), POWER, 3.0), ((0, 1), POWER, 1.5), ((0, 1), ONE_SIDED, 0.0)]
+    more.append(((1, 1), ISOTROPIC, 2.0))
     friction = Friction.of([*form.friction.rows()[:2], *more, *form.friction.rows()[-1:]], 2)
     terms = dataclasses.replace(form.terms, leaders=leaders)
     form = dataclasses.replace(form, terms=terms, friction=friction)
-    p = np.insert(p, form.basis.shape[1] + 3, [0.2, 0.3])
+    p = np.insert(p, form.basis.shape[1] + 3, [0.2, 0.3, 0.25])
     x[:, 2:] += np.where(np.abs(x[:, 2:]) < 0.1, 0.3, 0.0)  # of a side no turn
     law = form.lagrangian(p)
     ahead, behind = (form.step(p, x, s * h / 1e3, u[:, :1], 0).states for s in (1, -1))

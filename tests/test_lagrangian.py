@@ -7,16 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.families.lagrangian import (
-    DRY,
-    LINEAR,
-    ONE_SIDED,
-    POWER,
-    QUADRATIC,
-    Friction,
-    Lagrangian,
-    Terms,
-)
+from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, ONE_SIDED, POWER, QUADRATIC, Friction
+from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.flows.legendre import family_of
 
 ROWS = [
@@ -38,8 +30,8 @@ SHAPES = {
 }
 THETA = np.array([1.0, 0.7, 0.3, 0.1, 0.2, 2.0, -0.6, 0.3, 0.8])
 FRICTION = [((1, 0), LINEAR, 1.0), ((-1, 1), QUADRATIC, 1.0), ((0, 1), DRY, 0.1)]
-FRICTION += [((1, 0), POWER, 1.5), ((0, -1), ONE_SIDED, 0.0)]
-RHO = np.array([0.1, 0.2, 0.05, 0.3, 0.4])
+FRICTION += [((1, 0), POWER, 1.5), ((0, -1), ONE_SIDED, 0.0), ((1, 1), ISOTROPIC, 2.0)]
+RHO = np.array([0.1, 0.2, 0.05, 0.3, 0.4, 0.15])
 GAINS = np.array([[1.0, 0.0, 0.5], [0.0, -2.0, 0.3]])
 
 
@@ -66,6 +58,7 @@ def rayleigh(v):
         jnp.sqrt(v[1] ** 2 + 0.01),
         jnp.abs(v[0]) ** 2.5 / 2.5,
         jnp.maximum(-v[1], 0) ** 2 / 2,
+        (v @ v) ** 1.5 / 3,
     )
     return sum(rho * term for rho, term in zip(RHO, of_all, strict=True))
 
@@ -125,6 +118,19 @@ def test_energy_changes_by_the_power_of_the_forces():
     rate = (model.energy(q + h * v, v + h * a) - model.energy(q - h * v, v - h * a)) / (2 * h)
     lost, supplied = model.power(q, v, u)
     np.testing.assert_allclose(rate, supplied.sum(-1) - lost.sum(-1), rtol=1e-7)
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_friction_is_the_gradient_of_its_potential(xp):
+    """And its stiffness the Hessian, at rest too, where |v|³ has one."""
+    _, v = states()
+    model = law()
+    found = model.losses_by_v(xp.asarray(v))
+    np.testing.assert_allclose(found, jax.vmap(jax.hessian(rayleigh))(v), rtol=1e-11, atol=1e-12)
+    drag = Friction.of([((1, 1), ISOTROPIC, a) for a in (1.0, 2.0, 3.0)], 2)
+    rest, one = xp.zeros((1, 2)), xp.ones(3)
+    np.testing.assert_array_equal(drag.forces(rest, one), 0.0)
+    np.testing.assert_array_equal(drag.stiffness(rest, one)[0], np.eye(2))
 
 
 def test_dry_friction_without_a_width_has_finite_tables_at_rest():

@@ -15,14 +15,8 @@ from scipy.stats import norm
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.lagrangian import (
-    DRY,
-    LINEAR,
-    QUADRATIC,
-    UNIFORM,
-    Friction,
-    Terms,
-)
+from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, UNIFORM, Friction
+from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.fitting.evidence import Comparison
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.flows.dormand_prince import NODES

@@ -10,7 +10,7 @@ import scipy.integrate
 from analytic import mechanics
 
 import gfnn_jax as gfnn
-from gfnn_jax.families.lagrangian import DRY, LINEAR
+from gfnn_jax.families.friction import DRY, LINEAR
 from gfnn_jax.maps.energy import ledger
 from gfnn_jax.maps.estimates import Window, law_in_use, propagate
 from gfnn_jax.maps.inputs import Signals

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import scipy.integrate
 
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Lagrangian, Terms
+from gfnn_jax.families.friction import DRY, LINEAR, Friction
+from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import Legendre, family_of, law_of
 

@@ -17,7 +17,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.evaluate.page import page
 from gfnn_jax.evaluate.physics import _count, _of_swings, _System, physics
 from gfnn_jax.exports.symbolic import Formula, as_latex, as_mathml, equations_of_motion
-from gfnn_jax.families.lagrangian import QUADRATIC, Friction
+from gfnn_jax.families.friction import QUADRATIC, Friction
 from gfnn_jax.families.text import Term
 
 OMEGA, DAMPING, REST = 3.0, 0.06, 0.2  # 1/s, 1/s, m

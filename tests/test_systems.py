@@ -10,7 +10,8 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Lagrangian, Terms, functions_of
+from gfnn_jax.families.friction import DRY, LINEAR, Friction
+from gfnn_jax.families.lagrangian import Lagrangian, Terms, functions_of
 from gfnn_jax.flows.legendre import family_of, law_of
 from gfnn_jax.flows.systems import OfSystems
 from gfnn_jax.maps.laws import map_of_law

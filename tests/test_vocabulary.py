@@ -14,7 +14,8 @@ from scipy.signal import lfilter
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import Friction, Terms
+from gfnn_jax.families.friction import Friction
+from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import family_of
 from gfnn_jax.flows.motion import Form

@@ -8,7 +8,7 @@ from analytic import mechanics
 from test_law_fits import pendulum
 
 import gfnn_jax as gfnn
-from gfnn_jax.families.lagrangian import DRY, LINEAR
+from gfnn_jax.families.friction import DRY, LINEAR
 from gfnn_jax.maps.estimates import Window, estimate_states, law_in_use, propagate
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.maps.sensors import Sensors

@@ -35,7 +35,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Terms
+from gfnn_jax.families.friction import DRY, LINEAR, Friction
+from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.sensors import Sensors

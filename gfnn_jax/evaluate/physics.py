@@ -15,7 +15,8 @@ import numpy as np
 from scipy.optimize import brentq
 
 from gfnn_jax.coordinates import nearest_image
-from gfnn_jax.families.lagrangian import DRY, LINEAR, ONE_SIDED, UNIFORM, Lagrangian
+from gfnn_jax.families.friction import DRY, LINEAR, ONE_SIDED, UNIFORM
+from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.families.text import in_letters, measured
 from gfnn_jax.maps.laws import is_of_law, law_of_map
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw

@@ -23,7 +23,7 @@ from gfnn_jax.exports.c_pieces import on_symbols, why_not_piece
 from gfnn_jax.exports.symbols import Symbol, Tape
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
-from gfnn_jax.families.lagrangian import DRY, LINEAR, ONE_SIDED, POWER, QUADRATIC, Friction
+from gfnn_jax.families.friction import DRY, ISOTROPIC, ONE_SIDED, POWER, QUADRATIC, TABLE, Friction
 from gfnn_jax.flows.damped import DampedFlow
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
@@ -76,31 +76,17 @@ class LawGraph:
         return sum(map(len, self.series))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Signed:
-    """Friction on symbols: the signs of speeds are given, 0 of friction that needs none."""
-
-    friction: Friction
-    signs: np.ndarray
-
-    def slopes(self, v):
-        """dr_k/ds (F,) at v (d,)."""
-        own, slopes = self.friction, []
-        for s, kind, width, sign in zip(
-            own.directions @ v, own.kinds, own.widths, self.signs, strict=True
-        ):
-            signed = not _is_zero(sign)
-            if kind == LINEAR:
-                slopes.append(s)
-            elif kind == POWER:
-                slopes.append(sign * (sign * s) ** width if signed else s ** float(width))
-            elif kind == ONE_SIDED:
-                slopes.append(0.5 * (1.0 + sign) * s)
-            elif kind == QUADRATIC:
-                slopes.append(sign * s * s)
-            else:
-                slopes.append(sign if signed else s / (s * s + width**2).sqrt())
-        return np.array(slopes, dtype=object)
+def _pulls(own: Friction, v: np.ndarray, signs: np.ndarray) -> np.ndarray:
+    """∂r_k/∂v (F, d) at v (d,) on symbols: the signs of speeds are given, 0 of friction that needs
+    none. |v| of isotropic friction is that of speeds above 1e-8: it has no series at 0."""
+    pulls = []
+    for c, kind, width, sign in zip(own.directions, own.kinds, own.widths, signs, strict=True):
+        if kind == ISOTROPIC:
+            size = (c @ (v * v) + 1e-16).sqrt()
+            pulls.append(c * v * size ** (float(width) - 1))
+        else:
+            pulls.append(c * TABLE[kind].signed(c @ v, sign, width))
+    return np.array(pulls, dtype=object)
 
 
 def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
@@ -217,7 +203,7 @@ def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
     v = gradient[dim:]
     forces = -gradient[:dim] - z[0, dim:] * law.uniform
     if own.count:
-        forces = forces - own.directions.T @ (losses * _Signed(own, signs).slopes(v))
+        forces = forces - losses @ _pulls(own, v, signs)
     if law.num_inputs:
         forces = forces + gains @ args[0, -law.num_inputs :]
     speeds = [own.directions[k] @ v for k in signed]

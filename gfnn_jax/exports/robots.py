@@ -26,7 +26,8 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian
+from gfnn_jax.families.friction import DRY, LINEAR
+from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.families.rigid_bodies import BASE, pseudo_inertias
 from gfnn_jax.flows.bodies import BodiesLaw
 from gfnn_jax.maps.laws import bodies_of_map, is_of_law, law_of_map

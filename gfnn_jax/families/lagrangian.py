@@ -6,11 +6,8 @@
 
 k, n and m are whole numbers, and a term has at most two factors v: kinetic, gyroscopic and
 potential terms. g, where a term has one, is any other formula: its *shape*, 1/√(q1² + q2²) or
-exp(−q1); of a term without v it may have inputs too, u1²/(0.3 + q1). With s = c·v, the speed of one
-coordinate or the relative speed of two, friction is linear, r = ½s²; quadratic, r = ⅓|s|³; dry, r =
-√(s² + ε²) − ε; a power a of the speed, r = |s|^(a + 1)/(a + 1); or one-sided, r = ½ max(s, 0)²,
-which beside linear friction makes it depend on the direction. Everything is batch first, in closed
-form, and runs in NumPy or JAX.
+exp(−q1); of a term without v it may have inputs too, u1²/(0.3 + q1). R is that of
+`families.friction`. Everything is batch first, in closed form, and runs in NumPy or JAX.
 
 Of systems that differ in parameters μ, a length or a mass, each coefficient is multiplied by a
 product of whole powers of these: L = Σ θ_j ∏ μ_i^a_ji ℓ_j(q, v), and R and G alike. The law of one
@@ -36,15 +33,13 @@ from gfnn_jax.families.expressions import (
     parse,
     to_named_text,
 )
+from gfnn_jax.families.friction import Friction
 from gfnn_jax.families.jets import jets
-from gfnn_jax.families.text import added, barred, combination, power, shown
+from gfnn_jax.families.text import added, combination, power
 
 INPUTS = tuple(f"u{j + 1}" for j in range(64))  # their names in shapes
 MAX_POWER = 8  # of one coordinate in one term; powers come from a table of this length
 Powers = tuple[tuple[int, ...], ...]  # of the parameters, (m, k), for each coefficient
-# Kinds of friction. UNIFORM stands in a fit's `flows.motion.Form` alone.
-LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED = range(6)
-_FACTORS = {1 / 2: "½ ", 1 / 3: "⅓ ", 1 / 4: "¼ ", 1 / 8: "⅛ ", 1.0: ""}
 
 
 class Potentials(NamedTuple):
@@ -282,108 +277,6 @@ class Terms:
         return self.acting(push * f[..., None] + dg * along[..., None] - g[..., None] * df)
 
 
-@pytree()
-class Friction:
-    """Terms r_k of Rayleigh's R: directions c (F, d), whole numbers; kinds (F,), LINEAR, QUADRATIC,
-    DRY, POWER or ONE_SIDED; widths (F,): ε of dry friction, in units of v, and the exponent a of
-    POWER."""
-
-    directions: Any
-    kinds: Any
-    widths: Any
-
-    @staticmethod
-    def of(rows: Sequence[Sequence[Any]], dim: int) -> Friction:
-        """Make it of rows (c, kind, ε)."""
-        return Friction(
-            np.array([r[0] for r in rows], dtype=int).reshape(-1, dim),
-            np.array([r[1] for r in rows], dtype=int),
-            np.array([float(r[2]) for r in rows]),
-        )
-
-    @property
-    def count(self) -> int:
-        return self.kinds.shape[0]
-
-    def rows(self) -> list[tuple]:
-        """(c, kind, ε) of each term, hashable."""
-        return [
-            (tuple(map(int, self.directions[k])), int(self.kinds[k]), float(self.widths[k]))
-            for k in range(self.count)
-        ]
-
-    def texts(self, speeds: Sequence[str]) -> tuple[tuple[str, float], ...]:
-        """Each term as code in the names of the velocities, and the number before it: ("v1**2", ½),
-        ("abs(v2 - v1)**3", ⅓), ("abs(v2)", 1), ("(abs(v1) + v1)**2", ⅛) of one-sided friction;
-        uniform friction, a row without a direction, is γ T.
-        """
-        listed = []
-        for direction, kind, width in self.rows():
-            speed = combination(direction[::-1], [*speeds][::-1])
-            size = f"abs({speed.removeprefix('-')})"
-            squared = f"({speed})**2" if sum(map(bool, direction)) > 1 else f"{speed}**2"
-            listed.append(
-                {
-                    LINEAR: (squared, 1 / 2),
-                    QUADRATIC: (f"abs({speed})**3", 1 / 3),
-                    DRY: (f"sqrt({squared} + {width**2:.4g})" if width else f"abs({speed})", 1.0),
-                    UNIFORM: ("T", 1.0),
-                    POWER: (f"abs({speed})**{width + 1:g}", 1 / (width + 1)),
-                    ONE_SIDED: (f"({added([size, speed])})**2", 1 / 8),
-                }[kind]
-            )
-        return tuple(listed)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Each term as it stands in a formula: "½ v1²", "⅓ |v2 - v1|³", "|v2|"."""
-        speeds = [f"v{i + 1}" for i in range(self.directions.shape[1])]
-        sharp = dataclasses.replace(self, widths=np.where(self.kinds == DRY, 0.0, self.widths))
-        return tuple(
-            _FACTORS.get(part, f"{part:.4g} ") + barred(shown(t)) for t, part in sharp.texts(speeds)
-        )
-
-    @property
-    def jumps(self) -> np.ndarray:
-        """The dry friction (F,) that has no width: its force jumps where its speed turns."""
-        return (self.kinds == DRY) & (self.widths == 0)
-
-    def take(self, keep: Any) -> Friction:
-        return Friction(self.directions[keep], self.kinds[keep], self.widths[keep])
-
-    def tables(self, v: Any) -> tuple[Any, Any, Any]:
-        """r_k, dr_k/ds and d²r_k/ds² at v (..., d), each (..., F)."""
-        xp = namespace(v)
-        s = matmul(v, self.directions.astype(v.dtype).T)
-        size = xp.abs(s)
-        kinds, widths = as_row(self.kinds, s), as_row(self.widths, s)
-        # At rest with ε = 0 there is no direction to push: s/root is 0.
-        root = xp.sqrt(s * s + widths**2 + np.finfo(widths.dtype).tiny)
-        linear, quadratic = kinds == LINEAR, kinds == QUADRATIC
-        dry = (widths / root) ** 2 / root  # small speeds would underflow in ε²/root³
-        value = xp.where(linear, 0.5 * s * s, xp.where(quadratic, size**3 / 3, root - widths))
-        slope = xp.where(linear, s, xp.where(quadratic, s * size, s / root))
-        curvature = xp.where(linear, xp.ones_like(s), xp.where(quadratic, 2 * size, dry))
-        if xp is np and not np.any(self.kinds >= POWER):
-            return value, slope, curvature
-        power, one_sided = kinds == POWER, kinds == ONE_SIDED
-        exponent, forward = xp.where(power, widths, 1.0), xp.maximum(s, 0.0)
-        base = xp.where(size > 0, size, 1.0)  # |s|^(a − 1) has no value at rest where a < 1
-        raised = xp.where(size > 0, base ** (exponent - 1), 0.0)
-        of_power = raised * size * size / (exponent + 1), raised * s, exponent * raised
-        of_side = 0.5 * forward**2, forward, (s > 0).astype(s.dtype)
-        found = zip((value, slope, curvature), of_power, of_side, strict=True)
-        value, slope, curvature = (
-            xp.where(power, b, xp.where(one_sided, c, a)) for a, b, c in found
-        )
-        return value, slope, curvature
-
-    def residuals(self, v: Any) -> Any:
-        """∂r_k/∂v at v (..., d): (..., F, d)."""
-        _, slope, _ = self.tables(v)
-        return _outer(slope, self.directions.astype(v.dtype))
-
-
 @pytree("powers")
 class Lagrangian:
     """L = Σ θ_j ℓ_j with θ ``coefficients`` (P,), friction R = Σ ρ_k r_k with ρ ``losses`` (F,),
@@ -471,18 +364,12 @@ class Lagrangian:
 
     def forces(self, q: Any, v: Any, u: Any = None) -> Any:
         """−∂R/∂v − γ ∂L/∂v + G u (..., d); u is (..., inputs), or None for none."""
-        _, slope, _ = self.friction.tables(v)
-        push = -matmul(as_row(self.losses, slope) * slope, self.friction.directions.astype(v.dtype))
-        push = push - self.uniform * self.momentum(q, v)
+        push = -self.friction.forces(v, self.losses) - self.uniform * self.momentum(q, v)
         return push if u is None else push + pushed(self.gains, u)
 
     def losses_by_v(self, v: Any) -> Any:
         """∂²R/∂v∂v (..., d, d)."""
-        _, _, curvature = self.friction.tables(v)
-        c = self.friction.directions.astype(v.dtype)
-        outer = (c[:, :, None] * c[:, None, :]).reshape(-1, self.dim**2)
-        flat = matmul(as_row(self.losses, curvature) * curvature, outer)
-        return flat.reshape(*v.shape, self.dim)
+        return self.friction.stiffness(v, self.losses)
 
     def balance(self, q: Any, v: Any, u: Any = None) -> tuple[Any, Any]:
         """M (..., d, d) and the force (..., d) of M a = ∂L/∂q − (∂²L/∂v∂q) v − ∂R/∂v − γ ∂L/∂v +
@@ -503,7 +390,7 @@ class Lagrangian:
         """Energy per unit of time: lost to each friction (..., F + 1), the last one uniform
         friction, and supplied by each input (..., inputs)."""
         xp = namespace(v)
-        lost = (self.friction.residuals(v) * v[..., None, :]).sum(-1)
+        lost = self.friction.power(v)
         lost = lost * as_row(self.losses, lost)
         even = self.uniform * (self.momentum(q, v) * v).sum(-1)
         lost = xp.concatenate([lost, even[..., None]], axis=-1)

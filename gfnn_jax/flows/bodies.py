@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.arrays import as_row, matmul, namespace, pytree
+from gfnn_jax.arrays import as_row, namespace, pytree
 from gfnn_jax.families.family import DifferentiatedByJax, OfCoefficients
-from gfnn_jax.families.lagrangian import Friction
+from gfnn_jax.families.friction import Friction
 from gfnn_jax.families.rigid_bodies import PER_LINK, Bodies
 from gfnn_jax.phase_space import split
 from gfnn_jax.solve.linear import small_solve
@@ -101,13 +101,10 @@ class BodiesLaw:
 
     def balance(self, q: Any, v: Any) -> tuple[Any, Any]:
         """M (..., k, k) and all forces but those of inputs (..., k): M a = forces + G u."""
-        _, slope, _ = self.friction.tables(v)
-        lost = matmul(slope * self.losses, self.friction.directions.astype(v.dtype))
+        lost = self.friction.forces(v, self.losses)
         held = self.bodies.forces(self.parameters, q, v, 0 * v) + self.offsets
         return self.masses(q), -held - lost
 
     def losses_by_v(self, v: Any) -> Any:
         """∂²R/∂v∂v (..., k, k)."""
-        _, _, curvature = self.friction.tables(v)
-        c = self.friction.directions.astype(v.dtype)
-        return matmul(namespace(v).swapaxes((curvature * self.losses)[..., None] * c, -1, -2), c)
+        return self.friction.stiffness(v, self.losses)

@@ -19,7 +19,8 @@ import numpy as np
 
 from gfnn_jax.arrays import as_row, beside, matmul, namespace, pytree
 from gfnn_jax.families.family import AroundAnother, at_time, parameter_gradients
-from gfnn_jax.families.lagrangian import LINEAR, Friction, pushed
+from gfnn_jax.families.friction import LINEAR, Friction
+from gfnn_jax.families.lagrangian import pushed
 from gfnn_jax.phase_space import split
 
 
@@ -107,8 +108,7 @@ class Forced(WithForces):
     def term_gradients(self, w, args=None):
         """The field of every term of H and R (..., 2d, m), those of R as if v were p: to start
         from. NumPy."""
-        _, slope, _ = self.friction.tables(split(w)[1])
-        frictions = slope[..., None, :] * self.friction.directions.T.astype(w.dtype)
+        frictions = np.swapaxes(self.friction.residuals(split(w)[1]), -1, -2)
         frictions = np.concatenate([frictions, np.zeros_like(frictions)], axis=-2)
         return np.concatenate(
             [self.family.term_gradients(w, self._inner(args)), frictions], axis=-1
@@ -142,28 +142,26 @@ class Forced(WithForces):
         """(∂H/∂q + ∂R/∂v − G u, ∂H/∂p), shape (..., 2d)."""
         own, losses, gains = self.parts(params)
         gradient = self.family.gradient(own, w, self._inner(args))
-        _, slope, _ = self.friction.tables(split(gradient)[1])
-        return self._field(gradient, slope, losses, gains, args)
+        return self._field(gradient, losses, gains, args)
 
     def gradient_and_hessian(self, params, w, args=None):
         """Field and its derivative (..., 2d, 2d), which is not symmetric."""
         own, losses, gains = self.parts(params)
         gradient, hessian = self.family.gradient_and_hessian(own, w, self._inner(args))
-        _, slope, curvature = self.friction.tables(split(gradient)[1])
-        field = self._field(gradient, slope, losses, gains, args)
-        return field, self._beside(hessian, losses, curvature)
+        field = self._field(gradient, losses, gains, args)
+        return field, self._beside(hessian, self.friction.stiffness(split(gradient)[1], losses))
 
     def parameter_gradients(self, params, w, args=None, along=None):
         """∂/∂params of the field (..., 2d, m); of a family ``along`` of other terms of H those of
         its coefficients alone. NumPy."""
         own, losses, _ = self.parts(params)
         inner, dim = self._inner(args), self.dim
-        _, slope, curvature = self.friction.tables(split(self.family.gradient(own, w, inner))[1])
+        v = split(self.family.gradient(own, w, inner))[1]
         columns = parameter_gradients(self.family, own, w, inner, along)
-        columns = self._beside(columns, losses, curvature)
+        columns = self._beside(columns, self.friction.stiffness(v, losses))
         if along is not None:
             return columns
-        frictions = slope[..., None, :] * self.friction.directions.T.astype(w.dtype)
+        frictions = np.swapaxes(self.friction.residuals(v), -1, -2)
         u = self._inputs(args)
         pushes = -(np.eye(dim)[:, :, None] * u[..., None, None, :]).reshape(*u.shape[:-1], dim, -1)
         pushes = np.broadcast_to(pushes, (*w.shape[:-1], dim, dim * self.num_inputs))
@@ -176,9 +174,8 @@ class Forced(WithForces):
         by each input (..., k); by a term that has several, by the first of them."""
         own, losses, gains = self.parts(params)
         v = split(self.family.gradient(own, w, self._inner(args)))[1]
-        _, slope, _ = self.friction.tables(v)
-        speeds = matmul(v, self.friction.directions.astype(v.dtype).T)
-        lost = as_row(losses, slope) * slope * speeds
+        lost = self.friction.power(v)
+        lost = as_row(losses, lost) * lost
         supplied = pushed(namespace(gains).swapaxes(gains, -1, -2), v) * self._inputs(args)
         if not self._driven:
             return lost, supplied
@@ -209,21 +206,16 @@ class Forced(WithForces):
         start = args.shape[-1] - (self.degree + 1) * self.num_inputs
         return args[..., start : start + self.num_inputs]
 
-    def _field(self, gradient, slope, losses, gains, args):
+    def _field(self, gradient, losses, gains, args):
         along_q, along_p = split(gradient)
-        directions = self.friction.directions.astype(gradient.dtype)
-        along_q = along_q + matmul(as_row(losses, slope) * slope, directions)
+        along_q = along_q + self.friction.forces(along_p, losses)
         if self.num_inputs:
             along_q = along_q - pushed(gains, self._inputs(args))
         return namespace(gradient).concatenate([along_q, along_p], axis=-1)
 
-    def _beside(self, columns, losses, curvature):
+    def _beside(self, columns, by_v):
         """Derivatives (..., 2d, n) of ∇H with those of the friction, whose speed ∂H/∂p moves too:
         ∂²R/∂v² times the rows of p beside the rows of q."""
-        directions = self.friction.directions.astype(columns.dtype)
-        outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, self.dim**2)
-        by_v = matmul(as_row(losses, curvature) * curvature, outer)
-        by_v = by_v.reshape(*by_v.shape[:-1], self.dim, self.dim)
         along_q, along_p = columns[..., : self.dim, :], columns[..., self.dim :, :]
         along_q = along_q + matmul(by_v, along_p)
         return namespace(columns).concatenate([along_q, along_p], axis=-2)

@@ -53,7 +53,7 @@ from gfnn_jax import compiling
 
 FINE, UNFINISHED, LOST = range(3)  # status of a lane: followed; too many events; not finite
 # Kinds of friction; COULOMB: dry, without a width.
-VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN, RAISED_SPEED, ONE_SIDED = range(7)
+VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN, RAISED_SPEED, ONE_SIDED, DRAG = range(8)
 
 # Rows of n: sizes (below); of each term its degree in v, the coordinates of its factors v, its wave
 # m·q, the number of coordinates in its factor f(q), whether it has powers, and its level; the level
@@ -433,6 +433,13 @@ def _terms(n, f, gamma, u, order):
 
 
 @function
+def _other(n, f, k, i):
+    """The factor beside c_i of a direction: v_i of friction of |v|, which c is the coordinates
+    of."""
+    return f[X, n[SIZES, DIM] + i] if n[KINDS, k] == DRAG else 1.0
+
+
+@function
 def _friction(n, f, order):
     """The forces of friction but for uniform friction, and their derivatives in v."""
     d, c, raw = n[SIZES, DIM], n[SIZES, DIRECTIONS], n[SIZES, RAW]
@@ -440,9 +447,9 @@ def _friction(n, f, order):
         kind, loss = n[KINDS, k], f[LOSSES, k]
         if kind == EVEN:
             continue
-        speed, stiffness = 0.0, 0.0
+        speed, stiffness, turned = 0.0, 0.0, 0.0
         for i in range(d):
-            speed += f[c + i, k] * f[X, d + i]
+            speed += f[c + i, k] * f[X, d + i] * _other(n, f, k, i)
         pull = speed
         if kind == VISCOUS:
             stiffness = 1.0
@@ -459,15 +466,23 @@ def _friction(n, f, order):
         elif kind == ONE_SIDED:
             pull = max(speed, 0.0)
             stiffness = 1.0 if speed > 0.0 else 0.0
+        elif kind == DRAG:  # of |v|, by v: pull is that of a unit of v
+            pull = turned = math.sqrt(speed) ** (f[WIDTHS, k] - 1.0)
+            if speed > 0.0:
+                stiffness = (f[WIDTHS, k] - 1.0) * pull / speed
         else:
             pull = f[MODES, k]
         f[PULL, k] = pull
         f[HELD, k] = loss * pull
         for i in range(d):
             if f[c + i, k] != 0.0:
-                f[FORCE, i] -= loss * pull * f[c + i, k]
+                along = f[c + i, k] * _other(n, f, k, i)
+                f[FORCE, i] -= loss * pull * along
                 for m in range(d if order > 0 else 0):
-                    f[raw + i, d + m] += loss * stiffness * f[c + i, k] * f[c + m, k]
+                    by = f[c + m, k] * _other(n, f, k, m)
+                    f[raw + i, d + m] += loss * stiffness * along * by
+                    if i == m:
+                        f[raw + i, d + m] += loss * turned * f[c + i, k]
 
 
 @function
@@ -658,7 +673,7 @@ def _rates(n, f, u, order):
         first = 2 * d + n[SIZES, FREE_TERMS]
         for i in range(d):
             for k in range(n[SIZES, FRICTIONS]):
-                own = f[n[SIZES, DIRECTIONS] + i, k] * f[PULL, k]
+                own = f[n[SIZES, DIRECTIONS] + i, k] * f[PULL, k] * _other(n, f, k, i)
                 f[raw + i, first + k] = f[MOMENTUM, i] if n[KINDS, k] == EVEN else own
             for m in range(n[SIZES, INPUTS]):
                 column = n[SIZES, FRICTIONS] + i * n[SIZES, INPUTS] + m

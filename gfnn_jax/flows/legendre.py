@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.arrays import namespace, pytree
-from gfnn_jax.families.lagrangian import Derivatives, Friction, Lagrangian, Terms
+from gfnn_jax.families.friction import Friction
+from gfnn_jax.families.lagrangian import Derivatives, Lagrangian, Terms
 from gfnn_jax.families.text import shown
 from gfnn_jax.flows.forces import Forced
 from gfnn_jax.flows.systems import OfSystems

@@ -12,14 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import (
-    UNIFORM,
-    Friction,
-    Lagrangian,
-    Powers,
-    Terms,
-    functions_of,
-)
+from gfnn_jax.families.friction import UNIFORM, Friction
+from gfnn_jax.families.lagrangian import Lagrangian, Powers, Terms, functions_of
 
 if TYPE_CHECKING:
     from gfnn_jax.flows.tables import Tables

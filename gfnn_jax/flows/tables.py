@@ -8,17 +8,18 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from gfnn_jax.families.expressions import Expression, depends_on, number
-from gfnn_jax.families.functions import CHEBYSHEV, own_function
-from gfnn_jax.families.lagrangian import (
+from gfnn_jax.families.friction import (
     DRY,
+    ISOTROPIC,
     LINEAR,
     ONE_SIDED,
     POWER,
     QUADRATIC,
     UNIFORM,
     Friction,
-    Terms,
 )
+from gfnn_jax.families.functions import CHEBYSHEV, own_function
+from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.families.traced import traced_pieces
 from gfnn_jax.flows import kernel as row
 from gfnn_jax.flows.dormand_prince import NODES, STAGES, WEIGHTS
@@ -30,6 +31,7 @@ _KINDS = {
     UNIFORM: row.EVEN,
     POWER: row.RAISED_SPEED,
     ONE_SIDED: row.ONE_SIDED,
+    ISOTROPIC: row.DRAG,
 }
 _BINARY = {"+": row.PLUS, "*": row.TIMES, "max": row.LARGER, ">": row.GREATER}
 _TAKEN = dict.fromkeys(_BINARY.values(), 1) | {row.SELECT: 2, row.COMPOSE: 3}  # from the stack

@@ -20,7 +20,8 @@ import numpy as np
 from gfnn_jax.data.recording import Recording, args_of, channels_of
 from gfnn_jax.data.roles import is_wave, wave
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.lagrangian import DRY, UNIFORM, Friction, Lagrangian, functions_of
+from gfnn_jax.families.friction import DRY, UNIFORM, Friction
+from gfnn_jax.families.lagrangian import Lagrangian, functions_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import TAPS, at_stages
 from gfnn_jax.maps.laws import law_of_map

@@ -16,7 +16,8 @@ import numpy as np
 from jax.core import Tracer
 
 from gfnn_jax.coordinates import TWO_PI
-from gfnn_jax.families.lagrangian import DRY, functions_of
+from gfnn_jax.families.friction import DRY
+from gfnn_jax.families.lagrangian import functions_of
 from gfnn_jax.flows.dormand_prince import NODES
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.flows.schedules import of_polynomials

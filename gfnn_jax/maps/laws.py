@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, lift
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Lagrangian, coordinates_in
+from gfnn_jax.families.friction import DRY, LINEAR
+from gfnn_jax.families.lagrangian import Lagrangian, coordinates_in
 from gfnn_jax.flows.bodies import BodiesLaw, OfBodies
 from gfnn_jax.flows.collocation import Steps, images, of_lanes
 from gfnn_jax.flows.flow import Flow

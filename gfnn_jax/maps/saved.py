@@ -23,8 +23,9 @@ from gfnn_jax.coordinates import CARTESIAN, LOG, Coordinates
 from gfnn_jax.errors import InputError
 from gfnn_jax.families import lagrangian
 from gfnn_jax.families.displacements import OfDisplacement
+from gfnn_jax.families.friction import Friction
 from gfnn_jax.families.inputs import Inputs
-from gfnn_jax.families.lagrangian import Friction, Lagrangian
+from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.families.mlp import Ensemble, Mlp
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.rigid_bodies import Bodies

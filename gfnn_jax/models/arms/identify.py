@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, Friction
+from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, Friction
 from gfnn_jax.families.rigid_bodies import PER_LINK, PSEUDO, Bodies, pseudo_inertias
 from gfnn_jax.fitting.evidence import correlation_time
 from gfnn_jax.fitting.triangle import Triangle

@@ -28,7 +28,7 @@ import numpy as np
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC, UNIFORM, Friction
+from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, UNIFORM, Friction
 from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.linearised import Linearised

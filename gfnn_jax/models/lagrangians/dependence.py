@@ -30,7 +30,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.lagrangian import UNIFORM, functions_of
+from gfnn_jax.families.friction import UNIFORM
+from gfnn_jax.families.lagrangian import functions_of
 from gfnn_jax.fitting.evidence import EVIDENCE, Comparison
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.sparse import block_diag, vstack
 
-from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.families.friction import LINEAR
 from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs

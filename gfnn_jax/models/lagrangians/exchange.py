@@ -23,12 +23,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import LINEAR, UNIFORM
 from gfnn_jax.families.text import in_letters
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.friction_choice import is_coupled, kinds_of
-from gfnn_jax.models.lagrangians.libraries import FEW, RARE
+from gfnn_jax.models.lagrangians.libraries import FEW, RARE, together
 from gfnn_jax.models.lagrangians.structure import Loss, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import promising, protected
 
@@ -167,10 +166,11 @@ def _oddness(friction: Sequence[Loss]) -> tuple[int, ...]:
 
 
 def may_be_chosen(fit: LawFit) -> bool:
-    """Return whether the friction does not drive, and is not both linear and uniform."""
+    """Return whether the friction does not drive, and has no two kinds of which one stands for the
+    other."""
     losses = [value for key, value in fit.values.items() if key[0] == "loss"]
     kinds = {row[1] for row in fit.structure.friction}
-    return fit.follows and min(losses, default=0.0) >= 0 and not {LINEAR, UNIFORM} <= kinds
+    return fit.follows and min(losses, default=0.0) >= 0 and together(kinds)
 
 
 def _plainness(fit: LawFit) -> tuple[int, ...]:

@@ -264,6 +264,11 @@ class ArcProblem:
         return tuple(i for i in self.angles if i in shown)
 
     @property
+    def lengths(self) -> tuple[int, ...]:
+        """The coordinates that are no angles."""
+        return tuple(i for i in range(self.dim) if i not in self.angles)
+
+    @property
     def squares(self) -> bool:
         """Return whether squares of the inputs are no constants together, as of two waves."""
         u = np.concatenate([n.stretch.u for n in self.nodes])[:, -2:]
@@ -524,13 +529,16 @@ class LawFit:
 
     def values_within(self, structure: Structure) -> dict[Key, float]:
         """The coefficients, close to the fit by least squares, where those that a structure lacks
-        are zero: along a straight orbit a spring that goes leaves its force to others."""
+        are zero: along a straight orbit a spring that goes leaves its force to others. A mass that
+        the gauge gives is free where the structure couples more."""
         keys, p = self.structure.keys(), self.p
+        freed = [key for key in structure.keys() if key not in keys and key in self.values]  # noqa: SIM118
         of, kept = self.linearised.covariance, set(structure.keys())
         gone = [k for k, key in enumerate(keys) if key not in kept and 0 < of[k, k] < np.inf]
         if gone:
             p = p - of[:, gone] @ np.linalg.lstsq(of[np.ix_(gone, gone)], p[gone])[0]
-        return dict(zip(keys, p.tolist(), strict=True))
+        own = {key: self.values[key] for key in freed}
+        return own | dict(zip(keys, p.tolist(), strict=True))
 
     def in_thirds(self) -> tuple[Arcs, np.ndarray]:
         """Arcs of the nodes, and the third of the record (A,) that each lies in. They are as long

@@ -15,10 +15,10 @@ found from them as well, so that the odds of B, residuals being normal, are
 where of N residuals those that are correlated, over τ samples, count once. Of the sets against
 which the best has odds of less than 20 the one with the fewest kinds is taken: uniform friction,
 which has one coefficient and keeps a multiple of the symplectic form, before linear friction, and
-that before quadratic and dry friction. Uniform friction is tried beside linear friction only where
-both are asked for. Rare kinds, cubic and one-sided friction, come last: one of them beside the
-others, or in place of one, where that has odds of 20 against the set without it, by held-out arcs
-and by Schwarz's criterion of all.
+that before isotropic drag, quadratic and dry friction. Uniform friction is tried beside linear
+friction, and isotropic drag beside quadratic friction, only where both are asked for. Rare kinds,
+cubic and one-sided friction, come last: one of them beside the others, or in place of one, where
+that has odds of 20 against the set without it, by held-out arcs and by Schwarz's criterion of all.
 
 Odds alone let chance in: a direction that is not there takes up a part of what the other
 coefficients miss on the arcs that they are not from. Where there is a choice, a set is therefore
@@ -38,13 +38,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import LINEAR, UNIFORM, Friction
+from gfnn_jax.families.friction import ISOTROPIC, LINEAR, UNIFORM, Friction
 from gfnn_jax.families.text import in_letters
 from gfnn_jax.fitting.evidence import EVIDENCE, correlation_time, criterion
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit
-from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, RARE, losses
+from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, RARE, losses, together
 from gfnn_jax.models.lagrangians.structure import Loss
 from gfnn_jax.models.lagrangians.text import friction_of
 from gfnn_jax.solve.linear import non_negative
@@ -88,7 +88,7 @@ class FrictionChoice(NamedTuple):
         """The choice by the names of speeds; ``scale`` is that of L."""
 
         def named(kinds: tuple[int, ...]) -> str:
-            return "+".join(FRICTIONS[KINDS.index(k)] for k in kinds) or "none"
+            return "+".join(FRICTIONS[k] for k in kinds) or "none"
 
         plain = {direction for direction, _, _ in losses(dim, KINDS, 0.0)}
         rows = [r for r in self.limits if r[0] in plain and len(r) == 3]
@@ -96,7 +96,7 @@ class FrictionChoice(NamedTuple):
         largest = scale * np.array([self.limits[row] for row in rows])
         terms = friction_of(Friction.of(rows, dim), largest, 0 * largest, speeds).terms
         return WhichFriction(
-            tuple(FRICTIONS[KINDS.index(k)] for k in self.kinds),
+            tuple(FRICTIONS[k] for k in self.kinds),
             {named(kinds): odds for kinds, odds in self.odds.items()},
             {t.term: t.coefficient for t in terms},
         )
@@ -141,8 +141,8 @@ def kinds_of(rows: Sequence[Loss]) -> tuple[int, ...]:
 
 
 def is_coupled(row: Loss) -> bool:
-    """Return whether a friction is of the speeds of several coordinates."""
-    return sum(map(bool, row[0])) > 1
+    """Return whether a friction is of the sum or the difference of several speeds."""
+    return row[1] != ISOTROPIC and sum(map(bool, row[0])) > 1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -163,9 +163,11 @@ class _Judged:
         return kinds_of(self.rows)
 
     @property
-    def plainness(self) -> tuple[int, ...]:
-        """The rank of its kinds among as many others, uniform friction first."""
-        return tuple(sorted(-1 if kind == UNIFORM else kind for kind in self.kinds))
+    def plainness(self) -> tuple[float, ...]:
+        """The rank of its kinds among as many others: uniform friction first, and isotropic drag,
+        which has one coefficient, before quadratic friction."""
+        order = {UNIFORM: -1.0, ISOTROPIC: LINEAR + 0.5}
+        return tuple(sorted(order.get(kind, kind) for kind in self.kinds))
 
     @functools.cached_property
     def cost(self) -> float:
@@ -231,7 +233,7 @@ def chosen(
     kinds = sorted({row[1] for row in table.candidates})
     usual = [kind for kind in kinds if not (choose and kind in RARE)]
     every = (chosen for n in range(len(usual) + 1) for chosen in combinations(usual, n))
-    every = (chosen for chosen in every if not (choose and {LINEAR, UNIFORM} <= set(chosen)))
+    every = (chosen for chosen in every if together(chosen) or not choose)
     sets = [judged for judged in map(table.leanest, every) if judged is not None]
     if not choose:
         most = max(len(s.kinds) for s in sets)

@@ -33,16 +33,8 @@ from gfnn_jax.families.expressions import (
     to_text,
     whole_multiples,
 )
-from gfnn_jax.families.lagrangian import (
-    DRY,
-    INPUTS,
-    LINEAR,
-    MAX_POWER,
-    ONE_SIDED,
-    POWER,
-    QUADRATIC,
-    coordinates_in,
-)
+from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, ONE_SIDED, POWER, QUADRATIC
+from gfnn_jax.families.lagrangian import INPUTS, MAX_POWER, coordinates_in
 from gfnn_jax.families.told import told_of
 from gfnn_jax.models.lagrangians.structure import SINE, Loss, Row, with_powers
 
@@ -198,6 +190,11 @@ class _Reader(NamedTuple):
             raise self.refused(text)
         ((inside, exponent),) = factors.items()
         kind, width, d = LINEAR, 0.0, len(self.positions)
+        squares, half = (inside, 2) if inside.operation != "sqrt" else (inside.operands[0], 1)
+        plane = _squared(squares)
+        if len(plane) > 1 and min(plane) >= d and half * exponent >= 2:
+            direction = tuple(int(d + i in plane) for i in range(d))
+            return with_powers((direction, ISOTROPIC, half * exponent - 1), of_system)
         if inside.operation == "abs" and exponent >= 1:
             inside, kind = inside.operands[0], _OF_POWER.get(exponent, POWER)
             width = exponent - 1 if kind == POWER else 0.0
@@ -229,11 +226,21 @@ class _Reader(NamedTuple):
         return InputError(
             f"terms: '{text}' is no term of a law. A term of L or V is a formula of "
             f"{', '.join((*self.positions, *self.inputs))}, in L without inputs times up to two of "
-            f"{', '.join(self.speeds)}; one of R is v**2, abs(v)**a, abs(v) or (abs(v) + v)**2{of}"
+            f"{', '.join(self.speeds)}; one of R is v**2, abs(v)**a, abs(v), "
+            f"(abs(v) + v)**2 or sqrt(v**2 + w**2)**a, a >= 2{of}"
         )
 
 
 _OF_POWER: dict[float, int] = {1: DRY, 2: LINEAR, 3: QUADRATIC}  # of |v| to this power in R
+
+
+def _squared(tree: Expression) -> set[int]:
+    """The coordinates of which a tree is the sum of squares; none of another tree."""
+    if tree.operation == "+":
+        parts = [_squared(part) for part in tree.operands]
+        return set.union(*parts) if all(parts) and not set.intersection(*parts) else set()
+    square = tree.operation == "power" and tree.operands[1] == 2
+    return {_index(tree.operands[0])} - {-1} if square else set()
 
 
 def _side(tree: Expression) -> Expression | None:

@@ -22,7 +22,7 @@ import numpy as np
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import LINEAR
+from gfnn_jax.families.friction import LINEAR
 from gfnn_jax.maps.observation import Hidden
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit

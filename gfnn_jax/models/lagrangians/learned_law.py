@@ -10,7 +10,8 @@ import numpy as np
 from gfnn_jax.data.roles import symbols as code_names
 from gfnn_jax.exports import symbolic
 from gfnn_jax.exports.symbolic import Equation, Formula, equations_of_motion
-from gfnn_jax.families.lagrangian import DRY, Lagrangian
+from gfnn_jax.families.friction import DRY
+from gfnn_jax.families.lagrangian import Lagrangian
 from gfnn_jax.families.text import Term, measured
 from gfnn_jax.fitting.evidence import EVIDENCE, Rival
 from gfnn_jax.maps.laws import law_of_map

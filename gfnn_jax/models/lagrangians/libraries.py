@@ -9,25 +9,27 @@ asks for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import combinations, combinations_with_replacement, permutations
 
 from gfnn_jax.families.expressions import parse, product_of, to_text
-from gfnn_jax.families.lagrangian import (
+from gfnn_jax.families.friction import (
     DRY,
-    INPUTS,
+    ISOTROPIC,
     LINEAR,
     ONE_SIDED,
     POWER,
     QUADRATIC,
+    TABLE,
     UNIFORM,
-    tree_of,
 )
+from gfnn_jax.families.lagrangian import INPUTS, tree_of
 from gfnn_jax.models.lagrangians.structure import SINE, Loss, Row
 
-KINDS = (LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED)
-FRICTIONS = ("linear", "quadratic", "dry", "uniform", "cubic", "one-sided")  # their names
-RARE = (POWER, ONE_SIDED)  # taken only where they explain a record much better than the others do
+KINDS = tuple(range(len(TABLE)))
+FRICTIONS = tuple(kind.name for kind in TABLE)
+RARE = tuple(kind for kind in KINDS if TABLE[kind].rare)
+ALTERNATIVES = ({LINEAR, UNIFORM}, {QUADRATIC, ISOTROPIC})  # of which a law has one by choice
 CUBIC = 3.0  # the power of the speed that is tried
 HIGHEST = 6  # degree of potentials of lengths
 FEW = 3  # coordinates: of more of them a term couples two, for others would be too many
@@ -300,10 +302,12 @@ def modes(dim: int, angles: tuple[int, ...], order: int) -> list[tuple[int, ...]
     return found
 
 
-def losses(dim: int, kinds: tuple[int, ...], width: float) -> list[Loss]:
+def losses(
+    dim: int, kinds: tuple[int, ...], width: float, lengths: Sequence[int] = ()
+) -> list[Loss]:
     """Friction of each coordinate, and of the relative speed of neighbours (a joint); uniform
     friction has no direction. Rare kinds are those of single coordinates, one-sided friction of
-    either side."""
+    either side. Isotropic drag, as |v|², is that of the plane or the space of the ``lengths``."""
     directions = [unit(dim, i) for i in range(dim)]
     of_power = [(c, POWER, CUBIC) for c in directions if POWER in kinds]
     sides = [(tuple(side * i for i in c), ONE_SIDED, 0.0) for c in directions for side in (1, -1)]
@@ -314,11 +318,18 @@ def losses(dim: int, kinds: tuple[int, ...], width: float) -> list[Loss]:
     rows = [
         (c, kind, width if kind == DRY else 0.0)
         for kind in kinds
-        if kind not in (UNIFORM, *RARE)
+        if kind not in (UNIFORM, ISOTROPIC, *RARE)
         for c in directions
     ]
     rows += of_power + sides * (ONE_SIDED in kinds)
+    if ISOTROPIC in kinds and 1 < len(lengths) <= FEW:
+        rows.append((unit(dim, *lengths), ISOTROPIC, 2.0))
     return rows + [((0,) * dim, UNIFORM, 0.0)] * (UNIFORM in kinds)
+
+
+def together(kinds: Collection[int]) -> bool:
+    """Return whether a law may have these kinds of friction beside each other by choice."""
+    return not any(one <= set(kinds) for one in ALTERNATIVES)
 
 
 def opposite(row: Loss) -> Loss | None:

@@ -28,13 +28,8 @@ from gfnn_jax.families.expressions import (
     to_text,
     with_leaves,
 )
-from gfnn_jax.families.lagrangian import (
-    INPUTS,
-    LINEAR,
-    has_inputs,
-    shape_of,
-    tree_of,
-)
+from gfnn_jax.families.friction import LINEAR
+from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
 from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.maps.observation import observed
 from gfnn_jax.models.lagrangians.fit import LawFit

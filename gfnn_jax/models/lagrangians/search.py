@@ -18,13 +18,14 @@ from scipy.optimize import lsq_linear
 
 from gfnn_jax.dataset.stretches import arcs_of
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import LINEAR, UNIFORM, has_inputs, shape_of
+from gfnn_jax.families.friction import ISOTROPIC, LINEAR, UNIFORM
+from gfnn_jax.families.lagrangian import has_inputs, shape_of
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.exchange import may_be_chosen, with_exchanges
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
-from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
-from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, table_of
+from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
+from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, kinds_of, table_of
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.rivals import with_a_shape, with_constant, with_likeliest_power
@@ -112,7 +113,7 @@ def fit_given(given: Given, scale: float, problem: ArcProblem) -> SearchResult:
         p = model.fit.linearised.shortest()
         known = dict(zip(model.fit.structure.keys(), p.tolist(), strict=True))
         model = model._replace(fit=model.fit.again(known=known, rescale=False))
-    tried = frictions_tried(d, options) if given.friction is None else None
+    tried = frictions_tried(problem) if given.friction is None else None
     terms, fit = TermSearch(None, tried), model.fit
     found = terms.along(fit, longer)
     for _ in bounds:
@@ -216,7 +217,7 @@ class TermSearch:
         rows = of(d, problem.angles)
         terms, frictions = (
             libraries.without_forces(rows, shifted),
-            frictions_tried(d, problem.options),
+            frictions_tried(problem),
         )
         inputs, sensors = problem.num_inputs, problem.sensors
         return cls(Structure(d, terms, frictions, problem.turned, inputs, sensors), frictions)
@@ -447,13 +448,19 @@ def with_a_spring(fit: LawFit, angle: int) -> LawFit:
     return fit.again(plainer)
 
 
-def frictions_tried(dim: int, options: SearchOptions) -> tuple[Loss, ...]:
+def frictions_tried(problem: ArcProblem) -> tuple[Loss, ...]:
     """Friction of all the kinds that are asked for, in every direction; of many coordinates, where
     there is a choice, no rare kind, and of two speeds none of their sum."""
-    kinds = tuple(libraries.KINDS[libraries.FRICTIONS.index(k)] for k in options.frictions)
+    dim, options = problem.dim, problem.options
+    kinds = tuple(map(libraries.FRICTIONS.index, options.frictions))
     if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
         kinds = tuple(kind for kind in kinds if kind != UNIFORM)
-    rows = libraries.losses(dim, kinds, 0.0)
+    rows = libraries.losses(dim, kinds, 0.0, problem.lengths)
+    if not options.choose_friction and ISOTROPIC in kinds and ISOTROPIC not in kinds_of(rows):
+        raise InputError(
+            "isotropic friction is that of a plane or of space: expected two or three positions "
+            f"that are no angles, got {len(problem.lengths)}. Give friction of each: quadratic"
+        )
     if dim > libraries.FEW and options.choose_friction:
         return tuple(row for row in rows if row[1] not in libraries.RARE)
     turned = [one for one in map(libraries.opposite, rows) if one is not None]

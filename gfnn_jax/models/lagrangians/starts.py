@@ -19,7 +19,7 @@ from scipy.optimize import minimize_scalar
 
 from gfnn_jax.dataset.stretches import Scales
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.lagrangian import DRY, LINEAR, QUADRATIC
+from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, QUADRATIC
 from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
@@ -75,15 +75,15 @@ class _Library(NamedTuple):
     """Terms of a start. rank: among libraries, the plainest first. apart: without friction between
     coordinates, which with masses below zero imitates a force at right angles to the motion. equal:
     with equal masses of all coordinates, for the weak form makes the equation of one as small as it
-    likes. leaders: coordinates that drive the others and are not moved by them. dry: with dry
-    friction of each coordinate."""
+    likes. leaders: coordinates that drive the others and are not moved by them. rubs: a kind
+    of friction of single coordinates, or of the plane, beside linear friction."""
 
     rows: Sequence[Row]
     rank: int = 0
     apart: bool = False
     equal: bool = False
     leaders: tuple[int, ...] = ()
-    dry: bool = False
+    rubs: int | None = None
 
 
 def best_start(problem: ArcProblem) -> LawFit:
@@ -125,7 +125,9 @@ def best_start(problem: ArcProblem) -> LawFit:
     for degree in (3, 4):
         some.add_bodies(degree)
     some.add_richer(libraries.on_a_surface(d, angles), 3)
-    some.add_dry([textbook, _Library(first, 2)])
+    some.add_rubbing(DRY, [textbook, _Library(first, 2)])
+    if 1 < len(problem.lengths) <= libraries.FEW:
+        some.add_rubbing(ISOTROPIC, [textbook])
     if inputs := problem.num_inputs:
         driven = libraries.driven(d, angles, inputs, problem.squares)
         some.add_richer([*textbook.rows, *driven], 3)
@@ -164,9 +166,10 @@ def leading(problem: ArcProblem) -> list[tuple[int, ...]]:
 
 
 def _is_of(fit: LawFit, structure: Structure) -> bool:
-    """Return whether a fit has the terms and the dry friction of a structure."""
+    """Return whether a fit has the terms of a structure, and its friction that no other start
+    has."""
     parts = (
-        (one.terms, one.leaders, *(row for row in one.friction if row[1] == DRY))
+        (one.terms, one.leaders, *(row for row in one.friction if row[1] in (DRY, ISOTROPIC)))
         for one in (fit.structure, structure)
     )
     return len(set(parts)) == 1
@@ -188,9 +191,9 @@ class _Starts:
         zero: (d,) of angles, from which the fit begins."""
         problem, d = self.problem, self.problem.dim
         friction = tuple(self.linear[:d] if library.apart else self.linear)
-        if library.dry:
-            friction = tuple(libraries.losses(d, (LINEAR, DRY), 0.0))
-            friction = tuple(row for row in friction if sum(map(abs, row[0])) == 1)
+        if library.rubs is not None:
+            friction = libraries.losses(d, (LINEAR, library.rubs), 0.0, problem.lengths)
+            friction = tuple(row for row in friction if min(row[0]) >= 0)
         terms = libraries.without_forces(library.rows, problem.observation.shifts())
         seen = problem
         if zero is not None:
@@ -241,15 +244,16 @@ class _Starts:
             of = libraries.bodies if d <= libraries.FEW else libraries.side_by_side
             self.add(_Library(of(d, (), degree), 2, apart=True, equal=True))
 
-    def add_dry(self, some: Sequence[_Library]) -> None:
-        """Start from plain libraries beside dry friction where the residuals of all starts are more
-        than noise: what stops a body, and holds it, many terms imitate."""
+    def add_rubbing(self, kind: int, some: Sequence[_Library]) -> None:
+        """Start from plain libraries beside a kind of friction where the residuals of all starts
+        are more than noise: what stops a body, and holds it, many terms imitate, and the drag of a
+        plane masses that differ."""
         d = self.problem.dim
         if d > 1 and not self.problem.angles:
             some = [*some, _Library(libraries.bodies(d, (), 3), 2, apart=True, equal=True)]
         for library in some:
             if not self.are_noise and not self.one_valued:
-                self.add(library._replace(dry=True))
+                self.add(library._replace(rubs=kind))
 
     def add_led(self, rows: Sequence[Row], rank: int) -> None:
         """Start from coordinates that drive others and are not moved by them, as a cart whose motor

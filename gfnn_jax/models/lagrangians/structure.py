@@ -23,14 +23,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.lagrangian import (
-    UNIFORM,
-    Friction,
-    Powers,
-    Terms,
-    coordinates_in,
-    functions_of,
-)
+from gfnn_jax.families.friction import UNIFORM, Friction
+from gfnn_jax.families.lagrangian import Powers, Terms, coordinates_in, functions_of
 from gfnn_jax.flows.motion import Form
 
 Row = tuple[Any, ...]  # (k, n, m, φ), then a shape where it has one, and powers of parameters

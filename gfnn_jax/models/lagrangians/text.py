@@ -12,7 +12,8 @@ import numpy as np
 from gfnn_jax.data.recording import Recording, parameters_of
 from gfnn_jax.data.roles import is_wave, symbols
 from gfnn_jax.exports.symbolic import Formula
-from gfnn_jax.families.lagrangian import INPUTS, Friction, Powers, Terms
+from gfnn_jax.families.friction import Friction
+from gfnn_jax.families.lagrangian import INPUTS, Powers, Terms
 from gfnn_jax.families.text import Term, power
 from gfnn_jax.models.lagrangians.structure import powers_of
 

@@ -19,7 +19,8 @@ from scipy.sparse import csr_array
 
 from gfnn_jax.dataset.stretches import Nodes
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction, Terms, functions_of
+from gfnn_jax.families.friction import DRY, LINEAR, Friction
+from gfnn_jax.families.lagrangian import Terms, functions_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.libraries import FEW
