@@ -288,13 +288,15 @@ PIECES = {
     "twins": twins,
     "which": friction_kinds.which,
     "none": friction_kinds.none,
+    "plane": friction_kinds.plane,
 }
 
 
 def tables() -> None:
     """The table of RESULTS.md."""
     found = results(PIECES, "friction")
-    apart, which, none = (found.pop(name, None) for name in ("twins", "which", "none"))
+    others = ("twins", "which", "none", "plane")
+    apart, which, none, plane = (found.pop(name, None) for name in others)
     heads = (
         "system",
         "law",
@@ -325,6 +327,14 @@ def tables() -> None:
         )
     if which is not None and none is not None:
         text += f"\n\n{kinds_found(which['measured'], none['measured'])}"
+    if plane is not None:
+        m = plane["measured"]
+        farthest = max(c["standard_errors"] for c in m["cases"] if c["found"] == c["true"])
+        text += (
+            f"\n\nOf {len(m['cases'])} recordings of x, y with isotropic drag {m['right']} have it "
+            f"alone, its coefficient within {farthest:.2g} standard errors; of {len(m['none'])} "
+            f"without drag {sum('isotropic' in c['found'] for c in m['none'])}."
+        )
     between_markers(TABLES, "friction", text)
 
 

@@ -1,5 +1,5 @@
 """Which friction a simulated recording shows: positions with noise, of systems whose friction is
-known, by an integrator of SciPy."""
+known, by an integrator of SciPy. Numbers of the systems in a plane are drawn at random."""
 
 from __future__ import annotations
 
@@ -139,3 +139,88 @@ def none(quick: bool) -> Numbers:
             cases.append(case(name, (), seed))
             print(f"  {name} without friction: {cases[-1]['text']}", flush=True)
     return {"cases": cases, "reported": sum(bool(c["found"]) for c in cases)}
+
+
+def _thrown(rng: np.random.Generator) -> tuple[Any, list[np.ndarray], float, float, float]:
+    """Acceleration without friction, the runs' states at first, their end and step, and c of the
+    drag c |v| v: of balls that are thrown."""
+    speed, turn = rng.uniform(5, 12, 3), rng.uniform(0.5, 1.2, 3)
+    starts = [
+        np.array([0, 0, v * np.cos(a), v * np.sin(a)]) for v, a in zip(speed, turn, strict=True)
+    ]
+    end = float(1.6 * np.min(speed * np.sin(turn)) / 9.81)
+    return lambda q: np.array([0.0, -9.81]), starts, end, end / 60, rng.uniform(0.02, 0.1)
+
+
+def _around(rng: np.random.Generator, of: Any, size: float) -> Any:
+    """The same of one body about the origin."""
+    angle = rng.uniform(0, 2 * np.pi)
+    out, across = (
+        np.array([np.cos(angle), np.sin(angle)]),
+        np.array([-np.sin(angle), np.cos(angle)]),
+    )
+    start = np.concatenate([rng.uniform(0.9, 1.2) * out, rng.uniform(0.8, 1.05) * across])
+    period = 2 * np.pi
+    return of, [start], 8 * period, period / 40, size * rng.uniform(0.01, 0.05)
+
+
+def _springs(rng: np.random.Generator) -> Any:
+    stiff = np.array([1.0, rng.uniform(1.2, 1.9)])
+    return _around(rng, lambda q: -stiff * q, 1.0)
+
+
+def _orbit(rng: np.random.Generator) -> Any:
+    return _around(rng, lambda q: -q / np.linalg.norm(q) ** 3, 0.3)
+
+
+PLANE = {"thrown balls": _thrown, "springs": _springs, "orbit": _orbit}
+
+
+def drag_case(name: str, seed: int, drag: bool) -> Numbers:
+    """The friction that is found in x, y of a motion with isotropic drag, or without ``drag``."""
+    rng = np.random.default_rng([list(PLANE).index(name), seed])
+    force, starts, end, dt, c = PLANE[name](rng)
+    t, c = np.arange(0, end, dt), c if drag else 0.0
+
+    def rate(_, x):
+        return [*x[2:], *(force(x[:2]) - c * np.hypot(x[2], x[3]) * x[2:])]
+
+    runs = [solve_ivp(rate, (0, t[-1]), x, t_eval=t, rtol=1e-10, atol=1e-12).y[:2] for x in starts]
+    spread = np.std(np.concatenate(runs, axis=1), axis=1)[:, None]
+    tables = []
+    for i, q in enumerate(runs):
+        x, y = q + NOISE * spread * rng.normal(size=q.shape)
+        tables.append({"run": np.full(len(t), str(i)), "t": t, "x": x, "y": y})
+    record = gfnn.Recording(tables, positions=["x", "y"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", gfnn.FitWarning)
+        done = once(lambda: gfnn.fit(record))
+    fit = done.out
+    terms = fit.friction.terms
+    errors = [abs(t.coefficient - c / 3) / t.std for t in terms if t.term.startswith("sqrt(")]
+    return {
+        "system": name,
+        "true": ["isotropic"] * drag,
+        "seed": seed,
+        "found": list(fit.which_friction.kinds),
+        "odds": fit.which_friction.odds,
+        "text": str(fit.which_friction),
+        "formula": fit.formula,
+        "verdict": fit.verdict,
+        "standard_errors": max(errors, default=None),
+        "friction": {t.term: [t.coefficient, t.std] for t in terms},
+        "processor_seconds": done.processor_seconds,
+    }
+
+
+def plane(quick: bool) -> Numbers:
+    """Isotropic drag of three systems in a plane, five draws each, and one of each without."""
+    cases, none = [], []
+    for name in PLANE:
+        for seed in range(1 if quick else 5):
+            cases.append(drag_case(name, seed, True))
+            print(f"  {name}: {cases[-1]['text']}", flush=True)
+        none.append(drag_case(name, 100, False))
+        print(f"  {name} without friction: {none[-1]['text']}", flush=True)
+    right = sum(c["found"] == c["true"] for c in cases)
+    return {"cases": cases, "right": right, "none": none}

@@ -897,3 +897,20 @@ def test_costs_that_are_both_infinite_are_alike():
     one, other = np.array([np.inf, 1.0, 2.0]), np.array([np.inf, 1.0, 2.1])
     assert not Comparison.of(other, one).is_higher()
     assert Comparison.of(np.array([np.inf, np.inf, 2.0]), one).is_higher()
+
+
+def test_the_drag_of_a_body_in_a_plane_is_found_and_given():
+    """One coefficient of |v|³, though without drag neither coordinate moves the other."""
+    t, k, c = np.arange(0, 45, 0.15), np.array([1.0, 1.4]), 0.04
+    q = motion(lambda q, v: -k * q - c * np.hypot(*v) * v, [1.1, 0.3, -0.2, 0.9], t)
+    spread = q.std(axis=1, keepdims=True)
+    q = q + 1e-3 * spread * np.random.default_rng(3).normal(size=q.shape)
+    record = gfnn.Recording({"t": t, "x": q[0], "y": q[1]}, positions=["x", "y"])
+    fit = gfnn.fit(record)
+    (drag,) = fit.friction.terms
+    assert drag.term == "sqrt(x_dot**2 + y_dot**2)**3"
+    assert fit.verdict == "identified"
+    assert abs(drag.coefficient - c / 3) < 4 * drag.std
+    again = gfnn.fit(record, terms=["x**2", "y**2", f"R: {drag.term}"])
+    (same,) = again.friction.terms
+    np.testing.assert_allclose(same.coefficient, drag.coefficient, rtol=1e-4)

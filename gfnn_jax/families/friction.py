@@ -222,13 +222,14 @@ class Friction:
 
     def stiffness(self, v: Any, losses: Any) -> Any:
         """∂²R/∂v∂v at v (..., d), of coefficients ρ (F,) or (..., F): (..., d, d)."""
-        _, curvature, across, bent = self._parts(v)
+        xp, (_, curvature, across, bent) = namespace(v), self._parts(v)
         c, losses, d = self.directions.astype(v.dtype), as_row(losses, curvature), v.shape[-1]
         outer = (c[:, :, None] * c[:, None, :]).reshape(-1, d**2)
         along = matmul(losses * curvature, outer).reshape(*v.shape, d)
         if across is None:
             return along
-        along = along + matmul(losses * across, outer * np.eye(d).ravel()).reshape(along.shape)
+        alone = xp.eye(d, dtype=v.dtype).reshape(1, -1)
+        along = along + matmul(losses * across, outer * alone).reshape(along.shape)
         turned = matmul(losses * bent, outer).reshape(along.shape)
         return along + turned * v[..., :, None] * v[..., None, :]
 
