@@ -82,6 +82,15 @@ def test_an_orbit_that_turns_has_two_powers_of_the_distance():
     assert abs(terms[distance**-2].coefficient + 0.04) < 4 * terms[distance**-2].std
 
 
+def test_a_wheel_with_a_motor_that_swings_has_its_torque():
+    def acceleration(q, v):
+        return -3.0 * np.sin(q) + 0.4 - 0.13 * v
+
+    fit = gfnn.fit(recorded(acceleration, [0.0, 3.0], 24, angles=["x1"]))
+    within_errors(fit.lagrangian, {"v1**2": 0.5, "cos(x1)": 3.0, "x1": 0.4})
+    assert fit.verdict == "identified"
+
+
 def test_a_foucault_pendulum_has_its_field_and_its_hamiltonian():
     turn = 0.1
 

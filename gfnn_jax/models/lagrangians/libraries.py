@@ -254,7 +254,7 @@ def springs(dim: int, angles: Sequence[int]) -> list[Row]:
 
 
 def torques(dim: int, angles: Sequence[int]) -> list[Row]:
-    """Constant torques on angles that turn over: of a motor, on which V falls with every turn."""
+    """Constant torques on angles: of a motor, on which V falls with every turn."""
     return [((0,) * dim, unit(dim, i), (0,) * dim, 0.0) for i in angles]
 
 

@@ -224,10 +224,12 @@ class TermSearch:
 
     def every_beside(self, fit: LawFit) -> Structure:
         """All terms that the law of a fit may come to: of angles of which it has powers, springs
-        too."""
+        too, and torques on angles."""
         assert self.every is not None
-        sprung = [i for i in fit.problem.within_a_turn if fit.structure.has_powers(i)]
-        return self.every.plus([("term", row) for row in libraries.springs(self.every.dim, sprung)])
+        d, within = self.every.dim, fit.problem.within_a_turn
+        rows = libraries.springs(d, [i for i in within if fit.structure.has_powers(i)])
+        rows += libraries.torques(d, fit.problem.angles)
+        return self.every.plus([("term", row) for row in rows])
 
     # From a fit to the law.
 

@@ -95,11 +95,7 @@ def best_start(problem: ArcProblem) -> LawFit:
     """
     d, angles, some = problem.dim, problem.angles, _Starts(problem)
     textbook, first = _Library(libraries.textbook(d, angles)), libraries.first(d, angles)
-    within = problem.within_a_turn
-    pulls = [
-        *libraries.springs(d, within),
-        *libraries.torques(d, [a for a in angles if a not in within]),
-    ]
+    pulls = [*libraries.springs(d, problem.within_a_turn), *libraries.torques(d, angles)]
     every = libraries.every(d, angles)
     some.add(textbook)
     if problem.observation.swing is not None:  # whose sign a sensor may have wrong
