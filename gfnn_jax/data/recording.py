@@ -466,9 +466,10 @@ def read(
 
 def _timed(table: Table, time: str | None) -> Table:
     """The table with this column of times."""
-    if time is not None and time not in table.columns:
-        raise InputError(f"{table.source}: no column {time}, found {', '.join(table.columns)}")
-    return table if time is None else dataclasses.replace(table, time=time)
+    if time is None:
+        return table
+    check_known(table.source, "time", [time], [*table.columns])
+    return dataclasses.replace(table, time=time)
 
 
 def _number(text: str) -> float | None:
@@ -481,11 +482,7 @@ def _number(text: str) -> float | None:
 def _selected(table: Table, columns: tuple[str, ...]) -> Table:
     if not columns:
         return table
-    missing = [name for name in columns if name not in table.columns and name not in table.text]
-    if missing:
-        raise InputError(
-            f"{table.source}: no column {', '.join(missing)}, found {', '.join(table.columns)}"
-        )
+    check_known(table.source, "columns", columns, [*table.columns, *table.text])
     kept = {n: x for n, x in table.columns.items() if n in (*columns, *table.times) or is_run(n)}
     return dataclasses.replace(table, columns=kept)
 

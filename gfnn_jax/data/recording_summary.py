@@ -21,6 +21,7 @@ from gfnn_jax.data.traits import Traits, of_rows, traits
 from gfnn_jax.errors import InputError, said
 from gfnn_jax.signals import energy
 from gfnn_jax.signals.steps import dominant_frequencies, gaps
+from gfnn_jax.storage.outputs import finite
 
 if TYPE_CHECKING:
     from gfnn_jax.data.recording import Recording
@@ -119,11 +120,7 @@ class RecordingSummary:
             "dt_range": [self.steps[0], self.steps[2]],
             "gaps": [{"run": run, "begin": a, "end": b} for run, a, b in self.gaps],
             "columns": {
-                column.name: {
-                    key: list(value) if isinstance(value, tuple) else value
-                    for key, value in dataclasses.asdict(column).items()
-                    if key != "name"
-                }
+                column.name: {key: of for key, of in vars(column).items() if key != "name"}
                 for column in self.columns
             },
             "period": self.period,
@@ -138,7 +135,7 @@ class RecordingSummary:
             "options": dict(self.options),
             "command": self.command,
         }
-        return _without_nan(plain)
+        return finite(plain)
 
     @property
     def read_as(self) -> str:
@@ -178,15 +175,6 @@ class RecordingSummary:
     def _repr_html_(self) -> str:
         screen = self._printed().export_html(inline_styles=True, code_format=_NOTEBOOK)
         return f"{screen}<pre>next: {html.escape(self.call)}</pre>"
-
-
-def _without_nan(value: Any) -> Any:
-    """Plain data, with None for numbers that JSON has not."""
-    if isinstance(value, dict):
-        return {key: _without_nan(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(inner) for inner in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def summarise(

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.data.blocks import damage
-from gfnn_jax.data.columns import resolved
+from gfnn_jax.data.columns import check_known, resolved
 from gfnn_jax.data.roles import is_run, is_time, split_unit
 from gfnn_jax.data.tables import Table, rows_of
 from gfnn_jax.data.texts import text_of
@@ -210,11 +210,7 @@ class TextFile:
         if repeated:
             raise InputError(f"{self.path}: the header names {', '.join(repeated)} twice")
         known = [self.runs[name][0] if self.runs else name for name in names]
-        missing = [name for name in resolved(columns, known) if name not in known]
-        if missing:
-            raise InputError(
-                f"{self.path}: no column {', '.join(missing)}, found {', '.join(names)}"
-            )
+        check_known(str(self.path), "columns", resolved(columns, known), known)
         return tuple(names), units
 
     def _undecorated(self, cells: list[str]) -> list[str]:

@@ -6,10 +6,7 @@ that was learned from a recording has the law's own keys beside them.
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import math
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -18,6 +15,7 @@ import numpy as np
 from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.maps.saved import versions
 from gfnn_jax.solve.status import STATUS_NAMES
+from gfnn_jax.storage.outputs import finite as finite
 
 REPORT, PAGE = "report.json", "report.html"
 STEPS_REPORTED = (1, 10, 100, 1000)
@@ -276,21 +274,3 @@ def status_counts(status) -> dict[str, int]:
 def to_json(report: dict[str, Any]) -> str:
     """Write the report as strict JSON: numbers that are not finite become null."""
     return json.dumps(finite(report), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def finite(value: Any) -> Any:
-    """Copy a tree as dicts, of named tuples and dataclasses too, and lists, also of arrays, with
-    None for numbers that are not finite."""
-    if hasattr(value, "_asdict"):
-        value = value._asdict()
-    elif dataclasses.is_dataclass(value):
-        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    if isinstance(value, (np.generic, np.ndarray, jax.Array)):
-        return finite(np.asarray(value).tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -8,11 +8,13 @@ Nothing here needs JAX, so that a refusal comes at once.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
+import math
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -303,3 +305,19 @@ def _discard(folder: Path) -> None:
     with failures_as_work_errors(folder):
         if (folder / JOB).is_file():  # else it is not ours
             shutil.rmtree(folder)
+
+
+def finite(value: Any) -> Any:
+    """Copy a tree as dicts, of named tuples and dataclasses too, and lists, also of arrays, with
+    None for numbers that are not finite."""
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    elif dataclasses.is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    if hasattr(value, "__array__"):  # of NumPy or JAX
+        return finite(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
