@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,18 +26,42 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.exports.graph import LawGraph
 from gfnn_jax.exports.symbols import Symbol, Tape, literal
 
-# Of series that begin in rows a and b of T, the sums that their k-th coefficients take.
-SUMS = {
-    "product": """\
-static double product(const double *T, int a, int b, int k)
-{
+
+class Sum(NamedTuple):
+    """Σ_j w_j a_j b_{k−j} of the coefficients of two series, j from ``first`` to k or, where
+    ``below``, to k − 1. weight, by: w as C has it, and what C divides the sum by; share: w ÷ k of
+    (j, k, exponent)."""
+
+    first: int
+    below: bool = False
+    weight: str = ""
+    by: str = ""
+    share: Callable[[int, int, float], float] | None = None
+
+    def in_c(self, name: str) -> str:
+        """Write it as a function of series that begin in rows a and b of T."""
+        more = ", double exponent" * ("exponent" in self.weight)
+        return f"""\
+static double {name}(const double *T, int a, int b{more}, int k)
+{{
     double sum = 0.0;
-    for (int j = 0; j <= k; j++)
-        sum += T[a + j]*T[b + k - j];
-    return sum;
+    for (int j = {self.first}; j {"<" if self.below else "<="} k; j++)
+        sum += {self.weight}T[a + j]*T[b + k - j];
+    return sum{self.by};
+}}
+"""
+
+
+SUMS = {
+    "product": Sum(0),
+    "rest": Sum(1),
+    "derived": Sum(1, False, "j*", "/k", lambda j, k, _: j / k),
+    "inner": Sum(1, True, "j*", "/k", lambda j, k, _: j / k),
+    "powered": Sum(
+        1, False, "(exponent*j - (k - j))*", "/(k*T[a])", lambda j, k, e: (e * j - (k - j)) / k
+    ),
 }
-""",
-    "square": """\
+SQUARE = """\
 static double square(const double *T, int a, int k)
 {
     double sum = 0.0;
@@ -46,44 +70,7 @@ static double square(const double *T, int a, int k)
     sum *= 2.0;
     return k % 2 == 0 ? sum + T[a + k/2]*T[a + k/2] : sum;
 }
-""",
-    "rest": """\
-static double rest(const double *T, int a, int b, int k)
-{
-    double sum = 0.0;
-    for (int j = 1; j <= k; j++)
-        sum += T[a + j]*T[b + k - j];
-    return sum;
-}
-""",
-    "derived": """\
-static double derived(const double *T, int a, int b, int k)
-{
-    double sum = 0.0;
-    for (int j = 1; j <= k; j++)
-        sum += j*T[a + j]*T[b + k - j];
-    return sum/k;
-}
-""",
-    "inner": """\
-static double inner(const double *T, int a, int b, int k)
-{
-    double sum = 0.0;
-    for (int j = 1; j < k; j++)
-        sum += j*T[a + j]*T[b + k - j];
-    return sum/k;
-}
-""",
-    "powered": """\
-static double powered(const double *T, int a, int b, double exponent, int k)
-{
-    double sum = 0.0;
-    for (int j = 1; j <= k; j++)
-        sum += (exponent*j - (k - j))*T[a + j]*T[b + k - j];
-    return sum/(k*T[a]);
-}
-""",
-}
+"""
 
 MOVED = """\
 /* z a time t later; whether it is of numbers. */
@@ -102,17 +89,30 @@ static int moved(const double *T, int order, double t, double *z)
     return isfinite(all);
 }
 
-/* The time that terms of these orders reach: the last ones are rounding there. */
-static double reach(const double *T)
+/* A time, or as much of it as terms of all orders reach: the last ones are rounding there. */
+static double reach(const double *T, int order, double left)
 {
     double most = INFINITY;
+    if (order < ORDER)
+        return left;
     for (int k = ORDER - 1; k <= ORDER; k++) {
         double large = 0.0;
         for (int i = 0; i < WIDTH; i++)
             large = fmax(large, fabs(T[i*SIZE + k])/(fabs(T[i*SIZE]) + scale[i]));
         most = fmin(most, pow(ROUNDING/large, 1.0/k));
     }
-    return most;
+    return fabs(left) <= most ? left : left < 0.0 ? -most : most;
+}
+"""
+
+COUNTING = """\
+/* Whether the terms behind order k count, power = h^(k + 1). */
+static int counting(const double *T, int k, double power)
+{
+    for (int i = 0; i < WIDTH; i++)
+        if (!(fabs(T[i*SIZE + k + 1]*power) <= ROUNDING*(fabs(T[i*SIZE]) + scale[i])))
+            return 1;
+    return 0;
 }
 """
 
@@ -128,11 +128,7 @@ static int flow(double *z, double h, const double *u, const double *p)
             T[i*SIZE] = z[i];
         given(T, u, done);
         const int order = series(T, left, p);
-        double step = left;
-        if (order == ORDER) {
-            const double most = reach(T);
-            step = fabs(left) <= most ? left : left < 0.0 ? -most : most;
-        }
+        const double step = reach(T, order, left);
         if (!moved(T, order, step, z))
             return NON_FINITE;
         if (step == left)
@@ -150,16 +146,11 @@ static int series(double *T, double h, const double *p)
     double power = 1.0;
     int small = 0;
     for (int k = 0; k < ORDER; k++) {
-        int counts = 0;
         operations(T, k, p);
-        power *= h;
-        for (int i = 0; i < WIDTH; i++) {
+        for (int i = 0; i < WIDTH; i++)
             T[i*SIZE + k + 1] = T[rates[i] + k]/(k + 1);
-            const double size = fabs(T[i*SIZE]) + scale[i];
-            if (!(fabs(T[i*SIZE + k + 1]*power) <= ROUNDING*size))
-                counts = 1;
-        }
-        small = counts ? 0 : small + 1;
+        power *= h;
+        small = counting(T, k, power) ? 0 : small + 1;
         if (small == 2)
             return k + 1;
     }
@@ -226,7 +217,6 @@ static int series(double *T, double h, int most, const double *p, const double *
             T[(DIM + i)*SIZE] -= directions[j*DIM + i];
     }
     for (int k = 0; k < most; k++) {
-        int counts = 0;
         operations(T, k, p, sigma);
         for (int i = 0; i < WIDTH; i++)
             T[i*SIZE + k + 1] = T[rates[i] + k]/(k + 1);
@@ -242,12 +232,7 @@ static int series(double *T, double h, int most, const double *p, const double *
             }
         }
         power *= h;
-        for (int i = 0; i < WIDTH; i++) {
-            const double size = fabs(T[i*SIZE]) + scale[i];
-            if (!(fabs(T[i*SIZE + k + 1]*power) <= ROUNDING*size))
-                counts = 1;
-        }
-        small = counts ? 0 : small + 1;
+        small = counting(T, k, power) ? 0 : small + 1;
         if (small == 2) {
             operations(T, k + 1, p, sigma);
             return k + 1;
@@ -329,11 +314,7 @@ static int flow(double *z, double h, const double *u, const double *p)
                 break;
         }
         const int order = series(T, left, ORDER, p, sigma, held);
-        double step = left;
-        if (order == ORDER) {
-            const double most = reach(T);
-            step = fabs(left) <= most ? left : left < 0.0 ? -most : most;
-        }
+        double step = reach(T, order, left);
         int event = -1;
         for (int j = 0; j < FRICTIONS; j++) {
             double at = INFINITY;
@@ -586,24 +567,16 @@ class _Rows:
         def pair(i: int, j: int) -> str:
             return f"{self.at(a, i)}*{self.at(b, j)}"
 
-        def weighted(by: Any, terms: Sequence[int]) -> list[str]:
-            return [f"{literal(by(j))}*({pair(j, k - j)})" for j in terms]
-
         if name == "square":
             halves = [pair(j, k - j) for j in range((k + 1) // 2)]
             twice = [f"2.0*({_added(halves)})"] if halves else []
             return f"({_added(twice + ([pair(k // 2, k // 2)] if k % 2 == 0 else []))})"
-        if name == "product":
-            return f"({_added([pair(j, k - j) for j in range(k + 1)])})"
-        if name == "rest":
-            return f"({_added([pair(j, k - j) for j in range(1, k + 1)])})"
-        if name == "derived":
-            return f"({_added(weighted(lambda j: j / k, range(1, k + 1)))})"
-        if name == "inner":
-            return f"({_added(weighted(lambda j: j / k, range(1, k))) or '0.0'})"
-        exponent = float(more[0])
-        terms = weighted(lambda j: (exponent * j - (k - j)) / k, range(1, k + 1))
-        return f"({_added(terms)})/{self.at(a, 0)}"
+        own, exponent = SUMS[name], float(more[0]) if more else 0.0
+        pairs = [(j, pair(j, k - j)) for j in range(own.first, k + 1 - own.below)]
+        if own.share is not None:
+            pairs = [(j, f"{literal(own.share(j, k, exponent))}*({text})") for j, text in pairs]
+        whole = f"({_added([text for _, text in pairs]) or '0.0'})"
+        return f"{whole}/{self.at(a, 0)}" if more else whole
 
 
 def _added(terms: Sequence[str]) -> str:
@@ -654,8 +627,9 @@ def c_of_flow(graph: LawGraph, coefficients: bool = False, unrolled: bool | None
         ["if (k == 0) {", *_indented(zeroth), "    return;", "}", *later],
         [name for name in ("p", "sigma")[: 1 + bool(signed)] if f"{name}[" not in "".join(zeroth)],
     )
-    parts += [text for name, text in SUMS.items() if re.search(rf"\b{name}\(T,", operations)]
-    parts += [MOVED, _given(rows), operations]
+    sums = {name: own.in_c(name) for name, own in SUMS.items()} | {"square": SQUARE}
+    parts += [text for name, text in sums.items() if re.search(rf"\b{name}\(T,", operations)]
+    parts += [MOVED, COUNTING, _given(rows), operations]
     if not rows.count:
         return "\n".join([*parts, SERIES, SMOOTH])
     texts = enumerate(rows.at(limit, 0) for limit in rows.limits)
