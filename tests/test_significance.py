@@ -5,7 +5,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from gfnn_jax.fitting.significance import terms_above_noise
+from gfnn_jax.fitting.evidence import improved
+from gfnn_jax.fitting.significance import matched, of_two, terms_above_noise
 from gfnn_jax.fitting.triangle import Triangle
 
 RNG = np.random.default_rng(0)
@@ -47,3 +48,41 @@ def test_nothing_is_told_where_all_is_noise():
         Triangle.of(np.column_stack([a, RNG.normal(size=ROWS)])), np.zeros(a.shape[1]), CERTAIN
     )
     assert len(kept) == len(values) == 0
+
+
+def test_columns_one_after_another_and_in_pairs_explain_what_their_span_does():
+    a = RNG.normal(size=(50, 6))
+    a /= np.linalg.norm(a, axis=0)
+    b = RNG.normal(size=50)
+
+    def left(places):
+        basis = np.linalg.qr(a[:, list(places)])[0]
+        return np.linalg.norm(b - basis @ (basis.T @ b))
+
+    both = of_two(a.T @ b, a.T @ a, 1e-7)
+    for i, j in combinations(range(6), 2):
+        np.testing.assert_allclose(both[i, j], b @ b - left([i, j]) ** 2)
+    assert not np.diag(both).any()
+    kept, rest = [], np.linalg.norm(b)
+    for place, gain, before in matched(a, b):
+        np.testing.assert_allclose(before, rest)
+        others = set(range(6)) - set(kept)
+        assert left([*kept, place]) <= min(left([*kept, k]) for k in others) + 1e-12
+        kept.append(place)
+        rest = left(kept)
+        np.testing.assert_allclose(before**2 - gain**2, rest**2, atol=1e-12)
+    assert sorted(kept) == list(range(6))
+
+
+def test_changes_are_made_one_after_another_as_long_as_one_is_better():
+    """A model is a set of numbers; it is better without one that is negative."""
+    asked = []
+
+    def changed(model, gone):
+        asked.append(gone)
+        return model - {gone} if gone < 0 else None
+
+    found = improved(frozenset({3, -1, 2, -4}), sorted, changed)
+    assert found == {2, 3}
+    assert asked == [-4, -1, 2, 3]  # what was refused is not asked about again
+    assert improved(frozenset({3, -1, 2, -4}), sorted, changed, 1) == {3, -1, 2}

@@ -7,14 +7,20 @@
   choose what is compared, and decide where one part alone determines a coefficient.
 - Two models whose scale of residuals is found from them have *odds* of (S_A / S_B)^(n/2), n the
   number of independent residuals.
+
+A search among terms makes one change after another, terms that come or go, as long as one of them
+makes a better model (`improved`).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+
+Model = TypeVar("Model")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +35,8 @@ class Evidence:
     standard errors of a difference of held-out costs that chance makes. decided: odds below which
     two models are as good; needed: odds below which a direction of friction is left out. log_odds:
     the largest logarithm of odds that is stated. logarithm: of the ratio of likelihoods, that a
-    model of correlated residuals has to gain.
+    model of correlated residuals has to gain. rise: of the held-out error of pairs, that fewer
+    terms may cost; roundoff: of the spread, an error that is no more.
     """
 
     significant: float = 4.0
@@ -41,11 +48,18 @@ class Evidence:
     needed: float = 3.0
     log_odds: float = 20.0
     logarithm: float = 10.0
+    rise: float = 1.1
+    roundoff: float = 5e-15
 
     @property
     def deciding(self) -> float:
         """The difference of Schwarz's criteria of two models with odds that decide."""
         return 2 * float(np.log(self.decided))
+
+    def is_no_worse(self, error: float, before: float) -> bool:
+        """Return whether a held-out error ÷ spread is that of a model which is as good as the one
+        before."""
+        return error <= max(self.rise * before, self.roundoff)
 
     def odds(self, cost: float, other: float, count: float) -> float:
         """Odds of a model of this held-out sum of squares over another, by ``count`` independent
@@ -93,6 +107,34 @@ class Comparison(NamedTuple):
         """Return whether the model costs more than the other, by more than these standard errors,
         of which infinite costs have none."""
         return not self.apart <= errors * self.error
+
+
+def improved(
+    model: Model,
+    changes: Callable[[Model], Iterable[Any]],
+    changed: Callable[[Model, Any], Model | None],
+    most: float = np.inf,
+) -> Model:
+    """The model that one change after another leads to.
+
+    changes: names those of a model that may make it better, the most promising first. changed: the
+    model after one of them, None where it is no better: that change is not tried again. most: that
+    are tried.
+    """
+    refused, tried = set(), 0
+    while True:
+        for change in changes(model):
+            if change in refused:
+                continue
+            if tried == most:
+                return model
+            tried, other = tried + 1, changed(model, change)
+            if other is not None:
+                model = other
+                break
+            refused.add(change)
+        else:
+            return model
 
 
 def criterion(cost: float, count: float, coefficients: int) -> float:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import takewhile
 
 import numpy as np
 
+from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.fitting.gauss_newton import ROUNDOFF
 from gfnn_jax.fitting.triangle import Triangle
 
 # Standard errors. A term that is smaller than the first is noise (a larger one is so by chance once
 # in 16,000); what a message states as certain is larger than the second (once in 1.7 million).
-ABOVE_NOISE, CERTAIN = 4.0, 5.0
+ABOVE_NOISE, CERTAIN = EVIDENCE.significant, 5.0
 NULL = 1e-10  # of a term's size; one closer to the span of those before it is not known apart
 
 
@@ -25,14 +27,19 @@ def null_terms(family, z, tolerance: float = NULL, *, args=None) -> tuple[list[i
     kept: list[int] = []
     basis = np.zeros((len(scaled), 0))
     for j in range(scaled.shape[1]):
-        rest = scaled[:, j]
-        for _ in range(2):  # the second time makes it orthogonal to roundoff
-            rest = rest - basis @ (basis.T @ rest)
+        rest = beside(basis, scaled[:, j])
         distance = np.linalg.norm(rest)
         if np.isfinite(distance) and distance > tolerance and basis.shape[1] < len(scaled):
             kept.append(j)
             basis = np.column_stack([basis, rest / distance])
     return kept, sorted(set(range(scaled.shape[1])) - set(kept))
+
+
+def beside(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Columns (n, m), or one (n,), without what an orthonormal basis (n, k) spans of them."""
+    for _ in range(2):  # the second time makes them orthogonal to roundoff
+        columns = columns - basis @ (basis.T @ columns)
+    return columns
 
 
 def significant(
@@ -47,6 +54,21 @@ def significant(
     return _eliminated(problem, np.arange(len(coefficients)), coefficients, threshold * noise)
 
 
+def at_thresholds(
+    triangle: Triangle,
+    coefficients: np.ndarray,
+    thresholds: Sequence[float],
+    rms: float | None = None,
+) -> Iterator[list[int]]:
+    """Iterate over the sets of terms, neither all nor none, that are left by thresholds in turn, as
+    `significant`, each set once."""
+    found: list[list[int]] = [[], list(range(len(coefficients)))]
+    for threshold in thresholds:
+        found.append(significant(triangle, coefficients, threshold, rms)[0].tolist())
+        if found[-1] not in found[:-1]:
+            yield found[-1]
+
+
 def terms_above_noise(
     triangle: Triangle, coefficients: np.ndarray, threshold: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -59,9 +81,11 @@ def terms_above_noise(
     """
     problem = triangle.rebased(coefficients)
     limit = threshold * _noise(triangle, len(coefficients), None)
+    ahead = matched(problem.factor[:, :-1], problem.factor[:, -1])
+    first = sorted(place for place, gain, _ in takewhile(lambda one: one[1] > limit, ahead))
     found = [
         _eliminated(problem, kept, coefficients[kept], limit)
-        for kept in (np.arange(len(coefficients)), _matched(problem.factor, limit))
+        for kept in (np.arange(len(coefficients)), np.array(first, int))
     ]
 
     def cost(found: tuple[np.ndarray, np.ndarray]) -> float:
@@ -88,25 +112,31 @@ def _noise(triangle: Triangle, count: int, rms: float | None) -> float:
     return max(unexplained, ROUNDOFF) * np.sqrt(rows / max(rows - count, 1))
 
 
-def _matched(factor: np.ndarray, limit: float) -> np.ndarray:
-    """The columns of [A b] that explain b one after another, whichever explains the most, until the
-    next explains less than ``limit``."""
-    columns, left = factor[:, :-1].copy(), factor[:, -1].copy()
+def matched(
+    columns: np.ndarray, target: np.ndarray, null: float = NULL
+) -> Iterator[tuple[int, float, float]]:
+    """Iterate over the columns (n, m) that explain the target (n,) one after another, whichever
+    explains the most: its place, how much of what is left it explains, and how much is left. null:
+    of a column's size, below which those before explain it."""
     size = np.linalg.norm(columns, axis=0)
-    kept: list[int] = []
-    while len(kept) < columns.shape[1]:
+    for _ in size:
         rest = np.linalg.norm(columns, axis=0)
-        known = rest > NULL * size
-        known[kept] = False
-        gain = np.where(known, np.abs(left @ columns) / np.where(known, rest, 1.0), 0.0)
+        known = rest > null * size
+        gain = np.where(known, np.abs(target @ columns) / np.where(known, rest, 1.0), 0.0)
         best = int(np.argmax(gain))
-        if not gain[best] > limit:
-            break
-        kept.append(best)
-        direction = columns[:, best] / rest[best]
-        left -= direction * (direction @ left)
-        columns -= np.outer(direction, direction @ columns)
-    return np.sort(np.array(kept, int))
+        yield best, gain[best], np.linalg.norm(target)
+        unit = columns[:, best] / max(rest[best], 1e-300)
+        target, columns = target - unit * (unit @ target), columns - np.outer(unit, unit @ columns)
+        columns[:, best] = 0.0
+
+
+def of_two(along: np.ndarray, cosines: np.ndarray, null: float) -> np.ndarray:
+    """(m, m) of the square of a target what two columns explain together; 0 where one imitates the
+    other but for the share ``null`` of its square. along: (m,) the target's parts along columns of
+    unit length."""
+    free = 1 - cosines**2
+    both = along**2 + along[:, None] ** 2 - 2 * np.outer(along, along) * cosines
+    return np.where(free > null, both / np.where(free > null, free, 1.0), 0.0)
 
 
 def _eliminated(

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.brackets import Bracket, standard_constants
+from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.models.brackets.algebra import changed
 from gfnn_jax.models.brackets.poisson_field import PoissonField
 from gfnn_jax.solve.latent_arcs import (
@@ -29,8 +30,6 @@ class Options:
     most_substeps: int = 16
     nodes: int = 64  # of an arc, at most
     used: float = 0.8  # part of the states, at least, that an arc's length may leave in use
-    # standard errors of a coefficient that stays
-    significant: float = 4.0
     # distance of a constant of the bracket from a whole number that it may be, and the rise of
     # χ² for each that is made one
     near: float = 0.02
@@ -170,7 +169,7 @@ def fit_arcs(
         count = field.num
         errors = np.sqrt(np.sum(_root(fitted)[:, :count] ** 2, axis=0))
         strength = np.abs(fitted.p[:count]) / np.maximum(errors, 1e-300)
-        weak = np.sum(strength <= OPTIONS.significant)
+        weak = np.sum(strength <= EVIDENCE.significant)
         kept = np.sort(np.argsort(strength)[(weak + 1) // 2 :])
         if len(kept) == count or not np.any(kept < field.library.num_parameters):
             break

@@ -25,12 +25,13 @@ from gfnn_jax.families.family import at_time
 from gfnn_jax.families.sums import Sums, matrix_free
 from gfnn_jax.families.terms import Terms, joined, multiplied
 from gfnn_jax.fitting import least_squares, uncertainty
+from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.fitting.least_squares import ROWS_PER_TERM
 from gfnn_jax.fitting.linear_starts import fitted_gradients
 from gfnn_jax.fitting.significance import (
     ABOVE_NOISE,
+    at_thresholds,
     null_terms,
-    significant,
     terms_above_noise,
 )
 from gfnn_jax.fitting.triangle import Triangle
@@ -48,9 +49,6 @@ class Options:
     most_terms: int = 500
     # standard errors below which terms go, tried in turn
     thresholds: tuple[float, ...] = (10000.0, 1000.0, 100.0, 30.0, 10.0)
-    # of the held-out error that this may cost
-    rise: float = 1.1
-    rounding: float = 1e-15
     # numbers of training pairs that sites are fitted to: no more are needed
     structured_rows: int = 50_000
     null_rows: int = 4000  # of them, which tell whose gradients are combinations of others
@@ -301,16 +299,13 @@ def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance, noisy: bool) -> _
     terms = (piece.family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
     residual = terms @ piece.params - (target * weight).ravel()
     triangle = Triangle.of(np.column_stack([terms, residual]))
-    tried: set[int] = set()
-    remaining_terms, thresholds = (
-        (terms_above_noise, (ABOVE_NOISE,)) if noisy else (significant, OPTIONS.thresholds)
-    )
-    for threshold in thresholds:
-        kept, _ = remaining_terms(triangle, piece.params, threshold)
-        if not 0 < len(kept) < piece.family.num_parameters or len(kept) in tried:
-            continue
-        tried.add(len(kept))
-        found = _fitted(piece.chart, piece.family.take(kept.tolist()), data, tolerance)
-        if found.error.relative <= max(OPTIONS.rise * full.error.relative, OPTIONS.rounding):
+    c = np.asarray(piece.params)
+    sets = at_thresholds(triangle, c, OPTIONS.thresholds)
+    if noisy:
+        few = terms_above_noise(triangle, c, ABOVE_NOISE)[0].tolist()
+        sets = [few] if 0 < len(few) < len(c) else []
+    for kept in sets:
+        found = _fitted(piece.chart, piece.family.take(kept), data, tolerance)
+        if EVIDENCE.is_no_worse(found.error.relative, full.error.relative):
             return found
     return full

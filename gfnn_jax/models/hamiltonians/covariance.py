@@ -20,6 +20,7 @@ from gfnn_jax.families.sums import Sums
 from gfnn_jax.families.terms import Terms, multiplied
 from gfnn_jax.families.told import Constrained
 from gfnn_jax.fitting import least_squares, uncertainty
+from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.flows.collocation import Steps
@@ -121,8 +122,7 @@ class _Residuals:
         largest that the rows tell. generators: by rising size. states: the residual's derivatives
         and which pairs go on, as `uncertainty.scores` takes them. None where the rows are too few.
 
-        1 where K explains no more than it would of noise, by ``explained`` standard errors: an F
-        test.
+        1 where K explains no more than it would of noise, by two standard errors: an F test.
         """
         data, z, width = self.data, self.images, self.residual.shape[1]
         most = min(len(self.rows) * width // OPTIONS.sampled_rows, OPTIONS.most_terms)
@@ -152,7 +152,7 @@ class _Residuals:
 
 def _certain(part: float, count: int, rows: int) -> float:
     """The part of a mean square that ``count`` terms leave, 1 where that may be by chance."""
-    by_chance = OPTIONS.explained * np.sqrt(2 * count) / rows
+    by_chance = EVIDENCE.chance * np.sqrt(2 * count) / rows
     return part if part < 1 - by_chance else 1.0
 
 

@@ -11,13 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import combinations_with_replacement
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.fitting.significance import significant
+from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.problem import OPTIONS, LawProblem
@@ -39,13 +41,13 @@ def lagrangian_of(
     family = Legendre(library(dim, angles))
     if problem.options.rows_per_lagrangian_term * family.num_parameters > len(rows) * dim:
         return None
-    start = _start(family, problem.flows, rows)
+    start, none = _start(family, problem.flows, rows), np.zeros(family.num_parameters)
     last = None
     for share in (*problem.options.shares, 0.0):
-        kept, few = start.large(share)
+        kept, few = significant(start, none, 1.0, share * start.norm / np.sqrt(start.rows))
         if last is not None and len(kept) == last.family.num_parameters:
             continue
-        last = _fitted(problem, family.take(kept), few, forces)
+        last = _fitted(problem, family.take(kept.tolist()), few, forces)
         if problem.met_by(last):
             break
     return last
@@ -81,29 +83,9 @@ def library(dim: int, angles: tuple[int, ...]) -> Terms:
     return Terms.of([*masses, *(row for row in potentials if any(row[1]) or any(row[2]))], dim)
 
 
-class _Start(NamedTuple):
-    """The linear problem of the coefficients of L: matrix (n, P), target (n,)."""
-
-    matrix: np.ndarray
-    target: np.ndarray
-
-    def large(self, share: float) -> tuple[list[int], np.ndarray]:
-        """The terms that make at least this share of the target, the others solved for again when
-        the smallest goes, and their coefficients."""
-        kept = np.arange(self.matrix.shape[1])
-        size = np.linalg.norm(self.matrix, axis=0)
-        least = share * np.linalg.norm(self.target)
-        while True:
-            scaled = self.matrix[:, kept] / size[kept]
-            made = np.linalg.lstsq(scaled, self.target, rcond=1e-8)[0]
-            smallest = int(np.argmin(abs(made)))
-            if abs(made[smallest]) >= least or len(kept) == 1:
-                return kept.tolist(), made / size[kept]
-            kept = np.delete(kept, smallest)
-
-
-def _start(family: Legendre, problem: Problem, rows) -> _Start:
-    """Coefficients of L from p = ∂L/∂v and ṗ = ∂L/∂q in the middle of these pairs."""
+def _start(family: Legendre, problem: Problem, rows) -> Triangle:
+    """The triangle of the coefficients of L, from 0, by p = ∂L/∂v and ṗ = ∂L/∂q in the middle of
+    these pairs."""
     z0, z1, (dt, _) = problem.z0[rows], problem.z1[rows], problem.given(rows)
     q, p = split(0.5 * (z0 + z1))
     v, force = split((z1 - z0) / dt)
@@ -114,5 +96,4 @@ def _start(family: Legendre, problem: Problem, rows) -> _Start:
     design = np.concatenate([c / s for c, s in zip(columns, sizes, strict=True)], axis=0)
     matrix = np.moveaxis(design, 1, 2).reshape(-1, family.num_parameters)
     target = np.concatenate([p / sizes[0], force / sizes[1]]).ravel()
-    factor = np.linalg.qr(np.column_stack([matrix, target])).R
-    return _Start(factor[:, :-1], factor[:, -1])
+    return Triangle.of(np.column_stack([matrix, -target]))

@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -31,7 +32,13 @@ from gfnn_jax.families.terms import Terms
 from gfnn_jax.families.told import anything_told
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.linear_starts import forward_start, log_start, midpoint_start
-from gfnn_jax.fitting.significance import ABOVE_NOISE, null_terms, significant
+from gfnn_jax.fitting.significance import (
+    ABOVE_NOISE,
+    beside,
+    matched,
+    null_terms,
+    significant,
+)
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Steps, of_lanes
 from gfnn_jax.flows.rates import rates
@@ -48,7 +55,6 @@ class GrowthOptions:
 
     boxes: (order, degree) of the first library, the largest that has at most ``box`` modes and for
     which there are rows enough.
-    significant: standard errors that a mode must have to come in or to stay.
     weighty: of the heaviest candidate's, below which one waits for the next round.
     pairs: that the rounds look at, and rows that each of its modes needs.
     null: of a column's size, below which the other modes explain a candidate.
@@ -59,7 +65,6 @@ class GrowthOptions:
 
     boxes: tuple[tuple[int, int], ...] = ((2, 2), (1, 2), (1, 1))
     box: int = 250
-    significant: float = 4.0
     weighty: float = 0.2
     pairs: int = 600
     rows_per_mode: float = 4.0
@@ -140,7 +145,7 @@ def grow(
             ended = "the training pairs meet the tolerance"
             break
         before = present
-        solved, rest, span = looked.solved(OPTIONS.significant)
+        solved, rest, span = looked.solved(ABOVE_NOISE)
         room = most - len(solved)
         gain = np.linalg.norm(rest) / np.linalg.norm(looked.residual)
         # What a long step leaves over is curvature, which asks for any mode.
@@ -237,29 +242,20 @@ class _Linearised:
             order = np.argsort(-np.abs(rest @ columns), kind="stable")[: OPTIONS.shortlist]
             columns, heaviest = columns[:, order], heaviest[order]
         chosen, least = [], 0.0
-        size = np.linalg.norm(columns, axis=0)
-        while len(chosen) < min(room, OPTIONS.at_once, columns.shape[1]):
-            left = np.linalg.norm(columns, axis=0)
-            new = left > OPTIONS.null * size
-            weights = np.abs(rest @ columns) / np.where(new, left, np.inf)
-            weights *= degrees / np.linalg.norm(rest)
-            j = int(np.argmax(weights))
-            least = least or max(OPTIONS.significant, OPTIONS.weighty * weights[j])
-            if not weights[j] >= least:
+        ahead = matched(columns, rest, OPTIONS.null)
+        for j, gain, left in islice(ahead, min(room, OPTIONS.at_once)):
+            weight = gain * degrees / left
+            least = least or max(ABOVE_NOISE, OPTIONS.weighty * weight)
+            if not weight >= least:
                 break
             chosen.append(tried[heaviest[j]])
-            unit = columns[:, j] / left[j]
-            columns = columns - np.outer(unit, unit @ columns)
-            rest = rest - unit * (unit @ rest)
         return chosen
 
     def _beside(self, span, modes: list[Mode], null: float) -> np.ndarray:
         """The derivatives in the coefficients of these modes without what ``span`` explains, each
         column of length 1, or 0 where nothing is left."""
         columns = self._columns(self._images(self._basis.terms(modes)).by_coefficient)
-        size = np.linalg.norm(columns, axis=0)
-        for _ in range(2):  # the second time makes them orthogonal to roundoff
-            columns = columns - span @ (span.T @ columns)
+        size, columns = np.linalg.norm(columns, axis=0), beside(span, columns)
         left = np.linalg.norm(columns, axis=0)
         good = np.isfinite(left) & (left > null * size)
         return np.where(good, columns / np.where(good, left, 1.0), 0.0)

@@ -35,9 +35,7 @@ class LawOptions:
     rows_per_lagrangian_term: pairs times degrees of freedom that one of L needs.
     rows_compared: per term, on which libraries are compared; all pairs only count in the last fit.
     thresholds: standard errors below which terms go, tried in turn.
-    rise: of the held-out error that dropping terms may cost; rounding: below which it is roundoff.
     flat: libraries one after the other whose errors differ by less have met the pairs' noise.
-    explained: standard errors of the part of a residual that is noise, within which all of it is.
     gained: a library that lowers the error by less has not helped; gained_alone: where
     noise hides what it brings. poor: such libraries in a row
     that end the search; poor_given: of a user's terms; poor_structured: of a structure, whose
@@ -83,10 +81,7 @@ class LawOptions:
     rows_per_lagrangian_term: float = 2.0
     rows_compared: float = 12.0
     thresholds: tuple[float, ...] = (1e4, 1e3, 100.0, 30.0, 10.0, 5.0, 3.0)
-    rise: float = 1.1
-    rounding: float = 5e-15
     flat: float = 1.2
-    explained: float = 2.0
     gained: float = 0.5
     gained_alone: float = 0.8
     poor: int = 2

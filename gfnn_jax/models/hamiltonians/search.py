@@ -25,8 +25,9 @@ from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.modes import Modes
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.families.told import Constrained
+from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.fitting.linear_starts import backwards, tangent, turns
-from gfnn_jax.fitting.significance import ABOVE_NOISE, significant, terms_above_noise
+from gfnn_jax.fitting.significance import ABOVE_NOISE, at_thresholds, terms_above_noise
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
 from gfnn_jax.models.hamiltonians.covariance import covariance_root
 from gfnn_jax.models.hamiltonians.dictionary import law_of_physics, law_of_sequences
@@ -192,8 +193,8 @@ def _along_sequences(problem: LawProblem, best: FittedLaw) -> FittedLaw:
     with work.optional(what), work.again(what, best.family, len(rows)):
         if best.error.relative <= problem.options.roundoff:
             return best
-        found, rise = fitted_to_sequences(problem, best), problem.options.rise
-        better = found is not None and found.error.relative <= rise * best.error.relative
+        found, before = fitted_to_sequences(problem, best), best.error.relative
+        better = found is not None and EVIDENCE.is_no_worse(found.error.relative, before)
         return found if found is not None and better else best
     return best
 
@@ -206,7 +207,8 @@ def without_noise(problem: LawProblem, smallest: FittedLaw) -> FittedLaw:
     found, few = _significant(problem, smallest), None
     if found is not None:
         found = problem.refitted(found, rows)
-    if found is None or not found.error.relative <= problem.options.rise * smallest.error.relative:
+    before = smallest.error.relative
+    if found is None or not EVIDENCE.is_no_worse(found.error.relative, before):
         found = problem.refitted(smallest, rows)
     if smallest.larger is not None:
         few = _significant(problem, smallest.larger)
@@ -238,22 +240,15 @@ def _significant(problem: LawProblem, full: FittedLaw) -> FittedLaw | None:
 
 def sparse(problem: LawProblem, full: FittedLaw) -> FittedLaw:
     """Drop the terms that the pairs do not ask for, as far as the held-out error allows."""
-    options, count, before = problem.options, full.family.num_parameters, full.error.relative
-    tried: set[tuple[int, ...]] = set()
+    options, before, fit = problem.options, full.error.relative, full.fit
     thresholds = options.thresholds if full.thresholds is None else full.thresholds
-    fit = full.fit
-    for threshold in thresholds:
-        kept = tuple(significant(fit.triangle, fit.coefficients, threshold, fit.rms)[0].tolist())
-        if len(kept) == count:
-            break
-        if not kept or kept in tried:
-            continue
-        tried.add(kept)
+    count = len(fit.coefficients)
+    for kept in at_thresholds(fit.triangle, fit.coefficients, thresholds, fit.rms):
         problem.on_progress(f"H: {len(kept)} of {count} terms")
-        start, family = fit.coefficients[list(kept)], full.family.take(kept)
+        start, family = fit.coefficients[kept], full.family.take(kept)
         few = problem.fitted(family, start, fit.used, rounds=False, steps=fit.steps)
         after = few.error.relative
-        if after <= max(options.rise * before, options.rounding):
+        if EVIDENCE.is_no_worse(after, before):
             dropped = Dropped(count - len(kept), before, after)
             change = f"error {after:.2e}, before {before:.2e}"
             problem.on_progress(f"H without {dropped.terms} terms: {change}")

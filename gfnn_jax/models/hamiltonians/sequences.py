@@ -23,6 +23,7 @@ from gfnn_jax.dataset.rows import of_differences
 from gfnn_jax.dataset.runs import Arcs, arcs_of_pairs, onward, steps_between
 from gfnn_jax.dataset.split import Split
 from gfnn_jax.errors import InputError
+from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_above_noise
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.collocation import Images, Steps, images
@@ -61,7 +62,7 @@ class SequenceOptions:
     rise: of the held-out arcs' noise, by chance. rows_per_term: measured numbers for each term from
     which on a law that held-out sequences have borne out is fitted to these too: what judges it
     then is off by less than 1 / 200 of the noise's variance. in_a_row: times the noise, below which
-    neighbours of a state that stands alone stay. Misfit is certain beyond ``by_chance`` standard
+    neighbours of a state that stands alone stay. Misfit is certain beyond two standard
     errors of the arcs' variation, and ``clear`` of that of noise, which alone varies by a quarter.
     """
 
@@ -83,7 +84,6 @@ class SequenceOptions:
     rise: float = 1.01
     rows_per_term: float = 200.0
     in_a_row: float = 2.5
-    by_chance: float = 2.0
     clear: float = 0.5
 
 
@@ -474,7 +474,7 @@ def _misfit(scores: np.ndarray) -> tuple[float, bool]:
     arcs, count = scores.shape
     each = np.sum(scores**2, axis=1) / count
     misfit = max(float(each.sum()) / max(1 - count / arcs, 1 / arcs) - 1.0, 0.0)
-    by_chance = OPTIONS.by_chance * float(np.sqrt(arcs) * each.std())
+    by_chance = EVIDENCE.chance * float(np.sqrt(arcs) * each.std())
     return misfit, misfit > max(OPTIONS.clear, by_chance)
 
 

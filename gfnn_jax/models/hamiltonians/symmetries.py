@@ -16,6 +16,7 @@ import numpy as np
 
 from gfnn_jax.diagnosis.symmetries import generators, reflections
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.phase_space import symplectic_form
 
 
@@ -24,15 +25,13 @@ class SymmetryOptions:
     """Chosen on the laws of benchmarks/textbook.py and textbook_noise.py.
 
     holds: of the restriction's parts, that a symmetry leaves over. states: at which it is tried.
-    allowed: standard errors by which a symmetry may move a coefficient; digits: of a coefficient,
-    by which it may always move. known: of a number's size, or of the largest variance, an error
-    below it is none. null: of the largest restriction, below it a combination of terms has the
-    symmetry.
+    digits: of a coefficient, by which a symmetry may always move it. known: of a number's size, or
+    of the largest variance, an error below it is none. null: of the largest restriction, below it a
+    combination of terms has the symmetry.
     """
 
     holds: float = 1e-10
     states: int = 200
-    allowed: float = 4.0
     digits: float = 1e-14
     known: float = 1e-12
     null: float = 1e-8
@@ -78,7 +77,7 @@ def imposed(
     size = np.where(c != 0, np.abs(c), 1.0)
     rows = np.concatenate([_independent(found, c) for _, found in held]) * size
     moved = c - size * (np.linalg.pinv(rows, rcond=OPTIONS.null) @ (rows @ (c / size)))
-    most = np.maximum(OPTIONS.allowed * deviations, OPTIONS.digits * np.abs(c))
+    most = np.maximum(EVIDENCE.significant * deviations, OPTIONS.digits * np.abs(c))
     return moved if np.all(np.abs(moved - c) <= most) else c
 
 

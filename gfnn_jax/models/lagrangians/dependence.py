@@ -41,7 +41,7 @@ from gfnn_jax.models.lagrangians.search import (
     SearchResult,
     TermSearch,
     search,
-    to_arcs_of_periods,
+    to_longest_arcs,
 )
 from gfnn_jax.models.lagrangians.starts import no_law
 from gfnn_jax.models.lagrangians.structure import Key, Structure, with_powers
@@ -185,7 +185,8 @@ def _fitted(problem: ArcProblem, places: Sequence[int], structure: Structure) ->
         known = weak_start(dataclasses.replace(structure, zeros=()), own, prune=False)[1]
     except FitError:
         return None
-    fit = to_arcs_of_periods(own, structure, known)
+    first, *longer = own.options.periods
+    fit = to_longest_arcs(own.fit(structure, known, own.arcs(first), own.scales.sigma), longer)
     return fit if fit.follows else None
 
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from gfnn_jax.families.text import in_letters
 from gfnn_jax.fitting.evidence import Comparison, criterion
+from gfnn_jax.fitting.significance import of_two
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.friction_choice import is_coupled, kinds_of
 from gfnn_jax.models.lagrangians.libraries import FEW, RARE, together
@@ -120,8 +121,8 @@ def _compared(other: LawFit, fit: LawFit) -> Exchanged | None:
     """A fit beside another one; None where it is no law: M is not positive, or friction drives."""
     if not (may_be_chosen(other) and other.is_definite):
         return None
-    theirs, ours = (criterion(f.fitted.cost, fit.independent, len(f.p)) for f in (other, fit))
-    return Exchanged(other, theirs - ours - _for_fewer(fit, len(other.p)))
+    above = other.criterion(fit.independent) - fit.criterion()
+    return Exchanged(other, above - _for_fewer(fit, len(other.p)))
 
 
 def _for_fewer(fit: LawFit, count: int) -> float:
@@ -137,7 +138,7 @@ def _holds(other: LawFit, fit: LawFit) -> bool:
     if other is fit:
         return True
     theirs = fit.cross_validate(other.structure, other.values)
-    return not Comparison.of(theirs, fit.cross_validate()).is_higher()
+    return not Comparison.of(theirs, fit.costs).is_higher()
 
 
 def rivals(fit: LawFit, every: Structure) -> list[Exchanged]:
@@ -305,10 +306,7 @@ class _Screen:
     ) -> dict[tuple[int, int], float]:
         """The pairs that explain most, and the sum of squares that each explains."""
         apart = self._products[np.ix_(some, some)] - shared.T @ shared
-        apart /= np.outer(size, size)  # cosines
-        two = -2 * np.outer(along, along) * apart + along**2 + along[:, None] ** 2
-        two /= np.maximum(1 - apart**2, OPTIONS.imitated**2)
-        np.fill_diagonal(two, 0.0)
+        two = of_two(along, apart / np.outer(size, size), OPTIONS.imitated**2)
         rows = _largest(two.max(axis=1, initial=0.0), 2 * OPTIONS.screened)
         i, j = np.divmod(_largest(two[rows].ravel(), 2 * OPTIONS.screened), max(len(some), 1))
         pairs = {(min(one), max(one)) for one in zip(rows[i], j, strict=True) if np.ptp(one)}

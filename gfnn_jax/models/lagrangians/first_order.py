@@ -18,7 +18,7 @@ import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs
 from gfnn_jax.families.text import added, digits, power
-from gfnn_jax.fitting.evidence import criterion
+from gfnn_jax.fitting.evidence import EVIDENCE, criterion
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.significance import significant
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
@@ -31,18 +31,15 @@ class FirstOrderOptions:
     """Options of the rival (`benchmarks/any_record.py`, one orbit).
 
     degree: of the polynomials f, at most. columns: of them at most. as_well: times the law's
-    residual, up to which the rival's is another draw of the noise. significant: standard errors of
-    a term that stays. rate: largest h‖f'‖ of a Runge–Kutta step; most: of them between nodes.
-    decided: of twice the logarithm of the odds of the law, above which it alone is named.
+    residual, up to which the rival's is another draw of the noise. rate: largest h‖f'‖ of a
+    Runge–Kutta step; most: of them between nodes.
     """
 
     degree: int = 3
     columns: int = 60
     as_well: float = 1.1
-    significant: float = 4.0
     rate: float = 0.3
     most: int = 8
-    decided: float = 6.0
 
 
 OPTIONS = FirstOrderOptions()
@@ -200,7 +197,7 @@ def _pruned(found: FirstOrder, arcs: Arcs, sigma: np.ndarray, most: np.ndarray) 
     """The field without terms that are not significant, close to the fit."""
     while True:
         model, near = found.model, Linearised.of_arcs(found.fitted)
-        kept, p = significant(near.triangle, near.p, OPTIONS.significant, 1.0)
+        kept, p = significant(near.triangle, near.p, EVIDENCE.significant, 1.0)
         if not 0 < len(kept) < len(near.p):
             return found
         smaller = dataclasses.replace(model, places=model.places[kept])
@@ -245,7 +242,7 @@ def rival(fit: LawFit, names: tuple[str, ...]) -> str:
     numbers = len(found.fitted.p) + d * parts, len(fit.p) + 2 * d * parts
     costs = [np.exp(2 * np.mean(np.log(rms))) for rms in (found.rms, own)]
     unlikely, likely = (criterion(c, n, k) for c, k in zip(costs, numbers, strict=True))
-    if unlikely - likely > OPTIONS.decided:
+    if unlikely - likely > EVIDENCE.deciding:
         return ""
     return (
         "first order or mechanical: along this record the positions determine the velocities, and "

@@ -12,7 +12,7 @@ import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs, Nodes, Scales, arcs_of, with_noise, with_states
 from gfnn_jax.families.lagrangian import INPUTS
-from gfnn_jax.fitting.evidence import EVIDENCE, Evidence, correlation_time
+from gfnn_jax.fitting.evidence import EVIDENCE, Evidence, correlation_time, criterion
 from gfnn_jax.fitting.linearised import Linearised, without_each
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.motion import Form
@@ -406,6 +406,11 @@ class LawFit:
         """The number of residuals that are independent."""
         return np.count_nonzero(np.isfinite(self.arcs.y)) / self.correlation
 
+    def criterion(self, independent: float | None = None) -> float:
+        """Schwarz's criterion of its coefficients, by so many independent residuals; None: its
+        own."""
+        return criterion(self.fitted.cost, independent or self.independent, len(self.p))
+
     @functools.cached_property
     def is_definite(self) -> bool:
         """Return whether M is positive definite at all states, and not nearly singular: else there
@@ -587,6 +592,11 @@ class LawFit:
             some = self.again(structure, known, arcs.take(third != k), rescale=False)
             costs[third == k] = some.held_out(arcs.take(third == k))
         return costs
+
+    @functools.cached_property
+    def costs(self) -> np.ndarray:
+        """Held-out cost (A,) of each arc."""
+        return self.cross_validate()
 
     def without_thirds(self) -> list[FoldFit]:
         """The fit without each third of the record, by one Gauss–Newton step from that to all of

@@ -40,7 +40,7 @@ import numpy as np
 
 from gfnn_jax.families.friction import ISOTROPIC, LINEAR, UNIFORM, Friction
 from gfnn_jax.families.text import in_letters
-from gfnn_jax.fitting.evidence import EVIDENCE, correlation_time, criterion
+from gfnn_jax.fitting.evidence import EVIDENCE, correlation_time, criterion, improved
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit
@@ -408,8 +408,9 @@ class Table:
     ) -> _Judged:
         """The set without its spare directions: first those that are not seen, or first those that
         held-out arcs do not miss. Each of its kinds keeps one."""
-        begun = here = judged(subset)
-        while True:
+        begun = judged(subset)
+
+        def without_spare(here: _Judged) -> list[tuple[int, ...]]:
             kinds = [self.candidates[k][1] for k in here.subset]
             sizes = dict(zip(here.subset, here.sizes, strict=True))
             fewer = {
@@ -417,17 +418,15 @@ class Table:
                 for k, kind in zip(here.subset, kinds, strict=True)
                 if kinds.count(kind) > 1
             }
-            unseen = [k for k in fewer if sizes[k] <= 1]
-            smallest = min(unseen, key=lambda k: sizes[k], default=None)
-            if smallest is None or not seen_first:
-                missed_least = min(fewer, key=lambda k: judged(fewer[k]).cost, default=None)
-                if missed_least is not None:
-                    cost = judged(fewer[missed_least]).cost
-                    needed = EVIDENCE.odds(here.cost, cost, begun.independent) > EVIDENCE.needed
-                    smallest = smallest if needed else missed_least
-            if smallest is None:
-                return here
-            here = judged(fewer[smallest])
+            unseen = sorted((k for k in fewer if sizes[k] <= 1), key=lambda k: sizes[k])
+            if fewer and not (unseen and seen_first):
+                missed_least = min(fewer, key=lambda k: judged(fewer[k]).cost)
+                cost = judged(fewer[missed_least]).cost
+                needed = EVIDENCE.odds(here.cost, cost, begun.independent) > EVIDENCE.needed
+                unseen = unseen if needed else [missed_least]
+            return [fewer[k] for k in unseen[:1]]
+
+        return improved(begun, without_spare, lambda _, subset: judged(subset))
 
     def others(self, taken: tuple[Loss, ...]) -> dict[Loss, tuple[float, float]]:
         """ρ, of either sign, and its standard error of the candidates that were not taken, each

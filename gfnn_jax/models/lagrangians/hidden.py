@@ -28,7 +28,7 @@ from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.input_rules import InputModel
-from gfnn_jax.models.lagrangians.search import SearchResult, TermSearch, to_longer_arcs
+from gfnn_jax.models.lagrangians.search import SearchResult, TermSearch, to_longest_arcs
 from gfnn_jax.models.lagrangians.starts import OPTIONS as STARTS
 from gfnn_jax.models.lagrangians.starts import misfit
 from gfnn_jax.models.lagrangians.structure import Key, Row, Structure
@@ -154,12 +154,7 @@ def _followed(problem: ArcProblem) -> list[LawFit]:
     found: list[LawFit] = []
     fits = _of_pendulums(problem) if problem.angles else _of_modes(problem)
     for fit in sorted(fits, key=misfit)[: OPTIONS.finished]:
-        fit = fit.again()
-        for size in problem.options.periods[1:]:
-            longer = to_longer_arcs(fit, problem.length(size))
-            if longer is None:
-                break
-            fit = longer
+        fit = to_longest_arcs(fit.again(), problem.options.periods[1:])
         problem.on_progress(f"from oscillations: {fit}")
         if fit.follows and fit.is_definite:
             found.append(fit)

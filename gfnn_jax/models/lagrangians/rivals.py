@@ -30,7 +30,6 @@ from gfnn_jax.families.expressions import (
 )
 from gfnn_jax.families.friction import LINEAR
 from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
-from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.maps.observation import observed
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.libraries import (
@@ -108,7 +107,7 @@ def with_a_shape(fit: LawFit) -> LawFit:
     units = np.array(OPTIONS.constants) / np.ptp(fit.problem.states[:, 0])
     kept = tuple(row for row in structure.terms if any(row[0]) and is_constant(row))
     kept += (*torques(1, [0]), *springs(1, [0])) if driven else ()
-    found = [(criterion(fit.fitted.cost, count, len(fit.p)), "", fit)]
+    found = [(fit.criterion(), "", fit)]
     for name in GAINS if driven else SHAPES:
 
         def of(a: float, name: str = name) -> Structure:
@@ -123,8 +122,7 @@ def with_a_shape(fit: LawFit) -> LawFit:
         least_at: Any = minimize_scalar(share, bounds=ends, method="bounded")
         other = with_constant(fit.again(of(float(least_at.x)), rescale=False), False)
         if other.follows and other.is_definite:
-            size = criterion(other.fitted.cost, count, len(other.p) + 1)
-            found.append((size, name, other))
+            found.append((other.criterion(count) + np.log(count), name, other))
     (least, name, best), *others = sorted(found, key=lambda one: one[0])
     decide = fit.problem.options.evidence.deciding
     if best is fit or min(one[0] for one in others) < least + decide:
@@ -215,7 +213,7 @@ def of_a_sensor(fit: LawFit) -> str:
     if not seen.is_plain or problem.parameters or (is_noise and is_plain):
         return ""
     friction, count, best = losses(d, (LINEAR,), 0.0)[:d], fit.independent, ""
-    least = criterion(fit.fitted.cost, count, len(fit.p))
+    least = fit.criterion()
     least += problem.options.evidence.deciding if is_noise else -OPTIONS.clearly
     plain = dataclasses.replace(fit.structure, terms=tuple(terms), friction=tuple(friction))
     plain = dataclasses.replace(plain, zeros=())
@@ -234,7 +232,7 @@ def of_a_sensor(fit: LawFit) -> str:
             other = dataclasses.replace(problem, observation=shown)
             own = dataclasses.replace(plain, sensors=other.sensors)
             again = other.fit(own, known, fit.followed, fit.sigma, rescale=False)
-            unlikely = criterion(again.fitted.cost, count, len(again.p))
+            unlikely = again.criterion(count)
             early = what == "is late" and again.values["sensor", "late"] < 0  # and another late
             if again.follows and again.is_definite and unlikely < least and not early:
                 typed, least = shlex.quote(f"{name} = {text}"), unlikely

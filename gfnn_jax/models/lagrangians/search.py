@@ -20,7 +20,7 @@ from gfnn_jax.dataset.stretches import arcs_of
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.friction import ISOTROPIC, LINEAR, UNIFORM
 from gfnn_jax.families.lagrangian import has_inputs, shape_of
-from gfnn_jax.fitting.evidence import Comparison, criterion
+from gfnn_jax.fitting.evidence import Comparison, criterion, improved
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.exchange import may_be_chosen, with_exchanges
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
@@ -184,17 +184,14 @@ def to_longer_arcs(fit: LawFit, length: int) -> LawFit | None:
     return longer if longer.follows else None
 
 
-def to_arcs_of_periods(
-    problem: ArcProblem, structure: Structure, known: dict[Key, float]
-) -> LawFit:
-    """A structure fitted to arcs of growing length."""
-    first, *longer = problem.options.periods
-    fit = problem.fit(structure, known, problem.arcs(first), problem.scales.sigma)
-    for periods in longer:
-        arcs = fit.problem.arcs(periods)
-        if arcs.t.shape == fit.arcs.t.shape:
-            break  # no run is longer
-        fit = fit.again(arcs=arcs)
+def to_longest_arcs(fit: LawFit, lengths: Sequence[float]) -> LawFit:
+    """The same structure fitted to arcs of these lengths, in periods, in turn, as far as its orbits
+    follow them."""
+    for periods in lengths:
+        longer = to_longer_arcs(fit, fit.problem.length(periods))
+        if longer is None:
+            break
+        fit = longer
     return fit
 
 
@@ -326,30 +323,29 @@ class TermSearch:
         """The fit without terms that are not seen, the least seen first, as long as held-out arcs
         do not lose; and, unless ``friction`` has been chosen, without that which would drive.
         First, of terms that the record determines only together, without one."""
-        refused: set[Key] = set()
-        fit, evidence = with_equal_masses(without_degeneracies(fit)), fit.problem.options.evidence
-        costs = None
-        while True:
-            z = fit.significance
-            stays = {k for k in z if k[0] in ("gain", "sensor")}
-            stays |= set() if friction else {k for k in z if k[0] == "loss"}
-            fixed = protected(fit.structure, others=True) | refused | stays
-            z = {k: size for k, size in z.items() if k not in fixed and size < evidence.significant}
-            if not z:
-                return without_first_mass(fit)
-            key: Key = min(z.items(), key=lambda item: item[1])[0]
-            smaller = fit.structure.without({key})
-            if z[key] > evidence.nothing or (key[0] == "loss" and z[key] >= 0):
-                costs = fit.cross_validate() if costs is None else costs
-                if Comparison.of(costs, fit.cross_validate(smaller)).is_lower(evidence.gain):
-                    refused.add(key)
-                    continue
+        evidence = fit.problem.options.evidence
+        kinds = {"term", "zero", "loss"} if friction else {"term", "zero"}
+
+        def unseen(fit: LawFit) -> list[Key]:
+            z, fixed = fit.significance, protected(fit.structure, others=True)
+            weak = [k for k in z if k[0] in kinds and k not in fixed]
+            return sorted((k for k in weak if z[k] < evidence.significant), key=lambda k: z[k])
+
+        def without(fit: LawFit, key: Key) -> LawFit | None:
+            z, smaller = fit.significance[key], fit.structure.without({key})
+            doubtful = z > evidence.nothing or (key[0] == "loss" and z >= 0)
+            if doubtful and Comparison.of(fit.costs, fit.cross_validate(smaller)).is_lower(
+                evidence.gain
+            ):
+                return None
             less = fit.again(smaller)
             if not _leaves_little_more(less, fit):
-                refused.add(key)  # the others take no orbit to where they would make up for it
-                continue
-            _dropped(fit, key, f"{z[key]:.1f} standard errors")
-            fit, costs = less, None
+                return None  # the others take no orbit to where they would make up for it
+            _dropped(fit, key, f"{z:.1f} standard errors")
+            return less
+
+        fit = with_equal_masses(without_degeneracies(fit))
+        return without_first_mass(improved(fit, unseen, without))
 
     def grow(self, fit: LawFit, every: Structure | None = None) -> LawFit:
         """The fit with terms (of ``every``) that the residuals ask for, each kept where held-out
@@ -361,31 +357,27 @@ class TermSearch:
             problem, d = fit.problem, every.dim
             more = libraries.driven(d, problem.angles, problem.num_inputs, problem.squares)
             every = every.plus([("term", row) for row in more])
-        every = promising(fit, every)
-        refused: set[Key] = set()
-        options, problem, costs, found = fit.problem.options, fit.problem, None, None
-        evidence = options.evidence
-        for _ in range(options.tries):
-            found = fit.scores(every) if found is None else found
-            open_ = (k for k in found if k not in refused and fit.structure.may_have(k))
-            scores = {k: found[k] for k in open_ if found[k] > evidence.scored}
-            if not scores:
-                break
-            key = max(scores, key=lambda k: scores[k])
+        every, scores = promising(fit, every), dict[Key, float]()
+        options, problem = fit.problem.options, fit.problem
+
+        def asked_for(fit: LawFit) -> list[Key]:
+            scores.clear()
+            scores.update(fit.scores(every))
+            high = (k for k in scores if scores[k] > options.evidence.scored)
+            return sorted(filter(fit.structure.may_have, high), key=lambda k: -scores[k])
+
+        def with_term(fit: LawFit, key: Key) -> LawFit | None:
             larger = fit.structure.plus([key])
-            costs = fit.cross_validate() if costs is None else costs
-            apart = Comparison.of(fit.cross_validate(larger), costs)
-            kept = apart.is_lower(evidence.gain)
+            apart = Comparison.of(fit.cross_validate(larger), fit.costs)
+            kept = apart.is_lower(options.evidence.gain)
             problem.on_progress(
                 f"  {'added' if kept else 'refused'} {problem.word(key)}: "
                 f"{scores[key]:.1f} standard errors, cost of held-out arcs {apart.other:.5g} → "
                 f"{apart.cost:.5g}"
             )
-            if kept:
-                fit, costs, found = fit.again(larger), None, None
-            else:
-                refused.add(key)
-        return fit
+            return fit.again(larger) if kept else None
+
+        return improved(fit, asked_for, with_term, options.tries)
 
     # Friction.
 
@@ -442,7 +434,7 @@ def with_a_spring(fit: LawFit, angle: int) -> LawFit:
     spring = [("term", (none, tuple(n * k for k in alone), none, 0.0)) for n in (2, 1)]
     gone = {("term", row) for row in waves} | {("zero", angle)}
     plainer = structure.without(gone).plus(spring)
-    apart = Comparison.of(fit.cross_validate(plainer), fit.cross_validate())
+    apart = Comparison.of(fit.cross_validate(plainer), fit.costs)
     if not apart.cost <= apart.other * (1 + fit.problem.options.evidence.gain):
         return fit
     word = fit.problem.word(spring[0])
@@ -480,21 +472,22 @@ def without_degeneracies(fit: LawFit) -> LawFit:
         if couples and spring not in fit.structure.terms:
             with_it = fit.again(fit.structure.plus([("term", spring)]), rescale=False)
             fit = with_it if with_it.degenerate() else fit
-    while True:
-        step = fit.degenerate()
-        open_ = [key for key in step if key[0] == "term" and key not in fixed]
-        if not open_:
-            return fit
-        values, gone = fit.values, open_[0]
+
+    def combined(fit: LawFit) -> list[Key]:
+        return [key for key in fit.degenerate() if key[0] == "term" and key not in fixed]
+
+    def without(fit: LawFit, gone: Key) -> LawFit | None:
+        step, values = fit.degenerate(), fit.values
         along = values[gone] / step[gone]
         moved = {key: value - along * step.get(key, 0.0) for key, value in values.items()}
-        without = fit.again(fit.structure.without({gone}), moved, rescale=False)
-        if without.fitted.cost > fit.problem.options.as_well * fit.fitted.cost:
-            fixed = fixed | {gone}  # its zero is out of reach
-            continue
-        others = ", ".join(fit.problem.word(key) for key in open_[1:])
+        less = fit.again(fit.structure.without({gone}), moved, rescale=False)
+        if less.fitted.cost > fit.problem.options.as_well * fit.fitted.cost:
+            return None  # its zero is out of reach
+        others = ", ".join(fit.problem.word(key) for key in combined(fit) if key != gone)
         _dropped(fit, gone, f"determined only together with {others}")
-        fit = without
+        return less
+
+    return improved(fit, combined, without)
 
 
 def _leaves_little_more(less: LawFit, fit: LawFit) -> bool:
@@ -532,8 +525,8 @@ def without_first_mass(fit: LawFit) -> LawFit:
         return fit
     terms = (others[0], *(row for row in rest if row != others[0]))
     other = fit.again(dataclasses.replace(fit.structure, terms=terms), fit.values, rescale=False)
-    before, after = (criterion(f.fitted.cost, fit.independent, len(f.p)) for f in (fit, other))
-    if not (other.follows and other.is_definite and after < before):
+    likelier = other.criterion(fit.independent) < fit.criterion()
+    if not (other.follows and other.is_definite and likelier):
         return fit
     _dropped(fit, ("term", first), "it is not significant")
     return other
@@ -542,15 +535,16 @@ def without_first_mass(fit: LawFit) -> LawFit:
 def without_drives(fit: LawFit) -> LawFit:
     """The fit without friction whose coefficient has fallen below zero by other arcs than those
     that chose it, the farthest below first: friction does not drive."""
-    while fit.follows:
-        values = fit.values
-        z = {k: z for k, z in fit.significance.items() if k[0] == "loss" and values[k] < 0}
-        if not z:
-            break
-        key: Key = min(z, key=lambda key: z[key])
-        _dropped(fit, key, f"{z[key]:.1f} standard errors")
-        fit = fit.again(fit.structure.without({key}))
-    return fit
+
+    def driving(fit: LawFit) -> list[Key]:
+        z = fit.significance if fit.follows else {}
+        return sorted((k for k in z if k[0] == "loss" and fit.values[k] < 0), key=lambda k: z[k])
+
+    def without(fit: LawFit, key: Key) -> LawFit:
+        _dropped(fit, key, f"{fit.significance[key]:.1f} standard errors")
+        return fit.again(fit.structure.without({key}))
+
+    return improved(fit, driving, without)
 
 
 def likeliest(

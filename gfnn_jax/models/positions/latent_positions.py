@@ -23,6 +23,7 @@ from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.sums import matrix_free
+from gfnn_jax.fitting.evidence import Comparison
 from gfnn_jax.generating.arcs import PositionArcs, nodes_of
 from gfnn_jax.generating.charts import TYPE1
 from gfnn_jax.generating.generated import Generated
@@ -47,7 +48,6 @@ class Options:
     settled: float = 1.05  # a noise scale that changed by less needs no further fit
     scales: int = 4  # fits, at most, that find it
     gross: float = 5.0  # standard deviations: of what is not noise
-    certain: float = 2.0  # standard errors, by which least squares has to be better to be kept
     worse: int = 2  # sizes in a row that are no better end the search
     passes: float = 32.0  # over the rows: some four iterations, twice, with all derivatives
     most_operations: float = 20000000000.0  # of one size: about a minute
@@ -192,9 +192,8 @@ def without_noise(
         held_out_cost(best.family, coefficients, held_out, best.fit.sigma, held_out_arcs)
         for coefficients in (best.fit.coefficients, best.solved.coefficients)
     )
-    gain = latent - plain
-    plain_is_better = gain.mean() > OPTIONS.certain * gain.std() / np.sqrt(len(gain))
-    return best if np.isfinite(latent).all() and not plain_is_better else None
+    worse = Comparison.of(latent, plain).is_higher()
+    return best if np.isfinite(latent).all() and not worse else None
 
 
 _SOLVED = 1e-10  # a step in NumPy whose residual is larger has not been solved

@@ -200,14 +200,15 @@ def atom_text(atom: Atom, arguments: Sequence[Argument]) -> str:
     return "*".join(over or ["1"]) + "".join(f"/{text}" for text in under)
 
 
-def powers_of(atom: Atom, arguments: Sequence[Argument], width: int) -> tuple[int, ...] | None:
-    """The exponents (2d,) of an atom that is a product of coordinates; None of another."""
-    row = [0] * width
+def powers_of(atom: Atom, coordinates: int) -> tuple[int, ...] | None:
+    """The exponents of an atom that is a product of the first so many arguments; None of
+    another."""
+    row = [0] * coordinates
     for factor in atom:
-        index, (name, n) = arguments[factor.place].index, factor.kind
-        if index < 0 or name != "power" or n < 0 or n % 1:
+        name, n = factor.kind
+        if factor.place >= coordinates or name != "power" or n < 0 or n % 1:
             return None
-        row[index] += int(n)
+        row[factor.place] += int(n)
     return tuple(row)
 
 

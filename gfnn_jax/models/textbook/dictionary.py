@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.families.terms import Terms, exponents, given_terms, joined, polynomial_terms
-from gfnn_jax.fitting.significance import null_terms
+from gfnn_jax.fitting.significance import beside, null_terms
 from gfnn_jax.models.textbook.atoms import (
     Argument,
     Atom,
@@ -71,8 +71,8 @@ class Setting:
     (…, N, 2d) at the states, where they are not these themselves. forces: makes a family of H one
     with forces, linear in their coefficients. arguments: at the states. null:
     the coordinates and products of two that the states do not tell from those before. base: the
-    others, which are in every law; spanned: (rows, n) orthonormal columns of them. weight: (2d,),
-    or of each row, by which gradients are multiplied.
+    others, as atoms, which are in every law; spanned: (rows, n) orthonormal columns of them.
+    weight: (2d,), or of each row, by which gradients are multiplied.
     """
 
     def __init__(
@@ -90,12 +90,13 @@ class Setting:
         every = polynomial_terms(self.dim, 2, cyclic=(*angles, *cyclic))
         kept, null = null_terms(every, states)
         self.null = tuple(every.term_names[j] for j in null)
-        self.take(every.take(kept), weight)
+        self.base = tuple(self._product(every.powers[j]) for j in kept)
+        self.weigh(weight)
 
-    def take(self, base: Terms, weight: np.ndarray) -> None:
-        """Take this base, and these weights."""
-        self.base, self.weight = base, weight
-        self.spanned = orthonormal(self.columns(self.forces(base)))
+    def weigh(self, weight: np.ndarray) -> None:
+        """Take these weights."""
+        self.weight = weight
+        self.spanned = orthonormal(self.columns(self.law(())))
 
     @property
     def degree(self) -> int:
@@ -112,20 +113,24 @@ class Setting:
         gradients = np.moveaxis(family.term_gradients(self.states), -1, 0)
         return (self.average(gradients) * self.weight).reshape(family.num_parameters, -1).T
 
-    def plain(self, atoms: Sequence[Atom]) -> tuple[Terms, tuple[Atom, ...]]:
-        """The base with those of the atoms that are products of coordinates, and the others."""
-        rows = [powers_of(atom, self.arguments, 2 * self.dim) for atom in atoms]
-        others = tuple(atom for atom, row in zip(atoms, rows, strict=True) if row is None)
-        products = dict.fromkeys(row for row in rows if row is not None)
-        if not products:
-            return self.base, others
-        names = polynomial_terms(self.dim, 1).variables
-        return joined(self.base, Terms(self.dim, names, tuple(products))), others
+    def ordered(self, atoms: Sequence[Atom]) -> tuple[Atom, ...]:
+        """The base and these atoms, each once: products of coordinates, then the others."""
+        every = {atom: self.powers(atom) for atom in (*self.base, *atoms)}
+        products = {row: atom for atom, row in every.items() if row is not None}
+        return (*products.values(), *(atom for atom, row in every.items() if row is None))
 
-    def family(self, atoms: Sequence[Atom]) -> Any:
+    def terms(self, atoms: Iterable[Atom]) -> Terms:
+        """The terms of atoms in their order. Raises InputError for a constant that has run away."""
+        rows = [(atom, self.powers(atom)) for atom in atoms]
+        names = tuple(self.arguments[k].text for k in self._coordinates)
+        found = Terms(self.dim, names, tuple(row for _, row in rows if row is not None))
+        texts = [atom_text(atom, self.arguments) for atom, row in rows if row is None]
+        return joined(found, given_terms(self.dim, texts)) if texts else found
+
+    def law(self, atoms: Sequence[Atom]) -> Any:
         """Terms of the base and these atoms, and the forces. Raises InputError for a constant that
         has run away."""
-        return self.forces(beside(*self.plain(atoms), self.arguments))
+        return self.forces(self.terms(self.ordered(atoms)))
 
     def dictionary(
         self,
@@ -151,9 +156,7 @@ class Setting:
             rows = (np.concatenate(gradients) * self.weight).reshape(len(atoms), -1)
             size = np.linalg.norm(rows, axis=1)
         kept = np.flatnonzero(np.isfinite(size) & (size > 0))
-        columns = (rows[kept] / size[kept, None]).T
-        for _ in range(2):  # the second time makes them orthogonal to roundoff
-            columns = columns - self.spanned @ (self.spanned.T @ columns)
+        columns = beside(self.spanned, (rows[kept] / size[kept, None]).T)
         size = np.linalg.norm(columns, axis=0)
         independent = np.flatnonzero(size > OPTIONS.independent)
         atoms = [atoms[kept[i]] for i in independent]
@@ -218,7 +221,7 @@ class Setting:
     def _of_one(self) -> _Group:
         """Shapes of one argument."""
         for place, argument in enumerate(self.arguments):
-            factors, _, slopes = _singles(place, argument, 1)
+            factors, _, slopes = singles(place, argument, 1)
             yield [(factor,) for factor in factors], slopes[:, :, None] * argument.gradient
 
     def _of_coordinates(self) -> _Group:
@@ -229,7 +232,7 @@ class Setting:
     def _of_products(self) -> _Group:
         """Products with a shape of something else."""
         every = OPTIONS.coarse if 2 * self.dim <= OPTIONS.small else None
-        coarse = [_singles(place, x, every) for place, x in enumerate(self.arguments)]
+        coarse = [singles(place, x, every) for place, x in enumerate(self.arguments)]
         entering = [x.entering for x in self.arguments]
         for multiplier in self._multipliers():
             used = {i for f in multiplier for i in entering[f.place]}
@@ -268,12 +271,20 @@ class Setting:
 
     def _monomials(self, degree: int, *, alone: bool = False) -> list[Atom]:
         """Products of coordinates of degree 3 to this one. alone: powers of one coordinate too."""
-        plain = self._coordinates
         return [
-            tuple(Factor(plain[k], ("power", float(n))) for k, n in enumerate(row) if n)
-            for row in exponents(len(plain), degree)
+            self._product(row)
+            for row in exponents(len(self._coordinates), degree)
             if sum(row) > 2 and (alone or sum(n > 0 for n in row) > 1)
         ]
+
+    def _product(self, powers: Sequence[int]) -> Atom:
+        """The product of these powers of the coordinates."""
+        places = zip(self._coordinates, powers, strict=True)
+        return tuple(Factor(place, ("power", float(n))) for place, n in places if n)
+
+    def powers(self, atom: Atom) -> tuple[int, ...] | None:
+        """The exponents of an atom that is a product of coordinates; None of another."""
+        return powers_of(atom, len(self._coordinates))
 
     def _multipliers(self) -> list[Atom]:
         """Coordinates, products of two of them, sines and cosines: what shapes are multiplied
@@ -289,7 +300,7 @@ class Setting:
         return [*((one(i),) for i in plain), *squares, *((one(i),) for i in circular)]
 
 
-def _singles(
+def singles(
     place: int, argument: Argument, every: int | None
 ) -> tuple[list[Factor], np.ndarray, np.ndarray]:
     """Factors of the shapes of the argument, with every so manieth of the constants that are tried,
@@ -307,12 +318,6 @@ def _singles(
             f.append(value)
             slopes.append(slope)
     return factors, np.array(f), np.array(slopes)
-
-
-def beside(plain: Terms, atoms: Iterable[Atom], arguments: Sequence[Argument]) -> Terms:
-    """The terms, then these atoms. Raises InputError for a constant that has run away."""
-    texts = [atom_text(atom, arguments) for atom in atoms]
-    return joined(plain, given_terms(plain.dim, texts)) if texts else plain
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.fitting.significance import beside, of_two
 from gfnn_jax.models.textbook.atoms import (
     Atom,
     complexity_of,
@@ -34,12 +35,12 @@ class MatchingOptions:
 
     beam: states that go on. paired: atoms, those that explain most, whose pairs are tried.
     branches: atoms, and pairs of them, that each state is continued by, of so many looked_at.
-    independent: of a column,
-    that those before it do not span. hardly: times what a match leaves over, that a plainer one may
-    leave. refinements: Gauss–Newton steps of inner constants. gained: of what is left over, a step
-    that gains less is the last. farthest: of the distances, by which a centre moves in a step.
-    floor: of what is left over, below it is roundoff. penalty: halvings of what is left over that a
-    unit of complexity must bring, of clean pairs.
+    independent: of a column, that those before it do not span; alike: of its square, that another
+    does not. hardly: times what a match leaves over, that a plainer one may leave. refinements:
+    Gauss–Newton steps of inner constants. gained: of what is left over, a step that gains less is
+    the last. farthest: of the distances, by which a centre moves in a step. floor: of what is left
+    over, below it is roundoff. penalty: halvings of what is left over that a unit of complexity
+    must bring, of clean pairs.
     """
 
     beam: int = 4
@@ -47,6 +48,7 @@ class MatchingOptions:
     branches: int = 4
     looked_at: int = 240
     independent: float = 1e-5
+    alike: float = 1e-7
     hardly: float = 4.0
     refinements: int = 8
     gained: float = 1e-3
@@ -203,15 +205,10 @@ class Matching:
             return _Left(np.full_like(self.target, np.inf), self.base)
         size = np.linalg.norm(columns, axis=0)
         size = np.where(size > 0, size, 1.0)
-        part = columns / size
-        for _ in range(2):
-            part = part - self.base @ (self.base.T @ part)
+        part = beside(self.base, columns / size)
         q, r = np.linalg.qr(part)
-        good = np.abs(np.diag(r)) > 1e-12
-        basis, residual = np.hstack([self.base, q[:, good]]), self._beside_base
-        for _ in range(2):
-            residual = residual - basis @ (basis.T @ residual)
-        return _Left(residual, basis, (part, size))
+        basis = np.hstack([self.base, q[:, np.abs(np.diag(r)) > 1e-12]])
+        return _Left(beside(basis, self._beside_base), basis, (part, size))
 
     def _coefficients(self, left: _Left, count: int) -> np.ndarray:
         """Coefficients (count,) of the atoms; 0 where a column has an entry that is not finite."""
@@ -235,12 +232,7 @@ class Matching:
         top = np.argsort(-gain)[: OPTIONS.paired]
         top = top[independent[top]]
         unit = (columns[:, top] - own @ (own.T @ columns[:, top])) / size[top]
-        gram = unit.T @ unit
-        a, b = part[top][:, None], part[top][None, :]
-        free = 1 - gram**2
-        with np.errstate(all="ignore"):
-            both = (a * a + b * b - 2 * gram * a * b) / free
-        both = np.where(free > 1e-7, both, 0.0)
+        both = of_two(part[top], unit.T @ unit, OPTIONS.alike)
         order = np.argsort(-np.triu(both, 1), axis=None)
         pairs = (tuple(atoms[top[i]] for i in divmod(int(k), len(top))) for k in order)
         return found + _apart(pairs)

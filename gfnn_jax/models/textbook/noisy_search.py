@@ -22,20 +22,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from itertools import count, islice
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting.significance import significant
 from gfnn_jax.fitting.triangle import Triangle
-from gfnn_jax.models.textbook.atoms import (
-    Argument,
-    Atom,
-    complexity_of,
-    constants_of,
-    with_constants,
-)
-from gfnn_jax.models.textbook.dictionary import Setting, beside
+from gfnn_jax.models.textbook.atoms import Atom, complexity_of, constants_of, with_constants
+from gfnn_jax.models.textbook.dictionary import Setting
 from gfnn_jax.models.textbook.matching import Match, Matching
 from gfnn_jax.phase_space import apply_j
 
@@ -176,31 +172,27 @@ def _smoothed(sequence: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 class Formula(NamedTuple):
-    """H = Σ c_j φ_j: terms without constants inside, and atoms with them.
+    """H = Σ c_j φ_j of atoms of a setting: products of coordinates, then others, with constants.
 
     left: RMS of what it leaves over of the weak gradients, in units of their noise; rows: so many
     numbers.
     """
 
-    plain: Terms
+    setting: Setting
     atoms: tuple[Atom, ...]
-    arguments: list[Argument]
     coefficients: np.ndarray
     left: float
     rows: int
 
     @property
     def complexity(self) -> float:
-        """Complexity, in units of `shapes.complexity`: of the atoms, and of products of coordinates
-        beyond those of two."""
-        beyond = [row for row in self.plain.powers if sum(row) > 2]
-        return complexity_of(self.atoms) + sum(1.0 + 0.1 * n for row in beyond for n in row if n)
+        """Complexity, in units of `shapes.complexity`, of the atoms that not every law has."""
+        return complexity_of([atom for atom in self.atoms if atom not in self.setting.base])
 
     @property
     def length(self) -> float:
         """Description length: natural logarithms."""
-        numbers = len(self.coefficients) + len(self.constants)
-        penalty = OPTIONS.penalty * self.complexity + 0.5 * np.log(self.rows) * numbers
+        penalty = OPTIONS.penalty * self.complexity + 0.5 * np.log(self.rows) * len(self.p)
         return self.rows * np.log(self.left) + penalty
 
     @property
@@ -211,13 +203,8 @@ class Formula(NamedTuple):
     @property
     def numbers(self) -> list[list[int]]:
         """Places among coefficients and constants of the constants of each term."""
-        found: list[list[int]] = [[] for _ in range(self.plain.num_parameters)]
-        place = len(self.coefficients)
-        for atom in self.atoms:
-            inside = len(constants_of(atom))
-            found.append(list(range(place, place + inside)))
-            place += inside
-        return found
+        ahead = count(len(self.atoms))
+        return [list(islice(ahead, len(constants_of(atom)))) for atom in self.atoms]
 
     @property
     def p(self) -> np.ndarray:
@@ -226,27 +213,23 @@ class Formula(NamedTuple):
 
     def at(self, p: np.ndarray) -> Formula:
         """The same with these coefficients and constants."""
-        count = len(self.coefficients)
-        return self._replace(coefficients=p[:count], atoms=_with(self.atoms, p[count:]))
+        terms = len(self.atoms)
+        return self._replace(coefficients=p[:terms], atoms=_with(self.atoms, p[terms:]))
 
     def family(self, constants: np.ndarray) -> Terms:
         """The terms, with these constants inside. Raises InputError for one that has run away."""
-        return beside(self.plain, _with(self.atoms, constants), self.arguments)
+        return self.setting.terms(_with(self.atoms, constants))
 
     @property
     def kind(self) -> frozenset:
         """The terms without their constants."""
         shapes = [tuple(sorted(f.form for f in atom)) for atom in self.atoms]
-        return frozenset([*self.plain.term_names, *((s, shapes.count(s)) for s in shapes)])
+        return frozenset((shape, shapes.count(shape)) for shape in shapes)
 
     def take(self, kept: Sequence[int]) -> Formula:
         """Take these terms alone."""
-        count = self.plain.num_parameters
-        return self._replace(
-            plain=self.plain.take([j for j in kept if j < count]),
-            atoms=tuple(self.atoms[j - count] for j in kept if j >= count),
-            coefficients=self.coefficients[list(kept)],
-        )
+        atoms = tuple(self.atoms[j] for j in kept)
+        return self._replace(atoms=atoms, coefficients=self.coefficients[list(kept)])
 
 
 def _with(atoms: Sequence[Atom], constants: np.ndarray) -> tuple[Atom, ...]:
@@ -297,7 +280,7 @@ class NoisyTextbook:
 
     def _weigh(self, deviations: np.ndarray) -> None:
         """Weigh the rows by their noise (2d,) or (R, 2d)."""
-        self._setting.take(self._setting.base, 1.0 / deviations)
+        self._setting.weigh(1.0 / deviations)
         self._target = (self._weak.target * self._setting.weight).ravel()
 
     def _deviations(self, formula: Formula) -> np.ndarray:
@@ -318,7 +301,7 @@ class NoisyTextbook:
         )
         found = matching.best(dictionary, OPTIONS.atoms)
         if not products:
-            most = len(self._target) / 4 - setting.base.num_parameters
+            most = len(self._target) / 4 - len(setting.base)
             found += [matching.refined(b) for b in setting.blocks() if len(b) < most]
         likeliest = sorted(found, key=self._length_of_match)[: OPTIONS.exchanged]
         return found + [m for best in likeliest for m in matching.exchanged(best, dictionary)]
@@ -328,20 +311,13 @@ class NoisyTextbook:
 
     def _formula(self, match: Match) -> Formula:
         """The law of a match, without the coordinates and products that it does not ask for."""
-        setting = self._setting
-        plain, atoms = setting.plain(match.atoms)
-        nothing = np.zeros(plain.num_parameters + len(atoms))
-        whole = Formula(plain, atoms, setting.arguments, nothing, np.inf, len(self._target))
-        columns = setting.columns(whole.family(whole.constants))
-        triangle = Triangle.of(np.column_stack([columns, self._target]))
-        kept = np.arange(columns.shape[1])
-        while True:
-            spectrum = triangle.pruned(kept).spectrum()
-            c = spectrum.solution(spectrum.inverse)
-            left = spectrum.residual_norm / np.sqrt(triangle.rows - len(kept))
-            significance = np.abs(c) / (left * spectrum.deviations())
-            worst = int(np.argmin(significance))
-            if significance[worst] >= OPTIONS.kept or len(kept) == 1:
-                found = whole.take(kept.tolist())
-                return found._replace(coefficients=c, left=float(left))
-            kept = np.delete(kept, worst)
+        atoms = self._setting.ordered(match.atoms)
+        whole = Formula(self._setting, atoms, np.zeros(len(atoms)), np.inf, len(self._target))
+        columns, nothing = self._setting.columns(self._setting.terms(atoms)), whole.coefficients
+        triangle = Triangle.of(np.column_stack([columns, -self._target]))
+        kept, c = significant(triangle, nothing, OPTIONS.kept)
+        if not len(kept):  # none stands out
+            kept, c = significant(triangle, nothing, 0.0)
+        left = np.linalg.norm(columns[:, kept] @ c - self._target)
+        left = float(left / np.sqrt(len(self._target) - len(kept)))
+        return whole.take(kept.tolist())._replace(coefficients=c, left=left)

@@ -18,7 +18,9 @@ import numpy as np
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting.evidence import improved
 from gfnn_jax.fitting.gauss_newton import Problem
+from gfnn_jax.fitting.significance import beside
 from gfnn_jax.flows.collocation import Steps, of_lanes
 from gfnn_jax.models.textbook.atoms import Atom, complexity_of, constants_of, with_constants
 from gfnn_jax.models.textbook.dictionary import Dictionary, Setting
@@ -156,8 +158,7 @@ class Textbook:
         closest = min(self._partial, key=lambda s: s.law.left, default=None)
         if closest is None:
             return False
-        column, spanned = self._setting.flat(field(self._middle)), self._setting.spanned
-        column -= spanned @ (spanned.T @ column)
+        column = beside(self._setting.spanned, self._setting.flat(field(self._middle)))
         own = Dictionary([], column[:, None] / np.linalg.norm(column))
         return self._certain(self._matching(closest.target).gains(closest.match, own), 1)
 
@@ -177,7 +178,7 @@ class Textbook:
             if not self._certain(gains, len(dictionary.atoms)):
                 return None  # what is left over is noise
         self._on_progress(f"H: trying {len(dictionary.atoms)} functions of laws of physics")
-        most = self._middle.size / OPTIONS.rows_per_term - self._setting.base.num_parameters
+        most = self._middle.size / OPTIONS.rows_per_term - len(self._setting.base)
         blocks = [b for b in blocks if len(b) < most]
         target, last = self._target, np.inf
         for _ in range(OPTIONS.rounds):
@@ -206,14 +207,14 @@ class Textbook:
         atoms no law is told from an approximation, because no residual is below roundoff."""
         if state.law.left > OPTIONS.roundoff or self._is_exact(state):
             return state
-        return self._fewer(state, 3 * OPTIONS.roundoff)
+        return self._simpler(state, 3 * OPTIONS.roundoff)
 
     def _is_exact(self, state: _State) -> bool:
         """Return whether the law is as exact as no approximation of so many numbers would be."""
-        _, others = self._setting.plain(state.match.atoms)
-        if not others:
+        atoms = state.match.atoms
+        if None not in map(self._setting.powers, atoms):
             return state.law.left <= OPTIONS.roundoff
-        numbers = len(state.match.atoms) + sum(len(constants_of(a)) for a in others)
+        numbers = len(atoms) + sum(len(constants_of(a)) for a in atoms)
         digits = OPTIONS.digits + OPTIONS.digits_a_number * numbers
         return state.law.left <= 10.0**-digits
 
@@ -242,7 +243,7 @@ class Textbook:
         gradients as its flow corrects them; None where a constant has run away, or the flow fails.
         """
         try:
-            family = self._setting.family(match.atoms)
+            family = self._setting.law(match.atoms)
         except InputError:
             return None
         columns = self._setting.columns(family)
@@ -266,37 +267,28 @@ class Textbook:
     def _simplified(self, state: _State) -> _State:
         """The simplest law that is as exact: other atoms that match the corrected gradients, fewer
         of them, constants of fewer digits."""
-        matching, dictionary = self._matching(state.target), self._setting.dictionary()
-        bound = 3 * max(state.law.left, OPTIONS.roundoff)
-        others = matching.best(dictionary, min(3, len(state.match.atoms)))
-        simpler = [m for m in others if self._as_well(m.left, state)]
-        for match in sorted(simpler, key=lambda m: m.complexity):
-            if match.complexity >= state.match.complexity:
-                break
-            found = self._converged(match, state.target)
-            if found is not None and found.law.left <= bound:
-                state = found
-                break
-        return self._rounded(self._fewer(state, bound), bound)
+        bound, most = 3 * max(state.law.left, OPTIONS.roundoff), min(3, len(state.match.atoms))
+        others = self._matching(state.target).best(self._setting.dictionary(), most)
+        return self._rounded(self._simpler(state, bound, others), bound)
 
-    def _fewer(self, state: _State, bound: float) -> _State:
-        """Drop the atoms, and their factors, that are not needed."""
-        matching = self._matching(state.target)
-        for atoms in _shorter(state.match.atoms):
-            if complexity_of(atoms) >= state.match.complexity:
-                continue
-            match = matching.refined(atoms)  # spare atoms put the others' constants off
-            if not self._as_well(match.left, state):
-                continue
-            found = self._converged(match, state.target)
-            if found is not None and found.law.left <= bound:
-                return self._fewer(found, bound)
-        return state
+    def _simpler(self, state: _State, bound: float, others: Sequence[Match] = ()) -> _State:
+        """The law with other atoms that are simpler, and without the atoms, and their factors, that
+        are not needed."""
 
-    @staticmethod
-    def _as_well(left: float, state: _State) -> bool:
-        """Return whether another match may do as well as that of a law."""
-        return left <= OPTIONS.as_well * max(state.match.left, OPTIONS.matched)
+        def simpler(state: _State) -> Iterator[Match]:
+            yield from sorted(others, key=lambda match: match.complexity)
+            for atoms in _shorter(state.match.atoms):
+                if complexity_of(atoms) < state.match.complexity:
+                    # spare atoms put the others' constants off
+                    yield self._matching(state.target).refined(atoms)
+
+        def changed(state: _State, match: Match) -> _State | None:
+            as_well = match.left <= OPTIONS.as_well * max(state.match.left, OPTIONS.matched)
+            simpler = match.complexity < state.match.complexity
+            found = self._converged(match, state.target) if as_well and simpler else None
+            return found if found is not None and found.law.left <= bound else None
+
+        return improved(state, simpler, changed)
 
     def _rounded(self, state: _State, bound: float) -> _State:
         """Round each constant to as few digits as leave the law as exact."""
