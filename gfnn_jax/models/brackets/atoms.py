@@ -10,23 +10,19 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from gfnn_jax.brackets import Bracket
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms, joined
+from gfnn_jax.fitting.significance import beside
 from gfnn_jax.models.brackets.fields import FieldFit, fit_field, path_of
 from gfnn_jax.models.brackets.poisson_field import PoissonField, hamiltonian_of
-from gfnn_jax.models.textbook.shapes import (
-    Kind,
-    constants_for,
-    has_constant,
-    kinds_for,
-    text_of,
-    values,
-)
+from gfnn_jax.models.textbook.atoms import Argument, Factor, constants_of, with_constants
+from gfnn_jax.models.textbook.dictionary import singles
+from gfnn_jax.models.textbook.shapes import text_of, values
 from gfnn_jax.phase_space import sizes
 
 
@@ -47,22 +43,14 @@ OPTIONS = Options()
 Pairs = tuple[np.ndarray, np.ndarray, Any]  # z0, z1 (N, n), dt a number or (N,)
 
 
-class Atom(NamedTuple):
-    """f(z_i; θ). index: i. theta: None of a shape without a constant."""
-
-    index: int
-    kind: Kind
-    theta: float | None
-
-
 @dataclasses.dataclass(frozen=True)
 class ShapedField(PoissonField):
     """B∇H, H of a base and of atoms behind it, whose constants are fitted too (`fields.Shaped`)."""
 
-    atoms: tuple[Atom, ...] = ()
+    atoms: tuple[Factor, ...] = ()
 
     @classmethod
-    def of(cls, bracket: Bracket, base: Terms, atoms: tuple[Atom, ...]) -> ShapedField:
+    def of(cls, bracket: Bracket, base: Terms, atoms: tuple[Factor, ...]) -> ShapedField:
         """Make the field of a base and these atoms."""
         texts = tuple(text(atom, base.names) for atom in atoms)
         own = tuple(map(tuple, np.eye(len(texts), dtype=int).tolist()))
@@ -77,22 +65,22 @@ class ShapedField(PoissonField):
     @property
     def constants(self) -> np.ndarray:
         """(I,) of the atoms that have one."""
-        return np.array([atom.theta for atom in self.atoms if atom.theta is not None])
+        return np.array(constants_of(self.atoms))
 
     def by_constants(self, c: np.ndarray, z: np.ndarray) -> np.ndarray:
         """∂f/∂θ (N, n, I), by complex steps."""
         matrix, found, step = self.bracket.matrix(z), [], 1e-30
-        for weight, (index, kind, theta) in zip(c[-len(self.atoms) :], self.atoms, strict=True):
-            if theta is not None:
-                slope = values(kind, z[:, index] + 0j, theta + 1j * step)[1].imag / step
-                found.append(weight * matrix[:, :, index] * slope[:, None])
+        for weight, atom in zip(c[-len(self.atoms) :], self.atoms, strict=True):
+            if atom.theta is not None:
+                x, theta = z[:, atom.place] + 0j, atom.theta + 1j * step
+                slope = values(atom.kind, x, theta)[1].imag / step
+                found.append(weight * matrix[:, :, atom.place] * slope[:, None])
         return np.stack(found, axis=-1)
 
     def with_constants(self, theta: np.ndarray) -> ShapedField:
         """The same shapes with other constants (I,)."""
-        ahead = iter(theta.tolist())
-        atoms = (a if a.theta is None else a._replace(theta=next(ahead)) for a in self.atoms)
-        return ShapedField.of(self.bracket, self.base, tuple(atoms))
+        atoms = with_constants(self.atoms, theta.tolist())
+        return ShapedField.of(self.bracket, self.base, atoms)
 
 
 def with_shapes(
@@ -131,12 +119,12 @@ def _short(theta: float) -> float:
     return float(f"{theta:.6g}")
 
 
-def text(atom: Atom, names: tuple[str, ...]) -> str:
+def text(atom: Factor, names: tuple[str, ...]) -> str:
     """The atom as formulas write it."""
-    return text_of(atom.kind, names[atom.index], "", atom.theta)
+    return text_of(atom.kind, names[atom.place], "", atom.theta)
 
 
-def _next(best: FieldFit, pairs: Pairs) -> list[Atom]:
+def _next(best: FieldFit, pairs: Pairs) -> list[Factor]:
     """The atoms that explain most of what is left, of different shapes."""
     z0, z1, dt = pairs
     some = slice(None, None, max(1, len(z0) // OPTIONS.rows))
@@ -148,29 +136,22 @@ def _next(best: FieldFit, pairs: Pairs) -> list[Atom]:
     target = (path.target / spread).ravel()
     columns = (h[..., None] * field.columns(middle) / spread[:, None]).reshape(len(target), -1)
     basis = np.linalg.svd(columns, full_matrices=False)[0]
-    target = target - basis @ (basis.T @ target)
-    matrix, found = field.bracket.matrix(middle), []
+    target, found = beside(basis, target), list[tuple[float, Factor]]()
+    along = h[..., None] * field.bracket.matrix(middle) / spread[:, None]
     with np.errstate(all="ignore"):
-        for index in range(z0.shape[1]):
-            x = middle[:, index]
-            for kind in kinds_for(np.concatenate([z0[:, index], z1[:, index]])):
-                constants = constants_for(kind, x) if has_constant(kind) else [None]
-                for theta in constants:
-                    slope = values(kind, x, theta)[1]
-                    one = (h * matrix[:, :, index] * slope[:, None] / spread).ravel()
-                    own = one - basis @ (basis.T @ one)
-                    size = np.linalg.norm(own)
-                    if size > 1e-6 * np.linalg.norm(one):
-                        score = float(abs(own @ target) / size)
-                        theta = None if theta is None else float(theta)
-                        found.append((score, Atom(index, kind, theta)))
-    found = [one for one in found if np.isfinite(one[0])]
-    chosen: list[Atom] = []
-    for score, atom in sorted(found, key=lambda one: -one[0]):
-        if score < OPTIONS.near * max(one[0] for one in found):
+        for place, x in enumerate(np.concatenate([middle, z0, z1]).T):
+            atoms, _, slopes = singles(place, Argument("", x, x, index=place), 1)
+            whole = (along[..., place] * slopes[:, : len(z0), None]).reshape(len(atoms), -1).T
+            own = beside(basis, whole)
+            size = np.linalg.norm(own, axis=0)
+            score = np.where(
+                size > 1e-6 * np.linalg.norm(whole, axis=0), np.abs(target @ own) / size, np.nan
+            )
+            found += zip(score.tolist(), atoms, strict=True)
+    found = sorted((one for one in found if np.isfinite(one[0])), key=lambda one: -one[0])
+    chosen: dict[Any, Factor] = {}
+    for score, atom in found:
+        if score < OPTIONS.near * found[0][0] or len(chosen) == OPTIONS.continued:
             break
-        if all((atom.index, atom.kind) != (a.index, a.kind) for a in chosen):
-            chosen.append(atom)
-        if len(chosen) == OPTIONS.continued:
-            break
-    return chosen
+        chosen.setdefault(atom.form, atom)
+    return list(chosen.values())
