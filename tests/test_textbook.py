@@ -194,6 +194,15 @@ def test_products_of_coordinates_are_read_as_such():
     assert powers_of((Factor(0, ("power", -1.0)),), 4) is None
 
 
+def test_an_atom_that_a_match_holds_twice_is_one_term():
+    setting = Setting(ring(60), np.ones(4))
+    distance = next(i for i, x in enumerate(setting.arguments) if x.text.startswith("sqrt"))
+    pole, cube = (Factor(distance, ("power", -1.0)),), (Factor(0, ("power", 3.0)),)
+    atoms = setting.ordered((pole, cube, pole))
+    assert atoms[-2:] == (cube, pole)
+    assert setting.terms(atoms).num_parameters == len(atoms) == len(setting.base) + 2
+
+
 def test_matching_finds_atoms_that_were_put_there_and_their_constants():
     z = ring(60)
     setting = Setting(z, np.ones(4))
