@@ -114,7 +114,7 @@ def _noise(triangle: Triangle, count: int, rms: float | None) -> float:
 
 def matched(
     columns: np.ndarray, target: np.ndarray, null: float = NULL
-) -> Iterator[tuple[int, float, float]]:
+) -> Iterator[tuple[int, np.floating, np.floating]]:
     """Iterate over the columns (n, m) that explain the target (n,) one after another, whichever
     explains the most: its place, how much of what is left it explains, and how much is left. null:
     of a column's size, below which those before explain it."""
