@@ -211,7 +211,7 @@ class Lagrangian:
     input_hold: str = "auto"
     mass: Mapping[str, float] | None = None
     loss: Any = None
-    hidden: int = 0
+    hidden: int | None = None
 
 
 @_named
@@ -415,7 +415,7 @@ class FitOptions:
     input_hold: str = "auto"
     mass: Mapping[str, float] | None = None
     loss: Any = None
-    hidden: int = 0
+    hidden: int | None = None
     devices: int | str | None = None
 
     def __post_init__(self):
@@ -470,7 +470,7 @@ class FitOptions:
         values = {name: getattr(self, name) for name, about in OPTIONS.items() if about.decides}
         if self.bracket is None:
             del values["bracket"]  # jobs of canonical data are what they were
-        if not self.hidden:
+        if self.hidden is None:
             del values["hidden"]
         return {n: list(v) if isinstance(v, (tuple, list)) else v for n, v in values.items()}
 

@@ -119,6 +119,8 @@ class Options:
     sizes: tuple[float, ...] = tuple(np.geomspace(0.1, 2.5, 15))
     clean: float = 1e-3  # of a channel's size: more weight has no channel at the start
     few: float = 0.25  # of the samples: where fewer show positions alone, other channels do too
+    # of a swing by its period, that gates aside of zero may show
+    factors: tuple[float, ...] = tuple(np.outer((1, -1), 1.1 ** np.arange(-25.0, 26.0)).ravel())
     between: int = 16  # places between two events, at which a state stands
     iterations: int = 30
 
@@ -408,7 +410,7 @@ class Observation:
         q[:, seen] = y[:, [self.direct[i] for i in seen]]
         for i in self.unseen:
             if i in self.crossed:
-                q[:, i] = swung(t, y[:, self.crossed[i]], i in angles)
+                q[:, i] = self._between_gates(i, t, y, i in angles)
             else:
                 q[:, i] = between_extremes(t, self._velocity(i, y))[0]
         return q
@@ -419,15 +421,32 @@ class Observation:
         return tuple(k for k, one in enumerate(self.formulas) if isinstance(one, Crossing))
 
     @property
-    def crossed(self) -> dict[int, int]:
-        """Unseen coordinates -> the channel whose events they alone make."""
+    def crossed(self) -> dict[int, list[int]]:
+        """Unseen coordinates -> the channels whose events they alone make."""
         alone = {k: {i for i in self._used[k] if i < self.dim} for k in self.events}
-        return {min(own): k for k, own in alone.items() if len(own) == 1 and own <= {*self.unseen}}
+        own = {i: [k for k, used in alone.items() if used == {i}] for i in self.unseen}
+        return {i: gates for i, gates in own.items() if gates}
 
     @property
     def between(self) -> int:
         """Places between two events at which states stand; 0 where sensors show positions too."""
         return OPTIONS.between if self.crossed else 0
+
+    def _between_gates(self, i: int, t: np.ndarray, y: np.ndarray, turns: bool) -> np.ndarray:
+        """An unseen coordinate (n,) by the events that it alone makes: its swing, of the sign and
+        size that suit the gates best which are known to stand elsewhere than at zero."""
+        gates = self.crossed[i]
+        x = np.zeros((1, 2 * self.dim))
+        x[:, self.dim + i] = 1.0
+        aside = [k for k in gates if self(x).values[0, k] != 0]
+        z = swung(t, y[:, gates], turns and not aside)
+        if not aside:
+            return z
+        x = np.zeros((len(OPTIONS.factors), len(t), 2 * self.dim))
+        x[..., i], x[..., self.dim + i] = np.outer(OPTIONS.factors, z), 1.0
+        left = np.where(np.isfinite(y[:, aside]), self(x).values[..., aside], np.nan)
+        best = int(np.argmin(np.nansum(left**2, axis=(1, 2))))
+        return OPTIONS.factors[best] * z
 
     def _velocity(self, i: int, y: np.ndarray) -> np.ndarray:
         """The velocity (n,) of a coordinate by the channel that shows it alone, at ``values``."""
@@ -446,6 +465,13 @@ class Observation:
         """States (n, 2d) and accelerations (n, d) at times t (n,), of the unseen coordinates as
         integrals."""
         q = self._integrated(t, y)
+        if len(self.events) == len(self.channels):  # too few places for a curve
+            small = 1e-3 * float(np.median(np.diff(t)))
+            beside = (t[:, None] + small * np.arange(-1, 2)).ravel()
+            read = np.full((len(t), 3, y.shape[1]), np.nan)
+            read[:, 1] = y
+            near = self._integrated(beside, read.reshape(len(beside), -1)).reshape(len(t), 3, -1)
+            return np.concatenate([q, (near[:, 2] - near[:, 0]) / (2 * small)], axis=1), 0 * q
         found = splines([(t, q)]).smooth(t, q, t)
         return np.concatenate(found[:2], axis=1), found.a
 
@@ -468,7 +494,7 @@ class Observation:
             by_values = shown.by_coefficients.reshape(len(moved), -1)
             change = np.linalg.lstsq(by_values, moved, rcond=None)[0]
             found = dataclasses.replace(found, values=found.values + change)
-        if len(self.channels) == self.dim:
+        if len(self.channels) == self.dim and not (self.crossed and len(self.parameters)):
             return found
         states = [found._states(t, y) for t, y in runs]
         x, a = (np.concatenate(of) for of in zip(*states, strict=True))
@@ -480,8 +506,10 @@ class Observation:
         values, scale, cost = self.values, _roughness(y), np.inf
         for _ in range(OPTIONS.iterations):
             shown = self(x, values, a)
-            left = ((y - shown.values) / scale).ravel()
-            rows = (shown.by_coefficients / scale[:, None]).reshape(len(left), -1)
+            by_time = np.linalg.norm(shown.by_state[..., : self.dim], axis=-1)  # of an event: 1/ḣ
+            each = np.where(np.isin(range(len(scale)), self.events), by_time, scale)
+            left = ((y - shown.values) / each).ravel()
+            rows = (shown.by_coefficients / each[..., None]).reshape(len(left), -1)
             told = np.isfinite(left) & np.isfinite(rows).all(1)
             cost = float(np.mean(left[told] ** 2))
             change = np.linalg.lstsq(rows[told], left[told], rcond=1e-9)[0]
@@ -575,8 +603,8 @@ class Observation:
         J = by[..., 0, :].copy()
         by_rates = np.linalg.norm(by * omega ** np.arange(3)[:, None], axis=-2)
         J[..., unseen] = by_rates[..., unseen]
-        for i, k in self.crossed.items():  # by its speed, a time is a distance
-            J[:, k, i] = 1 / (omega * max(float(np.std(x[:, i])), 1e-300))
+        for i, gates in self.crossed.items():  # by its speed, a time is a distance
+            J[:, gates, i] = 1 / (omega * max(float(np.std(x[:, i])), 1e-300))
         J /= sigma[:, None]
         return 1 / np.sqrt(np.mean(np.sum(J**2, axis=1), axis=0))
 

@@ -4,6 +4,8 @@ from a channel that oscillates with it, as an accelerometer does."""
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 
@@ -17,11 +19,13 @@ class Options:
     """Limits of these starts (benchmarks/any_record.py, gyroscopes, accelerometers and gates).
 
     extreme: of the largest speed, that an extreme of the velocity has at least. same_period: of the
-    squares of periods: a decay that leaves more is none.
+    squares of periods: a decay that leaves more is none. missed: of a period: a crossing lies
+    between two of one gate that are farther apart.
     """
 
     extreme: float = 0.25
     same_period: float = 0.8
+    missed: float = 0.95
 
 
 OPTIONS = Options()
@@ -93,32 +97,54 @@ def between_extremes(t: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
     return np.where(known, q - np.polyval(line, t), np.nan), float(line[0])
 
 
+# Squares of amplitudes by linear and by quadratic friction, of minus times in units of their lives.
+_SQUARES = np.exp, lambda time: 1 / (1 - time) ** 2
+
+
 def swung(t: np.ndarray, seen: np.ndarray, turns: bool) -> np.ndarray:
-    """Swings (n,) that cross zero at the times t (n,) of events, where ``seen`` is no NaN; an
-    interval that is twice as long as most has a crossing that was missed. They are as large as a
-    pendulum's whose period T (1 + A²/16) dies down as these do. NaN before the first event and
-    behind the last.
+    """Swings (n,) that gates see cross their place at the times t (n,) where ``seen`` (n, k) is no
+    NaN, positive at the first turn. They are as large as a pendulum's whose period T (1 + A²/16)
+    dies down as these do. NaN before the first event and behind the last.
 
     Raises FitError where the periods of what ``turns`` are all the same, which any amplitude has.
     """
-    at = t[np.isfinite(seen)]
+    at, count = _turns([t[np.isfinite(column)] for column in seen.T])
     if len(at) < FEWEST:
         return np.full(len(t), np.nan)
-    steps = np.diff(at)
-    count = np.append(0.0, np.cumsum(np.maximum(np.round(steps / np.median(steps)), 1)))
-    place = np.interp(t, at, count, np.nan, np.nan)
     period = (at[2:] - at[:-2]) / (count[2:] - count[:-2])
-    best, size, life = np.inf, 1.0, np.inf
-    for tried in count[-1] * np.geomspace(0.1, 3.0, 20):
-        rows = np.stack([np.ones(len(period)), np.exp(-count[1:-1] / tried)], axis=1)
+    best, size, square, life = np.inf, 1.0, np.exp, np.inf
+    for of, tried in product(_SQUARES, count[-1] * np.geomspace(0.03, 3.0, 30)):
+        rows = np.stack([np.ones(len(period)), of(-count[1:-1] / tried)], axis=1)
         (least, more), *_ = np.linalg.lstsq(rows, period, rcond=None)
         left = np.sum((rows @ [least, more] - period) ** 2)
         if left < best and 0 < more < least / 2:
-            best, size, life = left, np.sqrt(16 * more / least), 2 * tried
+            best, size, square, life = left, np.sqrt(16 * more / least), of, tried
     if turns and not best < OPTIONS.same_period * np.sum((period - np.mean(period)) ** 2):
         raise FitError(
             "the times between events show no change of the period, so that they do not tell how "
             "large the swings are, nor the law: record swings that die down, or the angle too",
             verdict="no law: times of events without a change of the period tell no amplitude",
         )
-    return size * np.exp(-place / life) * np.sin(np.pi * place)
+    first, last = at[0] - period[0] / 2, at[-1] + period[-1] / 2
+    place = np.interp(t, [first, *at, last], [-0.5, *count, count[-1] + 0.5])
+    place[(t < first) | (t > last)] = np.nan
+    return size * np.sqrt(square(-np.maximum(place, 0) / life)) * np.cos(np.pi * place)
+
+
+def _turns(gates: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Times at which a motion turns that crosses gates at these times, and the number of turns
+    before each: two crossings of one gate, less than a period apart, have a turn in their middle.
+    None where a gate sees too few."""
+    periods = np.concatenate([g[2:] - g[:-2] for g in gates])
+    if not len(periods):
+        return np.zeros(0), np.zeros(0)
+    period = float(np.median(periods))
+    steps = [np.diff(g) for g in gates]
+    middles = np.sort(
+        np.concatenate(
+            [(g[:-1] + s / 2)[s < OPTIONS.missed * period] for g, s in zip(gates, steps, strict=True)]
+        )
+    )
+    count = np.cumsum(np.round(2 * np.diff(middles, prepend=middles[:1]) / period))
+    numbers, which = np.unique(count, return_inverse=True)
+    return np.bincount(which, middles) / np.bincount(which), numbers

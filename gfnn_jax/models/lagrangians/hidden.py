@@ -12,8 +12,9 @@ open, of which several are tried along short arcs.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
@@ -23,11 +24,13 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.families.friction import LINEAR
+from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.maps.observation import Hidden
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.input_rules import InputModel
+from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.search import SearchResult, TermSearch, to_longest_arcs
 from gfnn_jax.models.lagrangians.starts import OPTIONS as STARTS
 from gfnn_jax.models.lagrangians.starts import misfit
@@ -55,6 +58,48 @@ class HiddenOptions:
 
 
 OPTIONS = HiddenOptions()
+NOT_HIDDEN = "No law with one or two hidden coordinates follows to the noise"
+
+
+def may_hide(recording: Recording) -> bool:
+    """Return whether a recording is of one position, as it is, and without inputs."""
+    return len(recording.positions) == 1 and not (recording.observe or recording.inputs)
+
+
+def with_number(
+    find: Callable[..., LearnedLaw], recording: Recording, plain: LearnedLaw | None
+) -> LearnedLaw | None:
+    """The likeliest of the laws that ``find(hidden=)`` has for one and for two hidden coordinates
+    of a recording, beside the ``plain`` one of none, with a message on their number. One more is
+    tried where the residuals are not white. None where no law with a hidden coordinate leaves noise
+    alone."""
+    laws = {} if plain is None else {0: plain}
+    for count in range(1, 2 if recording.angles else 3):
+        with contextlib.suppress(FitError):
+            laws[count] = find(hidden=count)
+            if all(one.white for one in laws[count].whiteness.values()):
+                break
+    if not {*laws} - {0}:
+        return None
+    (name,) = laws[max(laws)].observe
+    scores = {n: _criterion(law, name) for n, law in laws.items()}
+    best = min(scores, key=lambda n: scores[n])
+    law = laws[best]
+    if best == 0 or law.flaws:
+        return None
+    others = [f"{n}: {more - scores[best]:+.0f}" for n, more in scores.items() if n != best]
+    line = (
+        f"{name} shows {1 + best} coordinates: {best} hidden, by Schwarz's criterion"
+        + f" (with {', '.join(others)})" * bool(others)
+    )
+    return dataclasses.replace(law, messages=(*law.messages, line))
+
+
+def _criterion(law: LearnedLaw, name: str) -> float:
+    """Schwarz's criterion of a law, by what it leaves of a column; a state begins each arc."""
+    fitted = [*law.lagrangian.terms, *law.friction.terms, *law.sensors]
+    states = 2 * len(law.symbols[0]) * len(law.traces)
+    return criterion(law.residual[name] ** 2, law.num_samples, len(fitted) + states)
 
 
 def with_hidden(recording: Recording, count: int) -> Recording:
@@ -63,7 +108,7 @@ def with_hidden(recording: Recording, count: int) -> Recording:
     Raises InputError where it has more than one position, or sensors or inputs, FitError where its
     spectrum does not show as many oscillations.
     """
-    if len(recording.positions) != 1 or recording.observe or recording.inputs or count > 2:
+    if not may_hide(recording) or count > 2:
         raise InputError(
             "hidden: expected a recording of one position, without inputs and formulas of sensors, "
             "and one or two hidden coordinates"

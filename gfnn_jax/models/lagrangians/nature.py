@@ -81,6 +81,7 @@ class NatureOptions:
 
 
 OPTIONS = NatureOptions()
+NO_COLUMN = "a coordinate that no column shows"
 
 
 class Nature(NamedTuple):
@@ -181,12 +182,11 @@ def nature(
         f"positions and velocities explain {100 * plain:.3g} % of the accelerations, with past "
         f"positions {100 * past:.3g} %"
     )
-    hidden = " (--hidden 1)" * (alone and not u.shape[1])
     if near < OPTIONS.differ:
         return Nature(
             "no law",
             f"unrecorded: states that nearly coincide have other accelerations: {shares}. An input "
-            f"is missing (--inputs), or a coordinate{hidden}",
+            f"is missing (--inputs), or {NO_COLUMN}",
             mostly=mostly,
         )
     if excited:
@@ -194,7 +194,7 @@ def nature(
     return Nature(
         "no law",
         f"no certain cause: {shares}, and no states come so close that they tell more. A force of "
-        f"another shape (--terms), an input (--inputs) or a coordinate{hidden} may be missing",
+        f"another shape (--terms), an input (--inputs) or {NO_COLUMN} may be missing",
         mostly=mostly,
     )
 

@@ -48,7 +48,14 @@ from gfnn_jax.models.lagrangians.first_order import plain_field
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, SearchOptions
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.given_terms import given_terms
-from gfnn_jax.models.lagrangians.hidden import no_hidden_law, search_hidden, with_hidden
+from gfnn_jax.models.lagrangians.hidden import (
+    NOT_HIDDEN,
+    may_hide,
+    no_hidden_law,
+    search_hidden,
+    with_hidden,
+    with_number,
+)
 from gfnn_jax.models.lagrangians.in_use import CalibratedLaw, GaugedLaw, RecordingData, best_in_use
 from gfnn_jax.models.lagrangians.in_words import (
     HIDES,
@@ -61,7 +68,7 @@ from gfnn_jax.models.lagrangians.in_words import (
 from gfnn_jax.models.lagrangians.input_rules import RULES, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS, last_of_series
-from gfnn_jax.models.lagrangians.nature import Nature, nature
+from gfnn_jax.models.lagrangians.nature import NO_COLUMN, Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions, parting
 from gfnn_jax.models.lagrangians.residuals import Trace
 from gfnn_jax.models.lagrangians.rivals import constant_of, of_a_sensor, other_powers
@@ -182,7 +189,7 @@ def _or_by_velocities(find: Callable[..., LearnedLaw]) -> Callable[..., LearnedL
             missed = error
         sure = law is not None and not law.flaws and HIDES not in law.rival
         with contextlib.suppress(FitError):
-            wider = None if sure or options.get("hidden") else read_from_the_start(recording)
+            wider = None if sure or options["hidden"] else read_from_the_start(recording)
             better = None if wider is None else find(wider, **options)
             law = law if better is None or better.flaws else better
         if law is None:
@@ -193,6 +200,36 @@ def _or_by_velocities(find: Callable[..., LearnedLaw]) -> Callable[..., LearnedL
     return found
 
 
+def _or_with_hidden(find: Callable[..., LearnedLaw]) -> Callable[..., LearnedLaw]:
+    """``find``, where the number of hidden coordinates is None; one column that leaves what a
+    coordinate may explain that no column shows tells the number."""
+
+    @wraps(find)
+    def found(recording: Recording, **options: Any) -> LearnedLaw:
+        if options.get("hidden") is not None:
+            return find(recording, **options)
+        plain, missed, none = None, FitError(""), {**options, "hidden": 0}
+        try:
+            plain = find(recording, **none)
+        except FitError as error:
+            missed = error
+        left = missed.verdict if plain is None else plain.nature
+        if NO_COLUMN in left and may_hide(recording) and not options.get("terms"):
+            law = with_number(partial(find, recording, **options), recording, plain or missed.fit)
+            if law is not None:
+                return law
+            if plain is None:
+                missed = FitError(str(missed), f"{missed.verdict}. {NOT_HIDDEN}", missed.fit)
+            else:
+                plain = dataclasses.replace(plain, nature=f"{plain.nature}. {NOT_HIDDEN}")
+        if plain is None:
+            raise missed
+        return plain
+
+    return found
+
+
+@_or_with_hidden
 @_or_by_velocities
 @np.errstate(all="ignore")  # laws that run away are part of the search
 def fit_recording(
@@ -203,7 +240,7 @@ def fit_recording(
     mass: Mapping[str, float] | None = None,
     terms: Sequence[Any] = (),
     loss: Loss | None = None,
-    hidden: int = 0,
+    hidden: int | None = None,
     on_progress: Callable[[str], Any] = lambda message: None,
 ) -> LearnedLaw:
     """The law of a recording, from its positions and inputs.
@@ -213,7 +250,8 @@ def fit_recording(
     moment of inertia) of one position, which fixes the scale of L. terms: those of L, V and R, as
     text in the names of columns (`models.lagrangians.given_terms`), which are then all that is
     fitted. loss: of residuals in units of their noise; None: the soft L1 of `solve.noise`. hidden:
-    coordinates beside the one position that no column shows (`models.lagrangians.hidden`).
+    coordinates beside the one position that no column shows (`models.lagrangians.hidden`); None:
+    as many as the record tells.
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found; its ``fit`` is then the `LearnedLaw` that misses most of the motion, where there is one.
     """
@@ -498,7 +536,7 @@ def _observation(recording: Recording) -> tuple[Observation, tuple[int, ...]]:
         columns=recording.columns,
     )
     unseen = [names[i] for i in observation.hidden_places()] if recording.observe else []
-    if unseen:
+    if unseen and observation.hidden is None:
         raise InputError(
             f"{', '.join(unseen)}: no column shows it. Leave it out of the coordinates, or write "
             "it into a formula of a column (--observe)"
