@@ -219,36 +219,59 @@ def worn_case(name: str, draw: int) -> Numbers:
 # Coordinates that no column shows
 
 
+def two_carts(rng: np.random.Generator) -> tuple[Callable, Any]:
+    """Rates of two carts between walls, joined by a cubic spring, and where they start."""
+    m, k1, k2, k, cubic = rng.uniform((0.7, 2, 2, 2, 1), (2.5, 10, 10, 10, 6))
+    start, rubs = [1.0, rng.uniform(-0.8, 0.8), 0.0, 0.0], rng.uniform(0.005, 0.05, 2)
+
+    def rates(_, s):
+        pull = k * (s[1] - s[0]) + cubic * (s[1] - s[0]) ** 3
+        return [
+            *s[2:],
+            -k1 * s[0] + pull - rubs[0] * s[2],
+            (-k2 * s[1] - pull - rubs[1] * s[3]) / m,
+        ]
+
+    return rates, start
+
+
+def three_carts(rng: np.random.Generator) -> tuple[Callable, Any]:
+    """Three carts, each on a spring of its own, in a row of cubic springs."""
+    m, rubs = np.append(1.0, rng.uniform(0.7, 2.0, 2)), rng.uniform(0.005, 0.05, 3)
+    k, cubic, own = rng.uniform(2, 10, 2), rng.uniform(1, 6, 2), rng.uniform(2.5, 10, 3)
+
+    def rates(_, s):
+        apart = np.diff(s[:3])
+        pull = np.pad(k * apart + cubic * apart**3, 1)
+        return [*s[3:], *((np.diff(pull) - own * s[:3] - rubs * s[3:]) / m)]
+
+    return rates, [1.0, *rng.uniform(-0.8, 0.8, 2), 0.0, 0.0, 0.0]
+
+
+def two_pendulums(rng: np.random.Generator) -> tuple[Callable, Any]:
+    """A pendulum on a pendulum."""
+    g, m, length = rng.uniform((4, 0.2, 0.5), (20, 0.7, 1.5))
+    start, rubs = (
+        [rng.uniform(0.4, 1.0), rng.uniform(-1, 1), 0.0, 0.0],
+        rng.uniform(0.005, 0.03, 2),
+    )
+
+    def rates(_, s):
+        c, sine = m * length * np.cos(s[0] - s[1]), m * length * np.sin(s[0] - s[1])
+        forces = [
+            -sine * s[3] ** 2 - g * np.sin(s[0]),
+            sine * s[2] ** 2 - g * m * length * np.sin(s[1]),
+        ]
+        return [*s[2:], *np.linalg.solve([[1, c], [c, m * length**2]], forces - rubs * s[2:])]
+
+    return rates, start
+
+
 def hidden_case(name: str, draw: int) -> Numbers:
     """The first of two positions, a law with one hidden coordinate, and its forecasts of five
     periods beside those of the law of both."""
     rng = np.random.default_rng([MECHANICAL.index(name), draw, 1])
-    if name == "carts":
-        m, k1, k2, k, cubic = rng.uniform((0.7, 2, 2, 2, 1), (2.5, 10, 10, 10, 6))
-        start, rubs = [1.0, rng.uniform(-0.8, 0.8), 0.0, 0.0], rng.uniform(0.005, 0.05, 2)
-
-        def rates(_, s):
-            pull = k * (s[1] - s[0]) + cubic * (s[1] - s[0]) ** 3
-            return [
-                *s[2:],
-                -k1 * s[0] + pull - rubs[0] * s[2],
-                (-k2 * s[1] - pull - rubs[1] * s[3]) / m,
-            ]
-    else:
-        g, m, length = rng.uniform((4, 0.2, 0.5), (20, 0.7, 1.5))
-        start, rubs = (
-            [rng.uniform(0.4, 1.0), rng.uniform(-1, 1), 0.0, 0.0],
-            rng.uniform(0.005, 0.03, 2),
-        )
-
-        def rates(_, s):
-            c, sine = m * length * np.cos(s[0] - s[1]), m * length * np.sin(s[0] - s[1])
-            forces = [
-                -sine * s[3] ** 2 - g * np.sin(s[0]),
-                sine * s[2] ** 2 - g * m * length * np.sin(s[1]),
-            ]
-            return [*s[2:], *np.linalg.solve([[1, c], [c, m * length**2]], forces - rubs * s[2:])]
-
+    rates, start = (two_carts if name == "carts" else two_pendulums)(rng)
     t = 0.02 * np.arange(3_000)
     options = {"t_eval": t, "rtol": 1e-10, "atol": 1e-12}
     q = solve_ivp(rates, (0, t[-1]), start, **options).y.T[:, :2]
@@ -268,6 +291,98 @@ def hidden_case(name: str, draw: int) -> Numbers:
         found |= said if len(columns) == 1 else {"of_both": said.get("error")}
     right = found.get("error", np.inf) < 3 * (found["of_both"] or 0.0)
     return found | {"right": bool(right), "named": bool(right), "verdict": found.get("verdict", "")}
+
+
+def one_that_swings(rng: np.random.Generator) -> tuple[Callable, Any]:
+    """A pendulum, or a spring of Duffing's."""
+    angle, squared, rubs = bool(rng.integers(2)), rng.uniform(4, 20), rng.uniform(0.0, 0.1)
+    cubic = rng.uniform(0.1, 1.0)
+
+    def rates(_, s):
+        pull = np.sin(s[0]) if angle else s[0] + cubic * s[0] ** 3
+        return [s[1], -squared * pull - rubs * s[1]]
+
+    return rates, [rng.uniform(0.5, 1.5), 0.0]
+
+
+def one_that_is_driven(rng: np.random.Generator) -> tuple[Callable, Any]:
+    """A spring of Duffing's under a harmonic force that nobody recorded."""
+    rates, start = one_that_swings(rng)
+    size, omega = rng.uniform(0.5, 3.0), rng.uniform(1.0, 6.0)
+    return lambda t, s: [s[1], rates(t, s)[1] + size * np.cos(omega * t)], start
+
+
+NUMBERS = {  # row -> what makes a motion, columns that show it, coordinates that none shows
+    "none: a pendulum or a spring": (one_that_swings, 1, 0),
+    "none: under a force": (one_that_is_driven, 1, 0),
+    "none: two carts": (two_carts, 2, 0),
+    "one: two carts": (two_carts, 1, 1),
+    "one: two pendulums": (two_pendulums, 1, 1),
+    "two: three carts": (three_carts, 1, 2),
+}
+
+
+def number_case(name: str, draw: int) -> Numbers:
+    """The first positions of a motion, and the number of hidden coordinates that a fit finds in
+    them, told nothing."""
+    rng = np.random.default_rng([*name.encode(), draw])
+    make, seen, number = NUMBERS[name]
+    rates, start = make(rng)
+    t = 0.02 * np.arange(1_800)
+    q = solve_ivp(rates, (0, t[-1]), start, t_eval=t, rtol=1e-10, atol=1e-12).y[:seen]
+    q = q + NOISE * q.std(axis=1)[:, None] * rng.normal(size=q.shape)
+    columns = {f"x{k + 1}": x for k, x in enumerate(q)}
+    angles = [*columns] if make is two_pendulums else []
+    recording = gfnn.Recording({"t": t, **columns}, positions=[*columns], angles=angles)
+    fit, said = _fitted(recording)
+    found = None if fit is None else fit.map.dim - seen
+    return {"draw": draw, "number": found, "named": found == number} | said
+
+
+# Times at which gates see a motion
+
+SIGMA_OF_TIMES = 1e-4
+
+
+def gates_case(name: str, draw: int) -> Numbers:
+    """A damped pendulum that two photogates at unknown angles see 200 times each, as long as it
+    reaches them. A law is right whose ω₀² is within 0.1 %, whose friction is of the right kind, and
+    whose gates are within four standard errors."""
+    rng = np.random.default_rng([*name.encode(), draw])
+    squared, size = rng.uniform((8, 0.6), (40, 1.4))
+    linear = bool(rng.integers(2))
+    rubs = rng.uniform(0.002, 0.006) * np.sqrt(squared) if linear else rng.uniform(0.005, 0.02)
+    places = rng.choice([-1, 1]) * rng.uniform((0.05, -0.2), (0.25, 0.05))
+
+    def rates(_, s):
+        return [s[1], -squared * np.sin(s[0]) - rubs * s[1] * (1.0 if linear else abs(s[1]))]
+
+    crossed = [lambda _, s, a=a: s[0] - a for a in places]
+    span, options = (0, 800 / np.sqrt(squared)), {"rtol": 1e-10, "atol": 1e-12}
+    times = solve_ivp(rates, span, [size, 0.0], "DOP853", events=crossed, **options).t_events
+    gates = [x[:200] + SIGMA_OF_TIMES * rng.normal(size=len(x[:200])) for x in times]
+    recording = gfnn.Recording(
+        {"t": np.concatenate(gates), "gate": np.repeat(["left", "right"], [*map(len, gates)])},
+        events={"left": "theta - a", "right": "theta - b"},
+        angles=["theta"],
+        std={"left": SIGMA_OF_TIMES, "right": SIGMA_OF_TIMES},
+    )
+    found: Numbers = {"draw": draw, "friction": "linear" if linear else "quadratic"}
+    fit, said = _fitted(recording)
+    found |= {"named": False} | said
+    if fit is None:
+        return found
+    terms = {term.term: term.coefficient for term in fit.lagrangian.terms}
+    rubbed = [term.term for term in fit.friction.terms]
+    found["squared_off"] = float(abs(terms.get("cos(theta)", 0.0) / squared - 1))
+    gates_off = [
+        (abs(fit.sensors[n][0]) - abs(a)) / fit.sensors[n][1]
+        for n, a in zip("ab", places, strict=True)
+    ]
+    found["gates_off"] = float(max(map(abs, gates_off)))
+    right = found["squared_off"] < 1e-3 and found["gates_off"] < 4
+    found["named"] = bool(right and rubbed == ["omega**2" if linear else "abs(omega)**3"])
+    return found
 
 
 # Records that no law of the vocabulary makes
@@ -645,6 +760,9 @@ PIECES |= {_slug(f"clean {n}"): partial(drawn, clean_case, n, CLEAN_DRAWS) for n
 PIECES |= {_slug(f"worn {n}"): partial(drawn, worn_case, n, DRAWS) for n in WORN}
 HIDDEN = ("carts", "double pendulum")
 PIECES |= {_slug(f"hidden {n}"): partial(drawn, hidden_case, n, DRAWS) for n in HIDDEN}
+PIECES |= {_slug(f"hidden number {n}"): partial(drawn, number_case, n, DRAWS) for n in NUMBERS}
+GATES = ("two gates",)
+PIECES |= {_slug(n): partial(drawn, gates_case, n, DRAWS) for n in GATES}
 PIECES |= {_slug(f"orbit {n}"): partial(drawn, orbit_case, n, EACH_ORBIT) for n in ORBITS}
 
 
@@ -721,6 +839,29 @@ def tables() -> None:
         "forecast within 3 × that of both",
         "median error, five periods ahead",
         "of both",
+    )
+    text += "\n\n" + markdown(heads, rows)
+    rows = []
+    for name in NUMBERS:
+        own = cases.get(_slug(f"hidden number {name}"), [])
+        times = [c["processor_seconds"] for c in own if "processor_seconds" in c]
+        right = f"{sum(c['named'] for c in own)} of {len(own)}"
+        if own:
+            rows.append([name, right, *(number(f(times)) for f in (np.median, max) if times)])
+    heads = ("hidden coordinates, told only the columns", "number right", "median CPU s", "most")
+    text += "\n\n" + markdown(heads, rows)
+    rows = []
+    for name in GATES:
+        own = cases.get(_slug(name), [])
+        errors = [[c[k] for c in own if k in c] for k in ("squared_off", "gates_off")]
+        right = f"{sum(c['named'] for c in own)} of {len(own)}"
+        if own:
+            rows.append([name, right, *(number(max(e)) if e else "–" for e in errors)])
+    heads = (
+        "a pendulum's times at",
+        "right",
+        "largest relative error of ω₀²",
+        "of the gates' angles, in standard errors",
     )
     text += "\n\n" + markdown(heads, rows)
     for kind, names, head in (

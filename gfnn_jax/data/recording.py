@@ -75,7 +75,8 @@ class ReadOptions(TypedDict, total=False):
              these names: coordinates, velocities, and parameters to be fitted.
     events:  column -> expression h, as {"gate": "theta"} of a photogate: the column holds the times
              at which the motion crosses h = 0, and ``std`` is the noise of these times in s. It is
-             short for ``observe={"gate": "crossing(theta)"}``.
+             short for ``observe={"gate": "crossing(theta)"}``. Several gates are several columns,
+             or a column of their names beside the times.
     guess:   where parameters of ``observe`` and ``events`` start.
     """
 
@@ -460,7 +461,9 @@ def read(
             tables.append(rows_of(table, start, stop, every))
         else:
             rows = {"start": start, "stop": stop, "every": every}
-            tables.append(from_text(path, chosen, time=time, **rows))
+            shown = with_crossings(options.get("observe") or {}, options.get("events") or {})
+            words = crossings_in(shown)
+            tables.append(from_text(path, chosen, time=time, words=words, **rows))
     return Recording(tables, **options)
 
 

@@ -24,16 +24,16 @@ _MOST_MOVED = 3  # rows in a row that are taken to be out of place; more are a r
 class Table:
     """Columns of equal length by name: (T,) float64, of runs (T,) text.
 
-    units: by column name, as a header or a row of units gave them. text: names of columns that hold
-    no numbers. notes: what reading had to decide. locate: says where a row stands, for a message.
-    time: the column of times, where its name does not tell. step: the time between rows in s that
-    the file gives beside its columns, and what it calls it.
+    units: by column name, as a header or a row of units gave them. text: columns of words, empty
+    where these were not read. notes: what reading had to decide. locate: says where a row stands,
+    for a message. time: the column of times, where its name does not tell. step: the time between
+    rows in s that the file gives beside its columns, and what it calls it.
     """
 
     columns: dict[str, np.ndarray]
     units: dict[str, str] = dataclasses.field(default_factory=dict)
     source: str = "the table"
-    text: tuple[str, ...] = ()
+    text: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     notes: tuple[str, ...] = ()
     locate: Callable[[int], str] = lambda row: f"row {row + 1}"
     time: str | None = None
@@ -51,32 +51,36 @@ def rows_of(table: Table, start: float, stop: float, every: int) -> Table:
     keep = np.arange(len(next(iter(table.columns.values()), ()))) % every == 0
     for name in table.times[:1]:
         keep &= ~((table.columns[name] < start) | (table.columns[name] > stop))
-    return dataclasses.replace(table, columns={n: v[keep] for n, v in table.columns.items()})
+    columns = {n: v[keep] for n, v in table.columns.items()}
+    text = {n: v[keep] if len(v) else v for n, v in table.text.items()}
+    return dataclasses.replace(table, columns=columns, text=text)
 
 
 def with_events(table: Table, names: Collection[str]) -> Table:
-    """The table with a row at each time that stands in columns of events, by ``names``, where that
-    column is 0; elsewhere it is missing, and all others are there.
+    """The table with a row at each time that stands in columns of events, by ``names``, or in rows
+    that a column of words gives such a name. The column of the name is 0 there; elsewhere it is
+    missing, and all others are there.
 
     Raises InputError where the table has several runs.
     """
-    events = {
-        n: table.columns[n][np.isfinite(table.columns[n])] for n in names if n in table.columns
-    }
+    time = next(iter(table.times), "t")
+    own = table.columns.get(time, np.zeros(0))
+    events = {n: table.columns[n] for n in names if n in table.columns}
+    for words in table.text.values():
+        events |= {n: own[words == n] for n in names if n in words}
+    events = {n: times[np.isfinite(times)] for n, times in events.items()}
     if not events:
         return table
     if _run_column(table) is not None:
         raise InputError(f"{table.source}: events of several runs: give a table for each run")
-    time = next(iter(table.times), "t")
-    others = {n: x for n, x in table.columns.items() if n not in events}
-    own = others.pop(time, np.zeros(0))
+    others = {n: x for n, x in table.columns.items() if n not in (*events, time)}
     every, place = np.unique(np.concatenate([own, *events.values()]), return_inverse=True)
     columns = {time: every} | {n: np.full(len(every), np.nan) for n in (*others, *events)}
     for name, values in others.items():
         columns[name][place[: len(own)]] = values
     for name, times in events.items():
         columns[name][np.isin(every, times)] = 0.0
-    return dataclasses.replace(table, columns=columns)
+    return dataclasses.replace(table, columns=columns, text={})
 
 
 def from_memory(table: Any) -> Table:
@@ -104,7 +108,7 @@ def from_memory(table: Any) -> Table:
             f"expected a DataFrame, a dict of arrays or a list of these, got {type(table).__name__}"
         )
     found: dict[str, np.ndarray] = {}
-    text = []
+    text: dict[str, np.ndarray] = {}
     for name, values in named.items():
         if values.ndim not in (1, 2):
             raise InputError(f"{name}: expected an array (T,) or (T, k), got shape {values.shape}")
@@ -118,7 +122,7 @@ def from_memory(table: Any) -> Table:
         try:
             numbers = values.astype(np.float64)
         except (TypeError, ValueError):
-            text.append(name)
+            text[name] = values.astype(str)
             continue
         each = {name: numbers} if numbers.ndim == 1 else _spread(name, numbers)
         found.update(each)
@@ -128,7 +132,7 @@ def from_memory(table: Any) -> Table:
             "expected columns of one length, got "
             + ", ".join(f"{name} {length}" for name, length in lengths.items())
         )
-    return Table(found, text=tuple(text))
+    return Table(found, text=text)
 
 
 def _spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ import itertools
 import re
 import shlex
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -427,14 +427,15 @@ def from_text(
     start: float = -np.inf,
     stop: float = np.inf,
     every: int = 1,
+    words: Collection[str] = (),
 ) -> Table:
     """The columns of a text file, of which rows between the times ``start`` and ``stop`` (in the
     file's unit), every so many of them, are kept.
 
     columns: names of those to read, or of all, in order, where the file has no header. time: name
-    of the column of times. The file is read in blocks of rows, so that of a file larger than memory
-    a part can be had. Raises InputError, with the line, at what is no number and at lines of
-    another width.
+    of the column of times. words: columns of these are read too. The file is read in blocks of
+    rows, so that of a file larger than memory a part can be had. Raises InputError, with the line,
+    at what is no number and at lines of another width.
     """
     text = TextFile(path, columns, time)
     columns = resolved(columns, [text.runs.get(name, (name,))[0] for name in text.names])
@@ -442,13 +443,15 @@ def from_text(
         return rows_of(_stacked(text, columns), start, stop, every)
     wanted = [n for n in text.names if n in (columns or text.names) or n in text.times or is_run(n)]
     wanted = [name for name in wanted if name not in text.text or name in text.times[:1]]
+    words_of = [name for name in text.text if name not in text.times]
+    read = words_of if words else []
     if not wanted:
         raise InputError(f"{path}: no column of numbers: {', '.join(text.names)} hold words")
     runs = [name for name in wanted if is_run(name)]
     kept: list[dict[str, np.ndarray]] = []
     numbers: list[np.ndarray] = []  # of the rows that are kept, in the file
     passed = 0
-    for block in text.blocks(wanted, _OPTIONS.block_rows, runs):
+    for block in text.blocks([*wanted, *read], _OPTIONS.block_rows, [*runs, *read]):
         rows = np.arange(len(next(iter(block.values()))))
         keep = (rows + passed) % every == 0
         for name in text.times[:1]:
@@ -456,23 +459,24 @@ def from_text(
         kept.append({name: values[keep] for name, values in block.items()})
         numbers.append(rows[keep] + passed)
         passed += len(rows)
-    found = {name: np.concatenate([block[name] for block in kept]) for name in wanted}
+    found = {name: np.concatenate([block[name] for block in kept]) for name in kept[0]}
+    of_words = {name: found.pop(name, np.array([], str)) for name in words_of}
+    aside = [name for name, cells in of_words.items() if not {*words} & {*cells}]
     row_numbers = np.concatenate(numbers)
     return Table(
         found,
         text.units,
         str(path),
-        tuple(name for name in text.text if name not in text.times),
-        (*text.notes, *_put_aside(text)),
+        of_words,
+        (*text.notes, *_put_aside(aside)),
         lambda row: text.locate(int(row_numbers[row])),
         next(iter(text.times), None),
         text.step,
     )
 
 
-def _put_aside(text: TextFile) -> tuple[str, ...]:
+def _put_aside(names: Sequence[str]) -> tuple[str, ...]:
     """A note about columns that hold words."""
-    names = [name for name in text.text if name not in text.times]
     verbs = "holds words and is" if len(names) == 1 else "hold words and are"
     return (f"{', '.join(names)} {verbs} put aside",) if names else ()
 
@@ -480,6 +484,7 @@ def _put_aside(text: TextFile) -> tuple[str, ...]:
 def _stacked(text: TextFile, columns: Sequence[str]) -> Table:
     """The table of a file whose runs stand side by side, the runs one after another."""
     wanted = [name for name in text.names if name not in text.text]
+    aside = [name for name in text.text if name not in text.times]
     blocks = list(text.blocks(wanted, _OPTIONS.block_rows))
     raw = {name: np.concatenate([block[name] for block in blocks]) for name in wanted}
     runs = [run for run in dict.fromkeys(run for _, run in text.runs.values()) if run]
@@ -501,8 +506,8 @@ def _stacked(text: TextFile, columns: Sequence[str]) -> Table:
         {name: found[name] for name in kept},
         {text.runs[name][0]: unit for name, unit in text.units.items()},
         str(text.path),
-        (),
-        (*text.notes, *_put_aside(text), f"the runs {', '.join(runs)} stand side by side"),
+        {},
+        (*text.notes, *_put_aside(aside), f"the runs {', '.join(runs)} stand side by side"),
         time=time,
     )
 

@@ -503,11 +503,13 @@ class Observation:
     def _suited(self, x: np.ndarray, a: np.ndarray, y: np.ndarray) -> tuple[Observation, float]:
         """The observation whose parameters suit channels y (n, k) of states x (n, 2d) and
         accelerations a (n, d) best, and the mean square that it leaves, of that of y."""
-        values, scale, cost = self.values, _roughness(y), np.inf
+        values, scale, cost = self.values, np.ones(len(self.channels)), np.inf
+        sampled = ~np.isin(range(len(scale)), self.events)
+        scale[sampled] = _roughness(y[:, sampled])
         for _ in range(OPTIONS.iterations):
             shown = self(x, values, a)
             by_time = np.linalg.norm(shown.by_state[..., : self.dim], axis=-1)  # of an event: 1/ḣ
-            each = np.where(np.isin(range(len(scale)), self.events), by_time, scale)
+            each = np.where(sampled, scale, by_time)
             left = ((y - shown.values) / each).ravel()
             rows = (shown.by_coefficients / each[..., None]).reshape(len(left), -1)
             told = np.isfinite(left) & np.isfinite(rows).all(1)

@@ -139,12 +139,9 @@ def _turns(gates: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     if not len(periods):
         return np.zeros(0), np.zeros(0)
     period = float(np.median(periods))
-    steps = [np.diff(g) for g in gates]
-    middles = np.sort(
-        np.concatenate(
-            [(g[:-1] + s / 2)[s < OPTIONS.missed * period] for g, s in zip(gates, steps, strict=True)]
-        )
-    )
+    near = [g[:-1][np.diff(g) < OPTIONS.missed * period] for g in gates]
+    far = [g[1:][np.diff(g) < OPTIONS.missed * period] for g in gates]
+    middles = np.sort((np.concatenate(near) + np.concatenate(far)) / 2)
     count = np.cumsum(np.round(2 * np.diff(middles, prepend=middles[:1]) / period))
     numbers, which = np.unique(count, return_inverse=True)
     return np.bincount(which, middles) / np.bincount(which), numbers

@@ -97,7 +97,7 @@ def oscillations(t: np.ndarray, y: np.ndarray, count: int) -> list[Oscillations]
             for peak in dominant_frequencies([t], rest, _OPTIONS.peaks):
                 tried.append(_refined(t, y, np.append(one.omega, 2 * np.pi * peak)))
         tried = [one for one in tried if one.are_apart]
-        tried.sort(key=lambda one: one.left(t, y))
+        tried = _unlike(sorted(tried, key=lambda one: one.left(t, y)))
         if found and len(found[0].omega) == 1:
             strongest = found[0].omega[0]
             tried = tried[: _OPTIONS.kept - 1] + [
@@ -109,6 +109,15 @@ def oscillations(t: np.ndarray, y: np.ndarray, count: int) -> list[Oscillations]
         else:
             found = tried[: _OPTIONS.kept]
     return found
+
+
+def _unlike(found: list[Oscillations]) -> list[Oscillations]:
+    """Sets of as many oscillations, each without those behind it that have its frequencies."""
+    kept: list[Oscillations] = []
+    for one in found:
+        if not any(np.allclose(one.omega, other.omega, rtol=0.01) for other in kept):
+            kept.append(one)
+    return kept
 
 
 def _refined(t: np.ndarray, y: np.ndarray, omega: np.ndarray) -> Oscillations:

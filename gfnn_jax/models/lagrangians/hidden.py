@@ -139,7 +139,7 @@ def no_hidden_law(count: int, law: Any = None) -> FitError:
     """Error where no law with so many hidden coordinates follows, but ``law`` in part."""
     return FitError(
         f"no law with {count} of its coordinates hidden follows the column: ask for fewer, "
-        f"hidden={count - 1}, or record another column",
+        f"--hidden {count - 1}, or record another column",
         f"no law: none with {count} hidden coordinates follows the recording",
         law,
     )
@@ -162,7 +162,7 @@ def search_hidden(problem: ArcProblem) -> SearchResult:
     """The law of a problem whose channel shows several coordinates, from the first set of
     oscillations that leads to one which leaves noise alone, else from the best.
 
-    Raises FitError where no start follows short arcs.
+    Raises FitError where no start follows the arcs to some times their noise.
     """
     longest = max(problem.nodes, key=lambda n: len(n.t))
     found: list[LawFit] = []
@@ -174,6 +174,8 @@ def search_hidden(problem: ArcProblem) -> SearchResult:
     if not found:
         raise no_hidden_law(problem.dim - 1)
     fit = min(found, key=misfit)
+    if misfit(fit) > STARTS.followed:
+        raise no_hidden_law(problem.dim - 1)
     fit = TermSearch(fit.structure, None).prune(fit)
     return SearchResult(InputModel(fit), FrictionChoice(fit.structure.friction, {}, {}, False))
 
@@ -199,7 +201,10 @@ def _followed(problem: ArcProblem) -> list[LawFit]:
     found: list[LawFit] = []
     fits = _of_pendulums(problem) if problem.angles else _of_modes(problem)
     for fit in sorted(fits, key=misfit)[: OPTIONS.finished]:
-        fit = to_longest_arcs(fit.again(), problem.options.periods[1:])
+        fit = fit.again()
+        if misfit(fit) > STARTS.followed:  # along longer arcs it would leave more
+            continue
+        fit = to_longest_arcs(fit, problem.options.periods[1:])
         problem.on_progress(f"from oscillations: {fit}")
         if fit.follows and fit.is_definite:
             found.append(fit)
