@@ -5,7 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
-from gfnn_jax.maps.observation import Crossing
+from gfnn_jax.data.recording import channels_of
+from gfnn_jax.maps.observation import Crossing, observed
 
 
 def swings(omega2, friction, start, seconds):
@@ -52,6 +53,79 @@ def test_a_photogate_tells_a_pendulum_and_its_friction(friction, text):
     assert fit.verdict == "identified"
     with pytest.raises(gfnn.InputError, match="no state is estimated"):
         fit.forecast(np.array([200.0]))
+
+
+def two_gates(places, start=0.9, friction=lambda v: 0.02 * v * abs(v), seconds=90.0):
+    """Times at which a pendulum of ω₀² = 22 passes gates at these angles."""
+
+    def rates(_, z):
+        return [z[1], -22.0 * np.sin(z[0]) - friction(z[1])]
+
+    gates = [lambda _, z, a=a: z[0] - a for a in places]
+    options = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-12}
+    times = solve_ivp(rates, (0, seconds), [start, 0.0], events=gates, **options).t_events
+    rng = np.random.default_rng(0)
+    return [x + 1e-4 * rng.normal(size=len(x)) for x in times]
+
+
+GATES = {"left": "theta - a", "right": "theta - b"}
+
+
+def named(times):
+    """Times of gates in one column, with their names in another."""
+    order = np.argsort(np.concatenate(times))
+    names = np.repeat([*GATES], [*map(len, times)])
+    return {"t": np.concatenate(times)[order], "gate": names[order]}
+
+
+def test_names_of_gates_stand_beside_their_times(tmp_path):
+    times = two_gates((0.2, -0.05), seconds=20.0)
+    table, longest = named(times), max(map(len, times))
+    columns = [np.append(x, np.full(longest - len(x), np.nan)) for x in times]
+    file = tmp_path / "gates.csv"
+    rows = zip(table["t"].tolist(), table["gate"], strict=True)
+    file.write_text("t,gate\n" + "".join(f"{t!r},{name}\n" for t, name in rows))
+    expected = gfnn.Recording(dict(zip(GATES, columns, strict=True)), events=GATES)
+    for found in (gfnn.Recording(table, events=GATES), gfnn.read(file, events=GATES)):
+        assert found.events == ("left", "right")
+        assert not found.notes
+        np.testing.assert_array_equal(found.times("0"), expected.times("0"))
+        for name in GATES:
+            one, other = found.values(name, "0"), expected.values(name, "0")
+            np.testing.assert_array_equal(one, other)
+
+
+def test_swings_start_between_gates():
+    """Gates that the swings reach no longer, aside of their middle, tell where they stand."""
+    record = gfnn.Recording(named(two_gates((0.2, -0.05))), events=GATES, angles=["theta"])
+    known = {"left": "theta - 0.2", "right": "theta + 0.05"}
+    for given, expected in ((GATES, (0.2, -0.05)), (known, ())):
+        shown = {name: f"crossing({h})" for name, h in given.items()}
+        g = observed(shown, ("theta",), ("omega",), {}, columns=("left", "right"))
+        y, _ = channels_of(record, g.channels, "0")
+        g = g.balanced([(record.times("0"), y)], (0,))
+        np.testing.assert_allclose(g.values * np.sign(g.values[:1]), expected, rtol=0.1)
+        theta = g.coordinates_of(y, (0,), record.times("0"))[:, 0]
+        for k, place in enumerate(expected or (0.2, -0.05)):
+            passed = np.isfinite(y[:, k]) & np.isfinite(theta)
+            assert abs(np.median(theta[passed]) - place * np.sign(g.values[:1].sum() or 1)) < 0.02
+
+
+@pytest.mark.slow
+def test_two_photogates_tell_a_pendulum_and_where_they_stand():
+    record = gfnn.Recording(
+        named(two_gates((0.2, -0.05))),
+        events=GATES,
+        angles=["theta"],
+        std=dict.fromkeys(GATES, 1e-4),
+    )
+    fit = gfnn.fit(record)
+    (term,) = [one for one in fit.found.lagrangian.terms if "cos" in one.term]
+    assert term.coefficient == pytest.approx(22.0, rel=1e-4)
+    assert [one.term for one in fit.found.friction.terms] == ["abs(omega)**3"]
+    for name, place in (("a", 0.2), ("b", -0.05)):
+        value, std = fit.found.sensors[name]
+        assert abs(abs(value) - abs(place)) < 4 * std < 1e-3
 
 
 def test_times_of_one_period_tell_no_law():

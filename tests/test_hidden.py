@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+from types import SimpleNamespace as Some
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.models.lagrangians.hidden import with_number
 from gfnn_jax.signals.oscillations import Oscillations, oscillations
 
 STEP = 0.025
@@ -48,6 +53,69 @@ def test_hidden_coordinates_that_cannot_be_are_refused(options, hidden, message)
         gfnn.fit(recording, model=gfnn.Lagrangian(hidden=hidden))
 
 
+def test_sets_of_oscillations_differ():
+    t = 0.05 * np.arange(800)
+    found = oscillations(t, np.cos(1.7 * t) + 0.4 * np.sin(4.1 * t), 2)
+    pairs = [(a.omega, b.omega) for k, a in enumerate(found) for b in found[:k]]
+    assert pairs
+    assert not any(np.allclose(a, b, rtol=0.01) for a, b in pairs)
+
+
+@dataclasses.dataclass
+class Law:
+    """What a number of hidden coordinates is chosen by."""
+
+    residual: dict[str, float]
+    white: bool
+    count: int
+    flaws: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
+    num_samples: int = 1_000
+
+    @property
+    def symbols(self):
+        return (("x",) * (1 + self.count), ())
+
+    @property
+    def whiteness(self):
+        return {"x": Some(white=self.white)}
+
+    @property
+    def lagrangian(self):
+        return Some(terms=range(10 * (1 + self.count)))
+
+    friction = Some(terms=())
+    sensors, observe, traces = (), ("x",), (0,)
+
+
+@pytest.mark.parametrize(
+    ("laws", "number", "tried"),
+    [
+        ({1: (0.1, True), 2: (0.05, True)}, 1, [1]),  # white: no more is tried
+        ({1: (0.2, False), 2: (0.1, True)}, 2, [1, 2]),
+        ({1: (0.1, False), 2: (0.0999, True)}, 1, [1, 2]),  # no more than chance
+        ({2: (0.1, True)}, 2, [1, 2]),
+        ({1: (5.0, False), 2: (6.0, False)}, None, [1, 2]),  # neither is as good as none
+        ({}, None, [1, 2]),
+    ],
+)
+def test_the_number_of_hidden_coordinates_is_the_likeliest(laws, number, tried):
+    recording: Any = Some(angles=())
+    asked = []
+
+    def find(hidden):
+        asked.append(hidden)
+        if hidden not in laws:
+            raise FitError("none")
+        size, white = laws[hidden]
+        return Law({"x": size}, white, hidden)
+
+    law: Any = with_number(find, recording, Law({"x": 4.0}, False, 0))
+    assert asked == tried
+    assert (law and law.count) == number
+    assert number is None or f"{number} hidden" in law.messages[0]
+
+
 @pytest.mark.slow
 def test_what_has_no_second_oscillation_has_no_hidden_coordinate():
     t = STEP * np.arange(400)
@@ -69,8 +137,9 @@ def test_a_pendulum_on_a_pendulum_is_told_by_the_first(tmp_path):
     t, q, true = followed(rates, [0.8, -0.5, 0.0, 0.0], 40)
     seen = t < 30
     recording = gfnn.Recording({"t": t[seen], "theta": q[0, seen]})
-    fit = gfnn.fit(recording, model=gfnn.Lagrangian(hidden=1))
+    fit = gfnn.fit(recording)  # one column, told nothing
     assert fit.verdict == "identified"
+    assert "theta shows 2 coordinates: 1 hidden" in " ".join(fit.messages)
     values = {term.term: term.coefficient for term in fit.law.lagrangian.terms}
     for name, value in (("cos(theta_seen)", g), ("cos(theta_hidden)", g * c)):
         assert values[name] == pytest.approx(value, rel=0.02)

@@ -186,7 +186,7 @@ def _missing(traits: Traits) -> Iterator[Fault]:
         cells = int(np.sum(~np.isfinite(traits.columns[name])))
         if gone:
             yield _note("missing column", f"{name} has no values in run {', '.join(gone[:8])}")
-        elif cells:
+        elif cells and name not in recording.events:
             rows = "1 row, which is" if cells == 1 else f"{cells} rows, which are"
             yield _note("missing", f"{name} has no value in {rows} not used for it")
 
