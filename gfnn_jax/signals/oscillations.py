@@ -81,13 +81,16 @@ class Oscillations(NamedTuple):
 
 
 def oscillations(t: np.ndarray, y: np.ndarray, count: int) -> list[Oscillations]:
-    """Sets of ``count`` oscillations of y (n,) at times t (n,), the one that follows best first.
+    """Sets of ``count`` oscillations of y (n,) at times t (n,), the one that follows best first;
+    none where it is shorter than a window.
 
     Each is the last set with a peak of the spectrum of what that does not follow, and then the
     frequencies that follow best. Behind them stand sets of the strongest one and one that is hidden
     behind how its size changes.
     """
     known = np.isfinite(y)
+    if known.sum() < _OPTIONS.fewest * count:
+        return []
     t, y = t[known], y[known] - np.mean(y[known])
     found = [Oscillations(np.zeros(0))]
     for _ in range(count):

@@ -62,8 +62,9 @@ NOT_HIDDEN = "No law with one or two hidden coordinates follows to the noise"
 
 
 def may_hide(recording: Recording) -> bool:
-    """Return whether a recording is of one position, as it is, and without inputs."""
-    return len(recording.positions) == 1 and not (recording.observe or recording.inputs)
+    """Return whether a recording is of one position, as it is, and of nothing else."""
+    others = recording.observe or recording.inputs or recording.parameters
+    return len(recording.positions) == 1 and not others
 
 
 def with_number(
@@ -75,7 +76,7 @@ def with_number(
     alone."""
     laws = {} if plain is None else {0: plain}
     for count in range(1, 2 if recording.angles else 3):
-        with contextlib.suppress(FitError):
+        with contextlib.suppress(FitError, np.linalg.LinAlgError):
             laws[count] = find(hidden=count)
             if all(one.white for one in laws[count].whiteness.values()):
                 break
@@ -110,8 +111,8 @@ def with_hidden(recording: Recording, count: int) -> Recording:
     """
     if not may_hide(recording) or count > 2:
         raise InputError(
-            "hidden: expected a recording of one position, without inputs and formulas of sensors, "
-            "and one or two hidden coordinates"
+            "hidden: expected a recording of one position, without inputs, parameters and formulas "
+            "of sensors, and one or two hidden coordinates"
         )
     (name,) = recording.positions
     if name in recording.angles and count > 1:
