@@ -44,8 +44,8 @@ class HiddenOptions:
 
     periods: lengths of arcs, in periods of the slowest oscillation. degrees: of the powers of
     modes. couplings: squares of c in ½v² + c v w + ½w², of two pendulums, and sizes: of the hidden
-    swings, times those that are seen, that are tried. sets: of oscillations that pendulums start
-    from, and finished: starts that are followed on. damped: of the critical friction, at the start.
+    swings, times those that are seen, that are tried. sets: of oscillations that are started from,
+    and finished: starts that are followed on. damped: of the critical friction, at the start.
     """
 
     periods: tuple[float, ...] = (0.75, 1.5, 3.0, 6.0, 12.0)
@@ -168,7 +168,7 @@ def search_hidden(problem: ArcProblem) -> SearchResult:
     longest = max(problem.nodes, key=lambda n: len(n.t))
     found: list[LawFit] = []
     sets = oscillations(longest.t, longest.y[:, 0], problem.dim)
-    for one in sets[: OPTIONS.sets] if problem.angles else sets:
+    for one in sets[: OPTIONS.sets]:
         found += _followed(_from(problem, one))
         if found and min(map(misfit, found)) < STARTS.noise:
             break
@@ -204,6 +204,7 @@ def _followed(problem: ArcProblem) -> list[LawFit]:
     for fit in sorted(fits, key=misfit)[: OPTIONS.finished]:
         fit = fit.again()
         if misfit(fit) > STARTS.followed:  # along longer arcs it would leave more
+            problem.on_progress(f"short arcs are not followed: {fit}")
             continue
         fit = to_longest_arcs(fit, problem.options.periods[1:])
         problem.on_progress(f"from oscillations: {fit}")
