@@ -399,7 +399,8 @@ def _between_gaps(
     q, v, _ = curves.smooth(s.t, s.q, filled.t)
     seen = np.flatnonzero(np.isfinite(filled.y).any(1))
     longest = max(OPTIONS.gap * scales.period, 2 * scales.spacing)
-    longest = longest if np.nan_to_num(filled.y).any() else np.inf  # of events
+    usual, events = float(np.median(np.diff(filled.t[seen]))), not np.nan_to_num(filled.y).any()
+    longest = np.inf if events or usual > longest else longest
     ends = np.flatnonzero(np.diff(filled.t[seen]) > longest) + 1
     for a, b in pairwise([0, *map(int, ends), len(seen)]):
         yield filled, np.arange(seen[a], seen[b - 1] + 1), np.concatenate([q, v], axis=1)
