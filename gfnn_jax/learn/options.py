@@ -371,8 +371,8 @@ OPTIONS: dict[str, About] = {
     ),
     "hidden": About(
         _whole(0, 2),
-        "for a recording of one position: the number of coordinates beside it that no column shows; "
-        "by default as many as the record asks for",
+        "for a recording of one position: the number of coordinates beside it that no column "
+        "shows; by default as many as the record asks for",
         "N",
     ),
     "devices": About(
