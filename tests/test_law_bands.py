@@ -8,7 +8,7 @@ from test_law_fits import chain, pendulum, recorded
 
 import gfnn_jax as gfnn
 from gfnn_jax.maps.sensors import Sensors
-from gfnn_jax.models.lagrangians.calibration import Thirds, _with_size
+from gfnn_jax.models.lagrangians.calibration import Thirds, _with_shape
 from gfnn_jax.models.lagrangians.fit import SearchOptions
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.search import search
@@ -17,9 +17,9 @@ from gfnn_jax.models.lagrangians.search import search
 def covered(fit, recording, starts, ahead):
     """Share of the samples up to ``ahead`` seconds after each start that lie within two standard
     deviations of a forecast, and the same without the misfit."""
-    bare = dataclasses.replace(
-        fit.map.sensors, misfit=np.zeros_like(np.asarray(fit.map.sensors.misfit))
-    )
+    sensors = fit.map.sensors
+    none = np.zeros_like(np.asarray(sensors.misfit))
+    bare = dataclasses.replace(sensors, misfit=none, of_law=False)
     inside = []
     for map_ in (fit.map, dataclasses.replace(fit.map, sensors=bare)):
         found = []
@@ -64,7 +64,8 @@ def test_bands_and_horizon_of_a_law_that_is_wrong_hold_what_it_misses():
 
 def test_bands_of_a_law_that_is_right_hold_no_more(swing):
     recording, fit = swing
-    assert np.all(np.asarray(fit.map.sensors.misfit) < 1e-3)  # as large as the noise
+    misfit = np.asarray(fit.map.sensors.misfit)
+    assert np.all(misfit < (2.0 if fit.map.sensors.of_law else 1e-3))  # as large as the noise
     assert fit.map.sensors.wander is None
     with_misfit, _ = covered(fit, recording, np.arange(30.5, 38.5, 0.7), 1.5)
     assert 0.9 < with_misfit < 0.995
@@ -80,9 +81,10 @@ def test_misfit_beyond_the_last_lead_grows_as_it_did():
     np.testing.assert_allclose(far[1], [np.sqrt(40), 3.0, 400.0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("relative", [True, False])
-def test_the_misfit_is_in_proportion_to_the_motion_where_its_errors_are(relative):
-    """Of swings that die down, an angle that has turned among them."""
+@pytest.mark.parametrize("kind", ["steady", "relative", "of_law"])
+def test_the_misfit_is_of_the_kind_that_its_errors_are(kind):
+    """Of swings that die down, an angle that has turned among them, by a law whose own deviations
+    are twice the errors where these are in proportion to them."""
     rng, phase = np.random.default_rng(0), np.linspace(0, 40, 400)
     amplitude = np.exp(-phase / 20)
     x = np.stack([amplitude * np.cos(phase) + 2 * np.pi, -amplitude * np.sin(phase)], axis=1)
@@ -90,7 +92,7 @@ def test_the_misfit_is_in_proportion_to_the_motion_where_its_errors_are(relative
         ("theta",),
         (),
         ("theta",),
-        1e-3 * np.ones(1),
+        1e-4 * np.ones(1),
         1.0,
         1.0,
         "hold",
@@ -101,11 +103,15 @@ def test_the_misfit_is_in_proportion_to_the_motion_where_its_errors_are(relative
     )
     reach = np.sqrt(np.mean(sensors.distances(x) ** 2, axis=0))
     sensors = dataclasses.replace(sensors, reach=reach)
-    errors = 0.01 * rng.normal(size=(400, 3, 1)) * (amplitude[:, None, None] if relative else 0.5)
-    chosen, large = _with_size(sensors, x, errors, 1e-3 * np.ones(errors.shape))
-    assert chosen.relative == relative
-    expected = amplitude / np.sqrt(np.mean(amplitude**2)) if relative else np.ones(400)
-    np.testing.assert_allclose(large[:, 0, 0], expected, rtol=0.15)
+    law = 1e-3 * (1.5 + np.sin(3 * phase))[:, None, None] * np.ones((400, 3, 1))
+    true = {"steady": 5e-3, "relative": 0.01 * amplitude[:, None, None], "of_law": 0.5 * law}[kind]
+    beside = 1e-4 if kind == "of_law" else law
+    errors = np.hypot(true, beside) * rng.normal(size=law.shape)
+    chosen, known, unit = _with_shape(sensors, x, errors, law)
+    assert (chosen.relative, chosen.of_law) == (kind == "relative", kind == "of_law")
+    misfit = np.mean((errors**2 - known) / unit)
+    expected = {"steady": 5e-3, "relative": 0.01 * np.sqrt(np.mean(amplitude**2)), "of_law": 0.5}
+    assert np.sqrt(misfit) == pytest.approx(expected[kind], rel=0.15)
 
 
 def test_thirds_begin_where_they_say():

@@ -550,10 +550,16 @@ class Orbits(NamedTuple):
         """Standard deviations (B, n, k) of the channels."""
         return np.sqrt(np.sum(self.modes**2, axis=-1) + self.noise**2)
 
-    def with_misfit(self, misfit: np.ndarray) -> Orbits:
-        """Add a misfit (B, n, k) of the law, one random number a channel."""
-        own = misfit[..., None] * np.eye(misfit.shape[-1])
+    def with_error(self, size: np.ndarray) -> Orbits:
+        """Add an error of this standard deviation (B, n, k), one random number a channel."""
+        own = size[..., None] * np.eye(size.shape[-1])
         return self._replace(modes=np.concatenate([self.modes, own], axis=-1))
+
+    def with_misfit(self, sensors: Sensors, misfit: np.ndarray, size: np.ndarray) -> Orbits:
+        """Add a misfit (B, n, k) of the law, in the sensors' units, of motions of size (B,)."""
+        if sensors.of_law:
+            return self._replace(modes=misfit[..., None] * self.modes)
+        return self.with_error(misfit * size[:, None, None])
 
     def largest(self, coverage: float, at: np.ndarray) -> np.ndarray:
         """Multiples (B, n) of the standard deviations that no channel exceeds from the first time
@@ -589,7 +595,7 @@ def propagate(
     """
     d, sensors = laws[0].form.dim, laws[0].sensors
     x, level, zeros = np.split(x, [2 * d, 2 * d + bool(sensors.level)], axis=1)
-    large = sensors.size_of(x)[:, None, None]
+    size = sensors.size_of(x)
     root = covariance_root(covariance).swapaxes(1, 2)
     ends, asked = _in_steps(sensors, np.concatenate([last[:, None], times], axis=1))
     u = _inputs(sensors, windows, ends, 1)
@@ -605,8 +611,8 @@ def propagate(
         modes[..., : root.shape[-1]] += left[..., None] * root[:, None, own:]
     orbits = Orbits(values, orbit, spread @ spread.swapaxes(2, 3), modes, sensors.sigma)
     if sensors.wander is not None:
-        orbits = orbits.with_misfit(sensors.wander.size * np.sqrt(1 - left**2) * sensors.sigma)
-    return orbits.with_misfit(sensors.misfit_at(ahead) * large)
+        orbits = orbits.with_error(sensors.wander.size * np.sqrt(1 - left**2) * sensors.sigma)
+    return orbits.with_misfit(sensors, sensors.misfit_at(ahead), size)
 
 
 def _followed(

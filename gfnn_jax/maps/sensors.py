@@ -59,11 +59,13 @@ class Sensors:
     σ in a period: of dry friction that is smoothed over no more, forecasts slide or stick.
     middle, reach: (d,) and (2d,) the mean of the coordinates over the data, and the rms of their
     distances from it and of the speeds. relative: whether the misfit is in proportion to how large
-    the motion is, in these units. scores: (B, n) the largest errors of held-out forecasts from
-    their start to each lead, as multiples of the tube that their law gives; None where unknown.
-    observed: seconds of data that they are from. level: relative standard deviation of the strength
-    of friction between times of the data; where it is not 0 each state is estimated with its own.
-    rivals: laws whose forecasts the bands hold too, by their shares.
+    the motion is, in these units. of_law: whether it is instead a factor on the deviations that the
+    errors of state and coefficients explain, below 1 where they explain too much. scores: (B, n)
+    the largest errors of held-out forecasts from their start to each lead, as multiples of the tube
+    that their law gives; None where unknown. observed: seconds of data that they are from. level:
+    relative standard deviation of the strength of friction between times of the data; where it is
+    not 0 each state is estimated with its own. rivals: laws whose forecasts the bands hold too, by
+    their shares.
     """
 
     positions: tuple[str, ...]
@@ -86,6 +88,7 @@ class Sensors:
     observed: float = 0.0
     level: float = 0.0
     rivals: tuple[OtherLaw, ...] = ()
+    of_law: bool = False
 
     def with_level(self, level: float) -> Sensors:
         """The same with a level of friction, and windows of a quarter of the longest held-out

@@ -5,8 +5,9 @@ the state is estimated, now from the window that does so best and now from a sho
 orbit followed. What has to be added to the variance that noise, state and coefficients explain so
 that two standard deviations hold 95 % of the errors is the misfit, by the time ahead (conformal
 prediction: Lei et al., J. Am. Stat. Assoc. 113 (2018) 1094). The colour of the noise is in it, and
-what is wrong with the law. Either is the same everywhere, or in proportion to how large the motion
-is (ibid., §5.2), as of friction of a wrong kind where motion dies down: the errors say which. The
+what is wrong with the law. It is the same everywhere, or in proportion to how large the motion is,
+as of friction of a wrong kind where motion dies down, or to the deviations that state and
+coefficients explain (ibid., §5.2), which then may be too large too: the errors say which. The
 time until which 95 % of the errors are below 1 %, 5 % and 20 % of the spread is the horizon.
 """
 
@@ -149,9 +150,12 @@ def calibrated(
     windows = np.where(np.arange(len(starts)) % 2, short, best)
     own, orbits, x, times = _forecasts(thirds, found, starts, windows, leads)
     errors, deviations = _shared(own), _shared(orbits.std)
-    sensors, large = _with_size(law.sensors, x, errors, deviations)
+    sensors, known, unit = _with_shape(law.sensors, x, errors, deviations)
     enough = np.isfinite(errors).all(axis=-1).sum(axis=0) >= OPTIONS.fewest
-    leads, errors, deviations = leads[enough], errors[:, enough], deviations[:, enough]
+    leads, errors, known, unit = (
+        leads[enough],
+        *(values[:, enough] for values in (errors, known, unit)),
+    )
     own, orbits = own[:, enough], orbits._replace(modes=orbits.modes[:, enough])
     if not len(leads):
         return _unknown(law, spread)
@@ -159,7 +163,7 @@ def calibrated(
     every = np.tile(part, len(errors) // len(part))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # times of one part alone
-        missed = (errors**2 / 4 - deviations**2) / large**2
+        missed = (errors**2 / 4 - known) / unit
         misfit, *others = (
             np.sqrt(np.maximum(np.nanquantile(missed[every != k], OPTIONS.inside, axis=0), 0.0))
             for k in range(-1, OPTIONS.parts)
@@ -172,10 +176,12 @@ def calibrated(
         window=best,
         leads=leads,
         misfit=misfit,
-        scores=_scores(own, orbits.with_misfit(unseen * large[: len(x)]), times[:, enough]),
+        scores=_scores(
+            own, orbits.with_misfit(sensors, unseen, sensors.size_of(x)), times[:, enough]
+        ),
         observed=float(sum(s.t[-1] - s.t[0] for s in found)),
     )
-    bands = np.where(np.isfinite(errors), 2 * np.hypot(deviations, misfit * large), np.nan)
+    bands = np.where(np.isfinite(errors), 2 * np.sqrt(known + misfit**2 * unit), np.nan)
     measured = np.max(np.nanquantile(np.abs(errors), OPTIONS.inside, axis=0) / spread, axis=1)
     predicted = np.max(np.nanmedian(bands, axis=0) / spread, axis=1)
     horizons = [
@@ -206,23 +212,28 @@ def _unknown(law: Law, spread: np.ndarray) -> Calibration:
     return Calibration(law, [], none, none[None])
 
 
-def _with_size(
+def _with_shape(
     sensors: Sensors, x: np.ndarray, errors: np.ndarray, deviations: np.ndarray
-) -> tuple[Sensors, np.ndarray]:
-    """The sensors with a misfit that is in proportion to the motion's size or does not depend on
-    it, whichever makes these errors (N, n, k) likelier, of deviations in a law that is right; and
-    the sizes (N, 1, 1), of N forecasts from states x (B, 2d) that N repeats (`_shared`)."""
-    best, chosen = np.inf, (sensors, np.ones((len(errors), 1, 1)))
-    for relative in (False, True):
-        one = dataclasses.replace(sensors, relative=relative)
-        large = np.tile(one.size_of(x), len(errors) // len(x))[:, None, None]
+) -> tuple[Sensors, np.ndarray, np.ndarray]:
+    """The sensors with the kind of misfit that makes errors (N, n, k) likeliest, which have these
+    deviations in a law that is right; the variances (N, n, k) without it, and those of a misfit of
+    1. The N forecasts are from states x (B, 2d), which N repeats (`_shared`)."""
+    best, chosen, repeated = np.inf, None, len(errors) // len(x)
+    for relative, of_law in ((False, False), (True, False), (False, True)):
+        one = dataclasses.replace(sensors, relative=relative, of_law=of_law)
+        known, unit = deviations**2, np.tile(one.size_of(x), repeated)[:, None, None] ** 2
+        unit = np.broadcast_to(unit, errors.shape)
+        if of_law:
+            noise = np.broadcast_to(sensors.sigma**2, errors.shape)
+            known, unit = noise, np.maximum(known - noise, np.finfo(float).eps * known)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # leads without errors
-            left = np.nanmean((errors**2 - deviations**2) / large**2, axis=0)
-        variance = deviations**2 + np.maximum(left, 0.0) * large**2
+            left = np.nanmean((errors**2 - known) / unit, axis=0)
+        variance = known + np.maximum(left, 0.0) * unit
         unlikely = float(np.nansum(np.log(variance) + errors**2 / variance))
-        if unlikely < best:
-            best, chosen = unlikely, (one, large)
+        if chosen is None or unlikely < best:
+            best, chosen = unlikely, (one, known, unit)
+    assert chosen is not None
     return chosen
 
 
