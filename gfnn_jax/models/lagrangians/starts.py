@@ -25,7 +25,7 @@ from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.input_rules import choose_rule
 from gfnn_jax.models.lagrangians.nature import told_by_positions
-from gfnn_jax.models.lagrangians.structure import Row, Structure, is_constant
+from gfnn_jax.models.lagrangians.structure import Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start, zeros_of_angles
 
 
@@ -118,12 +118,13 @@ def best_start(problem: ArcProblem) -> LawFit:
     if not (many and some.are_noise):
         some.add(_Library(first, 2))
     some.add_central(textbook.rows, 3, across=False)
+    if 1 < len(problem.lengths) <= libraries.FEW:
+        some.add_rubbing(ISOTROPIC, [textbook])
+        some.add_central(textbook.rows, 3, across=False, rubs=ISOTROPIC)
     for degree in (3, 4):
         some.add_bodies(degree)
     some.add_richer(libraries.on_a_surface(d, angles), 3)
     some.add_rubbing(DRY, [textbook, _Library(first, 2)])
-    if 1 < len(problem.lengths) <= libraries.FEW:
-        some.add_rubbing(ISOTROPIC, [textbook])
     if inputs := problem.num_inputs:
         driven = libraries.driven(d, angles, inputs, problem.squares)
         some.add_richer([*textbook.rows, *driven], 3)
@@ -186,10 +187,7 @@ class _Starts:
         """Start from the terms of a library that the weak form shows, if it determines them.
         zero: (d,) of angles, from which the fit begins."""
         problem, d = self.problem, self.problem.dim
-        friction = tuple(self.linear[:d] if library.apart else self.linear)
-        if library.rubs is not None:
-            friction = libraries.losses(d, (LINEAR, library.rubs), 0.0, problem.lengths)
-            friction = tuple(row for row in friction if min(row[0]) >= 0)
+        friction = self._friction(library)
         terms = libraries.without_forces(library.rows, problem.observation.shifts())
         seen = problem
         if zero is not None:
@@ -218,6 +216,13 @@ class _Starts:
         self.ranks.append(library.rank)
         problem.on_progress(f"arcs of {periods:g} periods: {rule.fit}")
 
+    def _friction(self, library: _Library) -> tuple[Loss, ...]:
+        d = self.problem.dim
+        if library.rubs is None:
+            return tuple(self.linear[:d] if library.apart else self.linear)
+        rows = libraries.losses(d, (LINEAR, library.rubs), 0.0, self.problem.lengths)
+        return tuple(row for row in rows if min(row[0]) >= 0)
+
     def add_richer(self, rows: Sequence[Row], rank: int) -> None:
         """Start from a richer library where the residuals of all starts are more than noise: of
         lengths with equal masses first. Not where positions tell the velocities: of what is of
@@ -245,7 +250,7 @@ class _Starts:
         are more than noise: what stops a body, and holds it, many terms imitate, and the drag of a
         plane masses that differ."""
         d = self.problem.dim
-        if d > 1 and not self.problem.angles:
+        if d > 1 and kind == DRY and not self.problem.angles:
             some = [*some, _Library(libraries.bodies(d, (), 3), 2, apart=True, equal=True)]
         for library in some:
             if not self.are_noise and not self.one_valued:
@@ -258,15 +263,18 @@ class _Starts:
             if not self.are_noise:
                 self.add(_Library(rows, rank, apart=True, leaders=leaders))
 
-    def add_central(self, textbook: Sequence[Row], rank: int, across: bool) -> None:
+    def add_central(
+        self, textbook: Sequence[Row], rank: int, across: bool, rubs: int | None = None
+    ) -> None:
         """Start from a force along or across the line to the origin by a power of the distance,
         with equal masses, alone or beside the textbook's, where the residuals of all starts are
         more than noise: the likeliest, by Schwarz's criterion. Across, the power 0 is a uniform
-        field."""
+        field. rubs: as of a library."""
         problem, d = self.problem, self.problem.dim
         if d == 1 or problem.angles or self.are_noise:
             return
         periods = sum(np.ptp(n.t) for n in problem.nodes) / problem.scales.period
+        plain = _Library((), rank, apart=True, equal=True, rubs=rubs)
 
         def rows(exponent: float, others: Sequence[Row]) -> list[Row]:
             if exponent == 2:
@@ -277,7 +285,7 @@ class _Starts:
             return [*others, *(fields if across else [along])]
 
         def share(exponent: float, others: Sequence[Row]) -> float:
-            terms, friction = tuple(rows(exponent, others)), tuple(self.linear[:d])
+            terms, friction = tuple(rows(exponent, others)), self._friction(plain)
             return weak_share(Structure(d, terms, friction, (), problem.num_inputs), problem)
 
         def unlikely(exponent: float, others: Sequence[Row]) -> float:
@@ -301,7 +309,7 @@ class _Starts:
             new = (exponent or across) and (len(others), exponent) not in tried
             if new and not self.are_noise:
                 before = len(self.fits)
-                self.add(_Library(rows(exponent, others), rank, apart=True, equal=True))
+                self.add(plain._replace(rows=rows(exponent, others)))
                 least = min(map(misfit, self.fits[before:]), default=np.inf)
                 tried[len(others), exponent] = least
 
