@@ -170,7 +170,7 @@ def _springs(rng: np.random.Generator) -> Any:
 
 
 def _orbit(rng: np.random.Generator) -> Any:
-    return _around(rng, lambda q: -q / np.linalg.norm(q) ** 3, 0.3)
+    return _around(rng, lambda q: -q / np.linalg.norm(q) ** 3, 0.1)
 
 
 PLANE = {"thrown balls": _thrown, "springs": _springs, "orbit": _orbit}

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from gfnn_jax.families.lagrangian import DRY, Friction, Terms
+from gfnn_jax.families.friction import DRY, Friction
+from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.fit import LawOnArcs
