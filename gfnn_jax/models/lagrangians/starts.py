@@ -274,7 +274,7 @@ class _Starts:
         if d == 1 or problem.angles or self.are_noise:
             return
         periods = sum(np.ptp(n.t) for n in problem.nodes) / problem.scales.period
-        plain = _Library((), rank, apart=True, equal=True, rubs=rubs)
+        library = _Library((), rank, apart=True, equal=True, rubs=rubs)
 
         def rows(exponent: float, others: Sequence[Row]) -> list[Row]:
             if exponent == 2:
@@ -285,7 +285,7 @@ class _Starts:
             return [*others, *(fields if across else [along])]
 
         def share(exponent: float, others: Sequence[Row]) -> float:
-            terms, friction = tuple(rows(exponent, others)), self._friction(plain)
+            terms, friction = tuple(rows(exponent, others)), self._friction(library)
             return weak_share(Structure(d, terms, friction, (), problem.num_inputs), problem)
 
         def unlikely(exponent: float, others: Sequence[Row]) -> float:
@@ -309,7 +309,7 @@ class _Starts:
             new = (exponent or across) and (len(others), exponent) not in tried
             if new and not self.are_noise:
                 before = len(self.fits)
-                self.add(plain._replace(rows=rows(exponent, others)))
+                self.add(library._replace(rows=rows(exponent, others)))
                 least = min(map(misfit, self.fits[before:]), default=np.inf)
                 tried[len(others), exponent] = least
 
