@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC
-from gfnn_jax.models.lagrangians.friction_choice import Table, WhichFriction, chosen
+from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, QUADRATIC
+from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, Table, WhichFriction, chosen
 from gfnn_jax.models.lagrangians.search import likeliest, without_drives
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.solve.latent_arcs import SOFT_L1
@@ -40,6 +40,19 @@ def test_friction_that_is_not_there_is_not_taken_by_the_errors_of_other_coeffici
 def test_a_direction_alike_does_not_stand_for_the_one_that_is_there(seed, alike, size):
     """Where held-out arcs alone, asked first, leave the other direction."""
     assert chosen(table(seed, size, alike)).rows == CANDIDATES[:1]
+
+
+def test_isotropic_drag_comes_before_quadratic_friction_that_explains_no_more():
+    """Though that was chosen before, as close to another fit."""
+    quadratic = tuple((c, QUADRATIC, 0.0) for c in ((1, 0), (0, 1)))
+    rng = np.random.default_rng(0)
+    two = rng.normal(size=(30, 20, 1, 2))
+    drag = two.sum(axis=-1, keepdims=True) + 0.01 * rng.normal(size=(30, 20, 1, 1))
+    law, noise = rng.normal(size=(30, 20, 1, 4)), rng.normal(size=(30, 20, 1, 1))
+    rows = np.concatenate([law, two, drag, two.sum(axis=-1, keepdims=True) + noise], axis=-1)
+    made = Table((*quadratic, ((1, 1), ISOTROPIC, 2.0)), rows, 1.0)
+    before = FrictionChoice(quadratic, {}, {}, gains=False)
+    assert chosen(made, before=before).kinds == (ISOTROPIC,)
 
 
 def test_kinds_that_are_asked_for_are_taken_and_odds_are_those_against_sets_that_are_seen():

@@ -38,7 +38,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.friction import ISOTROPIC, LINEAR, UNIFORM, Friction
+from gfnn_jax.families.friction import ISOTROPIC, LINEAR, QUADRATIC, UNIFORM, Friction
 from gfnn_jax.families.text import in_letters
 from gfnn_jax.fitting.evidence import EVIDENCE, correlation_time, criterion, improved
 from gfnn_jax.fitting.linearised import Linearised
@@ -138,6 +138,11 @@ def odds_text(odds: float) -> str:
 def kinds_of(rows: Sequence[Loss]) -> tuple[int, ...]:
     """The kinds of friction among these, in their order."""
     return tuple(sorted({row[1] for row in rows}))
+
+
+def _in_isotropic(kinds: Sequence[int]) -> tuple[int, ...]:
+    """These kinds with isotropic in place of quadratic friction, () where there is none."""
+    return tuple(sorted({*kinds, ISOTROPIC} - {QUADRATIC})) if QUADRATIC in kinds else ()
 
 
 def is_coupled(row: Loss) -> bool:
@@ -248,6 +253,8 @@ def chosen(
         return EVIDENCE.odds(one.cost, other.cost, count)
 
     tied = [s for s in seen if odds(best, s) < EVIDENCE.decided]
+    plain = {s.kinds for s in tied if ISOTROPIC in s.kinds}  # of one coefficient for several
+    tied = [s for s in tied if _in_isotropic(s.kinds) not in plain]
     known = before.kinds if before else ()
     taken = min(tied, key=lambda s: (len(s.kinds), s.kinds != known, s.plainness))
     if choose:
