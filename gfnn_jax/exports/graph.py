@@ -23,7 +23,16 @@ from gfnn_jax.exports.c_pieces import on_symbols, why_not_piece
 from gfnn_jax.exports.symbols import Symbol, Tape
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
-from gfnn_jax.families.friction import DRY, ISOTROPIC, ONE_SIDED, POWER, QUADRATIC, TABLE, Friction
+from gfnn_jax.families.friction import (
+    DRY,
+    ISOTROPIC,
+    ONE_SIDED,
+    POWER,
+    QUADRATIC,
+    STRIBECK,
+    TABLE,
+    Friction,
+)
 from gfnn_jax.flows.damped import DampedFlow
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.forces import Forced
@@ -189,7 +198,7 @@ def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
     law = law_of(family, p)
     own, dim = law.friction, law.dim
     sharp = (own.kinds == DRY) & (own.widths <= creep)
-    kinked = np.isin(own.kinds, (QUADRATIC, ONE_SIDED))
+    kinked = np.isin(own.kinds, (QUADRATIC, ONE_SIDED, STRIBECK))
     kinked |= (own.kinds == POWER) & (own.widths % 2 != 1)  # odd powers are smooth
     signed = np.flatnonzero(sharp | kinked)
     signs = np.zeros(own.count, dtype=object)

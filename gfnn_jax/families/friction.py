@@ -3,9 +3,10 @@ table.
 
 With s = c·v, the speed of one coordinate or the relative speed of two, friction is linear, r = ½s²;
 quadratic, r = ⅓|s|³; dry, r = √(s² + ε²) − ε; a power a of the speed, r = |s|^(a + 1)/(a + 1); or
-one-sided, r = ½ max(s, 0)², which beside linear friction makes it depend on the direction. The drag
-of a body in a plane or in space is isotropic: r = |v|^(a + 1)/(a + 1), |v| over the coordinates of
-c. Everything is batch first, in closed form, and runs in NumPy or JAX.
+one-sided, r = ½ max(s, 0)², which beside linear friction makes it depend on the direction.
+Stribeck's is what dry friction loses at speeds above w, r = −|s| + w (1 − e^(−|s|/w)) (Tustin
+1947). The drag of a body in a plane or in space is isotropic: r = |v|^(a + 1)/(a + 1), |v| over the
+coordinates of c. Everything is batch first, in closed form, and runs in NumPy or JAX.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from gfnn_jax.arrays import as_row, matmul, namespace, pytree
 from gfnn_jax.families.text import added, barred, combination, shown
 
 # Kinds of friction. UNIFORM stands in a fit's `flows.motion.Form` alone.
-LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED, ISOTROPIC = range(7)
+LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED, ISOTROPIC, STRIBECK = range(8)
 _FACTORS = {1 / 2: "½ ", 1 / 3: "⅓ ", 1 / 4: "¼ ", 1 / 8: "⅛ ", 1.0: ""}
 
 
@@ -53,6 +54,11 @@ def _power(xp: Any, s: Any, size: Any, width: Any) -> tuple[Any, Any, Any]:
     base = xp.where(size > 0, size, 1.0)  # |s|^(a − 1) has no value at rest where a < 1
     raised = xp.where(size > 0, base ** (width - 1), 0.0)
     return raised * size * size / (width + 1), raised * s, width * raised
+
+
+def _stribeck(xp: Any, s: Any, size: Any, width: Any) -> tuple[Any, Any, Any]:
+    fade = xp.exp(-size / width)
+    return width * (1 - fade) - size, (fade - 1) * xp.sign(s), -fade / width
 
 
 def _isotropic(xp: Any, s: Any, size: Any, width: Any) -> tuple[Any, Any, Any]:
@@ -112,6 +118,13 @@ TABLE = (
         _isotropic,
         lambda s, sign, width: s ** float(width),
     ),
+    Kind(
+        "stribeck",
+        lambda speed, size, width: (f"({size} + {width:g}*exp(-{size}/{width:g}))", -1.0),
+        _stribeck,
+        lambda s, sign, width: sign * ((sign * s * (-1 / width)).exp() - 1),
+        rare=True,
+    ),
 )
 
 
@@ -123,7 +136,8 @@ def _is_none(sign: Any) -> bool:
 @pytree()
 class Friction:
     """Terms r_k of Rayleigh's R: directions c (F, d), whole numbers; kinds (F,), places in `TABLE`;
-    widths (F,): ε of dry friction, in units of v, and the exponent a of POWER and ISOTROPIC."""
+    widths (F,): ε of dry friction and w of Stribeck's, in units of v, and the exponent a of POWER
+    and ISOTROPIC."""
 
     directions: Any
     kinds: Any

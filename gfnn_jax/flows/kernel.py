@@ -53,7 +53,7 @@ from gfnn_jax import compiling
 
 FINE, UNFINISHED, LOST = range(3)  # status of a lane: followed; too many events; not finite
 # Kinds of friction; COULOMB: dry, without a width.
-VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN, RAISED_SPEED, ONE_SIDED, DRAG = range(8)
+VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN, RAISED_SPEED, ONE_SIDED, DRAG, FADING = range(9)
 
 # Rows of n: sizes (below); of each term its degree in v, the coordinates of its factors v, its wave
 # m·q, the number of coordinates in its factor f(q), whether it has powers, and its level; the level
@@ -466,6 +466,9 @@ def _friction(n, f, order):
         elif kind == ONE_SIDED:
             pull = max(speed, 0.0)
             stiffness = 1.0 if speed > 0.0 else 0.0
+        elif kind == FADING:
+            stiffness = -math.exp(-abs(speed) / f[WIDTHS, k]) / f[WIDTHS, k]
+            pull = -math.copysign(1.0 + f[WIDTHS, k] * stiffness, speed)
         elif kind == DRAG:  # of |v|, by v: pull is that of a unit of v
             pull = turned = math.sqrt(speed) ** (f[WIDTHS, k] - 1.0)
             if speed > 0.0:

@@ -15,6 +15,7 @@ from gfnn_jax.families.friction import (
     ONE_SIDED,
     POWER,
     QUADRATIC,
+    STRIBECK,
     UNIFORM,
     Friction,
 )
@@ -32,6 +33,7 @@ _KINDS = {
     POWER: row.RAISED_SPEED,
     ONE_SIDED: row.ONE_SIDED,
     ISOTROPIC: row.DRAG,
+    STRIBECK: row.FADING,
 }
 _BINARY = {"+": row.PLUS, "*": row.TIMES, "max": row.LARGER, ">": row.GREATER}
 _TAKEN = dict.fromkeys(_BINARY.values(), 1) | {row.SELECT: 2, row.COMPOSE: 3}  # from the stack

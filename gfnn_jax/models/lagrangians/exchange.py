@@ -28,7 +28,7 @@ from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.fitting.significance import of_two
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.friction_choice import is_coupled, kinds_of
-from gfnn_jax.models.lagrangians.libraries import FEW, RARE, together
+from gfnn_jax.models.lagrangians.libraries import FEW, RARE, feeds, together
 from gfnn_jax.models.lagrangians.structure import Loss, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import promising, protected
 
@@ -169,9 +169,10 @@ def _oddness(friction: Sequence[Loss]) -> tuple[int, ...]:
 def may_be_chosen(fit: LawFit) -> bool:
     """Return whether the friction does not drive, and has no two kinds of which one stands for the
     other."""
-    losses = [value for key, value in fit.values.items() if key[0] == "loss"]
-    kinds = {row[1] for row in fit.structure.friction}
-    return fit.follows and min(losses, default=0.0) >= 0 and together(kinds)
+    losses = {key[1]: value for key, value in fit.values.items() if key[0] == "loss"}
+    kinds = {row[1] for row in losses}
+    drives = min(losses.values(), default=0.0) < 0 or feeds(losses)
+    return fit.follows and not drives and together(kinds)
 
 
 def _plainness(fit: LawFit) -> tuple[int, ...]:

@@ -38,13 +38,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.friction import ISOTROPIC, LINEAR, QUADRATIC, UNIFORM, Friction
+from gfnn_jax.families.friction import (
+    DRY,
+    ISOTROPIC,
+    LINEAR,
+    QUADRATIC,
+    STRIBECK,
+    UNIFORM,
+    Friction,
+)
 from gfnn_jax.families.text import in_letters
 from gfnn_jax.fitting.evidence import EVIDENCE, correlation_time, criterion, improved
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit
-from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, RARE, losses, together
+from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, RARE, feeds, losses, together
 from gfnn_jax.models.lagrangians.structure import Loss
 from gfnn_jax.models.lagrangians.text import friction_of
 from gfnn_jax.solve.linear import non_negative
@@ -195,6 +203,11 @@ class _Judged:
         """ρ of all candidates, from all arcs."""
         return self.table.solve(self.table.own[-1], self.subset)
 
+    @property
+    def of_all(self) -> dict[Loss, float]:
+        """Its friction -> ρ, from all arcs."""
+        return dict(zip(self.rows, self._of_all[list(self.subset)].tolist(), strict=True))
+
     @functools.cached_property
     def criterion(self) -> float:
         """Schwarz's, of all arcs."""
@@ -274,11 +287,13 @@ def chosen(
 
 
 def _with_rare(table: Table, taken: _Judged) -> list[_Judged]:
-    """The set with a rare kind of friction beside its own, or in place of one, where it is seen."""
+    """The set with a rare kind of friction beside its own, or in place of one, where it is seen.
+    Stribeck's hides linear friction, which it falls against: they come together too."""
     kinds, rare = set(taken.kinds), {row[1] for row in table.candidates if row[1] in RARE}
     sets = [kinds - gone | {new} for new in sorted(rare) for gone in [set(), *({k} for k in kinds)]]
+    sets += [kinds | {LINEAR, DRY, STRIBECK}] * (STRIBECK in rare)
     found = [table.leanest(tuple(sorted(one))) for one in sets]
-    return [one for one in found if one is not None and one.is_seen]
+    return [one for one in found if one is not None and one.is_seen and not feeds(one.of_all)]
 
 
 def table_of(fit: LawFit, candidates: Sequence[Loss]) -> Table:

@@ -33,7 +33,7 @@ from gfnn_jax.families.expressions import (
     to_text,
     whole_multiples,
 )
-from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, ONE_SIDED, POWER, QUADRATIC
+from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, ONE_SIDED, POWER, QUADRATIC, STRIBECK
 from gfnn_jax.families.lagrangian import INPUTS, MAX_POWER, coordinates_in
 from gfnn_jax.families.told import told_of
 from gfnn_jax.models.lagrangians.structure import SINE, Loss, Row, with_powers
@@ -195,7 +195,10 @@ class _Reader(NamedTuple):
         if len(plane) > 1 and min(plane) >= d and half * exponent >= 2:
             direction = tuple(int(d + i in plane) for i in range(d))
             return with_powers((direction, ISOTROPIC, half * exponent - 1), of_system)
-        if inside.operation == "abs" and exponent >= 1:
+        if exponent == 1 and (fading := _fading(inside)) is not None:
+            inside, width = fading
+            kind = STRIBECK
+        elif inside.operation == "abs" and exponent >= 1:
             inside, kind = inside.operands[0], _OF_POWER.get(exponent, POWER)
             width = exponent - 1 if kind == POWER else 0.0
         elif exponent == 2 and (side := _side(inside)) is not None:
@@ -251,6 +254,18 @@ def _side(tree: Expression) -> Expression | None:
     sizes = [part.operands[0] for part in tree.operands if part.operation == "abs"]
     alike = len(parts) == len(sizes) == 1 and sizes[0] in (parts[0], -parts[0])
     return parts[0] if alike else None
+
+
+def _fading(tree: Expression) -> tuple[Expression, float] | None:
+    """(v, w) of e^(−|v|/w), or of |v| + w e^(−|v|/w); None of another tree."""
+    for part in tree.operands if tree.operation == "+" else (tree,):
+        one = part.operands[-1] if part.operation == "*" else part
+        rate = one.operands[0] if one.operation == "exp" else one
+        if rate.operation == "*" and rate.operands[-1].operation == "abs":
+            size = rate.operands[0].value
+            if size is not None and size < 0:
+                return rate.operands[-1].operands[0], float(f"{-1 / size:.6g}")
+    return None
 
 
 def _index(tree: Expression) -> int:

@@ -9,7 +9,7 @@ asks for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import combinations, combinations_with_replacement, permutations
 
 from gfnn_jax.families.expressions import parse, product_of, to_text
@@ -20,6 +20,7 @@ from gfnn_jax.families.friction import (
     ONE_SIDED,
     POWER,
     QUADRATIC,
+    STRIBECK,
     TABLE,
     UNIFORM,
 )
@@ -307,9 +308,11 @@ def losses(
 ) -> list[Loss]:
     """Friction of each coordinate, and of the relative speed of neighbours (a joint); uniform
     friction has no direction. Rare kinds are those of single coordinates, one-sided friction of
-    either side. Isotropic drag, as |v|², is that of the plane or the space of the ``lengths``."""
+    either side, Stribeck's of the width 1. Isotropic drag, as |v|², is that of the plane or the
+    space of the ``lengths``."""
     directions = [unit(dim, i) for i in range(dim)]
     of_power = [(c, POWER, CUBIC) for c in directions if POWER in kinds]
+    of_power += [(c, STRIBECK, 1.0) for c in directions if STRIBECK in kinds]
     sides = [(tuple(side * i for i in c), ONE_SIDED, 0.0) for c in directions for side in (1, -1)]
     for i in range(dim - 1):
         wave = [0] * dim
@@ -328,8 +331,17 @@ def losses(
 
 
 def together(kinds: Collection[int]) -> bool:
-    """Return whether a law may have these kinds of friction beside each other by choice."""
-    return not any(one <= set(kinds) for one in ALTERNATIVES)
+    """Return whether a law may have these kinds of friction beside each other by choice: Stribeck's
+    is a part of dry friction."""
+    alone = STRIBECK in kinds and DRY not in kinds
+    return not alone and not any(one <= set(kinds) for one in ALTERNATIVES)
+
+
+def feeds(losses: Mapping[Loss, float]) -> bool:
+    """Return whether friction falls below zero at high speeds: Stribeck's takes more than there is
+    of dry friction."""
+    dry = {row[0]: size for row, size in losses.items() if row[1] == DRY}
+    return any(s > dry.get(row[0], 0.0) for row, s in losses.items() if row[1] == STRIBECK)
 
 
 def opposite(row: Loss) -> Loss | None:

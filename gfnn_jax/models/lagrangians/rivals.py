@@ -28,10 +28,10 @@ from gfnn_jax.families.expressions import (
     to_text,
     with_leaves,
 )
-from gfnn_jax.families.friction import LINEAR
+from gfnn_jax.families.friction import LINEAR, STRIBECK
 from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
 from gfnn_jax.maps.observation import observed
-from gfnn_jax.models.lagrangians.fit import LawFit
+from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.libraries import (
     GAINS,
     SHAPES,
@@ -42,7 +42,7 @@ from gfnn_jax.models.lagrangians.libraries import (
     textbook,
     torques,
 )
-from gfnn_jax.models.lagrangians.structure import Row, Structure, is_constant
+from gfnn_jax.models.lagrangians.structure import Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start
 
 
@@ -54,7 +54,8 @@ class RivalOptions:
     series of a shape. constants: inside a shape, times the range of the motion, where it begins;
     apart: relative, over which it is differentiated; corrections: of it; furthest: relative, of
     each; settled: standard errors, within which it is found. noise: times it, that is no more;
-    clearly: of Schwarz's criterion, that a sensor gains where a law leaves more.
+    fades: of a speed's rms, over which Stribeck's friction does where a search begins; faster: by
+    which it may. clearly: of Schwarz's criterion, that a sensor gains where a law leaves more.
     """
 
     most: int = 4
@@ -65,6 +66,8 @@ class RivalOptions:
     furthest: float = 0.3
     settled: float = 0.1
     noise: float = 2.0
+    fades: float = 0.15
+    faster: float = 6.0
     clearly: float = 10.0
 
 
@@ -91,6 +94,36 @@ def with_likeliest_power(fit: LawFit) -> LawFit:
             fit.problem.on_progress(f"  r**{best:g} in place of r**{own:g}: it is as likely")
             fit = whole[best].again()
     return fit
+
+
+def fading(direction: Sequence[int], problem: ArcProblem) -> float:
+    """The speed, to two digits, over which Stribeck's friction fades where a search begins."""
+    return float(f"{OPTIONS.fades * problem.scales.speed @ np.abs(direction):.2g}")
+
+
+def with_fading(fit: LawFit) -> LawFit:
+    """The fit with the speeds over which its Stribeck friction fades that leave least, to three
+    digits."""
+    begun = fit
+    for row in fit.structure.friction:
+        if row[1] != STRIBECK or not fit.follows:
+            continue
+
+        def of(log: float, row: Loss = row, fit: LawFit = fit) -> LawFit:
+            other = (row[0], STRIBECK, float(f"{np.exp(log):.3g}"))
+            turned = tuple(other if one == row else one for one in fit.structure.friction)
+            known = {("loss", other) if k == ("loss", row) else k: c for k, c in fit.values.items()}
+            structure = dataclasses.replace(fit.structure, friction=turned)
+            return fit.again(structure, known, rescale=False)
+
+        def cost(log: float, of=of) -> float:
+            found = of(log)
+            return found.fitted.cost if found.follows else np.inf
+
+        ends = np.log(row[2]) + np.log(OPTIONS.faster) * np.array([-1.0, 1.0])
+        found: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 0.01})
+        fit = of(found.x) if found.fun < fit.fitted.cost else fit
+    return fit if fit is begun else fit.again()
 
 
 def with_a_shape(fit: LawFit) -> LawFit:

@@ -18,7 +18,7 @@ from scipy.optimize import lsq_linear
 
 from gfnn_jax.dataset.stretches import arcs_of
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.friction import ISOTROPIC, LINEAR, UNIFORM
+from gfnn_jax.families.friction import ISOTROPIC, LINEAR, STRIBECK, UNIFORM
 from gfnn_jax.families.lagrangian import has_inputs, shape_of
 from gfnn_jax.fitting.evidence import Comparison, criterion, improved
 from gfnn_jax.models.lagrangians import libraries
@@ -28,7 +28,13 @@ from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, kinds_of, table_of
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, with_delay
-from gfnn_jax.models.lagrangians.rivals import with_a_shape, with_constant, with_likeliest_power
+from gfnn_jax.models.lagrangians.rivals import (
+    fading,
+    with_a_shape,
+    with_constant,
+    with_fading,
+    with_likeliest_power,
+)
 from gfnn_jax.models.lagrangians.starts import OPTIONS, best_start, leading, misfit
 from gfnn_jax.models.lagrangians.structure import (
     AS_EQUAL,
@@ -226,7 +232,9 @@ class TermSearch:
         d, within = self.every.dim, fit.problem.within_a_turn
         rows = libraries.springs(d, [i for i in within if fit.structure.has_powers(i)])
         rows += libraries.torques(d, fit.problem.angles)
-        return self.every.plus([("term", row) for row in rows])
+        rubs = self.every.friction if self.frictions is None else tuple(self._may_rub(fit))
+        every = dataclasses.replace(self.every, friction=rubs)
+        return every.plus([("term", row) for row in rows])
 
     # From a fit to the law.
 
@@ -287,6 +295,9 @@ class TermSearch:
             if self.frictions is not None and not fit.problem.parameters:
                 fit, choice = self._exchanged(fit, choice)
             fit = with_equal_masses(fit, fit.problem.options.evidence.significant)
+        if STRIBECK in choice.kinds and self.frictions is not None:
+            fit = with_fading(fit)
+            choice = choice._replace(rows=fit.structure.friction)
         return SearchResult(with_delay(fit), choice)
 
     def _exchanged(self, fit: LawFit, choice: FrictionChoice) -> tuple[LawFit, FrictionChoice]:
@@ -382,7 +393,10 @@ class TermSearch:
     # Friction.
 
     def _may_rub(self, fit: LawFit) -> list[Loss]:
-        return [row for row in self.frictions or () if fit.structure.may_have(("loss", row))]
+        """Friction that the law of a fit may have; Stribeck's as it has it."""
+        own = {row[:2]: row for row in fit.structure.friction if row[1] == STRIBECK}
+        rows = [own.get(row[:2], row) for row in self.frictions or ()]
+        return [row for row in rows if fit.structure.may_have(("loss", row))]
 
     def with_friction(self, fit: LawFit) -> tuple[LawFit, FrictionChoice]:
         """The fit with the friction that held-out arcs choose, and how sure that is. Arcs are as
@@ -392,6 +406,7 @@ class TermSearch:
         if self.frictions is None:
             return fit, FrictionChoice(fit.structure.friction, {}, {}, gains=False)
         problem, options, begun = fit.problem, fit.problem.options, fit
+        fit = with_fading(fit)
         frictions = self._may_rub(fit)
         third = problem.systems.a_third(problem.nodes)
         length = max(options.fewest, min(fit.arcs.t.shape[1], third))
@@ -405,7 +420,8 @@ class TermSearch:
             problem.on_progress(f"  friction: {', '.join(rows) or 'none'}")
             if set(choice.rows) == set(fit.structure.friction):
                 break
-            fit = fit.again(dataclasses.replace(fit.structure, friction=choice.rows))
+            fit = with_fading(fit.again(dataclasses.replace(fit.structure, friction=choice.rows)))
+            frictions = self._may_rub(fit)
             choice = chosen(table_of(fit, frictions), options.choose_friction, choice)
             tried.append((fit, choice))
         else:
@@ -450,6 +466,7 @@ def frictions_tried(problem: ArcProblem) -> tuple[Loss, ...]:
     if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
         kinds = tuple(kind for kind in kinds if kind != UNIFORM)
     rows = libraries.losses(dim, kinds, 0.0, problem.lengths)
+    rows = [(c, k, fading(c, problem)) if k == STRIBECK else (c, k, w) for c, k, w in rows]
     if not options.choose_friction and ISOTROPIC in kinds and ISOTROPIC not in kinds_of(rows):
         raise InputError(
             "isotropic friction is that of a plane or of space: expected two or three positions "

@@ -19,12 +19,13 @@ from scipy.optimize import minimize_scalar
 
 from gfnn_jax.dataset.stretches import Scales
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, QUADRATIC
+from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, QUADRATIC, STRIBECK
 from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.input_rules import choose_rule
 from gfnn_jax.models.lagrangians.nature import told_by_positions
+from gfnn_jax.models.lagrangians.rivals import fading
 from gfnn_jax.models.lagrangians.structure import Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start, zeros_of_angles
 
@@ -38,7 +39,8 @@ class StartOptions:
     period, below which more of them are the remedy. plain: times the residual of the larger
     library, that a plainer one's may have. noise: residual, times the noise, that is no more;
     white: that lacks no term. exponents: of the distance, where a power of it begins; beside: up to
-    which it is then found; rounded: up to which it is a half, or whole, or none.
+    which it is then found; rounded: up to which it is a half, or whole, or none. fading: times
+    `rivals.fading`, that are tried.
     """
 
     followed: float = 10.0
@@ -51,6 +53,7 @@ class StartOptions:
     exponents: tuple[float, ...] = (-3.0, -2.0, -1.0, -0.5, 0.5, 1.0, 1.5, 3.0, 4.0)
     beside: float = 0.6
     rounded: float = 0.1
+    fading: tuple[float, ...] = (0.3, 1.0, 3.0)
 
 
 OPTIONS = StartOptions()
@@ -125,6 +128,7 @@ def best_start(problem: ArcProblem) -> LawFit:
         some.add_bodies(degree)
     some.add_richer(libraries.on_a_surface(d, angles), 3)
     some.add_rubbing(DRY, [textbook, _Library(first, 2)])
+    some.add_rubbing(STRIBECK, [textbook])
     if inputs := problem.num_inputs:
         driven = libraries.driven(d, angles, inputs, problem.squares)
         some.add_richer([*textbook.rows, *driven], 3)
@@ -166,7 +170,7 @@ def _is_of(fit: LawFit, structure: Structure) -> bool:
     """Return whether a fit has the terms of a structure, and its friction that no other start
     has."""
     parts = (
-        (one.terms, one.leaders, *(row for row in one.friction if row[1] in (DRY, ISOTROPIC)))
+        (one.terms, one.leaders, *(r for r in one.friction if r[1] in (DRY, ISOTROPIC, STRIBECK)))
         for one in (fit.structure, structure)
     )
     return len(set(parts)) == 1
@@ -217,11 +221,25 @@ class _Starts:
         problem.on_progress(f"arcs of {periods:g} periods: {rule.fit}")
 
     def _friction(self, library: _Library) -> tuple[Loss, ...]:
-        d = self.problem.dim
+        """Linear friction, and the kind of a library, Stribeck's with dry friction, as fast as the
+        weak form prefers."""
+        problem, d = self.problem, self.problem.dim
         if library.rubs is None:
             return tuple(self.linear[:d] if library.apart else self.linear)
-        rows = libraries.losses(d, (LINEAR, library.rubs), 0.0, self.problem.lengths)
-        return tuple(row for row in rows if min(row[0]) >= 0)
+        kinds = {LINEAR, library.rubs, *((DRY,) if library.rubs == STRIBECK else ())}
+        rows = libraries.losses(d, tuple(sorted(kinds)), 0.0, problem.lengths)
+        rows = [row for row in rows if min(row[0]) >= 0]
+        if library.rubs != STRIBECK:
+            return tuple(rows)
+        found = [
+            tuple((c, k, by * fading(c, problem) if k == STRIBECK else w) for c, k, w in rows)
+            for by in OPTIONS.fading
+        ]
+        terms = tuple(library.rows)
+        return min(
+            found,
+            key=lambda some: weak_share(Structure(d, terms, some, (), problem.num_inputs), problem),
+        )
 
     def add_richer(self, rows: Sequence[Row], rank: int) -> None:
         """Start from a richer library where the residuals of all starts are more than noise: of

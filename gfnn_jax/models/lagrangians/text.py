@@ -55,7 +55,7 @@ def friction_of(
 ) -> Formula:
     """Terms of Rayleigh's R."""
     listed = zip(friction.texts(speeds), losses, std, strict=True)
-    return Formula(tuple(Term(text, float(ρ * r), float(s * r)) for (text, r), ρ, s in listed))
+    return Formula(tuple(Term(text, float(ρ * r), float(s * abs(r))) for (text, r), ρ, s in listed))
 
 
 def of_systems(found: Formula, powers: Powers, parameters: Sequence[str]) -> Formula:
