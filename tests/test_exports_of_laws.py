@@ -74,6 +74,7 @@ def sticking():
         ((0, 1), friction.DRY, 1e-4, 0.4),
         ((-1, 1), friction.DRY, 1e-4, 0.4),
         ((0, 1), friction.QUADRATIC, 0.0, 0.1),
+        ((1, 0), friction.STRIBECK, 0.2, 0.25),
         ((1, 0), friction.ONE_SIDED, 0.0, 0.3),
     ]
     return two_rods(rows, gain=True)

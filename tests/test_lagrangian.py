@@ -7,7 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, ONE_SIDED, POWER, QUADRATIC, Friction
+from gfnn_jax.families.friction import (
+    DRY,
+    ISOTROPIC,
+    LINEAR,
+    ONE_SIDED,
+    POWER,
+    QUADRATIC,
+    STRIBECK,
+    Friction,
+)
 from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.flows.legendre import family_of
 
@@ -31,7 +40,8 @@ SHAPES = {
 THETA = np.array([1.0, 0.7, 0.3, 0.1, 0.2, 2.0, -0.6, 0.3, 0.8])
 FRICTION = [((1, 0), LINEAR, 1.0), ((-1, 1), QUADRATIC, 1.0), ((0, 1), DRY, 0.1)]
 FRICTION += [((1, 0), POWER, 1.5), ((0, -1), ONE_SIDED, 0.0), ((1, 1), ISOTROPIC, 2.0)]
-RHO = np.array([0.1, 0.2, 0.05, 0.3, 0.4, 0.15])
+FRICTION += [((1, -1), STRIBECK, 0.4)]
+RHO = np.array([0.1, 0.2, 0.05, 0.3, 0.4, 0.15, 0.25])
 GAINS = np.array([[1.0, 0.0, 0.5], [0.0, -2.0, 0.3]])
 
 
@@ -59,6 +69,7 @@ def rayleigh(v):
         jnp.abs(v[0]) ** 2.5 / 2.5,
         jnp.maximum(-v[1], 0) ** 2 / 2,
         (v @ v) ** 1.5 / 3,
+        0.4 * (1 - jnp.exp(-jnp.abs(s) / 0.4)) - jnp.abs(s),
     )
     return sum(rho * term for rho, term in zip(RHO, of_all, strict=True))
 

@@ -15,7 +15,7 @@ from scipy.stats import norm
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, UNIFORM, Friction
+from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, STRIBECK, UNIFORM, Friction
 from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.fitting.evidence import Comparison
 from gfnn_jax.fitting.linearised import Linearised
@@ -399,6 +399,35 @@ def test_friction_of_rare_kinds(kind):
         assert abs(term.coefficient - expected) < 4 * term.std
     given = given_terms([f"R: {fit.friction.formula}"], ["x"], ["v"]).friction
     assert given == tuple(law_of(fit.map).form.friction.rows())
+
+
+@pytest.mark.slow
+def test_stribecks_friction_is_found_with_the_speed_over_which_it_fades():
+    """A body on a spring that is driven by a force which is recorded, and sticks."""
+    rng, t = np.random.default_rng([91, 1]), np.linspace(0, 60, 1500)
+    begin, share, width, viscous, omega, size = (
+        rng.uniform(*ends)
+        for ends in ((0.2, 0.4), (0.4, 0.7), (0.1, 0.3), (0.01, 0.05), (0.3, 0.6), (0.8, 1.5))
+    )
+
+    def force(t):
+        return size * (np.sin(omega * t) + 0.5 * np.sin(2.7 * omega * t + 1))
+
+    def rates(t, z):
+        dry = begin * (1 - share * (1 - np.exp(-abs(z[1]) / width)))
+        return [z[1], -z[0] + force(t) - dry * np.tanh(z[1] / 1e-4) - viscous * z[1]]
+
+    x = solve_ivp(rates, (0, 60), [1, 0], t_eval=t, rtol=1e-8, atol=1e-10, method="LSODA").y[0]
+    x = x + 1e-3 * x.std() * rng.normal(size=len(t))
+    recording = gfnn.Recording({"t": t, "x": x, "u": force(t)}, positions=["x"], inputs=["u"])
+    fit = gfnn.fit(recording)
+    assert set(fit.which_friction.kinds) == {"linear", "dry", "stribeck"}
+    given = given_terms([f"R: {fit.friction.formula}"], ["x"], ["v"]).friction
+    assert given == tuple(law_of(fit.map).form.friction.rows())
+    assert next(w for _, kind, w in given if kind == STRIBECK) == pytest.approx(width, rel=0.02)
+    truth = viscous / 2, begin, -share * begin
+    for term, expected in zip(fit.friction.terms, truth, strict=True):
+        assert abs(term.coefficient - expected) < 4 * term.std
 
 
 def test_a_power_of_the_distance_that_others_imitate_is_one_of_several():

@@ -349,7 +349,8 @@ OPTIONS: dict[str, About] = {
     "friction": About(
         _TEXT,
         "for a recording, friction by its force: auto, none, linear (viscous, ∝ v), quadratic "
-        "(drag, ∝ v |v|), isotropic (drag of a plane or of space), cubic, dry (Coulomb), "
+        "(drag, ∝ v |v|), isotropic (drag of a plane or of space), cubic, dry (Coulomb), stribeck "
+        "(beside dry: what it loses at speed), "
         "one-sided (viscous, of one direction), uniform (R = γT); several joined by +",
         "KIND",
     ),

@@ -287,13 +287,16 @@ def chosen(
 
 
 def _with_rare(table: Table, taken: _Judged) -> list[_Judged]:
-    """The set with a rare kind of friction beside its own, or in place of one, where it is seen.
-    Stribeck's hides linear friction, which it falls against: they come together too."""
+    """The set with a rare kind of friction beside its own, or in place of one, where it is seen;
+    Stribeck's with dry and linear friction where these are, which it hides."""
     kinds, rare = set(taken.kinds), {row[1] for row in table.candidates if row[1] in RARE}
     sets = [kinds - gone | {new} for new in sorted(rare) for gone in [set(), *({k} for k in kinds)]]
     sets += [kinds | {LINEAR, DRY, STRIBECK}] * (STRIBECK in rare)
     found = [table.leanest(tuple(sorted(one))) for one in sets]
-    return [one for one in found if one is not None and one.is_seen and not feeds(one.of_all)]
+    seen = [one for one in found if one is not None and one.is_seen and not feeds(one.of_all)]
+    if not any({LINEAR, STRIBECK} <= set(one.kinds) for one in seen):
+        return seen
+    return [one for one in seen if LINEAR in one.kinds or STRIBECK not in one.kinds]
 
 
 def table_of(fit: LawFit, candidates: Sequence[Loss]) -> Table:
