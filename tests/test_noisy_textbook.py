@@ -152,3 +152,34 @@ def test_clean_sequences_are_left_to_the_search_for_exact_laws():
     fit = gfnn.fit(pairs_of(z), learn="hamiltonian", tolerance=1e-6, max_seconds=None)
     assert fit.formula == "0.5*p1**2 + 0.32/q1**2 - 1/q1"
     assert fit.hamiltonian.constants == ()
+
+
+# Pairs that stand alone
+
+
+def swinging(z):
+    return np.concatenate([np.sin(z[..., :1]), z[..., 1:]], axis=-1)
+
+
+def hardening(z):
+    return np.concatenate([z[..., :1] + z[..., :1] ** 3, z[..., 1:]], axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("gradient", "true"),
+    [
+        (swinging, {"p1²": 0.5, "cos(q1)": -1.0}),
+        (hardening, {"q1²": 0.5, "p1²": 0.5, "q1⁴": 0.25}),
+    ],
+)
+def test_noisy_pairs_that_are_told_nothing_find_the_law_with_the_errors_of_its_numbers(
+    gradient, true
+):
+    z0 = np.random.default_rng(3).uniform(-1.2, 1.2, (150, 2))
+    z, _ = noisy(orbits(gradient, z0, 2, 0.2), 1e-3)
+    pairs = gfnn.Pairs(z[:, 0], z[:, 1], 0.2)
+    fit = gfnn.fit(pairs, learn="hamiltonian", tolerance=1e-6, max_seconds=None)
+    law = fit.hamiltonian
+    assert {t.term for t in law.terms} == set(true)
+    for term in law.terms:
+        assert abs(term.coefficient - true[term.term]) < 4 * term.std < 0.02

@@ -3,7 +3,8 @@
 What the search finds behind clean pairs is fitted through its flow as any library is, and taken
 where held-out pairs bear it out to the tolerance: an H of few terms, with the constants inside
 them, or none at all. What it finds behind noisy sequences is fitted to whole ones: coefficients,
-constants inside and latent states together. Among the laws within the noise the one of least
+constants inside and latent states together, and behind noisy pairs, which are sequences of two
+states, likewise. Among the laws within the noise the one of least
 description length is taken,
 
     Σ_i n_i ln σ_i + ½ k ln n + what there is to say of its atoms,
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +26,8 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.rows import of_differences
 from gfnn_jax.dataset.runs import next_of
 from gfnn_jax.errors import InputError
+from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.evidence import EVIDENCE, Rival
 from gfnn_jax.fitting.significance import ABOVE_NOISE, terms_with_constants
 from gfnn_jax.flows.collocation import Steps, operations
@@ -42,11 +46,18 @@ from gfnn_jax.models.hamiltonians.sequences import (
 )
 from gfnn_jax.models.hamiltonians.symmetries import LawNumbers, restricted
 from gfnn_jax.models.textbook.noisy_search import OPTIONS as NOISY
-from gfnn_jax.models.textbook.noisy_search import Formula, NoisyTextbook, weak_gradients
+from gfnn_jax.models.textbook.noisy_search import (
+    Formula,
+    NoisyTextbook,
+    WeakGradients,
+    gradients_of_pairs,
+    weak_gradients,
+)
 from gfnn_jax.models.textbook.search import OPTIONS as CLEAN
 from gfnn_jax.models.textbook.search import Law, Textbook
 from gfnn_jax.solve.latent_arcs import Fitted
 from gfnn_jax.solve.linear import covariance_root
+from gfnn_jax.solve.noise import robust
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,11 +71,11 @@ class DictionaryOptions:
 
     Behind noise: operations: of a search, by degrees of freedom from 1. least: of the spread, less
     noise than that is not what weak gradients leave over. looked_at: rows by which laws are
-    compared. behind: natural logarithms of likelihood by which a law is behind that is not fitted;
-    brought: that further terms must bring. fitted: laws. evaluations: of the flow at each state,
-    that the fits of a law to sequences take together. screened, iterations: part of the cost from
-    which one counts, and how many, while laws are compared. as_noise: times the noise, that a law
-    may leave over.
+    compared; compared: of pairs, by which atoms are. behind: natural logarithms of likelihood by
+    which a law is behind that is not fitted; brought: that further terms must bring. fitted: laws.
+    evaluations: of the flow at each state, that the fits of a law to sequences take together.
+    screened, iterations: part of the cost from which one counts, and how many, while laws are
+    compared. as_noise: times the noise, that a law may leave over.
     """
 
     dictionaries: tuple[tuple[str, tuple[str, ...], tuple[float, ...]], ...] = (
@@ -79,6 +90,7 @@ class DictionaryOptions:
     operations: tuple[float, ...] = (2e8, 4e8, 8e8, 1.6e9)
     least: float = 3e-6
     looked_at: int = 20_000
+    compared: int = 1_000
     behind: float = 40.0
     brought: float = 3.0
     fitted: int = 4
@@ -162,7 +174,7 @@ def law_of_sequences(problem: LawProblem) -> FittedLaw | None:
     """The law, or None where the pairs are no noisy sequences of one dt, or nothing in the
     dictionary leaves no more than their noise. ``partly`` is called with the three laws that come
     closest, where none does."""
-    data, budget = problem.data, problem.budget
+    data = problem.data
     if data.varied or data.structure is not None or data.dim > len(OPTIONS.operations):
         return None
     stretches = _stretches(data)
@@ -170,6 +182,34 @@ def law_of_sequences(problem: LawProblem) -> FittedLaw | None:
     weak = None if noise is None else weak_gradients(stretches, data.dt, noise)
     if noise is None or weak is None:
         return None
+    return _behind_noise(problem, weak, noise)
+
+
+def law_of_noisy_pairs(problem: LawProblem, best: FittedLaw) -> FittedLaw | None:
+    """The law of physics that tells the same pairs in fewer words than ``best``, a polynomial that
+    leaves little more than their noise; None where there is none, or these are other pairs."""
+    data, family, c = problem.data, best.family, best.fit.coefficients
+    rows = data.training[: OPTIONS.compared]
+    few = len(rows) < OPTIONS.fewest or data.dim > len(OPTIONS.operations)
+    polynomial = isinstance(family, Terms) and family.variables == coordinate_names(data.dim)
+    plain = not (data.coordinates.angles or data.coordinates.cyclic or data.varied)
+    if few or not (polynomial and plain and problem.simple):
+        return None
+    z0, z1 = data.y0[rows], data.y1[rows]
+    off = z1 - problem.flows.images(family, c, rows, best.fit.steps).states
+    noise = robust(off, axis=0) / np.sqrt(2)
+    if not (np.isfinite(off).all() and (noise > 0).all()):
+        return None
+    weak = gradients_of_pairs((z0, z1), data.dt, noise, off, partial(family.gradient, c))
+    return _behind_noise(problem, weak, noise, best)
+
+
+def _behind_noise(
+    problem: LawProblem, weak: WeakGradients, noise: np.ndarray, polynomial: FittedLaw | None = None
+) -> FittedLaw | None:
+    """The law of least description length among those that are worth a fit, and a rival that is a
+    polynomial; None where none leaves as little, or it is a polynomial too."""
+    data, budget = problem.data, problem.budget
     angles = tuple(a for a in data.coordinates.angles if a < data.dim)
     cyclic = data.coordinates.cyclic
     search = NoisyTextbook(weak, angles=angles, cyclic=cyclic, on_progress=problem.on_progress)
@@ -177,11 +217,16 @@ def law_of_sequences(problem: LawProblem) -> FittedLaw | None:
     with problem.work.optional(name), contextlib.suppress(InputError):  # constants have run away
         with budget.unit(name, MATCHING, OPTIONS.operations[data.dim - 1]):
             formulas = _worth(search.formulas())
+        rival = None
+        if polynomial is not None:
+            rival = search.polynomial(polynomial.family, polynomial.fit.coefficients)
+        if rival is not None and all(formula.is_polynomial for formula in formulas):
+            return None
         family = formulas[0].family(formulas[0].constants)
         states = len(formulas) * len(data.training)
         one = operations(family, 2 * data.dim, _STEPS, family)
         with budget.unit(name, FLOW, OPTIONS.evaluations * states * one):
-            return _chosen(problem, formulas, noise)
+            return _chosen(problem, formulas, noise, rival)
     return None
 
 
@@ -212,50 +257,73 @@ def _noise_of(stretches: list[np.ndarray], scale: np.ndarray) -> np.ndarray | No
     return np.array(found, float) * scale
 
 
-def _chosen(problem: LawProblem, formulas: list[Formula], noise: np.ndarray) -> FittedLaw | None:
-    """The law of least description length, where it leaves no more than noise."""
+def _chosen(
+    problem: LawProblem, formulas: list[Formula], noise: np.ndarray, rival: Formula | None
+) -> FittedLaw | None:
+    """The law of least description length that leaves no more than this noise, or than the rival.
+
+    None where that is a polynomial as the rival is, or has as many numbers as one and no odds that
+    decide: near 0 a parabola and a cosine are a parabola and a fourth power.
+    """
     first, data = formulas[0], problem.data
     family = first.family(first.constants)
     sequences = Sequences.along(problem, family, first.coefficients, _STEPS)
     if sequences is None:
         return None
     train, held = (
-        sequences.arcs(np.sort(rows)[: OPTIONS.looked_at])
+        sequences.arcs(np.sort(rows)[: OPTIONS.looked_at], alone=rival is not None)
         for rows in (data.training, data.validation)
     )
     if train is None or held is None:
         return None
-    laws: list[_LawOfSequences] = []
+
+    def on_held_out(law: _LawOfSequences) -> Fitted | None:
+        given = law.formula.family, law.fitted.p, len(law.formula.coefficients)
+        return sequences.fitted(held, *given, fix_coefficients=True)
+
+    laws, further = [], noise
+    if rival is not None:
+        known = _significant(sequences, train, rival)
+        there = None if known is None else on_held_out(known)
+        if known is None or there is None:
+            return None
+        laws, noise, further = [known], noise_of(known.fitted), noise_of(there)
     for tried, formula in enumerate(formulas):
         with contextlib.suppress(np.linalg.LinAlgError, InputError):  # constants have run away
             found = _significant(sequences, train, formula)
             laws += [] if found is None else [found]
         if tried and not laws:  # none of the likeliest two can be followed along its arcs
             return None
-    if not laws:
-        return None
     laws.sort(key=lambda law: law.length)
-    formula, fitted, _ = laws[0]
-    given = formula.family, fitted.p, len(formula.coefficients)
-    on_held_out = sequences.fitted(held, *given, fix_coefficients=True)
-    for found in (fitted, on_held_out):
-        if found is None or not _rms(noise_of(found) / noise) <= OPTIONS.as_noise:
-            for law in laws[:3]:
-                left = _rms(noise_of(law.fitted) / noise)
-                problem.partly(PartialLaw(_shown(law), left, "times the noise"))
+    near = [law for law in laws if _leaves(law.fitted, noise) <= OPTIONS.as_noise]
+    if not near or not _leaves(on_held_out(near[0]), further) <= OPTIONS.as_noise:
+        for law in laws[:3]:
+            left = _leaves(law.fitted, noise)
+            problem.partly(PartialLaw(_shown(law), left, "times the noise"))
+        return None
+    best, formula = near[0], near[0].formula
+    if rival is not None:
+        plain = next(law for law in near if law.formula.is_polynomial)
+        decided = plain.length - best.length > np.log(EVIDENCE.decided)
+        if not (decided or len(best.fitted.p) < len(plain.fitted.p)):
             return None
-    fitted = sequences.refitted(fitted, formula.family, len(formula.coefficients))
-    return _law(problem, formula, fitted)._replace(rivals=_rivals(laws))
+    fitted = sequences.refitted(best.fitted, formula.family, len(formula.coefficients))
+    return _law(problem, formula, fitted)._replace(rivals=_rivals(best, laws))
 
 
-def _rivals(laws: list[_LawOfSequences]) -> tuple[Rival, ...]:
-    """The next two laws of least description length, with the odds of the first against them."""
+def _leaves(found: Fitted | None, noise: np.ndarray) -> float:
+    """What a fit leaves over, in units of the noise (2d,)."""
+    return np.inf if found is None else _rms(noise_of(found) / noise)
+
+
+def _rivals(best: _LawOfSequences, laws: list[_LawOfSequences]) -> tuple[Rival, ...]:
+    """The next two laws of least description length, with the odds of the best against them."""
     others: dict[frozenset, _LawOfSequences] = {}
     for law in laws:
-        if law.formula.kind != laws[0].formula.kind:
+        if law.length > best.length and law.formula.kind != best.formula.kind:
             others.setdefault(law.formula.kind, law)
     return tuple(
-        Rival(_shown(law), float(np.exp(min(law.length - laws[0].length, EVIDENCE.log_odds))))
+        Rival(_shown(law), float(np.exp(min(law.length - best.length, EVIDENCE.log_odds))))
         for law in list(others.values())[:2]
     )
 

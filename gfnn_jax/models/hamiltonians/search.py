@@ -28,9 +28,14 @@ from gfnn_jax.families.told import Constrained
 from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.fitting.linear_starts import backwards, tangent, turns
 from gfnn_jax.fitting.significance import ABOVE_NOISE, at_thresholds, terms_above_noise
+from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
-from gfnn_jax.models.hamiltonians.covariance import covariance_root
-from gfnn_jax.models.hamiltonians.dictionary import law_of_physics, law_of_sequences
+from gfnn_jax.models.hamiltonians.covariance import covariance_root, leaves_white
+from gfnn_jax.models.hamiltonians.dictionary import (
+    law_of_noisy_pairs,
+    law_of_physics,
+    law_of_sequences,
+)
 from gfnn_jax.models.hamiltonians.fitted_law import Dropped, FittedLaw
 from gfnn_jax.models.hamiltonians.friction import is_smooth, mechanical, without_turns
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian, learned_from
@@ -101,7 +106,13 @@ def learn_hamiltonian(problem: LawProblem) -> LearnedHamiltonian:
         problem = problem.beginning(data)
         best = best._replace(error=problem.error_of(best.family, best.fit))
     problem.flows.allowance = UNBOUNDED
-    if best.noisy or arcs is not None:
+    told_nothing = not problem.terms and problem.scene is None and arcs is None
+    shorter = None
+    if told_nothing and _leaves_noise(problem, best):
+        shorter = law_of_noisy_pairs(problem, best)
+    if shorter is not None:
+        best, outside = shorter, None
+    elif best.noisy or arcs is not None:
         of_steps, best = best, _along_sequences(problem, best)
         best = of_steps if breaks_bounds(problem, best) else best
     clean = isinstance(best.family, Terms) and best.error.relative <= OPTIONS.roundoff
@@ -181,6 +192,17 @@ def _simplified(
     except OutOfTime:  # what was found stands
         work.budget.leave_out(what, work.ended)
     return best, outside
+
+
+def _leaves_noise(problem: LawProblem, law: FittedLaw) -> bool:
+    """Return whether the law leaves noise, and no more."""
+    if problem.met_by(law) or law.error.relative <= problem.options.roundoff:
+        return False
+    data, fit = problem.data, law.fit
+    steps = fit.steps.stages, fit.steps.substeps
+    return law.noisy or leaves_white(
+        Flow(law.family, fit.coefficients, data.dt, data.scale, *steps), data
+    )
 
 
 def _along_sequences(problem: LawProblem, best: FittedLaw) -> FittedLaw:

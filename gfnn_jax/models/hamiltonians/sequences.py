@@ -344,12 +344,14 @@ class Sequences:
         least = max(resolved, float(np.finfo(float).eps)) * flows.scale
         return cls(data, steps, longest, least, Allowance(problem.budget))
 
-    def arcs(self, rows: np.ndarray) -> Measured | None:
-        """Arcs of these rows; None where they say no more than their pairs do."""
+    def arcs(self, rows: np.ndarray, *, alone: bool = False) -> Measured | None:
+        """Arcs of these rows; None where they say no more than their pairs do, unless these are to
+        stand ``alone``."""
         rows, pairs, weight = np.sort(rows), self.data.pairs, self.data.weight
         onto = self.longest, onward(pairs, rows)
         arcs = arcs_of_pairs(np.asarray(pairs.z0)[rows], np.asarray(pairs.z1)[rows], *onto)
-        if arcs is None or np.median(arcs.measured.sum(axis=1)) <= OPTIONS.shortest:
+        short = arcs is None or np.median(arcs.measured.sum(axis=1)) <= OPTIONS.shortest
+        if arcs is None or (short and not alone):
             return None
         found = Measured(arcs, self.least, self.data.coordinates.angles)
         if weight is None:

@@ -21,7 +21,7 @@ from gfnn_jax.models.textbook.atoms import (
     powers_of,
     value_of,
 )
-from gfnn_jax.models.textbook.shapes import COSH, Kind, constants_for, has_constant, values
+from gfnn_jax.models.textbook.shapes import COSH, TURNING, Kind, constants_for, has_constant, values
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +90,7 @@ class Setting:
         every = polynomial_terms(self.dim, 2, cyclic=(*angles, *cyclic))
         kept, null = null_terms(every, states)
         self.null = tuple(every.term_names[j] for j in null)
-        self.base = tuple(self._product(every.powers[j]) for j in kept)
+        self.base = tuple(self.product(every.powers[j]) for j in kept)
         self.weigh(weight)
 
     def weigh(self, weight: np.ndarray) -> None:
@@ -183,6 +183,15 @@ class Setting:
                 found.append(block)
         return found
 
+    def turning(self) -> list[tuple[Atom, ...]]:
+        """Cosines of the positions that may be angles: of each, and of all."""
+        each = [
+            (Factor(place, TURNING),)
+            for place, x in enumerate(self.arguments)
+            if 0 <= x.index < self.dim
+        ]
+        return [*((atom,) for atom in each), *([tuple(each)] if len(each) > 1 else [])]
+
     def tops(self) -> list[tuple[Atom, ...]]:
         """The three atoms that (p_i − p_j cos q)²/sin² q has beside p_j²: of a body that turns
         about several axes, in Euler angles. None of them explains much without the others."""
@@ -272,12 +281,12 @@ class Setting:
     def _monomials(self, degree: int, *, alone: bool = False) -> list[Atom]:
         """Products of coordinates of degree 3 to this one. alone: powers of one coordinate too."""
         return [
-            self._product(row)
+            self.product(row)
             for row in exponents(len(self._coordinates), degree)
             if sum(row) > 2 and (alone or sum(n > 0 for n in row) > 1)
         ]
 
-    def _product(self, powers: Sequence[int]) -> Atom:
+    def product(self, powers: Sequence[int]) -> Atom:
         """The product of these powers of the coordinates."""
         places = zip(self._coordinates, powers, strict=True)
         return tuple(Factor(place, ("power", float(n))) for place, n in places if n)

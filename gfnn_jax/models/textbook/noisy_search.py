@@ -1,4 +1,4 @@
-"""The search for laws of physics behind noisy sequences: which few atoms are worth a fit.
+"""The search for laws of physics behind noisy sequences and pairs: which few atoms are worth a fit.
 
 Gradients of H are known in weak form. The equation of motion times a bump φ, integrated by parts
 over a window of a sequence,
@@ -149,6 +149,29 @@ def weak_gradients(
     )
 
 
+def gradients_of_pairs(
+    pairs: tuple[np.ndarray, np.ndarray],
+    dt: float,
+    noise: np.ndarray,
+    off: np.ndarray,
+    gradient: Callable[[np.ndarray], np.ndarray],
+) -> WeakGradients:
+    """Each pair z0 -> z1 (N, 2d) as a window of one state, its middle, with noise (2d,).
+
+    The rate of a pair is that of its middle to O(dt²), which a law that is close corrects: what its
+    flow leaves ``off`` (N, 2d) of z1 is left of its ``gradient`` (deferred correction).
+    """
+    middle = 0.5 * (pairs[0] + pairs[1])
+    return WeakGradients(
+        middle,
+        np.broadcast_to(noise / np.sqrt(2), middle.shape),
+        gradient(middle) - apply_j(off) / dt,
+        np.sqrt(2) * np.roll(noise, len(noise) // 2) / dt,
+        np.arange(len(middle))[:, None],
+        np.ones(1),
+    )
+
+
 def _followed(windows: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """(R,) which windows (R, w, 2d) polynomials follow to their noise (2d,)."""
     count = windows.shape[1]
@@ -188,6 +211,11 @@ class Formula(NamedTuple):
     def complexity(self) -> float:
         """Complexity, in units of `shapes.complexity`, of the atoms that not every law has."""
         return complexity_of([atom for atom in self.atoms if atom not in self.setting.base])
+
+    @property
+    def is_polynomial(self) -> bool:
+        """Whether the law is a sum of products of coordinates."""
+        return all(self.setting.powers(atom) is not None for atom in self.atoms)
 
     @property
     def length(self) -> float:
@@ -254,6 +282,11 @@ class NoisyTextbook:
         self._setting = Setting(*given)
         self._weigh(weak.deviation)
 
+    def polynomial(self, family: Terms, coefficients: np.ndarray) -> Formula:
+        """The law of products of the coordinates."""
+        atoms = tuple(map(self._setting.product, family.powers))
+        return Formula(self._setting, atoms, coefficients, 1.0, self._target.size)
+
     def formulas(self) -> list[Formula]:
         """The laws that are worth a fit, the likeliest for their complexity first."""
         with np.errstate(all="ignore"):
@@ -302,7 +335,8 @@ class NoisyTextbook:
         found = matching.best(dictionary, OPTIONS.atoms)
         if not products:
             most = len(self._target) / 4 - len(setting.base)
-            found += [matching.refined(b) for b in setting.blocks() if len(b) < most]
+            blocks = [*setting.blocks(), *setting.turning()]
+            found += [matching.refined(b) for b in blocks if len(b) < most]
         likeliest = sorted(found, key=self._length_of_match)[: OPTIONS.exchanged]
         return found + [m for best in likeliest for m in matching.exchanged(best, dictionary)]
 

@@ -11,6 +11,7 @@ import numpy as np
 
 Kind = tuple[str, float]  # name and exponent n
 COSH: Kind = ("cosh", 0.0)
+TURNING: Kind = ("cos", 1.0)  # of period 2π
 
 
 def values(kind: Kind, x, theta):
@@ -34,7 +35,8 @@ def values(kind: Kind, x, theta):
         case "sin":
             return np.sin(theta * x), theta * np.cos(theta * x)
         case "cos":
-            return np.cos(theta * x), -theta * np.sin(theta * x)
+            k = n or theta  # 1: of an angle
+            return np.cos(k * x), -k * np.sin(k * x)
         case "cosh":
             return np.cosh(theta * x), theta * np.sinh(theta * x)
         case "pole":
@@ -49,14 +51,14 @@ def values(kind: Kind, x, theta):
 
 
 def has_constant(kind: Kind) -> bool:
-    return kind[0] not in ("power", "log")
+    return kind[0] not in ("power", "log") and kind != TURNING
 
 
 def complexity(kind: Kind) -> float:
-    """Complexity of a shape: its name 1, a constant, an unusual exponent more."""
+    """Complexity of a shape: its name 1, a constant, an unusual exponent, a period of 2π more."""
     name, n = kind
     if name != "power":
-        return 1.0 + has_constant(kind) + 0.5 * (name == "exp" and n != 0)
+        return 1.0 + has_constant(kind) + 0.5 * (name in ("exp", "cos") and n != 0)
     return 1.0 + 0.1 * min(abs(n), 6.0) + (1.0 if n % 1 else 0.0)
 
 
@@ -136,7 +138,7 @@ def text_of(kind: Kind, x: str, square: str, theta: float | None) -> str:
         case "softened":
             return f"1/sqrt({t} + {squared})"
         case "sin" | "cos" | "cosh":
-            return f"{name}({x})" if theta == 1 else f"{name}({t}*{inner})"
+            return f"{name}({x})" if 1 in (n, theta) else f"{name}({t}*{inner})"
         case "pole":
             return f"1/({t} + {inner})"
         case "lorentz":
