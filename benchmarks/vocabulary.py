@@ -295,6 +295,20 @@ def motor_arm(rng: np.random.Generator) -> System:
     return cart._replace(lagrangian=terms)
 
 
+def stribeck_friction(rng: np.random.Generator) -> System:
+    """Dry friction that falls with speed, by a force that is recorded."""
+    rest, share, width = rng.uniform(0.2, 0.4), rng.uniform(0.4, 0.7), rng.uniform(0.1, 0.3)
+    fallen = f"(abs(v1) + {width}*exp(-abs(v1)/{width}))"
+    friction = {"v1**2": rng.uniform(0.01, 0.03), "abs(v1)": rest, fallen: -share * rest}
+    return System(
+        {"v1**2": 0.5, "x1**2": -0.5},
+        ((rng.uniform(0.8, 1.2),), (0.0,)),
+        friction=friction,
+        push=("u1",),
+        dwell=20,
+    )
+
+
 def spherical_pendulum(rng: np.random.Generator) -> System:
     weight = rng.uniform(0.8, 1.2)
     return System(
@@ -332,7 +346,7 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
         *(springs_between_angles, elastic_pendulum, relativistic),
         *(drive_not_recorded, drive_of_two_phases, cubic_drag, one_sided_friction),
         *(motor_cart, motor_arm, magnet_on_a_spring, parametric_drive),
-        *(spherical_pendulum, body_in_a_bowl, orbit_that_turns),
+        *(spherical_pendulum, body_in_a_bowl, orbit_that_turns, stribeck_friction),
     )
 }
 
