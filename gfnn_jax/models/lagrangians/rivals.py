@@ -54,8 +54,8 @@ class RivalOptions:
     series of a shape. constants: inside a shape, times the range of the motion, where it begins;
     apart: relative, over which it is differentiated; corrections: of it; furthest: relative, of
     each; settled: standard errors, within which it is found. noise: times it, that is no more;
-    fades: of a speed's rms, over which Stribeck's friction does where a search begins; faster: by
-    which it may. clearly: of Schwarz's criterion, that a sensor gains where a law leaves more.
+    fades: of a speed's rms, between which Stribeck's friction does. clearly: of Schwarz's
+    criterion, that a sensor gains where a law leaves more.
     """
 
     most: int = 4
@@ -66,8 +66,7 @@ class RivalOptions:
     furthest: float = 0.3
     settled: float = 0.1
     noise: float = 2.0
-    fades: float = 0.15
-    faster: float = 6.0
+    fades: tuple[float, float] = (0.03, 0.9)
     clearly: float = 10.0
 
 
@@ -98,7 +97,8 @@ def with_likeliest_power(fit: LawFit) -> LawFit:
 
 def fading(direction: Sequence[int], problem: ArcProblem) -> float:
     """The speed, to two digits, over which Stribeck's friction fades where a search begins."""
-    return float(f"{OPTIONS.fades * problem.scales.speed @ np.abs(direction):.2g}")
+    middle = np.sqrt(np.prod(OPTIONS.fades))
+    return float(f"{middle * problem.scales.speed @ np.abs(direction):.2g}")
 
 
 def with_fading(fit: LawFit) -> LawFit:
@@ -120,7 +120,7 @@ def with_fading(fit: LawFit) -> LawFit:
             found = of(log)
             return found.fitted.cost if found.follows else np.inf
 
-        ends = np.log(row[2]) + np.log(OPTIONS.faster) * np.array([-1.0, 1.0])
+        ends = np.log(row[2] / np.sqrt(np.prod(OPTIONS.fades))) + np.log(OPTIONS.fades)
         found: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 0.01})
         fit = of(found.x) if found.fun < fit.fitted.cost else fit
     return fit if fit is begun else fit.again()

@@ -39,8 +39,7 @@ class StartOptions:
     period, below which more of them are the remedy. plain: times the residual of the larger
     library, that a plainer one's may have. noise: residual, times the noise, that is no more;
     white: that lacks no term. exponents: of the distance, where a power of it begins; beside: up to
-    which it is then found; rounded: up to which it is a half, or whole, or none. fading: times
-    `rivals.fading`, that are tried.
+    which it is then found; rounded: up to which it is a half, or whole, or none.
     """
 
     followed: float = 10.0
@@ -53,7 +52,6 @@ class StartOptions:
     exponents: tuple[float, ...] = (-3.0, -2.0, -1.0, -0.5, 0.5, 1.0, 1.5, 3.0, 4.0)
     beside: float = 0.6
     rounded: float = 0.1
-    fading: tuple[float, ...] = (0.3, 1.0, 3.0)
 
 
 OPTIONS = StartOptions()
@@ -233,7 +231,7 @@ class _Starts:
             return tuple(rows)
         found = [
             tuple((c, k, by * fading(c, problem) if k == STRIBECK else w) for c, k, w in rows)
-            for by in OPTIONS.fading
+            for by in (0.3, 1.0, 3.0)
         ]
         terms = tuple(library.rows)
         return min(
