@@ -312,7 +312,7 @@ def _chosen(
 
 
 def _leaves(found: Fitted | None, noise: np.ndarray) -> float:
-    """What a fit leaves over, in units of the noise (2d,)."""
+    """Residuals of a fit, in units of the noise (2d,)."""
     return np.inf if found is None else _rms(noise_of(found) / noise)
 
 

@@ -149,7 +149,7 @@ def kinds_of(rows: Sequence[Loss]) -> tuple[int, ...]:
 
 
 def _in_isotropic(kinds: Sequence[int]) -> tuple[int, ...]:
-    """These kinds with isotropic in place of quadratic friction, () where there is none."""
+    """Kinds with isotropic in place of quadratic friction, () where there is none."""
     return tuple(sorted({*kinds, ISOTROPIC} - {QUADRATIC})) if QUADRATIC in kinds else ()
 
 
@@ -205,7 +205,7 @@ class _Judged:
 
     @property
     def of_all(self) -> dict[Loss, float]:
-        """Its friction -> ρ, from all arcs."""
+        """Friction -> ρ, from all arcs."""
         return dict(zip(self.rows, self._of_all[list(self.subset)].tolist(), strict=True))
 
     @functools.cached_property

@@ -214,7 +214,7 @@ class Formula(NamedTuple):
 
     @property
     def is_polynomial(self) -> bool:
-        """Whether the law is a sum of products of coordinates."""
+        """Return whether the law is a sum of products of coordinates."""
         return all(self.setting.powers(atom) is not None for atom in self.atoms)
 
     @property
