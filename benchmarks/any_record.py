@@ -358,8 +358,9 @@ def gates_case(name: str, draw: int) -> Numbers:
         return [s[1], -squared * np.sin(s[0]) - rubs * s[1] * (1.0 if linear else abs(s[1]))]
 
     crossed = [lambda _, s, a=a: s[0] - a for a in places]
-    span, options = (0, 800 / np.sqrt(squared)), {"rtol": 1e-10, "atol": 1e-12}
-    times = solve_ivp(rates, span, [size, 0.0], "DOP853", events=crossed, **options).t_events
+    span, start = (0, 800 / np.sqrt(squared)), [size, 0.0]
+    options: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12, "events": crossed}
+    times = solve_ivp(rates, span, start, "DOP853", **options).t_events
     gates = [x[:200] + SIGMA_OF_TIMES * rng.normal(size=len(x[:200])) for x in times]
     recording = gfnn.Recording(
         {"t": np.concatenate(gates), "gate": np.repeat(["left", "right"], [*map(len, gates)])},
