@@ -5,6 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import gfnn_jax as gfnn
+from gfnn_jax.errors import InputError
 from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, QUADRATIC
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, Table, WhichFriction, chosen
 from gfnn_jax.models.lagrangians.search import likeliest, without_drives
@@ -151,3 +153,10 @@ def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():
     assert likeliest(tried)[0] is one
     assert likeliest([(two, None), (last, None)])[0] is two
     assert likeliest([(drives, None), (lost, None)])[0] is lost  # none can be: the last
+
+
+def test_stribecks_friction_is_asked_for_beside_the_dry_friction_that_it_lowers():
+    t = 0.1 * np.arange(200)
+    recording = gfnn.Recording({"t": t, "x": np.cos(t)}, positions=["x"])
+    with pytest.raises(InputError, match=r"dry\+stribeck"):
+        gfnn.fit(recording, model=gfnn.Lagrangian(friction="linear+stribeck"))

@@ -17,7 +17,7 @@ which the best has odds of less than 20 the one with the fewest kinds is taken: 
 which has one coefficient and keeps a multiple of the symplectic form, before linear friction, and
 that before isotropic drag, quadratic and dry friction. Uniform friction is tried beside linear
 friction, and isotropic drag beside quadratic friction, only where both are asked for. Rare kinds,
-cubic and one-sided friction, come last: one of them beside the others, or in place of one, where
+cubic, one-sided and Stribeck's, come last: one of them beside the others, or in place of one, where
 that has odds of 20 against the set without it, by held-out arcs and by Schwarz's criterion of all.
 
 Odds alone let chance in: a direction that is not there takes up a part of what the other

@@ -230,7 +230,7 @@ class _Reader(NamedTuple):
             f"terms: '{text}' is no term of a law. A term of L or V is a formula of "
             f"{', '.join((*self.positions, *self.inputs))}, in L without inputs times up to two of "
             f"{', '.join(self.speeds)}; one of R is v**2, abs(v)**a, abs(v), "
-            f"(abs(v) + v)**2 or sqrt(v**2 + w**2)**a, a >= 2{of}"
+            f"(abs(v) + v)**2, exp(-abs(v)/0.1) beside abs(v), or sqrt(v**2 + w**2)**a, a >= 2{of}"
         )
 
 

@@ -18,7 +18,7 @@ from scipy.optimize import lsq_linear
 
 from gfnn_jax.dataset.stretches import arcs_of
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.friction import ISOTROPIC, LINEAR, STRIBECK, UNIFORM
+from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, STRIBECK, UNIFORM
 from gfnn_jax.families.lagrangian import has_inputs, shape_of
 from gfnn_jax.fitting.evidence import Comparison, criterion, improved
 from gfnn_jax.models.lagrangians import libraries
@@ -70,7 +70,8 @@ class SearchResult(NamedTuple):
 
 def search(problem: ArcProblem) -> SearchResult:
     """The law of a problem, by the best of its rules between samples of the inputs."""
-    fit, terms = best_start(problem), TermSearch.of(problem)
+    terms = TermSearch.of(problem)  # which refuses friction that cannot be
+    fit = best_start(problem)
     if len(fit.structure.uncoupled) > 1:  # what couples them is seen best along short arcs
         fit = terms.grow(fit)
     return terms.along(fit, problem.options.periods[1:])
@@ -471,6 +472,11 @@ def frictions_tried(problem: ArcProblem) -> tuple[Loss, ...]:
         raise InputError(
             "isotropic friction is that of a plane or of space: expected two or three positions "
             f"that are no angles, got {len(problem.lengths)}. Give friction of each: quadratic"
+        )
+    if not options.choose_friction and STRIBECK in kinds and DRY not in kinds:
+        raise InputError(
+            "stribeck friction is a part of dry friction, which falls with speed: expected both, "
+            f"got {'+'.join(options.frictions)}. Give them together: dry+stribeck"
         )
     if dim > libraries.FEW and options.choose_friction:
         return tuple(row for row in rows if row[1] not in libraries.RARE)
