@@ -28,7 +28,7 @@ from scipy.linalg import solve_discrete_are
 import gfnn_jax as gfnn
 from gfnn_jax.maps.estimates import law_of, substeps_of
 from gfnn_jax.maps.inputs import Signals
-from gfnn_jax.maps.laws import law_of_map, map_of_law, sticking
+from gfnn_jax.maps.laws import law_of_map, map_of_law, smoothed
 
 RECORD = Path(__file__).with_name("robot_arm.csv")
 LENGTHS = np.array([0.2, 0.3])  # m
@@ -91,7 +91,7 @@ class Motor(NamedTuple):
 def motor(fit: gfnn.Fit, joint: int, h: float) -> Motor:
     """The motor at a joint of a learned law, its dry friction smoothed; the step is accurate for
     speeds of some 6 rad/s."""
-    law, own = sticking(law_of_map(fit.map), WIDTH, 1.0), law_of(fit.map)
+    law, own = smoothed(law_of_map(fit.map), WIDTH), law_of(fit.map)
     law = dataclasses.replace(law, gains=law.gains[:, [joint]])
     others = len(own.p) - 4
     varied = NEAR * np.random.default_rng(3).normal(size=(SIDE, len(own.root))) @ own.root

@@ -1,6 +1,8 @@
 """Arms: inertias, friction and possible bodies from a log of known kinematics."""
 
+import ast
 import importlib.util
+import re
 from typing import Any
 
 import numpy as np
@@ -184,9 +186,9 @@ def test_what_a_motion_does_not_tell_is_said():
 @pytest.mark.parametrize(
     ("inputs", "gains", "said"),
     [
-        ((1, 2, 3), (1, -1, 1), r"of q2 .* -1 times .*gains=\(1, 1, 1\)"),
-        ((1, 2, 3), (-1, -1, -1), r"take energy .*gains=\(1, 1, 1\)"),
-        ((1, 2, 3), (1, 1e3, 1), r"q2 are 1e\+03 times .*gains=\(1, 1, 1\)"),
+        ((1, 2, 3), (1, -1, 1), r"of q2 .* -1 times .*gains=\[1, 1, 1\]"),
+        ((1, 2, 3), (-1, -1, -1), r"take energy .*gains=\[1, 1, 1\]"),
+        ((1, 2, 3), (1, 1e3, 1), r"q2 are 1e\+03 times .*gains=\[1, 1, 1\]"),
         ((1, 3, 2), (1, 1, 1), r"exchanged.*inputs=\['tau1', 'tau2', 'tau3'\]"),
         ((1,), None, r"inputs=\["),
     ],
@@ -196,6 +198,24 @@ def test_forces_that_do_not_go_with_the_motion_are_refused(inputs, gains, said):
     record = log(np.random.default_rng(0), inputs=[f"tau{i}" for i in inputs])
     with pytest.raises(ValueError if gains is None else gfnn.FitError, match=said):
         gfnn.fit(record, model=gfnn.Arm(axes=AXES, gains=gains))
+
+
+@pytest.mark.parametrize("wrong", [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)])
+def test_signs_of_a_slow_log_are_told_by_its_friction(wrong):
+    """Where gravity is most of the forces, a possible arm has those of the other sign too."""
+    rng, kinematics = np.random.default_rng(0), from_axes(AXES[1:])
+    t, q, v, a = motion(rng, (1, 1, 1), seconds=20.0)
+    q, (v, a) = q[:, 1:], (0.3 * v[:, 1:], 0.09 * a[:, 1:])
+    τ = kinematics.bodies.forces(LINKS[1:].ravel(), q, v, a) + ROTORS[1:] * a
+    τ += VISCOUS[1:] * v + DRY[1:] * v / np.hypot(v, 0.02) + 0.1 * rng.normal(size=q.shape)
+    q = q + 1e-5 * rng.normal(size=q.shape)
+    table = {"t": t / 0.3, "a": q[:, 0], "b": q[:, 1], "x": τ[:, 0], "y": τ[:, 1]}
+    record = gfnn.Recording(table, positions=["a", "b"], inputs=["x", "y"], angles=())
+    with pytest.raises(gfnn.FitError) as refusal:
+        gfnn.fit(record, model=gfnn.Arm(axes=AXES[1:], gains=wrong))
+    printed = re.search(r"gains=(\[.*\])", str(refusal.value))
+    assert printed is not None
+    assert ast.literal_eval(printed[1]) == [1, 1]
 
 
 def test_largest_forces_are_left_out_and_columns_have_to_be_the_joints():

@@ -109,6 +109,12 @@ class Arm:
                 at = [f"{n} {m:.1%}" for n, m in zip(names, shares, strict=True) if m]
                 notes.append(f"{title}: {', '.join(at)}")
         motion = motion.without(saturated)
+        if (told := int(np.isfinite(motion.force).sum())) <= columns.count:
+            raise InputError(
+                f"{recording.source}: expected more forces than the arm's {columns.count} "
+                f"parameters, found {told} inside runs, of joints that move, below their limits: "
+                "a longer log, or other inputs=[…]"
+            )
         factor = size_of_forces(kinematics, motion, columns)
         if not kinematics.known:  # links as heavy as the forces need
             kinematics = kinematics._replace(prior=kinematics.prior * abs(factor))

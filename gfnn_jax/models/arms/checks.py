@@ -72,22 +72,37 @@ def check_forces(
     noise = np.nanstd(np.diff(motion.force[:, given], 2, axis=0), axis=0) / np.sqrt(6)
     explained = np.maximum(OPTIONS.explained, 1 - alone**2 - OPTIONS.apart)
     poor = (1 - left**2 < explained) & (left > 3 * noise / scale[given])
-    sized = (
-        f"the forces are {factor:.2g} times those that the inertias of the URDF need: currents, or "
-        "other units? gfnn.Arm(…, gains=[…]), the force for a unit of each input"
-        if not 1 / OPTIONS.units < factor < OPTIONS.units
-        else ""
-    )
+    sized = ""
+    if not 1 / OPTIONS.units < factor < OPTIONS.units:
+        sized = f"the forces are {factor:.2g} times those that the inertias of the URDF need"
+        unit = _unit(factor)
+        sized += (
+            f": another unit or sign. {_gains(gains / unit)}"
+            if unit
+            else ": currents, or other units? gfnn.Arm(…, gains=[…]), the force for a unit of each "
+            "input"
+        )
+    _, slope, _ = columns.friction.tables(motion.v[known])
+    speeds = motion.v[known][:, given]
+
+    def takes(x: np.ndarray, left: np.ndarray, turned: np.ndarray) -> bool:
+        """Whether each joint's friction, of either sign, brings it energy, by a force that stands
+        clear of what is left, (k,) shares of the forces times ``turned``."""
+        lost = slope * (x / size)[columns.count - len(columns.kinds) * k :]
+        lost = lost.reshape(len(slope), -1, k).sum(axis=1)[:, given]
+        clear = np.sqrt(np.mean(lost**2, axis=0)) > left * (scale * abs(turned))[given]
+        return bool(np.all(clear & (np.mean(lost * speeds, axis=0) < 0)))
+
+    x, together = solved(given, order)
+    if takes(x, together, np.ones(k)):
+        raise FitError(
+            "the forces take energy from the motion of every joint. Their sign is wrong: "
+            f"{_gains(-gains)}"
+        )
     if not poor.any():
         if sized:
             raise FitError(sized)
         return
-    x, together = solved(given, order)
-    x = x / size
-    _, slope, _ = columns.friction.tables(motion.v[known])
-    lost = slope * x[columns.count - len(columns.kinds) * k :]
-    power = np.mean(lost.reshape(len(slope), -1, k).sum(axis=1) * motion.v[known], axis=0)
-    fed = power < -OPTIONS.fed * np.mean(np.abs(force * motion.v[known]), axis=0)
     said = f"the forces of {', '.join(names[given][poor])} do not go with the motion"
     trials: list[tuple[list[int], int | None]] = [(order, j) for j in given if len(given) > 1]
     for i, j in combinations(given, 2):
@@ -96,21 +111,16 @@ def check_forces(
         trials.append((turned, None))
     tried = [solved(given, of, free) for of, free in trials]
     worse = [float(np.max(rest / (alone + OPTIONS.mended))) for _, rest in tried]
-    if fed[given].all():
-        said += f": they take energy from it. Their sign is wrong: {_gains(-gains)}"
-    elif min(worse, default=np.inf) < 0.5 * np.max(together / (alone + OPTIONS.mended)):
+    if min(worse, default=np.inf) < 0.5 * np.max(together / (alone + OPTIONS.mended)):
         best = int(np.argmin(worse))
-        (of, free), gain = trials[best], tried[best][0][-1]
+        (of, free), (x, rest) = trials[best], tried[best]
         if free is None:
             listed = ", ".join(repr(inputs[i]) for i in of)
             said += f": two inputs are exchanged. gfnn.read(FILE, inputs=[{listed}])"
         else:
-            said += f": those of {names[free]} are {1 / gain:.2g} times what the others need. "
-            near = np.sign(gain) * 10.0 ** np.round(np.log10(abs(gain)))
-            gain = near if abs(gain / near - 1) < OPTIONS.apart else gain
-            said += _gains(gains * np.where(np.arange(k) == free, gain, 1.0))
-    elif sized:
-        said = sized
+            said += f": those of {names[free]} are {1 / x[-1]:.2g} times what the others need. "
+            turned = np.where(np.arange(k) == free, _unit(x[-1]) or x[-1], 1.0)
+            said += _gains(gains * turned * (-1 if takes(x[:-1], rest, turned) else 1))
     else:
         said += (
             ". Are positions in degrees (gfnn.read(FILE, degrees=[…])), inputs in the order of the "
@@ -119,8 +129,14 @@ def check_forces(
     raise FitError(said)
 
 
+def _unit(factor: float) -> float | None:
+    """The power of ten, of either sign, that a factor is near."""
+    near = float(np.sign(factor) * 10.0 ** np.round(np.log10(abs(factor))))
+    return near if abs(factor / near - 1) < OPTIONS.apart else None
+
+
 def _gains(gains: np.ndarray) -> str:
-    return f"gfnn.Arm(…, gains=({', '.join(f'{g:.3g}' for g in gains)}))"
+    return f"gfnn.Arm(…, gains=[{', '.join(f'{g:.3g}' for g in gains)}])"
 
 
 def size_of_forces(kinematics: Kinematics, motion: Motion, columns: Columns) -> float:

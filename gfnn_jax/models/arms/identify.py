@@ -39,12 +39,11 @@ class IdentifyOptions:
     its limit; plateau: share of samples at one largest force that are such a limit. explained:
     share of a joint's force below which its law does not explain it, or less than parameters of
     that joint alone by ``apart``; mended: error of a joint alone, as a share of its force, to which
-    others are compared. fed: share of a joint's power that friction may seem to bring. units:
-    factor between forces and those of a CAD model beyond which units are asked about. converged:
-    Newton's decrement at which it ends. structure: random motions that tell the base parameters.
-    dependent: share of a column's norm below which it depends on others. sharpened: a parameter's
-    standard error has to be below this share of the parameter, or of what the prior expects. most:
-    steps of Newton's method.
+    others are compared. units: factor between forces and those of a CAD model beyond which
+    units are asked about. converged: Newton's decrement at which it ends. structure: random motions
+    that tell the base parameters. dependent: share of a column's norm below which it depends on
+    others. sharpened: a parameter's standard error has to be below this share of the parameter, or
+    of what the prior expects. most: steps of Newton's method.
     """
 
     prior: float = 0.1
@@ -57,7 +56,6 @@ class IdentifyOptions:
     explained: float = 0.5
     apart: float = 0.2
     mended: float = 0.1
-    fed: float = 0.3
     units: float = 3.0
     converged: float = 1e-9
     structure: int = 200
