@@ -337,6 +337,32 @@ def orbit_that_turns(rng: np.random.Generator) -> System:
     )
 
 
+def elastic_on_video(rng: np.random.Generator) -> System:
+    """As seen by a camera, whose origin is not the pivot."""
+    (a, b), stiff = rng.uniform(-2, 2, 2), rng.uniform(4, 8)
+    x, y = f"(x1-{a})", f"(x2-{b})"
+    return System(
+        {
+            **FREE,
+            f"{x}**2": -stiff / 2,
+            f"{y}**2": -stiff / 2,
+            f"sqrt({x}**2+{y}**2)": stiff,
+            "x2": -1.0,
+        },
+        ((a + rng.uniform(0.5, 1), b + rng.uniform(-1, -0.7)), (0.0, 0.0)),
+        friction={"v1**2": 0.005, "v2**2": 0.005},
+    )
+
+
+def orbit_off_the_origin(rng: np.random.Generator) -> System:
+    a, b = rng.uniform(-2, 2, 2)
+    return System(
+        {**FREE, f"sqrt((x1-{a})**2+(x2-{b})**2)**(-1)": 1.0},
+        ((a + 1.0, b), (0.0, rng.uniform(0.75, 1.1))),
+        period=4.0,
+    )
+
+
 SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
     f.__name__.replace("_", "-"): f
     for f in (
@@ -347,6 +373,7 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
         *(drive_not_recorded, drive_of_two_phases, cubic_drag, one_sided_friction),
         *(motor_cart, motor_arm, magnet_on_a_spring, parametric_drive),
         *(spherical_pendulum, body_in_a_bowl, orbit_that_turns, stribeck_friction),
+        *(elastic_on_video, orbit_off_the_origin),
     )
 }
 

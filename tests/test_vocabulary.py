@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import sympy as sp
 from analytic import motion
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 
@@ -80,6 +81,46 @@ def test_an_orbit_that_turns_has_two_powers_of_the_distance():
     distance = sp.sqrt(x**2 + y**2)
     assert set(terms) >= {1 / distance, distance**-2}
     assert abs(terms[distance**-2].coefficient + 0.04) < 4 * terms[distance**-2].std
+
+
+def test_forces_through_a_point_that_is_not_the_origin(tmp_path):
+    """An elastic pendulum on a video, whose pivot nobody gave: V = 12 (r − 1)² + 9.8 y."""
+    pivot = np.array([2.3, -1.1])
+
+    def acceleration(q, v):
+        out = q - pivot
+        r = np.hypot(*out)
+        return -24 * (r - 1) * out / r - np.array([0.0, 9.8]) - 0.02 * v
+
+    fit = gfnn.fit(recorded(acceleration, [3.0, -2.2, 0.1, 0.3], 15))
+    assert fit.verdict == "identified"
+    for name, at in zip(("x1", "x2"), pivot, strict=True):
+        zero, std = fit.zeros[name]
+        assert abs(zero - at) < 4 * std < 0.02
+    x, y = sp.symbols("x1 x2")
+    V = -sum(t.coefficient * sp.sympify(t.term) for t in fit.lagrangian.terms if "v" not in t.term)
+    for turned in (4.0, 4.7, 5.4):  # where the motion was
+        out = 1.25 * np.array([np.cos(turned), np.sin(turned)])
+        force = [
+            float(-sp.diff(V, s).subs({x: pivot[0] + out[0], y: pivot[1] + out[1]})) for s in (x, y)
+        ]
+        assert_allclose(force, acceleration(pivot + out, np.zeros(2)), atol=0.05)
+    fit.save(tmp_path / "law")
+    assert gfnn.load(tmp_path / "law").lagrangian == fit.lagrangian
+
+
+def test_an_orbit_about_a_centre_that_nobody_gave():
+    centre = np.array([-0.8, 0.4])
+
+    def acceleration(q, v):
+        out = q - centre
+        return -out / np.hypot(*out) ** 3
+
+    fit = gfnn.fit(recorded(acceleration, [0.2, 0.4, 0.0, 0.95], 20, 400))
+    assert fit.verdict == "identified"
+    (term,) = [t for t in fit.lagrangian.terms if "v" not in t.term]
+    assert abs(term.coefficient - 1) < 4 * term.std < 0.01
+    assert_allclose([fit.zeros[name][0] for name in ("x1", "x2")], centre, atol=2e-3)
 
 
 def test_a_wheel_with_a_motor_that_swings_has_its_torque():

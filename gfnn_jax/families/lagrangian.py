@@ -17,7 +17,7 @@ system, `Lagrangian.at`, has plain coefficients again.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from typing import Any, NamedTuple
 
@@ -26,12 +26,15 @@ import numpy as np
 from gfnn_jax.arrays import as_row, matmul, namespace, pytree
 from gfnn_jax.families.expressions import (
     Expression,
+    coordinate,
     depends_on,
     has_parameters,
     leaves,
     number,
     parse,
     to_named_text,
+    to_text,
+    with_leaves,
 )
 from gfnn_jax.families.friction import Friction
 from gfnn_jax.families.jets import jets
@@ -88,6 +91,22 @@ def coordinates_in(row: Sequence[Any], phased: bool = True) -> tuple[bool, ...]:
     for i in depends_on(tree_of(shape_of(row), len(powers))):
         found[i] = True
     return tuple(found)
+
+
+def row_about(row: Sequence[Any], centre: Mapping[int, float]) -> tuple[Any, ...]:
+    """A row whose powers and shape are of q_i − c_i in place of q_i."""
+    speeds, powers, wave, phase = row[:4]
+
+    def moved(leaf: Expression) -> Expression:
+        at = centre.get(leaf.operands[0]) if leaf.operation == "coordinate" else None
+        return leaf if at is None else leaf - at
+
+    d, kept = len(powers), tuple(0 if i in centre else n for i, n in enumerate(powers))
+    tree = with_leaves(tree_of(shape_of(row), d), moved)
+    for i, n in enumerate(powers):
+        tree = tree * (coordinate(i) - centre[i]) ** n if n and i in centre else tree
+    shape = to_text(tree, d, INPUTS)
+    return (speeds, kept, wave, phase, shape if shape != "1" else "")
 
 
 @pytree("shapes", "leaders")

@@ -11,7 +11,7 @@ from gfnn_jax.data.roles import symbols as code_names
 from gfnn_jax.exports import symbolic
 from gfnn_jax.exports.symbolic import Equation, Formula, equations_of_motion
 from gfnn_jax.families.friction import DRY
-from gfnn_jax.families.lagrangian import Lagrangian
+from gfnn_jax.families.lagrangian import Lagrangian, Terms, row_about
 from gfnn_jax.families.text import Term, measured
 from gfnn_jax.fitting.evidence import EVIDENCE, Rival
 from gfnn_jax.maps.laws import law_of_map
@@ -213,7 +213,8 @@ class LearnedLaw:
             )
         lines += [f"nearly collinear: {pair}" for pair in self.alike[:_SHOWN]]
         lines += [
-            f"{name}: zero at {measured(zero, std)} rad" for name, (zero, std) in self.zeros.items()
+            f"{name}: zero at {measured(zero, std)} {self.units[name]}".rstrip()
+            for name, (zero, std) in self.zeros.items()
         ]
         lines += [f"{column} shows {formula}" for column, formula in self.observe.items()]
         lines += [f"{name} = {measured(value, std)}" for name, (value, std) in self.sensors.items()]
@@ -362,12 +363,21 @@ def hamiltonian_of(law: Lagrangian, lagrangian: Formula, names: Names) -> Hamilt
 
 
 def in_columns(fit: LawFit) -> tuple[Lagrangian, np.ndarray]:
-    """The law in the measured coordinates (zeros of angles inside the phases of its terms), and the
-    covariance of (θ, ρ, G row by row), and of γ where there is uniform friction."""
+    """The law in the measured coordinates (zeros of angles inside the phases of its terms, those of
+    lengths inside their shapes), and the covariance of (θ, ρ, G row by row), and of γ where there
+    is uniform friction."""
     form = fit.form
     law = form.lagrangian(fit.p[: form.count])
     terms = law.terms
     moved = dataclasses.replace(terms, phases=terms.phases - terms.modes @ fit.zeros)
+    centre = {}
+    for k, i in enumerate(fit.structure.zeros, form.count):
+        if i not in fit.problem.angles:  # to a hundredth of its standard error
+            error = np.fmin(np.fmax(fit.linearised.errors[k], 1e-13), 1.0)
+            centre[i] = round(float(fit.p[k]), 3 - int(np.log10(error)))
+    if centre:
+        rows = [row_about(row, centre) for row in moved.rows()]
+        moved = Terms.of(rows, terms.dim, terms.leaders)
     rest = form.count - form.basis.shape[1]
     turn = np.zeros((terms.count + rest, len(fit.p)))
     turn[: terms.count, : form.basis.shape[1]] = form.basis

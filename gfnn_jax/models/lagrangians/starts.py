@@ -27,7 +27,12 @@ from gfnn_jax.models.lagrangians.input_rules import choose_rule
 from gfnn_jax.models.lagrangians.nature import told_by_positions
 from gfnn_jax.models.lagrangians.rivals import fading
 from gfnn_jax.models.lagrangians.structure import Loss, Row, Structure, is_constant
-from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start, zeros_of_angles
+from gfnn_jax.models.lagrangians.weak_form import (
+    centre_of_forces,
+    weak_share,
+    weak_start,
+    zeros_of_angles,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,13 +170,25 @@ def leading(problem: ArcProblem) -> list[tuple[int, ...]]:
 
 
 def _is_of(fit: LawFit, structure: Structure) -> bool:
-    """Return whether a fit has the terms of a structure, and its friction that no other start
-    has."""
+    """Return whether a fit has the terms and zeros of a structure, and its friction that no other
+    start has."""
     parts = (
-        (one.terms, one.leaders, *(r for r in one.friction if r[1] in (DRY, ISOTROPIC, STRIBECK)))
+        (
+            one.terms,
+            one.zeros,
+            one.leaders,
+            *(r for r in one.friction if r[1] in (DRY, ISOTROPIC, STRIBECK)),
+        )
         for one in (fit.structure, structure)
     )
     return len(set(parts)) == 1
+
+
+def _about(zero: np.ndarray, problem: ArcProblem) -> ArcProblem:
+    """The problem whose coordinates are measured from there (d,)."""
+    by = np.concatenate([zero, 0 * zero])
+    nodes = [dataclasses.replace(n, x=n.x - by) for n in problem.nodes]
+    return dataclasses.replace(problem, nodes=nodes)
 
 
 class _Starts:
@@ -187,16 +204,12 @@ class _Starts:
 
     def add(self, library: _Library, zero: np.ndarray | None = None) -> None:
         """Start from the terms of a library that the weak form shows, if it determines them.
-        zero: (d,) of angles, from which the fit begins."""
-        problem, d = self.problem, self.problem.dim
+        zero: (d,) of angles, or a centre of lengths, from which the fit begins."""
+        problem = self.problem
         friction = self._friction(library)
         terms = libraries.without_forces(library.rows, problem.observation.shifts())
-        seen = problem
-        if zero is not None:
-            about = np.concatenate([zero, np.zeros(d)])
-            moved = [dataclasses.replace(n, x=n.x - about) for n in problem.nodes]
-            seen = dataclasses.replace(problem, nodes=moved)
-        whole = Structure(d, terms, friction, (), problem.num_inputs, problem.sensors)
+        seen = problem if zero is None else _about(zero, problem)
+        whole = Structure(problem.dim, terms, friction, (), problem.num_inputs, problem.sensors)
         whole = dataclasses.replace(whole, leaders=library.leaders)
         try:
             structure, known = weak_start(whole, seen, equal=library.equal)
@@ -204,13 +217,17 @@ class _Starts:
             return
         zeros = structure.with_a_zero(problem.turned)
         structure, known = structure.with_sines_as_zeros(known, zeros)
+        if zero is not None:
+            zeros = (*zeros, *(i for i in problem.lengths if zero[i]))
+            structure = structure.plus([("zero", i) for i in zeros])
         structure = structure.plus([("loss", row) for row in self.always])
         if zero is not None:
             known = known | {("zero", i): float(zero[i]) for i in zeros}
-        elif any(_is_of(other, structure) for other in self.fits):
+        new = zero is not None and problem.angles
+        if not new and any(_is_of(other, structure) for other in self.fits):
             return
         periods = problem.options.periods[0]
-        rule = choose_rule(problem, structure, known, problem.arcs(periods), problem.scales.sigma)
+        rule = choose_rule(problem, structure, known, seen.arcs(periods), problem.scales.sigma)
         # Inputs act so in the other libraries too.
         inputs = rule.fit.problem.inputs
         self.problem = dataclasses.replace(problem, inputs=inputs, rules=(rule.hold,))
@@ -282,13 +299,14 @@ class _Starts:
     def add_central(
         self, textbook: Sequence[Row], rank: int, across: bool, rubs: int | None = None
     ) -> None:
-        """Start from a force along or across the line to the origin by a power of the distance,
-        with equal masses, alone or beside the textbook's, where the residuals of all starts are
-        more than noise: the likeliest, by Schwarz's criterion. Across, the power 0 is a uniform
-        field. rubs: as of a library."""
+        """Start from a force along or across the line to the origin, or to the point that forces
+        pass through, by a power of the distance, with equal masses, alone or beside the textbook's,
+        where the residuals of all starts are more than noise: the likeliest, by Schwarz's
+        criterion. Across, the power 0 is a uniform field. rubs: as of a library."""
         problem, d = self.problem, self.problem.dim
         if d == 1 or problem.angles or self.are_noise:
             return
+        problem, zero = (problem, None) if across else self._about_centre()
         periods = sum(np.ptp(n.t) for n in problem.nodes) / problem.scales.period
         library = _Library((), rank, apart=True, equal=True, rubs=rubs)
 
@@ -325,7 +343,7 @@ class _Starts:
             new = (exponent or across) and (len(others), exponent) not in tried
             if new and not self.are_noise:
                 before = len(self.fits)
-                self.add(library._replace(rows=rows(exponent, others)))
+                self.add(library._replace(rows=rows(exponent, others)), zero)
                 least = min(map(misfit, self.fits[before:]), default=np.inf)
                 tried[len(others), exponent] = least
 
@@ -345,12 +363,19 @@ class _Starts:
                     plain if abs(best - plain) < OPTIONS.rounded else float(f"{best:.4g}"), others
                 )
 
+    def _about_centre(self) -> tuple[ArcProblem, np.ndarray | None]:
+        """The problem with its coordinates from the centre of forces, and that centre (d,); as it
+        is, and None, where that is the origin."""
+        centre = centre_of_forces(self.problem)
+        return (_about(centre, self.problem), centre) if centre.any() else (self.problem, None)
+
     def add_two_powers(self) -> None:
         """Start from equal masses and those two powers of the distance that the weak form
         prefers, as of a force that is nearly one of them."""
         problem, d = self.problem, self.problem.dim
         if d == 1 or problem.angles:
             return
+        problem, zero = self._about_centre()
         masses = [row for row in libraries.textbook(d, ()) if any(row[0])]
         pairs = combinations(OPTIONS.exponents, 2)
         found = [[*masses, *(libraries.central(d, a)[0] for a in two)] for two in pairs]
@@ -359,7 +384,7 @@ class _Starts:
             friction = tuple(self.linear[:d])
             return weak_share(Structure(d, tuple(rows), friction, (), problem.num_inputs), problem)
 
-        self.add(_Library(min(found, key=share), 4, apart=True, equal=True))
+        self.add(_Library(min(found, key=share), 4, apart=True, equal=True), zero)
 
     def plainest(self) -> LawFit:
         """The plainest of those that leave little more than the best."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,6 +49,8 @@ class WeakOptions:
     dry friction holds it; held: share of a window, above which it says nothing of the law. many:
     terms of a library, of which the ``kept`` that explain most are tried, ``block`` by block;
     imitated: share of what one does that those of the law do not, below which it explains nothing.
+    far: of the spread, that a centre of forces is from the origin; torque: share of the squares of
+    forces times distances, that is none about it; some: that forces through one point leave.
     """
 
     lengths: tuple[float, ...] = (0.5, 1.0)
@@ -64,6 +67,9 @@ class WeakOptions:
     kept: int = 120
     block: int = 300
     imitated: float = 0.03
+    far: float = 0.03
+    torque: float = 1e-4
+    some: float = 0.01
 
 
 OPTIONS = WeakOptions()
@@ -257,6 +263,48 @@ def zeros_of_angles(
             a, b = (known.get(("term", one), 0.0) for one in (cosine, row))
             zeros[row[2].index(1)] = np.arctan2(b, a)
     return np.where(np.abs(zeros) > np.pi / 2, zeros - np.pi * np.sign(zeros), zeros)
+
+
+def centre_of_forces(problem: ArcProblem) -> np.ndarray:
+    """The point c (d,) of lengths through which forces pass; 0 where there is none, or where it is
+    close to the origin.
+
+    About c the acceleration has no torque but that of a uniform field g and of drag:
+    (q − c) × (q̈ − g + γ q̇) = 0, which is linear in c, g, γ and in products of these. The plainest
+    choice of these is taken that leaves hardly any torque, else that by which c is known best.
+    """
+    d, period = problem.dim, problem.scales.period
+    period = min(period, max(np.ptp(n.t) for n in problem.nodes) / OPTIONS.periods)
+    planes, rows, targets, sizes = list(combinations(range(d), 2)), [], [], []
+    middle, spread = (of(problem.states[:, :d], axis=0) for of in (np.mean, np.std))
+    for node in problem.nodes:
+        q, v = np.split(node.x, 2, axis=1)
+        bumps = Bumps.of(node.t, OPTIONS.lengths[-1] * period)
+        one = summed(bumps.phi, np.ones(len(q)))
+        bent, speed, place = -summed(bumps.slope, v), summed(bumps.phi, v), summed(bumps.phi, q)
+        sizes.append(np.sum((place / one[:, None] - middle) ** 2, axis=1) @ np.sum(bent**2, axis=1))
+        for at, (i, j) in enumerate(planes):
+
+            def across(x: np.ndarray, i: int = i, j: int = j) -> np.ndarray:
+                """Those factors of a vector (d,) that its product with x has in this plane."""
+                return np.outer(x[:, j], np.eye(d)[i]) - np.outer(x[:, i], np.eye(d)[j])
+
+            spin = q[:, i] * v[:, j] - q[:, j] * v[:, i]
+            field = [across(place), np.outer(one, np.eye(len(planes))[at])]
+            drag = [across(speed), summed(bumps.phi, spin)[:, None]]
+            rows.append([across(bent), *field, *drag])
+            targets.append(-summed(bumps.slope, spin))
+    parts, Y = [np.concatenate(part) for part in zip(*rows, strict=True)], np.concatenate(targets)
+    found = []
+    for taken in ((0,), (0, 3, 4), (0, 1, 2), (0, 1, 2, 3, 4)):
+        X = np.concatenate([parts[k] for k in taken], axis=1)
+        c, left, inverse = _solve(X[:, None], Y[:, None])
+        error = np.sqrt(OPTIONS.overlap * np.mean(left**2)) * np.linalg.norm(inverse[:d])
+        found.append((error, np.sum(left**2) / max(sum(sizes), 1e-300), c[:d]))
+    plain = [one for one in found if one[1] < OPTIONS.torque]
+    error, share, c = plain[0] if plain else min(found, key=lambda one: one[0])
+    near = max(OPTIONS.far * np.linalg.norm(spread), problem.options.evidence.significant * error)
+    return c if share < OPTIONS.some and np.linalg.norm(c) > near else 0 * c
 
 
 def weak_rows(form: Form, node: Nodes, length: float) -> tuple[np.ndarray, np.ndarray]:
