@@ -122,7 +122,14 @@ def by_javascript(path, calls):
 
 
 @needs_cc
-@pytest.mark.parametrize("kind", [*SMOOTH, "bobs that attract"])
+def with_one(kind: str) -> list:
+    """The smooth laws, of which one is tried each time and the others are slow."""
+    return [pytest.param(k, marks=() if k == kind else pytest.mark.slow) for k in SMOOTH]
+
+
+@pytest.mark.parametrize(
+    "kind", [*SMOOTH, pytest.param("bobs that attract", marks=pytest.mark.slow)]
+)
 def test_a_taylor_series_in_c_is_the_flow(kind, tmp_path):
     map_, z, args = SMOOTH[kind]() if kind in SMOOTH else (*attracting(), None)
     library = compiled(gfnn.export(map_, "c", tmp_path / "own.c"))
@@ -139,7 +146,7 @@ def test_a_taylor_series_in_c_is_the_flow(kind, tmp_path):
 
 
 @needs_node
-@pytest.mark.parametrize("kind", SMOOTH)
+@pytest.mark.parametrize("kind", with_one("inputs that change"))
 def test_javascript_is_the_flow(kind, tmp_path):
     map_, z, args = SMOOTH[kind]()
     path = gfnn.export(map_, "js", tmp_path / "own.js")
@@ -304,7 +311,7 @@ def chain(relative=False):
 
 
 @pytest.mark.parametrize("to", ["mjcf", "urdf"])
-@pytest.mark.parametrize("relative", [False, True])
+@pytest.mark.parametrize("relative", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_mujoco_moves_a_chain_of_links_as_its_law_does(relative, to, tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="MuJoCo is an extra")
     map_, z = chain(relative)

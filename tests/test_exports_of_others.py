@@ -112,7 +112,7 @@ def test_names_with_commas_go_through_every_option():
     ("head", "columns", "options"),
     [
         (None, (T, SWING), ["--columns", "t,x"]),
-        ("x", (SWING,), ["--dt", "0.02"]),
+        pytest.param("x", (SWING,), ["--dt", "0.02"], marks=pytest.mark.slow),
         ("lap,x", (T, SWING), ["--time", "lap"]),
         pytest.param("t,#,x", (T, T, SWING), ["--columns", "t,x"], marks=pytest.mark.slow),
     ],
