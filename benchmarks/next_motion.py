@@ -9,7 +9,10 @@ multisine of random phases. Then one more motion is recorded, as `Fit.next_motio
 first, or at random: from rest within the angles that proposals may use, or by another multisine of
 the same largest force. The fit of both records has the terms that made them. It forecasts held-out
 motions at random, a second from true states, and its error is the median of their rms over the
-spread. Counted are the samples of the second motion that give the same error.
+spread. Counted are the samples of the second motion that give the same error: of the proposed one,
+of motions at random at the interval of the first record, and at the interval that is proposed,
+which tells what the interval saves and what the motion. One fit's error is that of one draw of
+noise; the last row of a twin has the geometric means over its draws.
 """
 
 from __future__ import annotations
@@ -28,8 +31,9 @@ import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
 from gfnn_jax.models.lagrangians.next_motion import OPTIONS
 
-SEED, DRAWS = 16_180, 2
-COUNTS = (32, 64, 128, 256)  # samples of the second motion
+SEED, DRAWS = 27_182, 4
+COUNTS = (16, 32, 64, 128, 256)  # samples of the second motion
+WAYS = ("proposed", "at random", "at random, as far apart")
 AT_RANDOM = 2  # motions for each draw of the first record
 HELD_OUT, AHEAD, NOISE = 24, 1.0, 1e-3  # motions, s, of the spread
 AXIS = np.array([100.0, 203.5, 20.39]) / 95.11  # force, viscous and dry friction by the mass
@@ -96,41 +100,55 @@ PLANTS = {
 }
 
 
-def at_random(plant: Plant, rng: np.random.Generator, count: int, reach: float) -> Any:
-    """A start at rest within a reach, and a multisine (n, k) of random phases."""
+class Made(NamedTuple):
+    """A motion: states (n, 2d), inputs (n, k), and the interval between them."""
+
+    states: np.ndarray
+    u: np.ndarray
+    dt: float
+
+    def first(self, count: int) -> Made:
+        return Made(self.states[:count], self.u[:count], self.dt)
+
+
+def at_random(plant: Plant, rng: np.random.Generator, count: int, reach: float, dt: float) -> Made:
+    """A motion from rest within a reach, under a multisine of random phases."""
     d = len(plant.names)
     if plant.reach:
-        return rng.uniform(-reach, reach, d), np.zeros((count, 0))
-    push = multisine(0.2, 2.5, 12, (1.0,))(rng, plant.dt * np.arange(count))
-    return np.zeros(d), AXIS[0] * push / np.max(np.abs(push))
+        start, u = rng.uniform(-reach, reach, d), np.zeros((count, 0))
+    else:
+        push = multisine(0.2, 2.5, 12, (1.0,))(rng, dt * np.arange(count))
+        start, u = np.zeros(d), AXIS[0] * push / np.max(np.abs(push))
+    return Made(plant.motion(start, u, dt), u, dt)
 
 
-def proposed(plant: Plant, fit: Any, count: int) -> Any:
-    """The start and the input of the motion that is proposed first."""
+def proposed(plant: Plant, fit: Any, count: int) -> Made:
+    """The motion that is proposed first."""
     best = fit.next_motions[0]
-    start = np.array([best.start[name] for name in plant.names])
-    if best.drive is None:
-        return start, np.zeros((count, 0 if plant.reach else 1))
-    _, first, second, period = best.drive
-    turned = (plant.dt * np.arange(count) / period + 0.25) % 1.0
-    return start, np.where(turned < 0.5, first, second)[:, None]
+    start, dt = np.array([best.start[name] for name in plant.names]), best.interval
+    u = np.zeros((count, 0 if plant.reach else 1))
+    if best.drive is not None:
+        _, first, second, period = best.drive
+        turned = (dt * np.arange(count) / period + 0.25) % 1.0
+        u = np.where(turned < 0.5, first, second)[:, None]
+    return Made(plant.motion(start, u, dt), u, dt)
 
 
-def recording(plant: Plant, made: list, rng: np.random.Generator) -> gfnn.Recording:
-    """What sensors show of motions (states, inputs)."""
+def recording(plant: Plant, made: list[Made], rng: np.random.Generator) -> gfnn.Recording:
+    """What sensors show of motions."""
     tables = []
-    for run, (states, u) in enumerate(made):
+    for run, (states, u, dt) in enumerate(made):
         q = states[:, : len(plant.names)]
-        q = q + NOISE * made[0][0][:, : q.shape[1]].std(axis=0) * rng.normal(size=q.shape)
+        q = q + NOISE * made[0].states[:, : q.shape[1]].std(axis=0) * rng.normal(size=q.shape)
         columns = dict(zip((*plant.names, "u"), (*q.T, *u.T), strict=False))
-        t = plant.dt * np.arange(len(q))
+        t = dt * np.arange(len(q))
         tables.append({"run": np.full(len(t), str(run)), "t": t, **columns})
     angles = plant.names if plant.reach else ()
     inputs = () if plant.reach else ("u",)
     return gfnn.Recording(tables, positions=plant.names, angles=angles, inputs=inputs)
 
 
-def fitted(plant: Plant, made: list, rng: np.random.Generator) -> Any:
+def fitted(plant: Plant, made: list[Made], rng: np.random.Generator) -> Any:
     """The fit of motions, None where it is refused."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
@@ -140,12 +158,12 @@ def fitted(plant: Plant, made: list, rng: np.random.Generator) -> Any:
             return None
 
 
-def error(plant: Plant, fit: Any, held_out: list) -> float:
-    """Median rms error of forecasts of motions (states, inputs) over the spread of all."""
+def error(plant: Plant, fit: Any, held_out: list[Made]) -> float:
+    """Median rms error of forecasts of motions over the spread of all."""
     if fit is None:
         return np.inf
     law, d = fit.map.law_in_use, len(plant.names)
-    states, u = (np.array(part) for part in zip(*held_out, strict=True))
+    states, u = (np.array(part) for part in [*zip(*held_out, strict=True)][:2])
     u = np.broadcast_to(u[:, :-1, None, None], (*u[:, :-1].shape[:2], 4, 6, u.shape[2]))
     h = np.full(u.shape[:2], plant.dt)
     found = law.form.follow(law.p, states[:, 0], h, u, order=0).states[..., :d]
@@ -167,40 +185,37 @@ def measured(name: str, quick: bool) -> Numbers:
     ahead = int(AHEAD / plant.dt)
     for draw in range(1 if quick else DRAWS):
         rng = np.random.default_rng([SEED, list(PLANTS).index(name), draw])
-        start, u = at_random(plant, rng, plant.first, plant.reach)
-        base = plant.motion(start, u, plant.dt), u
+        base = at_random(plant, rng, plant.first, plant.reach, plant.dt)
         fit = fitted(plant, [base], rng)
         if fit is None:
             continue
-        off = np.abs(base[0][:, : len(plant.names)] - np.median(base[0][:, : len(plant.names)]))
-        reach = min(max(OPTIONS.further) * float(off.max()), OPTIONS.highest)
+        q = base.states[:, : len(plant.names)]
+        far = float(np.max(np.abs(q - np.median(q))))
+        reach = min(max(OPTIONS.further) * far, OPTIONS.highest)
         held_out = []
         for _ in range(HELD_OUT):
-            start, u = at_random(plant, rng, 3 * ahead, reach)
-            states = plant.motion(start, u, plant.dt)
+            states, u, _ = at_random(plant, rng, 3 * ahead, reach, plant.dt)
             k = int(rng.integers(ahead))
-            held_out.append((states[k : k + ahead], u[k : k + ahead]))
+            held_out.append(Made(states[k : k + ahead], u[k : k + ahead], plant.dt))
 
-        def after(start: np.ndarray, u: np.ndarray, rng=rng, base=base, held_out=held_out):
-            whole = plant.motion(start, u, plant.dt)
-            fits = (fitted(plant, [base, (whole[:n], u[:n])], rng) for n in COUNTS)
-            return np.array([error(plant, one, held_out) for one in fits])
+        def after(whole: Made, rng=rng, base=base, held_out=held_out):
+            fits = (fitted(plant, [base, whole.first(n)], rng) for n in COUNTS)
+            return [error(plant, one, held_out) for one in fits]
 
-        chosen = after(*proposed(plant, fit, COUNTS[-1]))
-        others = [after(*at_random(plant, rng, COUNTS[-1], reach)) for _ in range(AT_RANDOM)]
-        usual = np.median(others, axis=0)
-        asked = max(chosen.min(), usual.min())
+        chosen = proposed(plant, fit, COUNTS[-1])
         c: Numbers = {
             "draw": draw,
             "before": error(plant, fit, held_out),
             "motion": str(fit.next_motions[0]),
-            "proposed": chosen.tolist(),
-            "at random": [row.tolist() for row in others],
-            "asked": float(asked),
-            "samples": [needed(chosen, asked), needed(usual, asked)],
+            "interval": [plant.dt, chosen.dt],
+            "proposed": after(chosen),
         }
+        for way, dt in zip(WAYS[1:], (plant.dt, chosen.dt), strict=True):
+            c[way] = [
+                after(at_random(plant, rng, COUNTS[-1], reach, dt)) for _ in range(AT_RANDOM)
+            ]
         cases.append(c)
-        print(f"  {draw}: {c['motion'][:150]}\n   ", chosen, usual, c["samples"], flush=True)
+        print(f"  {draw}: {c}", flush=True)
     return {"cases": cases}
 
 
@@ -209,30 +224,41 @@ PIECES: dict[str, Callable[[bool], Numbers]] = {
 }
 
 
+def judged(cases: list[Numbers]) -> tuple[float, float, list[float]]:
+    """Of cases the error before, that which all ways reach, and the samples that each needs."""
+    errors = [
+        np.exp(np.mean([np.log(np.median(np.atleast_2d(c[way]), axis=0)) for c in cases], axis=0))
+        for way in WAYS
+    ]
+    asked = max(float(one.min()) for one in errors)
+    before = float(np.exp(np.mean([np.log(c["before"]) for c in cases])))
+    return before, asked, [needed(one, asked) for one in errors]
+
+
 def tables() -> None:
     """The table of RESULTS.md."""
     found = results_of(PIECES, "next_motion")
     rows = []
     for name, piece in zip(PLANTS, PIECES, strict=True):
-        for c in found[piece]["measured"]["cases"] if piece in found else []:
-            chosen, usual = c["samples"]
-            rows.append(
-                [
-                    name,
-                    number(c["before"]),
-                    number(c["asked"]),
-                    number(chosen),
-                    number(usual),
-                    number(chosen / usual),
-                ]
-            )
+        cases = found[piece]["measured"]["cases"] if piece in found else []
+        for draw, some in [*((str(c["draw"]), [c]) for c in cases), ("all", cases)]:
+            if some:
+                before, asked, (chosen, usual, sparse) = judged(some)
+                apart = "; ".join(f"{c['interval'][1] / c['interval'][0]:g}" for c in some)
+                ratios = number(chosen / usual), number(chosen / sparse)
+                counts = map(number, (before, asked, chosen, usual, sparse))
+                rows.append([name, draw, apart, *counts, *ratios])
     heads = (
         "twin",
+        "draw",
+        "interval, times that of the first record",
         "error before",
         "error reached",
         "samples, as proposed",
         "samples, at random",
-        "ratio",
+        "at random, as far apart",
+        "ratio to random",
+        "ratio to random, as far apart",
     )
     between_markers(TABLES, "next-motion", f"{markdown(heads, rows)}\n\n{provenance(found)}")
 

@@ -171,3 +171,21 @@ def test_a_coordinate_that_nothing_shows_is_refused(gyroscope):
     recording = gfnn.Recording(gyroscope, observe={"gyro": "theta + 0*x"}, coordinates="theta,phi")
     with pytest.raises(InputError, match="phi"):
         gfnn.fit(recording)
+
+
+def test_runs_of_different_intervals_are_one_data_set():
+    """The stiffness of ẍ = −x, by a short run of many readings and a long one of few: its standard
+    error is that of all readings of the long run, by least squares."""
+    rng, runs, information = np.random.default_rng(0), [], 0.0
+    for run, (count, dt, used) in enumerate(((200, 0.05, 3), (120, 0.6, 1))):
+        t = dt * np.arange(count)
+        x = np.cos(t) + NOISE * rng.normal(size=count)
+        runs.append({"run": np.full(count, run), "t": t, "x": x})
+        t = t[::used]
+        free, moved = np.stack([np.cos(t), np.sin(t)], axis=1), -0.5 * t * np.sin(t)
+        left = moved - free @ np.linalg.lstsq(free, moved)[0]
+        information += left @ left / NOISE**2
+    fit = gfnn.fit(gfnn.Recording(runs, positions=["x"]), terms=["v**2", "x**2"])
+    (spring,) = [term for term in fit.lagrangian.terms if term.term == "x**2"]
+    assert spring.std == pytest.approx(0.5 / np.sqrt(information), rel=0.2)
+    assert spring.coefficient == pytest.approx(-0.5, abs=4 * spring.std)

@@ -44,6 +44,8 @@ class Options:
     creeping: float = 0.05  # of a coordinate's standard deviation: what creeps varies by less
     kept: float = 0.25  # periods of a rest that stay, in which the body comes to a stop or starts
     even: float = 0.95  # of the readings, that even stretches have to hold
+    alike: float = 1.5  # ratio of steps, from which on runs have an interval of their own
+    enough: int = 100  # samples of an interval, that tell noise
     gap: float = 0.25  # periods without a reading, over which a state is not predictable yet
     apart: float = 0.7  # of the time between nodes, after which a channel is looked at again
     empty: float = 100.0  # median steps: no spline leads over a longer one
@@ -68,6 +70,11 @@ class Stretch:
     noise: np.ndarray
     args: np.ndarray
     even: bool = True
+
+    @property
+    def step(self) -> float:
+        """The usual time between samples."""
+        return float(np.median(np.diff(self.t)))
 
     def part(self, a: int, b: int) -> Stretch:
         """Samples a to b."""
@@ -151,15 +158,16 @@ class Nodes:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scales:
     """Scales of the samples, from the samples: noise σ (k,) of the channels, rms speeds (d,), the
-    fastest frequency ω (1/s), the usual step dt, the window of the local cubics (samples to either
-    side) or, where sampling is uneven, the splines, the largest rms step of a channel ÷ its
-    standard deviation, and the time that the longest stretch lasts."""
+    fastest frequency ω (1/s), the usual steps of stretches, the shortest one first, the windows of
+    the local cubics (samples to either side) of each or, where sampling is uneven, the splines, the
+    largest rms step of a channel ÷ its standard deviation, and the time that the longest stretch
+    lasts."""
 
     sigma: np.ndarray
     speed: np.ndarray
     omega: float
-    dt: float
-    half: int | Splines
+    steps: tuple[float, ...]
+    half: tuple[int, ...] | Splines
     stride: float
     longest: float
 
@@ -168,10 +176,20 @@ class Scales:
         return 2 * np.pi / self.omega
 
     @property
-    def every(self) -> int:
-        """Samples from one node to the next, where sampling is even: as many nodes as a period has
-        also in a stretch that is shorter."""
-        return max(1, round(min(self.period, self.longest) / self.dt / PER_PERIOD))
+    def dt(self) -> float:
+        """The shortest of the usual steps."""
+        return self.steps[0]
+
+    def every(self, step: float) -> int:
+        """Samples so far apart from one node to the next, where sampling is even: as many nodes as
+        a period has also in a stretch that is shorter."""
+        return max(1, round(min(self.period, self.longest) / step / PER_PERIOD))
+
+    def of(self, s: Stretch) -> tuple[float, int]:
+        """The usual step of an even stretch, and its window."""
+        assert not isinstance(self.half, Splines)
+        kind = int(np.argmin(np.abs(np.log(np.array(self.steps) / s.step))))
+        return self.steps[kind], self.half[kind]
 
     @property
     def uneven(self) -> bool:
@@ -184,16 +202,19 @@ class Scales:
 
     def cubics(self, s: Stretch, at: np.ndarray) -> np.ndarray:
         """States (m, 2d) at samples of an even stretch, by local cubics."""
-        assert not isinstance(self.half, Splines)
-        q, v, _ = smooth(s.t, s.q, self.half, at)[0]
+        q, v, _ = smooth(s.t, s.q, self.of(s)[1], at)[0]
         return np.concatenate([q, v], axis=1)
 
     @property
     def spacing(self) -> float:
-        """Time between nodes."""
+        """Time between nodes, the least where runs differ."""
         if self.uneven:
             return max(self.dt, self.period / PER_PERIOD)
-        return self.dt * self.every
+        return min(self._spacings)
+
+    @property
+    def _spacings(self) -> list[float]:
+        return [step * self.every(step) for step in self.steps]
 
     @property
     def per_period(self) -> float:
@@ -208,7 +229,8 @@ class Scales:
     @property
     def substeps(self) -> int:
         """Runge–Kutta steps between two nodes that a search begins with."""
-        return max(1, int(np.ceil(2 * np.pi / self.per_period / OPTIONS.step)))
+        longest = self.spacing if self.uneven else max(self._spacings)
+        return max(1, int(np.ceil(2 * np.pi / (self.period / longest) / OPTIONS.step)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -305,28 +327,30 @@ def measure(found: Sequence[Stretch]) -> Scales:
     """Noise, speeds and the fastest frequency, from local cubics at some two thousand samples, or
     from splines."""
     every = max(1, sum(len(s.t) for s in found) // 2_000)
-    dt = float(np.median(np.concatenate([np.diff(s.t) for s in found])))
     if all(s.even for s in found):
-        half, sigma = choose_half([(s.t, s.q) for s in found])
-        smooths = [smooth(s.t, s.q, half, np.arange(0, len(s.t), every))[0] for s in found]
+        steps, half, sigma = _windows([(s.t, s.q) for s in found])
+        scales = Scales(sigma, sigma, 0.0, steps, half, 0.0, 0.0)
+        smooths = [
+            smooth(s.t, s.q, scales.of(s)[1], np.arange(0, len(s.t), every))[0] for s in found
+        ]
     else:
         half = splines([(s.t, s.q) for s in found])
         sigma = half.sigma
         smooths = [half.smooth(s.t, s.q, _inside(s.t)[::every]) for s in found]
         apart = np.concatenate([np.diff(s.t) for s in found])
-        dt = float(np.mean(apart[apart <= 10 * np.median(apart)]))  # of steps that are no gap
+        steps = (float(np.mean(apart[apart <= 10 * np.median(apart)])),)  # of those that are no gap
     speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
     if not np.all(speed > 0):
         still = ", ".join(str(i + 1) for i in np.flatnonzero(~(speed > 0)))
         raise InputError(f"position {still} does not move: leave it out of --positions")
     if not all(np.array_equal(s.y, s.q, equal_nan=True) for s in found):
         sigma = _noise_of_channels(found)
-    steps = [
+    moves = [
         np.concatenate([np.diff(s.y[have, k]) for s in found for have in [~np.isnan(s.y[:, k])]])
         for k in range(found[0].y.shape[1])
     ]
-    resolution = np.array([np.median(np.abs(one)) for one in steps])
-    size = np.array([np.sqrt(np.mean(one**2)) for one in steps])
+    resolution = np.array([np.median(np.abs(one)) for one in moves])
+    size = np.array([np.sqrt(np.mean(one**2)) for one in moves])
     sigma = np.maximum(sigma, 1e-9 * np.maximum(resolution, size))  # clean data have none
     systems: dict[tuple[float, ...], list[Smooth]] = {}
     for stretch, own in zip(found, smooths, strict=True):
@@ -339,9 +363,25 @@ def measure(found: Sequence[Stretch]) -> Scales:
         )
         omega = max(omega, float(np.max(a / np.maximum(v, OPTIONS.slow * speed))))
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
-    stride = np.divide(size, spread, out=np.full(len(size), omega * dt), where=spread > 0)
+    stride = np.divide(size, spread, out=np.full(len(size), omega * steps[0]), where=spread > 0)
     longest = max(float(np.ptp(s.t)) for s in found)
-    return Scales(sigma, speed, omega, dt, half, float(np.max(stride)), longest)
+    return Scales(sigma, speed, omega, steps, half, float(np.max(stride)), longest)
+
+
+def _windows(
+    known: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> tuple[tuple[float, ...], tuple[int, ...], np.ndarray]:
+    """The usual steps of even stretches (t (n,), y (n, d)), the shortest one first, the windows of
+    local cubics for each, and σ (d,), by those of which there are enough."""
+    known = sorted(known, key=lambda one: np.median(np.diff(one[0])))
+    each = np.array([np.median(np.diff(t)) for t, _ in known])
+    edges = [0, *(np.flatnonzero(each[1:] > OPTIONS.alike * each[:-1]) + 1).tolist(), len(known)]
+    kinds = [known[a:b] for a, b in pairwise(edges)]
+    steps = tuple(float(np.median(np.concatenate([np.diff(t) for t, _ in one]))) for one in kinds)
+    windows, noise = zip(*(choose_half(one) for one in kinds), strict=True)
+    counts = np.array([sum(len(t) for t, _ in one) for one in kinds])
+    enough = counts >= min(OPTIONS.enough, counts.max())
+    return steps, windows, np.min(np.array(noise)[enough], axis=0)
 
 
 def _inside(t: np.ndarray) -> np.ndarray:
@@ -363,7 +403,7 @@ def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
             known = [pair for pair in known if len(pair[0]) >= OPTIONS.shortest]
             if not known:
                 raise FitError(f"a column has no {OPTIONS.shortest} samples in a row: leave it out")
-            sigma.append(float(choose_half(known)[1][0]))
+            sigma.append(float(_windows(known)[2][0]))
         else:
             sigma.append(float(splines(known).sigma[0]))
     return np.array(sigma)
@@ -374,7 +414,7 @@ def nodes_of(found: Sequence[Stretch], scales: Scales) -> list[Nodes]:
     if isinstance(scales.half, Splines):
         parts = [part for s in found for part in _between_gaps(s, scales, scales.half)]
     else:
-        parts = [(s, np.arange(0, len(s.t), scales.every), None) for s in found]
+        parts = [(s, np.arange(0, len(s.t), scales.every(scales.of(s)[0])), None) for s in found]
     total = sum(len(at) for _, at, _ in parts)
     length = round(OPTIONS.block * scales.per_period)
     keep = -(-total * scales.substeps // MOST_STEPS)  # every so many blocks
@@ -467,14 +507,14 @@ def without_rests(found: Sequence[Stretch], scales: Scales) -> Moving:
     motion would be left, or where sampling is uneven, none."""
     if scales.uneven:
         return Moving(list(found), 0.0, 0.0)
-    window = max(9, round(scales.period / scales.dt))
     kept, resting, short = [], 0.0, 0.0
     for stretch in found:
+        window = max(9, round(scales.period / scales.of(stretch)[0]))
         at_rest = _still(stretch, scales.sigma, window) | _creeps(stretch, scales.sigma, window)
         at_rest = _shrunk(at_rest, round(OPTIONS.kept * window))
         resting += sum(float(stretch.t[b - 1] - stretch.t[a]) for a, b in _runs(at_rest))
         for a, b in _runs(~at_rest):
-            if b - a >= window:
+            if b - a >= min(window, len(at_rest)):
                 kept.append(stretch.part(a, b))
             else:
                 short += float(stretch.t[b - 1] - stretch.t[a])

@@ -37,10 +37,10 @@ class ArcInputs:
     def within_samples(self, fewest: int) -> int:
         """The least number of steps between two nodes, from ``fewest`` on, of which none goes on
         beyond a sample where inputs jump, as those do that are held."""
-        every = int(np.median(np.concatenate([np.diff(n.at) for n in self._nodes])))
+        apart = {int(np.median(np.diff(n.at))) for n in self._nodes}
         jump = self.hold == "hold" and self._nodes[0].stretch.u.shape[1] > 0
         count = fewest
-        while jump and every % count and count % every:
+        while jump and any(every % count and count % every for every in apart):
             count += 1
         return count
 

@@ -359,7 +359,7 @@ def named_motions(motions: Sequence[Motion], recording: Recording) -> tuple[Next
             name = recording.inputs[motion.drive.place]
             ends = np.array(motion.drive[1:3]) / recording.factors.get(name, 1.0)
             drive = name, *ends.tolist(), motion.drive.period
-        named.append(NextMotion(start, gains, units, motion.apart, drive))
+        named.append(NextMotion(start, motion.interval, gains, units, motion.apart, drive))
     return tuple(named)
 
 

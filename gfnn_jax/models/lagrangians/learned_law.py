@@ -40,12 +40,14 @@ def _of(value: float, unit: str) -> str:
 
 
 class NextMotion(NamedTuple):
-    """A motion to record: where to let go, at rest, and by how much that makes the standard errors
-    of terms smaller, the most improved first. units: of the coordinates, "" where not known. apart:
-    standard deviations of its readings together between the law and its nearest rival. drive: an
-    input that is switched meanwhile, its two values, the first one first, and the period, s."""
+    """A motion to record: where to let go, at rest, the interval of its readings, s, and by how
+    much that makes the standard errors of terms smaller, the most improved first. units: of the
+    coordinates, "" where not known. apart: standard deviations of its readings together between the
+    law and its nearest rival. drive: an input that is switched meanwhile, its two values, the first
+    one first, and the period, s."""
 
     start: dict[str, float]
+    interval: float
     gains: dict[str, float]
     units: dict[str, str]
     apart: float = 0.0
@@ -55,6 +57,7 @@ class NextMotion(NamedTuple):
     def start_text(self) -> str:
         """The start, and the input that drives it, as text."""
         at = ", ".join(f"{name} = {_of(q, self.units[name])}" for name, q in self.start.items())
+        at += f", read every {self.interval:.3g} s"
         if self.drive is None:
             return at
         name, first, second, period = self.drive

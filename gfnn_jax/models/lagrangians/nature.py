@@ -240,7 +240,7 @@ def _states(
         if isinstance(scales.half, Splines):
             q, v, a = scales.half.smooth(s.t, s.q, s.t[at])
         else:
-            q, v, a = smooth(s.t, s.q, scales.half, at)[0]
+            q, v, a = smooth(s.t, s.q, scales.of(s)[1], at)[0]
         known = np.isfinite(q).all(axis=1)
         parts.append((q[known], v[known], a[known], s.u[at][known]))
     q, v, a, u = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -258,9 +258,11 @@ def _reliability(a: np.ndarray, scales: Scales) -> float:
     """The share of the squares of accelerations (n, d) by local cubics that is no noise."""
     if isinstance(scales.half, Splines) or len(scales.sigma) != a.shape[1]:
         return 1.0
-    x = np.linspace(-1.0, 1.0, 2 * scales.half + 1)[:, None] ** np.arange(4)
-    span = scales.half * scales.dt
-    noise = 4 * scales.sigma**2 * np.linalg.inv(x.T @ x)[2, 2] / span**4
+    noise = np.zeros(a.shape[1])
+    for step, half in zip(scales.steps, scales.half, strict=True):
+        x = np.linspace(-1.0, 1.0, 2 * half + 1)[:, None] ** np.arange(4)
+        own = 4 * scales.sigma**2 * np.linalg.inv(x.T @ x)[2, 2] / (half * step) ** 4
+        noise = np.maximum(noise, own)
     return float(np.min(1 - np.minimum(noise / np.var(a, axis=0), 1.0)))
 
 

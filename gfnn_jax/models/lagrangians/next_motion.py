@@ -3,13 +3,14 @@
 A motion from rest, let go or driven by an input, is followed by the law. With J its sensitivities,
 its own first state eliminated, a record of it turns the information RᵀR of the coefficients into
 RᵀR + JᵀJ (Fedorov, Theory of Optimal Experiments, 1972). The best is the one after which forecasts
-of all motions that are compared err least.
+of all motions that are compared err least. All have as many readings, at some intervals: of a slow
+or faint force a longer motion tells more.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -25,13 +26,15 @@ class MotionOptions:
     """Options of the motions that are compared (`tests/test_next_motion.py`).
 
     further: of the largest deflections of the record. highest: radians, that an angle is let go.
-    most: motions. largest: derivative of a residual, whose square is finite. turns: periods of a
-    square wave of an input, between its ends in the record, in a motion. known: information, to the
-    largest, that is taken for what a record which tells nothing has.
+    intervals: between readings, of the time between nodes. most: motions. largest: derivative of a
+    residual, whose square is finite. turns: periods of a square wave of an input, between its ends
+    in the record, in a motion. known: information, to the largest, that is taken for what a record
+    which tells nothing has.
     """
 
     further: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 4.0)
     highest: float = 3.0
+    intervals: tuple[int, ...] = (1, 2, 4)
     most: int = 3
     largest: float = 1e100
     turns: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
@@ -58,30 +61,48 @@ class Drive(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """A start from rest (d,), by how much it makes the standard errors of coefficients (by their
-    keys) smaller, the most improved first, by how many standard deviations of its readings
-    together the nearest of rivals is apart, and what drives it."""
+    """A start from rest (d,), the interval of its readings in seconds, by how much it makes the
+    standard errors of coefficients (by their keys) smaller, the most improved first, by how many
+    standard deviations of its readings together the nearest of rivals is apart, and what drives
+    it."""
 
     start: np.ndarray
+    interval: float
     gains: dict[Key, float]
     apart: float = 0.0
     drive: Drive | None = None
 
 
 def next_motions(fit: LawFit, steered: Sequence[int] = ()) -> list[Motion]:
-    """The best motions to record next, the best first; each as long as an arc of the fit. steered:
-    places of inputs that can be chosen; motions that they drive stay as near as other starts."""
-    structure, d, problem = fit.structure, fit.form.dim, fit.problem
+    """The best motions to record next, the best first; each of as many readings as an arc of the
+    fit. steered: places of inputs that can be chosen; motions that they drive stay as near as other
+    starts."""
+    structure, problem = fit.structure, fit.problem
     own = [k for k, key in enumerate(structure.keys()) if key[0] != "sensor"]
     here = problem.linearised(structure, fit).among(own)
     if not here.columns.any():
         return []  # the law moves no residual, nor would it elsewhere
+    found = [told for times in OPTIONS.intervals for told in _told(fit, own, list(steered), times)]
+    if not found:
+        return []
+    motions, each = zip(*found, strict=True)
+    left, gains = _after(here.columns, np.stack(each))
+    named = [structure.keys()[k] for k in own]
+    gained = [{named[j]: float(row[j]) for j in np.argsort(-row)} for row in gains]
+    return [motions[k]._replace(gains=gained[k]) for k in np.argsort(left)[: OPTIONS.most]]
+
+
+def _told(
+    fit: LawFit, own: list[int], steered: Sequence[int], times: int
+) -> Iterator[tuple[Motion, np.ndarray]]:
+    """Motions whose readings are so many times as far apart as nodes are, and their derivatives (m,
+    n) in coefficients, by their places."""
+    structure, d, problem = fit.structure, fit.form.dim, fit.problem
     middle, reach = _middle(fit)
-    reach = max(OPTIONS.further) * reach
     begun = [(start, None) for start in _starts(fit)]
-    begun += [(middle, drive) for drive in _drives(fit, steered)]
-    found = []
-    lanes, inputs, h = _lanes(fit, begun)
+    begun += [(middle, drive) for drive in _drives(fit, steered, times)]
+    reach = max(OPTIONS.further) * reach
+    lanes, inputs, h = _lanes(fit, begun, times)
     for (start, drive), lane, u in zip(begun, lanes, inputs, strict=True):
         if not np.isfinite(lane).all() or (drive and np.any(abs(lane[:, :d] - middle) > reach)):
             continue
@@ -90,16 +111,8 @@ def next_motions(fit: LawFit, steered: Sequence[int] = ()) -> list[Motion]:
         arcs = Arcs(t, y, lane[None], np.ones(y.shape), home)
         acted = dataclasses.replace(problem, inputs=lambda arcs, own=u[None]: own)
         there = acted.linearised(structure, fit, arcs).among(own)
-        if not np.abs(there.columns).max() < OPTIONS.largest:
-            continue  # along which a small change grows without bound
-        found.append((Motion(start, {}, drive=drive), there.columns))
-    if not found:
-        return []
-    motions, each = zip(*found, strict=True)
-    left, gains = _after(here.columns, np.stack(each))
-    named = [structure.keys()[k] for k in own]
-    gained = [{named[j]: float(row[j]) for j in np.argsort(-row)} for row in gains]
-    return [motions[k]._replace(gains=gained[k]) for k in np.argsort(left)[: OPTIONS.most]]
+        if np.abs(there.columns).max() < OPTIONS.largest:  # else a small change grows without bound
+            yield Motion(start, h, {}, drive=drive), there.columns
 
 
 def _after(here: np.ndarray, each: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -121,15 +134,13 @@ def parting(fit: LawFit, others: Sequence[LawFit]) -> list[Motion]:
     """The motion along which the nearest of other laws is farthest from that of a fit; none where
     all leave for far away."""
     starts = _starts(fit)
-    own, *theirs = (
-        one.problem.observation(_lanes(one, [(q, None) for q in starts])[0]).values / fit.sigma
-        for one in (fit, *others)
-    )
+    each = [(one, *_lanes(one, [(q, None) for q in starts])) for one in (fit, *others)]
+    own, *theirs = (one.problem.observation(lanes).values / fit.sigma for one, lanes, *_ in each)
     apart = np.min([np.sqrt(np.sum((y - own) ** 2, axis=(1, 2))) for y in theirs], axis=0)
     if not np.isfinite(apart).any():
         return []
     best = int(np.nanargmax(apart))
-    return [Motion(starts[best], {}, float(apart[best]))]
+    return [Motion(starts[best], each[0][-1], {}, float(apart[best]))]
 
 
 def _starts(fit: LawFit) -> list[np.ndarray]:
@@ -157,25 +168,28 @@ def _middle(fit: LawFit) -> tuple[np.ndarray, np.ndarray]:
     return middle, np.max(np.abs(fit.problem.gauge - middle), axis=0)
 
 
-def _drives(fit: LawFit, steered: Sequence[int]) -> list[Drive]:
-    """Square waves of each input that can be chosen, between the ends of what it was."""
+def _drives(fit: LawFit, steered: Sequence[int], times: int) -> list[Drive]:
+    """Square waves of each input that can be chosen, between the ends of what it was, in motions so
+    many times as long as an arc."""
     u = np.concatenate([n.stretch.u for n in fit.problem.nodes])
     high, low = np.nanmax(u, axis=0), np.nanmin(u, axis=0)
-    long = float(np.max(fit.arcs.t[:, -1] - fit.arcs.t[:, 0]))
+    long = times * float(np.max(fit.arcs.t[:, -1] - fit.arcs.t[:, 0]))
     return [
         Drive(i, float(high[i]), float(low[i]), long / n) for i in steered for n in OPTIONS.turns
     ]
 
 
 def _lanes(
-    fit: LawFit, begun: Sequence[tuple[np.ndarray, Drive | None]]
+    fit: LawFit, begun: Sequence[tuple[np.ndarray, Drive | None]], times: int = 1
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """States (S, n, 2d) of the motions from starts at rest, driven or free, NaN of those that leave
-    for far away, their inputs (S, n − 1, substeps, 6, k), and the time between states."""
+    for far away, their inputs (S, n − 1, substeps, 6, k), and the time between states, so many
+    times that between nodes."""
     d, length, problem = fit.form.dim, fit.arcs.t.shape[1], fit.problem
     steps = np.diff(fit.arcs.t, axis=1)
-    h = np.full((len(begun), length - 1), np.median(steps[steps > 0]))
-    u = np.zeros((*h.shape, *problem.inputs(fit.arcs).shape[2:]))
+    h = np.full((len(begun), length - 1), times * np.median(steps[steps > 0]))
+    substeps, *of_step = problem.inputs(fit.arcs).shape[2:]
+    u = np.zeros((*h.shape, times * substeps, *of_step))
     for k, (_, drive) in enumerate(begun):
         if drive:
             u[k, ..., drive.place] = drive.at(h[0, 0] * np.arange(length - 1))[:, None, None]
