@@ -211,9 +211,7 @@ def measured(name: str, quick: bool) -> Numbers:
             "proposed": after(chosen),
         }
         for way, dt in zip(WAYS[1:], (plant.dt, chosen.dt), strict=True):
-            c[way] = [
-                after(at_random(plant, rng, COUNTS[-1], reach, dt)) for _ in range(AT_RANDOM)
-            ]
+            c[way] = [after(at_random(plant, rng, COUNTS[-1], reach, dt)) for _ in range(AT_RANDOM)]
         cases.append(c)
         print(f"  {draw}: {c}", flush=True)
     return {"cases": cases}
