@@ -86,7 +86,7 @@ def check_forces(
     speeds = motion.v[known][:, given]
 
     def takes(x: np.ndarray, left: np.ndarray, turned: np.ndarray) -> bool:
-        """Whether each joint's friction, of either sign, brings it energy, by a force that stands
+        """True where each joint's friction, of either sign, brings it energy, by a force that stands
         clear of what is left, (k,) shares of the forces times ``turned``."""
         lost = slope * (x / size)[columns.count - len(columns.kinds) * k :]
         lost = lost.reshape(len(slope), -1, k).sum(axis=1)[:, given]
