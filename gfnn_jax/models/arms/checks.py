@@ -72,22 +72,14 @@ def check_forces(
     noise = np.nanstd(np.diff(motion.force[:, given], 2, axis=0), axis=0) / np.sqrt(6)
     explained = np.maximum(OPTIONS.explained, 1 - alone**2 - OPTIONS.apart)
     poor = (1 - left**2 < explained) & (left > 3 * noise / scale[given])
-    sized = ""
-    if not 1 / OPTIONS.units < factor < OPTIONS.units:
-        sized = f"the forces are {factor:.2g} times those that the inertias of the URDF need"
-        unit = _unit(factor)
-        sized += (
-            f": another unit or sign. {_gains(gains / unit)}"
-            if unit
-            else ": currents, or other units? gfnn.Arm(…, gains=[…]), the force for a unit of each "
-            "input"
-        )
+    far = not 1 / OPTIONS.units < factor < OPTIONS.units
+    sized = f"{factor:.2g} times those that the inertias of the URDF need"
     _, slope, _ = columns.friction.tables(motion.v[known])
     speeds = motion.v[known][:, given]
 
     def takes(x: np.ndarray, left: np.ndarray, turned: np.ndarray) -> bool:
-        """True where each joint's friction, of either sign, brings it energy, by a force that stands
-        clear of what is left, (k,) shares of the forces times ``turned``."""
+        """True where each joint's friction, of either sign, brings it energy, by a force clear of
+        what is left, (k,) shares of the forces times ``turned``."""
         lost = slope * (x / size)[columns.count - len(columns.kinds) * k :]
         lost = lost.reshape(len(slope), -1, k).sum(axis=1)[:, given]
         clear = np.sqrt(np.mean(lost**2, axis=0)) > left * (scale * abs(turned))[given]
@@ -99,11 +91,19 @@ def check_forces(
             "the forces take energy from the motion of every joint. Their sign is wrong: "
             f"{_gains(-gains)}"
         )
-    if not poor.any():
-        if sized:
-            raise FitError(sized)
+    if far and np.max(together) < OPTIONS.mended:
+        unit = _unit(factor)
+        raise FitError(
+            f"the forces are {sized}: another unit or sign. {_gains(gains / unit)}"
+            if unit
+            else f"the forces are {sized}: currents, or other units? gfnn.Arm(…, gains=[…]), the "
+            "force for a unit of each input"
+        )
+    if not (far or poor.any()):
         return
+    poor |= not poor.any()
     said = f"the forces of {', '.join(names[given][poor])} do not go with the motion"
+    said += f", and are {sized}" if far else ""
     trials: list[tuple[list[int], int | None]] = [(order, j) for j in given if len(given) > 1]
     for i, j in combinations(given, 2):
         turned = [*order]
