@@ -12,7 +12,6 @@ open, of which several are tried along short arcs.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
 from itertools import combinations_with_replacement
@@ -31,7 +30,7 @@ from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice
 from gfnn_jax.models.lagrangians.input_rules import InputModel
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
-from gfnn_jax.models.lagrangians.search import SearchResult, TermSearch, to_longest_arcs
+from gfnn_jax.models.lagrangians.search import SearchResult, TermSearch, to_longer_arcs
 from gfnn_jax.models.lagrangians.starts import OPTIONS as STARTS
 from gfnn_jax.models.lagrangians.starts import misfit
 from gfnn_jax.models.lagrangians.structure import Key, Row, Structure
@@ -45,7 +44,9 @@ class HiddenOptions:
     periods: lengths of arcs, in periods of the slowest oscillation. degrees: of the powers of
     modes. couplings: squares of c in ½v² + c v w + ½w², of two pendulums, and sizes: of the hidden
     swings, times those that are seen, that are tried. sets: of oscillations that are started from,
-    and finished: starts that are followed on. damped: of the critical friction, at the start.
+    and finished: starts that are followed on. nearly: residual of short arcs, of the variation, up
+    to which one more coordinate may explain the rest. damped: of the critical friction, at the
+    start.
     """
 
     periods: tuple[float, ...] = (0.75, 1.5, 3.0, 6.0, 12.0)
@@ -54,11 +55,13 @@ class HiddenOptions:
     sizes: tuple[float, ...] = (0.5, 1.0, 2.0)
     sets: int = 3
     finished: int = 3
+    nearly: float = 0.05
     damped: float = 0.003
 
 
 OPTIONS = HiddenOptions()
 NOT_HIDDEN = "No law with one or two hidden coordinates follows to the noise"
+_BEYOND = " beyond short arcs"
 
 
 def may_hide(recording: Recording) -> bool:
@@ -72,13 +75,17 @@ def with_number(
 ) -> LearnedLaw | None:
     """The likeliest of the laws that ``find(hidden=)`` has for one and for two hidden coordinates
     of a recording, beside the ``plain`` one of none, with a message on their number. One more is
-    tried where the residuals are not white. None where no law with a hidden coordinate leaves noise
-    alone."""
+    tried where the residuals are more than noise and not white, or where short arcs alone are
+    followed. None where no law with a hidden coordinate leaves noise alone."""
     laws = {} if plain is None else {0: plain}
     for count in range(1, 2 if recording.angles else 3):
-        with contextlib.suppress(FitError, np.linalg.LinAlgError):
+        try:
             laws[count] = find(hidden=count)
-            if all(one.white for one in laws[count].whiteness.values()):
+        except (FitError, np.linalg.LinAlgError) as error:
+            if not getattr(error, "verdict", "").endswith(_BEYOND):
+                break
+        else:
+            if _leaves_noise(laws[count]):
                 break
     if not {*laws} - {0}:
         return None
@@ -94,6 +101,14 @@ def with_number(
         + f" (with {', '.join(others)})" * bool(others)
     )
     return dataclasses.replace(law, messages=(*law.messages, line))
+
+
+def _leaves_noise(law: LearnedLaw) -> bool:
+    """Return whether the residuals of a law are white, or hardly larger than the noise."""
+    return all(
+        one.white or law.residual[name] < STARTS.white * law.noise[name]
+        for name, one in law.whiteness.items()
+    )
 
 
 def _criterion(law: LearnedLaw, name: str) -> float:
@@ -136,12 +151,14 @@ def with_hidden(recording: Recording, count: int) -> Recording:
     )
 
 
-def no_hidden_law(count: int, law: Any = None) -> FitError:
-    """Error where no law with so many hidden coordinates follows, but ``law`` in part."""
+def no_hidden_law(count: int, law: Any = None, missed: str = "") -> FitError:
+    """Error where no law with so many hidden coordinates follows, but ``law`` in part, or short
+    arcs are followed, as the verdict ``missed`` says."""
+    beyond = _BEYOND if law is not None or missed.endswith(_BEYOND) else ""
     return FitError(
         f"no law with {count} of its coordinates hidden follows the column: ask for fewer, "
         f"--hidden {count - 1}, or record another column",
-        f"no law: none with {count} hidden coordinates follows the recording",
+        f"no law: none with {count} hidden coordinates follows the recording{beyond}",
         law,
     )
 
@@ -166,17 +183,21 @@ def search_hidden(problem: ArcProblem) -> SearchResult:
     Raises FitError where no start follows the arcs to some times their noise.
     """
     longest = max(problem.nodes, key=lambda n: len(n.t))
+    short: list[LawFit] = []
     found: list[LawFit] = []
-    sets = oscillations(longest.t, longest.y[:, 0], problem.dim)
-    for one in sets[: OPTIONS.sets]:
-        found += _followed(_from(problem, one))
-        if found and min(map(misfit, found)) < STARTS.noise:
-            break
+    sets = oscillations(longest.t, longest.y[:, 0], problem.dim)[: OPTIONS.sets]
+    for start in (fit for one in sets for fit in _along_short_arcs(_from(problem, one))):
+        short.append(start)
+        fit = _along_longer_arcs(start)
+        problem.on_progress(f"from oscillations: {fit}")
+        if misfit(fit) < STARTS.followed:
+            found.append(fit)
+            if misfit(fit) < STARTS.noise:
+                break
     if not found:
-        raise no_hidden_law(problem.dim - 1)
+        near = any(np.all(fit.rms() < OPTIONS.nearly * fit.spread) for fit in short)
+        raise no_hidden_law(problem.dim - 1, missed=_BEYOND * near)
     fit = min(found, key=misfit)
-    if misfit(fit) > STARTS.followed:
-        raise no_hidden_law(problem.dim - 1)
     fit = TermSearch(fit.structure, None).prune(fit)
     return SearchResult(InputModel(fit), FrictionChoice(fit.structure.friction, {}, {}, False))
 
@@ -197,22 +218,23 @@ def _sensor_of(problem: ArcProblem) -> Hidden:
     return sensor
 
 
-def _followed(problem: ArcProblem) -> list[LawFit]:
-    """The best starts along longer and longer arcs, those that are laws."""
-    found: list[LawFit] = []
+def _along_short_arcs(problem: ArcProblem) -> Iterator[LawFit]:
+    """The best starts along short arcs; again where a fit follows them, or has not converged."""
     fits = _of_pendulums(problem) if problem.angles else _of_modes(problem)
     for fit in sorted(fits, key=misfit)[: OPTIONS.finished]:
-        fit = fit.again()
+        again = misfit(fit) < STARTS.followed or not fit.fitted.converged
+        yield fit.again() if again else fit
+
+
+def _along_longer_arcs(fit: LawFit) -> LawFit:
+    """A start along longer and longer arcs, as far as it follows them."""
+    for periods in fit.problem.options.periods[1:]:
         if misfit(fit) > STARTS.followed:  # along longer arcs it would leave more
-            problem.on_progress(f"short arcs are not followed: {fit}")
-            continue
-        fit = to_longest_arcs(fit, problem.options.periods[1:])
-        problem.on_progress(f"from oscillations: {fit}")
-        if fit.follows and fit.is_definite:
-            found.append(fit)
-            if misfit(fit) < STARTS.noise:
-                break
-    return found
+            break
+        if (longer := to_longer_arcs(fit, fit.problem.length(periods))) is None:
+            break
+        fit = longer
+    return fit
 
 
 class _Shape(NamedTuple):

@@ -298,9 +298,11 @@ def fit_recording(
     lost = _loses_a_channel(law)
     if _is_no_law(law) or (hidden and lost):
         missed = missed or no_law(data.problem.scales)
-    if missed is None and (law.flaws or lost) and not hidden and not law.nature:
+    if missed is None and (law.flaws or lost) and not hidden and (lost or not law.nature):
         what = _nature(data)
-        if what.mostly if lost else what.partly:
+        if law.nature:  # a sensor, beside which the law may leave much too
+            law = dataclasses.replace(law, nature=f"{law.nature}; {what.reason}")
+        elif what.mostly if lost else what.partly:
             law = dataclasses.replace(law, nature=what.reason)
         else:
             missed = no_law(data.problem.scales)
@@ -385,7 +387,7 @@ def _with_nature(error: FitError, data: RecordingData) -> FitError:
     """The error where no law was found, with what the record is."""
     sensor = data.problem.observation.hidden
     if sensor is not None:  # whose states tell nothing of the record then
-        return no_hidden_law(len(sensor.names) - 1, error.fit)
+        return no_hidden_law(len(sensor.names) - 1, error.fit, error.verdict)
     if not error.verdict:
         return error
     what = _nature(data)
