@@ -12,6 +12,7 @@ open, of which several are tried along short arcs.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
 from itertools import combinations_with_replacement
@@ -44,9 +45,7 @@ class HiddenOptions:
     periods: lengths of arcs, in periods of the slowest oscillation. degrees: of the powers of
     modes. couplings: squares of c in ½v² + c v w + ½w², of two pendulums, and sizes: of the hidden
     swings, times those that are seen, that are tried. sets: of oscillations that are started from,
-    and finished: starts that are followed on. nearly: residual of short arcs, of the variation, up
-    to which one more coordinate may explain the rest. damped: of the critical friction, at the
-    start.
+    and finished: starts that are followed on. damped: of the critical friction, at the start.
     """
 
     periods: tuple[float, ...] = (0.75, 1.5, 3.0, 6.0, 12.0)
@@ -55,13 +54,11 @@ class HiddenOptions:
     sizes: tuple[float, ...] = (0.5, 1.0, 2.0)
     sets: int = 3
     finished: int = 3
-    nearly: float = 0.05
     damped: float = 0.003
 
 
 OPTIONS = HiddenOptions()
 NOT_HIDDEN = "No law with one or two hidden coordinates follows to the noise"
-_BEYOND = " beyond short arcs"
 
 
 def may_hide(recording: Recording) -> bool:
@@ -75,16 +72,12 @@ def with_number(
 ) -> LearnedLaw | None:
     """The likeliest of the laws that ``find(hidden=)`` has for one and for two hidden coordinates
     of a recording, beside the ``plain`` one of none, with a message on their number. One more is
-    tried where the residuals are more than noise and not white, or where short arcs alone are
-    followed. None where no law with a hidden coordinate leaves noise alone."""
+    tried where the residuals are more than noise and not white. None where no law with a hidden
+    coordinate leaves noise alone."""
     laws = {} if plain is None else {0: plain}
     for count in range(1, 2 if recording.angles else 3):
-        try:
+        with contextlib.suppress(FitError, np.linalg.LinAlgError):
             laws[count] = find(hidden=count)
-        except (FitError, np.linalg.LinAlgError) as error:
-            if not getattr(error, "verdict", "").endswith(_BEYOND):
-                break
-        else:
             if _leaves_noise(laws[count]):
                 break
     if not {*laws} - {0}:
@@ -151,14 +144,12 @@ def with_hidden(recording: Recording, count: int) -> Recording:
     )
 
 
-def no_hidden_law(count: int, law: Any = None, missed: str = "") -> FitError:
-    """Error where no law with so many hidden coordinates follows, but ``law`` in part, or short
-    arcs are followed, as the verdict ``missed`` says."""
-    beyond = _BEYOND if law is not None or missed.endswith(_BEYOND) else ""
+def no_hidden_law(count: int, law: Any = None) -> FitError:
+    """Error where no law with so many hidden coordinates follows, but ``law`` in part."""
     return FitError(
         f"no law with {count} of its coordinates hidden follows the column: ask for fewer, "
         f"--hidden {count - 1}, or record another column",
-        f"no law: none with {count} hidden coordinates follows the recording{beyond}",
+        f"no law: none with {count} hidden coordinates follows the recording",
         law,
     )
 
@@ -183,11 +174,9 @@ def search_hidden(problem: ArcProblem) -> SearchResult:
     Raises FitError where no start follows the arcs to some times their noise.
     """
     longest = max(problem.nodes, key=lambda n: len(n.t))
-    short: list[LawFit] = []
     found: list[LawFit] = []
     sets = oscillations(longest.t, longest.y[:, 0], problem.dim)[: OPTIONS.sets]
     for start in (fit for one in sets for fit in _along_short_arcs(_from(problem, one))):
-        short.append(start)
         fit = _along_longer_arcs(start)
         problem.on_progress(f"from oscillations: {fit}")
         if misfit(fit) < STARTS.followed:
@@ -195,8 +184,7 @@ def search_hidden(problem: ArcProblem) -> SearchResult:
             if misfit(fit) < STARTS.noise:
                 break
     if not found:
-        near = any(np.all(fit.rms() < OPTIONS.nearly * fit.spread) for fit in short)
-        raise no_hidden_law(problem.dim - 1, missed=_BEYOND * near)
+        raise no_hidden_law(problem.dim - 1)
     fit = min(found, key=misfit)
     fit = TermSearch(fit.structure, None).prune(fit)
     return SearchResult(InputModel(fit), FrictionChoice(fit.structure.friction, {}, {}, False))
@@ -255,7 +243,8 @@ def _started(problem: ArcProblem, shapes: np.ndarray) -> ArcProblem:
 
 
 def _of_modes(problem: ArcProblem) -> list[LawFit]:
-    """Short arcs fitted by modes of small swings, and then with powers that couple them."""
+    """Short arcs fitted by modes of small swings, and then with powers that couple them: of three
+    modes, which have many, where the modes alone follow."""
     sensor, d = _sensor_of(problem), problem.dim
     none, omega = (0,) * d, sensor.omega
     masses = [(libraries.unit(d, i, i), none, none, 0.0) for i in range(d)]
@@ -274,6 +263,8 @@ def _of_modes(problem: ArcProblem) -> list[LawFit]:
     problem = _started(problem, np.eye(d))
     arcs, sigma = problem.arcs(problem.options.periods[0]), problem.scales.sigma
     plain = problem.fit(linear, known, arcs, sigma)
+    if d > 2 and misfit(plain) > STARTS.followed:
+        return []
     whole = dataclasses.replace(linear, terms=(*linear.terms, *powers), friction=friction)
     values = {**plain.values, **{("term", row): 0.5 for row in masses}}
     rich = plain.again(whole, values)

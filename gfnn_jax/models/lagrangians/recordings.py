@@ -387,7 +387,7 @@ def _with_nature(error: FitError, data: RecordingData) -> FitError:
     """The error where no law was found, with what the record is."""
     sensor = data.problem.observation.hidden
     if sensor is not None:  # whose states tell nothing of the record then
-        return no_hidden_law(len(sensor.names) - 1, error.fit, error.verdict)
+        return no_hidden_law(len(sensor.names) - 1, error.fit)
     if not error.verdict:
         return error
     what = _nature(data)
