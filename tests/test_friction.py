@@ -7,6 +7,7 @@ import scipy.integrate
 from analytic import mechanics
 
 import gfnn_jax as gfnn
+from gfnn_jax.families.friction import DRY, LINEAR, ONE_SIDED, POWER, QUADRATIC, Friction
 
 
 def pairs_of(field, z, dt):
@@ -14,6 +15,17 @@ def pairs_of(field, z, dt):
     options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-15}
     images = [scipy.integrate.solve_ivp(field, (0, dt), y, **options).y[:, -1] for y in z]
     return gfnn.Pairs(z, np.stack(images), dt)
+
+
+@pytest.mark.parametrize("direction", [(1, -1), (-1, 1), (1, 1), (-2, -1), (-1, 0)])
+def test_texts_of_friction_are_what_it_loses(direction):
+    kinds = (LINEAR, QUADRATIC, DRY, POWER, ONE_SIDED)
+    friction = Friction.of([(direction, kind, 4.0 if kind == POWER else 0.0) for kind in kinds], 2)
+    v = np.array([0.7, 0.4])
+    said = [
+        part * eval(text, {"v1": v[0], "v2": v[1]}) for text, part in friction.texts(("v1", "v2"))
+    ]
+    np.testing.assert_allclose(said, friction.tables(v)[0], rtol=1e-12)
 
 
 def states(count=200, seed=0, dim=2):

@@ -171,8 +171,9 @@ class Friction:
         """
         listed = []
         for direction, kind, width in self.rows():
-            speed = combination(direction[::-1], [*speeds][::-1])
-            size = f"abs({speed.removeprefix('-')})"
+            parts, named = np.array(direction[::-1]), [*speeds][::-1]
+            speed = combination(parts, named)
+            size = f"abs({combination(-parts if speed.startswith('-') else parts, named)})"
             if kind == ISOTROPIC:
                 squares = (f"{v}**2" for v, c in zip(speeds, direction, strict=True) if c)
                 size = f"sqrt({added(squares)})"
