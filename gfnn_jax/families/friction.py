@@ -171,9 +171,11 @@ class Friction:
         """
         listed = []
         for direction, kind, width in self.rows():
-            parts, named = np.array(direction[::-1]), [*speeds][::-1]
-            speed = combination(parts, named)
-            size = f"abs({combination(-parts if speed.startswith('-') else parts, named)})"
+            named = [*speeds][::-1]
+            speed = even = combination(direction[::-1], named)
+            if even.startswith("-"):  # all kinds but one-sided are the same of −v
+                even = combination([-c for c in direction[::-1]], named)
+            speed, size = speed if kind == ONE_SIDED else even, f"abs({even})"
             if kind == ISOTROPIC:
                 squares = (f"{v}**2" for v, c in zip(speeds, direction, strict=True) if c)
                 size = f"sqrt({added(squares)})"
