@@ -309,6 +309,18 @@ def stribeck_friction(rng: np.random.Generator) -> System:
     )
 
 
+def load_friction(rng: np.random.Generator) -> System:
+    """Dry friction in proportion to the force that drives, as of a wedge."""
+    friction = {"v1**2": rng.uniform(0.01, 0.03), "abs(u1)*abs(v1)": rng.uniform(0.15, 0.4)}
+    return System(
+        {"v1**2": 0.5, "x1**2": -0.5},
+        ((rng.uniform(0.8, 1.2),), (0.0,)),
+        friction=friction,
+        push=("u1",),
+        dwell=20,
+    )
+
+
 def spherical_pendulum(rng: np.random.Generator) -> System:
     weight = rng.uniform(0.8, 1.2)
     return System(
@@ -374,6 +386,7 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
         *(motor_cart, motor_arm, magnet_on_a_spring, parametric_drive),
         *(spherical_pendulum, body_in_a_bowl, orbit_that_turns, stribeck_friction),
         *(elastic_on_video, orbit_off_the_origin),
+        load_friction,
     )
 }
 

@@ -5,7 +5,7 @@ import numpy as np
 import scipy.integrate
 import scipy.optimize
 
-from gfnn_jax.families.friction import DRY, LINEAR, Friction
+from gfnn_jax.families.friction import DRY, LINEAR, LOADED, Friction
 from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.flows.dormand_prince import NODES
 from gfnn_jax.flows.motion import Form
@@ -121,6 +121,25 @@ def test_an_input_moves_a_body_once_it_is_strong_enough():
     q = [0.0, 0.0, 0.2, 0.8, 1.35, 1.35 + 0.09 / 1.4, 1.35 + 0.09 / 1.4, 1.25 + 0.09 / 1.4]
     np.testing.assert_allclose(found, np.stack([q, v], axis=1), atol=1e-9)
     assert modes[:, 0].tolist() == [0, 0, 1, 1, 1, 0, 0, -1]
+
+
+def test_a_load_decides_what_friction_holds():
+    """A push of 0.5 against 0.4 N, N = 2 − t: the body lets go at t = 0.75, in the middle of a
+    step; and dry friction beside holds it until 0.6 + 0.4 N is as small as a push of 1.1."""
+    one = Terms.of([((2,), (0,), (0,), 0.0)], 1)
+    h, count = 0.1, 15
+    ends = h * np.arange(1, count + 1)
+    load = 2 - h * (np.arange(count)[:, None] + np.asarray(NODES))
+    for push, rho, rows in ((0.5, [0.4], []), (1.1, [0.4, 0.6], [((1,), DRY, 0.0)])):
+        form = Form(
+            one, np.zeros(1), np.eye(1), Friction.of([((1,), LOADED + 1, 0.0), *rows], 1), 2
+        )
+        inputs = np.stack([np.full_like(load, push), load], axis=-1)[None, :, None]
+        p = np.array([0.5, *rho, 1.0, 0.0])
+        found = form.follow(p, np.zeros((1, 2)), np.full((1, count), h), inputs)
+        since = np.maximum(ends - 0.75, 0.0)
+        np.testing.assert_allclose(found.states[0, :, 1], 0.2 * since**2, atol=1e-13)
+        np.testing.assert_allclose(found.states[0, :, 0], 0.2 * since**3 / 3, atol=1e-13)
 
 
 def test_more_directions_than_coordinates():

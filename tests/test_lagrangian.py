@@ -11,6 +11,7 @@ from gfnn_jax.families.friction import (
     DRY,
     ISOTROPIC,
     LINEAR,
+    LOADED,
     ONE_SIDED,
     POWER,
     QUADRATIC,
@@ -40,8 +41,8 @@ SHAPES = {
 THETA = np.array([1.0, 0.7, 0.3, 0.1, 0.2, 2.0, -0.6, 0.3, 0.8])
 FRICTION = [((1, 0), LINEAR, 1.0), ((-1, 1), QUADRATIC, 1.0), ((0, 1), DRY, 0.1)]
 FRICTION += [((1, 0), POWER, 1.5), ((0, -1), ONE_SIDED, 0.0), ((1, 1), ISOTROPIC, 2.0)]
-FRICTION += [((1, -1), STRIBECK, 0.4)]
-RHO = np.array([0.1, 0.2, 0.05, 0.3, 0.4, 0.15, 0.25])
+FRICTION += [((1, -1), STRIBECK, 0.4), ((1, 0), LOADED + 2, 0.2)]
+RHO = np.array([0.1, 0.2, 0.05, 0.3, 0.4, 0.15, 0.25, 0.35])
 GAINS = np.array([[1.0, 0.0, 0.5], [0.0, -2.0, 0.3]])
 
 
@@ -60,7 +61,7 @@ def plain(q, v):
     return total
 
 
-def rayleigh(v):
+def rayleigh(v, u):
     s = v[1] - v[0]
     of_all = (
         v[0] ** 2 / 2,
@@ -70,6 +71,7 @@ def rayleigh(v):
         jnp.maximum(-v[1], 0) ** 2 / 2,
         (v @ v) ** 1.5 / 3,
         0.4 * (1 - jnp.exp(-jnp.abs(s) / 0.4)) - jnp.abs(s),
+        jnp.abs(u[2]) * jnp.sqrt(v[0] ** 2 + 0.04),
     )
     return sum(rho * term for rho, term in zip(RHO, of_all, strict=True))
 
@@ -113,7 +115,7 @@ def test_acceleration_solves_the_equation_of_motion():
 
     for k in range(5):
         rate = jax.jacfwd(momentum_along)(0.0, q[k], v[k], a[k])
-        force = jax.grad(plain)(q[k], v[k]) - jax.grad(rayleigh)(v[k]) + GAINS @ u[k]
+        force = jax.grad(plain)(q[k], v[k]) - jax.grad(rayleigh)(v[k], u[k]) + GAINS @ u[k]
         force = force - 0.03 * jax.grad(plain, 1)(q[k], v[k])
         np.testing.assert_allclose(rate, force, rtol=1e-11, atol=1e-11)
     terms = law().terms.residuals(q, v, a)
@@ -136,8 +138,9 @@ def test_friction_is_the_gradient_of_its_potential(xp):
     """And its stiffness the Hessian, at rest too, where |v|³ has one."""
     _, v = states()
     model = law()
-    found = model.losses_by_v(xp.asarray(v))
-    np.testing.assert_allclose(found, jax.vmap(jax.hessian(rayleigh))(v), rtol=1e-11, atol=1e-12)
+    u = np.random.default_rng(1).normal(size=(5, 3))
+    found, expected = model.losses_by_v(xp.asarray(v), u), jax.vmap(jax.hessian(rayleigh))(v, u)
+    np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
     drag = Friction.of([((1, 1), ISOTROPIC, a) for a in (1.0, 2.0, 3.0)], 2)
     rest, one = xp.zeros((1, 2)), xp.ones(3)
     np.testing.assert_array_equal(drag.forces(rest, one), 0.0)

@@ -401,6 +401,76 @@ def test_friction_of_rare_kinds(kind):
     assert given == tuple(law_of(fit.map).form.friction.rows())
 
 
+def with_a_load(seed, rest):
+    """A recording of a body on a spring that is driven, sticks, and is pressed on its support by a
+    normal force N; and its friction: ½ρ v², beside dry friction of ``rest``, by the load."""
+    rng, t = np.random.default_rng([92, seed]), np.linspace(0, 30, 500)
+    size, omega, load, viscous = (
+        rng.uniform(*ends) for ends in ((0.8, 1.5), (0.3, 0.6), (0.1, 0.3), (0.02, 0.06))
+    )
+
+    def pushed(t):
+        return size * (np.sin(omega * t) + 0.5 * np.sin(2.7 * omega * t + 1))
+
+    def pressed(t):
+        return 1 + 0.7 * np.sin(0.5 * omega * t + 1)
+
+    def rates(t, z):
+        dry = (rest + load * pressed(t)) * np.tanh(z[1] / 1e-4)
+        return [z[1], -z[0] + pushed(t) - viscous * z[1] - dry]
+
+    x = solve_ivp(rates, (0, 30), [1, 0], t_eval=t, rtol=1e-8, atol=1e-10, method="LSODA").y[0]
+    x = x + 1e-3 * x.std() * rng.normal(size=len(t))
+    columns = {"t": t, "x": x, "F": pushed(t), "N": pressed(t)}
+    truth = {"v**2": viscous / 2, "abs(v)": rest, "abs(N)*abs(v)": load}
+    recording = gfnn.Recording(columns, positions=["x"], inputs=["F", "N"])
+    return recording, {term: c for term, c in truth.items() if c}
+
+
+def test_friction_by_a_load_that_is_given(tmp_path):
+    """It is fitted, printed, read again, saved and forecast; formats that need its series refuse
+    it, and C has it."""
+    recording, truth = with_a_load(0, 0.0)
+    given = ["x_dot**2", "x**2", *(f"R: {term.replace('v', 'x_dot')}" for term in truth)]
+    fit = gfnn.fit(recording, model=gfnn.Lagrangian(terms=given))
+    for term, (name, expected) in zip(fit.friction.terms, truth.items(), strict=True):
+        assert term.term == name.replace("v", "x_dot")
+        assert abs(term.coefficient - expected) < 4 * term.std
+    again = given_terms([f"R: {fit.friction.formula}"], ["x"], ["x_dot"], (), ["F", "N"]).friction
+    assert again == tuple(law_of(fit.map).form.friction.rows())
+    fit.save(tmp_path / "model")
+    times = 30 + 0.1 * np.arange(1, 20)
+    ahead = {"t": times, "F": np.ones(19), "N": np.full(19, 30.0)}
+    inputs = gfnn.Recording(ahead, inputs=["F", "N"])
+    forecasts = [
+        one.map.forecast(recording, times, inputs=inputs).values["x"]
+        for one in (fit, gfnn.load(tmp_path / "model"))
+    ]
+    np.testing.assert_array_equal(*forecasts)
+    assert np.ptp(forecasts[0][..., -8:]) < 1e-9  # so heavy a load holds it
+    with pytest.raises(InputError, match="--to c"):
+        gfnn.export(fit.map, "js", tmp_path / "own.js")
+    assert "fabs" in gfnn.export(fit.map, "c", tmp_path / "own.c").read_text()
+
+
+def test_a_load_that_no_column_shows_is_asked_for():
+    t = 0.1 * np.arange(200)
+    recording = gfnn.Recording({"t": t, "x": np.cos(t)}, positions=["x"])
+    with pytest.raises(InputError, match="--inputs"):
+        gfnn.fit(recording, model=gfnn.Lagrangian(friction="load-dependent"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rest", [0.0, 0.1])
+def test_friction_by_a_load_is_found(rest):
+    recording, truth = with_a_load(1, rest)
+    fit = gfnn.fit(recording)
+    assert fit.verdict == "identified"
+    found = {term.term.replace("x_dot", "v"): term for term in fit.friction.terms}
+    assert set(found) == set(truth)
+    assert all(abs(found[k].coefficient - c) < 4 * found[k].std for k, c in truth.items())
+
+
 @pytest.mark.slow
 def test_stribecks_friction_is_found_with_the_speed_over_which_it_fades():
     """A body on a spring that is driven by a force which is recorded, and sticks."""

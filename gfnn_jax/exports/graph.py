@@ -24,7 +24,6 @@ from gfnn_jax.exports.symbols import Symbol, Tape
 from gfnn_jax.families.expressions import coordinate_names
 from gfnn_jax.families.family import at_time
 from gfnn_jax.families.friction import (
-    DRY,
     ISOTROPIC,
     ONE_SIDED,
     POWER,
@@ -197,7 +196,12 @@ def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
     whose sign is given; dry friction of no width beyond ``creep`` is sharp."""
     law = law_of(family, p)
     own, dim = law.friction, law.dim
-    sharp = (own.kinds == DRY) & (own.widths <= creep)
+    if np.any(own.loaded):
+        raise InputError(
+            "this law has friction by the size of an input, which has a kink where that is 0: use "
+            "--to c or --to stablehlo"
+        )
+    sharp = own.dry & (own.widths <= creep)
     kinked = np.isin(own.kinds, (QUADRATIC, ONE_SIDED, STRIBECK))
     kinked |= (own.kinds == POWER) & (own.widths % 2 != 1)  # odd powers are smooth
     signed = np.flatnonzero(sharp | kinked)

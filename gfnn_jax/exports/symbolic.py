@@ -237,17 +237,18 @@ def _collect(side: dict[Any, list[Term]], expression: Any, term: Term, sign: flo
 
 def _slope(loss: Any, v: Any) -> Any:
     """Derivative of a term of R by a speed: s |s| of |s|³, the sign of s of |s|, and |s| + s of
-    (|s| + s)²."""
+    (|s| + s)²; times what does not depend on the speed, as a load."""
     import sympy
 
+    load, loss = loss.as_independent(v, as_Add=False)
     base, power = loss.as_base_exp()
     if base.is_Add and base.has(sympy.Abs):
-        return 4 * base * sympy.diff(base.replace(sympy.Abs, lambda s: 0), v)
+        return 4 * load * base * sympy.diff(base.replace(sympy.Abs, lambda s: 0), v)
     if not isinstance(base, sympy.Abs):
-        return sympy.diff(loss, v)
+        return load * sympy.diff(loss, v)
     s = base.args[0]
     slope = sympy.sign(s) if power == 1 else s * base ** (power - 2)
-    return power * slope * sympy.diff(s, v)
+    return load * power * slope * sympy.diff(s, v)
 
 
 def _by_known_mass(equation: Equation) -> Equation:

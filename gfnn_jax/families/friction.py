@@ -6,7 +6,9 @@ quadratic, r = ⅓|s|³; dry, r = √(s² + ε²) − ε; a power a of the speed
 one-sided, r = ½ max(s, 0)², which beside linear friction makes it depend on the direction.
 Stribeck's is what dry friction loses at speeds above w, r = −|s| + w (1 − e^(−|s|/w)) (Tustin
 1947). The drag of a body in a plane or in space is isotropic: r = |v|^(a + 1)/(a + 1), |v| over the
-coordinates of c. Everything is batch first, in closed form, and runs in NumPy or JAX.
+coordinates of c. Friction that depends on a load is dry friction times the size of an input, the
+normal force that is recorded, r = |u_j| |s| (Coulomb 1785). Everything is batch first, in closed
+form, and runs in NumPy or JAX.
 """
 
 from __future__ import annotations
@@ -20,8 +22,9 @@ import numpy as np
 from gfnn_jax.arrays import as_row, matmul, namespace, pytree
 from gfnn_jax.families.text import added, barred, combination, shown
 
-# Kinds of friction. UNIFORM stands in a fit's `flows.motion.Form` alone.
-LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED, ISOTROPIC, STRIBECK = range(8)
+# Kinds of friction. UNIFORM stands in a fit's `flows.motion.Form` alone. LOADED + j is the kind of
+# which input j is the load.
+LINEAR, QUADRATIC, DRY, UNIFORM, POWER, ONE_SIDED, ISOTROPIC, STRIBECK, LOADED = range(9)
 _FACTORS = {1 / 2: "½ ", 1 / 3: "⅓ ", 1 / 4: "¼ ", 1 / 8: "⅛ ", 1.0: ""}
 
 
@@ -66,6 +69,15 @@ def _isotropic(xp: Any, s: Any, size: Any, width: Any) -> tuple[Any, Any, Any]:
     return raised * size * size / (width + 1), raised * size, width * raised
 
 
+_OF_DRY = Kind(
+    "dry",
+    lambda speed, size, width: (
+        (f"sqrt({_squared(speed)} + {width**2:.4g})" if width else size),
+        1.0,
+    ),
+    _dry,
+    lambda s, sign, width: s / (s * s + width**2).sqrt() if _is_none(sign) else sign,
+)
 TABLE = (
     Kind(
         "linear",
@@ -79,15 +91,7 @@ TABLE = (
         lambda xp, s, size, width: (size**3 / 3, s * size, 2 * size),
         lambda s, sign, width: sign * s * s,
     ),
-    Kind(
-        "dry",
-        lambda speed, size, width: (
-            (f"sqrt({_squared(speed)} + {width**2:.4g})" if width else size),
-            1.0,
-        ),
-        _dry,
-        lambda s, sign, width: s / (s * s + width**2).sqrt() if _is_none(sign) else sign,
-    ),
+    _OF_DRY,
     Kind(
         "uniform",
         lambda speed, size, width: ("T", 1.0),
@@ -125,7 +129,13 @@ TABLE = (
         lambda s, sign, width: sign * ((sign * s * (-1 / width)).exp() - 1),
         rare=True,
     ),
+    _OF_DRY._replace(name="load-dependent", rare=True),
 )
+
+
+def kind_of(kind: int) -> Kind:
+    """The entry of `TABLE` of a kind of friction."""
+    return TABLE[min(kind, LOADED)]
 
 
 def _is_none(sign: Any) -> bool:
@@ -135,9 +145,11 @@ def _is_none(sign: Any) -> bool:
 
 @pytree()
 class Friction:
-    """Terms r_k of Rayleigh's R: directions c (F, d), whole numbers; kinds (F,), places in `TABLE`;
-    widths (F,): ε of dry friction and w of Stribeck's, in units of v, and the exponent a of POWER
-    and ISOTROPIC."""
+    """Terms r_k of Rayleigh's R: directions c (F, d), whole numbers; kinds (F,), places in `TABLE`,
+    from LOADED on by the input that is the load; widths (F,): ε of dry friction and w of
+    Stribeck's, in units of v, and the exponent a of POWER and ISOTROPIC.
+
+    Methods take inputs u (..., k), or None: a load is 0 where none are given."""
 
     directions: Any
     kinds: Any
@@ -163,11 +175,14 @@ class Friction:
             for k in range(self.count)
         ]
 
-    def texts(self, speeds: Sequence[str]) -> tuple[tuple[str, float], ...]:
-        """Each term as code in the names of the velocities, and the number before it: ("v1**2", ½),
-        ("abs(v2 - v1)**3", ⅓), ("abs(v2)", 1), ("(abs(v1) + v1)**2", ⅛) of one-sided friction,
-        ("sqrt(v1**2 + v2**2)**3", ⅓) of isotropic drag; uniform friction, a row without a
-        direction, is γ T.
+    def texts(
+        self, speeds: Sequence[str], inputs: Sequence[str] = ()
+    ) -> tuple[tuple[str, float], ...]:
+        """Each term as code in the names of the velocities and of the inputs, by default u1, …, and
+        the number before it: ("v1**2", ½), ("abs(v2 - v1)**3", ⅓), ("abs(v2)", 1), ("(abs(v1) +
+        v1)**2", ⅛) of one-sided friction, ("sqrt(v1**2 + v2**2)**3", ⅓) of isotropic drag,
+        ("abs(u1)*abs(v1)", 1) of friction by a load; uniform friction, a row without a direction,
+        is γ T.
         """
         listed = []
         for direction, kind, width in self.rows():
@@ -179,22 +194,46 @@ class Friction:
             if kind == ISOTROPIC:
                 squares = (f"{v}**2" for v, c in zip(speeds, direction, strict=True) if c)
                 size = f"sqrt({added(squares)})"
-            listed.append(TABLE[kind].text(speed, size, width))
+            text, number = kind_of(kind).text(speed, size, width)
+            if kind >= LOADED:
+                text = f"abs({inputs[kind - LOADED] if inputs else f'u{kind - LOADED + 1}'})*{text}"
+            listed.append((text, number))
         return tuple(listed)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Each term as it stands in a formula: "½ v1²", "⅓ |v2 - v1|³", "|v2|"."""
         speeds = [f"v{i + 1}" for i in range(self.directions.shape[1])]
-        sharp = dataclasses.replace(self, widths=np.where(self.kinds == DRY, 0.0, self.widths))
+        sharp = dataclasses.replace(self, widths=np.where(self.dry, 0.0, self.widths))
         return tuple(
             _FACTORS.get(part, f"{part:.4g} ") + barred(shown(t)) for t, part in sharp.texts(speeds)
         )
 
     @property
+    def dry(self) -> Any:
+        """The dry friction (F,), by a load or not."""
+        return (self.kinds == DRY) | self.loaded
+
+    @property
+    def loaded(self) -> Any:
+        """The friction (F,) by a load."""
+        return self.kinds >= LOADED
+
+    @property
     def jumps(self) -> np.ndarray:
         """The dry friction (F,) that has no width: its force jumps where its speed turns."""
-        return (self.kinds == DRY) & (self.widths == 0)
+        return self.dry & (self.widths == 0)
+
+    def loads(self, u: Any) -> Any:
+        """What each term is multiplied by at inputs u (..., k): |u_j| (..., F) of friction by a
+        load, 1 of others; 1.0 where none has a load."""
+        xp, loaded = namespace(self.kinds, u), self.loaded
+        if np.size(u) == 0 or (namespace(loaded) is np and not np.any(loaded)):
+            return 1.0
+        if u is None:
+            return xp.where(loaded, 0.0, 1.0)
+        place = xp.clip(self.kinds - LOADED, 0, u.shape[-1] - 1)
+        return xp.where(loaded, xp.abs(u[..., place]), 1.0)
 
     def take(self, keep: Any) -> Friction:
         return Friction(self.directions[keep], self.kinds[keep], self.widths[keep])
@@ -214,8 +253,8 @@ class Friction:
         xp = namespace(v)
         s = self.speeds(v)
         size = xp.abs(s)
-        kinds, widths = as_row(self.kinds, s), as_row(self.widths, s)
-        some = range(len(TABLE)) if xp is not np else np.unique(self.kinds).tolist()
+        kinds, widths = as_row(xp.minimum(self.kinds, LOADED), s), as_row(self.widths, s)
+        some = range(len(TABLE)) if xp is not np else np.unique(kinds).tolist()
         found = (0 * s,) * 3
         for kind in some:
             of_kind = TABLE[kind].tables(xp, s, size, xp.where(kinds == kind, widths, 1.0))
@@ -223,23 +262,26 @@ class Friction:
         value, slope, curvature = found
         return value, slope, curvature
 
-    def residuals(self, v: Any) -> Any:
+    def residuals(self, v: Any, u: Any = None) -> Any:
         """∂r_k/∂v at v (..., d): (..., F, d)."""
         plain, _, across, _ = self._parts(v)
+        plain = plain * self.loads(u)
         c = as_row(self.directions.astype(v.dtype), plain[..., None])
         pulls = plain[..., None] * c
         return pulls if across is None else pulls + across[..., None] * c * v[..., None, :]
 
-    def forces(self, v: Any, losses: Any) -> Any:
+    def forces(self, v: Any, losses: Any, u: Any = None) -> Any:
         """∂R/∂v at v (..., d), of coefficients ρ (F,) or (..., F): (..., d)."""
         plain, _, across, _ = self._parts(v)
+        plain = plain * self.loads(u)
         c, losses = self.directions.astype(v.dtype), as_row(losses, plain)
         along = matmul(losses * plain, c)
         return along if across is None else along + v * matmul(losses * across, c)
 
-    def stiffness(self, v: Any, losses: Any) -> Any:
+    def stiffness(self, v: Any, losses: Any, u: Any = None) -> Any:
         """∂²R/∂v∂v at v (..., d), of coefficients ρ (F,) or (..., F): (..., d, d)."""
         xp, (_, curvature, across, bent) = namespace(v), self._parts(v)
+        curvature = curvature * self.loads(u)
         c, losses, d = self.directions.astype(v.dtype), as_row(losses, curvature), v.shape[-1]
         outer = (c[:, :, None] * c[:, None, :]).reshape(-1, d**2)
         along = matmul(losses * curvature, outer).reshape(*v.shape, d)
@@ -250,9 +292,9 @@ class Friction:
         turned = matmul(losses * bent, outer).reshape(along.shape)
         return along + turned * v[..., :, None] * v[..., None, :]
 
-    def power(self, v: Any) -> Any:
+    def power(self, v: Any, u: Any = None) -> Any:
         """v·∂r_k/∂v at v (..., d): (..., F)."""
-        return self.tables(v)[1] * self.speeds(v)
+        return self.tables(v)[1] * self.speeds(v) * self.loads(u)
 
     def _parts(self, v: Any) -> tuple[Any, Any, Any, Any]:
         """dr/ds and d²r/ds² (..., F) of speeds c·v; and of isotropic rows (dr/ds) ÷ |v|, by which

@@ -108,7 +108,7 @@ class Forced(WithForces):
     def term_gradients(self, w, args=None):
         """The field of every term of H and R (..., 2d, m), those of R as if v were p: to start
         from. NumPy."""
-        frictions = np.swapaxes(self.friction.residuals(split(w)[1]), -1, -2)
+        frictions = np.swapaxes(self.friction.residuals(split(w)[1], self._inputs(args)), -1, -2)
         frictions = np.concatenate([frictions, np.zeros_like(frictions)], axis=-2)
         return np.concatenate(
             [self.family.term_gradients(w, self._inner(args)), frictions], axis=-1
@@ -149,7 +149,8 @@ class Forced(WithForces):
         own, losses, gains = self.parts(params)
         gradient, hessian = self.family.gradient_and_hessian(own, w, self._inner(args))
         field = self._field(gradient, losses, gains, args)
-        return field, self._beside(hessian, self.friction.stiffness(split(gradient)[1], losses))
+        by_v = self.friction.stiffness(split(gradient)[1], losses, self._inputs(args))
+        return field, self._beside(hessian, by_v)
 
     def parameter_gradients(self, params, w, args=None, along=None):
         """∂/∂params of the field (..., 2d, m); of a family ``along`` of other terms of H those of
@@ -158,11 +159,11 @@ class Forced(WithForces):
         inner, dim = self._inner(args), self.dim
         v = split(self.family.gradient(own, w, inner))[1]
         columns = parameter_gradients(self.family, own, w, inner, along)
-        columns = self._beside(columns, self.friction.stiffness(v, losses))
+        u = self._inputs(args)
+        columns = self._beside(columns, self.friction.stiffness(v, losses, u))
         if along is not None:
             return columns
-        frictions = np.swapaxes(self.friction.residuals(v), -1, -2)
-        u = self._inputs(args)
+        frictions = np.swapaxes(self.friction.residuals(v, u), -1, -2)
         pushes = -(np.eye(dim)[:, :, None] * u[..., None, None, :]).reshape(*u.shape[:-1], dim, -1)
         pushes = np.broadcast_to(pushes, (*w.shape[:-1], dim, dim * self.num_inputs))
         more = np.concatenate([frictions, pushes], axis=-1)
@@ -174,12 +175,13 @@ class Forced(WithForces):
         by each input (..., k); by a term that has several, by the first of them."""
         own, losses, gains = self.parts(params)
         v = split(self.family.gradient(own, w, self._inner(args)))[1]
-        lost = self.friction.power(v)
+        u = self._inputs(args)
+        lost = self.friction.power(v, u)
         lost = as_row(losses, lost) * lost
-        supplied = pushed(namespace(gains).swapaxes(gains, -1, -2), v) * self._inputs(args)
+        supplied = pushed(namespace(gains).swapaxes(gains, -1, -2), v) * u
         if not self._driven:
             return lost, supplied
-        f = self.family.terms.potentials(split(w)[0], 1, self._inputs(args))
+        f = self.family.terms.potentials(split(w)[0], 1, u)
         along = as_row(own, f.value) * (f.slope * v[..., None, :]).sum(-1)
         return lost, supplied + matmul(along, self.family.terms.first_inputs(self.num_inputs))
 
@@ -208,7 +210,7 @@ class Forced(WithForces):
 
     def _field(self, gradient, losses, gains, args):
         along_q, along_p = split(gradient)
-        along_q = along_q + self.friction.forces(along_p, losses)
+        along_q = along_q + self.friction.forces(along_p, losses, self._inputs(args))
         if self.num_inputs:
             along_q = along_q - pushed(gains, self._inputs(args))
         return namespace(gradient).concatenate([along_q, along_p], axis=-1)

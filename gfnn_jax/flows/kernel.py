@@ -18,12 +18,13 @@ Dry friction without a width jumps:
 
     M a = f(q, v) − Σ c λ,      λ = ρ sign(s) where s slides,      |λ| ≤ ρ, c·a = 0 where it sticks
 
-with s = c·v for each direction c (J. J. Moreau, in "Nonsmooth Mechanics and Applications" (1988)
-1). As long as no direction changes from one to the other the motion is smooth. A step in which a
-sliding speed turns, or a λ that holds passes ρ, ends there: at the root of a cubic through the
-speeds and their slopes at the step's ends, or of a line through λ. Where a speed turns at the time
-τ the acceleration jumps from a₋ to a₊, and so do the derivatives, for τ depends on the state too
-(M. A. Aizerman & F. R. Gantmacher, Q. J. Mech. Appl. Math. 11 (1958) 225):
+with s = c·v for each direction c, and ρ in proportion to the size of an input where that is the
+load (J. J. Moreau, in "Nonsmooth Mechanics and Applications" (1988) 1). As long as no direction
+changes from one to the other the motion is smooth. A step in which a sliding speed turns, or a λ
+that holds passes ρ, ends there: at the root of a cubic through the speeds and their slopes at the
+step's ends, or of a line through λ and ρ. Where a speed turns at the time τ the acceleration jumps
+from a₋ to a₊, and so do the derivatives, for τ depends on the state too (M. A. Aizerman & F. R.
+Gantmacher, Q. J. Mech. Appl. Math. 11 (1958) 225):
 
     D → D + (0, a₋ − a₊) dτ,      dτ = −c·D_v / c·a₋
 
@@ -58,11 +59,11 @@ VISCOUS, CUBIC, SMOOTHED, COULOMB, EVEN, RAISED_SPEED, ONE_SIDED, DRAG, FADING =
 # Rows of n: sizes (below); of each term its degree in v, the coordinates of its factors v, its wave
 # m·q, the number of coordinates in its factor f(q), whether it has powers, and its level; the level
 # of each coordinate; a term of each wave; where the columns of each term begin among those of ∂θ/∂c
-# without zeros; kinds of friction; where the operations of each term's shape begin, and operations.
-# Then rows, as many as there are coordinates in an f at the most, of coordinates, of powers and of
-# modes of f.
+# without zeros; kinds of friction, and the inputs that are their loads, -1 of others; where the
+# operations of each term's shape begin, and operations. Then rows, as many as there are coordinates
+# in an f at the most, of coordinates, of powers and of modes of f.
 SIZES, DEGREE, FIRST_V, LAST_V, WAVE, COUNT, POWERED, LEVEL, LEVELS = range(9)
-WAVES, BEGINS, COLUMNS, KINDS, PROGRAMS, CODE, COORDINATES = range(9, 16)
+WAVES, BEGINS, COLUMNS, KINDS, LOADS, PROGRAMS, CODE, COORDINATES = range(9, 17)
 
 # Operations: variables, constants, values of the stack and inputs are put on it. Of two numbers
 # that are taken from it sum, product, the larger one, whether the first is greater; of three one,
@@ -84,15 +85,16 @@ NUM_SIZES = 28
 
 # Rows of f: states (q, v) at the begin and the end of a step and at a stage; a at the stage and at
 # the begin; forces; momenta ∂L/∂v; of terms θ, cos φ, sin φ, f, ∂f/∂q · v; cos and sin of each
-# wave; ∂θ/∂c without zeros; of friction ρ, ε, dr/ds, λ, λ at the begin, modes (1 or −1 where it
-# slides, 0 where it sticks), directions that turned, that are carried, and speeds along the modes
-# at the end; a row of derivatives; operands of operations, and a row as long as the stack; powers
-# of coordinates with derivatives; rates and inputs at the stages; the tableau of Dormand and
-# Prince. Numbers of other modules would stay as they were in the cache of numba, which looks at
-# this file alone.
+# wave; ∂θ/∂c without zeros; of friction ρ, ε, dr/ds, λ and the most that it can be, both at the
+# begin, modes (1 or −1 where it slides, 0 where it sticks), directions that turned, that are
+# carried, and speeds along the modes at the end; a row of derivatives; operands of operations, and
+# a row as long as the stack; powers of coordinates with derivatives; rates and inputs at the
+# stages; the tableau of Dormand and Prince. Numbers of other modules would stay as they were in the
+# cache of numba, which looks at this file alone.
 X0, X1, X, A, A_FIRST, FORCE, MOMENTUM, THETA, COS_PHASE, SIN_PHASE, FACTOR, ALONG = range(12)
-COSINE, SINE, PARTS, LOSSES, WIDTHS, PULL, HELD, HELD_FIRST, MODES, TURNED = range(12, 22)
-CARRIED, AFTER, ROW, POWER, POWER_BY, POWER_BY_TWO, OPERANDS, STACK, RATES = range(22, 31)
+COSINE, SINE, PARTS, LOSSES, WIDTHS, PULL, HELD, LIMIT, HELD_FIRST, LIMIT_FIRST = range(12, 22)
+MODES, TURNED, CARRIED, AFTER, ROW, POWER, POWER_BY, POWER_BY_TWO = range(22, 30)
+OPERANDS, STACK, RATES = range(30, 33)
 _STAGES = 6
 U = RATES + _STAGES
 INSIDE = U + _STAGES
@@ -440,14 +442,16 @@ def _other(n, f, k, i):
 
 
 @function
-def _friction(n, f, order):
-    """The forces of friction but for uniform friction, and their derivatives in v."""
+def _friction(n, f, u, order):
+    """The forces of friction but for uniform friction, with inputs in the row u, and their
+    derivatives in v."""
     d, c, raw = n[SIZES, DIM], n[SIZES, DIRECTIONS], n[SIZES, RAW]
     for k in range(n[SIZES, FRICTIONS]):
         kind, loss = n[KINDS, k], f[LOSSES, k]
         if kind == EVEN:
             continue
         speed, stiffness, turned = 0.0, 0.0, 0.0
+        load = abs(f[u, n[LOADS, k]]) if n[LOADS, k] >= 0 else 1.0
         for i in range(d):
             speed += f[c + i, k] * f[X, d + i] * _other(n, f, k, i)
         pull = speed
@@ -475,8 +479,9 @@ def _friction(n, f, order):
                 stiffness = (f[WIDTHS, k] - 1.0) * pull / speed
         else:
             pull = f[MODES, k]
+        pull, stiffness = pull * load, stiffness * load
         f[PULL, k] = pull
-        f[HELD, k] = loss * pull
+        f[HELD, k], f[LIMIT, k] = loss * pull, loss * load
         for i in range(d):
             if f[c + i, k] != 0.0:
                 along = f[c + i, k] * _other(n, f, k, i)
@@ -635,7 +640,7 @@ def _rates(n, f, u, order):
         if n[KINDS, k] == EVEN:
             gamma += f[LOSSES, k]
     _terms(n, f, gamma, u, order)
-    _friction(n, f, order)
+    _friction(n, f, u, order)
     for i in range(d):
         for m in range(n[SIZES, INPUTS]):
             f[FORCE, i] += f[gains + i, m] * f[u, m]
@@ -722,7 +727,7 @@ def _smooth(n, f, span, order, u):
             for k in range(d):
                 f[A_FIRST, k] = f[A, k]
             for k in range(n[SIZES, FRICTIONS]):
-                f[HELD_FIRST, k] = f[HELD, k]
+                f[HELD_FIRST, k], f[LIMIT_FIRST, k] = f[HELD, k], f[LIMIT, k]
         slope = slopes + 2 * d * i
         for k in range(rows // 2):
             for m in range(width):
@@ -843,13 +848,13 @@ def _first_event(n, f, span):
     the rates at both ends of the step."""
     d, part, event = n[SIZES, DIM], 1.0, 0
     for k in range(n[SIZES, FRICTIONS]):
-        mode, loss, share = f[MODES, k], f[LOSSES, k], 1.0
+        mode, share = f[MODES, k], 1.0
         if n[KINDS, k] != COULOMB:
             continue
         if mode == 0.0:
-            spare = loss - abs(f[HELD, k])
+            spare = f[LIMIT, k] - abs(f[HELD, k])
             if spare < 0.0:
-                begun = max(loss - abs(f[HELD_FIRST, k]), 0.0)
+                begun = max(f[LIMIT_FIRST, k] - abs(f[HELD_FIRST, k]), 0.0)
                 share = begun / (begun - spare)
         elif f[AFTER, k] < 0.0:
             before, slope = mode * _speed(n, f, k, X0, d), mode * _speed(n, f, k, A_FIRST, 0)
@@ -903,7 +908,7 @@ def _released(n, f):
     False where there is none."""
     most, event = 0.0, 0
     for k in range(n[SIZES, FRICTIONS]):
-        beyond = abs(f[HELD, k]) - f[LOSSES, k]
+        beyond = abs(f[HELD, k]) - f[LIMIT, k]
         if n[KINDS, k] == COULOMB and f[MODES, k] == 0.0 and beyond > most:
             most, event = beyond, k
     if most > 0.0:

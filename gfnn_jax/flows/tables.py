@@ -12,6 +12,7 @@ from gfnn_jax.families.friction import (
     DRY,
     ISOTROPIC,
     LINEAR,
+    LOADED,
     ONE_SIDED,
     POWER,
     QUADRATIC,
@@ -34,6 +35,7 @@ _KINDS = {
     ONE_SIDED: row.ONE_SIDED,
     ISOTROPIC: row.DRAG,
     STRIBECK: row.FADING,
+    LOADED: row.SMOOTHED,
 }
 _BINARY = {"+": row.PLUS, "*": row.TIMES, "max": row.LARGER, ">": row.GREATER}
 _TAKEN = dict.fromkeys(_BINARY.values(), 1) | {row.SELECT: 2, row.COMPOSE: 3}  # from the stack
@@ -84,7 +86,7 @@ class Tables(NamedTuple):
             waves.setdefault(one, j)
         numbered = {one: k for k, one in enumerate(waves)}
         at, columns = np.nonzero(basis)
-        kinds = np.array([_KINDS[int(kind)] for kind in friction.kinds], dtype=np.int64)
+        kinds = np.array([_KINDS[min(int(k), LOADED)] for k in friction.kinds], dtype=np.int64)
         kinds[friction.jumps] = row.COULOMB
         speeds = terms.speeds
         code: list[Operation] = []
@@ -106,6 +108,7 @@ class Tables(NamedTuple):
             row.BEGINS: np.searchsorted(at, np.arange(count + 1)),
             row.COLUMNS: columns,
             row.KINDS: kinds,
+            row.LOADS: np.maximum(friction.kinds - LOADED, -1),
             row.PROGRAMS: begins,
             row.CODE: [operation for operation, _ in code],
         }

@@ -350,7 +350,7 @@ OPTIONS: dict[str, About] = {
         _TEXT,
         "for a recording, friction by its force: auto, none, linear (viscous, ∝ v), quadratic "
         "(drag, ∝ v |v|), isotropic (drag of a plane or of space), cubic, dry (Coulomb), stribeck "
-        "(beside dry: what it loses at speed), "
+        "(beside dry: what it loses at speed), load-dependent (dry, ∝ the size of an input), "
         "one-sided (viscous, of one direction), uniform (R = γT); several joined by +",
         "KIND",
     ),

@@ -20,7 +20,7 @@ import numpy as np
 from gfnn_jax.data.recording import Recording, args_of, channels_of
 from gfnn_jax.data.roles import is_wave, wave
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.friction import DRY, UNIFORM, Friction
+from gfnn_jax.families.friction import UNIFORM, Friction
 from gfnn_jax.families.lagrangian import Lagrangian, functions_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import TAPS, at_stages
@@ -112,10 +112,9 @@ def law_in_use(law: Lagrangian, root: np.ndarray | None, sensors: Sensors) -> La
     """Prepare a Lagrangian and the root (m, n) of the covariance of (θ, ρ, G), and of γ where there
     is uniform friction. Dry friction that creeps by less than the sensors see slides or sticks."""
     count, losses = law.terms.count, law.losses
-    rows = [
-        (c, kind, ε if kind != DRY or ε > sensors.creep else 0.0)
-        for c, kind, ε in law.friction.rows()
-    ]
+    sharp = law.friction.dry & (law.friction.widths <= sensors.creep)
+    widths = np.where(sharp, 0.0, law.friction.widths)
+    rows = dataclasses.replace(law.friction, widths=widths).rows()
     order = np.arange(count + law.friction.count + law.gains.size)
     if law.uniform != 0:  # γ, the last of all, stands behind ρ in a form
         rows, losses = [*rows, ((0,) * law.dim, UNIFORM, 0.0)], np.append(losses, law.uniform)

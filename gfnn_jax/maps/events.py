@@ -16,7 +16,6 @@ import numpy as np
 from jax.core import Tracer
 
 from gfnn_jax.coordinates import TWO_PI
-from gfnn_jax.families.friction import DRY
 from gfnn_jax.families.lagrangian import functions_of
 from gfnn_jax.flows.dormand_prince import NODES
 from gfnn_jax.flows.legendre import Legendre
@@ -136,7 +135,7 @@ def followed(map_: Any, *given: Any) -> Followed | None:
     if not is_of_law(map_) or any(isinstance(a, Tracer) for a in jax.tree.leaves((map_, given))):
         return None
     friction = law_of_map(map_).friction
-    if not np.any((friction.kinds == DRY) & (friction.widths <= map_.sensors.creep)):
+    if not np.any(friction.dry & (friction.widths <= map_.sensors.creep)):
         return None
     bare = jax.tree.map(np.asarray, map_)
     if np.any(bare.dt <= 0):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gfnn_jax.coordinates import Coordinates, lift
-from gfnn_jax.families.friction import DRY, LINEAR
+from gfnn_jax.families.friction import LINEAR
 from gfnn_jax.families.lagrangian import Lagrangian, coordinates_in
 from gfnn_jax.flows.bodies import BodiesLaw, OfBodies
 from gfnn_jax.flows.collocation import Steps, images, of_lanes
@@ -78,12 +78,14 @@ def map_of_law(
     whole = tuple(a for a, all_of_it in zip(angles, covered, strict=True) if all_of_it)
     scale, some = sizes(z), slice(None, None, -(-len(z) // OPTIONS.test_states))
     own = args[some] if parameters else None
+    u = None
     if signals is not None:
         u = np.zeros((len(z), count)) if inputs is None else np.asarray(inputs, float)
-        own = signals.constant(own, u[some], z[some].shape, np.float64)
+        u = u[some]
+        own = signals.constant(own, u, z[some].shape, np.float64)
     one = law.at(args[some]) if parameters else law
     flow = Flow(family, params, dt, scale)
-    steps = _steps(one, flow, z[some], own, tolerance)
+    steps = _steps(flow, z[some], own, tolerance, stiffness(one, split(z[some])[0], u))
     flow = dataclasses.replace(flow, **dataclasses.asdict(steps))
     posterior = None if root is None else Posterior(0, np.asarray(root))
     return SymplecticMap(
@@ -131,12 +133,12 @@ def conformal(law: Lagrangian, covariance: np.ndarray) -> tuple[Lagrangian, np.n
     return even, by[:, None] * covariance * by
 
 
-def stiffness(law: Lagrangian | BodiesLaw, q: np.ndarray) -> float:
-    """The fastest rate at which dry friction brings bodies to rest at positions q (n, d), 1/time;
-    0 without dry friction."""
-    if not np.any(law.friction.kinds == DRY):
+def stiffness(law: Lagrangian | BodiesLaw, q: np.ndarray, u: np.ndarray | None = None) -> float:
+    """The fastest rate at which dry friction brings bodies to rest at positions q (n, d) under
+    inputs u (n, k), 1/time; 0 without dry friction."""
+    if not np.any(law.friction.dry):
         return 0.0
-    rates = np.linalg.solve(law.masses(q), law.losses_by_v(0 * q))
+    rates = np.linalg.solve(law.masses(q), law.losses_by_v(0 * q, u))
     return float(np.abs(np.linalg.eigvals(rates)).max())
 
 
@@ -207,7 +209,7 @@ def inverse_dynamics(map_: SymplecticMap, q, v, a, args=None) -> InverseDynamics
             f"{a.shape}"
         )
     law = _law_at(map_, args)
-    if isinstance(law, Lagrangian) and law.terms.driven:
+    if isinstance(law, Lagrangian) and (law.terms.driven or np.any(law.friction.loaded)):
         raise ValueError(
             "terms of this law have inputs: a motion tells no inputs by its gains alone"
         )
@@ -232,15 +234,16 @@ def _law_at(map_: SymplecticMap, args) -> Lagrangian | BodiesLaw:
     return law.at(None if args is None else np.asarray(args, float))
 
 
-def _steps(law: Lagrangian, flow: Flow, z, args, tolerance: float) -> Steps:
+def _steps(flow: Flow, z, args, tolerance: float, rate: float) -> Steps:
     """The cheapest steps of a flow whose own error is within the tolerance at nearly all of these
-    states; and whether Newton's method is to solve them: where dry friction is stiff, whose force
-    turns over within ε, and no more than Newton's method bears in a substep.
+    states; and whether Newton's method is to solve them: where dry friction of this ``rate``
+    (`stiffness`) is stiff, whose force turns over within ε, and no more than Newton's method bears
+    in a substep.
 
     Substeps of the most stages are halved until nearly all states stay where they are; those that
     do are halved no further, and are what steps of fewer stages are compared with."""
     dt, most = float(flow.dt), OPTIONS.stages[-1]
-    turned = dt * stiffness(law, split(z)[0])
+    turned = dt * rate
     fewest, stiff = turned / OPTIONS.stiffest, bool(turned > OPTIONS.contracting)
 
     def after(steps: Steps, lanes: Any = slice(None)) -> np.ndarray:

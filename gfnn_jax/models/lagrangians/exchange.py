@@ -23,12 +23,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.families.friction import kind_of
 from gfnn_jax.families.text import in_letters
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.fitting.significance import of_two
 from gfnn_jax.models.lagrangians.fit import LawFit
 from gfnn_jax.models.lagrangians.friction_choice import is_coupled, kinds_of
-from gfnn_jax.models.lagrangians.libraries import FEW, RARE, feeds, together
+from gfnn_jax.models.lagrangians.libraries import FEW, feeds, together
 from gfnn_jax.models.lagrangians.structure import Loss, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import promising, protected
 
@@ -162,8 +163,8 @@ def leaves_open(fit: LawFit, rival: Exchanged) -> bool:
 
 def _oddness(friction: Sequence[Loss]) -> tuple[int, ...]:
     """The number of kinds of friction, of rare ones, and of those of several speeds."""
-    rare, coupled = ([row[1] in RARE for row in friction], [is_coupled(row) for row in friction])
-    return len(kinds_of(friction)), sum(rare), sum(coupled)
+    rare = sum(kind_of(row[1]).rare for row in friction)
+    return len(kinds_of(friction)), rare, sum(map(is_coupled, friction))
 
 
 def may_be_chosen(fit: LawFit) -> bool:
@@ -181,7 +182,7 @@ def _plainness(fit: LawFit) -> tuple[int, ...]:
     return (
         len(fit.p),
         sum(any(row[0]) and not is_constant(row) for row in terms),
-        sum(row[1] in RARE for row in friction),
+        sum(kind_of(row[1]).rare for row in friction),
         sum(sum(row[1]) for row in terms),
     )
 

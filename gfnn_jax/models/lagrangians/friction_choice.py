@@ -17,8 +17,9 @@ which the best has odds of less than 20 the one with the fewest kinds is taken: 
 which has one coefficient and keeps a multiple of the symplectic form, before linear friction, and
 that before isotropic drag, quadratic and dry friction. Uniform friction is tried beside linear
 friction, and isotropic drag beside quadratic friction, only where both are asked for. Rare kinds,
-cubic, one-sided and Stribeck's, come last: one of them beside the others, or in place of one, where
-that has odds of 20 against the set without it, by held-out arcs and by Schwarz's criterion of all.
+cubic, one-sided, Stribeck's and that by a load, come last: one of them beside the others, or in
+place of one, where that has odds of 20 against the set without it, by held-out arcs and by
+Schwarz's criterion of all.
 
 Odds alone let chance in: a direction that is not there takes up a part of what the other
 coefficients miss on the arcs that they are not from. Where there is a choice, a set is therefore
@@ -46,15 +47,16 @@ from gfnn_jax.families.friction import (
     STRIBECK,
     UNIFORM,
     Friction,
+    kind_of,
 )
 from gfnn_jax.families.text import in_letters
 from gfnn_jax.fitting.evidence import EVIDENCE, correlation_time, criterion, improved
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.models.lagrangians.fit import FOLDS, LawFit
-from gfnn_jax.models.lagrangians.libraries import FRICTIONS, KINDS, RARE, feeds, losses, together
+from gfnn_jax.models.lagrangians.libraries import KINDS, feeds, losses, names_of, together
 from gfnn_jax.models.lagrangians.structure import Loss
-from gfnn_jax.models.lagrangians.text import friction_of
+from gfnn_jax.models.lagrangians.text import Names, friction_of
 from gfnn_jax.solve.linear import non_negative
 
 
@@ -92,19 +94,19 @@ class FrictionChoice(NamedTuple):
     def kinds(self) -> tuple[int, ...]:
         return kinds_of(self.rows)
 
-    def in_words(self, scale: float, dim: int, speeds: Sequence[str]) -> WhichFriction:
-        """The choice by the names of speeds; ``scale`` is that of L."""
+    def in_words(self, scale: float, dim: int, names: Names) -> WhichFriction:
+        """The choice in these names; ``scale`` is that of L."""
 
         def named(kinds: tuple[int, ...]) -> str:
-            return "+".join(FRICTIONS[k] for k in kinds) or "none"
+            return "+".join(names_of(kinds)) or "none"
 
         plain = {direction for direction, _, _ in losses(dim, KINDS, 0.0)}
         rows = [r for r in self.limits if r[0] in plain and len(r) == 3]
-        rows = [r for r in rows if r[1] not in (*self.kinds, *RARE)]
+        rows = [r for r in rows if r[1] not in self.kinds and not kind_of(r[1]).rare]
         largest = scale * np.array([self.limits[row] for row in rows])
-        terms = friction_of(Friction.of(rows, dim), largest, 0 * largest, speeds).terms
+        terms = friction_of(Friction.of(rows, dim), largest, 0 * largest, names).terms
         return WhichFriction(
-            tuple(FRICTIONS[k] for k in self.kinds),
+            names_of(self.kinds),
             {named(kinds): odds for kinds, odds in self.odds.items()},
             {t.term: t.coefficient for t in terms},
         )
@@ -249,7 +251,7 @@ def chosen(
     ``before`` stay. rows: friction that has been taken, where only its odds are asked for. Odds are
     those against sets whose coefficients are all seen."""
     kinds = sorted({row[1] for row in table.candidates})
-    usual = [kind for kind in kinds if not (choose and kind in RARE)]
+    usual = [kind for kind in kinds if not (choose and kind_of(kind).rare)]
     every = (chosen for n in range(len(usual) + 1) for chosen in combinations(usual, n))
     every = (chosen for chosen in every if together(chosen) or not choose)
     sets = [judged for judged in map(table.leanest, every) if judged is not None]
@@ -289,7 +291,7 @@ def chosen(
 def _with_rare(table: Table, taken: _Judged) -> list[_Judged]:
     """The set with a rare kind of friction beside its own, or in place of one, where it is seen;
     Stribeck's with dry and linear friction where these are, which it hides."""
-    kinds, rare = set(taken.kinds), {row[1] for row in table.candidates if row[1] in RARE}
+    kinds, rare = set(taken.kinds), {k for _, k, *_ in table.candidates if kind_of(k).rare}
     sets = [kinds - gone | {new} for new in sorted(rare) for gone in [set(), *({k} for k in kinds)]]
     sets += [kinds | {LINEAR, DRY, STRIBECK}] * (STRIBECK in rare)
     found = [table.leanest(tuple(sorted(one))) for one in sets]

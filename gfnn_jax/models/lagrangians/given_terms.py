@@ -33,7 +33,16 @@ from gfnn_jax.families.expressions import (
     to_text,
     whole_multiples,
 )
-from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, ONE_SIDED, POWER, QUADRATIC, STRIBECK
+from gfnn_jax.families.friction import (
+    DRY,
+    ISOTROPIC,
+    LINEAR,
+    LOADED,
+    ONE_SIDED,
+    POWER,
+    QUADRATIC,
+    STRIBECK,
+)
 from gfnn_jax.families.lagrangian import INPUTS, MAX_POWER, coordinates_in
 from gfnn_jax.families.told import told_of
 from gfnn_jax.models.lagrangians.structure import SINE, Loss, Row, with_powers
@@ -186,6 +195,14 @@ class _Reader(NamedTuple):
     def loss(self, tree: Expression, text: str) -> Loss:
         """(c, kind, ε) of a friction, with its powers of parameters."""
         factors, of_system = self.apart(tree)
+        loads = [base for base, exponent in factors.items() if exponent == 1 and _of_input(base)]
+        if len(factors) == 2 and len(loads) == 1:
+            del factors[loads[0]]
+            direction, kind, width = self.loss(product_of(factors), text)
+            if kind != DRY:
+                raise self.refused(text)
+            (which,) = loads[0].operands[0].operands
+            return with_powers((direction, LOADED + which, width), of_system)
         if len(factors) != 1:
             raise self.refused(text)
         ((inside, exponent),) = factors.items()
@@ -230,7 +247,8 @@ class _Reader(NamedTuple):
             f"terms: '{text}' is no term of a law. A term of L or V is a formula of "
             f"{', '.join((*self.positions, *self.inputs))}, in L without inputs times up to two of "
             f"{', '.join(self.speeds)}; one of R is v**2, abs(v)**a, abs(v), "
-            f"(abs(v) + v)**2, exp(-abs(v)/0.1) beside abs(v), or sqrt(v**2 + w**2)**a, a >= 2{of}"
+            f"(abs(v) + v)**2, exp(-abs(v)/0.1) beside abs(v), abs(u)*abs(v) of an input u, or "
+            f"sqrt(v**2 + w**2)**a, a >= 2{of}"
         )
 
 
@@ -266,6 +284,11 @@ def _fading(tree: Expression) -> tuple[Expression, float] | None:
             if size is not None and size < 0:
                 return rate.operands[-1].operands[0], float(f"{-1 / size:.6g}")
     return None
+
+
+def _of_input(tree: Expression) -> bool:
+    """Return whether a tree is the size of an input."""
+    return tree.operation == "abs" and tree.operands[0].operation == "parameter"
 
 
 def _index(tree: Expression) -> int:

@@ -112,7 +112,7 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
         gains=gains,
         delay=(inputs.delay, inputs.error) if recording.inputs else None,
         input_rules=dict(inputs.others),
-        which_friction=best.choice.in_words(best.scale, law.dim, names.speeds),
+        which_friction=best.choice.in_words(best.scale, law.dim, names),
         hamiltonian=(None if law.terms.leaders else hamiltonian_of(law, lagrangian, names)),
         zeros=zeros,
         noise=dict(zip(channels, map(float, sensors.sigma / factors), strict=True)),
@@ -174,7 +174,7 @@ def _expressions(best: CalibratedLaw | GaugedLaw, names: Names) -> tuple[Formula
     law = best.law
     of_terms, of_losses, _, of_rate = _standard_errors(best)
     lagrangian = terms_of(law.terms, law.coefficients, of_terms, names)
-    friction = friction_of(law.friction, law.losses, of_losses, names.speeds)
+    friction = friction_of(law.friction, law.losses, of_losses, names)
     if law.powers is not None:
         lagrangian = of_systems(lagrangian, law.powers[: law.terms.count], names.parameters)
         of_friction = law.powers[law.terms.count :][: law.friction.count]

@@ -10,7 +10,6 @@ import numpy as np
 from gfnn_jax.data.roles import symbols as code_names
 from gfnn_jax.exports import symbolic
 from gfnn_jax.exports.symbolic import Equation, Formula, equations_of_motion
-from gfnn_jax.families.friction import DRY
 from gfnn_jax.families.lagrangian import Lagrangian, Terms, row_about
 from gfnn_jax.families.text import Term, measured
 from gfnn_jax.fitting.evidence import EVIDENCE, Rival
@@ -209,7 +208,7 @@ class LearnedLaw:
         """Details: choices beside the law, and how well it is known, a line each."""
         lines = [f"friction: {self.which_friction}", f"scale of L: {self.gauge}"]
         sensors = self.map.sensors
-        if sensors is not None and np.any(law_of_map(self.map).friction.kinds == DRY):
+        if sensors is not None and np.any(law_of_map(self.map).friction.dry):
             lines.append(
                 "dry friction: bodies slide or stick in fits, forecasts and rollouts; under jit, "
                 f"grad and vmap the map smooths it over speeds of {sensors.creep:.2g}"

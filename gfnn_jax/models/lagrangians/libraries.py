@@ -9,7 +9,7 @@ asks for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import combinations, combinations_with_replacement, permutations
 
 from gfnn_jax.families.expressions import parse, product_of, to_text
@@ -17,19 +17,20 @@ from gfnn_jax.families.friction import (
     DRY,
     ISOTROPIC,
     LINEAR,
+    LOADED,
     ONE_SIDED,
     POWER,
     QUADRATIC,
     STRIBECK,
     TABLE,
     UNIFORM,
+    kind_of,
 )
 from gfnn_jax.families.lagrangian import INPUTS, tree_of
 from gfnn_jax.models.lagrangians.structure import SINE, Loss, Row
 
 KINDS = tuple(range(len(TABLE)))
 FRICTIONS = tuple(kind.name for kind in TABLE)
-RARE = tuple(kind for kind in KINDS if TABLE[kind].rare)
 ALTERNATIVES = ({LINEAR, UNIFORM}, {QUADRATIC, ISOTROPIC})  # of which a law has one by choice
 CUBIC = 3.0  # the power of the speed that is tried
 HIGHEST = 6  # degree of potentials of lengths
@@ -303,16 +304,23 @@ def modes(dim: int, angles: tuple[int, ...], order: int) -> list[tuple[int, ...]
     return found
 
 
+def names_of(kinds: Iterable[int]) -> tuple[str, ...]:
+    """The names of kinds of friction, as a request has them."""
+    return tuple(dict.fromkeys(kind_of(kind).name for kind in kinds))
+
+
 def losses(
-    dim: int, kinds: tuple[int, ...], width: float, lengths: Sequence[int] = ()
+    dim: int, kinds: tuple[int, ...], width: float, lengths: Sequence[int] = (), inputs: int = 0
 ) -> list[Loss]:
     """Friction of each coordinate, and of the relative speed of neighbours (a joint); uniform
     friction has no direction. Rare kinds are those of single coordinates, one-sided friction of
-    either side, Stribeck's of the width 1. Isotropic drag, as |v|², is that of the plane or the
-    space of the ``lengths``."""
+    either side, Stribeck's of the width 1, and by the load of each of so many ``inputs``. Isotropic
+    drag, as |v|², is that of the plane or the space of the ``lengths``."""
     directions = [unit(dim, i) for i in range(dim)]
     of_power = [(c, POWER, CUBIC) for c in directions if POWER in kinds]
     of_power += [(c, STRIBECK, 1.0) for c in directions if STRIBECK in kinds]
+    loads = range(inputs * (LOADED in kinds))
+    of_power += [(c, LOADED + j, width) for c in directions for j in loads]
     sides = [(tuple(side * i for i in c), ONE_SIDED, 0.0) for c in directions for side in (1, -1)]
     for i in range(dim - 1):
         wave = [0] * dim
@@ -321,7 +329,7 @@ def losses(
     rows = [
         (c, kind, width if kind == DRY else 0.0)
         for kind in kinds
-        if kind not in (UNIFORM, ISOTROPIC, *RARE)
+        if kind not in (UNIFORM, ISOTROPIC) and not kind_of(kind).rare
         for c in directions
     ]
     rows += of_power + sides * (ONE_SIDED in kinds)

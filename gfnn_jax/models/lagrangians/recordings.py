@@ -67,7 +67,7 @@ from gfnn_jax.models.lagrangians.in_words import (
 )
 from gfnn_jax.models.lagrangians.input_rules import RULES, choose_again
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
-from gfnn_jax.models.lagrangians.libraries import FRICTIONS, last_of_series
+from gfnn_jax.models.lagrangians.libraries import FRICTIONS, last_of_series, names_of
 from gfnn_jax.models.lagrangians.nature import NO_COLUMN, Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions, parting
 from gfnn_jax.models.lagrangians.residuals import Trace
@@ -473,7 +473,7 @@ def _at_bound(options: SearchOptions, choice: FrictionChoice, dim: int) -> list[
     """A message where kinds of friction were asked for that the record does not show."""
     if options.choose_friction:
         return []
-    taken = {FRICTIONS[kind] for kind in choice.kinds}
+    taken = set(names_of(choice.kinds))
     taken |= {"uniform"} if dim == 1 and "linear" in taken else set()  # which is the same there
     absent = [kind for kind in options.frictions if kind not in taken]
     if not absent:

@@ -18,7 +18,15 @@ from scipy.optimize import lsq_linear
 
 from gfnn_jax.dataset.stretches import arcs_of
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, STRIBECK, UNIFORM
+from gfnn_jax.families.friction import (
+    DRY,
+    ISOTROPIC,
+    LINEAR,
+    LOADED,
+    STRIBECK,
+    UNIFORM,
+    kind_of,
+)
 from gfnn_jax.families.lagrangian import has_inputs, shape_of
 from gfnn_jax.fitting.evidence import Comparison, criterion, improved
 from gfnn_jax.models.lagrangians import libraries
@@ -224,7 +232,8 @@ class TermSearch:
             frictions_tried(problem),
         )
         inputs, sensors = problem.num_inputs, problem.sensors
-        return cls(Structure(d, terms, frictions, problem.turned, inputs, sensors), frictions)
+        rubs = tuple(row for row in frictions if row[1] < LOADED)
+        return cls(Structure(d, terms, rubs, problem.turned, inputs, sensors), frictions)
 
     def every_beside(self, fit: LawFit) -> Structure:
         """All terms that the law of a fit may come to: of angles of which it has powers, springs
@@ -394,9 +403,12 @@ class TermSearch:
     # Friction.
 
     def _may_rub(self, fit: LawFit) -> list[Loss]:
-        """Friction that the law of a fit may have; Stribeck's as it has it."""
+        """Friction that the law of a fit may have; Stribeck's as it has it, and by a load where it
+        has dry friction."""
         own = {row[:2]: row for row in fit.structure.friction if row[1] == STRIBECK}
         rows = [own.get(row[:2], row) for row in self.frictions or ()]
+        dry = np.any(fit.form.friction.dry) or not fit.problem.options.choose_friction
+        rows = [row for row in rows if row[1] < LOADED or dry]
         return [row for row in rows if fit.structure.may_have(("loss", row))]
 
     def with_friction(self, fit: LawFit) -> tuple[LawFit, FrictionChoice]:
@@ -466,7 +478,7 @@ def frictions_tried(problem: ArcProblem) -> tuple[Loss, ...]:
     kinds = tuple(map(libraries.FRICTIONS.index, options.frictions))
     if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
         kinds = tuple(kind for kind in kinds if kind != UNIFORM)
-    rows = libraries.losses(dim, kinds, 0.0, problem.lengths)
+    rows = libraries.losses(dim, kinds, 0.0, problem.lengths, problem.num_inputs)
     rows = [(c, k, fading(c, problem)) if k == STRIBECK else (c, k, w) for c, k, w in rows]
     if not options.choose_friction and ISOTROPIC in kinds and ISOTROPIC not in kinds_of(rows):
         raise InputError(
@@ -478,8 +490,13 @@ def frictions_tried(problem: ArcProblem) -> tuple[Loss, ...]:
             "stribeck friction is a part of dry friction, which falls with speed: expected both, "
             f"got {'+'.join(options.frictions)}. Give them together: dry+stribeck"
         )
+    if not options.choose_friction and LOADED in kinds and not problem.num_inputs:
+        raise InputError(
+            "load-dependent friction is in proportion to an input, the load: expected one, got "
+            "none. Name its column: --inputs"
+        )
     if dim > libraries.FEW and options.choose_friction:
-        return tuple(row for row in rows if row[1] not in libraries.RARE)
+        return tuple(row for row in rows if not kind_of(row[1]).rare)
     turned = [one for one in map(libraries.opposite, rows) if one is not None]
     return tuple(sorted((*rows, *turned), key=lambda row: row[1] == UNIFORM))
 

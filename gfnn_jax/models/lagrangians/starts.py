@@ -19,7 +19,7 @@ from scipy.optimize import minimize_scalar
 
 from gfnn_jax.dataset.stretches import Scales
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, QUADRATIC, STRIBECK
+from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, LOADED, QUADRATIC, STRIBECK
 from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
@@ -133,6 +133,7 @@ def best_start(problem: ArcProblem) -> LawFit:
     some.add_rubbing(DRY, [textbook, _Library(first, 2)])
     some.add_rubbing(STRIBECK, [textbook])
     if inputs := problem.num_inputs:
+        some.add_rubbing(LOADED, [textbook])
         driven = libraries.driven(d, angles, inputs, problem.squares)
         some.add_richer([*textbook.rows, *driven], 3)
     some.add_richer([*first, *libraries.gyroscopic(d, angles, 1)], 3)
@@ -177,7 +178,7 @@ def _is_of(fit: LawFit, structure: Structure) -> bool:
             one.terms,
             one.zeros,
             one.leaders,
-            *(r for r in one.friction if r[1] in (DRY, ISOTROPIC, STRIBECK)),
+            *(r for r in one.friction if r[1] not in (LINEAR, QUADRATIC)),
         )
         for one in (fit.structure, structure)
     )
@@ -236,13 +237,14 @@ class _Starts:
         problem.on_progress(f"arcs of {periods:g} periods: {rule.fit}")
 
     def _friction(self, library: _Library) -> tuple[Loss, ...]:
-        """Linear friction, and the kind of a library, Stribeck's with dry friction, as fast as the
-        weak form prefers."""
+        """Linear friction, and the kind of a library, by a load with dry friction, and so
+        Stribeck's, as fast as the weak form prefers."""
         problem, d = self.problem, self.problem.dim
         if library.rubs is None:
             return tuple(self.linear[:d] if library.apart else self.linear)
-        kinds = {LINEAR, library.rubs, *((DRY,) if library.rubs == STRIBECK else ())}
-        rows = libraries.losses(d, tuple(sorted(kinds)), 0.0, problem.lengths)
+        kinds = {LINEAR, library.rubs, *((DRY,) if library.rubs in (STRIBECK, LOADED) else ())}
+        loads = problem.num_inputs
+        rows = libraries.losses(d, tuple(sorted(kinds)), 0.0, problem.lengths, loads)
         rows = [row for row in rows if min(row[0]) >= 0]
         if library.rubs != STRIBECK:
             return tuple(rows)

@@ -50,11 +50,9 @@ def terms_of(terms: Terms, coefficients: np.ndarray, std: np.ndarray, names: Nam
     return Formula(tuple(Term(text, float(c), float(s)) for text, c, s in listed))
 
 
-def friction_of(
-    friction: Friction, losses: np.ndarray, std: np.ndarray, speeds: Sequence[str]
-) -> Formula:
+def friction_of(friction: Friction, losses: np.ndarray, std: np.ndarray, names: Names) -> Formula:
     """Terms of Rayleigh's R."""
-    listed = zip(friction.texts(speeds), losses, std, strict=True)
+    listed = zip(friction.texts(names.speeds, names.inputs), losses, std, strict=True)
     return Formula(tuple(Term(text, float(ρ * r), float(s * abs(r))) for (text, r), ρ, s in listed))
 
 
@@ -85,7 +83,7 @@ def word_of(key: tuple[Any, ...], names: Names) -> str:
         found = (
             terms_of(Terms.of(rest, dim), one, none, names)
             if kind == "term"
-            else friction_of(Friction.of(rest, dim), one, none, names.speeds)
+            else friction_of(Friction.of(rest, dim), one, none, names)
         )
         powers = (powers_of(rest[0], len(names.parameters)),)
         (term,) = of_systems(found, powers, names.parameters).terms

@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 
 from gfnn_jax.dataset.stretches import Nodes
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.friction import DRY, LINEAR, Friction
+from gfnn_jax.families.friction import LINEAR, Friction
 from gfnn_jax.families.lagrangian import Terms, functions_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
@@ -115,7 +115,7 @@ class _Equations(NamedTuple):
         bumps = [Bumps.of(n.t, length) for n, length in windows]
         t = np.concatenate([one.t for one in bumps])
         X, Y = np.concatenate(rows), -np.concatenate(targets)
-        if any(row[1] == DRY for row in structure.friction):
+        if np.any(form.friction.dry):
             least = OPTIONS.slow * np.sqrt(np.mean(problem.states[:, d:] ** 2, axis=0))
             slow = [1.0 * (np.abs(n.x[:, d:]) < least) for n, _ in windows]
             inside: list[Any] = [1.0 * (one.phi != 0) for one in bumps]
@@ -323,7 +323,7 @@ def weak_rows(form: Form, node: Nodes, length: float) -> tuple[np.ndarray, np.nd
     bumps = Bumps.of(t, length)
     of_terms = -summed(bumps.slope, momentum) - summed(bumps.phi, force)
     of_terms = of_terms * weights[: terms.count]
-    lost = summed(bumps.phi, form.friction.residuals(v).swapaxes(1, 2))
+    lost = summed(bumps.phi, form.friction.residuals(v, u).swapaxes(1, 2))
     rows = [of_terms @ form.basis, lost * weights[terms.count :]]
     if form.num_inputs:
         push = -summed(bumps.phi, u[:, None])
