@@ -132,7 +132,7 @@ def in_words(recording: Recording, best: CalibratedLaw, findings: Findings) -> L
             *findings.messages,
             *(f"{flaw}: {remedy}" for flaw, remedy in flaws.items()),
             *about_parameters(recording, law.powers, fit.structure.most_functions),
-            *(() if law.terms.driven else _not_seen(gains)),
+            *(() if law.terms.driven or np.any(law.friction.loaded) else _not_seen(gains)),
             *_leading(law.terms.leaders, recording.coordinates),
         ),
         steps=findings.steps,

@@ -106,7 +106,8 @@ def traces_of(recording: Recording, fit: LawFit, law: Lagrangian) -> tuple[Trace
         t, y, x = arcs.t[k, :n], arcs.y[k, :n] + nodes[i].zero, fit.fitted.x[k, :n]
         q, v = x[:, :d] + fit.zeros, x[:, d:]
         own = law.at(stretch.args)
-        rate = own.power(q, v)[0][:, : law.friction.count + (law.uniform != 0)]
+        read = stretch.u[nodes[i].at[a:b]]
+        rate = own.power(q, v, read)[0][:, : law.friction.count + (law.uniform != 0)]
         lost = 0.5 * np.diff(t)[:, None] * (rate[1:] + rate[:-1])
         u = acting[k, : n - 1]
         supplied = u * (np.diff(q, axis=0) @ law.gains)
@@ -121,7 +122,7 @@ def traces_of(recording: Recording, fit: LawFit, law: Lagrangian) -> tuple[Trace
                 y / factors,
                 (y - left[k, :n]) / factors,
                 fit.fitted.residuals[k, :n],
-                stretch.u[nodes[i].at[a:b]],
+                read,
                 own.energy(q, v),
                 _summed(lost),
                 _summed(supplied),
