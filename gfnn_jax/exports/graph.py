@@ -198,8 +198,8 @@ def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
     own, dim = law.friction, law.dim
     if np.any(own.loaded):
         raise InputError(
-            "this law has friction by the size of an input, which has no series where that is 0, and "
-            "is in no format of a law yet: forecast it here (gfnn predict)"
+            "this law has friction by the size of an input, which has no series where that is 0, "
+            "and is in no format of a law yet: forecast it here (gfnn predict)"
         )
     sharp = own.dry & (own.widths <= creep)
     kinked = np.isin(own.kinds, (QUADRATIC, ONE_SIDED, STRIBECK))
