@@ -286,7 +286,7 @@ def centre_of_forces(problem: ArcProblem) -> np.ndarray:
         for at, (i, j) in enumerate(planes):
 
             def across(x: np.ndarray, i: int = i, j: int = j) -> np.ndarray:
-                """Those factors of a vector (d,) that its product with x has in this plane."""
+                """Return the factors of a vector (d,) in the plane's part of its product with x."""
                 return np.outer(x[:, j], np.eye(d)[i]) - np.outer(x[:, i], np.eye(d)[j])
 
             spin = q[:, i] * v[:, j] - q[:, j] * v[:, i]
