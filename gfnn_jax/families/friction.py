@@ -225,7 +225,7 @@ class Friction:
         return self.dry & (self.widths == 0)
 
     def loads(self, u: Any) -> Any:
-        """What each term is multiplied by at inputs u (..., k): |u_j| (..., F) of friction by a
+        """Return the factor of each term at inputs u (..., k): |u_j| (..., F) of friction by a
         load, 1 of others; 1.0 where none has a load."""
         xp, loaded = namespace(self.kinds, u), self.loaded
         if np.size(u) == 0 or (namespace(loaded) is np and not np.any(loaded)):
