@@ -51,6 +51,7 @@ from gfnn_jax.models.lagrangians.friction_choice import (
 )
 from gfnn_jax.models.lagrangians.libraries import losses
 from gfnn_jax.models.lagrangians.structure import Loss
+from gfnn_jax.models.lagrangians.text import Names
 from gfnn_jax.phase_space import split
 
 
@@ -308,7 +309,8 @@ def kinds_of_friction(problem: LawProblem, law: FittedLaw, steps: Steps) -> Whic
         limits = {} if table is None else table.limits(taken)
     sharp = {(c, kind, 0.0): limit for (c, kind, _), limit in limits.items()}
     choice = FrictionChoice(taken, law.odds or {}, sharp, gains=False)
-    return choice.in_words(1.0, data.dim, [f"v{i + 1}" for i in range(data.dim)])
+    q, v = (tuple(f"{letter}{i + 1}" for i in range(data.dim)) for letter in "qv")
+    return choice.in_words(1.0, data.dim, Names(q, v))
 
 
 def _rows_of(family) -> tuple[Loss, ...]:
