@@ -456,7 +456,7 @@ def test_friction_by_a_load_that_is_given(tmp_path):
 def test_a_load_that_no_column_shows_is_asked_for():
     t = 0.1 * np.arange(200)
     recording = gfnn.Recording({"t": t, "x": np.cos(t)}, positions=["x"])
-    with pytest.raises(InputError, match="--inputs"):
+    with pytest.raises(InputError, match="the load: expected one, got none"):
         gfnn.fit(recording, model=gfnn.Lagrangian(friction="load-dependent"))
 
 
