@@ -22,6 +22,8 @@ from gfnn_jax.flows.legendre import family_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.given_terms import given_terms
+from gfnn_jax.models.lagrangians.recordings import samples_of
+from gfnn_jax.models.lagrangians.weak_form import centre_of_forces
 
 NOISE = 1e-3
 
@@ -107,6 +109,30 @@ def test_forces_through_a_point_that_is_not_the_origin(tmp_path):
         assert_allclose(force, acceleration(pivot + out, np.zeros(2)), atol=0.05)
     fit.save(tmp_path / "law")
     assert gfnn.load(tmp_path / "law").lagrangian == fit.lagrangian
+
+
+@pytest.mark.parametrize(
+    ("centre", "drag"), [([0.7, -0.4, 1.1], 0.05), ([-1.0, 0.5], 0.0), ([0, 0], 0)]
+)
+def test_the_point_about_which_forces_have_no_torque(centre, drag):
+    """A spring of rest length 1 from there, a uniform field and drag, in the plane or in space."""
+    field = np.array([0.2, -0.6, 0.3])[: len(centre)]
+
+    def acceleration(q, v):
+        out = q - np.array(centre)
+        r = np.sqrt(out @ out)
+        return -9 * (r - 1) * out / r + field - drag * v
+
+    begin = np.array([0.5, 0.9, -0.3])[: len(centre)] + centre
+    recording = recorded(acceleration, [*begin, *(0.8 * field)], 12)
+    assert_allclose(centre_of_forces(samples_of(recording).problem), centre, atol=0.02)
+    if len(centre) == 2 and any(centre):  # columns that show sums say nothing of a zero
+        (run,) = recording.runs
+        x, y = (recording.values(name, run) for name in ("x1", "x2"))
+        seen = {"t": recording.times(run), "a": x + y, "b": x - y}
+        shown = {"a": "x1 + x2", "b": "x1 - x2"}
+        mixed = gfnn.Recording(seen, observe=shown, coordinates=["x1", "x2"])
+        assert not centre_of_forces(samples_of(mixed).problem).any()
 
 
 def test_an_orbit_about_a_centre_that_nobody_gave():

@@ -218,7 +218,11 @@ def _scaled(row: Row, by: float) -> Row:
 def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
     """A line on the powers of the distance that follow a record as those of its law do; "" where
     there are none."""
-    squares, lines = " + ".join(f"{name}**2" for name in coordinates), []
+    from_there = (
+        f"({name} - {at:.4g})" if at > 0 else f"({name} + {-at:.4g})" if at < 0 else name
+        for name, at in zip(coordinates, fit.zeros, strict=True)
+    )
+    squares, lines = " + ".join(f"{name}**2" for name in from_there), []
     for own in _powers(fit):
         others = [a for a, other in _as_likely(fit, own).items() if other is not fit]
         if others:

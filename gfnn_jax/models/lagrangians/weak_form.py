@@ -266,14 +266,16 @@ def zeros_of_angles(
 
 
 def centre_of_forces(problem: ArcProblem) -> np.ndarray:
-    """The point c (d,) of lengths through which forces pass; 0 where there is none, or where it is
-    close to the origin.
+    """The point c (d,) of lengths through which forces pass; 0 where there is none, where it is
+    close to the origin, or where a column shows more than one of them, or a parameter its zero.
 
     About c the acceleration has no torque but that of a uniform field g and of drag:
     (q − c) × (q̈ − g + γ q̇) = 0, which is linear in c, g, γ and in products of these. The plainest
     choice of these is taken that leaves hardly any torque, else that by which c is known best.
     """
     d, period = problem.dim, problem.scales.period
+    if len(problem.observation.direct) < d:
+        return np.zeros(d)
     period = min(period, max(np.ptp(n.t) for n in problem.nodes) / OPTIONS.periods)
     planes, rows, targets, sizes = list(combinations(range(d), 2)), [], [], []
     middle, spread = (of(problem.states[:, :d], axis=0) for of in (np.mean, np.std))
