@@ -28,7 +28,7 @@ from scipy.linalg import solve_discrete_are
 import gfnn_jax as gfnn
 from gfnn_jax.maps.estimates import law_of, substeps_of
 from gfnn_jax.maps.inputs import Signals
-from gfnn_jax.maps.laws import law_of_map, map_of_law, smoothed
+from gfnn_jax.maps.laws import law_of_map, map_of_law
 
 RECORD = Path(__file__).with_name("robot_arm.csv")
 LENGTHS = np.array([0.2, 0.3])  # m
@@ -91,8 +91,10 @@ class Motor(NamedTuple):
 def motor(fit: gfnn.Fit, joint: int, h: float) -> Motor:
     """The motor at a joint of a learned law, its dry friction smoothed; the step is accurate for
     speeds of some 6 rad/s."""
-    law, own = smoothed(law_of_map(fit.map), WIDTH), law_of(fit.map)
-    law = dataclasses.replace(law, gains=law.gains[:, [joint]])
+    law, own = law_of_map(fit.map), law_of(fit.map)
+    widths = np.where(law.friction.dry, WIDTH, law.friction.widths)
+    friction = dataclasses.replace(law.friction, widths=widths)
+    law = dataclasses.replace(law, gains=law.gains[:, [joint]], friction=friction)
     others = len(own.p) - 4
     varied = NEAR * np.random.default_rng(3).normal(size=(SIDE, len(own.root))) @ own.root
     draws = varied[:, [*range(others), others + joint, others + 2 + joint]]

@@ -38,8 +38,8 @@ def check_forces(
     found: Identified, motion: Motion, inputs: Sequence[str], gains: np.ndarray, factor: float
 ) -> None:
     """Raise FitError where the law leaves most of a joint's forces unexplained, which parameters of
-    that joint alone explain, with what mends it; or where forces are far from ``factor`` = 1 times
-    those that the inertias of a CAD model need."""
+    that joint alone explain, with what mends it; where forces are far from ``factor`` = 1 times
+    those that the inertias of a CAD model need; or those of one joint from what the others need."""
     columns, given = found.columns, np.flatnonzero(motion.heard).tolist()
     names, k = np.array(columns.bodies.names), columns.bodies.dim
     known = np.flatnonzero(np.isfinite(motion.force[:, given]).all(axis=1))
@@ -99,11 +99,6 @@ def check_forces(
             else f"the forces are {sized}: currents, or other units? gfnn.Arm(…, gains=[…]), the "
             "force for a unit of each input"
         )
-    if not (far or poor.any()):
-        return
-    poor |= not poor.any()
-    said = f"the forces of {', '.join(names[given][poor])} do not go with the motion"
-    said += f", and are {sized}" if far else ""
     trials: list[tuple[list[int], int | None]] = [(order, j) for j in given if len(given) > 1]
     for i, j in combinations(given, 2):
         turned = [*order]
@@ -111,8 +106,15 @@ def check_forces(
         trials.append((turned, None))
     tried = [solved(given, of, free) for of, free in trials]
     worse = [float(np.max(rest / (alone + OPTIONS.mended))) for _, rest in tried]
-    if min(worse, default=np.inf) < 0.5 * np.max(together / (alone + OPTIONS.mended)):
-        best = int(np.argmin(worse))
+    best = int(np.argmin([*worse, np.inf]))
+    mends = min(worse, default=np.inf) < 0.5 * np.max(together / (alone + OPTIONS.mended))
+    odd = mends and trials[best][1] is not None and abs(np.log(abs(tried[best][0][-1])))
+    if not (far or poor.any() or odd > np.log(OPTIONS.units)):
+        return
+    poor |= not poor.any()
+    said = f"the forces of {', '.join(names[given][poor])} do not go with the motion"
+    said += f", and are {sized}" if far else ""
+    if mends:
         (of, free), (x, rest) = trials[best], tried[best]
         if free is None:
             listed = ", ".join(repr(inputs[i]) for i in of)
