@@ -50,6 +50,7 @@ def without(fit, *parts):
     return fit.pairs.take(np.array(rows))
 
 
+@pytest.mark.slow
 def test_the_coefficients_are_of_training_and_test_pairs(few):
     fit, _ = few
     assert fit.stated_by.endswith(
@@ -66,6 +67,7 @@ def test_the_coefficients_are_of_training_and_test_pairs(few):
     assert off < 1e-12 < 1e-10 < np.abs(found - alone).max()
 
 
+@pytest.mark.slow
 def test_the_stated_error_is_that_without_them(few):
     fit, fresh = few
     test = fit.test_pairs

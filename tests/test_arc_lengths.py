@@ -70,6 +70,7 @@ def pulls_of(found):
     return np.array([found.fit.values["term", wave] for wave in waves])
 
 
+@pytest.mark.slow
 def test_longer_arcs_tell_more_where_the_law_is_all_that_acts():
     found = searched(swung(0.0))
     assert found.shorter is None
@@ -97,6 +98,7 @@ def test_arcs_that_no_orbit_follows_are_not_taken(longest, followed):
     assert (longer is not None and longer.arcs.t.shape[1] > 40) == followed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "search", [pytest.param(search, marks=pytest.mark.slow), partial(fit_given, GIVEN, 1.0)]
 )

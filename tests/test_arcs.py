@@ -101,6 +101,7 @@ def test_arcs_tell_the_law_better_than_steps(monkeypatch):
 # A budget of operations.
 
 
+@pytest.mark.slow
 def test_a_counted_budget_ends_where_it_is_spent():
     pairs = sequences(0.3, 0.0)
     counted = Counted(np.inf)

@@ -101,6 +101,7 @@ def test_derivatives_in_the_coefficients_at_each_own_dt():
 # Irregular sampling.
 
 
+@pytest.mark.slow
 def test_irregular_sampling_serves_any_dt():
     law = given_terms(1, ["p**2/2 + q**2/2 + q**4/4"])
     rng = np.random.default_rng(0)
@@ -129,6 +130,7 @@ def test_a_gap_in_uniform_data_costs_a_pair_and_not_the_map():
 # Parameters.
 
 
+@pytest.mark.slow
 def test_a_law_is_read_with_its_parameter(learned):
     assert len(learned.hamiltonian.terms) == 2
     terms = {t.term: t.coefficient for t in learned.hamiltonian.terms}
@@ -237,6 +239,7 @@ def test_parameters_outside_the_data_are_a_status_of_their_lane(learned):
     assert info.left_at.tolist() == [-1, 0, -1]
 
 
+@pytest.mark.slow
 def test_a_length_is_found_from_an_orbit(learned):
     """Gauss–Newton on one number, by `jax.grad` through a rollout."""
     start, true = np.array([[0.5, 0.2]]), np.array([1.3])
@@ -286,6 +289,7 @@ def series():
     return gfnn.fit(pairs, family="polynomial", tolerance=1e-7)
 
 
+@pytest.mark.slow
 def test_a_series_in_state_and_parameter_steps_other_ones(series):
     assert series.met
     assert series.base_map  # an angle of 2.2
@@ -312,6 +316,7 @@ def test_a_series_is_differentiated_in_its_parameter(series):
     np.testing.assert_allclose(jax.jacfwd(step)(0.03), exact, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_series_with_a_parameter_is_saved_and_put_in_a_row(series, tmp_path):
     z, delta = np.array([[0.2, -0.1], [0.1, 0.3]]), {"delta": np.array([0.05, -0.02])}
     series.map.save(tmp_path / "model")
@@ -414,6 +419,7 @@ def write_csv(path, parameter=True):
     return rows
 
 
+@pytest.mark.slow
 def test_a_csv_with_uneven_times_and_a_column_more(tmp_path, capsys):
     rows = write_csv(tmp_path / "d.csv")
     data = read_trajectories(tmp_path / "d.csv")

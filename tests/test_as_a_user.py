@@ -24,6 +24,7 @@ def long_ones_slow(name):
     return name if name in SHORT else pytest.param(name, marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_a_user")
 @pytest.mark.parametrize("name", [long_ones_slow(name) for name in benchmark.CASES])
 def test_what_is_said_is_true(name):

@@ -118,6 +118,7 @@ def test_noise_leaves_the_six_terms_of_the_law(told_nothing):
     assert rms[100] < 6e-4
 
 
+@pytest.mark.slow
 def test_bands_hold_the_true_error_of_a_noisy_law(noisy):
     scene, fit = noisy
     z0 = np.asarray(gfnn.sample_test_states(scene, 30, jax.random.key(9)))
@@ -134,6 +135,7 @@ def test_bands_hold_the_true_error_of_a_noisy_law(noisy):
         assert np.median(band[:, step]) < 4 * np.sqrt(np.mean(error**2))
 
 
+@pytest.mark.slow
 def test_a_rollout_has_the_bands_of_its_samples(noisy):
     scene, fit = noisy
     z0 = np.asarray(gfnn.sample_test_states(scene, 3, jax.random.key(9)))
@@ -150,6 +152,7 @@ def test_a_rollout_has_the_bands_of_its_samples(noisy):
         fit.map.rollout(z0, 6, samples=8)
 
 
+@pytest.mark.slow
 def test_every_sample_is_a_symplectic_map_and_rolls_out_as_it(noisy):
     scene, fit = noisy
     z0 = np.asarray(gfnn.sample_test_states(scene, 3, jax.random.key(9)))
@@ -164,6 +167,7 @@ def test_every_sample_is_a_symplectic_map_and_rolls_out_as_it(noisy):
     np.testing.assert_array_equal(again, np.asarray(samples.params))
 
 
+@pytest.mark.slow
 def test_samples_roll_back_to_where_they_began(noisy):
     _, fit = noisy
     samples = fit.map.sample(jax.random.key(1), 3)
@@ -179,6 +183,7 @@ def test_samples_roll_back_to_where_they_began(noisy):
         samples.rollout(z, -2, inputs=np.ones((2, 1)))
 
 
+@pytest.mark.slow
 def test_a_law_of_uneven_times_knows_each_rows_own_step():
     """Of an oscillator, turned by h, noise σ leaves each of 2N numbers an error of σ√2, and a
     coefficient moves them by about h times the states: two thirds of a unit in the square."""
@@ -257,6 +262,7 @@ def test_horizon_is_the_first_step_beyond():
     np.testing.assert_array_equal(horizon(std, [0, 10, 20, 30], 1.5), [20, -1, 30])
 
 
+@pytest.mark.slow
 def test_predictions_hold_bands(noisy, tmp_path, monkeypatch):
     scene, fit = noisy
     fit.map.save(tmp_path / "model")

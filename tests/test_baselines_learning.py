@@ -59,6 +59,7 @@ def smaller(monkeypatch, name, recipe, **sizes):
     return METHODS[name]
 
 
+@pytest.mark.slow
 def test_ridges_of_large_states_start_finite(monkeypatch):
     """States in [0, 2π), as the standard map's, through all 24 layers."""
     method = smaller(monkeypatch, "p-sympnet", dataclasses.replace(RECIPE, epochs=1))
@@ -114,6 +115,7 @@ def test_every_method_ends_in_a_step(name, monkeypatch):
     assert np.max(np.abs(states[:, 1] - sequences.z[:3, 1])) < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "share"), [("hnn", 0.2), pytest.param("srnn-5", 0.1, marks=pytest.mark.slow)]
 )

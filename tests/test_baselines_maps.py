@@ -53,6 +53,7 @@ def test_gradients_with_respect_to_the_parameters(name):
     check_grads(lambda params: step(params, STATES[0]), (roughened(params),), 1, modes=("rev",))
 
 
+@pytest.mark.slow
 def test_la_module_by_module():
     """A state through the paper's shears one after another, written out (their eqs. of LA)."""
     params = roughened(la_init(KEY, 2, 3, 4))
@@ -132,6 +133,7 @@ def states_near(scene):
     return scene.sampling.start + 0.05 * np.random.default_rng(3).normal(size=(8, 4))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("step_of", "make"), [(leapfrog, henon_heiles), (tao, pcr3bp)])
 def test_integrators_are_of_second_order(step_of, make):
     """Check with the exact H that the error of a step falls eightfold at half the dt."""
@@ -157,6 +159,7 @@ def test_leapfrog_is_symplectic_and_reversible():
     np.testing.assert_allclose(returned, z, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_taos_step_is_symplectic_in_the_doubled_phase_space_only():
     """Check that the defect of the plain state is of order dt³, the copies' distance."""
     scene = pcr3bp()

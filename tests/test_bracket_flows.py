@@ -76,6 +76,7 @@ def wide(casimirs, number, lanes):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [1_000, pytest.param(10_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.slow) if n == "spins" else n for n in SYSTEMS]
@@ -110,6 +111,7 @@ def test_step(name, steps, tmp_path):
     assert str(again.bracket) == str(bracket)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["top", *(pytest.param(n, marks=pytest.mark.slow) for n in SYSTEMS)]
 )

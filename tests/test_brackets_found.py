@@ -130,6 +130,7 @@ def test_h_that_is_no_polynomial(term, slope):
     assert term in law.field.library.term_names
 
 
+@pytest.mark.slow
 def test_noisy_sequences():
     rng = np.random.default_rng(0)
     law, _ = learned(top, rng.normal(size=(6, 3)), dt=0.05, steps=300, noise=1e-3)
@@ -161,6 +162,7 @@ def damped_heavy(z):
     return heavy(z) - 0.05 * np.append(z[:3], np.zeros(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("field", "width"), [(damped_top, 3), pytest.param(damped_heavy, 6, marks=pytest.mark.slow)]
 )

@@ -296,6 +296,7 @@ SLOW = {  # much like those
 FITS = QUICK | SLOW
 
 
+@pytest.mark.slow
 @QUIETLY
 @pytest.mark.parametrize(
     "what", [*QUICK, *(pytest.param(what, marks=pytest.mark.slow) for what in SLOW)]
@@ -313,6 +314,7 @@ def test_without_a_budget_no_decision_looks_at_a_clock(what, monkeypatch):
     assert (one.ended, one.operations) == (other.ended, other.operations)
 
 
+@pytest.mark.slow
 @QUIETLY
 def test_a_bound_on_operations_puts_none_on_the_clock_unless_told():
     """Of a clock that jumps by hours, 120 s end a fit that is told nothing before any unit."""
@@ -353,6 +355,7 @@ def test_a_faster_clock_ends_at_an_earlier_unit_which_operations_reproduce(learn
     assert len(set(operations)) == len(operations)
 
 
+@pytest.mark.slow
 @QUIETLY
 def test_where_the_budget_does_not_pay_for_all_pairs_a_sample_is_fitted(monkeypatch):
     """The seconds and operations of the budget tell, not the clock."""

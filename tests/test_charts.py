@@ -80,6 +80,7 @@ def facts(chart):
     return jax.tree.map(np.asarray, all_about(chart, random_params(chart, z.shape[1] // 2), z))
 
 
+@pytest.mark.slow
 @EVERY
 def test_unrolled_step_is_symplectic_at_random_weights(chart):
     found = facts(chart)
@@ -165,6 +166,7 @@ def test_derivatives_of_step_and_rollout_in_state_and_parameters(chart):
     np.testing.assert_allclose((above - below) / (2 * step), forward, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_second_derivative_through_the_step():
     piece = random_piece(random_params(MIDPOINT), MIDPOINT)
 

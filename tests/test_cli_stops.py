@@ -215,6 +215,7 @@ def interrupt():
     raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_a_prediction_backwards_comes_back(model, tmp_path, capsys):
     assert predict(model, tmp_path / "there.npz", num_steps=40) == 0
     with np.load(tmp_path / "there.npz") as there:

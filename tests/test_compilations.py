@@ -17,6 +17,7 @@ def pairs(seed):
     return gfnn.Pairs(z, np.stack([z[:, 0] + 0.3 * p, p], axis=1), 0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("as_a_user")
 def test_a_fit_compiles_one_step_and_a_second_fit_nothing(compilations):
     jax.clear_caches()  # what a process begins with

@@ -37,6 +37,7 @@ def learned():
         return gfnn.fit(Pairs(z, damped_standard_map(z), 1.0), angles=(0,))
 
 
+@pytest.mark.slow
 def test_the_factor_and_the_drift_are_learned(learned):
     assert learned.met
     assert abs(learned.damping.factor - B) < 1e-12
@@ -79,6 +80,7 @@ def test_it_is_saved_and_loaded(learned, tmp_path):
     assert loaded.multiplier() == learned.map.multiplier()
 
 
+@pytest.mark.slow
 def test_oscillators_of_different_friction_keep_no_multiple_of_the_form():
     """Their determinant is the same everywhere, which would pass for one factor."""
     rates = np.array([0.1, 0.3])
@@ -116,6 +118,7 @@ def of_decay():
     return gfnn.fit(pairs_by(900, 0), angles=(0,), tolerance=1e-9)
 
 
+@pytest.mark.slow
 def test_a_factor_that_depends_on_a_parameter_is_learned(of_decay):
     assert of_decay.met
     given = np.array([0.07, 0.15, 0.28])
@@ -130,6 +133,7 @@ def test_a_factor_that_depends_on_a_parameter_is_learned(of_decay):
     assert of_decay.symplecticity_defect < 1e-14
 
 
+@pytest.mark.slow
 def test_a_map_of_such_a_factor_goes_back_and_is_saved(of_decay, tmp_path):
     test = pairs_by(200, 2)
     image = of_decay.map.step(test.z0, test.args)[0]
@@ -145,6 +149,7 @@ def test_a_map_of_such_a_factor_goes_back_and_is_saved(of_decay, tmp_path):
     assert abs(high - np.exp(-0.05)) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_factor_that_no_parameter_changes_is_one_number():
     """K is the parameter: b is the same for all, and told as one."""
     z, rng = states_of(900, 3), np.random.default_rng(4)
@@ -216,6 +221,7 @@ def test_a_rotation_number_is_the_golden_mean():
     assert found.error < 1e-10
 
 
+@pytest.mark.slow
 def test_a_periodic_orbit_closes_and_loses_area(learned):
     """(π, 2π) is a fixed point where the drift is 2π (1 − b)."""
     z = states_of(1_000, 3)

@@ -84,6 +84,7 @@ def test_identities_and_noise_that_are_none(given, message):
         in_rows(walks(*LENGTHS), **given)
 
 
+@pytest.mark.slow
 def test_a_permuted_fit_is_the_same_fit():
     rng = np.random.default_rng(0)
     states = np.zeros((20, 12, 2))
@@ -274,6 +275,7 @@ def test_the_stated_error_is_of_pairs_that_chose_nothing():
         assert one.chosen.validation_bound > one.chosen.validation_relative
 
 
+@pytest.mark.slow
 def test_a_short_orbit_is_learned_though_a_single_stretch_validates():
     """45 pairs of a hardening spring: no bound is known where four rows in a row choose."""
 

@@ -124,6 +124,7 @@ def refitted(group, pairs, held, fit):
     return help_refit(group.broadcast(), own, group)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learns", ["map", "hamiltonian"])
 def test_the_same_fit_of_any_number_of_processes(learns, fits, in_threads):
     _, held, fit = fits[learns]
@@ -297,6 +298,7 @@ def test_pairs_that_differ_in_dt_or_parameters_are_all_taken(of, options, in_thr
     assert errors[1] < 0.7 * errors[0]  # eight times the pairs: √8 at best
 
 
+@pytest.mark.slow
 def test_pairs_of_another_dt_are_left_out(in_threads):
     """As those across a gap, where nearly all are of one dt."""
     pairs = noisy(image)
@@ -313,6 +315,7 @@ def test_pairs_of_another_dt_are_left_out(in_threads):
     np.testing.assert_allclose(*(f.map.step(z)[0] for f in (again, other)), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_files_of_several_dt_are_all_taken(tmp_path):
     pairs = noisy(flow)
     for i, dt in enumerate((0.999 * DT, 1.001 * DT)):

@@ -183,6 +183,7 @@ def test_libraries_of_an_even_law_grow_past_odd_degrees():
 # A fit and its map.
 
 
+@pytest.mark.slow
 def test_a_driven_law_is_read_and_predicts_many_periods(learned):
     terms = {t.term: t.coefficient for t in learned.hamiltonian.terms}
     drive = f"cos(q1) cos({RATE!r}*t)"
@@ -200,6 +201,7 @@ def test_a_driven_law_is_read_and_predicts_many_periods(learned):
     np.testing.assert_allclose(energy, LAW.value(C, z, t0[:, None]), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_any_dt_and_lanes_in_parts(learned):
     z, t0 = states(6, seed=2)
     found, _ = learned.map.step(z, t0=t0, dt=1.7)
@@ -213,6 +215,7 @@ def test_any_dt_and_lanes_in_parts(learned):
     np.testing.assert_allclose(back[:, -1], z, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_the_stroboscopic_map_is_a_period_of_steps(learned, tmp_path):
     z, _ = states(5, seed=3)
     z = 0.7 * z
@@ -299,6 +302,7 @@ def test_pairs_are_a_pytree_with_their_time():
 # The scene, files and the command line.
 
 
+@pytest.mark.slow
 def test_the_scene_begins_at_any_time():
     scene = gfnn.scenes.driven_pendulum_phase(steps=8)
     key = jax.random.key(0)
@@ -355,6 +359,7 @@ def test_files_of_pairs_and_of_trajectories(tmp_path):
             read_trajectories(tmp_path / "b.npz")
 
 
+@pytest.mark.slow
 def test_fit_and_predict_on_the_command_line(tmp_path, capsys):
     rows, t0 = write_npz(tmp_path / "t.npz")
     terms = ["--angles", "0", "--terms", f"p**2; cos(q); cos(q)*cos({RATE!r}*t)"]

@@ -55,6 +55,7 @@ def gradients(num, seed):
     return w, np.stack([w[:, 0] + np.cos(2 * w[:, 0]), w[:, 1] ** 3], axis=1)
 
 
+@pytest.mark.slow
 def test_members_are_trained_as_they_are_alone():
     """With equal shares, as long as every step lowers the loss."""
     (w, target), held = gradients(90, 0), gradients(30, 1)
@@ -87,6 +88,7 @@ def test_members_are_trained_as_they_are_alone():
             assert ours.damping[i] == pytest.approx(its.damping)
 
 
+@pytest.mark.slow
 def test_shares_are_the_weights_of_the_pairs():
     """A pair of share 2 counts as one that is there twice; of share 0, as none."""
     (w, target), held = gradients(60, 0), gradients(30, 1)
@@ -105,6 +107,7 @@ def test_shares_are_the_weights_of_the_pairs():
     assert found.validation_rms == pytest.approx(other.validation_rms, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_map_is_the_mean(fit):
     piece, z = fit.map.pieces[0], states(5, 3)
     one = [
@@ -127,6 +130,7 @@ def test_samples_are_symplectic(fit):
     assert np.max(np.abs(energy[..., -1] - energy[..., 0])) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, pytest.param(1e-2, marks=pytest.mark.slow)])
 def test_bands_hold_the_true_error(fit, noise):
     if noise:

@@ -273,6 +273,7 @@ def with_length(kind):
     return map_, z, lengths
 
 
+@pytest.mark.slow
 @needs_cc
 @pytest.mark.parametrize(
     "kind",
@@ -309,6 +310,7 @@ def driven(kind):
     return dataclasses.replace(map_of(piece, z), parameters=most), z, times
 
 
+@pytest.mark.slow
 @needs_cc
 def test_c_of_a_driven_map(tmp_path):
     map_, z, times = driven("type 2")
@@ -346,6 +348,7 @@ def pushed(hold, delay=0.0, uniform=0.0):
     return map_of_law(law, z, 0.05, tolerance=1e-12, signals=signals), z
 
 
+@pytest.mark.slow
 @needs_cc
 @pytest.mark.parametrize(
     ("hold", "delay"),
@@ -382,6 +385,7 @@ def test_c_of_a_map_with_inputs(hold, delay, tmp_path):
     assert np.abs(np.asarray(expected) - map_.rollout(z[0], 30)[0]).max() > 0.1  # the force acts
 
 
+@pytest.mark.slow
 @needs_cc
 def test_c_of_laws_before_and_behind_a_generated_step(tmp_path):
     """Two flows in one file, in polar coordinates."""

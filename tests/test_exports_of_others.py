@@ -108,6 +108,7 @@ def test_names_with_commas_go_through_every_option():
     assert gfnn.Recording(table, positions=both).positions == ("Angle, Ch 1", "Current (A), Ch 2")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("head", "columns", "options"),
     [

@@ -92,6 +92,7 @@ def test_symmetries_of_polar_coordinates_have_polar_names():
     assert "translation of φ: p_φ conserved" in [text for text, _ in generators(2, (1,), names)]
 
 
+@pytest.mark.slow
 def test_panels_of_a_law_do_not_cover_each_other():
     fit = discovered()
     found = boxes(law_figure(fit.found, fit.seen))

@@ -36,6 +36,7 @@ def test_the_equations_of_a_membrane_are_found():
     assert float(second.split()[-1].rpartition("*")[0]) == pytest.approx(0.064, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_an_orbit_of_equal_springs_may_be_of_first_order():
     """q̇ = A q with six numbers, and springs with six: the same ellipse."""
     start = [1.0, 0.0, 0.3, 0.6]

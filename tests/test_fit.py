@@ -201,6 +201,7 @@ def test_too_many_degrees_of_freedom_for_so_few_pairs_are_answered_at_once():
 # The choice
 
 
+@pytest.mark.slow
 def test_the_choice_is_as_accurate_as_it_says(pendulum_fit):
     fit, z = pendulum_fit, disc(200, seed=3)
     assert fit.met
@@ -320,6 +321,7 @@ def test_what_is_found_on_the_way_is_handed_on(pendulum_fit):
     np.testing.assert_allclose(kept[-1][0].step(z)[0], fit.map.step(z)[0], rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_map_without_all_images_is_still_given(monkeypatch):
     """The most accurate there is, with a warning, even where no step could be judged."""
     from gfnn_jax.dataset import measured_error
@@ -408,6 +410,7 @@ def test_states_that_cover_the_torus_have_no_outside():
     assert fit.chosen.outside is None
 
 
+@pytest.mark.slow
 def test_a_degree_of_freedom_at_rest_does_no_harm():
     z = np.random.default_rng(0).uniform(-1, 1, (200, 2))
     q, p = z.T

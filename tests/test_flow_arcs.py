@@ -189,6 +189,7 @@ def spoilt():
     return rows, fit
 
 
+@pytest.mark.slow
 def test_gross_errors_among_pairs_do_not_spoil_the_law(spoilt):
     rows, fit = spoilt
     assert fit.num_pairs == 300 - len(rows)
@@ -206,6 +207,7 @@ def test_gross_errors_among_pairs_do_not_spoil_the_law(spoilt):
     assert sorted(named) == rows.tolist()
 
 
+@pytest.mark.slow
 def test_maps_are_drawn_of_an_s_of_sites():
     """Of kicked rotors in a ring, noise of 1e-3: coefficients within their deviations."""
     scene = gfnn.scenes.froeschle(20)

@@ -80,6 +80,7 @@ def test_the_flow_of_a_quadratic_hamiltonian_is_a_matrix():
     np.testing.assert_allclose(images_, Z @ matrix.T, atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("newton", [False, True])
 def test_inverse_and_defect(newton):
     learned = map_of(flow(newton=newton, substeps=2))
@@ -90,6 +91,7 @@ def test_inverse_and_defect(newton):
     assert learned.defect(Z).max() < 1e-13
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("newton", [False, True])
 def test_derivatives_in_everything_forward_and_reverse(newton):
     @jax.jit
@@ -123,6 +125,7 @@ def test_a_bad_lane_changes_no_other(newton):
     assert info.status[3] in (NOT_CONVERGED, NON_FINITE)
 
 
+@pytest.mark.slow
 def test_newton_solves_what_the_fixed_point_does_not():
     stiff = given_terms(1, ["p**2", "q**2"])
     z = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (4, 2)))

@@ -68,6 +68,7 @@ def exact(gamma, forced):
 DAMPED = exact(GAMMA, forced=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("newton", "substeps"), [(False, 1), (False, 3), (True, 2)])
 def test_uniform_friction_multiplies_the_form(newton, substeps):
     piece = flow(Uniform(H), np.append(C, GAMMA), substeps, newton)
@@ -113,6 +114,7 @@ def test_another_friction_compiles_nothing(compilations):
     assert found.count == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("newton", "substeps"), [(False, 3), (True, 1)])
 def test_friction_and_inputs_in_the_stages(newton, substeps):
     args, expected = INPUTS.reshape(12, -1), exact(GAMMA, forced=True)
@@ -124,6 +126,7 @@ def test_friction_and_inputs_in_the_stages(newton, substeps):
     assert map_.multiplier() is None
 
 
+@pytest.mark.slow
 def test_derivatives_in_everything():
     """Of NumPy's flow in the state and the params, of JAX's in the inputs."""
     args, fine = INPUTS.reshape(12, -1), Steps(6, 2)

@@ -53,6 +53,7 @@ def damped():
     return gfnn.fit(pairs, tolerance=1e-10, learn="hamiltonian")
 
 
+@pytest.mark.slow
 def test_uniform_friction_is_learned_with_h(damped, tmp_path):
     assert law_of(damped) == pytest.approx(HENON_HEILES, rel=1e-12)
     (rate,) = damped.hamiltonian.friction
@@ -69,6 +70,7 @@ def test_uniform_friction_is_learned_with_h(damped, tmp_path):
         damped.map.modified_hamiltonian(z)
 
 
+@pytest.mark.slow
 def test_a_damped_forecast_and_its_energy(damped):
     """1,000 steps against another integrator: the energy falls to e⁻⁵ of itself."""
     z = states(3, 2)
@@ -114,6 +116,7 @@ def test_a_system_that_keeps_its_energy_gets_no_friction(noise):
     assert fit.map.multiplier() == 1.0
 
 
+@pytest.mark.slow
 def test_quadratic_friction_is_told_from_pairs():
     """Exact where no speed turns; of the kinds not there an upper limit."""
     rng = np.random.default_rng(0)

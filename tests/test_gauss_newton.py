@@ -152,6 +152,7 @@ def test_terms_that_no_state_tells_apart_are_removed():
     assert found.candidate.validation_relative < 1e-14
 
 
+@pytest.mark.slow
 def test_a_pendulum_of_any_angle():
     """H is −cos q + ½p²: the angle enters by its cosine and sine."""
     family = given_terms(1, ["p**2", "cos(q)"])
@@ -203,6 +204,7 @@ def test_formulas():
     assert formula(()) == "0"
 
 
+@pytest.mark.slow
 def test_close_passages_do_not_hide_the_law():
     """Two bodies, e up to 0.98: a few passages at a fiftieth of the axis outweigh all quiet pairs,
     and no start resolves them."""

@@ -160,6 +160,7 @@ def test_what_cannot_be_told(told):
         read(told)
 
 
+@pytest.mark.slow
 def test_bounds_values_and_ties_of_coefficients():
     """Of L = ½ω² + 20 cos θ − 2 cos 2θ the wrong bound is held; the tie is right."""
     t = np.arange(0, 8, 0.05)

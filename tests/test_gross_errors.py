@@ -142,6 +142,7 @@ def test_without_a_budget_gross_errors_are_left_out(looked_for):
     assert again.operations == budget.operations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [0.9, 1.1])
 def test_where_the_budget_has_no_room_for_all_pairs_none_is_looked_at(part, spoilt, looked_for):
     """At a part of the operations, and of the seconds, that the residuals alone take; with a

@@ -89,6 +89,7 @@ def test_no_start_far_outside_is_ok(clean, factor):
     np.testing.assert_array_equal(lost, status > 1)
 
 
+@pytest.mark.slow
 def test_lanes_far_outside_change_no_bit_and_no_update_of_good_ones(clean):
     good = disc(20, 0.8, seed=2)
     alone, first = clean.rollout(good, 50)
@@ -136,6 +137,7 @@ def test_noise_of_a_tenth_is_fitted_not_refused():
 # Long times
 
 
+@pytest.mark.slow
 def test_standard_map_stays_on_its_curve_and_comes_back(exact):
     """Rounding does not add up: a plain sum would be 2e-12 away by then, and ten times the steps
     ten times as far."""
@@ -191,6 +193,7 @@ def test_midpoint_close_to_half_a_period_warns():
 # Chaos
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [0.9716, 2.0, 5.0])
 def test_chaotic_statistics_are_those_of_the_exact_map(exact, k):
     generated = dataclasses.replace(exact.pieces[0], params=np.float64(k))

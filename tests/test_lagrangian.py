@@ -133,6 +133,7 @@ def test_energy_changes_by_the_power_of_the_forces():
     np.testing.assert_allclose(rate, supplied.sum(-1) - lost.sum(-1), rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("xp", [np, jnp])
 def test_friction_is_the_gradient_of_its_potential(xp):
     """And its stiffness the Hessian, at rest too, where |v|³ has one."""
@@ -183,6 +184,7 @@ def test_terms_of_coordinates_that_are_led_act_on_these_alone(leaders):
     np.testing.assert_allclose(slope, by, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_bad_terms_are_refused():
     with pytest.raises(ValueError, match="two factors v"):
         Terms.of([((2, 1), (0, 0), (0, 0), 0.0)], 2)

@@ -42,6 +42,7 @@ def drawn(dim, num, family, params, dt):
     return gfnn.Pairs(z0, images(family, params, z0, dt, Steps(8, 2)).states, dt)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", ENDS)
 def test_a_sum_is_what_is_written_out(ends):
     dim, w = 6, RNG.normal(size=(2, 12))
@@ -164,6 +165,7 @@ def test_a_ring_of_many_sites(tmp_path):
     assert (np.asarray(fit.map.step(far)[1].status) == 1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", ["free", pytest.param("fixed", marks=pytest.mark.slow)])
 def test_the_ends_of_a_chain_and_a_term_that_a_user_knows(ends):
     pinned = Part(Terms(1, ("p1", "1/(1 + q1**2)"), ((2, 0), (0, 1))), Windows(ends, 0))
@@ -243,6 +245,7 @@ def test_bodies_in_space():
         np.testing.assert_allclose(values, values[:, :1] * np.ones(101), atol=1e-15, err_msg=name)
 
 
+@pytest.mark.slow
 def test_bodies_that_are_alike_share_their_coefficients():
     family, corners = body_terms(3, 2, (-1,), alike=True), 2 * np.pi / 3 * np.arange(3)
     around = np.stack([np.cos(corners), np.sin(corners)], axis=1).ravel()
@@ -359,6 +362,7 @@ def test_a_generated_step_without_matrices():
     assert (error < 1e-14).all()
 
 
+@pytest.mark.slow
 def test_where_the_fixed_point_diverges():
     """S of 1,000 sites at a long dt: its equation to roundoff, the inverse, NumPy's own solve; a
     lane that is not finite says so; no array of (2d)² numbers."""
@@ -573,6 +577,7 @@ def test_figures_show_each_panel_what_it_is_named(tmp_path):
     figures.save(figures.modes(times, z, off), tmp_path / "modes.png")
 
 
+@pytest.mark.slow
 def test_too_few_sites_or_pairs_are_refused():
     with pytest.raises(gfnn.FitError, match="at least 5 sites, got 2"):
         gfnn.fit(gfnn.Pairs(*(RNG.normal(size=(2, 20, 4))), 0.1), structure="ring")

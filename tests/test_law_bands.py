@@ -32,6 +32,7 @@ def covered(fit, recording, starts, ahead):
     return inside
 
 
+@pytest.mark.slow
 def test_a_fit_without_a_third_is_that_of_the_other_two():
     """One linear step against a fit of the arcs of the other thirds."""
     recording = chain(noise=2e-3, runs=3, end=4.0)

@@ -319,6 +319,7 @@ def test_wrong_values_are_left_out_of_a_fit_and_told():
             assert named in found.messages[0]
 
 
+@pytest.mark.slow
 def test_a_driven_mass_has_a_law_of_one_term():
     """ẍ = u − ẋ/2: no coefficient of L is free."""
     t = 0.02 * np.arange(1000)
@@ -427,6 +428,7 @@ def with_a_load(seed, rest):
     return recording, {term: c for term, c in truth.items() if c}
 
 
+@pytest.mark.slow
 def test_friction_by_a_load_that_is_given(tmp_path):
     """It is fitted, printed, read again, saved and forecast; formats that need its series refuse
     it."""
@@ -640,6 +642,7 @@ def test_friction_that_is_asked_for_and_is_there_needs_no_word(swing, recwarn):
     assert not [w for w in recwarn if "asked for" in str(w.message)]
 
 
+@pytest.mark.slow
 def test_linear_friction_of_one_mass_is_uniform(swing):
     """The map keeps a multiple of the symplectic form."""
     _, fit = swing
@@ -666,6 +669,7 @@ def test_uniform_friction_of_a_double_pendulum(tmp_path):
     np.testing.assert_array_equal(*values)
 
 
+@pytest.mark.slow
 def test_energy_that_no_input_explains_is_named():
     t, theta = pendulum(gamma=-0.03, end=25.0, amplitude=0.6)
     with pytest.warns(gfnn.FitWarning, match="gains energy that no input explains"):
@@ -861,6 +865,7 @@ def test_a_recording_is_run_from_file_to_forecasts(tmp_path, capsys):
     assert len(json.loads((out / "report.json").read_text(encoding="utf-8"))["forecasts"]) == 5
 
 
+@pytest.mark.slow
 def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     """ẍ = −9 x − 0.3 ẋ + 2 u, u held: a law that was found with u linear in between."""
     rng, dt = np.random.default_rng(2), 0.1
@@ -920,6 +925,7 @@ def test_an_input_that_was_not_named_is_told():
     assert not any("lamp" in line for line in fit.messages)
 
 
+@pytest.mark.slow
 def test_the_gain_of_a_band_limited_input_has_no_bias():
     """ẍ = −4 x − 0.2 ẋ + 3 u, driven for long: an error of u between samples is one of the gain."""
     t, rates = np.arange(0, 60, 0.1), np.array([0.7, 1.3, 2.1, 3.3])

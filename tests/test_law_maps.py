@@ -51,6 +51,7 @@ def forecast(z, input_at):
     return np.array(states)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hold", "input_at"),
     [
@@ -140,6 +141,7 @@ def test_the_law_beside_its_map(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_the_ledger_closes():
     """What is stored is what is supplied less what is lost, to the order of the steps."""
     found = ledger(MAP, Z[:4], STEPS, inputs=U)
@@ -149,6 +151,7 @@ def test_the_ledger_closes():
     assert np.abs(found.closure).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_uniform_friction_of_a_law_is_conformal():
     law = mechanics(ROWS, uniform=0.3)
     map_ = map_of_law(law, Z, DT)
@@ -310,6 +313,7 @@ def test_rollouts_with_events_that_end():
     np.testing.assert_array_equal(none[:, 0], z[:1])
 
 
+@pytest.mark.slow
 def test_bodies_that_stick_to_each_other():
     """Two bodies on springs with friction between them: lanes go on from their states as from their
     modes, and lose energy."""
@@ -345,6 +349,7 @@ def test_samples_of_a_law_that_sticks():
     np.testing.assert_array_equal(bands.std[1], 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "hold", ["hold", *(pytest.param(hold, marks=pytest.mark.slow) for hold in ("linear", "band"))]
 )

@@ -79,6 +79,7 @@ def test_numbers_that_their_errors_tell_apart_are_left_so():
     np.testing.assert_array_equal(found.numbers, p)
 
 
+@pytest.mark.slow
 def test_diffrax_takes_the_vector_field_of_a_law():
     rng = np.random.default_rng(0)
     z0 = rng.uniform(-1, 1, (60, 2))

@@ -52,6 +52,7 @@ def test_the_law_holds_where_no_pair_was(law, pairs):
     np.testing.assert_allclose(law.map.step(fresh.z0)[0], fresh.z1, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_h_can_be_evaluated_and_does_not_drift(law, pairs):
     q1, q2, p1, p2 = pairs.z0[:20].T
     energy = 0.5 * (q1**2 + q2**2 + p1**2 + p2**2) + q1**2 * q2 - q2**3 / 3
@@ -192,6 +193,7 @@ def test_a_law_that_misses_the_tolerance_is_the_best_there_is():
     assert repr(fit.map) == "SymplecticMap(Flow; cartesian, d = 1, dt = 0.2)"
 
 
+@pytest.mark.slow
 def test_noise_does_not_make_a_series_of_a_cosine():
     """A pendulum's pairs, whose angle nobody named: its polynomial of four terms leaves noise too,
     and is the longer description."""
@@ -258,6 +260,7 @@ def test_what_a_law_leaves_over_is_diagnosed():
     assert "differs between the sequences" in fit.ended
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_formula(tmp_path, capsys, pairs):
     data = tmp_path / "d.npz"
     np.savez(data, z0=pairs.z0, z1=pairs.z1, dt=0.5)
@@ -268,6 +271,7 @@ def test_the_command_prints_the_formula(tmp_path, capsys, pairs):
     assert command(*predict, "--out", tmp_path / "p.npz") == 0
 
 
+@pytest.mark.slow
 def test_single_precision_data_give_a_law_too(pairs):
     single = gfnn.Pairs(pairs.z0.astype("f4"), pairs.z1.astype("f4"), pairs.dt)
     fit = gfnn.fit(single, tolerance=1e-5)
@@ -293,6 +297,7 @@ def test_an_alias_is_named_and_the_map_is_had_in_time():
     assert fit.seconds < 20
 
 
+@pytest.mark.slow
 def test_a_law_is_made_a_map_at_another_time_step(law):
     fast = law.accelerate(dt=0.2, tolerance=1e-6, num_pairs=800)
     assert fast.chosen.learns == "map"

@@ -62,6 +62,7 @@ def test_derivatives():
     )
 
 
+@pytest.mark.slow
 def test_the_flow_obeys_the_equations_of_motion():
     """Positions and velocities by another integrator, from the accelerations of the law."""
     q, v, u = W[:, :2], W[:, 2:], np.linspace(-1, 1, 5)[:, None]

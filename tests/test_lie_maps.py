@@ -33,6 +33,7 @@ def flow_of(bracket, gradient, z, dt):
     return moved(lambda _, y: bracket.apply(y.T, gradient(y.T)).T, z, dt, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_mean_of_arc():
     """x = ∫ e^(sM) z ds, and its derivative, against a matrix exponential by JAX."""
     bracket, z, xi = gfnn.Bracket.se3(), RNG.normal(size=6), RNG.normal(size=6)
@@ -83,6 +84,7 @@ def test_substeps_follow_the_states():
     np.testing.assert_allclose(piece.image(z), reference, atol=3e-12)
 
 
+@pytest.mark.slow
 def test_map_without_a_law():
     """Euler's top over 0.3 by S of degree 8, and a kicked top, which no law has."""
     spin, z = gfnn.Bracket.so3(), RNG.normal(size=(900, 3))
@@ -118,6 +120,7 @@ def test_only_for_brackets_with_that_chart():
         lie_generated(lambda p, z: z[0], None, bracket, 0.1, np.ones(4))
 
 
+@pytest.mark.slow
 def test_fit_of_a_map_without_a_law(tmp_path):
     """Lotka–Volterra by S alone, through gfnn.fit; without a bracket it says what to type."""
     bracket, z = gfnn.Bracket.log([[0, -1], [1, 0]]), RNG.uniform(0.6, 1.6, (400, 2))

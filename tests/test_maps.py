@@ -26,6 +26,7 @@ ROTATING = map_of(
 )
 
 
+@pytest.mark.slow
 def test_one_state_and_a_batch_take_the_same_step():
     images, info = PENDULUM.step(Z)
     assert images.shape == (16, 2)
@@ -125,6 +126,7 @@ def steep(strength, w):
     return pendulum(strength, w)
 
 
+@pytest.mark.slow
 def test_defect_is_roundoff_and_shows_an_unfinished_solve(monkeypatch):
     assert PENDULUM.defect(Z).max() < 1e-13
     # Another function than that of other tests, so that nothing compiled before is used.
@@ -167,6 +169,7 @@ def test_affine_piece_and_its_inverse():
     assert (info.status == OK).all()
 
 
+@pytest.mark.slow
 def test_base_map_around_a_generated_piece():
     base = Affine(turn(1, 0.9), np.array([0.1, -0.2]), np.array([0.05, 0.0]))
     learned = map_of(PENDULUM.pieces[0], DATA, around=(base,))
@@ -197,6 +200,7 @@ class Scaling(Affine):
         return self.known
 
 
+@pytest.mark.slow
 def test_the_defect_is_that_of_the_multiplier():
     """q and 0.9 p: of the form it keeps 0.9 times; twice, 0.81 times; of no known multiple, NaN."""
 
@@ -222,6 +226,7 @@ def kepler_polar(strength, w):
     return 0.5 * (p_r**2 + (p_phi / r) ** 2) - strength / r
 
 
+@pytest.mark.slow
 def test_polar_coordinates_are_inside_only():
     """Kepler: angular momentum is conserved to roundoff because φ does not enter S."""
     rng = np.random.default_rng(1)
@@ -272,6 +277,7 @@ def test_map_passes_through_jit_and_vmap():
     np.testing.assert_array_equal(as_argument(PENDULUM, Z), expected)
 
 
+@pytest.mark.slow
 def test_gradients_in_the_state_the_parameters_and_the_map():
     def energy_after(map_, z):
         return pendulum(1.0, map_.step(z)[0])
@@ -290,6 +296,7 @@ def test_gradients_in_the_state_the_parameters_and_the_map():
     np.testing.assert_allclose(forward, by_state, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_float32_map_keeps_its_dtype():
     learned = jax.tree.map(lambda a: np.asarray(a, np.float32), ROTATING)
     images, info = learned.step(Z)

@@ -139,6 +139,7 @@ def test_a_map_is_not_overwritten_unasked(learned, tmp_path):
         learned.save(tmp_path / "model")
 
 
+@pytest.mark.slow
 def test_a_negative_number_of_steps_goes_back(learned):
     ahead, _ = learned.rollout(Z0[:3], 100)
     back, info = learned.rollout(np.asarray(ahead[:, -1]), -100, save_every=20)

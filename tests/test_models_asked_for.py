@@ -102,5 +102,6 @@ def test_an_option_belongs_to_one_model(data, options):
         gfnn.fit(data, **options)
 
 
+@pytest.mark.slow
 def test_the_type_that_is_promised():
     assert inspect.signature(gfnn.fit).return_annotation == "Fit"

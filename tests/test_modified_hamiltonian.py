@@ -83,6 +83,7 @@ def test_of_a_linear_map_it_is_the_logarithm(name):
         np.testing.assert_allclose(off, 0, atol=2e-13)
 
 
+@pytest.mark.slow
 def test_the_series_of_the_midpoint_rule():
     """Hairer, Lubich & Wanner, Geometric Numerical Integration, IX: H̃ = S − h²/24 S''(J∇S, J∇S) +
     O(h⁴)."""
@@ -110,6 +111,7 @@ def test_the_series_of_the_midpoint_rule():
     assert error.max() < 1e-9
 
 
+@pytest.mark.slow
 def test_turns_of_an_angle_change_nothing():
     coordinates = Coordinates("pendulum", angles=(0,))
     map_ = map_of(generated(pendulum, 1.0, MIDPOINT, 0.2), DATA, coordinates=coordinates)
@@ -122,6 +124,7 @@ def test_turns_of_an_angle_change_nothing():
     assert np.asarray(error).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_a_kicked_map_is_near_no_flow():
     map_ = map_of(generated(standard, 2.0, TYPE2, 1.0), DATA)
     value, error = map_.modified_hamiltonian(np.array([[0.3, 0.2], [np.nan, 0.0]]))
@@ -130,6 +133,7 @@ def test_a_kicked_map_is_near_no_flow():
     assert map_.modified_hamiltonian(Z[0]).error.shape == ()
 
 
+@pytest.mark.slow
 def test_the_error_is_that_of_a_known_flow():
     dt = 2.0
     map_ = map_of(generated(oscillator, exact_oscillator(dt), MIDPOINT, dt), DATA)

@@ -55,6 +55,7 @@ def ring():
     return gfnn.fit_monitors(recording, PLACES, [LENGTH, None], tolerance=1e-10)
 
 
+@pytest.mark.slow
 def test_two_monitors_across_a_drift_tell_momenta_and_their_scale(ring):
     first, second = read(5, 6, 1)
     recording = recorded(first, second)
@@ -80,6 +81,7 @@ def test_a_map_for_each_place_and_their_composition(ring):
     assert abs(float(np.asarray(ring.turn().dt)) - 1) < 1e-15
 
 
+@pytest.mark.slow
 def test_one_monitor_tells_momenta_but_for_their_scale(ring):
     """What the drift adds: S of positions alone fixes p by its mixed term, and is off by a
     factor."""

@@ -32,6 +32,7 @@ def fit():
     )
 
 
+@pytest.mark.slow
 def test_the_flow_of_the_network_is_that_of_the_pendulum(fit):
     """The midpoint rule alone errs by 1e-3 of the spread here: the flow has been fitted."""
     assert fit.met
@@ -77,6 +78,7 @@ def test_what_it_cannot_be_learned_from_is_refused():
         gfnn.fit(several, family="mlp", **options)
 
 
+@pytest.mark.slow
 def test_the_flow_in_numpy_is_that_of_the_step(fit):
     """By it the pairs are looked at for gross errors, where a network misses the tolerance."""
     z = states(20, 4)

@@ -71,6 +71,7 @@ def test_noise_of_sites_is_that_of_each_half(sigma):
         assert found.argmax() == np.argmax(sigma)
 
 
+@pytest.mark.slow
 def test_a_fit_with_a_structure_tells_the_noise():
     scene = froeschle(32)
     pairs = gfnn.sample_pairs(scene, 100, jax.random.key(0))

@@ -174,6 +174,7 @@ def test_derivatives_in_the_states_count_a_base_map():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
 @pytest.mark.parametrize("tolerance", [1e-5, 1e-12])
 def test_pairs_without_noise_are_fitted_as_measured(monkeypatch, tolerance):

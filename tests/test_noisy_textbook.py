@@ -117,6 +117,7 @@ def test_steps_with_a_constant_inside_have_its_derivative():
 # The search
 
 
+@pytest.mark.slow
 def test_matching_finds_the_terms_behind_noise():
     z, noise = noisy(radial_orbits(), 1e-3)
     weak = weak_gradients(list(z), 0.1, noise)
@@ -165,6 +166,7 @@ def hardening(z):
     return np.concatenate([z[..., :1] + z[..., :1] ** 3, z[..., 1:]], axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gradient", "true"),
     [

@@ -12,6 +12,7 @@ def disc(amplitude, t):
     return motion(lambda q, v: -q * (1 + v**2) / (1 + q**2), [amplitude, 0.0], t)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("amplitudes", "kind"), [((0.9,), "one"), ((0.9, 0.4), "identified")])
 def test_masses_of_one_coordinate_are_told_by_several_energies(amplitudes, kind):
     t, rng = np.linspace(0, 60, 800), np.random.default_rng(1)

@@ -44,6 +44,7 @@ def test_a_trap_whose_axes_are_not_coupled_has_its_law():
     assert kind == "uniform"
 
 
+@pytest.mark.slow
 def test_a_spring_that_goes_leaves_its_force_to_no_other_coordinate():
     """The mass and the spring of y are told only together: the fit without the spring is no fit."""
     trap = recorded(
@@ -60,6 +61,7 @@ def test_a_spring_that_goes_leaves_its_force_to_no_other_coordinate():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("eccentricity", "part"),
     [
@@ -99,6 +101,7 @@ def test_torsion_of_a_radian_is_no_series_of_cosines(periodic):
         assert terms == pytest.approx({"a_dot**2": 0.5, "a**2": -10.0}, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_two_pendulums_in_one_file_have_their_laws():
     both = recorded(
         lambda q, v: -np.array([1.0, 2.3]) * np.sin(q) - 0.01 * v,
@@ -146,6 +149,7 @@ def test_henon_and_heiles_potential_from_positions(start):
     assert len(found) == 6
 
 
+@pytest.mark.slow
 def test_a_quartic_spring_of_five_periods_is_seen():
     """Its own misfit is correlated over a third of a period; what it leaves over is not."""
     spring = recorded(lambda q, v: -q - 0.87 * q**3 - 0.01 * v, [0.65, 0], ["x"], 34.0, 431, 4e-6)
@@ -153,6 +157,7 @@ def test_a_quartic_spring_of_five_periods_is_seen():
     assert found["x**4"] == pytest.approx(-0.2175, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zero", [1.3, pytest.param(-2.0, marks=pytest.mark.slow)])
 def test_an_encoder_that_was_switched_on_anywhere(zero):
     """Of a pendulum: 2 cos(theta − zero), whichever of cos and sin has the smaller phase."""
@@ -190,6 +195,7 @@ def test_two_encoders_that_were_switched_on_anywhere():
     assert sizes == pytest.approx([0.25, 0.4, 0.5, 8.0, 20.0], rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_recording_of_too_few_samples_is_refused_by_their_number():
     spring = recorded(lambda q, v: -q - q**3 - 0.02 * v, [0.9, 0], ["x"], 68 * 1.9, 68)
     with pytest.raises(FitError, match=r"sample more often: it has about 2.\d samples in a period"):
@@ -263,6 +269,7 @@ def test_the_zero_of_an_angle_takes_the_place_of_its_sine():
     assert structure.may_have(("term", sine))  # without a zero nothing else tells it
 
 
+@pytest.mark.slow
 def test_an_angle_about_a_center_has_no_mass_of_its_own():
     """L = ½(r² θ̇² + ṙ²) + 9.8 r cos θ − 15 (r − 1)², whichever coordinate comes first."""
 

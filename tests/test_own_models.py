@@ -58,6 +58,7 @@ def test_a_family(pairs, fresh, tmp_path):
     assert np.ptp(states[:, :, 1], axis=0).max() < 1e-2
 
 
+@pytest.mark.slow
 def test_a_model_and_its_piece(pairs, fresh, tmp_path):
     fit = gfnn.fit(pairs, SCENE, model=own_module.Kicks(), tolerance=2e-2)
     assert fit.met
@@ -149,6 +150,7 @@ def test_a_term(tmp_path):
         gfnn.register_function(own_module.Wall())
 
 
+@pytest.mark.slow
 def test_a_term_of_a_recording(tmp_path):
     """The same particle, recorded: V = x²/2 + 4 wall(x), with friction."""
     t = 0.05 * np.arange(600)

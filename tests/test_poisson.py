@@ -114,6 +114,7 @@ def test_few_runs_with_noise_are_told_to_be_too_few(count):
     assert raised.value.verdict == f"no law: {named} not determine it"
 
 
+@pytest.mark.slow
 def test_exact_runs_that_are_too_few_to_bound_the_error_say_how_many_more_are_needed():
     starts = np.random.default_rng(0).normal(size=(6, 3))
     with pytest.warns(gfnn.FitWarning, match="too few to bound it") as told:
@@ -159,6 +160,7 @@ def test_one_noisy_orbit_of_two_populations(law, start, off):
         assert abs(value - law[name]) < 3 * std
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own", [0.002, 0.01])
 def test_prey_that_crowd_are_no_law_with_a_bracket(own):
     """A wound-in orbit fits arc by arc, but H drifts from arc to arc."""
@@ -271,6 +273,7 @@ def test_tops_whose_moment_differs_from_run_to_run(tmp_path, capsys):
         gfnn.fit(gfnn.Pairs(data.z0[:, :3], data.z1[:, :3], 0.2, {"m": two}, structure="poisson"))
 
 
+@pytest.mark.slow
 def test_a_gyroscope_on_the_command_line(tmp_path, capsys):
     data = gyroscope(tmp_path / "gyro.csv", 6)
     figure = str(tmp_path / "look.png")

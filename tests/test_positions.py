@@ -76,6 +76,7 @@ def test_the_standard_map_from_its_angle_alone(kind, request):
         assert learned.symplecticity_defect < 1e-14
 
 
+@pytest.mark.slow
 def test_a_lift_is_trusted(lifted):
     """Rollouts of lifted readings go on with their turns."""
     read = turns(50, 10, 2)
@@ -94,6 +95,7 @@ def test_momenta_are_the_maps_own(lifted):
     assert np.array_equal(one, z[0])
 
 
+@pytest.mark.slow
 def test_it_is_saved_and_loaded(wrapped, tmp_path):
     wrapped.map.save(tmp_path / "model")
     loaded = gfnn.load(tmp_path / "model").map
@@ -189,6 +191,7 @@ def test_a_ring_of_64_that_is_told_to_be_one():
     assert np.sqrt(np.mean(error**2)) < 1e-10
 
 
+@pytest.mark.slow
 def test_a_map_that_is_not_reversible_needs_an_s_without_symmetry():
     """S = ½ (Q − q)² + V(q) + 0.1 (Q − q)³, whose kicks differ from those of its inverse."""
     rng = np.random.default_rng(0)
@@ -293,6 +296,7 @@ def of_noisy():
     return gfnn.fit(recorded(read, ["theta"], ["theta"]), learn="map", tolerance=1e-2)
 
 
+@pytest.mark.slow
 def test_bands_of_forecasts_hold(of_noisy):
     """Of what is read, and, without the noise of a reading, of what is true."""
     (sigma,) = of_noisy.positions.noise
@@ -350,6 +354,7 @@ def test_a_state_is_estimated_from_all_readings_before_it(of_noisy):
         of_noisy.map.forecast(recording, 10.5)
 
 
+@pytest.mark.slow
 def test_samples_start_from_the_same_two_positions(of_noisy):
     """Each with the momentum of its own S; their spread is that of the coefficients."""
     read = turns(5, 8, 3)
@@ -363,6 +368,7 @@ def test_samples_start_from_the_same_two_positions(of_noisy):
     assert (off < 4 * std[:, 2:]).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_it_forecasts_the_same_when_loaded(of_noisy, tmp_path):
     of_noisy.map.save(tmp_path / "model")
     recording = recorded(noisy(turns(5, 10, 1), 1e-3, 5), ["theta"], ["theta"])
@@ -374,6 +380,7 @@ def test_it_forecasts_the_same_when_loaded(of_noisy, tmp_path):
     assert np.array_equal(ours.std["theta"], theirs.std["theta"])
 
 
+@pytest.mark.slow
 def test_a_forecast_is_compared_with_what_was_read(of_noisy, tmp_path):
     read = noisy(turns(20, 15, 1), 1e-3, 5)[..., 0]
     run, turn = np.indices(read.shape)
@@ -399,6 +406,7 @@ def test_a_forecast_is_compared_with_what_was_read(of_noisy, tmp_path):
 # The command line
 
 
+@pytest.mark.slow
 def test_positions_in_a_file_are_fitted_and_continued(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 

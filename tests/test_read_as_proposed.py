@@ -82,6 +82,7 @@ def options_named(path: Path):
             yield from re.findall(r"--([a-z][a-z-]+)", text)
 
 
+@pytest.mark.slow
 def test_every_option_that_a_message_names_is_a_keyword_of_python():
     package = Path(gfnn.__file__).parent
     known = {*ReadOptions.__annotations__, *OPTIONS, *inspect.signature(gfnn.read).parameters}

@@ -58,6 +58,7 @@ def test_a_recording_gives_its_law():
     assert abs(values[0, 0] - measured) < 0.03
 
 
+@pytest.mark.slow
 def test_gradients_pass_through_steps(example):
     _, names = example
     z = np.asarray(names["pairs"].z0[0])

@@ -67,6 +67,7 @@ def test_quadratic_friction_alone_has_no_damping_ratio():
     assert "depends on the amplitude" in quality.about
 
 
+@pytest.mark.slow
 def test_a_pendulum_slows_down_as_elliptic_integrals_say():
     from scipy.special import ellipk
 
@@ -118,6 +119,7 @@ class _Outline(HTMLParser):
         self.fetched += [v for k, v in attrs if k in fetching and not (v or "#").startswith("#")]
 
 
+@pytest.mark.slow
 def test_the_page_is_whole_small_and_needs_no_network():
     text = page(discovered())
     outline = _Outline()
@@ -130,6 +132,7 @@ def test_the_page_is_whole_small_and_needs_no_network():
     assert discovered().verdict.partition(":")[0] in text
 
 
+@pytest.mark.slow
 def test_the_simulation_begins_at_its_first_dot_and_names_the_columns():
     found = re.search("const shown = (.*);\n", page(discovered()))
     assert found is not None
@@ -167,6 +170,7 @@ def test_one_command_writes_the_report(tmp_path, monkeypatch, capsys):
     assert "gfnn swing.csv" in text
 
 
+@pytest.mark.slow
 def test_a_fit_forecasts_plots_and_shows_itself(tmp_path):
     fit = discovered()
     times = fit.learned_to + np.array([0.5, 1.0])
@@ -183,6 +187,7 @@ def test_a_fit_forecasts_plots_and_shows_itself(tmp_path):
     assert gfnn.load(tmp_path / "model").forecast(times, after=fit.seen).values["x"].shape == (1, 2)
 
 
+@pytest.mark.slow
 def test_the_page_of_pairs():
     scene = gfnn.scenes.make("standard-map-regular")
     pairs = gfnn.sample_pairs(scene, num_pairs=300, key=jax.random.key(0))
@@ -204,6 +209,7 @@ def test_a_wrong_keyword_is_named_with_the_nearest_right_one():
             call()
 
 
+@pytest.mark.slow
 def test_forecasts_are_in_the_degrees_of_the_file():
     t, x = swing(sigma=1e-3)
     table = {"t": t, "angle": 20 * x}

@@ -69,6 +69,7 @@ def test_bad_counts_are_refused(num_steps, save_every):
         OSCILLATOR.rollout(Z, num_steps, save_every=save_every)
 
 
+@pytest.mark.slow
 def test_blocks_are_the_whole_bit_for_bit():
     learned = map_of(generated(standard, KICK, TYPE2, 1.0), 3 * DISC, coordinates=TORUS)
     z = np.random.default_rng(1).uniform(-3, 3, (6, 2))
@@ -244,6 +245,7 @@ def test_plain_step_functions(compilations):
 # Derivatives.
 
 
+@pytest.mark.slow
 def test_initial_state_is_found_through_a_rollout():
     """A few Gauss–Newton steps on the last state of a rollout recover where it began."""
 

@@ -77,6 +77,7 @@ def test_every_reading_is_used_and_nodes_stand_between():
     np.testing.assert_allclose(found[3:-3, 1], omega[near][3:-3], atol=0.1)
 
 
+@pytest.mark.slow
 def test_a_law_of_random_times_and_missing_cells():
     rng = np.random.default_rng(3)
     t = np.sort(rng.uniform(0, 30, 500))
@@ -128,6 +129,7 @@ def test_a_gyroscope_alone(gyroscope):
 PHONE = {"y": "A*omega**2 + G*cos(theta)", "x": "A*theta_ddot + G*sin(theta)"}
 
 
+@pytest.mark.slow
 def test_an_accelerometer_alone(tmp_path):
     """Of unknown scale on the bob, where the axis across the rod shows friction alone."""
     rng, t = np.random.default_rng(6), np.arange(0, 16, 0.02)

@@ -123,6 +123,7 @@ def test_honest_pairs_are_all_kept(make):
     assert len(named(make())) == 0
 
 
+@pytest.mark.slow
 def test_a_jump_that_stays_is_no_gross_error_of_a_state():
     """Ten sequences are kicked once: the states before do not lead to those after."""
     states = henon_heiles(50)
@@ -144,6 +145,7 @@ def test_what_was_left_out_is_bridged():
         np.testing.assert_array_equal(arcs.states[n, measured], states[n, measured])
 
 
+@pytest.mark.slow
 def test_sequences_are_held_out_whole_where_pairs_were_left_out():
     states, _ = spoilt(henon_heiles(50), 0.05, "box")
     data = clean(identified(pairs_of(states)), Coordinates("cartesian"))[0].divided(0)

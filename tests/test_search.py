@@ -292,6 +292,7 @@ def test_nothing_is_foretold_from_two_sizes_or_a_stall():
         assert ";" not in found_in(Sweep(sizes), bound=1e-6).ended
 
 
+@pytest.mark.slow
 def test_what_the_spent_budget_cut_off_is_foretold():
     sweep = Sweep(geometric(1e-1, 1e-1, 9))
     found = found_in(sweep, bound=1e-7, budget=Budget(max_operations=4 * WORK))

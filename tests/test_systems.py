@@ -120,6 +120,7 @@ def test_a_law_of_one_system_has_plain_coefficients():
         np.testing.assert_allclose(together[k], own, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_family_of_systems_is_each_system_s_own():
     """Derivatives are those of JAX and of differences; the law comes back from its family."""
     family, params = family_of(LAW)
@@ -226,6 +227,7 @@ def of_lengths():
     return recording, gfnn.fit(recording)
 
 
+@pytest.mark.slow
 def test_pendulums_of_five_lengths_are_one_law(of_lengths):
     _, fit = of_lengths
     within(fit.lagrangian.terms, {"omega**2": 0.5, "cos(theta)/l": G})

@@ -236,6 +236,7 @@ def broken_kepler_pairs(count, broken):
     return pairs_of(gradient, ring(count))
 
 
+@pytest.mark.slow
 def test_a_softened_distance_is_found():
     found = read(searched(softened_pairs(300)))
     expected = {"p1²": 0.5, "p2²": 0.5, "1/sqrt(0.53 + q1**2 + q2**2)": -1.0}
@@ -254,6 +255,7 @@ def test_constants_inside_come_out_exactly():
     assert found == pytest.approx(expected, abs=1e-11)
 
 
+@pytest.mark.slow
 def test_exponentials_of_either_sign_are_a_hyperbolic_cosine():
     """½(p₁² + p₂²) + e^(q₁ − q₂) + e^(q₂ − q₁)."""
 
@@ -267,6 +269,7 @@ def test_exponentials_of_either_sign_are_a_hyperbolic_cosine():
     assert found == pytest.approx(expected, abs=1e-10)
 
 
+@pytest.mark.slow
 def test_a_mass_that_depends_on_the_distance_is_found_beside_a_pole():
     """Radial motion around a black hole (Schwarzschild), less a constant."""
 
@@ -283,6 +286,7 @@ def test_a_mass_that_depends_on_the_distance_is_found_beside_a_pole():
     assert found == pytest.approx(expected, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_centres_beside_the_origin_are_found_told_nothing():
     rng = np.random.default_rng(0)
     z0 = rng.uniform(-1, 1, (600, 4)) * [1.6, 1.6, 1, 1]
@@ -354,6 +358,7 @@ def test_noise_is_no_formula():
 # In a fit
 
 
+@pytest.mark.slow
 def test_friction_is_found_beside_a_law_of_physics():
     law, c = given_terms(1, ["p**2/2", "exp(-1.3*q)", "exp(-2.6*q)"]), [1.0, -2.0, 1.0, 0.08]
     rng = np.random.default_rng(0)
@@ -367,6 +372,7 @@ def test_friction_is_found_beside_a_law_of_physics():
     assert fit.friction.terms[0].coefficient == pytest.approx(0.08, abs=1e-10)
 
 
+@pytest.mark.slow
 def test_a_law_is_found_where_sums_with_spare_atoms_leave_roundoff_too():
     # Of these pairs every sum of five atoms that holds cos q leaves roundoff, and no fewer are met.
     pairs = gfnn.sample_pairs(pendulum(), 100, jax.random.key(29))

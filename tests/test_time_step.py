@@ -32,6 +32,7 @@ def learned():
     return gfnn.fit(sampled(1_000), learn="map", tolerance=1e-5)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_jax():
     rng = np.random.default_rng(0)
     w, dt = rng.uniform(-1, 1, (7, 4)), rng.uniform(0.1, 1, (7, 1))
@@ -72,6 +73,7 @@ def test_any_step_of_the_range(learned):
     assert learned.model_determinant_min > 0.5
 
 
+@pytest.mark.slow
 def test_a_step_that_was_not_sampled_has_a_status(learned):
     z = np.full((1, 2), 0.1)
     for dt, status in ((0.05, 1), (0.3, 0), (0.7, 1)):
@@ -79,6 +81,7 @@ def test_a_step_that_was_not_sampled_has_a_status(learned):
         assert learned.map.rollout(z, 3, dt=dt)[1].status.tolist() == [status]
 
 
+@pytest.mark.slow
 def test_a_step_after_another_is_within_the_range_of_both(learned):
     z = np.full((1, 2), 0.1)
     for dts, status in (((0.4, 0.5), 0), ((0.6, 0.7), 1)):
@@ -95,6 +98,7 @@ def test_the_derivative_in_dt_is_the_velocity(learned):
     np.testing.assert_allclose(velocity, [p, -2 * np.sin(q)], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_saved_and_predicted_at_any_dt(learned, tmp_path, capsys):
     learned.map.save(tmp_path / "m")
     z, dt = sampled(3, seed=2).z0, np.array([0.2, 0.3, 0.5])
@@ -121,6 +125,7 @@ def test_saved_and_predicted_at_any_dt(learned, tmp_path, capsys):
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_bands_of_samples(learned):
     """Check bands at every dt, for S of few and noisy pairs."""
     pairs = sampled(300, seed=3)

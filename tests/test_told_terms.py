@@ -118,6 +118,7 @@ def test_what_is_exact_comes_out_exact_and_a_term_that_is_missing_is_found():
     assert found == pytest.approx({"q1**4": 0.1, "q1**2": 0.5, "q1 p1": 0.05}, abs=1e-10)
 
 
+@pytest.mark.slow
 def test_a_wrong_value_is_no_identified_law():
     """The stated error is that of the law that is given back, refits of parts of the pairs too."""
     known, model = pairs(0.0), gfnn.Hamiltonian(terms={"q1**4": 0.05, "q1**2": None})
@@ -128,6 +129,7 @@ def test_a_wrong_value_is_no_identified_law():
     assert fit.chosen.validation_rms > 0.2 * np.sqrt(np.mean(off**2))
 
 
+@pytest.mark.slow
 def test_a_term_that_would_be_dropped_stays_at_its_bound():
     assert coefficients(learn_hamiltonian(problem_of({}, noise=0.05)))[2] == 0
     law = learn_hamiltonian(problem_of({"q1*p1": "q1*p1 >= 0.2"}, noise=0.05))

@@ -62,6 +62,7 @@ def test_flow_agrees_with_another_solver(name):
         np.testing.assert_allclose(z[lane, -1], other.y[:, -1], atol=3e-13, rtol=0)
 
 
+@pytest.mark.slow
 def test_the_stroboscopic_map_agrees_with_another_solver_and_starts_at_time_0_every_time():
     scene = scenes.driven_pendulum(periods=3)
     z0 = draws.sample_states(scene, 3, jax.random.key(9))
@@ -105,6 +106,7 @@ def returned(z):
     return next(x for t, x in zip(*found.t_events, *found.y_events, strict=True) if t > 1)[[1, 3]]
 
 
+@pytest.mark.slow
 def test_the_return_map():
     """Check against an event of another solver; a fixed point; area; orbits without return."""
     scene = scenes.henon_heiles_section()
@@ -191,6 +193,7 @@ def test_a_collision_is_nan_and_leaves_the_others_alone():
     np.testing.assert_array_equal(z[:2], alone[:2])
 
 
+@pytest.mark.slow
 def test_time_dependent_hamiltonian():
     """Forced oscillator q'' = −q + cos 2t from rest: q = (cos t − cos 2t)/3."""
 
@@ -226,6 +229,7 @@ def test_pairs_are_the_same_bits_for_the_same_seed_and_conserve_the_invariants(n
         assert np.ptp(start) > 1e-4 or np.abs(start).max() < 1e-15
 
 
+@pytest.mark.slow
 def test_a_scene_with_a_parameter():
     """Check that each length conserves its energy; pairs at random times are those of the flow."""
     scene, key = scenes.pendulum_length(), jax.random.key(3)

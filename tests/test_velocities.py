@@ -27,6 +27,7 @@ def fit(table):
     return gfnn.fit(gfnn.Recording(table), terms=["V: cos(theta)", "R: omega**2"])
 
 
+@pytest.mark.slow
 def test_an_honest_velocity_is_used(record):
     both, alone = fit(record), fit({"t": record["t"], "theta": record["theta"]})
     of = both.velocities["omega"]
@@ -94,6 +95,7 @@ def test_velocities_make_up_for_positions_that_noise_hides(driven_round):
         assert abs(found[name].coefficient - true) < 4 * found[name].std, fit.formula
 
 
+@pytest.mark.slow
 def test_a_file_without_the_velocity_is_forecast_all_the_same(record, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     columns = [record["t"], np.degrees(record["theta"]), np.degrees(record["omega"])]

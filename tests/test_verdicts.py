@@ -225,6 +225,7 @@ def test_motion_that_does_not_come_back_is_free_or_falls(power, force):
     assert found == pytest.approx({"v1**2": 0.5} | force, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_fit_of_pairs_can_be_pickled():
     scene = gfnn.scenes.henon_heiles(energy=1 / 12)
     pairs = gfnn.sample_pairs(scene, num_pairs=400, key=jax.random.key(0))

@@ -47,6 +47,7 @@ def within_errors(formula, exact, scale=1.0):
         assert abs(term.coefficient - scale * value) <= 4 * term.std + 1e-12, term
 
 
+@pytest.mark.slow
 def test_a_spherical_pendulum_is_a_law_of_its_two_angles():
     def acceleration(q, v):
         sine, cosine = np.sin(q[0]), np.cos(q[0])
@@ -58,6 +59,7 @@ def test_a_spherical_pendulum_is_a_law_of_its_two_angles():
     assert fit.verdict == "identified"
 
 
+@pytest.mark.slow
 def test_a_body_in_a_bowl_has_the_inertia_of_its_surface():
     bend = np.array([0.4, 1.1])
 
@@ -72,6 +74,7 @@ def test_a_body_in_a_bowl_has_the_inertia_of_its_surface():
     within_errors(fit.lagrangian, exact, scale)
 
 
+@pytest.mark.slow
 def test_an_orbit_that_turns_has_two_powers_of_the_distance():
     def acceleration(q, v):
         r = np.hypot(*q)
@@ -85,6 +88,7 @@ def test_an_orbit_that_turns_has_two_powers_of_the_distance():
     assert abs(terms[distance**-2].coefficient + 0.04) < 4 * terms[distance**-2].std
 
 
+@pytest.mark.slow
 def test_forces_through_a_point_that_is_not_the_origin(tmp_path):
     """An elastic pendulum on a video, whose pivot nobody gave: V = 12 (r − 1)² + 9.8 y."""
     pivot = np.array([2.3, -1.1])
@@ -135,6 +139,7 @@ def test_the_point_about_which_forces_have_no_torque(centre, drag):
         assert not centre_of_forces(samples_of(mixed).problem).any()
 
 
+@pytest.mark.slow
 def test_an_orbit_about_a_centre_that_nobody_gave():
     centre = np.array([-0.8, 0.4])
 
@@ -149,6 +154,7 @@ def test_an_orbit_about_a_centre_that_nobody_gave():
     assert_allclose([fit.zeros[name][0] for name in ("x1", "x2")], centre, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_wheel_with_a_motor_that_swings_has_its_torque():
     def acceleration(q, v):
         return -3.0 * np.sin(q) + 0.4 - 0.13 * v
@@ -184,11 +190,13 @@ def test_a_field_with_a_gradient_from_motion_that_drifts():
     within_errors(fit.lagrangian, {"v1**2": 0.5, "v2**2": 0.5, "v2*x1": 1.0, "v2*x1**2": 0.2})
 
 
+@pytest.mark.slow
 def test_two_wells_from_one_to_the_other():
     fit = gfnn.fit(recorded(lambda q, v: q - q**3 - 0.05 * v, [1.8, 0.0], 60))
     within_errors(fit.lagrangian, {"v1**2": 0.5, "x1**2": 0.5, "x1**4": -0.25})
 
 
+@pytest.mark.slow
 def test_a_bead_on_a_wire_has_a_mass_that_depends_on_its_place():
     """y = ½ x²: L = ½ (1 + x²) v² − ½ x²."""
 
@@ -212,6 +220,7 @@ def test_a_torsion_spring_between_pendulums_that_stay_within_a_turn():
     assert fit.map.coordinates.angles == ()
 
 
+@pytest.mark.slow
 def test_a_constant_torque_on_an_angle_that_turns_over():
     def acceleration(q, v):
         return 6.4 - 5.6 * np.sin(q) - 1.2 * v
@@ -272,6 +281,7 @@ def test_a_drive_that_nobody_recorded_is_found_named_and_forecast(tmp_path):
     assert np.abs(ahead.values["x"][0] - x[until:]).max() < 0.01
 
 
+@pytest.mark.slow
 def test_terms_with_inputs_move_by_the_compiled_law_as_by_the_lagrangian():
     """A support that moves and a magnet: ½v² − ½(x − u)² + i²/(0.4 + x); the oracle is SciPy."""
     given = given_terms(["V: (x - u)**2", "V: i**2/(0.4 + x)"], ["x"], ["v"], (), ["u", "i"])

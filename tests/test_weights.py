@@ -93,6 +93,7 @@ def test_rows_of_H_are_weighted():
     np.testing.assert_allclose(fit.standard_errors, errors, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learn", [pytest.param("map", marks=pytest.mark.slow), "hamiltonian"])
 def test_a_fit_that_is_told_is_nearly_that_of_the_quiet_half(learn):
     z = np.random.default_rng(1).uniform(-1, 1, (200, 2))

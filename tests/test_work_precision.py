@@ -42,6 +42,7 @@ def test_a_composition_has_its_order(name, order):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.5)
 
 
+@pytest.mark.slow
 def test_integrators_reach_the_reference_or_say_why_not():
     scene = gfnn.scenes.make("pcr3bp")
     z0 = gfnn.sample_test_states(scene, 3, jax.random.key(0))

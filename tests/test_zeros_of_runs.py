@@ -25,6 +25,7 @@ def fit():
     return gfnn.fit(swings(ZEROS), friction="linear")
 
 
+@pytest.mark.slow
 def test_zeros_of_runs_are_found_with_the_law(fit):
     wander = fit.map.sensors.wander
     assert wander is not None
