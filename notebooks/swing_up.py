@@ -39,7 +39,7 @@ FAR, EFFORT = (10.0, 10.0, 0.1, 0.1), 30.0  # of a regulator: of q², v² off th
 # Draws beside the mean in a plan, so many times as far from it; the weight of their distance² from
 # it ÷ sizes².
 SIDE, NEAR, STRAY = 4, 0.3, 100.0
-RHYTHMS, DRAWS, ENOUGH, PLANNED = (5.0, 6.0), 50, 0.95, 0.7  # rad/s; of `controller`
+RHYTHMS, DRAWS, ENOUGH, PLANNED = (4.0, 5.0, 6.0), 50, 0.95, 0.7  # rad/s; of `controller`
 WARM, MOST = 40, 100  # iterations by Gauss and Newton, then by the exact Hessian
 FEW, DAMPED = 12, 1.0  # of a plan that goes on from another: iterations, added to the Hessian
 Plant = Callable[[np.ndarray, np.ndarray], np.ndarray]  # x (n, 4) = (q, v), torques (n,) -> x

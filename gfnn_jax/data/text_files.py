@@ -51,7 +51,6 @@ class _Options:
 _OPTIONS = _Options()
 # What begins as dates and times of day do: 2024-05-01, 5/7/2021, 7.5.2021, 09:33:31.
 _DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}(\D|$)|\d{1,2}:\d{2}(:\d|$)")
-_DAY = 86_400.0
 # Names of the time between rows, and of its inverse, in what instruments write above a table.
 _STEP = re.compile(r"(?i)(sampl\w+ |horizontal )?(interval|increment|period)|xincr|delta ?t|dt")
 _RATE = re.compile(r"(?i)sampl\w+ (rate|frequency)")
@@ -341,7 +340,7 @@ class TextFile:
                 f"({reason})"
             )
         _, step, way = min(found, key=lambda one: one[0])
-        second = _DAY if step >= _OPTIONS.daily else 1.0
+        second = 24 * 3600.0 if step >= _OPTIONS.daily else 1.0
         unit = "s" if second == 1 else "d"
         self.units[self.times[0]] = unit
         self.notes += (

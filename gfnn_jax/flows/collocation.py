@@ -26,8 +26,6 @@ _SETTLED = 1e-12  # of it: what no longer shrinks below this is roundoff too
 _MOST, _SLOW, _FIRST = 60, 0.8, 4
 _MOST_NEWTON = 12
 _USUAL = 25  # iterations, where their number is not known yet
-# Of a derivative without matrices: Gauss–Newton steps need no more of it.
-_DERIVATIVE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -284,7 +282,8 @@ def _carried(family, params, inside, h, rule, args, along, before):
         new = explicit + apply_j(family.hessian_product(bends, before + h * turned))
         change = np.abs(new - slopes).max(initial=0.0)
         slopes = new
-        if not change > _DERIVATIVE * np.abs(new).max(initial=0.0):
+        # Gauss–Newton steps need no more of it.
+        if not change > 1e-6 * np.abs(new).max(initial=0.0):
             break
     moved = np.stack([_summed(rule.weights[None, :], of_term) for of_term in slopes])
     return np.moveaxis((before + h * moved)[:, 0], 0, -1)

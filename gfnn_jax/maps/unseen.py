@@ -97,10 +97,6 @@ def between_extremes(t: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
     return np.where(known, q - np.polyval(line, t), np.nan), float(line[0])
 
 
-# Squares of amplitudes by linear and by quadratic friction, of minus times in units of their lives.
-_SQUARES = np.exp, lambda time: 1 / (1 - time) ** 2
-
-
 def swung(t: np.ndarray, seen: np.ndarray, turns: bool) -> np.ndarray:
     """Swings (n,) that gates see cross their place at the times t (n,) where ``seen`` (n, k) is no
     NaN, positive at the first turn. They are as large as a pendulum's whose period T (1 + A²/16)
@@ -113,7 +109,9 @@ def swung(t: np.ndarray, seen: np.ndarray, turns: bool) -> np.ndarray:
         return np.full(len(t), np.nan)
     period = (at[2:] - at[:-2]) / (count[2:] - count[:-2])
     best, size, square, life = np.inf, 1.0, np.exp, np.inf
-    for of, tried in product(_SQUARES, count[-1] * np.geomspace(0.03, 3.0, 30)):
+    # By linear and by quadratic friction, of minus times in units of their lives.
+    squares = np.exp, lambda time: 1 / (1 - time) ** 2
+    for of, tried in product(squares, count[-1] * np.geomspace(0.03, 3.0, 30)):
         rows = np.stack([np.ones(len(period)), of(-count[1:-1] / tried)], axis=1)
         (least, more), *_ = np.linalg.lstsq(rows, period, rcond=None)
         left = np.sum((rows @ [least, more] - period) ** 2)

@@ -24,7 +24,6 @@ from gfnn_jax.models.lagrangians.text import Names, of_systems, terms_of
 from gfnn_jax.models.lagrangians.velocities import Velocity
 
 ONLY_TOGETHER = "only together"  # end of a line about coefficients that are identified as a sum
-_TOLD = 2  # rivals that the verdict lists
 _SHOWN = 3  # pairs of nearly collinear coefficients that are listed
 
 
@@ -167,7 +166,7 @@ class LearnedLaw:
         if self.rival:
             return f"one of several: {self.rival}"
         if rivals := [one.terms for one in self.rivals if one.leaves_open]:
-            told = ", or one ".join(rivals[:_TOLD])
+            told = ", or one ".join(rivals[:2])
             return f"one of several: a law {told} fits the record as well"
         together = [names for names in self.alike if names.endswith(ONLY_TOGETHER)]
         if together:

@@ -42,7 +42,6 @@ class Options:
 OPTIONS = Options()
 
 _HALF_TURN = np.pi  # moves of two lifts differ by whole turns
-_ONE_TURN = 2 * np.pi * (1 + 1e-3)  # a column that ranges over more is a lift
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +134,8 @@ def triples_of(recording: Recording, *, sites: bool = False) -> Triples:
             f"some are off by {off:.2g} s. A law takes uneven times: --learn lagrangian"
         )
     whole = np.concatenate([recording.array("positions", run) for run in recording.runs])
-    wrapped = bool(angles) and bool(np.nanmax(np.ptp(whole[:, angles], axis=0)) <= _ONE_TURN)
+    lifted = 2 * np.pi * (1 + 1e-3)  # a column that ranges over more is a lift
+    wrapped = bool(angles) and bool(np.nanmax(np.ptp(whole[:, angles], axis=0)) <= lifted)
     run, place = np.concatenate(runs), np.concatenate(places)
     found = Triples(q[:, 0], q[:, 1], q[:, 2], run, place, dt, angles, wrapped)
     return _lifted(found, sites) if wrapped else found
