@@ -91,6 +91,7 @@ def test_bad_usage_is_one_line(tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_which_scenes_are_separable():
     assert separable(scenes.make("two-body"))
     assert separable(scenes.make("standard-map-regular"))

@@ -151,6 +151,7 @@ def test_a_plain_function_is_a_hamiltonian():
     np.testing.assert_allclose(one, other, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_energy_does_not_drift():
     learned = map_of(flow(stages=8))
     states, info = learned.rollout(Z[:4], 20_000, save_every=200)

@@ -44,6 +44,7 @@ def test_the_flow_of_the_network_is_that_of_the_pendulum(fit):
     assert np.sqrt(np.mean(error**2)) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_the_network_is_h_up_to_a_constant_and_holds_at_any_dt(fit):
     z = states(300, 2) * [1, 0.9]
     off = np.asarray(fit.map.hamiltonian(z)) - PENDULUM.value(TRUE, z)

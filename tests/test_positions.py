@@ -344,6 +344,7 @@ def test_latent_positions_of_a_ring_of_equal_sites():
     assert abs(found.coefficients[coupling] - 0.1) < 3 * std < 1e-3
 
 
+@pytest.mark.slow
 def test_a_state_is_estimated_from_all_readings_before_it(of_noisy):
     true = turns(300, 10, 1)
     recording = recorded(noisy(true, 1e-3, 51), ["theta"], ["theta"])

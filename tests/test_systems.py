@@ -237,6 +237,7 @@ def test_pendulums_of_five_lengths_are_one_law(of_lengths):
     assert fit.messages == ()
 
 
+@pytest.mark.slow
 def test_a_length_that_no_run_had_is_forecast_within_its_band(of_lengths, tmp_path):
     _, fit = of_lengths
     fit.map.save(tmp_path / "law")
