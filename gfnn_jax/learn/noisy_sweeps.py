@@ -10,6 +10,7 @@ every size on fresh pairs follows from one factor, as Mallows' C_p does (Technom
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -31,11 +32,13 @@ from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.models.generating_functions.map_arcs import LONGEST, NearestArcs
 from gfnn_jax.models.generating_functions.sweeps import (
+    FREE,
     SAMPLE_ROWS,
     Factors,
     LinearSweep,
     Size,
     part_of_noise,
+    quiet,
 )
 from gfnn_jax.models.hamiltonians.search import preferred
 from gfnn_jax.search.search import GAINED, Entry
@@ -84,23 +87,34 @@ def without_bias(found: Searched, request: Request) -> Searched:
 
 
 def _as_far(found: Searched) -> list[Entry]:
-    """The best entry of every sweep that has come as far as the best one and can be corrected."""
-    best: dict[int, Entry] = {}
-    limit = found.found.ranking[0].candidate.validation_relative / GAINED
+    """The best entry of every sweep that has come as far as the best one and can be corrected.
+
+    All by their residuals: a search validates few by steps, whose errors are no measure of those
+    that were estimated where noise is nothing like the spread, as of a radial momentum.
+    """
+    best: dict[int, tuple[float, Entry]] = {}
+    limit = _estimated(found.found.ranking[0]) / GAINED
     for entry in found.found.entries:
-        error = entry.candidate.validation_relative
+        error = _estimated(entry)
         known = best.get(id(entry.sweep))
-        if error <= limit and (known is None or error < known.candidate.validation_relative):
-            best[id(entry.sweep)] = entry
+        if error <= limit and (known is None or error < known[0]):
+            best[id(entry.sweep)] = error, entry
     able = [
-        e
-        for e in best.values()
+        (error, e)
+        for error, e in best.values()
         if e.sweep.linear
         and isinstance(e.size.family, Products)
         and not e.sweep.data.varied
         and e.sweep.moved_by_states
     ]
-    return sorted(able, key=lambda e: e.candidate.validation_relative)[:_MOST_SWEEPS]
+    return [e for _, e in sorted(able, key=lambda known: known[0])[:_MOST_SWEEPS]]
+
+
+def _estimated(entry: Entry) -> float:
+    """The error that the held-out residuals of ∇S tell; of a network the validated one."""
+    if not entry.sweep.linear:
+        return entry.candidate.validation_relative
+    return entry.sweep.estimate(entry.size, FREE, quiet).validation_relative
 
 
 class Expected(NamedTuple):
@@ -145,25 +159,33 @@ def best_size(sweep: LinearSweep, near: Size, most: Size, budget: Budget, on_pro
 def _corrected(rivals: list[Entry], request: Request) -> Entry:
     """The entry of smallest expected error, or the cheapest that is as good."""
     given = request.budget, request.watch.on_progress
-    most = [entry.sweep.largest_known for entry in rivals]
-    starts = [best_size(e.sweep, e.size, m, *given).size for e, m in zip(rivals, most, strict=True)]
-    # The same for all, so that their distances have one unit.
-    deviations = rivals[0].sweep.state_deviations(starts[0])
-    estimated: list[tuple[NoisySweep, Expected]] = []
-    for entry, start, m in zip(rivals, starts, most, strict=True):
-        sweep = NoisySweep(entry.sweep, entry.sweep, start, deviations)
-        estimated.append((sweep, best_size(sweep, start, m, *given)))
-    floor = min(expected.noise for _, expected in estimated)
-    risks = [max(expected.error - floor, expected.own) for _, expected in estimated]
-    sweep, expected = min(
+    estimated: list[tuple[NoisySweep, Expected, Size]] = []
+    deviations = None
+    for entry in rivals:
+        most = entry.sweep.largest_known
+        # Of much noise the measured points ask for more terms than any states near them follow.
+        for start in (best_size(entry.sweep, entry.size, most, *given).size, entry.size):
+            # The same for all, so that their distances have one unit.
+            unit = entry.sweep.state_deviations(start) if deviations is None else deviations
+            with contextlib.suppress(np.linalg.LinAlgError):
+                sweep = NoisySweep(entry.sweep, entry.sweep, start, unit)
+                estimated.append((sweep, best_size(sweep, start, most, *given), most))
+                deviations = unit
+                break
+    if deviations is None:
+        raise np.linalg.LinAlgError("expected a chart that is regular at all pairs")
+    floor = min(expected.noise for _, expected, _ in estimated)
+    risks = [max(expected.error - floor, expected.own) for _, expected, _ in estimated]
+    sweep, expected, most = min(
         (j for j, risk in zip(estimated, risks, strict=True) if risk <= _NO_WORSE * min(risks)),
         key=lambda j: j[1].size.operations,
     )
+    size = expected.size
     # Once more, by states that a corrected S has found: where an S of too many terms reaches beyond
     # the states, one pass is not enough.
-    size, m = expected.size, most[estimated.index((sweep, expected))]
-    sweep = NoisySweep(sweep.plain, sweep, size, deviations)
-    size = best_size(sweep, size, m, *given).size
+    with contextlib.suppress(np.linalg.LinAlgError):
+        again = NoisySweep(sweep.plain, sweep, size, deviations)
+        sweep, size = again, best_size(again, size, most, *given).size
     free = Budget()
     candidate = sweep.validate(
         size, sweep.estimate(size, free, request.watch.on_progress), free, request.watch.on_progress
