@@ -77,12 +77,17 @@ def covariance_root(law: FittedLaw, flows: Problem, data: Dataset, steps: Steps)
 
 def leaves_white(flow: Flow, data: Dataset) -> bool:
     """Return whether a law is right, as far as the pairs tell: no generator explains more than
-    chance of what its flow leaves over. False also where the pairs are too few for the test, for an
-    H over sites, and for pairs of many dt."""
+    chance of what its flow leaves over. False also where that is not known."""
+    return noise_left(flow, data) == 1.0
+
+
+def noise_left(flow: Flow, data: Dataset) -> float | None:
+    """The part of the mean square which the flow of a law leaves over that no generator explains.
+    None where the pairs are too few for the test, for an H over sites, and for pairs of many dt."""
     family = without_forces(flow.family)
     plain = isinstance(family, Terms) and data.own_dt is None and data.structure is None
     if not plain:
-        return False
+        return None
     rows = np.sort(data.training)[: OPTIONS.white_pairs]
     residual = data.y1[rows] - flow.image(data.y0[rows], data.given(rows)[1])
     known = np.isfinite(residual).all(axis=1)
@@ -93,7 +98,7 @@ def leaves_white(flow: Flow, data: Dataset) -> bool:
         states, functions = states_and_functions(data, rows)
         every = (multiplied(state, own) for own in functions[0] for state in states)
         generators = sorted(every, key=lambda family: family.num_parameters)
-    return residuals.unexplained(generators) == 1.0
+    return residuals.unexplained(generators)
 
 
 def _degree(family: Terms) -> int:

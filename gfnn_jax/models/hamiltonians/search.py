@@ -30,7 +30,7 @@ from gfnn_jax.fitting.linear_starts import backwards, tangent, turns
 from gfnn_jax.fitting.significance import ABOVE_NOISE, at_thresholds, terms_above_noise
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.rates import MOST_SUBSTEPS
-from gfnn_jax.models.hamiltonians.covariance import covariance_root, leaves_white
+from gfnn_jax.models.hamiltonians.covariance import covariance_root, noise_left
 from gfnn_jax.models.hamiltonians.dictionary import (
     law_of_noisy_pairs,
     law_of_physics,
@@ -195,14 +195,14 @@ def _simplified(
 
 
 def _leaves_noise(problem: LawProblem, law: FittedLaw) -> bool:
-    """Return whether the law leaves noise, and no more."""
+    """Return whether what the law leaves over is noise for the most part: a polynomial that is near
+    the law may leave some misfit too."""
     if problem.met_by(law) or law.error.relative <= problem.options.roundoff:
         return False
     data, fit = problem.data, law.fit
     steps = fit.steps.stages, fit.steps.substeps
-    return law.noisy or leaves_white(
-        Flow(law.family, fit.coefficients, data.dt, data.scale, *steps), data
-    )
+    flow = Flow(law.family, fit.coefficients, data.dt, data.scale, *steps)
+    return law.noisy or (noise_left(flow, data) or 0.0) > 0.5
 
 
 def _along_sequences(problem: LawProblem, best: FittedLaw) -> FittedLaw:
