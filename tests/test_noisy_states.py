@@ -211,3 +211,21 @@ def test_noisy_pairs_are_fitted_to_their_nearest_states(monkeypatch):
     corrected = error()
     monkeypatch.setattr(noisy_sweeps, "only_noise", lambda entry, found: False)
     assert corrected < 0.8 * error()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
+def test_noise_beyond_the_radial_speed_leaves_a_chart_that_is_corrected():
+    """In polar coordinates the noise is half of the radial momentum's spread: no states near the
+    measured ones follow an S of many terms, and errors of different coordinates do not compare."""
+    scene = gfnn.scenes.two_body()
+    clean, rng = gfnn.sample_pairs(scene, 1_000, jax.random.key(511)), np.random.default_rng(511)
+    z0, z1 = (
+        np.asarray(z) + 0.01 * np.std(clean.z0, axis=0) * rng.normal(size=z.shape)
+        for z in (clean.z0, clean.z1)
+    )
+    fit = gfnn.fit(gfnn.Pairs(z0, z1, scene.dt), scene, learn="map", max_seconds=None)
+    test = np.asarray(gfnn.sample_test_states(scene, 100, jax.random.key(7)))
+    true = np.asarray(gfnn.reference_trajectories(scene, test, 1))[:, 1]
+    error = np.asarray(fit.map.step(test)[0]) - true
+    assert np.sqrt(np.mean(error**2)) < 4e-3  # 7e-3 of the measured points

@@ -19,6 +19,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
 from gfnn_jax.budget import NETWORK, Budget
 from gfnn_jax.candidates.assemble import Candidate, validated
@@ -213,7 +214,9 @@ class EnsembleSweep(NetworkSweep):
         """(E, E): rootᵀ root is the covariance of the weights, the members' own times a factor.
 
         Where the held-out residuals of ∇S are larger than the members' spread, that part of them is
-        noise which polynomials leave too; the spread has it already. All else is misfit.
+        noise which polynomials leave too; the spread has it already, as well as few members tell
+        it: two deviations are to hold what as many of Student's distribution do. All else is
+        misfit, whose size the residuals tell.
         """
         (w, target), weight = rows_of(self.data, self.chart, self.data.validation)
         each = np.stack([size.family.gradient(only, w) for only in np.eye(len(self._params))])
@@ -222,6 +225,7 @@ class EnsembleSweep(NetworkSweep):
         ratio, noise = float(np.mean((left / spread) ** 2)), 0.0
         if ratio > 1:
             noise = min(1.0, trial_residual(self.data) ** 2 / float(np.mean(left**2)))
-        factor = np.sqrt(noise + (1 - noise) * _ALIKE * ratio)
         count = len(self._params)
+        of_few = float(stdtrit(count - 1, ndtr(2.0))) / 2.0
+        factor = np.sqrt(noise * of_few**2 + (1 - noise) * _ALIKE * ratio)
         return factor / np.sqrt(count - 1) * (np.eye(count) - 1 / count)
