@@ -9,7 +9,8 @@ one is ruled out:
 - *First order*: the velocities are functions of the positions.
 - *Impacts*: peaks of second differences as narrow as a few samples hold most of their squares.
 - *Self-excited*: polynomials of positions and velocities explain the accelerations, neither memory
-  nor a state that was not recorded does more, and friction is negative at rest in the middle.
+  nor a state that was not recorded does more, forces that the same motion backwards would have
+  leave much more, and friction is negative at rest in the middle.
 - *Memory*: plays between position and force leave much less of the accelerations than these
   polynomials, and than the same with as many of the past positions, as of a hidden coordinate.
 - *Unrecorded*: states that nearly coincide have accelerations that differ. What the nearest states
@@ -47,7 +48,8 @@ class NatureOptions:
     the share that these are at least, by the curves' own bias.
     excited: negative friction, in ω. turns: passages through the mean of what oscillates; lasts:
     ratio of its spreads, later and before, of what sustains itself. memory: share that plays
-    explain; gains, beats: of what polynomials and past positions leave, that they leave. near: rms
+    explain; gains, beats: of what polynomials and past positions leave, that they leave; and
+    of what forces without friction leave, that self-excitation does. near: rms
     distance of states, in standard deviations, from which that to none is extrapolated; differ:
     share that they determine, below which more acts. degree: of polynomials. samples: that are
     looked at. plays: widths, in amplitudes, and as many past positions within a period. blocks: of
@@ -147,10 +149,14 @@ def nature(
         return Nature(
             "no law",
             f"impacts: {100 * jumps:.0f} % of the squares of the accelerations are in peaks of a "
-            f"few samples, velocities jump, as at {when:.4g} s. Cut them off (--from, --to)",
+            f"few samples, velocities jump, as at {when:.4g} s. Cut them off (--from, --to), or, if "
+            "they are close passages, record these finer",
         )
     rate = _rate_at_rest(state, a / v.std(axis=0), state.shape[1] - v.shape[1] - u.shape[1])
     excited = plain > OPTIONS.mostly and rate > OPTIONS.excited * scales.omega and _lasts(found)
+    if excited:
+        places = np.concatenate([_variables(q, angles), u], axis=1)
+        excited = 1 - plain < OPTIONS.gains * (1 - _reversible(places, v, a, block))
     self_excited = Nature(
         "not mechanical",
         "self-excited: friction is negative where motion is slow, or small, "
@@ -294,6 +300,20 @@ def _best(
         for degree in range(1, OPTIONS.degree + 1)
     ]
     return max(0.0, *shares)
+
+
+def _reversible(x: np.ndarray, v: np.ndarray, target: np.ndarray, block: np.ndarray) -> float:
+    """The largest share that forces explain which are the same where motion goes backwards:
+    polynomials in columns x (n, k), of twice the degree, times none or two of the speeds v
+    (n, d)."""
+    even = np.delete(_products(v / v.std(axis=0), 2), range(1, v.shape[1] + 1), axis=1)
+    shares = [0.0]
+    for degree in range(1, 2 * OPTIONS.degree + 1):
+        rows = (_products(x, degree)[:, :, None] * even[:, None]).reshape(len(x), -1)
+        if rows.shape[1] > len(x) / OPTIONS.blocks:
+            break  # which would explain chance
+        shares.append(_explained(rows, target, block))
+    return max(shares)
 
 
 def _explained(rows: np.ndarray, target: np.ndarray, block: np.ndarray) -> float:
