@@ -268,3 +268,30 @@ def test_what_flies_by_is_not_self_excited():
         runs.append({"t": t, "x": x, "y": y})
     found = stretches(gfnn.Recording(runs, positions=["x", "y"]))
     assert "self-excited" not in nature(found, measure(found), ()).verdict
+
+
+@pytest.mark.parametrize("across", [0.5, 0.8])
+def test_an_orbit_is_not_self_excited(across):
+    """About a rod (log r): cubic polynomials told of negative friction at rest at its place."""
+    x = orbit(lambda _, z: [*z[2:], *(-z[:2] / (z[:2] @ z[:2]))], [1.3, 0.0, 0.0, across])[::4, :2]
+    columns = {"t": 0.08 * np.arange(len(x)), "x": x[:, 0], "y": x[:, 1]}
+    found = stretches(gfnn.Recording(columns, positions=["x", "y"]))
+    assert "self-excited" not in nature(found, measure(found), ()).verdict
+
+
+@pytest.mark.parametrize("way", [0.04, 0.25, 0.0])
+def test_friction_that_yields_before_it_slips_is_named(way):
+    """Dahl's, by a force that is recorded; dry friction, which slips at once, has no memory."""
+    t, rng = np.arange(700) * 0.14, np.random.default_rng(1)
+    u = np.repeat(rng.uniform(-1.5, 1.5, 35), 20)
+
+    def rates(s, z):
+        slips = z[2] if way else np.tanh(z[1] / 0.01)
+        yields = z[1] / way * (1 - z[2] * np.sign(z[1])) if way else 0.0
+        return [z[1], u[min(int(s / 0.14 + 1e-9), 699)] - z[0] - 0.2 * slips, yields]
+
+    steps = {"t_eval": t, "max_step": 0.14, "method": "LSODA", "rtol": 1e-8}
+    x = solve_ivp(rates, (0, t[-1]), [1.0, 0.0, 0.0], **steps).y[0] + 1e-3 * rng.normal(size=700)
+    table = gfnn.Recording({"t": t, "x": x, "u": u}, positions=["x"], inputs=["u"])
+    found = stretches(table)
+    assert ("memory" in nature(found, measure(found), ()).verdict) == (way > 0)

@@ -11,8 +11,9 @@ one is ruled out:
 - *Self-excited*: polynomials of positions and velocities explain the accelerations, neither memory
   nor a state that was not recorded does more, forces that the same motion backwards would have
   leave much more, and friction is negative at rest in the middle.
-- *Memory*: plays between position and force leave much less of the accelerations than these
-  polynomials, and than the same with as many of the past positions, as of a hidden coordinate.
+- *Memory*: forces that yield before they slip (Dahl, Trans. ASME 90 (1968) 158) leave much less of
+  the accelerations than these polynomials with dry friction, and than the same with as many of the
+  past positions, as of a hidden coordinate.
 - *Unrecorded*: states that nearly coincide have accelerations that differ. What the nearest states
   differ by is extrapolated to none between them (Stefánsson, Končar & Jones, Neural Comput. Appl. 5
   (1997) 131).
@@ -47,13 +48,13 @@ class NatureOptions:
     ``width`` samples. closed: squares of the accelerations that are left, in those of noise; bias:
     the share that these are at least, by the curves' own bias.
     excited: negative friction, in ω. turns: passages through the mean of what oscillates; lasts:
-    ratio of its spreads, later and before, of what sustains itself. memory: share that plays
-    explain; gains, beats: of what polynomials and past positions leave, that they leave; and
-    of what forces without friction leave, that self-excitation does. near: rms
-    distance of states, in standard deviations, from which that to none is extrapolated; differ:
-    share that they determine, below which more acts. degree: of polynomials. samples: that are
-    looked at. plays: widths, in amplitudes, and as many past positions within a period. blocks: of
-    ``parts`` of the record.
+    ratio of its spreads, later and before, of what sustains itself. memory: share that it
+    explains; gains, beats: of what polynomials and past positions leave, that they leave;
+    backwards: of what forces leave that are the same backwards, that self-excited motion does.
+    near: rms distance of states, in standard deviations, from which that to none is extrapolated;
+    differ: share that they determine, below which more acts. degree: of polynomials. samples: that
+    are looked at. slips: ways, in amplitudes, and as many past positions within a period. blocks:
+    of ``parts`` of the record.
     """
 
     still: float = 0.5
@@ -73,11 +74,12 @@ class NatureOptions:
     memory: float = 0.9
     gains: float = 0.5
     beats: float = 0.75
+    backwards: float = 0.2
     near: float = 0.2
     differ: float = 0.95
     degree: int = 3
     samples: int = 4_000
-    plays: tuple[float, ...] = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.6)
+    slips: tuple[float, ...] = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.45, 0.6)
     blocks: int = 4
     parts: int = 32
 
@@ -149,14 +151,14 @@ def nature(
         return Nature(
             "no law",
             f"impacts: {100 * jumps:.0f} % of the squares of the accelerations are in peaks of a "
-            f"few samples, velocities jump, as at {when:.4g} s. Cut them off (--from, --to), or, if "
-            "they are close passages, record these finer",
+            f"few samples, velocities jump, as at {when:.4g} s. Cut them off (--from, --to), or "
+            "record them finer where they are close passages",
         )
     rate = _rate_at_rest(state, a / v.std(axis=0), state.shape[1] - v.shape[1] - u.shape[1])
     excited = plain > OPTIONS.mostly and rate > OPTIONS.excited * scales.omega and _lasts(found)
     if excited:
         places = np.concatenate([_variables(q, angles), u], axis=1)
-        excited = 1 - plain < OPTIONS.gains * (1 - _reversible(places, v, a, block))
+        excited = 1 - plain < OPTIONS.backwards * (1 - _reversible(places, v, a, block))
     self_excited = Nature(
         "not mechanical",
         "self-excited: friction is negative where motion is slow, or small, "
@@ -171,17 +173,20 @@ def nature(
             "%, by a force that the terms tried lack: give terms that you know (--terms)",
         )
     period = scales.period * len(q) / sum(float(np.ptp(s.t)) for s in found)
+    dry = np.concatenate([np.sign(v), *(_shifted(u, k) for k in (-2, -1, 1, 2))], axis=1)
+    rubbed = max(plain, _best(state, a, block, dry))
     memory, past = (
-        max(plain, *(_best(state, a, block, columns[:, ::k]) for k in (1, 2, 4, 8)))
-        for columns in (_plays(q), _past(q, period))
+        max(rubbed, *(_best(state, a, block, np.hstack([dry, own[:, ::k]])) for k in (1, 2, 4, 8)))
+        for own in (_slips(q), _past(q, period))
     )
-    rivals = OPTIONS.gains * (1 - plain), OPTIONS.beats * (1 - past)
+    rivals = OPTIONS.gains * (1 - rubbed), OPTIONS.beats * (1 - past)
     if memory > OPTIONS.memory and 1 - memory < min(rivals):
         return Nature(
             "no law",
-            f"memory (hysteresis): positions and velocities explain {100 * plain:.3g} % of the "
-            f"accelerations, with past positions {100 * past:.3g} %, and with as many plays of "
-            f"them {100 * memory:.3g} %",
+            "memory (hysteresis, or friction that yields before it slips), which no term has: "
+            f"positions and velocities explain {100 * rubbed:.4g} % of the accelerations, with "
+            f"past positions {100 * past:.4g} %, and with as many forces that slip "
+            f"{100 * memory:.4g} %",
         )
     near, mostly = _of_near_states(state, a, period), plain > OPTIONS.mostly
     shares = (
@@ -395,21 +400,27 @@ def _of_near_states(x: np.ndarray, target: np.ndarray, period: float) -> float:
     return float(np.min(1 - np.maximum(at_none, 0.0) / target.var(axis=0)))
 
 
+def _shifted(x: np.ndarray, by: int) -> np.ndarray:
+    """Columns x (n, k), some samples later: accelerations are means over a few."""
+    return x[np.clip(np.arange(len(x)) + by, 0, len(x) - 1)]
+
+
 def _past(q: np.ndarray, period: float) -> np.ndarray:
-    """Past positions (n, d w), as many within a ``period`` of samples as there are plays."""
-    size, n = (q - q.mean(axis=0)) / q.std(axis=0), len(OPTIONS.plays)
+    """Past positions (n, d w), as many within a ``period`` of samples as there are slips."""
+    size, n = (q - q.mean(axis=0)) / q.std(axis=0), len(OPTIONS.slips)
     back = np.arange(len(q))[:, None] - np.round(np.arange(1, n + 1) * period / n).astype(int)
     return size[np.maximum(back, 0)].transpose(0, 2, 1).reshape(len(q), -1)
 
 
-def _plays(q: np.ndarray) -> np.ndarray:
-    """Positions behind plays of some widths, (n, d w)."""
+def _slips(q: np.ndarray) -> np.ndarray:
+    """Forces (n, d w) of unit size that yield over some ways before they slip."""
     columns = []
     for x in ((q - q.mean(axis=0)) / np.abs(q - q.mean(axis=0)).max(axis=0)).T:
-        for width in OPTIONS.plays:
-            p, last = np.empty_like(x), x[0]
-            for k, one in enumerate(x.tolist()):
-                last = min(max(last, one - width), one + width)
-                p[k] = last
-            columns.append(p)
+        steps = np.diff(x, prepend=x[0])
+        for way in OPTIONS.slips:
+            force, last = np.empty_like(x), 0.0
+            kept, sides = np.exp(-np.abs(steps) / way).tolist(), np.sign(steps).tolist()
+            for k, (keep, side) in enumerate(zip(kept, sides, strict=True)):
+                force[k] = last = side + (last - side) * keep
+            columns.append(force)
     return np.stack(columns, axis=1)
