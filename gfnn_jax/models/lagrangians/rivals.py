@@ -97,8 +97,12 @@ def with_likeliest_power(fit: LawFit) -> LawFit:
 
 def fading(direction: Sequence[int], problem: ArcProblem) -> float:
     """The speed, to two digits, over which Stribeck's friction fades where a search begins."""
-    middle = np.sqrt(np.prod(OPTIONS.fades))
-    return float(f"{middle * problem.scales.speed @ np.abs(direction):.2g}")
+    return float(f"{np.sqrt(np.prod(_fades(direction, problem))):.2g}")
+
+
+def _fades(direction: Sequence[int], problem: ArcProblem) -> np.ndarray:
+    """The least and the largest speed (2,) over which Stribeck's friction fades."""
+    return problem.scales.speed @ np.abs(direction) * np.array(OPTIONS.fades)
 
 
 def with_fading(fit: LawFit) -> LawFit:
@@ -120,7 +124,7 @@ def with_fading(fit: LawFit) -> LawFit:
             found = of(log)
             return found.fitted.cost if found.follows else np.inf
 
-        ends = np.log(row[2] / np.sqrt(np.prod(OPTIONS.fades))) + np.log(OPTIONS.fades)
+        ends = np.log(_fades(row[0], fit.problem))
         found: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 0.01})
         fit = of(found.x) if found.fun < fit.fitted.cost else fit
     return fit if fit is begun else fit.again()
