@@ -31,7 +31,7 @@ from gfnn_jax.dataset.stretches import (
     without_rests,
 )
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.families.lagrangian import INPUTS, Lagrangian, shape_of
+from gfnn_jax.families.lagrangian import INPUTS, Lagrangian
 from gfnn_jax.families.text import measured
 from gfnn_jax.fitting.evidence import Rival
 from gfnn_jax.flows.dormand_prince import WEIGHTS
@@ -71,7 +71,7 @@ from gfnn_jax.models.lagrangians.libraries import FRICTIONS, last_of_series, nam
 from gfnn_jax.models.lagrangians.nature import NO_COLUMN, Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions, parting
 from gfnn_jax.models.lagrangians.residuals import Trace
-from gfnn_jax.models.lagrangians.rivals import constant_of, of_a_sensor, other_powers
+from gfnn_jax.models.lagrangians.rivals import constant_of, constants, of_a_sensor, other_powers
 from gfnn_jax.models.lagrangians.search import (
     SearchResult,
     TermSearch,
@@ -450,13 +450,13 @@ def _options(friction: str) -> SearchOptions:
 def _with_constants(fit: LawFit) -> list[str]:
     """A message where a search has found numbers inside of shapes of the one coordinate."""
     some = fit.structure.terms if fit.structure.dim == 1 else ()
-    shapes = [row for row in some if shape_of(row) not in ("", *INPUTS)]
+    shapes = [row for row in some if constants(row)]
     if not shapes:
         return []
     constant, _, error = constant_of(fit)
     return [
         f"the number {measured(constant, abs(constant) * error)} inside "
-        f"{fit.problem.word(('term', shapes[0]))} is fitted too: standard errors of the other "
+        f"{fit.problem.word(('term', shapes[-1]))} is fitted too: standard errors of the other "
         "coefficients are with it as it is"
     ]
 

@@ -184,12 +184,11 @@ def with_constant(fit: LawFit, rescale: bool = True) -> LawFit:
 
 
 def constant_of(fit: LawFit) -> tuple[float, float, float]:
-    """The number inside the shapes of a law, 0 where there is none, its relative change that fits
-    best, and the standard error of that; NaN where the coefficients imitate it."""
+    """The number inside the last shape of a law, 0 where there is none, its relative change that
+    fits best, and the standard error of that; NaN where the coefficients imitate it."""
     d, changes, numbers = fit.structure.dim, {}, [0.0]
     for row in fit.structure.terms:
-        own = [leaf.value for leaf in leaves(tree_of(shape_of(row), d)) if _is_free(leaf)]
-        if own:
+        if own := constants(row):
             numbers = [*own, *numbers]
             more, less = (
                 tree_of(shape_of(_scaled(row, 1 + by)), d) for by in (OPTIONS.apart, -OPTIONS.apart)
@@ -199,6 +198,11 @@ def constant_of(fit: LawFit) -> tuple[float, float, float]:
     if not changes or not fit.follows:
         return numbers[0], 0.0, np.nan
     return numbers[0], *fit.along(changes, fit.structure.plus(list(changes)))
+
+
+def constants(row: Row) -> list[float]:
+    """The numbers inside the shape of a row that are not whole."""
+    return [leaf.value for leaf in leaves(tree_of(shape_of(row), len(row[0]))) if _is_free(leaf)]
 
 
 def _is_free(leaf: Expression) -> bool:
