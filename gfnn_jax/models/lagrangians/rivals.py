@@ -200,7 +200,7 @@ def constant_of(fit: LawFit) -> tuple[float, float, float]:
     return numbers[0], *fit.along(changes, fit.structure.plus(list(changes)))
 
 
-def constants(row: Row) -> list[float]:
+def constants(row: Row) -> list[Any]:
     """The numbers inside the shape of a row that are not whole."""
     return [leaf.value for leaf in leaves(tree_of(shape_of(row), len(row[0]))) if _is_free(leaf)]
 
