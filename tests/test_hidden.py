@@ -53,12 +53,15 @@ def test_hidden_coordinates_that_cannot_be_are_refused(options, hidden, message)
         gfnn.fit(recording, model=gfnn.Lagrangian(hidden=hidden))
 
 
-def test_sets_of_oscillations_differ():
-    t = 0.05 * np.arange(800)
-    found = oscillations(t, np.cos(1.7 * t) + 0.4 * np.sin(4.1 * t), 2)
-    pairs = [(a.omega, b.omega) for k, a in enumerate(found) for b in found[:k]]
-    assert pairs
-    assert not any(np.allclose(a, b, rtol=0.01) for a, b in pairs)
+def test_a_tone_of_stronger_oscillations_stands_behind_a_weaker_oscillation():
+    """2·3.5 − 4.4 = 2.6 is as large as powers of degree 4 make it; frequencies follow sizes."""
+    t = 0.02 * np.arange(1_800)
+    strong = np.exp(-0.02 * t) * np.cos(3.5 * t - 2.0 * np.exp(-0.04 * t))
+    y = strong + 0.5 * np.cos(4.4 * t) + 0.12 * np.cos(2.6 * t + 1) + 0.06 * np.cos(1.9 * t)
+    y += 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    first, second, *_ = oscillations(t, y, 3)
+    np.testing.assert_allclose(first.omega, [1.9, 3.5, 4.4], atol=0.05)
+    np.testing.assert_allclose(second.omega, [2.6, 3.5, 4.4], atol=0.05)
 
 
 @dataclasses.dataclass

@@ -3,30 +3,36 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.linalg import hankel
 
+from gfnn_jax.signals.splines import FEWEST, splines
 from gfnn_jax.signals.steps import dominant_frequencies
 
 
 @dataclasses.dataclass(frozen=True)
 class _Options:
-    """periods: of the slowest oscillation, in a window. fewest: samples of a window, for each
-    oscillation. peaks: of a spectrum that are tried. kept: sets that more is added to. steps: of a
-    window, from one to the next, where sets are compared; places: where states are told. apart:
-    ratio of neighbouring frequencies that a window tells from one whose size changes. beside:
-    ratios to the strongest, that a weak oscillation may have."""
+    """periods: of the slowest oscillation, and of the slowest beat, in a window. fewest: samples of
+    a window, for each oscillation. places: where states are told. dense, cells: values a period of
+    the fastest peak, and at the most, of which lines are made, and lines: of these. width: of an
+    oscillation, whose frequency follows its size, in 2π over the record. clear: standard errors,
+    and weak: size beside the strongest, of a line. imitated: size beside a stronger one, below
+    which a line may be its tone, or come of how its size changes. sets: that are told."""
 
     periods: float = 1.5
     fewest: int = 8
-    peaks: int = 4
-    kept: int = 3
-    steps: int = 4
     places: int = 64
-    apart: float = 1.15
-    beside: tuple[float, ...] = (0.5, 0.7, 1.4, 2.0, 0.85, 1.2)
+    dense: int = 10
+    cells: int = 400
+    lines: int = 12
+    width: float = 2.0
+    clear: float = 5.0
+    weak: float = 2e-3
+    imitated: float = 0.5
+    sets: int = 4
 
 
 _OPTIONS = _Options()
@@ -40,95 +46,105 @@ class Oscillations(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """Length of a window."""
-        return _OPTIONS.periods * 2 * np.pi / float(np.min(self.omega[self.omega > 0]))
-
-    @property
-    def are_apart(self) -> bool:
-        """Return whether a window tells each frequency from its neighbours."""
-        return bool(np.all(self.omega[1:] > _OPTIONS.apart * self.omega[:-1]))
+        """Length of a window, which tells each frequency from its neighbours."""
+        slowest = np.min(np.diff(self.omega), initial=float(np.min(self.omega[self.omega > 0])))
+        return _OPTIONS.periods * 2 * np.pi / float(slowest)
 
     def parts(self, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The parts (n, count) of y (n,) at times t (n,), and their rates of change; y may have
-        NaN."""
+        NaN. Within a window sizes are constant of one, and change evenly of several."""
         known = np.flatnonzero(np.isfinite(y))
-        _, at, _, c = self._fitted(t[known], y[known], _OPTIONS.places)
+        at, size, change = self._fitted(t[known], y[known])
         nearest = np.abs(t[:, None] - at).argmin(axis=1)
-        turned = np.exp(1j * self.omega * (t - at[nearest])[:, None])
-        z = (c[nearest, 0::2] + 1j * c[nearest, 1::2]) * turned
-        return z.real, (1j * self.omega * z).real
+        apart = (t - at[nearest])[:, None]
+        turned = np.exp(1j * self.omega * apart)
+        z = (size[nearest] + apart * change[nearest]) * turned
+        return z.real, (1j * self.omega * z + change[nearest] * turned).real
 
-    def left(self, t: np.ndarray, y: np.ndarray) -> float:
-        """Mean square of y (n,) that no windows' oscillations follow."""
-        Y, _, A, c = self._fitted(t, y, _OPTIONS.steps)
-        return float(np.mean((Y - np.einsum("nwi,ni->nw", A, c)) ** 2))
-
-    def _fitted(self, t: np.ndarray, y: np.ndarray, parts: int) -> tuple[np.ndarray, ...]:
-        """Windows of y (n, w), the times (n,) that they are about, the oscillations in them
-        (n, w, 2 count), and their sizes (n, 2 count)."""
+    def _fitted(self, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times (n,) that windows of y are about, the complex sizes (n, count) of the oscillations
+        in them, and how these change in a second."""
+        count, several = len(self.omega), len(self.omega) > 1
         step = np.ptp(t) / max(len(t) - 1, 1)
-        size = max(round(self.seconds / step), _OPTIONS.fewest * len(self.omega))
+        size = max(round(self.seconds / step), _OPTIONS.fewest * count)
         size = min(size, len(t))
-        begun = np.arange(0, len(t) - size + 1, max(1, size // parts))
+        begun = np.arange(0, len(t) - size + 1, max(1, size // _OPTIONS.places))
         index = begun[:, None] + np.arange(size)
         at = t[index].mean(axis=1)
-        turned = np.exp(1j * self.omega * (t[index] - at[:, None])[..., None])
-        A = np.stack([turned.real, -turned.imag], axis=-1).reshape(*index.shape, -1)
+        apart = (t[index] - at[:, None])[..., None]
+        turned = np.exp(1j * self.omega * apart)
+        if several:
+            turned = np.concatenate([turned, turned * apart / self.seconds], axis=-1)
+        A = np.concatenate([turned.real, -turned.imag], axis=-1)
         G = A.swapaxes(1, 2) @ A
         G += 1e-9 * size * np.eye(G.shape[1])
         c = np.linalg.solve(G, A.swapaxes(1, 2) @ y[index][..., None])[..., 0]
-        return y[index], at, A, c
+        z = c[:, : c.shape[1] // 2] + 1j * c[:, c.shape[1] // 2 :]
+        return at, z[:, :count], z[:, count:] / self.seconds if several else 0 * z
 
 
 def oscillations(t: np.ndarray, y: np.ndarray, count: int) -> list[Oscillations]:
-    """Sets of ``count`` oscillations of y (n,) at times t (n,), the one that follows best first;
-    none where it is shorter than a window.
+    """Sets of ``count`` oscillations of y (n,) at times t (n,), the likeliest first; none where it
+    has fewer.
 
-    Each is the last set with a peak of the spectrum of what that does not follow, and then the
-    frequencies that follow best. Behind them stand sets of the strongest one and one that is hidden
-    behind how its size changes.
+    They are of the strongest of its oscillations, first of those that no stronger ones make (tones
+    at ±a ± b ± c come of powers of degree 4), then each with a weaker one for its last.
     """
     known = np.isfinite(y)
-    if known.sum() < _OPTIONS.fewest * count:
+    if known.sum() < _OPTIONS.fewest * max(count, FEWEST):
         return []
-    t, y = t[known], y[known] - np.mean(y[known])
-    found = [Oscillations(np.zeros(0))]
-    for _ in range(count):
-        tried = []
-        for one in found:
-            rest = y - one.parts(t, y)[0].sum(axis=1) if len(one.omega) else y
-            for peak in dominant_frequencies([t], rest, _OPTIONS.peaks):
-                tried.append(_refined(t, y, np.append(one.omega, 2 * np.pi * peak)))
-        tried = [one for one in tried if one.are_apart]
-        tried = _unlike(sorted(tried, key=lambda one: one.left(t, y)))
-        if found and len(found[0].omega) == 1:
-            strongest = found[0].omega[0]
-            tried = tried[: _OPTIONS.kept - 1] + [
-                Oscillations(np.sort(strongest * np.array([1.0, ratio])))
-                for ratio in _OPTIONS.beside
-                if count == 2
-            ]
-            found = tried
-        else:
-            found = tried[: _OPTIONS.kept]
-    return found
+    lines, width = _lines(t[known], y[known] - np.mean(y[known]))
+    own, others = [], []
+    for size, omega in lines:
+        strong = [w for other, w in own if size < _OPTIONS.imitated * other]
+        tones = combinations_with_replacement([*strong, *(-w for w in strong)], 3)
+        side = any(abs(w - omega) < 2 * width for w in strong)
+        made = side or any(abs(sum(three) - omega) < width for three in tones)
+        (others if made else own).append((size, omega))
+    ranked = [omega for _, omega in (*own, *others)]
+    ends = ranked[count - 1 :][: _OPTIONS.sets]
+    return [Oscillations(np.sort([*ranked[: count - 1], end])) for end in ends]
 
 
-def _unlike(found: list[Oscillations]) -> list[Oscillations]:
-    """Sets of as many oscillations, each without those behind it that have its frequencies."""
-    kept: list[Oscillations] = []
-    for one in found:
-        if not any(np.allclose(one.omega, other.omega, rtol=0.01) for other in kept):
-            kept.append(one)
-    return kept
+def _lines(t: np.ndarray, y: np.ndarray) -> tuple[list[tuple[float, float]], float]:
+    """Sizes and angular frequencies of the oscillations of y (n,) at times t (n,), the strongest
+    first, and how far apart they are at the least.
 
-
-def _refined(t: np.ndarray, y: np.ndarray, omega: np.ndarray) -> Oscillations:
-    """The oscillations near these frequencies that follow best."""
-    found = minimize(
-        lambda logs: np.log(Oscillations(np.exp(logs)).left(t, y)),
-        np.log(omega),
-        method="Nelder-Mead",
-        options={"xatol": 1e-3, "fatol": 1e-3, "maxfev": 60},
-    )
-    return Oscillations(np.sort(np.exp(found.x)))
+    A matrix pencil of the Hankel matrix of even values (Hua and Sarkar 1990) has a line, which
+    grows or dies down, for each; or several side by side, where its frequency changes with its
+    size. Those are clear whose sizes are some standard errors.
+    """
+    peaks = dominant_frequencies([t], y, 4)
+    if not peaks:
+        return [], 0.0
+    step = 1 / (_OPTIONS.dense * max(peaks))
+    n = min(int(np.ptp(t) / step), _OPTIONS.cells)
+    if n < _OPTIONS.fewest:
+        return [], 0.0
+    even = t[0] + step * np.arange(n)
+    seen = t < even[-1] + step
+    t, y = t[seen], y[seen]
+    z = splines([(t, y[:, None])]).curve(t, y)(even)
+    vectors, *_ = np.linalg.svd(hankel(z[: n // 3], z[n // 3 - 1 :]))
+    vectors = vectors[:, : min(2 * _OPTIONS.lines, n // 6)]
+    turns = np.linalg.eigvals(np.linalg.lstsq(vectors[:-1], vectors[1:])[0])
+    rates = np.log(turns[turns.imag > 0]) / step
+    rates.real = rates.real.clip(-8 / np.ptp(t), 4 / np.ptp(t))
+    waves = np.exp((t - t[0])[:, None] * rates)
+    waves /= np.sqrt(np.mean(np.abs(waves) ** 2, axis=0))
+    A = np.concatenate([waves.real, -waves.imag], axis=1)
+    inverse = np.linalg.pinv(A.T @ A)
+    c = inverse @ (A.T @ y)
+    errors = np.sqrt(np.mean((y - A @ c) ** 2) * np.diag(inverse).reshape(2, -1).sum(axis=0))
+    size = np.hypot(*c.reshape(2, -1))
+    width = _OPTIONS.width * 2 * np.pi / np.ptp(t)
+    found: list[tuple[float, float]] = []
+    left = np.flatnonzero((size > _OPTIONS.clear * errors) & (size > _OPTIONS.weak * size.max()))
+    while len(left):
+        top = left[np.argmax(size[left])]
+        near = np.abs(rates.imag[left] - rates.imag[top]) < width
+        weight = size[left[near]] ** 2
+        omega = float(np.average(rates.imag[left[near]], weights=weight))
+        found.append((float(np.sqrt(weight.sum())), omega))
+        left = left[~near]
+    return sorted(found, reverse=True), width
