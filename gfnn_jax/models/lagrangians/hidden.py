@@ -210,8 +210,7 @@ def _along_short_arcs(problem: ArcProblem) -> Iterator[LawFit]:
     """The best starts along short arcs; again where a fit follows them, or has not converged."""
     fits = _of_pendulums(problem) if problem.angles else _of_modes(problem)
     for fit in sorted(fits, key=misfit)[: OPTIONS.finished]:
-        again = misfit(fit) < STARTS.followed or not fit.fitted.converged
-        yield fit.again() if again else fit
+        yield fit if misfit(fit) < STARTS.followed or fit.fitted.converged else fit.again()
 
 
 def _along_longer_arcs(fit: LawFit) -> LawFit:
@@ -262,12 +261,10 @@ def _of_modes(problem: ArcProblem) -> list[LawFit]:
     known |= {("loss", row): OPTIONS.damped * w for row, w in zip(friction[:d], omega, strict=True)}
     problem = _started(problem, np.eye(d))
     arcs, sigma = problem.arcs(problem.options.periods[0]), problem.scales.sigma
-    plain = problem.fit(linear, known, arcs, sigma)
-    if d > 2 and misfit(plain) > STARTS.followed:
-        return []
+    plain = problem.fit(linear, known, arcs, sigma, rescale=False)
     whole = dataclasses.replace(linear, terms=(*linear.terms, *powers), friction=friction)
     values = {**plain.values, **{("term", row): 0.5 for row in masses}}
-    rich = plain.again(whole, values)
+    rich = plain.again(whole, values, rescale=False)
     return [fit for fit in (rich, plain) if fit.follows][:1]
 
 
