@@ -50,6 +50,17 @@ def test_whitened_noise_is_white(rng):
     assert np.abs(noisier[0, 1] - white).max() > 0.1
 
 
+def test_innovations_whiten_as_the_matrix_does(rng):
+    t = np.sort(rng.uniform(0, 8, (3, 20)), axis=1)
+    noise, rows = rng.uniform(0.5, 2.0, (3, 20, 2)), rng.normal(size=(3, 20, 2, 4))
+    noise[1, 4:7, 0] = np.inf
+    matrix = WANDER.whitening(t, noise)
+    whitened, logs = WANDER.whitened(t, noise, rows)
+    np.testing.assert_allclose(whitened, np.einsum("akij,ajkw->aikw", matrix, rows), atol=1e-12)
+    diagonals = np.diagonal(matrix, axis1=2, axis2=3)
+    assert logs == pytest.approx(np.log(diagonals).sum(), abs=1e-10)
+
+
 def free_body(sigma, wander):
     """A law without forces, known exactly, q = q0 + v t; residuals of any size count in full."""
     law = mechanics([((2,), (0,), (0,), 0.0, 0.5)])

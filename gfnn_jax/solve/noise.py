@@ -116,6 +116,27 @@ class Wander:
         found = [dtrtri(root.T)[0].T for root in roots.reshape(-1, *roots.shape[2:])]
         return np.broadcast_to(np.reshape(found, roots.shape), whole)
 
+    def whitened(
+        self, t: np.ndarray, noise: np.ndarray, rows: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """L⁻¹ applied to rows (A, n, k, w), and the sum of the logarithms of its diagonals: by the
+        innovations of a Kalman filter of b, whose work grows as n."""
+        weight, out = 1 / noise, np.empty(rows.shape)
+        fade = np.exp(-np.abs(np.diff(t, axis=1, prepend=t[:, :1])) / self.time)[..., None]
+        known, variance = 0.0, self.size**2 * np.ones(weight[:, 0].shape)
+        logs = 0.0
+        for j in range(t.shape[1]):
+            known = fade[:, j, :, None] * known
+            variance = fade[:, j] ** 2 * (variance - self.size**2) + self.size**2
+            shown = weight[:, j] * variance
+            total = 1 + weight[:, j] * shown
+            missed = rows[:, j] - weight[:, j, :, None] * known
+            out[:, j] = missed / np.sqrt(total)[..., None]
+            known = known + (shown / total)[..., None] * missed
+            variance = variance - shown**2 / total
+            logs -= 0.5 * float(np.sum(np.log(total)))
+        return out, logs
+
     def latest(self, t: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Covariance (A, n, k) of each value, in units of its own noise, with b at the last time of
         its row, in units of its channel's."""

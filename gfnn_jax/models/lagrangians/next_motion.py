@@ -76,8 +76,10 @@ class Motion(NamedTuple):
 def next_motions(fit: LawFit, steered: Sequence[int] = ()) -> list[Motion]:
     """The best motions to record next, the best first; each of as many readings as an arc of the
     fit. steered: places of inputs that can be chosen; motions that they drive stay as near as other
-    starts."""
+    starts. None of modes, of which nobody can let go one."""
     structure, problem = fit.structure, fit.problem
+    if problem.observation.hidden is not None and not problem.angles:
+        return []
     own = [k for k, key in enumerate(structure.keys()) if key[0] != "sensor"]
     here = problem.linearised(structure, fit).among(own)
     if not here.columns.any():

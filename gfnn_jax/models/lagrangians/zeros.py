@@ -137,9 +137,8 @@ def wander_of(fit: LawFit) -> Wander | None:
 
     @cache
     def likelihood(size: float, periods: float) -> float:
-        white = Wander(size, periods * period).whitening(arcs.t, noise)
-        mixed = np.einsum("akij,ajkw->aikw", white, rows, optimize=True)
-        return _likelihood(mixed, m, free) + _log_diagonal(white)
+        mixed, logs = Wander(size, periods * period).whitened(arcs.t, noise, rows)
+        return _likelihood(mixed, m, free) + logs
 
     here, best = (1.0, 1.0), likelihood(1.0, 1.0)
     for step in OPTIONS.factors:
