@@ -32,7 +32,7 @@ class _Options:
     clear: float = 5.0
     weak: float = 2e-3
     imitated: float = 0.5
-    sets: int = 4
+    sets: int = 3
 
 
 _OPTIONS = _Options()

@@ -44,15 +44,14 @@ class HiddenOptions:
 
     periods: lengths of arcs, in periods of the slowest oscillation. degrees: of the powers of
     modes. couplings: squares of c in ½v² + c v w + ½w², of two pendulums, and sizes: of the hidden
-    swings, times those that are seen, that are tried. sets: of oscillations that are started from,
-    and finished: starts that are followed on. damped: of the critical friction, at the start.
+    swings, times those that are seen, that are tried. finished: starts that are followed on.
+    damped: of the critical friction, at the start.
     """
 
     periods: tuple[float, ...] = (0.75, 1.5, 3.0, 6.0, 12.0)
     degrees: tuple[int, ...] = (3, 4)
     couplings: tuple[float, ...] = (0.1, 0.3, 0.6, 0.85)
     sizes: tuple[float, ...] = (0.5, 1.0, 2.0)
-    sets: int = 3
     finished: int = 3
     damped: float = 0.003
 
@@ -175,7 +174,7 @@ def search_hidden(problem: ArcProblem) -> SearchResult:
     """
     longest = max(problem.nodes, key=lambda n: len(n.t))
     found: list[LawFit] = []
-    sets = oscillations(longest.t, longest.y[:, 0], problem.dim)[: OPTIONS.sets]
+    sets = oscillations(longest.t, longest.y[:, 0], problem.dim)
     for start in (fit for one in sets for fit in _along_short_arcs(_from(problem, one))):
         fit = _along_longer_arcs(start)
         problem.on_progress(f"from oscillations: {fit}")
@@ -207,7 +206,8 @@ def _sensor_of(problem: ArcProblem) -> Hidden:
 
 
 def _along_short_arcs(problem: ArcProblem) -> Iterator[LawFit]:
-    """The best starts along short arcs; again where a fit follows them, or has not converged."""
+    """The best starts along short arcs; again where a fit that does not follow them yet has not
+    converged. Longer arcs, which tell more, converge sooner."""
     fits = _of_pendulums(problem) if problem.angles else _of_modes(problem)
     for fit in sorted(fits, key=misfit)[: OPTIONS.finished]:
         yield fit if misfit(fit) < STARTS.followed or fit.fitted.converged else fit.again()
@@ -242,8 +242,7 @@ def _started(problem: ArcProblem, shapes: np.ndarray) -> ArcProblem:
 
 
 def _of_modes(problem: ArcProblem) -> list[LawFit]:
-    """Short arcs fitted by modes of small swings, and then with powers that couple them: of three
-    modes, which have many, where the modes alone follow."""
+    """Short arcs fitted by modes of small swings, and then with powers that couple them."""
     sensor, d = _sensor_of(problem), problem.dim
     none, omega = (0,) * d, sensor.omega
     masses = [(libraries.unit(d, i, i), none, none, 0.0) for i in range(d)]
