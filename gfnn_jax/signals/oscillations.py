@@ -15,8 +15,8 @@ from gfnn_jax.signals.steps import dominant_frequencies
 
 @dataclasses.dataclass(frozen=True)
 class _Options:
-    """periods: of the slowest oscillation, and of the slowest beat, in a window. fewest: samples of
-    a window, for each oscillation. places: where states are told. dense, cells: values a period of
+    """periods: of the slowest oscillation, in a window. fewest: samples of a window, for each
+    oscillation. places: where states are told. dense, cells: values a period of
     the fastest peak, and at the most, of which lines are made, and lines: of these. width: of an
     oscillation, whose frequency follows its size, in 2π over the record. clear: standard errors,
     and weak: size beside the strongest, of a line. imitated: size beside a stronger one, below
@@ -46,41 +46,34 @@ class Oscillations(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """Length of a window, which tells each frequency from its neighbours."""
-        slowest = np.min(np.diff(self.omega), initial=float(np.min(self.omega[self.omega > 0])))
-        return _OPTIONS.periods * 2 * np.pi / float(slowest)
+        """Length of a window."""
+        return _OPTIONS.periods * 2 * np.pi / float(np.min(self.omega[self.omega > 0]))
 
     def parts(self, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The parts (n, count) of y (n,) at times t (n,), and their rates of change; y may have
-        NaN. Within a window sizes are constant of one, and change evenly of several."""
+        NaN."""
         known = np.flatnonzero(np.isfinite(y))
-        at, size, change = self._fitted(t[known], y[known])
+        at, c = self._fitted(t[known], y[known])
         nearest = np.abs(t[:, None] - at).argmin(axis=1)
-        apart = (t - at[nearest])[:, None]
-        turned = np.exp(1j * self.omega * apart)
-        z = (size[nearest] + apart * change[nearest]) * turned
-        return z.real, (1j * self.omega * z + change[nearest] * turned).real
+        turned = np.exp(1j * self.omega * (t - at[nearest])[:, None])
+        z = (c[nearest, 0::2] + 1j * c[nearest, 1::2]) * turned
+        return z.real, (1j * self.omega * z).real
 
-    def _fitted(self, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Times (n,) that windows of y are about, the complex sizes (n, count) of the oscillations
-        in them, and how these change in a second."""
-        count, several = len(self.omega), len(self.omega) > 1
+    def _fitted(self, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Times (n,) that windows of y are about, and sizes (n, 2 count) of the oscillations in
+        them."""
         step = np.ptp(t) / max(len(t) - 1, 1)
-        size = max(round(self.seconds / step), _OPTIONS.fewest * count)
+        size = max(round(self.seconds / step), _OPTIONS.fewest * len(self.omega))
         size = min(size, len(t))
         begun = np.arange(0, len(t) - size + 1, max(1, size // _OPTIONS.places))
         index = begun[:, None] + np.arange(size)
         at = t[index].mean(axis=1)
-        apart = (t[index] - at[:, None])[..., None]
-        turned = np.exp(1j * self.omega * apart)
-        if several:
-            turned = np.concatenate([turned, turned * apart / self.seconds], axis=-1)
-        A = np.concatenate([turned.real, -turned.imag], axis=-1)
+        turned = np.exp(1j * self.omega * (t[index] - at[:, None])[..., None])
+        A = np.stack([turned.real, -turned.imag], axis=-1).reshape(*index.shape, -1)
         G = A.swapaxes(1, 2) @ A
         G += 1e-9 * size * np.eye(G.shape[1])
         c = np.linalg.solve(G, A.swapaxes(1, 2) @ y[index][..., None])[..., 0]
-        z = c[:, : c.shape[1] // 2] + 1j * c[:, c.shape[1] // 2 :]
-        return at, z[:, :count], z[:, count:] / self.seconds if several else 0 * z
+        return at, c
 
 
 def oscillations(t: np.ndarray, y: np.ndarray, count: int) -> list[Oscillations]:
