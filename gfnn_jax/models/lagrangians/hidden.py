@@ -264,6 +264,9 @@ def _of_modes(problem: ArcProblem) -> list[LawFit]:
     whole = dataclasses.replace(linear, terms=(*linear.terms, *powers), friction=friction)
     values = {**plain.values, **{("term", row): 0.5 for row in masses}}
     rich = plain.again(whole, values, rescale=False)
+    # With their powers three modes follow short arcs of what they move, and of little else.
+    if d > 2 and min(misfit(rich), misfit(plain)) > STARTS.followed:
+        return []
     return [fit for fit in (rich, plain) if fit.follows][:1]
 
 
