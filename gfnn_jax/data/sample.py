@@ -24,7 +24,6 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.processes import Group
 
 _ARG = "arg "  # before the name of a parameter in a table
-_MORE = 10  # standard deviations of the number of pairs that fall below a bound
 
 
 def read_sample(
@@ -61,7 +60,8 @@ def read_sample(
     if not total:
         raise InputError(f"{named(paths)}: no pair of consecutive states found")
     if group.share.count > 1:  # those that the first will want, and a few more
-        part = (num_pairs + _MORE * np.sqrt(num_pairs * ARC)) / max(int(total), 1)
+        more = 10 * np.sqrt(num_pairs * ARC)  # ten deviations of the number below a bound
+        part = (num_pairs + more) / max(int(total), 1)
         if found is not None and part < 1:
             found = _taken(found, found["key"] < np.uint64(part * 2.0**64))
         found = group.folded(found or {}, _both)

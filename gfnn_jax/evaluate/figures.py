@@ -39,6 +39,7 @@ from gfnn_jax.evaluate.figures_style import save as save
 from gfnn_jax.evaluate.metrics import error_statistics, kl_divergence
 from gfnn_jax.phase_space import split
 
+_HALO = [withStroke(linewidth=2, foreground="white")]  # keeps text legible on lines
 _LOG_LOG: dict[str, Any] = {"xscale": "log", "yscale": "log"}
 _ALONE: dict[str, Any] = {"linestyle": "none"}  # points without a line
 
@@ -437,8 +438,7 @@ def _number_points(ax, x, y, order):
     points = ax.transData.transform(np.column_stack([x, y])) * 72 / ax.figure.dpi
     taken = list(points)
     sides = np.array([(8, 8), (0, 10), (10, 0), (0, -10), (-10, 0), (-8, -8), (8, -8), (-8, 8)])
-    legible = [withStroke(linewidth=2, foreground="white")]  # on lines
-    look: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "path_effects": legible}
+    look: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "path_effects": _HALO}
     for number, i in enumerate(order, 1):
         places = points[i] + sides
         nearest = np.linalg.norm(places[:, None] - np.array(taken), axis=-1).min(axis=1)
