@@ -80,6 +80,7 @@ def test_the_stated_error_is_that_without_them(few):
     assert relative[1] < 1.5 * fit.chosen.validation_relative
 
 
+@pytest.mark.slow
 def test_test_pairs_take_no_size_away(few):
     """190 pairs, of which 19 choose: 171 of four rows each determine 228 terms, 152 only 202."""
     fit, _ = few

@@ -202,6 +202,7 @@ def test_noise_hides_no_law_with_a_parameter():
     assert np.abs(off).max() < 4
 
 
+@pytest.mark.slow
 def test_a_map_without_a_flow_has_parameters_too():
     rng = np.random.default_rng(0)
     z, strength = rng.uniform(0, 2 * np.pi, (500, 2)), rng.uniform(0.5, 2, 500)
@@ -217,6 +218,7 @@ def test_a_map_without_a_flow_has_parameters_too():
         fit.map.step(z, {"k": strength}, dt=0.5)
 
 
+@pytest.mark.slow
 def test_rollouts_take_parameters_by_name_and_by_place(learned):
     z, length, _ = pendulums(8, seed=2)
     by_name, _ = learned.map.rollout(z, 20, params={"l": length}, dt=0.05)

@@ -201,6 +201,7 @@ def test_a_law_of_uneven_times_knows_each_rows_own_step():
     assert np.all((std > 0.3 * expected) & (std < 3 * expected)), std / expected
 
 
+@pytest.mark.slow
 def test_a_map_without_posterior_says_so(noisy):
     bare = jax.tree.map(lambda leaf: leaf, noisy[1].map)
     with pytest.raises(ValueError, match="no posterior to draw from"):

@@ -44,6 +44,7 @@ def test_the_flow_of_the_exact_hamiltonian_is_the_reference():
     np.testing.assert_allclose(energy, energy[:, :1] * np.ones((1, 21)), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_flow_that_fails_is_nan():
     """ż = z² reaches infinity at t = 1."""
     step = flow_step(lambda z: z**2, 2.0, 1e-9)

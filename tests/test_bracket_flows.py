@@ -138,6 +138,7 @@ def test_long_rollouts_of_short_steps_keep_the_energy(name):
     assert np.max(abs(energy - energy[0])) < 1e-14
 
 
+@pytest.mark.slow
 def test_long_rollouts_leave_the_domain():
     map_, z = made("top", stages=STAGES)
     domain = covering(np.random.default_rng(0).uniform(-1, 1, (200, 6)) * 0.2 + z)

@@ -183,6 +183,7 @@ def test_uniform_friction(field, width, tmp_path):
     np.testing.assert_array_equal(again.step(data.z0)[0], images)
 
 
+@pytest.mark.slow
 def test_uniform_friction_of_noisy_sequences():
     def field(w):
         return top(w) - 0.08 * w

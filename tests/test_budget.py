@@ -328,6 +328,7 @@ def test_a_bound_on_operations_puts_none_on_the_clock_unless_told():
     same_bits(both, told_nothing)
 
 
+@pytest.mark.slow
 @QUIETLY
 @pytest.mark.parametrize("learn", ["map", pytest.param("auto", marks=pytest.mark.slow)])
 def test_a_faster_clock_ends_at_an_earlier_unit_which_operations_reproduce(learn):
@@ -411,6 +412,7 @@ def test_seconds_that_are_gone_already_count():
     assert "there was no time for a first model" in fit.ended
 
 
+@pytest.mark.slow
 @QUIETLY
 def test_ended_names_the_clock_where_the_maps_ended_by_themselves(monkeypatch):
     """Every size of S that so few pairs determine is judged before the clock ends the search for

@@ -89,6 +89,7 @@ def test_unrolled_step_is_symplectic_at_random_weights(chart):
     assert symplecticity_defect(found["jacobian"]).max() < 1e-12
 
 
+@pytest.mark.slow
 @EVERY
 def test_inverse_after_step_is_the_identity(chart):
     np.testing.assert_allclose(facts(chart)["back"], states_of(chart), rtol=0, atol=1e-12)
@@ -236,6 +237,7 @@ def test_midpoint_chart_of_the_hamiltonian_is_the_implicit_midpoint_rule():
         np.testing.assert_allclose(image, expected, rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_types_2_and_3_of_a_separable_hamiltonian_are_symplectic_euler():
     q, p = z = np.random.default_rng(4).uniform(-2, 2, (2, 50))
     second = images(generated(separable, 1.0, TYPE2, 0.4), z.T)

@@ -227,6 +227,7 @@ def test_refusals(typed, named, tmp_path, model, capsys, monkeypatch):
     assert files(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_usage_is_refused_before_jax_is_loaded():
     code = "import sys; from gfnn_jax.cli import main; n = main(sys.argv[1:]); "
     code += "print(n, 'jax' in sys.modules)"
@@ -380,6 +381,7 @@ def test_pairs_from_plain_numpy(suffix, num_pairs, tolerance, num_steps, tmp_pat
     assert (error <= 3 * tolerance * np.maximum(1, np.arange(0, num_steps + 1, 5))).all()
 
 
+@pytest.mark.slow
 def test_fit_of_csv(tmp_path):
     sequences = oscillator(60, DT * np.arange(4))
     data = csv_file(tmp_path / "d.csv", sequences, "sequence,t,q1 [m],p1")
@@ -391,6 +393,7 @@ def test_fit_of_csv(tmp_path):
     assert report["fit"]["validation_rms"] < 1e-12  # a quadratic S is exact
 
 
+@pytest.mark.slow
 def test_a_model_is_kept_and_known_again(fitted, tmp_path, capsys, monkeypatch):
     """An existing model is refused, replaced on demand, and the very job known again."""
     monkeypatch.setattr(output, "fit", lambda *args, **kwargs: fitted)

@@ -40,6 +40,7 @@ def fitted():
     return fitted_oscillator()
 
 
+@pytest.mark.slow
 def test_a_training_that_was_stopped(fitted, tmp_path, capsys, monkeypatch):
     """Stop a training: its checkpoints stay beside the output, and are resumed or discarded."""
     started_from = []

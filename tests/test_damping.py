@@ -60,6 +60,7 @@ def test_a_step_is_the_maps_and_conformally_symplectic(learned):
     assert np.abs(nearest_image(back - z, (0,))).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_the_rotation_number_of_its_attractor_is_the_maps(learned):
     states, _ = learned.map.rollout(np.array([1.0, 0.5]), 12_000)
     true = [np.array([1.0, 0.5])]
@@ -181,6 +182,7 @@ def test_two_factors_that_depend_on_a_parameter():
     assert " in (q1, p1), " in str(learned.damping)
 
 
+@pytest.mark.slow
 def test_friction_that_differs_over_phase_space_is_said_to():
     z = np.random.default_rng(0).normal(size=(600, 2))
     pairs = Pairs(z, moved(lambda _, z: [z[1], -z[0] - 0.3 * z[0] ** 2 * z[1]], z, 0.3), 0.3)

@@ -87,6 +87,7 @@ def test_a_driven_law_is_white_where_it_is_right():
 # The arithmetic.
 
 
+@pytest.mark.slow
 def test_the_stages_stand_at_their_times():
     z, t0 = states(4)
     dt = np.array([0.3, 0.1, 1.0, 0.5])
@@ -234,6 +235,7 @@ def test_the_stroboscopic_map_is_a_period_of_steps(learned, tmp_path):
         gfnn.stroboscopic(once)
 
 
+@pytest.mark.slow
 def test_a_drive_that_was_seen_in_part_has_a_status(learned):
     z, t0 = states(300)
     t0 = np.mod(t0, 0.5 * PERIOD)
@@ -322,6 +324,7 @@ def write_npz(path, count=60, length=4):
     return np.stack(rows, axis=1), t0
 
 
+@pytest.mark.slow
 def test_files_of_pairs_and_of_trajectories(tmp_path):
     path = tmp_path / "t.npz"
     rows, t0 = write_npz(path)

@@ -68,6 +68,7 @@ def test_dry_friction_of_two_carts_is_not_that_of_their_relative_speed():
     assert words(law.friction) == {"abs(v1)", "abs(v2)"}
 
 
+@pytest.mark.slow
 def test_friction_that_is_stronger_one_way_is_no_constant_force():
     """By a tenth. Residuals without it are correlated by what they lack, and count all the same."""
     made = record(lambda q, v: -q - 0.04 * v + 0.004 * abs(v), [1.5], 60.0, 0.25, 1e-3, 1)

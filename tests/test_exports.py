@@ -413,6 +413,7 @@ def test_c_gives_up_where_the_map_does(tmp_path):
     assert (status == NOT_CONVERGED).sum() > 10
 
 
+@pytest.mark.slow
 @needs_cc
 def test_c_is_optimised_to_the_same(tmp_path):
     map_, z = map_in(MIDPOINT, 1, 4)
@@ -475,6 +476,7 @@ def test_stablehlo_is_the_maps_own_step(kind, tmp_path):
         np.testing.assert_allclose(images[good], expected[good], rtol=1e-14, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_stablehlo_takes_any_function(tmp_path):
     map_ = map_of(generated(oscillator, 1.1, MIDPOINT, DT), z := states(1))
     path = gfnn.export(map_, "stablehlo", tmp_path / "own.zip")
@@ -525,6 +527,7 @@ def test_command_line(tmp_path, capsys):
 # Polynomials
 
 
+@pytest.mark.slow
 def test_polynomials_are_arranged_anew():
     map_, z = map_in(TYPE2, 2, 3, angles=(1,), predicted=True)
     model = jax.tree.map(np.asarray, map_.pieces[0].predictor.forward)

@@ -145,6 +145,7 @@ def test_a_taylor_series_in_c_is_the_flow(kind, tmp_path):
             np.testing.assert_allclose(images, expected(own, z, args), rtol=1e-14, atol=atol)
 
 
+@pytest.mark.slow
 @needs_node
 @pytest.mark.parametrize("kind", with_one("inputs that change"))
 def test_javascript_is_the_flow(kind, tmp_path):
@@ -179,6 +180,7 @@ def test_a_body_without_a_force_and_one_that_falls_in_javascript(tmp_path):
     np.testing.assert_allclose(found, wanted, atol=1e-14)
 
 
+@pytest.mark.slow
 @needs_cc
 def test_bodies_stick_in_c_as_in_a_rollout(tmp_path):
     map_, z = sticking()
@@ -310,6 +312,7 @@ def chain(relative=False):
     return map_of_law(own, z, 0.01, tolerance=1e-12, signals=Signals(("F",))), z
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", ["mjcf", "urdf"])
 @pytest.mark.parametrize("relative", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_mujoco_moves_a_chain_of_links_as_its_law_does(relative, to, tmp_path):

@@ -101,6 +101,7 @@ def test_sequences_of_any_length(tmp_path, lengths, dim, chunk, dtype, compresse
 FINITE = st.floats(-LARGEST, LARGEST)
 
 
+@pytest.mark.slow
 @QUICK
 @given(
     hnp.arrays(np.float64, st.tuples(st.integers(6, 20), st.just(4)), elements=FINITE),

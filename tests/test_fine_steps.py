@@ -55,6 +55,7 @@ def test_errors_of_steps_do_not_move_coefficients(noise):
     assert f"{substeps} steps between nodes" in lines[-1]
 
 
+@pytest.mark.slow
 def test_less_noise_asks_for_shorter_steps_and_much_noise_for_none():
     counts = [
         with_fine_steps(fitted(noise)[0]).problem.inputs.substeps for noise in (1e-6, 1e-4, 3e-2)

@@ -54,6 +54,7 @@ def turning(num=4, steps=300):
     return np.concatenate([q, p], axis=-1)
 
 
+@pytest.mark.slow
 def test_all_methods_of_a_comparison_differ_and_ours_looks_as_in_a_run():
     assert len(set(figures.COLOURS)) == len(figures.COLOURS) >= len(TITLES)
     assert len(set(figures.MARKERS)) >= len(TITLES)
@@ -103,6 +104,7 @@ def test_panels_of_a_law_do_not_cover_each_other():
             assert min(wide, high) < 2
 
 
+@pytest.mark.slow
 def test_results_come_before_details_and_horizons_are_told_once():
     law = discovered().law
     lines = law.table.splitlines()

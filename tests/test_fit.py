@@ -124,6 +124,7 @@ def test_friction_is_noticed():
         gfnn.fit(damped, learn="hamiltonian", on_candidate=stop)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["columns", "friction"])
 def test_what_is_not_symplectic_is_noticed_at_short_steps(wrong):
     """A short step is close to the identity whatever it does."""
@@ -216,6 +217,7 @@ def test_the_choice_is_as_accurate_as_it_says(pendulum_fit):
     assert fit.messages == ()
 
 
+@pytest.mark.slow
 def test_one_of_the_candidates_is_chosen(pendulum_fit):
     chosen = pendulum_fit.chosen
     assert sum(c.chosen for c in pendulum_fit.candidates) == 1
@@ -238,6 +240,7 @@ def test_the_table_shows_all_candidates_and_marks_the_chosen(pendulum_fit):
     assert any("~" in line for line in lines)  # estimates are told from what was measured
 
 
+@pytest.mark.slow
 def test_one_seed_chooses_one_map(pendulum_fit):
     told = []
     again = quiet_fit(pendulum_pairs(), tolerance=1e-7, learn="map", on_candidate=told.append)
@@ -381,6 +384,7 @@ def test_noise_is_told_in_the_units_of_each_coordinate(noisy_pairs, noisy_fit):
     assert labels[0] == labels[1]
 
 
+@pytest.mark.slow
 def test_friction_that_is_left_over_is_told_from_noise():
     """A pendulum that loses a thousandth of its momentum a step still looks symplectic. Beside a
     base that the user knows, which keeps areas, no friction is learned."""
@@ -394,6 +398,7 @@ def test_friction_that_is_left_over_is_told_from_noise():
 # What must come out
 
 
+@pytest.mark.slow
 def test_the_standard_map_is_found_to_roundoff():
     scene = gfnn.scenes.standard_map()
     pairs = gfnn.sample_pairs(scene, 300, jax.random.key(0))
@@ -403,6 +408,7 @@ def test_the_standard_map_is_found_to_roundoff():
     assert rms(fit.map, fresh.z0, fresh.z1) < 1e-13
 
 
+@pytest.mark.slow
 def test_states_that_cover_the_torus_have_no_outside():
     scene = gfnn.scenes.standard_map(1.2)
     fit = quiet_fit(gfnn.sample_pairs(scene, 600, jax.random.key(0)), scene, tolerance=1e-12)
@@ -519,6 +525,7 @@ def test_a_linear_map_far_from_the_identity_needs_a_base_map():
     assert fit.symplecticity_defect < 1e-12
 
 
+@pytest.mark.slow
 def test_where_steps_do_not_bear_the_search_out_a_larger_map_is_taken(monkeypatch):
     measured, refused = choose.measured, []
 
@@ -551,6 +558,7 @@ def test_where_every_map_has_failing_steps_the_one_with_the_fewest_is_taken(monk
     assert (fit.chosen.chart, fit.chosen.label) == (seen[1].chart, seen[1].label)
 
 
+@pytest.mark.slow
 def test_where_every_map_has_failing_steps_smaller_ones_are_looked_at(monkeypatch):
     measured, of_ranking, counts, seen = choose.measured, choose._of_ranking, [], []
 

@@ -82,6 +82,7 @@ def test_errors_are_those_that_the_covariance_says():
     np.testing.assert_allclose(noise, NOISE, rtol=0.04)
 
 
+@pytest.mark.slow
 def test_a_pair_is_an_arc_of_two_states():
     """Noise of 3e-3 on q and 1e-3 on p, told from single pairs, of which a state is latent."""
     squares, noise = 0.0, 0.0

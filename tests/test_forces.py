@@ -99,6 +99,7 @@ def test_the_order_with_uniform_friction(stages):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * stages, abs=0.1)
 
 
+@pytest.mark.slow
 def test_no_friction_has_the_same_bits():
     plain, none = flow(H, C, 2), flow(Uniform(H), np.append(C, 0.0), 2)
     np.testing.assert_array_equal(step(none, Z)[0], step(plain, Z)[0])

@@ -160,6 +160,7 @@ def swings(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["deg", "rad"])
 @pytest.mark.parametrize(("initial", "compare"), [("deg", "rad"), ("rad", "deg")])
 def test_degrees_and_radians_go_together(swings, model, initial, compare, capsys):

@@ -91,6 +91,7 @@ def test_what_is_no_term_is_refused(text, message):
         read(text)
 
 
+@pytest.mark.slow
 def test_exactly_these_terms_are_fitted():
     t, theta = pendulum(end=20.0)
     recording = gfnn.Recording({"t": t, "theta": theta}, positions=["theta"], angles=["theta"])
@@ -106,6 +107,7 @@ def test_exactly_these_terms_are_fitted():
         gfnn.fit(recording, terms=["exp(omega)"])
 
 
+@pytest.mark.slow
 def test_a_law_with_a_distance():
     """An orbit around a centre, with drag; its law is read again, saved, forecast and exported."""
     t = 0.05 * np.arange(400)

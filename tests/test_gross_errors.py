@@ -159,6 +159,7 @@ def test_where_the_budget_has_no_room_for_all_pairs_none_is_looked_at(part, spoi
     assert again.operations == clock.operations
 
 
+@pytest.mark.slow
 def test_after_the_end_of_the_search_no_pair_is_looked_at(looked_for):
     budget = Budget(max_operations=0)
     with pytest.raises(gfnn.errors.OutOfTime), budget.unit("H", FLOW, 1):

@@ -102,6 +102,7 @@ def test_lanes_far_outside_change_no_bit_and_no_update_of_good_ones(clean):
 # Bad data
 
 
+@pytest.mark.slow
 def test_wrong_pairs_are_named_and_left_out():
     z0 = disc(800, seed=3)
     z1 = kick_and_drift(z0)
@@ -115,6 +116,7 @@ def test_wrong_pairs_are_named_and_left_out():
     assert rms(fitted.map, z, kick_and_drift(z)) < 1e-3
 
 
+@pytest.mark.slow
 def test_little_friction_is_learned():
     z0, rate = disc(400, seed=5), 0.01
     z1 = kick_and_drift(z0) * [1, math.exp(-rate * DT)]
@@ -176,6 +178,7 @@ def test_type_2_ends_at_a_quarter_period_and_says_what_does_not():
         oscillated(np.pi / 2, "type2")
 
 
+@pytest.mark.slow
 def test_half_a_period_has_no_base_map_and_is_learned_beyond_the_fold():
     error, fitted, said = oscillated(np.pi, "auto")
     assert error < 1e-8

@@ -135,6 +135,7 @@ def test_every_module_has_a_place():
     assert not {name for name in names if room_of(name) is None}
 
 
+@pytest.mark.slow
 def test_imports_follow_the_order():
     wrong = []
     for name, tree in modules():

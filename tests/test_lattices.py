@@ -461,6 +461,7 @@ def test_coupled_standard_maps(tmp_path, reduced):
     np.testing.assert_array_equal(again, states)
 
 
+@pytest.mark.slow
 def test_kicked_sites_of_plain_coordinates():
     dim, z0 = 20, 0.3 * RNG.normal(size=(24, 40))
     r = np.roll(z0[:, :dim], -1, axis=1) - z0[:, :dim]
@@ -560,6 +561,7 @@ def test_mode_energies_add_up(kind):
     np.testing.assert_allclose(np.delete(energy, 2), 0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_figures_show_each_panel_what_it_is_named(tmp_path):
     times, z = np.arange(5.0), RNG.normal(size=(5, 12))
     off = z + 1e-8

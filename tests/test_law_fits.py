@@ -265,6 +265,7 @@ def test_names_of_functions_are_columns_all_the_same():
     assert str(found.sympy()) == "gamma**2 + cos(beta)"
 
 
+@pytest.mark.slow
 def test_lanes_that_follow_their_own_laws_are_followed_as_if_alone(swing):
     law = law_of(swing[1].map)
     laws = [law, law._replace(p=1.1 * law.p, root=2 * law.root)]
@@ -611,6 +612,7 @@ def undamped():
     return recorded(*pendulum(gamma=0.0, end=25.0))
 
 
+@pytest.mark.slow
 def test_the_friction_that_a_record_shows(swing):
     """Linear friction is told from the others, and limits of these are below what was put in."""
     _, fit = swing
@@ -788,6 +790,7 @@ def test_a_double_pendulum_has_its_five_terms():
     assert losses["omega1**2"] == pytest.approx(0.015, rel=0.3)
 
 
+@pytest.mark.slow
 def test_a_known_mass_scales_the_law():
     t, theta = pendulum(end=15.0)
     fit = gfnn.fit(recorded(t, theta), friction="linear", mass={"theta": 3.0})

@@ -35,6 +35,7 @@ def law(pairs):
     return gfnn.fit(pairs, tolerance=1e-12)
 
 
+@pytest.mark.slow
 def test_a_law_of_six_numbers_comes_out_of_raw_pairs(law):
     assert law.chosen.learns == "hamiltonian"
     assert str(law.hamiltonian) == FORMULA
@@ -236,6 +237,7 @@ def test_what_the_pairs_do_not_determine_is_named():
     assert "3 terms of H (q2², q2 p2, p2²)" in " ".join(fit.messages)
 
 
+@pytest.mark.slow
 def test_terms_that_are_the_same_everywhere_are_no_gap_in_the_pairs(pairs):
     fit = gfnn.fit(pairs, learn="hamiltonian", terms=["q1**2 + q2**2"], tolerance=1e-10)
     assert fit.hamiltonian.null_terms

@@ -37,6 +37,7 @@ def law_of_recording():
 FITS = ("law_of_pairs", "generated", "law_of_recording")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FITS)
 def test_round_trip(name, tmp_path, request):
     fit = request.getfixturevalue(name)

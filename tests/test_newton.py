@@ -304,6 +304,7 @@ def test_unrolled_derivative_of_a_damped_solve_is_finite(bend, dtype):
     assert np.isfinite(np.asarray(slope)[ok]).all()
 
 
+@pytest.mark.slow
 def test_batches_of_batches_and_their_derivatives():
     """Lanes with their own θ and a common number, under vmap, in reverse and in forward mode."""
     stretched = PerLane(lambda scale, theta, x: scale * x + 8.0 * jnp.sin(x) - theta)

@@ -158,6 +158,7 @@ def test_misfit_weighs_as_much_as_in_the_posterior(misfit, count):
     assert found.noise == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_derivatives_in_the_states_count_a_base_map():
     plain, *_ = sweep_of(MIDPOINT, 0.0, 400)
     turn = np.array([[0.8, 0.6], [-0.6, 0.8]])

@@ -70,6 +70,7 @@ def test_a_camera_tells_the_angle():
     np.testing.assert_allclose(g.coordinates_of(y, [0])[:, 0], theta, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_potentiometer_and_its_scale():
     t, theta, _, noise = swing()
     table = {"t": t, "theta": 1.3 * theta + 0.1 + noise(1e-3)}

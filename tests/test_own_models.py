@@ -134,6 +134,7 @@ def test_a_sensor(tmp_path):
     np.testing.assert_array_equal(values["x"], same["x"])
 
 
+@pytest.mark.slow
 def test_a_term(tmp_path):
     """A particle that a soft wall, one of the terms, sends back: H = p²/2 + q²/2 + 4 wall(q)."""
     z0 = np.random.default_rng(0).uniform(-2, 2, (300, 2))

@@ -59,6 +59,7 @@ def test_a_saved_law_is_the_same(heavy_top, tmp_path):
     assert gfnn.export(fit, "latex", tmp_path / "top.tex").read_text().startswith("H = ")
 
 
+@pytest.mark.slow
 def test_a_given_bracket():
     data = runs_of(populations, np.random.default_rng(0).uniform(0.5, 1.5, (20, 4)), 0.2, 20)
     form = [[0, 1, 0, -0.9], [-1, 0, 0.7, 0], [0, -0.7, 0, 1.3], [0.9, 0, -1.3, 0]]

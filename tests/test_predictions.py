@@ -194,6 +194,7 @@ def test_full_disk(tmp_path, whole, when):
     assert complete(out, resume=True, overwrite=True) == whole
 
 
+@pytest.mark.slow
 def test_memory_is_bounded(tmp_path, monkeypatch):
     """An output of 50 MB within a few chunks and the assembly's buffer, also for a single lane."""
     monkeypatch.setattr(predictions.OPTIONS, "assembly", 2**20)

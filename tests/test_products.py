@@ -186,6 +186,7 @@ def test_terms_are_counted_without_making_them(case, even):
 # Args beside the state.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "num_args"), [(4, 1), (2, 1), (2, 3)])
 def test_products_of_state_and_args_have_the_gradients_of_jax(width, num_args):
     """Compare with JAX, also where one half of the variables is args alone."""

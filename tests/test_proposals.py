@@ -191,6 +191,7 @@ def test_exact_velocities_are_no_differences_and_no_period_is_told_that_is_not_s
     assert "its period is longer than the runs show" in str(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("axes", "options"),
     [
@@ -231,6 +232,7 @@ def tumbling(rng, count, noise=0.01):
     return {"run": np.repeat(np.arange(count), len(t)), "t": np.tile(t, count)}, w.T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_rates_of_a_body_are_no_positions(seed):
     begin, w = tumbling(np.random.default_rng(seed), 6)

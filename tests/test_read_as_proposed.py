@@ -127,6 +127,7 @@ def test_tables_of_other_libraries(library):
     np.testing.assert_array_equal(gfnn.read(table).times("0"), T)
 
 
+@pytest.mark.slow
 def test_units_in_the_names_of_a_table():
     recording = gfnn.Recording({"Time [ms]": 1e3 * T, "angle [deg]": 20 * RATE})
     np.testing.assert_allclose(recording.times("0"), T)

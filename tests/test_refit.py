@@ -33,6 +33,7 @@ def moved(fit, pairs):
     return np.asarray(fit.map.step(pairs.z0)[0])
 
 
+@pytest.mark.slow
 def test_a_stand_in_is_not_blamed_on_its_family(sampled):
     """Where the time was over before any S, nobody has asked for a network."""
     *_, found = sampled
@@ -40,6 +41,7 @@ def test_a_stand_in_is_not_blamed_on_its_family(sampled):
     assert "needs a family that is linear" in why_not(found.map)
 
 
+@pytest.mark.slow
 def test_all_pairs_fit_better_than_the_sample(sampled):
     pairs, held, fit = sampled
     again = refit(fit, [pairs], held)

@@ -39,6 +39,7 @@ def discovered():
     return gfnn.discover(table, positions=["x"])
 
 
+@pytest.mark.slow
 def test_quantities_are_those_of_the_oscillator():
     by_name = {q.name: q for q in physics(discovered().law).quantities}
     known = {
@@ -143,6 +144,7 @@ def test_the_simulation_begins_at_its_first_dot_and_names_the_columns():
     assert [slider["label"] for slider in shown["sliders"]] == ["x", "x²", "damping rate"]
 
 
+@pytest.mark.slow
 def test_a_refusal_has_its_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     t = np.arange(0.0, 20.0, 0.05)

@@ -31,6 +31,7 @@ def test_rollout_of_the_oscillator_is_a_rotation():
     assert (info.iterations >= 1).all()
 
 
+@pytest.mark.slow
 def test_one_lane_and_saving_every_k():
     states = np.asarray(OSCILLATOR.rollout(Z, 50)[0])
     some, info = OSCILLATOR.rollout(Z, 50, save_every=7)

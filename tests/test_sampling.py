@@ -175,6 +175,7 @@ def test_a_coordinate_that_nothing_shows_is_refused(gyroscope):
         gfnn.fit(recording)
 
 
+@pytest.mark.slow
 def test_runs_of_different_intervals_are_one_data_set():
     """The stiffness of ẍ = −x, by a short run of many readings and a long one of few: its standard
     error is that of all readings of the long run, by least squares."""

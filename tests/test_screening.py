@@ -131,6 +131,7 @@ def test_a_jump_that_stays_is_no_gross_error_of_a_state():
     assert len(named(pairs_of(states))) == 0
 
 
+@pytest.mark.slow
 def test_what_was_left_out_is_bridged():
     states = henon_heiles(50)[:2, :8]
     kept = np.setdiff1d(np.arange(14), [2, 3])  # the state 3 of the first sequence

@@ -146,6 +146,7 @@ def test_the_family_of_systems_is_each_system_s_own():
     assert OfSystems(inner.family.family, LAW.powers[:5]).multiplier(c[:5], 0.1) == 1.0
 
 
+@pytest.mark.slow
 def test_coefficients_of_a_run_are_linear_in_those_of_the_law():
     row = ((2,), (0,), (0,), 0.0)
     terms = (row, (*row, (1,)), ((0,), (2,), (0,), 0.0, (-1,)))
@@ -253,6 +254,7 @@ def test_a_length_that_no_run_had_is_forecast_within_its_band(of_lengths, tmp_pa
     assert "l = 2.3 is outside 0.5 to 2" in found.outside[0]
 
 
+@pytest.mark.slow
 def test_a_rollout_takes_the_parameter(of_lengths):
     _, fit = of_lengths
     steps, dt = 200, float(fit.map.dt)

@@ -44,6 +44,7 @@ def neighbours(scene):
     return np.array([scene.sampling.start]) + 0.01 * np.arange(3.0)[:, None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", long_ones_slow(INTEGRATED))
 def test_flow_agrees_with_another_solver(name):
     scene = scenes.make(name)
@@ -159,6 +160,7 @@ def test_forward_and_back(name):
     np.testing.assert_allclose(back, z0, atol=2e-12, rtol=0)
 
 
+@pytest.mark.slow
 def test_measured_error_of_the_reference():
     z0 = np.array([scenes.henon_heiles().sampling.start])
     assert 0 < tr.reference_error(scenes.henon_heiles(), z0, 1) < 2e-15
@@ -306,6 +308,7 @@ def test_data_of_a_scene_take_one_compilation_per_program(compilations):
     assert of_more.count == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["henon-heiles-section", "driven-pendulum-phase", "two-body"])
 def test_a_state_has_the_same_bits_beside_any_others(name, compilations):
     """Alone, in another order, in blocks that are full or not, and for any number of steps."""

@@ -38,6 +38,7 @@ def test_zeros_of_runs_are_found_with_the_law(fit):
     assert "differs from run to run by 0.046" in fit.table
 
 
+@pytest.mark.slow
 def test_an_estimate_tells_the_zero_of_its_run(fit):
     """The law's own zero is the mean of those of the runs it was learned from."""
     law, other = law_of(fit.map), swings([0.07])
@@ -47,6 +48,7 @@ def test_an_estimate_tells_the_zero_of_its_run(fit):
     assert abs(x[2] - (0.07 - ZEROS.mean())) < 3 * error
 
 
+@pytest.mark.slow
 def test_runs_with_one_zero_keep_it():
     fit = gfnn.fit(swings(np.full(5, 0.05)), friction="linear")
     assert fit.map.sensors.wander is None
