@@ -104,6 +104,7 @@ class Law:
         ({1: (0.095, False), 2: (0.05, True)}, 1, [1]),  # as large as the noise: no more is tried
         ({2: (0.1, True)}, 2, [1, 2]),
         ({1: (5.0, False), 2: (6.0, False)}, None, [1, 2]),  # neither is as good as none
+        ({1: (0.2, False), 2: (0.12, False)}, None, [1, 2]),  # better than none, and no noise
         ({}, None, [1, 2]),
     ],
 )

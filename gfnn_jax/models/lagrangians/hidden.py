@@ -85,7 +85,7 @@ def with_number(
     scores = {n: _criterion(law, name) for n, law in laws.items()}
     best = min(scores, key=lambda n: scores[n])
     law = laws[best]
-    if best == 0 or law.flaws:
+    if best == 0 or law.flaws or not _leaves_noise(laws[max(laws)]):
         return None
     others = [f"{n}: {more - scores[best]:+.0f}" for n, more in scores.items() if n != best]
     line = (
