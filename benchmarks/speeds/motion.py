@@ -35,11 +35,15 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
-from gfnn_jax.families.friction import DRY, LINEAR, Friction
 from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.sensors import Sensors
+
+try:
+    from gfnn_jax.families.friction import DRY, LINEAR, Friction
+except ModuleNotFoundError:  # as in OLD
+    from gfnn_jax.families.lagrangian import DRY, LINEAR, Friction  # pyright: ignore
 
 OLD = "f45649e9^"  # before laws were followed by compiled code
 LANES = (1, 768)
