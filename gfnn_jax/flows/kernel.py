@@ -38,6 +38,7 @@ minutes. This module alone imports numba; the first step of a law imports it.
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 import sys
@@ -127,10 +128,14 @@ class Task(NamedTuple):
     status: np.ndarray
 
 
-# Compilation optimises a function with all that it calls, again in each that calls it: the large
+# Compilation optimises a function with all that it calls, again in each that calls it: the
 # large ones call no large ones, but for `follow`.
-function = numba.njit(  # pyright: ignore[reportCallIssue]: two options lack in its types
-    error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
+function = numba.njit(  # pyright: ignore[reportCallIssue]: three options lack in its types
+    error_model="numpy",
+    nogil=True,
+    no_cpython_wrapper=True,
+    no_cfunc_wrapper=True,
+    no_rewrites=True,
 )
 
 
@@ -138,13 +143,16 @@ class _Compilation(event.Listener):
     """Says what is compiled, where no cache holds it, and sets options of LLVM meanwhile, of which
     numba has none of a function; who compiles holds its lock. The loops of `follow` are not
     unrolled: short as they are that is a third of the time, and makes them slower. In other
-    functions four numbers are done at once where lines of them stand side by side."""
+    functions four numbers are done at once where lines of them stand side by side. Garbage is not
+    collected meanwhile: numba makes millions of objects, and keeps most of them."""
 
     def on_start(self, event: event.Event) -> None:
         compiled = (event.data or {}).get("dispatcher")
         if compiled not in _said:
             return
         compiling.say(f"compiling, once on this machine, {_said[compiled]}")
+        self._collects = gc.isenabled()
+        gc.disable()
         if compiled is follow:
             llvm.create_pipeline_tuning_options = _rolled
         else:
@@ -155,6 +163,8 @@ class _Compilation(event.Listener):
         if compiled not in _said:
             return
         compiling.say("")
+        if self._collects:
+            gc.enable()
         if compiled is follow:
             llvm.create_pipeline_tuning_options = _options
         else:
