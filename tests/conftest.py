@@ -21,6 +21,18 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
+# The compiled kernel of motion, kept on disk: a step of a free particle.
+KERNEL = """
+import numpy as np
+from gfnn_jax.families.friction import Friction
+from gfnn_jax.families.lagrangian import Terms
+from gfnn_jax.flows.motion import Form
+
+terms, friction = Terms.of([((2,), (0,), (0,), 0.0)], 1), Friction.of([], 1)
+form = Form(terms, np.zeros(1), np.eye(1), friction, 0)
+form.step(np.ones(1), np.ones((1, 2)), np.full(1, 0.1), np.zeros((1, 1, 6, 0)))
+"""
+
 # Most of the suite's time goes into compiling programs that run once: this halves it. A program
 # that is split to be compiled by several threads takes half as much again of a processor's time.
 SOON_COMPILED = (
@@ -64,6 +76,9 @@ def pytest_configure(config):
     for name, value in shared.items():
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
+    # Several workers would compile the kernel at once: it is compiled while they begin.
+    if getattr(config.option, "numprocesses", None):
+        subprocess.Popen([sys.executable, "-c", KERNEL], stderr=subprocess.DEVNULL)
     # Each operation that is traced keeps where it was called from: a twentieth of the time.
     with contextlib.suppress(ImportError, AttributeError):  # no part of JAX's interface
         from jax._src.lib import _jax
