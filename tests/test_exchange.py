@@ -23,7 +23,12 @@ def words(formula):
 
 
 @pytest.mark.parametrize(
-    ("hardening", "end", "noise"), [(0.1, 50.0, 3e-2), (0.3, 100.0, 3e-2), (0.3, 100.0, 1e-4)]
+    ("hardening", "end", "noise"),
+    [
+        pytest.param(0.1, 50.0, 3e-2, marks=pytest.mark.slow),
+        (0.3, 100.0, 3e-2),
+        pytest.param(0.3, 100.0, 1e-4, marks=pytest.mark.slow),
+    ],
 )
 def test_a_law_beside_which_noise_leaves_others_is_one_of_several(hardening, end, noise, tmp_path):
     made = record(lambda q, v: -q - hardening * q**3 - 0.02 * v, [1.0], end, 0.6, noise)

@@ -128,7 +128,11 @@ def with_one(kind: str) -> list:
 
 
 @pytest.mark.parametrize(
-    "kind", [*SMOOTH, pytest.param("bobs that attract", marks=pytest.mark.slow)]
+    "kind",
+    [
+        *with_one("double pendulum with friction"),
+        pytest.param("bobs that attract", marks=pytest.mark.slow),
+    ],
 )
 def test_a_taylor_series_in_c_is_the_flow(kind, tmp_path):
     map_, z, args = SMOOTH[kind]() if kind in SMOOTH else (*attracting(), None)
@@ -259,8 +263,9 @@ def one_step(to, path, map_):
 @pytest.mark.parametrize(
     ("to", "kind"),
     [
-        *((to, kind) for to in ("jax", "casadi") for kind in SMOOTH),
-        *(("fmu", kind) for kind in list(SMOOTH)[2:]),
+        pytest.param(to, kind, marks=() if kind == "inputs that change" else pytest.mark.slow)
+        for to in ("jax", "casadi", "fmu")
+        for kind in (list(SMOOTH)[2:] if to == "fmu" else SMOOTH)
     ],
 )
 def test_steps_of_other_tools_are_the_maps(to, kind, tmp_path):

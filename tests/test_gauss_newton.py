@@ -111,6 +111,7 @@ def test_an_exact_polynomial_ends_the_search_before_laws_of_physics():
     assert not any("atoms" in line for line in said)
 
 
+@pytest.mark.slow
 def test_long_steps_from_the_logarithm():
     pairs = henon_heiles(90, 3.0, size=0.2)
     family = polynomial_terms(2, 3)

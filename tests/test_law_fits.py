@@ -1007,6 +1007,7 @@ def test_costs_that_are_both_infinite_are_alike():
     assert Comparison.of(np.array([np.inf, np.inf, 2.0]), one).is_higher()
 
 
+@pytest.mark.slow
 def test_the_drag_of_a_body_in_a_plane_is_found_and_given():
     """One coefficient of |v|³, though without drag neither coordinate moves the other."""
     t, k, c = np.arange(0, 45, 0.15), np.array([1.0, 1.4]), 0.04

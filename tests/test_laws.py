@@ -244,6 +244,7 @@ def test_terms_that_are_the_same_everywhere_are_no_gap_in_the_pairs(pairs):
     assert not any("do not determine" in message for message in fit.messages)
 
 
+@pytest.mark.slow
 def test_what_a_law_leaves_over_is_diagnosed():
     """Pendulums of different length, told nothing of it: the states have no law."""
     rng = np.random.default_rng(0)

@@ -109,6 +109,7 @@ def noisy():
         return gfnn.fit_monitors(recorded(*states), PLACES, [LENGTH, None], tolerance=1e-3)
 
 
+@pytest.mark.slow
 def test_the_noise_of_both_monitors_is_told(noisy):
     assert np.abs(np.array(noisy.noise) / NOISE - 1).max() < 0.06
 

@@ -172,6 +172,7 @@ def test_an_encoder_that_was_switched_on_anywhere(zero):
     )
 
 
+@pytest.mark.slow
 def test_two_encoders_that_were_switched_on_anywhere():
     """Zeros of 1 and −0.7 rad: from 0 no fit finds them."""
 

@@ -109,6 +109,7 @@ def gyroscope():
     return {"t": t, "gyro": omega + 0.05 + 5e-3 * rng.normal(size=len(t))}
 
 
+@pytest.mark.slow
 def test_a_gyroscope_alone(gyroscope):
     """θ is seen by no sensor; the bias is fitted."""
     recording = gfnn.Recording(gyroscope, observe={"gyro": "omega + b"})

@@ -39,7 +39,15 @@ def test_every_archive_has_its_numbers():
     assert {path.stem for path in FOLDERS.glob("*.zip")} == set(NUMBERS)
 
 
-@pytest.mark.parametrize("name", NUMBERS)
+# One of each structure is tried each time; of what else a folder may hold, all are slow.
+OTHERS = {"base-map", "drive", "features", "mlp", "parameters-map", "pendulum-angle", "recording"}
+OTHERS |= {"recording-inputs", "recording-parameters", "recording-two", "ring-map", "scene-polar"}
+OTHERS |= {"sines", "type3"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in OTHERS else ()) for n in NUMBERS]
+)
 def test_a_folder_of_0_3_0(name, tmp_path):
     fit = loaded(name, tmp_path)
     assert isinstance(fit, gfnn.Fit)

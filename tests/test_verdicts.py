@@ -36,6 +36,7 @@ def test_a_self_sustained_oscillator_is_not_identified():
     assert fit.found.whiteness["x1"].fit_percent > 95
 
 
+@pytest.mark.slow
 def test_correlated_residuals_beside_much_noise_are_a_law_that_lacks_something():
     """Five periods of two carts whose coupling the search refuses: 1.8 times the noise is left."""
     rng = np.random.default_rng([27_182_818, 300])  # of certificates.py

@@ -250,6 +250,7 @@ def test_a_field_has_one_representative():
     assert all(any(row[1][: row[0].index(1)]) for row in rows)
 
 
+@pytest.mark.slow
 def test_masses_of_either_sign_are_no_law():
     """ẍ = −x + ẏ, ÿ = −y − ẋ without v_j f(q): only L = ½ẋ² − ½ẏ² and friction that drives."""
     rows = [f"{c}**2" for c in ("v1", "v2", "x1", "x2")]
@@ -259,6 +260,7 @@ def test_masses_of_either_sign_are_no_law():
         gfnn.fit(recording, terms=[*rows, *losses])
 
 
+@pytest.mark.slow
 def test_a_drive_that_nobody_recorded_is_found_named_and_forecast(tmp_path):
     omega, until = 1.37, 400
 
