@@ -370,21 +370,31 @@ def test_two_values_do_not_tell_two_functions_and_that_is_said():
     assert one.messages == ()
 
 
-@pytest.mark.slow
-def test_a_dependence_that_no_power_is_is_told_to_be_an_interpolation():
-    """g/(l + l³/10)."""
+def swinging(lever):
+    """Five pendulums whose frequencies are those of g/lever(l)."""
 
     def rate(_, x, length):
-        return [x[1], -G / (length + 0.1 * length**3) * np.sin(x[0]) - 0.05 * x[1]]
+        return [x[1], -G / lever(length) * np.sin(x[0]) - 0.05 * x[1]]
 
     starts = [(1.2 - 0.1 * k, 0.0) for k in range(5)]
+    return gfnn.fit(recorded(rate, starts, LENGTHS, "l", ("theta",), ("theta",)))
+
+
+@pytest.mark.slow
+def test_a_dependence_that_no_power_is_is_told_to_be_an_interpolation():
     with pytest.warns(gfnn.FitWarning, match="functions of l, and the runs are of 5 values"):
-        fit = gfnn.fit(recorded(rate, starts, LENGTHS, "l", ("theta",), ("theta",)))
-    new = recorded(rate, [(1.0, 0.0)], (1.2,), "l", ("theta",), ("theta",))
-    t = new.times("0")[new.times("0") > 4.0]
-    found = fit.map.forecast(new.slice(stop=4.0), t)
-    error = found.values["theta"][0] - new.values("theta", "0")[-len(t) :]
-    assert np.sqrt(np.mean(error**2)) < 2e-3
+        swinging(lambda length: length + 0.3 * np.sin(3 * length))
+
+
+@pytest.mark.slow
+def test_a_quotient_of_powers_comes_out():
+    """g/(l + l³/10): an inertia of 1 + l²/10, and forces by 1/l."""
+    c = {
+        t.term: t.coefficient
+        for t in swinging(lambda length: length + 0.1 * length**3).lagrangian.terms
+    }
+    assert c["omega**2*l**2"] / c["omega**2"] == pytest.approx(0.1, rel=2e-3)
+    assert c["cos(theta)/l"] / c["omega**2"] == pytest.approx(2 * G, rel=2e-3)
 
 
 @pytest.mark.slow
