@@ -16,10 +16,10 @@ from gfnn_jax.models.lagrangians.search import search
 
 def covered(fit, recording, starts, ahead):
     """Share of the samples up to ``ahead`` seconds after each start that lie within two standard
-    deviations of a forecast, and the same without the misfit."""
+    deviations of a forecast, and the same without the misfit, or readings that wander for it."""
     sensors = fit.map.sensors
     none = np.zeros_like(np.asarray(sensors.misfit))
-    bare = dataclasses.replace(sensors, misfit=none, of_law=False)
+    bare = dataclasses.replace(sensors, misfit=none, of_law=False, wander=None)
     inside = []
     for map_ in (fit.map, dataclasses.replace(fit.map, sensors=bare)):
         found = []
