@@ -21,6 +21,7 @@ from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.legendre import family_of
 from gfnn_jax.flows.motion import Form
 from gfnn_jax.models.lagrangians import libraries
+from gfnn_jax.models.lagrangians.drives import hidden_frequency
 from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.weak_form import centre_of_forces
@@ -284,6 +285,21 @@ def test_a_drive_that_nobody_recorded_is_found_named_and_forecast(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_drive_between_two_frequencies_that_are_tried_is_found_beside_an_own_one():
+    """A line of the spring's own leaves less at the frequencies tried, and more between them."""
+    t, omega = 0.02 * np.arange(1_800), 1.99
+
+    def rates(t, s):
+        return [s[1], -5.81 * (s[0] + 0.15 * s[0] ** 3) + 1.21 * np.cos(omega * t)]
+
+    x = solve_ivp(rates, (0, t[-1]), [1.01, 0.0], t_eval=t, rtol=1e-9, atol=1e-9).y[0]
+    x += 1e-3 * x.std() * np.random.default_rng(0).normal(size=len(x))
+    recording = gfnn.Recording({"t": t, "x": x}, positions=["x"], angles=[])
+    found = hidden_frequency(samples_of(recording).problem, stiff=False)
+    assert found is not None
+    assert_allclose(found, omega, rtol=1e-3)
+
+
 def test_terms_with_inputs_move_by_the_compiled_law_as_by_the_lagrangian():
     """A support that moves and a magnet: ½v² − ½(x − u)² + i²/(0.4 + x); the oracle is SciPy."""
     given = given_terms(["V: (x - u)**2", "V: i**2/(0.4 + x)"], ["x"], ["v"], (), ["u", "i"])

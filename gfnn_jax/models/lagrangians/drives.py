@@ -34,7 +34,8 @@ from gfnn_jax.models.lagrangians.weak_form import Bumps, summed, weak_rows
 class DriveOptions:
     """Options of the search for a drive (`benchmarks/vocabulary.py`).
 
-    spacing: of the frequencies tried, in turns over the record. fewest: turns of the slowest.
+    spacing: of the frequencies tried, in turns over the record, and lows: of them, that are looked
+    at more closely. fewest: turns of the slowest.
     windows: independent weak residuals, at least.
     fastest: times the fastest motion's frequency. width: turns over the record, of a line.
     stands_out: times the logarithm of the likelihood of any other frequency, of what is a line.
@@ -45,6 +46,7 @@ class DriveOptions:
     """
 
     spacing: float = 0.25
+    lows: int = 3
     fewest: float = 2.0
     windows: float = 10.0
     fastest: float = 4.0
@@ -74,10 +76,8 @@ def hidden_frequency(problem: ArcProblem, stiff: bool) -> float | None:
     if not len(tried):
         return None
     shares = np.array([left(omega) for omega in tried])
-    best = float(tried[np.argmin(shares)])
+    best, found = _lowest(left, tried, shares)
     beside = shares[np.abs(tried - best) > OPTIONS.width * turn]
-    ends = best - OPTIONS.spacing * turn, best + OPTIONS.spacing * turn
-    found: Any = minimize_scalar(left, bounds=ends, method="bounded")
     gain, others = (
         -np.log(max(float(share), 1e-300)) for share in (found.fun, min(beside, default=1.0))
     )
@@ -85,6 +85,22 @@ def hidden_frequency(problem: ArcProblem, stiff: bool) -> float | None:
     is_line = gain > OPTIONS.stands_out * others
     is_seen = is_line and 0.5 * count * gain > EVIDENCE.logarithm + chance
     return float(found.x) if is_seen and not _repeats(problem, float(found.x)) else None
+
+
+def _lowest(
+    left: Callable[[float], float], tried: np.ndarray, shares: np.ndarray
+) -> tuple[float, Any]:
+    """Of the frequencies tried the one near which least is left, and the minimum there: between
+    them a drive leaves much more than where it is, and an own frequency of the motion may leave
+    less there."""
+    around, spacing = np.pad(shares, 1, constant_values=np.inf), float(np.ptp(tried[:2]))
+    lows = np.flatnonzero((shares <= around[:-2]) & (shares <= around[2:]))
+    some = tried[lows[np.argsort(shares[lows])][: OPTIONS.lows]].tolist()
+    found = [
+        (omega, minimize_scalar(left, bounds=(omega - spacing, omega + spacing), method="bounded"))
+        for omega in some
+    ]
+    return min(found, key=lambda one: one[1].fun)
 
 
 def _repeats(problem: ArcProblem, omega: float) -> bool:

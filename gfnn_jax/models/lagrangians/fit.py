@@ -135,7 +135,8 @@ class SearchOptions:
     term may leave. imitated: share of what a term changes, below which the fitted ones imitate it.
     least: noise of a channel, of its spread; rounding, truncation and printed digits are below it.
     singular: eigenvalue of M, its diagonal 1, of motion with no inertia to speak of.
-    frictions: kinds that are tried; choose_friction: by held-out arcs, else all of these.
+    frictions: kinds that are tried; choose_friction: by held-out arcs, else all of these. partly:
+    laws with hidden coordinates may leave more than noise.
     """
 
     periods: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
@@ -152,6 +153,7 @@ class SearchOptions:
     singular: float = 1e-5
     frictions: tuple[str, ...] = FRICTIONS
     choose_friction: bool = True
+    partly: bool = True
 
 
 class Systems(NamedTuple):

@@ -170,15 +170,16 @@ def search_hidden(problem: ArcProblem) -> SearchResult:
     """The law of a problem whose channel shows several coordinates, from the first set of
     oscillations that leads to one which leaves noise alone, else from the best.
 
-    Raises FitError where no start follows the arcs to some times their noise.
+    Raises FitError where no start follows the arcs to some times their noise, or to the noise.
     """
+    most = STARTS.followed if problem.options.partly else STARTS.noise
     longest = max(problem.nodes, key=lambda n: len(n.t))
     found: list[LawFit] = []
     sets = oscillations(longest.t, longest.y[:, 0], problem.dim)
     for start in (fit for one in sets for fit in _along_short_arcs(_from(problem, one))):
         fit = _along_longer_arcs(start)
         problem.on_progress(f"from oscillations: {fit}")
-        if misfit(fit) < STARTS.followed:
+        if misfit(fit) < most:
             found.append(fit)
             if misfit(fit) < STARTS.noise:
                 break

@@ -216,7 +216,8 @@ def _or_with_hidden(find: Callable[..., LearnedLaw]) -> Callable[..., LearnedLaw
             missed = error
         left = missed.verdict if plain is None else plain.nature
         if NO_COLUMN in left and may_hide(recording) and not options.get("terms"):
-            law = with_number(partial(find, recording, **options), recording, plain or missed.fit)
+            alone = partial(find, recording, **options, partly=False)
+            law = with_number(alone, recording, plain or missed.fit)
             if law is not None:
                 return law
             if plain is None:
@@ -242,6 +243,7 @@ def fit_recording(
     terms: Sequence[Any] = (),
     loss: Loss | None = None,
     hidden: int | None = None,
+    partly: bool = True,
     on_progress: Callable[[str], Any] = lambda message: None,
 ) -> LearnedLaw:
     """The law of a recording, from its positions and inputs.
@@ -252,12 +254,12 @@ def fit_recording(
     text in the names of columns (`models.lagrangians.given_terms`), which are then all that is
     fitted. loss: of residuals in units of their noise; None: the soft L1 of `solve.noise`. hidden:
     coordinates beside the one position that no column shows (`models.lagrangians.hidden`); None:
-    as many as the record tells.
+    as many as the record tells. partly: such a law may leave more than noise.
     Raises InputError for bad options or a recording without positions, FitError where no law is
     found; its ``fit`` is then the `LearnedLaw` that misses most of the motion, where there is one.
     """
     started = time.process_time()
-    options = _options(friction)
+    options = dataclasses.replace(_options(friction), partly=partly)
     _check(recording, input_hold, mass)
     _check_moves(recording)
     steps: list[str] = []

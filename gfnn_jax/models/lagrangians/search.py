@@ -548,12 +548,21 @@ def with_equal_masses(fit: LawFit, least: float = np.inf) -> LawFit:
         free = fit
     z, masses = free.significance, protected(free.structure)
     held = tuple(Held(k[1], 0.5, None, AS_EQUAL) for k in z if k in masses and z[k] < least)
-    if not held:
+    if not held or (free.is_definite and _far_from(free, held)):
         return free
     equal = free.again(dataclasses.replace(free.structure, held=held))
     stands = _leaves_little_more(equal, free)
     stands |= equal.loudest < OPTIONS.noise and not free.is_definite
     return equal if stands else free
+
+
+def _far_from(fit: LawFit, held: Sequence[Held]) -> bool:
+    """Return whether coefficients that are held there would leave some times as much, by the
+    residuals close to the fit."""
+    places = [fit.structure.keys().index(("term", one.row)) for one in held]
+    apart = np.array([one.value for one in held]) - fit.p[places]
+    rise = apart @ np.linalg.lstsq(fit.linearised.covariance[np.ix_(places, places)], apart)[0]
+    return bool(1 + rise / fit.independent > OPTIONS.noise**2)
 
 
 def without_first_mass(fit: LawFit) -> LawFit:
