@@ -96,7 +96,7 @@ def _lowest(
     around, spacing = np.pad(shares, 1, constant_values=np.inf), float(np.ptp(tried[:2]))
     lows = np.flatnonzero((shares <= around[:-2]) & (shares <= around[2:]))
     some = tried[lows[np.argsort(shares[lows])][: OPTIONS.lows]].tolist()
-    found = [
+    found: list[tuple[float, Any]] = [
         (omega, minimize_scalar(left, bounds=(omega - spacing, omega + spacing), method="bounded"))
         for omega in some
     ]
