@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gfnn_jax.families.friction import kind_of
+from gfnn_jax.families.friction import STRIBECK, kind_of
 from gfnn_jax.families.text import in_letters
 from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.fitting.significance import of_two
@@ -153,8 +153,13 @@ def leaves_open(fit: LawFit, rival: Exchanged) -> bool:
     """Return whether a rival leaves open which law it is: it is likelier than the law, or its
     friction is as plain and terms that it has more are as far from zero as chance does not make
     them. Less plain is friction of more kinds, of a rare kind, or of several speeds, which odds
-    that decide are needed for (`friction_choice`)."""
+    that decide are needed for (`friction_choice`). Stribeck's is a part of dry friction, whose
+    coefficient is another one beside it: it leaves the law open where it is more than chance."""
     more = len(rival.fit.p) - len(fit.p)
+    new = {row[1] for row in rival.fit.structure.friction if row not in fit.structure.friction}
+    if new == {STRIBECK} and more == 1:
+        evidence = fit.problem.options.evidence
+        return np.log(fit.independent) - rival.above > evidence.chance**2
     unlikely = rival.above + more * _for_fewer(fit, len(fit.p) - more)
     kinds, others = (_oddness(one.structure.friction) for one in (fit, rival.fit))
     plain = all(map(le, others, kinds)) and unlikely < fit.problem.options.evidence.deciding

@@ -28,10 +28,10 @@ from gfnn_jax.families.expressions import (
     to_text,
     with_leaves,
 )
-from gfnn_jax.families.friction import LINEAR, STRIBECK
+from gfnn_jax.families.friction import DRY, LINEAR, STRIBECK
 from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
 from gfnn_jax.maps.observation import observed
-from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
+from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, places
 from gfnn_jax.models.lagrangians.libraries import (
     GAINS,
     SHAPES,
@@ -66,7 +66,7 @@ class RivalOptions:
     furthest: float = 0.3
     settled: float = 0.1
     noise: float = 2.0
-    fades: tuple[float, float] = (0.03, 0.9)
+    fades: tuple[float, ...] = (0.01, 0.025, 0.06, 0.15, 0.37, 0.9)
     clearly: float = 10.0
 
 
@@ -95,14 +95,22 @@ def with_likeliest_power(fit: LawFit) -> LawFit:
     return fit
 
 
-def fading(direction: Sequence[int], problem: ArcProblem) -> float:
-    """The speed, to two digits, over which Stribeck's friction fades where a search begins."""
-    return float(f"{np.sqrt(np.prod(_fades(direction, problem))):.2g}")
+def fades(direction: Sequence[int], problem: ArcProblem) -> list[float]:
+    """Speeds, to two digits, over which Stribeck's friction may fade, from the least on."""
+    speed = float(problem.scales.speed @ np.abs(direction))
+    return [float(f"{speed * one:.2g}") for one in OPTIONS.fades]
 
 
-def _fades(direction: Sequence[int], problem: ArcProblem) -> np.ndarray:
-    """The least and the largest speed (2,) over which Stribeck's friction fades."""
-    return problem.scales.speed @ np.abs(direction) * np.array(OPTIONS.fades)
+def as_it_fades(row: Loss, fit: LawFit) -> Loss:
+    """Stribeck's friction as a fit has it. Of one that has dry friction alone, with the speed over
+    which it would be seen best: with another one it may not be seen at all."""
+    along = {one[1]: one for one in fit.structure.friction if one[0] == row[0]}
+    if STRIBECK in along or DRY not in along:
+        return along.get(STRIBECK, row)
+    tried = [("loss", (*row[:2], speed)) for speed in fades(row[0], fit.problem)]
+    larger = fit.structure.plus(tried)
+    one = fit.problem.linearised(larger, fit).added(*places(larger, fit.structure, tried))
+    return tried[int(np.argmax(one.value * one.size))][1]
 
 
 def with_fading(fit: LawFit) -> LawFit:
@@ -124,7 +132,7 @@ def with_fading(fit: LawFit) -> LawFit:
             found = of(log)
             return found.fitted.cost if found.follows else np.inf
 
-        ends = np.log(_fades(row[0], fit.problem))
+        ends = np.log([fades(row[0], fit.problem)[k] for k in (0, -1)])
         found: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 0.01})
         fit = of(found.x) if found.fun < fit.fitted.cost else fit
     return fit if fit is begun else fit.again()

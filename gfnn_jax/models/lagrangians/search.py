@@ -37,7 +37,8 @@ from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, chosen, 
 from gfnn_jax.models.lagrangians.given_terms import Given
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_rule, with_delay
 from gfnn_jax.models.lagrangians.rivals import (
-    fading,
+    as_it_fades,
+    fades,
     with_a_shape,
     with_constant,
     with_fading,
@@ -405,8 +406,7 @@ class TermSearch:
     def _may_rub(self, fit: LawFit) -> list[Loss]:
         """Friction that the law of a fit may have; Stribeck's as it has it, and by a load where it
         has dry friction."""
-        own = {row[:2]: row for row in fit.structure.friction if row[1] == STRIBECK}
-        rows = [own.get(row[:2], row) for row in self.frictions or ()]
+        rows = [as_it_fades(r, fit) if r[1] == STRIBECK else r for r in self.frictions or ()]
         dry = np.any(fit.form.friction.dry) or not fit.problem.options.choose_friction
         rows = [row for row in rows if row[1] < LOADED or dry]
         return [row for row in rows if fit.structure.may_have(("loss", row))]
@@ -479,7 +479,7 @@ def frictions_tried(problem: ArcProblem) -> tuple[Loss, ...]:
     if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
         kinds = tuple(kind for kind in kinds if kind != UNIFORM)
     rows = libraries.losses(dim, kinds, 0.0, problem.lengths, problem.num_inputs)
-    rows = [(c, k, fading(c, problem)) if k == STRIBECK else (c, k, w) for c, k, w in rows]
+    rows = [(c, k, fades(c, problem)[-3]) if k == STRIBECK else (c, k, w) for c, k, w in rows]
     if not options.choose_friction and ISOTROPIC in kinds and ISOTROPIC not in kinds_of(rows):
         raise InputError(
             "isotropic friction is that of a plane or of space: expected two or three positions "

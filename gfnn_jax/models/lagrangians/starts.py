@@ -25,7 +25,7 @@ from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.input_rules import choose_rule
 from gfnn_jax.models.lagrangians.nature import told_by_positions
-from gfnn_jax.models.lagrangians.rivals import fading
+from gfnn_jax.models.lagrangians.rivals import fades
 from gfnn_jax.models.lagrangians.structure import Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import (
     centre_of_forces,
@@ -249,8 +249,8 @@ class _Starts:
         if library.rubs != STRIBECK:
             return tuple(rows)
         found = [
-            tuple((c, k, by * fading(c, problem) if k == STRIBECK else w) for c, k, w in rows)
-            for by in (0.3, 1.0, 3.0)
+            tuple((c, k, fades(c, problem)[by] if k == STRIBECK else w) for c, k, w in rows)
+            for by in range(len(fades(rows[0][0], problem)))
         ]
         terms = tuple(library.rows)
         return min(
