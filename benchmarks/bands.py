@@ -71,7 +71,7 @@ CASES = {
     "ring-32": partial(
         calibrated, partial(froeschle, 32), lend=True, data_sets=SETS_OF_RINGS, learn="map"
     ),
-    "ensemble": partial(calibrated, henon_heiles, lend=False, data_sets={500: 3}, **NETWORKS),
+    "ensemble": partial(calibrated, henon_heiles, lend=False, data_sets={500: 10}, **NETWORKS),
 }
 PIECES = {
     **{
