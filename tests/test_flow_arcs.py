@@ -21,6 +21,7 @@ from gfnn_jax.models.hamiltonians.sequences import (
     covariance_root_of,
     lacks_terms,
     longest_arc,
+    triangle_of,
 )
 from gfnn_jax.solve.latent_arcs import OUTLYING
 
@@ -93,6 +94,15 @@ def test_a_pair_is_an_arc_of_two_states():
         noise += found.sigma / 4
     assert 4 < squares < 24  # chi squared of 12
     np.testing.assert_allclose(noise, [3e-3, 1e-3], rtol=0.08)
+
+
+@pytest.mark.parametrize("length", [2, 11])
+def test_residuals_are_as_many_as_latent_states_leave(length):
+    """What is left is noise of variance 1 by that count: it is what terms are told from. Of pairs,
+    half of whose numbers their latent states follow, it would be ½ by the numbers measured."""
+    triangle = triangle_of(shot(measured(3, 600 // length, length)[0]))
+    variance = triangle.residual_norm(len(TRUE)) ** 2 / (triangle.rows - len(TRUE))
+    assert 0.85 < variance < 1.15  # outlying ones have less weight
 
 
 def test_gross_errors_change_nothing_and_are_counted():
@@ -247,7 +257,10 @@ def test_a_misfit_that_is_alike_along_an_arc_does_not_average_away(misfit):
     left = y - y.mean()
     whole = np.concatenate([np.ones((y.size, 1)), left.reshape(-1, 1)], axis=1)
     found = SimpleNamespace(
-        factor=np.linalg.qr(whole, mode="r"), residuals=left, scores=left.sum(axis=1)
+        factor=np.linalg.qr(whole, mode="r"),
+        residuals=left,
+        scores=left.sum(axis=1),
+        x=np.zeros((*left.shape[:2], 0)),
     )
     deviation = abs(covariance_root_of(found)[0, 0])
     expected = misfit or 1 / np.sqrt(y.size)

@@ -9,7 +9,8 @@ description length is taken,
 
     Σ_i n_i ln σ_i + ½ k ln n + what there is to say of its atoms,
 
-σ_i what it leaves over of each coordinate (n_i numbers), k its own numbers (Rissanen 1978).
+σ_i what it leaves over of each coordinate (n_i numbers more than its latent states have), k its own
+numbers (Rissanen 1978).
 """
 
 from __future__ import annotations
@@ -380,9 +381,10 @@ def _significant(
             return None
         formula = formula.take(kept)
     count = np.isfinite(found.residuals).sum(axis=(0, 1))
+    free = count * (1 - found.x[:, 0].size / count.sum())  # an arc's first state follows its own
     length = float(
-        np.sum(count * np.log(noise_of(found)))
-        + 0.5 * np.log(count.sum()) * len(found.p)
+        np.sum(free * np.log(noise_of(found)))
+        + 0.5 * np.log(free.sum()) * len(found.p)
         + NOISY.penalty * formula.complexity
     )
     return _LawOfSequences(formula, found, length)

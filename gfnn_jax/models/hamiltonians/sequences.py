@@ -431,11 +431,12 @@ def noise_of(found: Fitted) -> np.ndarray:
 
 
 def triangle_of(found: Fitted) -> Triangle:
-    """Triangle of [∂r/∂c, r] without the latent states, r predicted less measured, for the numbers
-    that have weight."""
+    """Triangle of [∂r/∂c, r] without the latent states, r predicted less measured, of as many rows
+    as the numbers that have weight are more than the latent ones: of a pair half."""
     factor = found.factor.copy()
     factor[:, -1] *= -1
-    return Triangle(factor, int((np.abs(found.residuals) < BIWEIGHT.k).sum()))
+    weighty = np.sum(np.abs(found.residuals) < BIWEIGHT.k, axis=(1, 2))
+    return Triangle(factor, int(np.maximum(weighty - found.x.shape[-1], 0).sum()))
 
 
 def _of_selection(triangle: Triangle, c: np.ndarray, few: np.ndarray) -> float:
