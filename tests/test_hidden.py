@@ -11,8 +11,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
+from gfnn_jax.budget import Counted
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.models.lagrangians.hidden import with_number
+from gfnn_jax.models.lagrangians import hidden
+from gfnn_jax.models.lagrangians.hidden import with_hidden, with_number
+from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.signals.oscillations import Oscillations, oscillations
 
 STEP = 0.025
@@ -123,6 +126,31 @@ def test_the_number_of_hidden_coordinates_is_the_likeliest(laws, number, tried):
     assert asked == tried
     assert (law and law.count) == number
     assert number is None or f"{number} hidden" in law.messages[0]
+
+
+@pytest.mark.slow
+def test_the_work_of_a_search_is_counted_and_ends_with_what_was_found(monkeypatch):
+    t = 0.1 * np.arange(120)
+    x = np.cos(2 * t) + 0.4 * np.exp(-0.02 * t) * np.cos(5.1 * t)
+    x += 1e-3 * np.random.default_rng(0).normal(size=len(t))
+    recording = with_hidden(gfnn.Recording({"t": t, "x": x}, positions=["x"], angles=[]), 1)
+    problem, caps = samples_of(recording).problem, []
+
+    def searched(most):
+        caps.append(Counted(most))
+        monkeypatch.setattr(hidden, "Counted", lambda most: caps[-1])
+        return hidden.search_hidden(problem)
+
+    whole = searched(np.inf)
+    assert not whole.ended
+    most = 0.9 * caps[0].spent
+    part = searched(most)
+    assert most < caps[1].spent < 1.2 * most  # an evaluation more, with which it ends
+    assert "terms that the record does not show may be left" in part.ended
+    assert len(part.fit.p) >= len(whole.fit.p)
+    assert part.fit.problem.allowance is problem.allowance  # bands are not bounded
+    with pytest.raises(FitError, match=r"follows the column after 1e\+00 operations: ask for"):
+        searched(1.0)
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from gfnn_jax.budget import Counted
 from gfnn_jax.fitting.evidence import improved
 from gfnn_jax.fitting.significance import matched, of_two, terms_above_noise
 from gfnn_jax.fitting.triangle import Triangle
@@ -86,3 +87,13 @@ def test_changes_are_made_one_after_another_as_long_as_one_is_better():
     assert found == {2, 3}
     assert asked == [-4, -1, 2, 3]  # what was refused is not asked about again
     assert improved(frozenset({3, -1, 2, -4}), sorted, changed, 1) == {3, -1, 2}
+
+
+def test_what_a_search_has_when_its_work_is_spent_stands():
+    cap = Counted(1)
+
+    def changed(model, gone):
+        cap.spend(1)
+        return model - {gone} if gone < 0 else None
+
+    assert improved(frozenset({3, -1, -2, -4}), sorted, changed) == {3, -1}

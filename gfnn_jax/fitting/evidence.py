@@ -20,6 +20,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from gfnn_jax.errors import OutOfTime
+
 Model = TypeVar("Model")
 
 
@@ -119,7 +121,7 @@ def improved(
 
     changes: names those of a model that may make it better, the most promising first. changed: the
     model after one of them, None where it is no better: that change is not tried again. most: that
-    are tried.
+    are tried. A change that raises OutOfTime is the last: the model before it stands.
     """
     refused, tried = set(), 0
     while True:
@@ -128,7 +130,10 @@ def improved(
                 continue
             if tried == most:
                 return model
-            tried, other = tried + 1, changed(model, change)
+            try:
+                tried, other = tried + 1, changed(model, change)
+            except OutOfTime:
+                return model
             if other is not None:
                 model = other
                 break

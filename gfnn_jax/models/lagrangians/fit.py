@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import UNBOUNDED, Allowance
 from gfnn_jax.dataset.stretches import Arcs, Nodes, Scales, arcs_of, with_noise, with_states
 from gfnn_jax.families.lagrangian import INPUTS
 from gfnn_jax.fitting.evidence import EVIDENCE, Evidence, correlation_time, criterion
@@ -33,7 +34,8 @@ class LawOnArcs:
     channels of ``observation`` plus the ``zeros`` of angles; their coefficients come last, first
     the zeros', then the parameters of ``observation``. Coefficients that are not ``free`` (indices)
     stay as in ``given``. args (A, k): parameters of the system that each arc is of, where the
-    coefficients depend on such."""
+    coefficients depend on such. allowance: spends the numbers that steps and their derivatives
+    are."""
 
     form: Form
     observation: Observation
@@ -43,6 +45,7 @@ class LawOnArcs:
     given: np.ndarray
     free: np.ndarray
     args: np.ndarray | None = None
+    allowance: Allowance = UNBOUNDED
 
     def full(self, p: np.ndarray) -> np.ndarray:
         """All coefficients, of the free ones."""
@@ -61,6 +64,7 @@ class LawOnArcs:
     def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         arcs, length, m = x.shape
         whole, num = self.full(p), arcs * (length - 1)
+        self.allowance.spend(num * self.u.shape[2] * m * (1 + m + len(self.free)))
         form, coefficients, turn = self._of_arcs(whole)
         if turn is not None:
             coefficients = np.repeat(coefficients, length - 1, axis=0)
@@ -225,6 +229,7 @@ class ArcProblem:
     channels, where they do. gauge: (n, d) positions over which the mean inertia is 1; those of the
     nodes unless given. inputs: `ArcInputs`, by the first of the rules unless given, or a function
     of arcs in their place where nothing else is asked of them. forces: names of the inputs.
+    allowance: what fits may take, in numbers of `LawOnArcs`.
     """
 
     nodes: Sequence[Nodes]
@@ -239,6 +244,7 @@ class ArcProblem:
     gauge: np.ndarray = None  # pyright: ignore[reportAssignmentType]
     inputs: Any = None
     forces: tuple[str, ...] = INPUTS
+    allowance: Allowance = UNBOUNDED
 
     def __post_init__(self):
         if self.gauge is None:
@@ -327,7 +333,8 @@ class ArcProblem:
             args = self.systems.of_nodes[[i for i, _, _ in arcs.home]]
         h, u = np.diff(arcs.t, axis=1), self.inputs(arcs)
         places = np.arange(len(p) if free else 0)
-        return LawOnArcs(form, self.observation, structure.zeros, h, u, p, places, args)
+        seen, allowance = self.observation, self.allowance
+        return LawOnArcs(form, seen, structure.zeros, h, u, p, places, args, allowance)
 
     def whitening(self, arcs: Arcs) -> np.ndarray | None:
         """Whitening (A, k, L, L) of the residuals of arcs; None where they are white."""

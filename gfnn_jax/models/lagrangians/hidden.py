@@ -15,14 +15,16 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from gfnn_jax.budget import Allowance, Counted, within
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import symbols
-from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.errors import FitError, InputError, OutOfTime
 from gfnn_jax.families.friction import LINEAR
 from gfnn_jax.fitting.evidence import criterion
 from gfnn_jax.maps.observation import Hidden
@@ -45,7 +47,8 @@ class HiddenOptions:
     periods: lengths of arcs, in periods of the slowest oscillation. degrees: of the powers of
     modes. couplings: squares of c in ½v² + c v w + ½w², of two pendulums, and sizes: of the hidden
     swings, times those that are seen, that are tried. finished: starts that are followed on.
-    damped: of the critical friction, at the start.
+    damped: of the critical friction, at the start. most: numbers of steps and of their derivatives
+    that a search may take, twice as many as any whose law was right.
     """
 
     periods: tuple[float, ...] = (0.75, 1.5, 3.0, 6.0, 12.0)
@@ -54,6 +57,7 @@ class HiddenOptions:
     sizes: tuple[float, ...] = (0.5, 1.0, 2.0)
     finished: int = 3
     damped: float = 0.003
+    most: float = 5e8
 
 
 OPTIONS = HiddenOptions()
@@ -143,10 +147,10 @@ def with_hidden(recording: Recording, count: int) -> Recording:
     )
 
 
-def no_hidden_law(count: int, law: Any = None) -> FitError:
+def no_hidden_law(count: int, law: Any = None, after: str = "") -> FitError:
     """Error where no law with so many hidden coordinates follows, but ``law`` in part."""
     return FitError(
-        f"no law with {count} of its coordinates hidden follows the column: ask for fewer, "
+        f"no law with {count} of its coordinates hidden follows the column{after}: ask for fewer, "
         f"--hidden {count - 1}, or record another column",
         f"no law: none with {count} hidden coordinates follows the recording",
         law,
@@ -168,26 +172,41 @@ def _sensor(recording: Recording, name: str, found: Oscillations, mean: float) -
 
 def search_hidden(problem: ArcProblem) -> SearchResult:
     """The law of a problem whose channel shows several coordinates, from the first set of
-    oscillations that leads to one which leaves noise alone, else from the best.
+    oscillations that leads to one which leaves noise alone, else from the best. Where it has taken
+    what it may, what was found by then stands.
 
     Raises FitError where no start follows the arcs to some times their noise, or to the noise.
     """
     most = STARTS.followed if problem.options.partly else STARTS.noise
     longest = max(problem.nodes, key=lambda n: len(n.t))
-    found: list[LawFit] = []
+    cap, found = Counted(OPTIONS.most), list[LawFit]()
+    capped = dataclasses.replace(problem, allowance=Allowance(cap=cap))
     sets = oscillations(longest.t, longest.y[:, 0], problem.dim)
-    for start in (fit for one in sets for fit in _along_short_arcs(_from(problem, one))):
-        fit = _along_longer_arcs(start)
-        problem.on_progress(f"from oscillations: {fit}")
-        if misfit(fit) < most:
-            found.append(fit)
-            if misfit(fit) < STARTS.noise:
-                break
+    with contextlib.suppress(OutOfTime):
+        for start in (fit for one in sets for fit in _along_short_arcs(_from(capped, one))):
+            fit = _along_longer_arcs(start)
+            problem.on_progress(f"from oscillations: {fit}")
+            if misfit(fit) < most:
+                found.append(fit)
+                if misfit(fit) < STARTS.noise:
+                    break
     if not found:
-        raise no_hidden_law(problem.dim - 1)
-    fit = min(found, key=misfit)
-    fit = TermSearch(fit.structure, None).prune(fit)
-    return SearchResult(InputModel(fit), FrictionChoice(fit.structure.friction, {}, {}, False))
+        raise no_hidden_law(problem.dim - 1, after=_spent(cap))
+    best = min(found, key=misfit)
+    fewer = partial(TermSearch(best.structure, None).prune, best)
+    fit = within(contextlib.nullcontext(), fewer) or best
+    freed = dataclasses.replace(fit.problem, allowance=problem.allowance)
+    fit = dataclasses.replace(fit, problem=freed)
+    choice = FrictionChoice(fit.structure.friction, {}, {}, False)
+    ended = _spent(cap) and (
+        f"the search ended{_spent(cap)}: terms that the record does not show may be left in the law"
+    )
+    return SearchResult(InputModel(fit), choice, ended=ended)
+
+
+def _spent(cap: Counted) -> str:
+    """What a search has taken, where that was all it might."""
+    return f" after {cap.most:.0e} operations" if cap.spent > cap.most else ""
 
 
 def _from(problem: ArcProblem, found: Oscillations) -> ArcProblem:

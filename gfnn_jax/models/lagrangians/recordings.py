@@ -407,7 +407,7 @@ def _findings(
     """The law that was found, made ready for forecasts, and what its fit shows."""
     note, options = data.problem.on_progress, data.problem.options
     note(f"law (its bands follow): {line_of(recording, GaugedLaw.of(data, found.fit))}")
-    (model, choice, _), ready = _forecasting_best(found, data)
+    (model, choice, *_), ready = _forecasting_best(found, data)
     fit = with_fine_steps(model.fit)
     measured = velocities(recording, fit)
     for name, one in measured.items():
@@ -421,6 +421,7 @@ def _findings(
         *left_out,
         *data.messages,
         *_without_role(recording),
+        *filter(None, [found.ended]),
         *_held(best.fit),
         *_at_bound(options, best.choice, best.law.dim),
     )

@@ -61,11 +61,13 @@ from gfnn_jax.models.lagrangians.zeros import with_zeros_of_runs
 
 class SearchResult(NamedTuple):
     """Findings of a search: the fit to the longest arcs with the inputs as they act, which friction
-    and how sure that is; and the same of shorter arcs, where these tell the coefficients better."""
+    and how sure that is; the same of shorter arcs, where these tell the coefficients better; and a
+    message where the search ended before its end."""
 
     model: InputModel
     choice: FrictionChoice
     shorter: SearchResult | None = None
+    ended: str = ""
 
     @property
     def fit(self) -> LawFit:
