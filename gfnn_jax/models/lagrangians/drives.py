@@ -90,9 +90,9 @@ def hidden_frequency(problem: ArcProblem, stiff: bool) -> float | None:
 def _lowest(
     left: Callable[[float], float], tried: np.ndarray, shares: np.ndarray
 ) -> tuple[float, Any]:
-    """Of the frequencies tried the one near which least is left, and the minimum there: between
-    them a drive leaves much more than where it is, and an own frequency of the motion may leave
-    less there."""
+    """The frequency, of those tried, near which least is left, and the minimum there: between them
+    a drive leaves much more than where it is, and an own frequency of the motion may leave less
+    there."""
     around, spacing = np.pad(shares, 1, constant_values=np.inf), float(np.ptp(tried[:2]))
     lows = np.flatnonzero((shares <= around[:-2]) & (shares <= around[2:]))
     some = tried[lows[np.argsort(shares[lows])][: OPTIONS.lows]].tolist()
