@@ -10,7 +10,7 @@ import contextlib
 import difflib
 import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 # An option with its value, up to the punctuation of a sentence; a value is no word of the sentence.
@@ -34,6 +34,7 @@ _TEXTS = (
     "scene",
     "base",
 )
+_FORMULAS = ("observe", "events")  # one for each column
 _PAIRS = ("guess", "mass", "std")
 _PLACES = (None, "FILE", "NAME", "A,B")  # for a value that the reader knows
 _readers = ["python"]  # of the messages; the innermost last
@@ -73,7 +74,7 @@ def _as_keyword(found: re.Match[str]) -> str:
     if value in _PLACES:
         return f"{name}="
     value = shlex.split(value)[0]
-    if name in ("observe", "events"):
+    if name in _FORMULAS:
         return f"{name}={dict([value.split(' = ', 1)])!r}"
     if name in _PAIRS:
         pairs = (pair.split("=", 1) for pair in value.split(","))
@@ -84,6 +85,36 @@ def _as_keyword(found: re.Match[str]) -> str:
         return f"{name}={value.replace(',', '')}"
     items = [] if value == "none" else value.split(",")
     return f"{name}={[int(x) if x.isdecimal() else x for x in items]!r}"
+
+
+def as_typed(options: Mapping[str, Any]) -> str:
+    """Keywords as options of the command line, with a blank before each: the way back.
+
+    >>> as_typed({"degrees": ("angle",), "start": 2.5, "observe": {"x": "l*sin(theta)"}})
+    " --degrees angle --from 2.5 --observe 'x = l*sin(theta)'"
+    """
+    words = {of: name for name, of in _IN_PYTHON.items() if of != "positions"} | {"stop": "to"}
+    parts = []
+    for option, value in options.items():
+        name, each = words.get(option, option).replace("_", "-"), [value]
+        if option in _FORMULAS:
+            each = [f"{column} = {formula}" for column, formula in value.items()]
+        elif isinstance(value, Mapping):
+            number = {n: x if isinstance(x, str) else f"{x:g}" for n, x in value.items()}
+            each = [",".join(f"{of}={text}" for of, text in number.items())]
+        elif isinstance(value, (tuple, list)):
+            each = [",".join(map(str, value)) or "none"]
+        parts += [f" --{name} {shlex.quote(str(one))}" for one in each]
+    return "".join(parts)
+
+
+def advised(advice: str, options: Mapping[str, Any]) -> str:
+    """Advice, with the options that follow it typed behind it where it ends in a colon.
+
+    >>> advised("Its unit is degrees:", {"degrees": ("angle",)})
+    'Its unit is degrees: --degrees angle'
+    """
+    return advice + as_typed(options) if advice.endswith(":") else advice
 
 
 def _number(text: str) -> str:

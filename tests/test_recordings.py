@@ -10,9 +10,8 @@ import gfnn_jax as gfnn
 from gfnn_jax.cli_parser import add_column_options, column_options, masses, names_roles
 from gfnn_jax.data.files import are_recordings
 from gfnn_jax.data.recording import parameters_of
-from gfnn_jax.data.recording_summary import as_typed
 from gfnn_jax.data.roles import symbols
-from gfnn_jax.errors import InputError
+from gfnn_jax.errors import InputError, as_typed
 from gfnn_jax.models.lagrangians.in_words import about_parameters
 
 T = np.array([0.0, 0.1, 0.25, 0.3, 1.0])

@@ -16,7 +16,7 @@ from scipy.linalg import eigh
 
 from gfnn_jax.data.roles import OF_CALENDAR, ROLES, by_name, is_angle, is_rate_of_turning, plain
 from gfnn_jax.data.tables import Table
-from gfnn_jax.errors import InputError
+from gfnn_jax.errors import InputError, advised, as_typed
 from gfnn_jax.signals.derivatives import derivatives, window
 from gfnn_jax.signals.noise import noise
 
@@ -87,7 +87,7 @@ class Undecided(InputError):
     """Columns whose roles nothing tells; ``options`` of `gfnn_jax.read`, or of a fit, may do."""
 
     def __init__(self, message: str, options: Mapping[str, Any]):
-        super().__init__(message)
+        super().__init__(advised(message, options))
         self.options = dict(options)
 
 
@@ -240,20 +240,17 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int)
     strengths = np.linalg.svd(known, compute_uv=False) if known.size else np.ones(len(names))
     shown = f"{', '.join(names)} {'is a rate' if len(names) == 1 else 'are rates'} of turning"
     if len(names) == 3 and strengths[1] > _OPTIONS.one_axis * strengths[0]:
-        states = ",".join(names)
         least = _OPTIONS.runs_of_a_body
         wanted = f", from {least} or more runs of different speeds" * (runs < least)
         return Undecided(
-            f"{source}: {shown} of a body about three axes. To learn its bracket{wanted}: "
-            f"--structure poisson --states {shlex.quote(states)}",
+            f"{source}: {shown} of a body about three axes. To learn its bracket{wanted}:",
             {"structure": "poisson", "states": tuple(names)},
         )
     main = names[int(np.argmax(known.std(axis=1)))] if known.size else names[0]
-    observe = {main: "omega + b"}
     return Undecided(
         f"{source}: {shown}, and no column shows the angle. To learn its law, with an offset b of "
-        f"the sensor: --coordinates theta --observe {shlex.quote(f'{main} = omega + b')}",
-        {"coordinates": ("theta",), "observe": observe},
+        "the sensor:",
+        {"coordinates": ("theta",), "observe": {main: "omega + b"}},
     )
 
 
@@ -266,20 +263,20 @@ def _unclear(
 ) -> Undecided:
     """Options for columns that nothing tells apart. explained: share of their rates that functions
     of them explain."""
-    typed = shlex.quote(",".join(moving))
+    positions = {"positions": tuple(moving)}
     if explained > _OPTIONS.first_order:
+        states = {"structure": "poisson", "states": tuple(moving)}
         return Undecided(
             f"{source}: the names {', '.join(columns)} do not show what was measured; their rates "
             f"are functions of {', '.join(moving)} themselves, as of states without velocities, of "
-            f"populations say: --structure poisson --states {typed}. If they are positions: "
-            f"--positions {typed}",
-            {"structure": "poisson", "states": tuple(moving)},
+            f"populations say:{as_typed(states)}. If they are positions:{as_typed(positions)}",
+            states,
         )
     return Undecided(
         f"{source}: the names {', '.join(moving)} do not show what was measured, and "
-        f"{', '.join(shown)} may be motion or what drives it. Name them: --positions {typed}, or "
+        f"{', '.join(shown)} may be motion or what drives it. Name them:{as_typed(positions)}, or "
         "some of them and --inputs",
-        {"positions": tuple(moving)},
+        positions,
     )
 
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from gfnn_jax.data.traits import (
     missed,
     scaled,
 )
+from gfnn_jax.errors import advised, as_typed
 from gfnn_jax.signals.derivatives import Relation, difference
 from gfnn_jax.signals.steps import drift
 from gfnn_jax.signals.wrong_values import TURN
@@ -46,6 +46,7 @@ WRONG = (
     "circle",
     "first order",
 )
+PROPOSED = ("kind", "let go", "caught", "rounded times", "roles")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,17 +92,25 @@ _OPTIONS = _Options()
 class Fault:
     """A mistake in a recording.
 
-    kind: one of WRONG, or of a note. message: what was found. remedy: what mends it, "" for nothing
-    to do. options: those of `gfnn_jax.read` that do, if any. wrong: whether a fit must not begin.
-    proposed: whether the command to type has these options, of a note too.
+    kind: one of WRONG, with which a fit must not begin, one of PROPOSED, whose options the command
+    to type has too, or of a note. message: what was found. advice: what mends it, "" for nothing to
+    do. options: those of `gfnn_jax.read` that do, if any; typed behind advice that ends in a colon.
     """
 
     kind: str
     message: str
-    remedy: str = ""
+    advice: str = ""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    wrong: bool = True
-    proposed: bool = False
+
+    @property
+    def wrong(self) -> bool:
+        """Whether a fit must not begin."""
+        return self.kind in WRONG
+
+    @property
+    def remedy(self) -> str:
+        """What mends it, with the options to type."""
+        return advised(self.advice, self.options)
 
     def __str__(self) -> str:
         return f"{self.message}. {self.remedy}" if self.remedy else self.message
@@ -111,15 +120,6 @@ def faults(traits: Traits) -> tuple[Fault, ...]:
     """All mistakes that are found, the wrong ones first."""
     found = [fault for check in _CHECKS for fault in check(traits)]
     return tuple(sorted(found, key=lambda fault: not fault.wrong))
-
-
-def _note(kind: str, message: str, remedy: str = "", options: Mapping[str, Any] | None = None):
-    return Fault(kind, message, remedy, options or {}, wrong=False)
-
-
-def _typed(names: Sequence[str] | str) -> str:
-    """Names as one word of a command line."""
-    return shlex.quote(names if isinstance(names, str) else ",".join(names))
 
 
 # Columns that a sensor did not measure, or measured badly.
@@ -133,8 +133,8 @@ def _constant(traits: Traits) -> Iterator[Fault]:
             if low == high:
                 shown = f"{low / recording.factors[name]:g} {recording.unit(name)}".rstrip()
                 found = f"{name} is {shown} in all rows"
-                remedy = f"Leave it out of --{role}"
-                yield Fault("constant", found, remedy, wrong=role != "inputs")
+                kind = "constant input" if role == "inputs" else "constant"
+                yield Fault(kind, found, f"Leave it out of --{role}")
 
 
 def _repeated(traits: Traits) -> Iterator[Fault]:
@@ -185,10 +185,10 @@ def _missing(traits: Traits) -> Iterator[Fault]:
         gone = [run for run, x in of_runs if not np.isfinite(x).any()]
         cells = int(np.sum(~np.isfinite(traits.columns[name])))
         if gone:
-            yield _note("missing column", f"{name} has no values in run {', '.join(gone[:8])}")
+            yield Fault("missing column", f"{name} has no values in run {', '.join(gone[:8])}")
         elif cells and name not in recording.events:
             rows = "1 row, which is" if cells == 1 else f"{cells} rows, which are"
-            yield _note("missing", f"{name} has no value in {rows} not used for it")
+            yield Fault("missing", f"{name} has no value in {rows} not used for it")
 
 
 def _wrong_values(traits: Traits) -> Iterator[Fault]:
@@ -197,7 +197,7 @@ def _wrong_values(traits: Traits) -> Iterator[Fault]:
     told = [in_words(traits.recording, name, of) for name, of in traits.wrong.items()]
     for kind in ("stuck", "outliers"):
         for of_column in (one for one in told if kind in one):
-            yield _note(kind, of_column[kind], "Left out of a fit")
+            yield Fault(kind, of_column[kind], "Left out of a fit")
 
 
 # Velocities that are not the derivatives of their positions.
@@ -220,15 +220,14 @@ def _related(traits: Traits) -> Iterator[Fault]:
         yield Fault(
             "order",
             f"the columns are in another order than their names say: {finding}",
-            f"--positions {_typed(positions)} --velocities {_typed(velocities)}",
+            "Name them in that order:",
             {"positions": positions, "velocities": velocities},
         )
         return
     unit = _time_unit(recording.time_unit, [relation.factor for relation in known.values()])
     if unit is not None:
         finding = ", ".join(f"{v} is {r.factor:.4g} × d{x}/dt" for (x, v), r in known.items())
-        remedy = f"The times are in {unit}: --time-unit {unit}"
-        yield Fault("time unit", finding, remedy, {"time_unit": unit})
+        yield Fault("time unit", finding, f"The times are in {unit}:", {"time_unit": unit})
         return
     for (x, v), relation in known.items():
         yield from _of_pair(traits, x, v, relation)
@@ -283,27 +282,26 @@ def _time_unit(unit: str, factors: list[float]) -> str | None:
 
 def _of_pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
     factor, degree, near = relation.factor, 180 / np.pi, _OPTIONS.near
-    positions = traits.recording.positions
-    without = f"or ignore {v}: --positions {_typed(positions)}"
-    alone, typed = {"positions": positions}, _typed(v)
+    alone = {"positions": traits.recording.positions}
+    without = f"or ignore {v}:{as_typed(alone)}"
     finding = f"{v} is {factor:.4g} × d{x}/dt"
     if relation.explained < _OPTIONS.derivative:
         part = f"{100 * relation.explained:.0f} % of its variance"
         finding = f"{v} is not the derivative of {x}: d{x}/dt explains {part}"
-        remedy = f"Name {v} as an input (--inputs {typed}), {without}"
+        remedy = f"Name {v} as an input ({as_typed({'inputs': (v,)}).strip()}), {without}"
         if _drives(traits, v):
-            alone = {"positions": positions, "inputs": (*traits.recording.inputs, v)}
+            alone["inputs"] = (*traits.recording.inputs, v)
         yield Fault("no derivative", finding, remedy, alone)
     elif abs(factor * degree - 1) < near:
-        remedy = f"The unit of {x} is degrees: --degrees {_typed(x)}"
-        yield Fault("degrees", finding, remedy, {"degrees": (x,)})
+        yield Fault("degrees", finding, f"The unit of {x} is degrees:", {"degrees": (x,)})
     elif abs(factor / degree - 1) < near:
-        remedy = f"The unit of {v} is degrees per second: --degrees {typed}"
+        remedy = f"The unit of {v} is degrees per second:"
         yield Fault("degrees", finding, remedy, {"degrees": (v,)})
     elif abs(factor + 1) < near:
         yield Fault("sign", finding, f"Change the sign of {v} in the file, {without}", alone)
     elif factor < 0 or abs(np.log(factor)) > _OPTIONS.off:
-        remedy = f"Check its unit, fit its scale (--scale {typed}), {without}"
+        scale = as_typed({"scale": (v,)}).strip()
+        remedy = f"Check its unit, fit its scale ({scale}), {without}"
         yield Fault("factor", finding, remedy, alone)
     else:
         yield from _derived(traits, x, v, relation)
@@ -323,12 +321,11 @@ def _drives(traits: Traits, name: str) -> bool:
 
 def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
     """Notes about a velocity that was made of the position."""
-    alone = {"positions": traits.recording.positions}
-    without = f"To ignore {v}: --positions {_typed(traits.recording.positions)}"
+    alone, without = {"positions": traits.recording.positions}, f"To ignore {v}:"
     kind = difference(traits.times, traits.columns[x], traits.columns[v])
     if kind is not None:
         found = f"{v} is the {kind} difference of {x} and adds no information"
-        yield _note("difference", found, without, alone)
+        yield Fault("difference", found, without, alone)
         return
     error = max(5 * relation.factor_error, _OPTIONS.filtered)
     late = max(5 * relation.lag_error, _OPTIONS.late * traits.step)
@@ -337,7 +334,7 @@ def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fau
             f"{v} looks filtered: it is {relation.factor:.3g} × d{x}/dt with a lag of "
             f"{1e3 * relation.lag:.2g} ms"
         )
-        yield _note("filtered", found, without, alone)
+        yield Fault("filtered", found, without, alone)
 
 
 # Angles in other units, wrapped angles, and jumps that interpolation has cut.
@@ -373,16 +370,16 @@ def _units_of_angles(traits: Traits) -> Iterator[Fault]:
     for name in _angles(traits):
         if recording.factors[name] != 1 or name in recording.explained:
             continue
-        option, degrees = {"degrees": (name,)}, f"--degrees {_typed(name)}"
-        raw = traits.raw(name)
+        option, raw = {"degrees": (name,)}, traits.raw(name)
         jump, swing = _jumps(traits, name), _swing(raw)
         wide = swing > _OPTIONS.swing and np.ptp(np.concatenate(raw)) < 720
         if jump is not None and jump[0] == 360:
             found = f"{name} jumps by 360 ({jump[1]} times)"
-            yield Fault("degrees", found, f"Its unit is degrees: {degrees}", option)
+            yield Fault("degrees", found, "Its unit is degrees:", option)
         elif wide and not _settled(traits, name):
             found = f"{name} swings by {swing:.3g}, degrees or {swing / TURN:.0f} turns in radians"
-            remedy = f"If degrees: {degrees}. If radians: --angles {_typed(recording.angles)}"
+            radians = as_typed({"angles": recording.angles})
+            remedy = f"If degrees:{as_typed(option)}. If radians:{radians}"
             yield Fault("degrees", found, remedy, option)
 
 
@@ -416,8 +413,7 @@ def _wraps(traits: Traits) -> Iterator[Fault]:
         if jump is not None:
             option = "degrees" if jump[0] == 360 else "angles"
             found = f"{name} jumps by {jump[0]:.3g} ({jump[1]} times)"
-            remedy = f"Name it as an angle: --{option} {_typed(name)}"
-            yield Fault("wrapped", found, remedy, {option: (name,)})
+            yield Fault("wrapped", found, "Name it as an angle:", {option: (name,)})
 
 
 def _interpolated_jumps(traits: Traits) -> Iterator[Fault]:
@@ -460,7 +456,7 @@ def _coarse(traits: Traits) -> Iterator[Fault]:
         is_lift = np.ptp(np.concatenate(raw)) > 1.02 * TURN
         if wide > max(3, 0.01 * len(steps)) and not is_lift:
             found = f"{name} moves by more than 135° in {wide} steps, in an ambiguous direction"
-            yield _note("coarse", found, "Sample faster, or give the unwrapped angle")
+            yield Fault("coarse", found, "Sample faster, or give the unwrapped angle")
 
 
 # Times in several units, clocks that drift, and runs that do not belong together.
@@ -529,7 +525,7 @@ def _of_other_systems(traits: Traits) -> list[str]:
 
 
 def _reading(traits: Traits) -> Iterator[Fault]:
-    return (_note("reading", note) for note in traits.recording.notes)
+    return (Fault("reading", note) for note in traits.recording.notes)
 
 
 _CHECKS = (

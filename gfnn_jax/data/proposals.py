@@ -7,7 +7,6 @@ nothing is done without them.
 from __future__ import annotations
 
 import dataclasses
-import shlex
 from collections.abc import Iterator
 
 import numpy as np
@@ -92,7 +91,7 @@ def _states(traits: Traits) -> Iterator[Fault]:
         "first order",
         f"the rates of {shown} are functions of {shown} themselves{keeps}, as {what}: these are "
         "not positions",
-        f"Learn their bracket: --structure poisson --states {shlex.quote(','.join(names))}",
+        "Learn their bracket:",
         {"structure": "poisson", "states": names},
     )
 
@@ -168,10 +167,7 @@ def _circles(traits: Traits) -> Iterator[Fault]:
         before = pair
     guess = {name: float(f"{value:.4g}") for name, value in guess.items()}
     options = {"coordinates": tuple(angles), "observe": shows, "guess": guess}
-    typed = " ".join(f"--observe {shlex.quote(f'{n} = {text}')}" for n, text in shows.items())
-    start = ",".join(f"{n}={value:g}" for n, value in guess.items())
-    remedy = f"What moves is an angle: --coordinates {','.join(angles)} {typed} --guess {start}"
-    yield Fault("circle", "; ".join(told), remedy, options)
+    yield Fault("circle", "; ".join(told), "What moves is an angle:", options)
 
 
 # Angles, in radians or degrees, and lengths.
@@ -218,10 +214,7 @@ def _kinds(traits: Traits) -> Iterator[Fault]:
             f"the accelerations of {name} are those of {what.get(best, 'an angle in degrees')}: "
             f"{times:.2g} times closer"
         )
-        typed = f"To say so: --degrees {shlex.quote(name)}"
-        if best != "degrees":
-            typed = f"To say so: --angles {shlex.quote(','.join(angles) or 'none')}"
-        yield Fault("kind", found, typed, options, wrong=False, proposed=True)
+        yield Fault("kind", found, "To say so:", options)
 
 
 def _left(known: Accelerations, now: list[bool], k: int, angle: bool, factor: float = 1.0) -> float:
@@ -305,13 +298,11 @@ def _hands(traits: Traits) -> Iterator[Fault]:
             f"the motion begins at rest and is free from {shown:g} on at the earliest: before it "
             "something moves the body that no column shows"
         )
-        yield Fault(
-            "let go", found, f"To begin there: --from {shown:g}", {"start": shown}, False, True
-        )
+        yield Fault("let go", found, "To begin there:", {"start": shown})
     if end is not None:
         shown = float(f"{end / second:.6g}")
         found = f"the motion stops at once behind {shown:g}, as if caught"
-        yield Fault("caught", found, f"To end there: --to {shown:g}", {"stop": shown}, False, True)
+        yield Fault("caught", found, "To end there:", {"stop": shown})
 
 
 def _rounded_times(traits: Traits) -> Iterator[Fault]:
@@ -333,7 +324,7 @@ def _rounded_times(traits: Traits) -> Iterator[Fault]:
     told = float(f"{step:.{short}g}")
     if traits.recording.clock == "s" and all(abs(s - told) < 2 * e for s, e in steps):
         found = f"the times are rounded: an even step of {told:g} s agrees with all of them"
-        yield Fault("rounded times", found, f"To take it: --dt {told:g}", {"dt": told}, False, True)
+        yield Fault("rounded times", found, "To take it:", {"dt": told})
 
 
 _CHECKS = (_hands, _rounded_times)

@@ -69,5 +69,5 @@ def summarised(source: Any, options: Mapping[str, Any]) -> tuple[Recording, Reco
     roles = {name: value for name, value in told.items() if name not in of_fit}
     recording = read(source, **{**reading, **(roles or {"positions": told.get("states", ())})})
     message = message.removeprefix(f"{recording.source}: ")
-    fault = Fault("roles", message, "", of_fit, wrong=False, proposed=True)
+    fault = Fault("roles", message, "", of_fit)
     return recording, summarise(recording, {**options, **roles}, [fault])

@@ -14,11 +14,11 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from gfnn_jax.data.faults import WRONG, Fault
+from gfnn_jax.data.faults import PROPOSED, WRONG, Fault
 from gfnn_jax.data.proposals import findings, mistakes
 from gfnn_jax.data.roles import ROLES
 from gfnn_jax.data.traits import Traits, of_rows, traits
-from gfnn_jax.errors import InputError, said
+from gfnn_jax.errors import InputError, as_typed, said
 from gfnn_jax.signals import energy
 from gfnn_jax.signals.steps import dominant_frequencies, gaps
 from gfnn_jax.storage.outputs import finite
@@ -26,7 +26,6 @@ from gfnn_jax.storage.outputs import finite
 if TYPE_CHECKING:
     from gfnn_jax.data.recording import Recording
 
-_FORMULAS = {"observe": "observe", "events": "event"}  # keyword: option, one for each column
 _SEEN = ("events", "accelerations")  # what a sensor shows, more exactly than its role
 _OF_FITS = ("structure", "states", "mass")
 _NOTEBOOK = '<pre style="line-height:normal;white-space:pre">{code}</pre>'
@@ -312,7 +311,7 @@ def _derivative_of(known: Traits, name: str):
 def _options(found: tuple[Fault, ...], given: Mapping[str, Any]) -> dict[str, Any]:
     """The options that were given, those that mend what is wrong, and those that are proposed."""
     typed = dict(given)
-    for fault in (f for f in found if f.wrong or f.proposed):
+    for fault in (f for f in found if f.kind in (*WRONG, *PROPOSED)):
         if {"coordinates", "states"} & set(fault.options):  # in place of what columns show
             typed = {name: value for name, value in typed.items() if name not in ROLES}
         for option, value in fault.options.items():
@@ -324,24 +323,6 @@ def _options(found: tuple[Fault, ...], given: Mapping[str, Any]) -> dict[str, An
 
 def _as_code(value: Any) -> str:
     return repr(list(value) if isinstance(value, tuple) else value)
-
-
-def as_typed(options: Mapping[str, Any]) -> str:
-    """Keywords of `gfnn_jax.read` as options of the command line, with a blank before each."""
-    words = {"start": "from", "stop": "to", "time_unit": "time-unit"}
-    parts = []
-    for option, value in options.items():
-        if option in _FORMULAS:
-            name = _FORMULAS[option]
-            parts += [f" --{name} {shlex.quote(f'{c} = {f}')}" for c, f in value.items()]
-            continue
-        if isinstance(value, Mapping):
-            number = {n: x if isinstance(x, str) else f"{x:g}" for n, x in value.items()}
-            value = ",".join(f"{name}={text}" for name, text in number.items())
-        elif isinstance(value, (tuple, list)):
-            value = ",".join(map(str, value)) or "none"
-        parts.append(f" --{words.get(option, option)} {shlex.quote(str(value))}")
-    return "".join(parts)
 
 
 # The screen.

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 
 from gfnn_jax.data.proposed import as_proposed
 from gfnn_jax.data.recording import SECONDS, Recording
-from gfnn_jax.data.recording_summary import as_typed
-from gfnn_jax.errors import InputError, WorkError
+from gfnn_jax.errors import InputError, WorkError, as_typed
 from gfnn_jax.evaluate import report
 from gfnn_jax.evaluate.forecasts import Forecasts, end_of_part, forecasts_of
 from gfnn_jax.evaluate.report import About
