@@ -8,7 +8,7 @@ import lzma
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -55,17 +55,23 @@ class Block:
     states: np.ndarray
     sequence: np.ndarray
     place: np.ndarray
-    locate: Callable[[int, int], str]
+    locate: Callable[[int, int], str] = lambda row, column: f"row {row}, column {column}"
     own: np.ndarray | None = None
 
     def rows(self, index: np.ndarray) -> Block:
+        locate = self.locate  # `self` would keep all rows in memory
         return Block(
             self.states[index],
             self.sequence[index],
             self.place[index],
-            lambda r, c: self.locate(int(index[r]), c),
+            lambda r, c: locate(int(index[r]), c),
             None if self.own is None else self.own[index],
         )
+
+    @property
+    def going(self) -> np.ndarray:
+        """The rows (n',) with which the next one goes on."""
+        return np.flatnonzero(self.sequence[1:] == self.sequence[:-1])
 
     def checked(self, path) -> Block:
         """Itself, if every number is finite and not too large; else InputError."""
@@ -81,6 +87,18 @@ class Block:
                     f"{self.locate(row, column)} = {self.states[row, column]}"
                 )
         return self
+
+
+def joined(blocks: Iterable[Block], dim: int) -> Block:
+    """Checked blocks of states (n, 2 · dim) one behind another; none may be there."""
+    parts = [Block(np.empty((0, 2 * dim)), np.empty(0), np.empty(0, int)), *blocks]
+    own = [block.own for block in parts if block.own is not None]
+    return Block(
+        np.concatenate([block.states for block in parts]),
+        np.concatenate([block.sequence for block in parts]),
+        np.concatenate([block.place for block in parts]),
+        own=np.concatenate(own) if own else None,
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -327,11 +327,6 @@ def angles_of(
     return tuple(n for n in roles["positions"] if n in angles), in_degrees
 
 
-def factors_of(names: Sequence[str], in_degrees: set[str]) -> dict[str, float]:
-    """Factors of the numbers in the file, by column: π/180 for degrees, else 1."""
-    return {name: math.pi / 180 if name in in_degrees else 1.0 for name in names}
-
-
 def _unit(units: Mapping[str, str], name: str) -> str:
     return units.get(name, "").strip().lower()
 

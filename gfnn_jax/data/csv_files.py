@@ -31,7 +31,7 @@ def are_states(names: Sequence[str]) -> bool:
     return {name[0] for name in found if _STATE.fullmatch(name)} == {"q", "p"}
 
 
-def open_csv(request: Request) -> Source:
+def open_csv(request: Request, _stream: object) -> Source:
     """Open a text file of states. Raises InputError where its columns are not those of states."""
     return _StatesInText(request).source
 
@@ -122,7 +122,7 @@ class _StatesInText:
         """The rows in blocks of at most so many. Raises InputError, with the line, where the rows
         of a sequence do not stand together, times do not rise or a parameter changes."""
         earlier: set[float] = set()
-        last, count = (np.nan, np.nan), 0  # sequence and time of the row before; its place
+        last, count = np.full((1, 2 + len(self.parameters)), np.nan), 0  # the row before; its place
         passed = 0
         for table in self._tables(min(rows, BLOCK_ROWS)):
             length, begin = len(table["q1"]), passed
@@ -130,7 +130,11 @@ class _StatesInText:
             sequence = (
                 begin + np.arange(length) if self.each_row else table.get("sequence", nothing)
             )
-            for row in np.flatnonzero(np.append(last[0], sequence[:-1]) != sequence):
+            time = table["t"] if self.with_time else nothing
+            told = np.stack([sequence, time, *(table[n] for n in self.parameters)], axis=1)
+            both = np.concatenate([last, told])
+            begins = both[1:, 0] != both[:-1, 0]
+            for row in np.flatnonzero(begins):
                 if sequence[row] in earlier or not np.isfinite(sequence[row]):
                     raise InputError(
                         f"{self.path}: {self.file.locate(begin + int(row))}: the rows of sequence "
@@ -138,40 +142,33 @@ class _StatesInText:
                     )
                 if "sequence" in table:
                     earlier.add(float(sequence[row]))
-            time = table["t"] if self.with_time else nothing
             if self.with_time:
-                before = np.append(last[1], time), np.append(last[0], sequence)
-                self._check_times_rise(*before, begin)
-                self.source.uneven |= not _even(*before, self.usual)
+                self._check_times_rise(both[:, 1], both[:, 0], begin)
+                self.source.uneven |= not _even(both[:, 1], both[:, 0], self.usual)
             if self.period is not None:
                 self._check_period(table, self.period)
-            values = (
-                np.stack([table[n] for n in self.parameters], axis=1)
-                if self.parameters
-                else (np.empty((length, 0)))
-            )
             if not self.each_row:
-                self._check_constant(values, sequence, begin)
-            begins = np.append(last[0], sequence[:-1]) != sequence
+                self._check_constant(both[:, 2:], begins, begin)
             row = np.arange(length)  # along its sequence; the first row may go on with one
             place = row - np.maximum.accumulate(np.where(begins, row, -count))
-            last, count = (sequence[-1], time[-1]), int(place[-1]) + 1
+            last, count = told[-1:], int(place[-1]) + 1
             passed += length
             yield Block(
                 np.stack([table[name] for name in self.states], axis=1),
                 sequence,
                 place,
                 lambda r, c, n=begin: f"{self.file.locate(n + r)}, {self.states[c]}",
-                np.column_stack([time, values]),
+                told[:, 1:],
             )
 
-    def _check_constant(self, values: np.ndarray, sequence: np.ndarray, begin: int) -> None:
-        """Raises InputError where a parameter (n, k) changes within a sequence."""
-        changes = np.any(np.diff(values, axis=0) != 0, axis=1) & (np.diff(sequence) == 0)
+    def _check_constant(self, values: np.ndarray, begins: np.ndarray, begin: int) -> None:
+        """Raises InputError where a parameter (1 + n, k) changes within a sequence. ``values``
+        start one row before the row ``begin``."""
+        changes = np.any(values[1:] != values[:-1], axis=1) & ~begins
         bad = changes | ~np.isfinite(values[1:]).all(axis=1)
         if bad.any():
-            row = int(np.argmax(bad)) + 1
-            now, before = (", ".join(f"{v:g}" for v in values[r]) for r in (row, row - 1))
+            row = int(np.argmax(bad))
+            before, now = (", ".join(f"{v:g}" for v in values[r]) for r in (row, row + 1))
             raise InputError(
                 f"{self.path}: {self.file.locate(begin + row)}: expected "
                 f"{', '.join(self.parameters)} finite and constant in each sequence, as parameters "

@@ -23,6 +23,7 @@ from gfnn_jax.data.traits import (
     in_words,
     missed,
     scaled,
+    turning_points,
 )
 from gfnn_jax.errors import advised, as_typed
 from gfnn_jax.signals.derivatives import Relation, difference
@@ -247,7 +248,9 @@ def _other_order(traits: Traits, declared: list[tuple[str, str]]) -> list[tuple[
     names = [name for pair in declared for name in pair]
     related = {pair: traits.relation(*pair) for pair in itertools.permutations(names, 2)}
     scores = {pair: 0.0 if r is None else r.likeness for pair, r in related.items()}
-    best = max(_pairings(names), key=lambda pairs: sum(scores[pair] for pair in pairs))
+    orders = itertools.permutations(names)
+    pairings = (list(zip(order[::2], order[1::2], strict=True)) for order in orders)
+    best = max(pairings, key=lambda pairs: sum(scores[pair] for pair in pairs))
     gain = sum(scores[pair] for pair in best) - sum(scores[pair] for pair in declared)
     good = gain > _OPTIONS.better and all(scores[pair] > 0.9 for pair in best)
     turned = (r for pair in declared if (r := related[pair]) is not None)
@@ -256,18 +259,6 @@ def _other_order(traits: Traits, declared: list[tuple[str, str]]) -> list[tuple[
     if not good or set(best) == set(declared):
         return None
     return sorted(best, key=lambda pair: names.index(pair[0]))
-
-
-def _pairings(names: list[str]) -> Iterator[list[tuple[str, str]]]:
-    """All ways to make ordered pairs of an even number of names."""
-    if not names:
-        yield []
-        return
-    first = names[0]
-    for other in names[1:]:
-        for pairs in _pairings([name for name in names[1:] if name != other]):
-            yield [(first, other), *pairs]
-            yield [(other, first), *pairs]
 
 
 def _time_unit(unit: str, factors: list[float]) -> str | None:
@@ -393,15 +384,10 @@ def _settled(traits: Traits, name: str) -> bool:
 
 def _swing(runs: list[np.ndarray]) -> float:
     """The median way between turning points, the ends of runs among them; 0 where nothing turns."""
-    from scipy import signal  # takes half a second: loaded when first used
-
     ways = [np.empty(0)]
     for x in runs:
-        prominence = 0.05 * np.ptp(x) if len(x) else 0.0
-        if prominence > 0:
-            turns = [signal.find_peaks(sign * x, prominence=prominence)[0] for sign in (1, -1)]
-            found = np.sort(np.concatenate(turns))
-            ways.append(np.abs(np.diff(x[[0, *found, -1]] if len(found) else [])))
+        found = turning_points(x, 0.05 * np.ptp(x)) if len(x) and np.ptp(x) > 0 else []
+        ways.append(np.abs(np.diff(x[[0, *found, -1]] if len(found) else [])))
     every = np.concatenate(ways)
     return float(np.median(every)) if len(every) else 0.0
 

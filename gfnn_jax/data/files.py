@@ -44,6 +44,7 @@ from gfnn_jax.data.blocks import (
     check_dt,
     column,
     damage,
+    joined,
 )
 from gfnn_jax.data.csv_files import are_states, open_csv
 from gfnn_jax.data.npz_files import open_npy, open_npz
@@ -52,6 +53,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.processes import WHOLE, Share
 from gfnn_jax.signals.steps import longest_step
 
+_OPENERS = {".npz": open_npz, ".npy": open_npy, ".csv": open_csv}
 FILE_STEP = 2**40  # between the labels of the runs of one file and those of the next
 
 
@@ -100,9 +102,7 @@ class TrajectoryData:
         """All pairs of consecutive states, as `Pairs` of shape (num_pairs, 2d)."""
         from gfnn_jax.phase_space import Pairs  # brings JAX
 
-        starts = np.ones(len(self.states), bool)
-        starts[np.cumsum(self.lengths) - 1] = False
-        rows = np.flatnonzero(starts)
+        rows = np.delete(np.arange(len(self.states)), np.cumsum(self.lengths) - 1)
         return Pairs(
             self.states[rows],
             self.states[rows + 1],
@@ -125,24 +125,21 @@ def read_trajectories(
     duplicated columns and about states that never move.
     """
     with opened(path, dt) as source:
-        blocks = list(source.blocks(2**62))
-        states = np.concatenate([np.empty((0, 2 * source.dim)), *(b.states for b in blocks)])
-        sequence = np.concatenate([np.empty(0), *(b.sequence for b in blocks)])
-        place = np.concatenate([np.empty(0, int), *(b.place for b in blocks)])
-        own = joined([b.own for b in blocks])
-    going = np.flatnonzero(sequence[1:] == sequence[:-1])
-    dt, args = source.of_pairs(own, going)
-    ends = np.flatnonzero(sequence[1:] != sequence[:-1]) + 1
-    lengths = np.diff(np.concatenate([[0], ends, [len(sequence)]])) if len(sequence) else ends
-    pairs = len(states) - len(lengths)
+        whole = joined(source.blocks(2**62), source.dim)
+    states, sequence, going = whole.states, whole.sequence, whole.going
+    dt, args = source.of_pairs(whole.own, going)
+    begins = np.flatnonzero(np.diff(sequence, prepend=np.nan) != 0)
+    lengths, pairs = np.diff(begins, append=len(sequence)), len(going)
     needed = 2 * source.dim + 1 if fewest is None else fewest
     if pairs < needed:
         raise InputError(
             f"{path}: {pairs} pair{'s' * (pairs != 1)} of consecutive states found, at least "
             f"{needed} are needed for d = {source.dim}"
         )
-    _warn_of_odd_columns(path, states, sequence)
-    identities = (None, None) if source.of_pairs_alone else (labels(sequence[going]), place[going])
+    for odd in _odd_columns(states, going):
+        warnings.warn(f"{path}: {odd}", DataWarning, stacklevel=2)
+    known = (labels(sequence[going]), whole.place[going])
+    identities = (None, None) if source.of_pairs_alone else known
     return TrajectoryData(
         states,
         lengths,
@@ -206,31 +203,25 @@ def iterate_pairs(
                 "as many files as processes"
             )
         with opened(path, dt) as source:
-            last_state, last_sequence = np.empty((0, 2 * source.dim)), np.empty(0)
-            last_place, last_arc = np.empty(0, int), (0, np.empty(2 * source.dim))
-            last_own: list[np.ndarray | None] = []
-            for block in source.blocks(chunk, *([of_rows] if of_rows.count > 1 else [])):
-                states = np.concatenate([last_state, block.states])
-                sequence = np.concatenate([last_sequence, block.sequence])
-                place = np.concatenate([last_place, block.place])
-                beside = joined([*last_own, block.own])
-                rows = np.flatnonzero(sequence[1:] == sequence[:-1])
+            last: list[Block] = []  # the row before the next block
+            last_arc = (0, np.empty(2 * source.dim))
+            for new in source.blocks(chunk, *([of_rows] if of_rows.count > 1 else [])):
+                block = joined([*last, new], source.dim)
+                last, rows = [block.rows(np.array([-1]))], block.going
                 if len(rows):
-                    z0, z1, given = states[rows], states[rows + 1], source.of_pairs(beside, rows)
-                    run, along = labels(sequence[rows]), place[rows]
+                    z0, z1 = block.states[rows], block.states[rows + 1]
+                    run, along = labels(block.sequence[rows]), block.place[rows]
                     if source.of_pairs_alone:
                         pair, run = run, _arcs_of_pairs(run, z0, z1, *last_arc)
                         along, last_arc = pair - run, (int(run[-1]), z1[-1])
                     yield Pairs(
                         z0,
                         z1,
-                        *given,
+                        *source.of_pairs(block.own, rows),
                         period=source.period,
                         run=run + number * FILE_STEP,
                         place=along,
                     )
-                last_state, last_sequence, last_place = states[-1:], sequence[-1:], place[-1:]
-                last_own = [None if beside is None else beside[-1:]]
 
 
 def _arcs_of_pairs(pair: np.ndarray, z0, z1, last_arc: int, last_image) -> np.ndarray:
@@ -240,12 +231,6 @@ def _arcs_of_pairs(pair: np.ndarray, z0, z1, last_arc: int, last_image) -> np.nd
     before = np.concatenate([last_image[None], z1[:-1]])
     begins = (pair % ARC == 0) | np.any(before != z0, axis=1)
     return np.maximum.accumulate(np.where(begins, pair, last_arc))
-
-
-def joined(parts: list[np.ndarray | None]) -> np.ndarray | None:
-    """The rows of all parts; None where they have none."""
-    found = [part for part in parts if part is not None]
-    return np.concatenate(found) if found else None
 
 
 def read_initial(
@@ -285,20 +270,19 @@ def read_initial(
         found: list[Block] = []
         held: Block | None = None  # the last row so far: the end of its sequence, or not
         for block in source.blocks(BLOCK_ROWS):
-            ends = np.flatnonzero(block.sequence[1:] != block.sequence[:-1])
             if held is not None and held.sequence[0] != block.sequence[0]:
                 found.append(held.checked(path))
+            ends = np.flatnonzero(block.sequence[1:] != block.sequence[:-1])
             found.append(block.rows(ends).checked(path))
             held = block.rows(np.array([len(block.sequence) - 1]))
         if held is None:
             raise InputError(f"{path}: holds no states")
         found.append(held.checked(path))
-    states = np.concatenate([block.states for block in found])
+    ends = joined(found, dim)
     if not parameters:
-        return states, None
-    own = joined([block.own for block in found])
-    assert own is not None
-    return states, own[:, [columns[name] for name in parameters]]
+        return ends.states, None
+    assert ends.own is not None
+    return ends.states, ends.own[:, [columns[name] for name in parameters]]
 
 
 def read_initial_noise(path, shape: tuple[int, int]) -> np.ndarray | None:
@@ -325,7 +309,8 @@ def opened(
     """Open a trajectory file, its header checked. ``initial``: only its last states are wanted, and
     their times where ``driven``."""
     path = Path(path)
-    if path.suffix.lower() not in (".npz", ".npy", ".csv"):
+    opener = _OPENERS.get(path.suffix.lower())
+    if opener is None:
         raise InputError(f"{path}: expected a .npz, .npy or .csv file")
     request = Request(path, None if dt is None else check_dt(dt, "the given dt"), initial, driven)
     try:
@@ -337,10 +322,7 @@ def opened(
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     with stream:
-        if path.suffix.lower() == ".csv":
-            source = open_csv(request)
-        else:
-            source = (open_npz if path.suffix.lower() == ".npz" else open_npy)(request, stream)
+        source = opener(request, stream)
         unchecked = source.blocks
         if not initial:  # of initial states only the rows that are used are checked
             source.blocks = lambda *given: (block.checked(path) for block in unchecked(*given))
@@ -372,9 +354,7 @@ def _is_recording(path: Path, with_roles: bool) -> bool:
     if suffix == ".npz":
         with damage(path, "the archive"), zipfile.ZipFile(path) as archive:
             return not {"z0.npy", "trajectories.npy"} & set(archive.namelist())
-    if with_roles:
-        return True
-    if suffix == ".mat":
+    if with_roles or suffix == ".mat":
         return True
     if suffix == ".npy":
         with damage(path, "the array"):
@@ -385,32 +365,19 @@ def _is_recording(path: Path, with_roles: bool) -> bool:
         return True  # the reader of recordings says what is the matter
 
 
-def _warn_of_odd_columns(path, states: np.ndarray, sequence: np.ndarray) -> None:
+def _odd_columns(states: np.ndarray, going: np.ndarray) -> Iterator[str]:
+    """What looks odd in states (T, 2d), of which the rows ``going`` are followed by the next."""
     dim = states.shape[1] // 2
-    same = sequence[1:] == sequence[:-1]
-    if np.array_equal(states[1:][same], states[:-1][same]):
-        warnings.warn(
-            f"{path}: every state equals the one before it",
-            DataWarning,
-            stacklevel=3,
-        )
+    if np.array_equal(states[going + 1], states[going]):
+        yield "every state equals the one before it"
         return
     constant = [c for c in range(2 * dim) if np.all(states[:, c] == states[0, c])]
     if constant:
         names = ", ".join(column(c, dim) for c in constant)
-        warnings.warn(
-            f"{path}: constant column(s) {names}. A conserved momentum is constant; else check "
-            "the columns",
-            DataWarning,
-            stacklevel=3,
-        )
+        yield f"constant column(s) {names}. A conserved momentum is constant; else check them"
     for a, b in itertools.combinations(range(2 * dim), 2):
         if a not in constant and np.array_equal(states[:, a], states[:, b]):
-            warnings.warn(
-                f"{path}: columns {column(a, dim)} and {column(b, dim)} are equal in every row",
-                DataWarning,
-                stacklevel=3,
-            )
+            yield f"columns {column(a, dim)} and {column(b, dim)} are equal in every row"
 
 
 def digest_of(path) -> str:
@@ -446,7 +413,7 @@ def summary(data: TrajectoryData) -> list[str]:
     lines = ["; ".join([*parts, f"copies: {copies}"])]
     move = np.sqrt(np.mean((pairs.z1 - pairs.z0) ** 2, axis=0))
     low, high = data.states.min(axis=0), data.states.max(axis=0)
-    names = [f"{letter}{i + 1}" for letter in "qp" for i in range(data.dim)]
+    names = [column(c, data.dim) for c in range(2 * data.dim)]
     columns = list(zip(names, low, high, data.states.std(axis=0), move, strict=True))
     if len(columns) > _MOST_COLUMNS:
         some = _MOST_COLUMNS // 4

@@ -15,7 +15,7 @@ from scipy import optimize
 from gfnn_jax.data.columns import TOLD, first_order
 from gfnn_jax.data.faults import Fault, faults
 from gfnn_jax.data.roles import is_rate_of_turning
-from gfnn_jax.data.traits import Accelerations, Traits, accelerations
+from gfnn_jax.data.traits import Accelerations, Traits, accelerations, turning_points
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,18 +112,17 @@ def _circle(
     points = np.stack([x, y])[:, :: max(len(x) // _OPTIONS.most, 1)]
     apart = points - points.mean(axis=1)[:, None]
     line = float(np.linalg.svd(apart, compute_uv=False)[1]) / np.sqrt(points.shape[1])
-    table = np.stack([*points, np.ones(points.shape[1])])
-    start = np.linalg.lstsq(table.T, (points**2).sum(axis=0), rcond=None)[0]
-    size = float(np.sqrt(max(start[2] + (start[:2] ** 2).sum() / 4, 1e-300)))
-    first = np.array([size] if fixed else [*start[:2] / 2, size])
 
-    def off(c: np.ndarray) -> np.ndarray:
-        centre = np.zeros(2) if fixed else c[:2]
-        return np.hypot(points[0] - centre[0], points[1] - centre[1]) - c[-1]
+    def away(centre: np.ndarray) -> np.ndarray:
+        return np.hypot(points[0] - centre[0], points[1] - centre[1])
 
-    c = optimize.least_squares(off, first, x_scale=np.maximum(np.abs(first), 1e-12)).x
-    rms = float(np.sqrt(np.mean(off(c) ** 2)))
-    centre, radius = (np.zeros(2) if fixed else c[:2]), float(abs(c[-1]))
+    centre = np.zeros(2)
+    if not fixed:  # the radius is the mean distance from any centre
+        table = np.stack([*points, np.ones(points.shape[1])])
+        first = np.linalg.lstsq(table.T, (points**2).sum(axis=0), rcond=None)[0][:2] / 2
+        scale = np.maximum(np.abs(first), 1e-12)
+        centre = optimize.least_squares(lambda c: away(c) - away(c).mean(), first, x_scale=scale).x
+    radius, rms = float(away(centre).mean()), float(away(centre).std())
     if rms > _OPTIONS.round * sigma or line < _OPTIONS.bent * max(rms, sigma):
         return None
     ways = np.diff(np.unwrap(np.arctan2(x - centre[0], centre[1] - y)))
@@ -272,14 +271,9 @@ def _caught(traits: Traits) -> float | None:
         away = np.flatnonzero(np.abs(off) > _OPTIONS.at_rest * sigma)
         if not len(away) or len(x) - away[-1] <= _OPTIONS.still:
             continue
-        from scipy import signal  # takes half a second: loaded when first used
-
         swing = off[: away[-1] + 1]
         size = float(np.ptp(swing))
-        prominent = (
-            signal.find_peaks(s * swing, prominence=_OPTIONS.large * size) for s in (1, -1)
-        )
-        wide = np.sort(np.concatenate([peaks for peaks, _ in prominent]))
+        wide = turning_points(swing, _OPTIONS.large * size)
         if len(wide) < _OPTIONS.swings or size < _OPTIONS.moved * sigma:
             continue
         half = float(np.median(np.diff(wide)))  # of a period, in samples

@@ -10,8 +10,9 @@ needs JAX.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
@@ -25,7 +26,6 @@ from gfnn_jax.data.columns import (
     check_sigmas,
     clock_of,
     crossings_in,
-    factors_of,
     listed,
     resolved,
     roles_of,
@@ -216,7 +216,7 @@ class Recording:
             angles is None,
             units,
         )
-        factors = factors_of(numbers, in_degrees)
+        factors = {name: np.pi / 180 if name in in_degrees else 1.0 for name in numbers}
         factors |= {of: factors[name] for name, of in sigmas.items()}
         values = {
             run: {name: column * factors[name] for name, column in of_run.items()}
@@ -254,8 +254,7 @@ class Recording:
             "_values": values,
             "_sigmas": sigmas,
         }
-        for name, value in fields.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(fields)
         for run in self.runs:
             for array in (self._times[run], *self._values[run].values()):
                 array.flags.writeable = False
@@ -320,12 +319,10 @@ class Recording:
         """A column (n,) in a run, NaN where missing; angles in radians, wrapped as they came; or a
         wave, cos(1.37*t)."""
         found = self._values[self._named(run)]
-        of_time = None if name in found else wave(name, self.times(run))
-        if of_time is not None:
-            return of_time
-        if name not in found:
+        column = found[name] if name in found else wave(name, self.times(run))
+        if column is None:
             raise InputError(f"{self.source}: no column {name}, found {', '.join(found)}")
-        return found[name]
+        return column
 
     def sigma(self, name: str, run: str | float) -> np.ndarray | None:
         """σ (n,) of the values of a column in a run, None where it was not given."""
@@ -344,9 +341,11 @@ class Recording:
         known = np.isfinite(values)
         if not known.any() or np.ptp(values[known]) > TURN * (1 + 1e-3):
             return values
-        lifted = values.copy()
-        lifted[known] = np.unwrap(values[known])
-        return lifted
+        return lift(values)
+
+    def each(self, column: Callable[[str, str], np.ndarray], name: str) -> list[np.ndarray]:
+        """A column in each run, (n,) by `values` or by `unwrapped`."""
+        return [column(name, run) for run in self.runs]
 
     def array(self, role: str, run: str | float) -> np.ndarray:
         """The columns of a role (n, k) in a run, as `values`. Raises InputError at no such role."""
@@ -395,10 +394,8 @@ class Recording:
 
     def _with(self, **changed: Any) -> Recording:
         """The same recording with other fields."""
-        part = object.__new__(Recording)
-        for field in dataclasses.fields(self):
-            value = changed.get(field.name, getattr(self, field.name))
-            object.__setattr__(part, field.name, value)
+        part = copy.copy(self)
+        vars(part).update(changed)
         return part
 
     def summary(self) -> RecordingSummary:
@@ -490,6 +487,13 @@ def _selected(table: Table, columns: tuple[str, ...]) -> Table:
     return dataclasses.replace(table, columns=kept)
 
 
+def lift(angle: np.ndarray) -> np.ndarray:
+    """An angle (n,) that moves by less than half a turn between neighbours."""
+    known, lifted = np.isfinite(angle), angle.copy()
+    lifted[known] = np.unwrap(angle[known])
+    return lifted
+
+
 def channels_of(
     recording: Recording, names: Sequence[str], run: str
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -512,7 +516,7 @@ def parameters_of(recording: Recording) -> tuple[str, ...]:
     run."""
     found = []
     for name in recording.parameters:
-        columns = [recording.values(name, run) for run in recording.runs]
+        columns = recording.each(recording.values, name)
         for run, column in zip(recording.runs, columns, strict=True):
             if not (np.isfinite(column).all() and np.ptp(column) == 0):
                 raise InputError(

@@ -7,7 +7,7 @@ import html
 import io
 import shlex
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from rich.console import Console, Group
@@ -16,15 +16,13 @@ from rich.text import Text
 
 from gfnn_jax.data.faults import PROPOSED, WRONG, Fault
 from gfnn_jax.data.proposals import findings, mistakes
+from gfnn_jax.data.recording import Recording
 from gfnn_jax.data.roles import ROLES
 from gfnn_jax.data.traits import Traits, of_rows, traits
 from gfnn_jax.errors import InputError, as_typed, said
 from gfnn_jax.signals import energy
 from gfnn_jax.signals.steps import dominant_frequencies, gaps
 from gfnn_jax.storage.outputs import finite
-
-if TYPE_CHECKING:
-    from gfnn_jax.data.recording import Recording
 
 _SEEN = ("events", "accelerations")  # what a sensor shows, more exactly than its role
 _OF_FITS = ("structure", "states", "mass")

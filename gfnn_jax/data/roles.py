@@ -113,8 +113,7 @@ def is_run(name: str) -> bool:
 
 def is_angle(name: str) -> bool:
     """Return whether this is the usual name of an angle."""
-    found = _INDEXED.fullmatch(_bare(name))
-    return bool(found) and found[1] in _ANGLES
+    return _word(name)[0] in _ANGLES
 
 
 def is_rate_of_turning(name: str) -> bool:
@@ -159,8 +158,7 @@ def derivative_of(name: str) -> str | None:
 
 def role_of(name: str) -> str | None:
     """The role that a column of this name usually has; None where names do not tell."""
-    found = _INDEXED.fullmatch(_bare(name))
-    role = _ROLE_OF.get(found[1]) if found else None
+    role = _ROLE_OF.get(_word(name)[0])
     if role is None and (of := derivative_of(name)) is not None and role_of(of) == "positions":
         return "velocities"
     return role
@@ -207,16 +205,17 @@ def _mate(positions: list[str], name: str) -> str | None:
     for position in positions:
         if of in (plain(position), _bare(position)):
             return position
-    index = _index(name)
-    same = [p for p in positions if index and (_index(p) == index or plain(p) == index)]
+    index = _word(name)[1]
+    same = [p for p in positions if index and index in (_word(p)[1], plain(p))]
     if len(same) == 1:
         return same[0]
     return positions[0] if len(positions) == 1 else None
 
 
-def _index(name: str) -> str:
+def _word(name: str) -> tuple[str, str]:
+    """(word, index or "") of the name; ("", "") of one that is no single word."""
     found = _INDEXED.fullmatch(_bare(name))
-    return (found[2] or "") if found else ""
+    return (found[1], found[2] or "") if found else ("", "")
 
 
 _WAVE = re.compile(r"(cos|sin)\((\d[\d.]*(?:e[-+]?\d+)?)\*t\)")

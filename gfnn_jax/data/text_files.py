@@ -192,7 +192,7 @@ class TextFile:
         if named:
             told, notes = _titled(titles, named[0])
             self.notes += notes
-            names, units = _named(self._undecorated(told))
+            names, units = self._undecorated(told)
             for cells in named[1:2]:
                 below = [cell.strip().strip("[]()").strip() for cell in cells]
                 units |= {n: unit for n, unit in zip(names, below, strict=True) if unit}
@@ -212,21 +212,22 @@ class TextFile:
         check_known(str(self.path), "columns", resolved(columns, known), known)
         return tuple(names), units
 
-    def _undecorated(self, cells: list[str]) -> list[str]:
-        """Names without what programs write around them: "Latest: Time", "Angle (rad) Run #1".
+    def _undecorated(self, cells: list[str]) -> tuple[list[str], dict[str, str]]:
+        """(names, units by name) where brackets or a stroke before them give these, without what
+        programs write around them: "Latest: Time", "Angle (rad) Run #1".
 
         Columns of several runs side by side keep their run behind the name, and are in ``runs``.
         """
         parts = [part for part in map(_OF_RUN.fullmatch, cells) if part is not None]
         labels = [part["before"] or part["behind"] or "" for part in parts]
-        bare = [part["name"] for part in parts]
-        if len(set(filter(None, labels))) < 2:
-            return bare
-        runs = [re.sub(r"\D", "", label) or label for label in labels]
-        names, units = zip(*(split_unit(name) for name in bare), strict=True)
-        found = [f"{n} {run}".strip() for n, run in zip(names, runs, strict=True)]
-        self.runs = dict(zip(found, zip(names, runs, strict=True), strict=True))
-        return [f"{n} [{u}]" if u else n for n, u in zip(found, units, strict=True)]
+        split = [split_unit(part["name"]) for part in parts]
+        names = [name for name, _ in split]
+        if len(set(filter(None, labels))) > 1:
+            runs = [re.sub(r"\D", "", label) or label for label in labels]
+            of_runs = list(zip(names, runs, strict=True))
+            names = [f"{name} {run}".strip() for name, run in of_runs]
+            self.runs = dict(zip(names, of_runs, strict=True))
+        return names, {n: unit for n, (_, unit) in zip(names, split, strict=True) if unit}
 
     def _times(self, held: Mapping[str, list[str]], time: str | None) -> tuple[str, ...]:
         """The columns that tell the time: the given one, else by name, numbers before dates, else
@@ -482,27 +483,22 @@ def _put_aside(names: Sequence[str]) -> tuple[str, ...]:
 
 def _stacked(text: TextFile, columns: Sequence[str]) -> Table:
     """The table of a file whose runs stand side by side, the runs one after another."""
+    import pandas as pd
+
     wanted = [name for name in text.names if name not in text.text]
     aside = [name for name in text.text if name not in text.times]
     blocks = list(text.blocks(wanted, _OPTIONS.block_rows))
     raw = {name: np.concatenate([block[name] for block in blocks]) for name in wanted}
     runs = [run for run in dict.fromkeys(run for _, run in text.runs.values()) if run]
-    parts: list[dict[str, np.ndarray]] = []
+    parts = []
     for run in runs:
         of_run = {text.runs[n][0]: x for n, x in raw.items() if text.runs[n][1] in ("", run)}
-        held = np.isfinite(np.stack(list(of_run.values()))).any(axis=0)
-        parts.append(
-            {name: x[held] for name, x in of_run.items()} | {"run": np.full(held.sum(), run)}
-        )
-    names = list(dict.fromkeys(name for part in parts for name in part))
-    found = {
-        name: np.concatenate([p.get(name, np.full(len(p["run"]), np.nan)) for p in parts])
-        for name in names
-    }
+        parts.append(pd.DataFrame(of_run).dropna(how="all").assign(run=run))
+    found = pd.concat(parts)
     time = text.runs[text.times[0]][0] if text.times else None
-    kept = [n for n in names if not columns or n in (*columns, time, "run")]
+    kept = [n for n in found if not columns or n in (*columns, time, "run")]
     return Table(
-        {name: found[name] for name in kept},
+        {name: found[name].to_numpy() for name in kept},
         {text.runs[name][0]: unit for name, unit in text.units.items()},
         str(text.path),
         {},
@@ -598,9 +594,3 @@ def _titled(titles: list[str], names: list[str]) -> tuple[list[str], tuple[str, 
 def _cleaned(column: Any) -> Any:
     """Words of dates with single blanks and decimal points."""
     return column.str.strip().str.replace(r"\s+", " ", regex=True).str.replace(",", ".")
-
-
-def _named(cells: list[str]) -> tuple[list[str], dict[str, str]]:
-    """Names, and units by name where brackets, or a stroke before them, give them."""
-    found = [split_unit(cell) for cell in cells]
-    return [name for name, _ in found], {name: unit for name, unit in found if unit}

@@ -30,14 +30,7 @@ _LABELLED = re.compile(r"([A-Z]+) *= *([-+]?[\d.]+(?:E[-+]?\d+)?)")
 _ENCODINGS = ["utf_16", "utf_16_le", "utf_16_be", "cp1252"]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Options:
-    """sniffed: bytes of a file's begin that tell its encoding."""
-
-    sniffed: int = 1 << 20
-
-
-_OPTIONS = _Options()
+_SNIFFED = 1 << 20  # bytes of a file's begin that tell its encoding
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +49,7 @@ def text_of(path: Path) -> Text:
             return _of_sheets(path)
         opened, notes = _opener(path, suffix)
         with opened() as stream:
-            head = stream.read(_OPTIONS.sniffed)
+            head = stream.read(_SNIFFED)
     encoding = _encoding(path, head)
 
     def text() -> Any:  # a TextIO, which io.TextIOWrapper is not at run time
@@ -99,7 +92,7 @@ def _encoding(path: Path, head: bytes) -> str:
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"
     try:
-        head[: -4 if len(head) == _OPTIONS.sniffed else None].decode("utf-8")
+        head[: -4 if len(head) == _SNIFFED else None].decode("utf-8")
     except UnicodeDecodeError as error:
         import charset_normalizer  # loaded when first needed
 

@@ -5,22 +5,33 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gfnn_jax.data.recording import Recording, lift
 from gfnn_jax.signals.derivatives import Derivatives, Relation, derivatives, window
 from gfnn_jax.signals.local_polynomials import local_fits
 from gfnn_jax.signals.noise import Noise, noise, resolution
 from gfnn_jax.signals.steps import median_step
 from gfnn_jax.signals.wrong_values import WrongValues, wrong_at_jumps, wrong_values
 
-if TYPE_CHECKING:
-    from gfnn_jax.data.recording import Recording
+
+@dataclasses.dataclass(frozen=True)
+class _Options:
+    """narrowest: samples of a window. degree: of its polynomial. block: windows fitted or judged
+    together. ridge: of the fits, relative to columns of unit size. ignored: most columns without a
+    role that are looked at. gone: part of the rows; where more lack a position, columns take turns,
+    and all rows count."""
+
+    narrowest: int = 9
+    degree: int = 5
+    block: int = 8
+    ridge: float = 1e-8
+    ignored: int = 8
+    gone: float = 0.5
 
 
-_MOST_IGNORED = 8  # columns without a role that are looked at
-_MOST_GONE = 0.5  # of the rows; where more lack a position, columns take turns, and all rows count
+_OPTIONS = _Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,8 +73,7 @@ class Traits:
         recording = self.recording
         if wrong := [stretch.rows for stretch in self.wrong.get(name, ())]:
             recording = recording.without({name: np.concatenate(wrong)})
-        found = [recording.values(name, run) for run in recording.runs]
-        return [x[np.isfinite(x)] for x in found]
+        return [x[np.isfinite(x)] for x in recording.each(recording.values, name)]
 
     def by_run(self, name: str) -> list[np.ndarray]:
         """A column of `columns`, (n_r,) of each run."""
@@ -72,17 +82,11 @@ class Traits:
 
 def traits(recording: Recording) -> Traits:
     """The traits of a recording, in seconds for a million rows."""
-    ignored = [name for name in recording.ignored if name in recording.factors][:_MOST_IGNORED]
+    ignored = [name for name in recording.ignored if name in recording.factors][: _OPTIONS.ignored]
     names = [*recording.columns, *ignored]
     times = [recording.times(run) for run in recording.runs]
-    columns = {
-        name: np.concatenate([recording.unwrapped(name, run) for run in recording.runs])
-        for name in names
-    }
-    steps = {
-        n: resolution(np.concatenate([recording.values(n, run) for run in recording.runs]))
-        for n in names
-    }
+    columns = {n: np.concatenate(recording.each(recording.unwrapped, n)) for n in names}
+    steps = {n: _resolution(recording, n) for n in names}
     shown = (*recording.positions, *recording.sensors)
     wrong = wrong_values_of(recording)
     gone = np.zeros(len(recording), bool)
@@ -118,7 +122,7 @@ def of_rows(times: list[np.ndarray], rows: np.ndarray) -> list[np.ndarray]:
 
 def _rows(gone: np.ndarray) -> np.ndarray:
     """The rows that are not gone, or all where most are."""
-    return np.flatnonzero(~gone) if gone.mean() <= _MOST_GONE else np.arange(len(gone))
+    return np.flatnonzero(~gone) if gone.mean() <= _OPTIONS.gone else np.arange(len(gone))
 
 
 def wrong_values_of(recording: Recording) -> dict[str, tuple[WrongValues, ...]]:
@@ -126,25 +130,22 @@ def wrong_values_of(recording: Recording) -> dict[str, tuple[WrongValues, ...]]:
     times = [recording.times(run) for run in recording.runs]
     found = {}
     for name in (*recording.positions, *recording.sensors):
-        values = np.concatenate([recording.values(name, run) for run in recording.runs])
-        parts = [recording.unwrapped(name, run) for run in recording.runs]
-        found[name] = wrong_values(times, parts, resolution(values))
+        parts, smallest = recording.each(recording.unwrapped, name), _resolution(recording, name)
+        found[name] = wrong_values(times, parts, smallest)
         if name in recording.angles:  # one wrong value makes a wrapped angle seem lifted
-            lifted = wrong_values(times, [_lifted(x) for x in parts], resolution(values))
+            lifted = wrong_values(times, [lift(x) for x in parts], smallest)
             known = {int(row) for wrong in found[name] for row in wrong.rows}
             more = [wrong for wrong in lifted if known.isdisjoint(wrong.rows.tolist())]
             found[name] = tuple(sorted([*found[name], *more], key=lambda wrong: wrong.rows[0]))
     for name in recording.inputs:
-        parts = [recording.values(name, run) for run in recording.runs]
-        found[name] = wrong_at_jumps(times, parts, resolution(np.concatenate(parts)))
+        parts = recording.each(recording.values, name)
+        found[name] = wrong_at_jumps(times, parts, _resolution(recording, name))
     return found
 
 
-def _lifted(angle: np.ndarray) -> np.ndarray:
-    """An angle that moves by less than half a turn between neighbours."""
-    known, lifted = np.isfinite(angle), angle.copy()
-    lifted[known] = np.unwrap(angle[known])
-    return lifted
+def _resolution(recording: Recording, name: str) -> float | None:
+    """The smallest step between the values of a column, as it came."""
+    return resolution(np.concatenate(recording.each(recording.values, name)))
 
 
 def without_wrong_values(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
@@ -177,18 +178,12 @@ def in_words(recording: Recording, name: str, wrong: Sequence[WrongValues]) -> d
     return found
 
 
-@dataclasses.dataclass(frozen=True)
-class _Options:
-    """narrowest: samples of a window. degree: of its polynomial. block: windows fitted or judged
-    together. ridge: of the fits, relative to columns of unit size."""
+def turning_points(x: np.ndarray, prominence: float) -> np.ndarray:
+    """The places, rising, at which x (n,) turns by at least the prominence."""
+    from scipy import signal  # takes half a second: loaded when first used
 
-    narrowest: int = 9
-    degree: int = 5
-    block: int = 8
-    ridge: float = 1e-8
-
-
-_OPTIONS = _Options()
+    turns = [signal.find_peaks(sign * x, prominence=prominence)[0] for sign in (1, -1)]
+    return np.sort(np.concatenate(turns))
 
 
 @dataclasses.dataclass(frozen=True)
