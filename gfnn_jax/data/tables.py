@@ -254,12 +254,9 @@ def _parts(
     if dt is not None:
         return {run: (rows, dt * np.arange(len(rows))) for run, rows in groups.items()}
     assert time is not None
-    parts = {}
-    for run, rows in groups.items():
-        times = table.columns[time][rows]
-        _check_times(table, time, rows, times)
-        parts[run] = (rows, times * second)
-    return parts
+    for rows in groups.values():
+        _check_times(table, time, rows)
+    return {run: (rows, table.columns[time][rows] * second) for run, rows in groups.items()}
 
 
 def restarts(tables: list[Table], runs: Mapping[str, Any]) -> list[str]:
@@ -268,10 +265,9 @@ def restarts(tables: list[Table], runs: Mapping[str, Any]) -> list[str]:
         return []
     table = next(t for t in tables if len(_falls(t.columns[t.times[0]])))
     place = table.locate(int(_falls(table.columns[table.times[0]])[0]))
-    if len(runs) == len(tables) + 1:
-        return [f"the times run back once, at {place}, and a run begins there"]
     count = len(runs) - len(tables)
-    return [f"the times run back {count} times, first at {place}, and a run begins there"]
+    often = "once, at" if count == 1 else f"{count} times, first at"
+    return [f"the times run back {often} {place}, and a run begins there"]
 
 
 def second_times(tables: list[Table]) -> list[str]:
@@ -301,8 +297,9 @@ def _check_places(table: Table, name: str, falls: np.ndarray) -> None:
         begin = int(row)
 
 
-def _check_times(table: Table, name: str, rows: np.ndarray, times: np.ndarray) -> None:
+def _check_times(table: Table, name: str, rows: np.ndarray) -> None:
     """Raises InputError where the times of a run are missing or do not rise."""
+    times = table.columns[name][rows]
     if not np.isfinite(times).all():
         row = int(rows[np.argmin(np.isfinite(times))])
         raise InputError(f"{table.source}: {table.locate(row)}: {name} is missing")

@@ -496,7 +496,7 @@ def _stacked(text: TextFile, columns: Sequence[str]) -> Table:
         parts.append(pd.DataFrame(of_run).dropna(how="all").assign(run=run))
     found = pd.concat(parts)
     time = text.runs[text.times[0]][0] if text.times else None
-    kept = [n for n in found if not columns or n in (*columns, time, "run")]
+    kept = [str(n) for n in found if not columns or n in (*columns, time, "run")]
     return Table(
         {name: found[name].to_numpy() for name in kept},
         {text.runs[name][0]: unit for name, unit in text.units.items()},
