@@ -117,10 +117,9 @@ class Fault:
         return f"{self.message}. {self.remedy}" if self.remedy else self.message
 
 
-def faults(traits: Traits) -> tuple[Fault, ...]:
-    """All mistakes that are found, the wrong ones first."""
-    found = [fault for check in _CHECKS for fault in check(traits)]
-    return tuple(sorted(found, key=lambda fault: not fault.wrong))
+def faults(traits: Traits) -> Iterator[Fault]:
+    """All mistakes that are found, in the order of the checks."""
+    return (fault for check in _CHECKS for fault in check(traits))
 
 
 # Columns that a sensor did not measure, or measured badly.

@@ -78,15 +78,12 @@ class _StoredArray:
         size = width * self.dtype.itemsize
         with damage(self.path, self.name):
             self.stream.seek(first * size, os.SEEK_CUR)
-        while first < last:
-            count = min(rows, last - first)
-            with damage(self.path, self.name):
+            while first < last:
+                count = min(rows, last - first)
                 block = np.frombuffer(self.stream.read(count * size), self.dtype)
-                block = block.reshape(count, width)
-            first += count
-            yield block.astype(np.float64, copy=False)
-        if last == number:
-            with damage(self.path, self.name):
+                first += count
+                yield block.reshape(count, width).astype(np.float64, copy=False)
+            if last == number:
                 self.stream.read(1)  # the end of an archive's member: its checksum is compared
 
 

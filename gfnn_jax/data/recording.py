@@ -37,6 +37,7 @@ from gfnn_jax.data.columns import (
 from gfnn_jax.data.roles import ROLES, coordinates_in, is_run, unit_in, wave
 from gfnn_jax.data.tables import (
     ARRAYS,
+    Rows,
     Table,
     from_arrays,
     from_memory,
@@ -449,18 +450,17 @@ def read(
         begin, end = start * found.second, stop * found.second
         return found if start == -stop == -np.inf else found.slice(begin, end)
     chosen, time = listed(options.get("columns")), options.get("time")
-    tables = []
+    tables, rows = [], Rows(start, stop, every)
     for path in map(Path, several):
         if not path.is_file():
             raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
         if path.suffix.lower() in ARRAYS:
             table = _timed(from_arrays(path, chosen), time)
-            tables.append(rows_of(table, start, stop, every))
+            tables.append(rows_of(table, rows))
         else:
-            rows = {"start": start, "stop": stop, "every": every}
             shown = with_crossings(options.get("observe") or {}, options.get("events") or {})
             words = crossings_in(shown)
-            tables.append(from_text(path, chosen, time=time, words=words, **rows))
+            tables.append(from_text(path, chosen, time=time, rows=rows, words=words))
     return Recording(tables, **options)
 
 

@@ -7,7 +7,7 @@ import dataclasses
 import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import narwhals.stable.v2 as nw
 import numpy as np
@@ -46,11 +46,27 @@ class Table:
         return named if self.time is None else [self.time, *named]
 
 
-def rows_of(table: Table, start: float, stop: float, every: int) -> Table:
-    """The rows of a table between two times, in its unit, every so many of them."""
-    keep = np.arange(len(next(iter(table.columns.values()), ()))) % every == 0
-    for name in table.times[:1]:
-        keep &= ~((table.columns[name] < start) | (table.columns[name] > stop))
+class Rows(NamedTuple):
+    """Rows to keep: between two times, in the unit of a file, every so many of them."""
+
+    start: float = -np.inf
+    stop: float = np.inf
+    every: int = 1
+
+    def kept(
+        self, columns: Mapping[str, np.ndarray], times: Sequence[str], begin: int = 0
+    ) -> np.ndarray:
+        """Which rows of columns (n,) to keep, (n,), by the first of these columns of times, where
+        there is one. ``begin``: rows of the table before these."""
+        keep = (begin + np.arange(len(next(iter(columns.values()), ())))) % self.every == 0
+        for name in times[:1]:
+            keep &= ~((columns[name] < self.start) | (columns[name] > self.stop))
+        return keep
+
+
+def rows_of(table: Table, rows: Rows) -> Table:
+    """The table with these rows alone."""
+    keep = rows.kept(table.columns, table.times)
     columns = {n: v[keep] for n, v in table.columns.items()}
     text = {n: v[keep] if len(v) else v for n, v in table.text.items()}
     return dataclasses.replace(table, columns=columns, text=text)

@@ -20,7 +20,7 @@ import numpy as np
 from gfnn_jax.data.blocks import damage
 from gfnn_jax.data.columns import check_known, resolved
 from gfnn_jax.data.roles import is_run, is_time, split_unit
-from gfnn_jax.data.tables import Table, rows_of
+from gfnn_jax.data.tables import Rows, Table, rows_of
 from gfnn_jax.data.texts import text_of
 from gfnn_jax.errors import InputError
 
@@ -424,13 +424,10 @@ def from_text(
     columns: Sequence[str] = (),
     *,
     time: str | None = None,
-    start: float = -np.inf,
-    stop: float = np.inf,
-    every: int = 1,
+    rows: Rows = Rows(),
     words: Collection[str] = (),
 ) -> Table:
-    """The columns of a text file, of which rows between the times ``start`` and ``stop`` (in the
-    file's unit), every so many of them, are kept.
+    """The columns of a text file, in these rows.
 
     columns: names of those to read, or of all, in order, where the file has no header. time: name
     of the column of times. words: columns of these are read too. The file is read in blocks of
@@ -440,7 +437,7 @@ def from_text(
     text = TextFile(path, columns, time)
     columns = resolved(columns, [text.runs.get(name, (name,))[0] for name in text.names])
     if text.runs:
-        return rows_of(_stacked(text, columns), start, stop, every)
+        return rows_of(_stacked(text, columns), rows)
     wanted = [n for n in text.names if n in (columns or text.names) or n in text.times or is_run(n)]
     wanted = [name for name in wanted if name not in text.text or name in text.times[:1]]
     words_of = [name for name in text.text if name not in text.times]
@@ -452,13 +449,10 @@ def from_text(
     numbers: list[np.ndarray] = []  # of the rows that are kept, in the file
     passed = 0
     for block in text.blocks([*wanted, *read], _OPTIONS.block_rows, [*runs, *read]):
-        rows = np.arange(len(next(iter(block.values()))))
-        keep = (rows + passed) % every == 0
-        for name in text.times[:1]:
-            keep &= ~((block[name] < start) | (block[name] > stop))
+        keep = rows.kept(block, text.times, passed)
         kept.append({name: values[keep] for name, values in block.items()})
-        numbers.append(rows[keep] + passed)
-        passed += len(rows)
+        numbers.append(np.flatnonzero(keep) + passed)
+        passed += len(keep)
     found = {name: np.concatenate([block[name] for block in kept]) for name in kept[0]}
     of_words = {name: found.pop(name, np.array([], str)) for name in words_of}
     aside = [name for name, cells in of_words.items() if not {*words} & {*cells}]
