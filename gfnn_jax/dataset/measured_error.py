@@ -76,6 +76,26 @@ class Tolerance:
         """Return whether the candidate's error is within it, at 95 %."""
         return candidate.validation_bound <= self.bound
 
+    def size_of(self, candidate: Any) -> float:
+        """The candidate's error, in the unit of the tolerance."""
+        return candidate.validation_relative if self.relative else candidate.validation_rms
+
+    def text_of(self, candidate: Any) -> str:
+        """The candidate's error and its bound as messages say them."""
+        size, bound = self.size_of(candidate), candidate.validation_bound
+        if not np.isfinite(size):
+            return "an infinite one-step error (its step fails at some of the held-out states),"
+        shown = f"at most {bound:.1e} with 95 % confidence"
+        shown = shown if np.isfinite(bound) else "without a bound"
+        return f"a one-step error of {size:.1e}{self.relative * ' of the spread'}, {shown},"
+
+    def missed_by(self, candidate: Any, ended: str) -> str:
+        """The warning that nothing meets it, which came nearest, and why the search ended."""
+        return (
+            f"no candidate meets the tolerance {self.bound:g}: the most accurate, {candidate.label}"
+            f", has {self.text_of(candidate)} and the search ended because {ended}"
+        )
+
 
 class OneStepError(NamedTuple):
     """Z_predicted − Z on some rows, in the user's coordinates, angles to the nearest image.

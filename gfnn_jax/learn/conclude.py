@@ -10,7 +10,6 @@ import numpy as np
 from gfnn_jax.budget import SOLVE, Budget, within
 from gfnn_jax.candidates.assemble import Candidate, stepped
 from gfnn_jax.coordinates import CARTESIAN, nearest_image
-from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.residuals import (
     differs_between_sequences,
     hidden_friction,
@@ -121,7 +120,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         diagnosis += proposed(searched.data)
     if unmet and noise is None and not reason:  # else it is known why
         messages = [unmet, *messages]
-    unmet = not_met(candidate, request.tolerance, ended)
+    unmet = request.tolerance.missed_by(candidate, ended)
     messages = (
         [*diagnosis, *messages, unmet] if reason == _WHITE else [*messages, unmet, *diagnosis]
     )
@@ -377,18 +376,3 @@ def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOv
         "(give known ones: --terms)"
     )
     return _LeftOver(noise, [message])
-
-
-def not_met(chosen: Candidate, tolerance: Tolerance, ended: str) -> str:
-    """The warning that nothing meets the tolerance."""
-    error = chosen.validation_relative if tolerance.relative else chosen.validation_rms
-    found = (
-        f"has a one-step error of {error:.2e}{' of the spread' if tolerance.relative else ''} "
-        f"(95 % bound {chosen.validation_bound:.2e})"
-        if np.isfinite(error)
-        else "leaves held-out states without an image (its step does not converge there)"
-    )
-    return (
-        f"no candidate meets the tolerance {tolerance.bound:g}: the most accurate {found}. "
-        f"The search ended because {ended}"
-    )

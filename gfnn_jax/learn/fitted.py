@@ -20,11 +20,12 @@ from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.diagnosis.damping import LearnedDamping
 from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
 from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
-from gfnn_jax.errors import FitWarning, said
+from gfnn_jax.errors import FitError, FitWarning, said
 from gfnn_jax.exports.symbolic import Formula
 from gfnn_jax.families.sums import Sums
 from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.learn.choose import work_of_posterior
+from gfnn_jax.maps.domain import Ranges
 from gfnn_jax.maps.forecasts import Forecast
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.models.arms.learned_arm import LearnedArm
@@ -32,8 +33,8 @@ from gfnn_jax.models.brackets.search import ONE_LEVEL, of_noise, on_one_level
 from gfnn_jax.models.hamiltonians.fitted_law import PartialLaw
 from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
-from gfnn_jax.models.maps_of_laws.law_maps import NUM_PAIRS
-from gfnn_jax.phase_space import Pairs
+from gfnn_jax.models.maps_of_laws.law_maps import NUM_PAIRS, Drawing, drawn
+from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.scenes.scene import Scene
 
 STATES_MEASURED = 200  # states at which the chosen map's defect and determinant are taken
@@ -145,7 +146,7 @@ class Choice:
         """H, where one was found that meets the tolerance or was chosen."""
         law = self.hamiltonian
         known = law is not None and (
-            self.chosen.learns == "hamiltonian" or self._met_by(law.candidate)
+            self.chosen.learns == "hamiltonian" or self.asked.met_by(law.candidate)
         )
         return law if known else None
 
@@ -157,13 +158,12 @@ class Choice:
     @property
     def verdict(self) -> str:
         """Verdict of the pairs, as of `Fit.verdict`."""
-        law = self.law
+        law, error = self.law, self.asked.text_of(self.chosen)
+        missed = f"{error} misses the tolerance, for {self.ended}"
         if law is None:
-            if self.met:
-                return "map"
-            return f"map: {self._error} misses the tolerance, for {self.ended}"
+            return "map" if self.met else f"map: {missed}"
         if not (self.met or self.white):
-            return f"partly: {self._error} misses the tolerance, for {self.ended}"
+            return f"partly: {missed}"
         # Sums over sites have terms that vanish or add up to nothing, whatever the data.
         if law.null_terms and not isinstance(law.flow.family, Sums):
             return f"one of several: the pairs do not distinguish {', '.join(law.null_terms)}"
@@ -194,24 +194,14 @@ class Choice:
         return on_one_level(h, by_noise, slopes, np.std(z, axis=0))
 
     @property
-    def _error(self) -> str:
-        """One-step error of the chosen candidate and its bound, in the unit of the tolerance."""
-        best, relative = self.chosen, self.asked.relative
-        error = best.validation_relative if relative else best.validation_rms
-        bound = f"at most {best.validation_bound:.1e} with 95 % confidence"
-        if np.isinf(best.validation_bound) and np.isfinite(error):
-            bound = "without a bound"
-        return f"a one-step error of {error:.1e}{relative * ' of the spread'}, {bound},"
-
-    @property
     def line(self) -> str:
         """The chosen map, its error and the tolerance."""
         best = self.chosen
-        error = best.validation_relative if self.asked.relative else best.validation_rms
         return (
             f"{best.chart} {best.label}, {best.num_parameters:,} parameters: one-step error "
-            f"{error:.2e} (≤ {best.validation_bound:.2e} at 95 %), tolerance {self.tolerance:g} "
-            f"{'met' if self.met else 'not met'}, {self.num_pairs:,} pairs, {self.seconds:.1f} s"
+            f"{self.asked.size_of(best):.2e} (≤ {best.validation_bound:.2e} at 95 %), tolerance "
+            f"{self.tolerance:g} {'met' if self.met else 'not met'}, {self.num_pairs:,} pairs, "
+            f"{self.seconds:.1f} s"
         )
 
     @property
@@ -240,10 +230,7 @@ class Choice:
     def met(self) -> bool:
         """Return whether the chosen candidate's validation error is within the tolerance, at 95
         %."""
-        return self._met_by(self.chosen)
-
-    def _met_by(self, candidate: Candidate) -> bool:
-        return candidate.validation_bound <= self.tolerance
+        return self.asked.met_by(self.chosen)
 
     @property
     def table(self) -> str:
@@ -469,7 +456,13 @@ class Fit:
         return None if self.law is None else self.law._repr_latex_()
 
     def accelerate(
-        self, *, dt: float | None = None, region=None, num_pairs: int = NUM_PAIRS, **options: Any
+        self,
+        *,
+        dt: float | None = None,
+        region=None,
+        num_pairs: int = NUM_PAIRS,
+        seed: int = 0,
+        **options: Any,
     ) -> Fit:
         """A generated map of the Hamiltonian that was learned, fitted to pairs drawn from its flow.
 
@@ -478,12 +471,33 @@ class Fit:
         them. options: of `gfnn.fit`; the tolerance, where none is given as was asked for, is
         relative to the spread of the drawn states.
 
-        Raises FitError where no Hamiltonian was learned that meets the tolerance or was chosen, or
-        its flow fails in the region, InputError for a region that is none.
+        Raises FitError where no Hamiltonian was learned that meets the tolerance or was chosen,
+        its flow fails in the region, or a folder gave the fit, without its pairs; InputError for a
+        region that is none.
         """
-        from gfnn_jax.learn import fit  # stands after this module: a shorthand
+        from gfnn_jax.learn.fit import fit  # stands after this module: a shorthand
 
-        return fit.accelerated(self, dt=dt, region=region, num_pairs=num_pairs, **options)
+        law, pairs = self.hamiltonian, getattr(self.found, "pairs", None)
+        refused = {
+            "an H of terms to draw pairs from, got a network": law is not None
+            and law.formula is None,
+            "an H within the tolerance, this fit has none": law is None or self.formula is None,
+            "no friction, for a map generated by S keeps areas": self.friction is not None,
+            "no parameters, for a map generated by S has none": self.map.parameters is not None,
+            "no structure, for a map generated by S has none": isinstance(self.map.domain, Ranges),
+            "the pairs, which no folder and no recording holds": pairs is None,
+        }
+        for what in (what for what, given in refused.items() if given):
+            raise FitError(f"accelerate: expected {what}")
+        dt = float(np.asarray(self.map.dt)) if dt is None else dt
+        if not (isinstance(dt, (int, float)) and 0 < dt < np.inf):
+            raise FitError(f"expected a time step that is finite and above 0, got {dt!r}")
+        scene, coordinates, bound = self.scene, self.map.coordinates, self.asked.bound
+        relative = bound if self.asked.relative else bound / float(np.max(sizes(pairs.z0)))
+        pairs = drawn(law.flow, coordinates, pairs.z0, dt, Drawing(num_pairs, seed, region))
+        angles = () if scene is not None else coordinates.angles
+        asked = {"learn": "map", "seed": seed, "angles": angles, "tolerance": relative}
+        return fit(pairs, scene, **{**asked, **options})
 
     def settled(self) -> Fit:
         """Compute what a report and a saved model hold beside the map, as far as the budget goes:

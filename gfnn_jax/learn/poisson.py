@@ -42,6 +42,10 @@ from gfnn_jax.search.search import MET
 
 EVEN = 1e-3  # of a sampling interval: what printed times may be off by
 FEW = 0.1  # of the pairs: those that may be wrong readings of positive states
+_NO_MORE = (
+    "no larger library was more accurate: the pairs have noise, or the library lacks a part of H "
+    "(--terms)"
+)
 NOISE = 1.15  # times the noise, that the errors of a law may be which misses nothing else
 
 
@@ -111,21 +115,15 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         microseconds_per_step=steps.microseconds_per_step,
     )
     watch.on_candidate(candidate)
-    met, messages = candidate.validation_bound <= tolerance.bound, [*left_out, *learned.notes]
-    ended = MET if met else "no larger library was more accurate"
+    met, messages = tolerance.met_by(candidate), [*left_out, *learned.notes]
+    ended = MET if met else _NO_MORE
     if white and not met and sigma is not None:
         noise = ", ".join(f"{s:.2g}" for s in sigma)
         messages.append(f"the law leaves no more than the noise of the states, {noise}")
     elif not met:
-        size = error.relative if tolerance.relative else error.rms
-        few = size <= tolerance.bound  # the error is small enough, its bound is not
-        ended = _too_few(pairs) if few else ended
-        messages.append(
-            f"one-step error {size:.1e}: {ended}"
-            if few
-            else f"one-step error {candidate.validation_bound:.1e} misses the tolerance "
-            f"{tolerance.bound:g}: pairs with noise, or an H that the library lacks (--terms)"
-        )
+        if tolerance.size_of(candidate) <= tolerance.bound:  # it is small enough, its bound is not
+            ended = _too_few(pairs)
+        messages.append(tolerance.missed_by(candidate, ended))
         warnings.warn(messages[-1], FitWarning, stacklevel=4)
     tested = tested.take(slice(min(STATES_MEASURED, block_of(n))))
     choice = Choice(

@@ -123,7 +123,7 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
         sensors,
     )
     best = sweep.best(symmetric=True)
-    if best is None or best.candidate.validation_bound > tolerance.bound:
+    if best is None or not tolerance.met_by(best.candidate):
         other = sweep.best(symmetric=False)
         least = np.inf if best is None else OPTIONS.gain * best.candidate.validation_bound
         if other is not None and (best is None or other.candidate.validation_bound < least):
@@ -346,14 +346,9 @@ class _Sweep:
             microseconds_per_step=steps.microseconds_per_step,
         )
         others = [c for c in self.tried if c is not best.candidate]
-        met, messages = chosen.validation_bound <= self.tolerance.bound, list(left_out)
+        met, messages = self.tolerance.met_by(chosen), list(left_out)
         ended = MET if met else self.budget.ended or "larger S are no more accurate"
-        if not met:
-            messages.append(
-                f"no S of positions meets the tolerance {self.tolerance.bound:g}: the most "
-                f"accurate has a one-step error of {chosen.validation_relative:.2e} of the spread "
-                f"(95 % bound {chosen.validation_bound:.2e}); the search ended because {ended}"
-            )
+        messages += [] if met else [self.tolerance.missed_by(chosen, ended)]
         self.watch.on_progress(str(best.about))
         part = "took no part in the fit or its choices" if test is self.split.test else "also chose"
         tested = states.take(test[: min(STATES_MEASURED, block_of(2 * map_.dim))])

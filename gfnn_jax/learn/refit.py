@@ -33,7 +33,6 @@ from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.choose import FEWEST_RUNS_TESTED
-from gfnn_jax.learn.conclude import not_met
 from gfnn_jax.learn.fitted import Fit
 from gfnn_jax.maps.piece import serves_any_dt
 from gfnn_jax.maps.saved import packed, unpacked
@@ -127,7 +126,8 @@ def refit(
     started = time.perf_counter()
     group = group or Group()
     tolerance = fitted.asked
-    messages = [m for m in fitted.messages if m != not_met(fitted.chosen, tolerance, fitted.ended)]
+    missed = tolerance.missed_by(fitted.chosen, fitted.ended)
+    messages = [m for m in fitted.messages if m != missed]
 
     def warn(message: str) -> None:
         messages.append(message)
@@ -184,8 +184,8 @@ def refit(
         chosen, num_pairs = old, fitted.num_pairs
     elif law is not None and found.law is not None and old.learns == "hamiltonian":
         law = _with_coefficients(law, found.law, chosen)
-    if chosen.validation_bound > fitted.tolerance:
-        warn(not_met(chosen, tolerance, fitted.ended))
+    if not tolerance.met_by(chosen):
+        warn(tolerance.missed_by(chosen, fitted.ended))
     return fitted.replaced(
         map=map_ if chosen is old else better,
         candidates=tuple(chosen if c.chosen else c for c in fitted.candidates),
