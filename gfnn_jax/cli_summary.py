@@ -31,21 +31,6 @@ def law_line(report: dict[str, Any]) -> str:
     return f"{'' if chosen else 'found, and costlier per step than the map: '}H = {law['formula']}"
 
 
-def error_line(fit: dict[str, Any]) -> str:
-    """Line about the one-step error, its bound, and the tolerance that this bound is held to."""
-    if fit["validation_rms"] is None:
-        return "one-step error not known, for the step fails at some of the held-out states"
-    unit = "of the spread" if fit["tolerance_is_relative"] else "in the data's units"
-    bound = fit["validation_bound"]
-    shown = "not known" if bound is None else f"{bound:.2e}"  # of few pairs it is infinite
-    return (
-        f"one-step error {fit['validation_rms']:.2e} in the data's units, "
-        f"{fit['validation_relative']:.2e} of the spread; 95 % bound "
-        f"{shown}, tolerance {fit['tolerance']:g} {unit}: "
-        f"{'met' if fit['tolerance_met'] else 'not met'}"
-    )
-
-
 def print_summary(ran: Any, out: Path) -> None:
     if ran is None:
         print(f"{out}: already holds the result of this job")
@@ -56,7 +41,7 @@ def print_summary(ran: Any, out: Path) -> None:
     print_table(candidates_table(ran.fit))
     report = ran.report
     fit, defect = report["fit"], report["map"]["symplecticity_defect"]
-    print(f"{report['model']['chart']} {report['model']['label']}: {error_line(fit)}")
+    print(ran.fit.line)
     print(f"symplecticity defect {'not computed (no time)' if defect is None else f'{defect:.1e}'}")
     if report["hamiltonian"] is not None:
         print(law_line(report))
@@ -114,7 +99,8 @@ def print_table(table: Any) -> None:
 def print_record(ran: Any, out: Path) -> None:
     """Print a law, its physical quantities, and its forecasts of the last third of the
     recording."""
-    fit, ahead = ran.learned.fit, partial(_print_ahead, ran.forecasts, ran.held_out)
+    fit = ran.learned.fit
+    ahead = partial(_print_ahead, ran.forecasts, fit.held_out)
     if fit.bracket is None:
         print_law(fit, ahead)
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,6 +55,16 @@ class Forecasts(NamedTuple):
     ahead: tuple[float, ...]
     median: dict[str, tuple[float, ...]]
     within: float
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """Entry of ``report.json``."""
+        return {
+            "num": len(self.each),
+            "ahead": self.ahead,
+            "median": self.median,
+            "within_two_deviations": self.within,
+        }
 
 
 def end_of_part(recording: Recording) -> float:

@@ -66,10 +66,7 @@ class Section(NamedTuple):
 
 def page(fit: Fit, *, about: About = About(), forecasts: Forecasts | None = None) -> str:  # noqa: B008
     """The page of a fit, as text. forecasts: of its held-out part."""
-    found = fit.found
-    if forecasts is None and fit.held_out is not None:
-        with contextlib.suppress(InputError):  # it is too short
-            forecasts = forecasts_of(fit, fit.held_out)
+    found, forecasts = fit.found, forecasts or _of_held_out(fit)
     if isinstance(found, LearnedLaw):
         sections = list(_of_law(fit, found, forecasts, about.notes))
     elif isinstance(found, Choice):
@@ -118,10 +115,27 @@ def write_page(fit: Fit, path: str | os.PathLike[str], **options: Any) -> None:
     atomic_write(path, page(fit, **options))
 
 
-def write_reports(fit: Fit, folder: Path, about: About) -> None:
-    """Write the report as page and as JSON into a folder, which is made where there is none."""
-    write_page(fit, folder / PAGE, about=about)
-    atomic_write(folder / REPORT, to_json(fit.report()))
+def _of_held_out(fit: Fit) -> Forecasts | None:
+    """Forecasts of the held-out part; None without one, or where it is too short."""
+    with contextlib.suppress(InputError):
+        return None if fit.held_out is None else forecasts_of(fit, fit.held_out)
+
+
+def write_reports(
+    fit: Fit,
+    folder: Path,
+    about: About,
+    *,
+    result: dict[str, Any] | None = None,
+    forecasts: Forecasts | None = None,
+) -> None:
+    """Write the report as page and as JSON into a folder, which is made where there is none.
+    result: the report that a job has made. forecasts: of the held-out part."""
+    forecasts, result = forecasts or _of_held_out(fit), result or fit.report()
+    if forecasts is not None:
+        result = {**result, "forecasts": {"begin": fit.learned_to, **forecasts.report}}
+    atomic_write(folder / REPORT, to_json(result))
+    write_page(fit, folder / PAGE, about=about, forecasts=forecasts)
 
 
 def write_refusal(recording: Recording, error: Exception, folder: Path, about: About) -> None:
@@ -332,29 +346,15 @@ def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
             heads=("term", "coefficient"),
             rows=[(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms],
         )
-    best = found.chosen
     yield Section(
         "The map",
         lines=[
-            found.line + ".",
+            f"{found.line}.",
+            f"Time step {float(np.asarray(fit.map.dt)):g}.",
             f"The search ended: {found.ended}.",
             *([found.stated_by] if found.stated_by else []),
             *([str(found.positions)] if found.positions is not None else []),
             *map(str, found.partial_laws if not found.met else ()),
-        ],
-        heads=("quantity", "value"),
-        rows=[
-            ("time step", f"{float(np.asarray(fit.map.dt)):g}"),
-            ("parameters", f"{best.num_parameters:,}"),
-            ("operations of a step", f"{best.operations:,.0f}"),
-            ("one-step error, RMS", f"{best.validation_rms:.2e}"),
-            ("one-step error ÷ spread", f"{best.validation_relative:.2e}"),
-            ("95 % bound", f"{best.validation_bound:.2e}"),
-            ("tolerance", f"{found.tolerance:g}: {'met' if found.met else 'not met'}"),
-            (
-                "relative error at the outermost 5 % of the states",
-                "–" if best.outside is None else f"{best.outside:.1e}",
-            ),
         ],
     )
     heads, rows = candidate_cells(found)

@@ -194,24 +194,15 @@ def _write(out: Path, found: dict[str, Forecast]) -> None:
         runs = np.repeat(list(found), [len(t) for t in times.values()])
         atomic_write(out, to_text({"run": runs, **columns}))
         return
-    length = max(len(t) for t in times.values())
+    longest = max(map(len, times.values()))
 
     def padded(of_runs: Mapping[str, np.ndarray]) -> np.ndarray:
-        rows = [(0, length - len(a)) for a in of_runs.values()]
-        return np.stack(
-            [
-                np.pad(a, [row, *[(0, 0)] * (a.ndim - 1)], constant_values=np.nan)
-                for a, row in zip(of_runs.values(), rows, strict=True)
-            ]
-        )
+        rows = np.full((len(found), longest, *of_runs[next(iter(found))].shape[1:]), np.nan)
+        for row, values in zip(rows, of_runs.values(), strict=True):
+            row[: len(values)] = values
+        return rows
 
-    stream = io.BytesIO()
-    np.savez(
-        stream,
-        runs=np.array(list(found)),
-        columns=np.array(names),
-        times=padded(times),
-        values=padded(values),
-        std=padded(std),
-    )
+    stream, of_runs = io.BytesIO(), {"times": times, "values": values, "std": std}
+    arrays = {name: padded(each) for name, each in of_runs.items()}
+    np.savez(stream, runs=np.array(list(found)), columns=np.array(names), **arrays)
     atomic_write(out, stream.getvalue())

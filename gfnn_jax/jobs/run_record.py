@@ -23,12 +23,10 @@ FIGURE = "forecasts.png"
 
 
 class Ran(NamedTuple):
-    """A law, where it was written, its forecasts of the rest, None where that is too short to
-    forecast, and that part of the recording."""
+    """A law, where it was written, and its forecasts of the rest, None where that is too short."""
 
     learned: Learned
     forecasts: Forecasts | None
-    held_out: Recording
 
 
 def run_record(
@@ -74,28 +72,18 @@ def _report(
 ) -> Ran:
     from gfnn_jax.evaluate.figures_of_recordings import forecasts_figure
     from gfnn_jax.evaluate.figures_style import save  # matplotlib, when the law is on screen
-    from gfnn_jax.evaluate.page import write_page
+    from gfnn_jax.evaluate.page import write_reports
 
     fit = dataclasses.replace(learned.fit, data=whole, learned_to=end)
     held_out = fit.held_out
     assert held_out is not None
     output.progress.line("forecasting the last third, which no fit has seen")
-    result = dict(learned.report)
+    found = None
     try:
         found = forecasts_of(fit, held_out)
-    except InputError as error:
-        found = None
-        output.progress.line(f"no forecasts: {error}")
-    else:
         save(forecasts_figure(found, held_out), folder / FIGURE, dpi=110)
-        result["forecasts"] = {
-            "begin": end,
-            "num": len(found.each),
-            "ahead": list(found.ahead),
-            "median": {name: list(of) for name, of in found.median.items()},
-            "within_two_deviations": found.within,
-        }
-    (folder / report.REPORT).write_text(report.to_json(result), encoding="utf-8")
+    except InputError as error:
+        output.progress.line(f"no forecasts: {error}")
     output.progress.line("writing the report")
-    write_page(fit, folder / report.PAGE, about=about, forecasts=found)
-    return Ran(learned._replace(fit=fit), found, held_out)
+    write_reports(fit, folder, about, result=learned.report, forecasts=found)
+    return Ran(learned._replace(fit=fit), found)

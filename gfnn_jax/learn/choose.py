@@ -39,6 +39,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.request import Request
 from gfnn_jax.learn.searches import Searched
 from gfnn_jax.maps.posterior import Posterior
+from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.learned_law import assembled as flow_assembled
 from gfnn_jax.models.hamiltonians.problem import work_of_refit
 from gfnn_jax.models.hamiltonians.search import preferred
@@ -74,7 +75,8 @@ _TEST_ROWS = "the fit of the chosen size to the test pairs too"
 
 class Chosen(NamedTuple):
     """The candidate with its map; the data set that it was fitted to and measured on; the seconds
-    that compiling took; the entry that it comes from, None for H and for an S with parameters.
+    that compiling took; the entry that it comes from, None for H and for an S with parameters; law:
+    H, where its flow is the map.
     by: what states its error: "test", pairs that chose nothing; "cross-validation"; or
     "validation", pairs that chose too, where the model is neither a linear S nor an H. stated_by:
     the same as text, with their number. few: a warning where few states make the error."""
@@ -83,6 +85,7 @@ class Chosen(NamedTuple):
     data: Dataset
     compile_seconds: float
     entry: Entry | None = None
+    law: LearnedHamiltonian | None = None
     by: str = ""
     stated_by: str = ""
     few: str = ""
@@ -110,7 +113,7 @@ def choose(searched: Searched, request: Request) -> Chosen:
     expected = max(bound, OPTIONS.confirmed * law.candidate.validation_bound)
     if best is not None and not candidate.validation_bound <= expected:
         return _of_ranking(ranking, request)
-    return Chosen(candidate, data, seconds)
+    return Chosen(candidate, data, seconds, law=law)
 
 
 def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
@@ -183,15 +186,13 @@ def with_posterior(chosen: Chosen, searched: Searched) -> Chosen:
     """The choice with the posterior of its map, where that was fitted to the user's pairs and its
     model tells the covariance of its coefficients; as it is elsewhere. It is computed when it is
     first asked for."""
-    map_, entry, law = chosen.candidate.map, chosen.entry, searched.law
+    map_, entry, law = chosen.candidate.map, chosen.entry, chosen.law
     if entry is not None:
         data = entry.sweep.data
         root = entry.sweep.posterior(entry.size) if data.pairs is searched.data.pairs else None
-    elif searched.of_terms is not None and chosen.candidate.learns == "map":
+    elif searched.of_terms is not None:
         data, root = searched.of_terms.data, searched.of_terms.covariance
-    elif (
-        law is not None and law.covariance is not None and chosen.candidate.learns == "hamiltonian"
-    ):
+    elif law is not None and law.covariance is not None:
         data, root = searched.data, lambda: law.root
     else:
         return chosen
@@ -261,8 +262,8 @@ def _of_steps(chosen: Chosen, found: Searched) -> float:
     It is known without images, so all states tell it: the few that pass a centre closely have most
     of it, and hardly one may be among those that state the error.
     """
-    law, data = found.law, found.data
-    if law is None or chosen.candidate.learns != "hamiltonian" or not law.terms:
+    law, data = chosen.law, found.data
+    if law is None or not law.terms:
         return 0.0
     rows = np.arange(0, len(data), -(-len(data) * data.y0.shape[1] // OPTIONS.numbers))
     (dt, args), flow = data.given(rows), law.flow
@@ -346,7 +347,7 @@ class _Refits(NamedTuple):
 
 def _refits(chosen: Chosen, found: Searched) -> _Refits | None:
     """The chosen model; None where it is not known how to fit it anew in little time."""
-    entry, law = chosen.entry, found.law
+    entry, law = chosen.entry, chosen.law
     if entry is not None:
         sweep, size = entry.sweep, entry.size
         work = sweep.work_of_refit(size)
@@ -358,13 +359,10 @@ def _refits(chosen: Chosen, found: Searched) -> _Refits | None:
             return [sweep.predicted(size, np.setdiff1d(rows, part), part) for part in parts]
 
         return _Refits(predicts, ROWS, work)
-    flow = law is not None and chosen.candidate.learns == "hamiltonian" and law.terms
-    return _of_law(found) if flow else None
+    return _of_law(law, found.data) if law is not None and law.terms else None
 
 
-def _of_law(found: Searched) -> _Refits:
-    data, law = found.data, found.law
-    assert law is not None
+def _of_law(law: LearnedHamiltonian, data: Dataset) -> _Refits:
     flow = law.flow
     problem = Problem(
         data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight

@@ -130,8 +130,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
 
 def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
     """Warn of friction that the tolerance hides."""
-    candidate, law, data = chosen.candidate, searched.law, searched.data
-    lossy = candidate.learns == "hamiltonian" and law is not None and bool(law.friction)
+    candidate, data = chosen.candidate, searched.data
+    lossy = chosen.law is not None and bool(chosen.law.friction)
     compiled = candidate.microseconds_per_step is not None
     if lossy or not compiled or data.varied or not candidate.validation_relative > OPTIONS.roundoff:
         return []
@@ -285,17 +285,16 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
 
     The residuals are those of the chosen map, or of the best generated one where H was chosen.
     """
-    candidate, data = chosen.candidate, searched.data
-    law = searched.law
+    candidate, data, law = chosen.candidate, searched.data, chosen.law
     entry = chosen.entry or next(iter(searched.found.ranking), None)
-    if candidate.learns == "hamiltonian" and law is not None and law.turns:
+    if law is not None and law.turns:
         return _LeftOver(None, [], TURNS)
-    if candidate.learns == "hamiltonian" and law is not None and law.friction:
+    if law is not None and law.friction:
         entry = None  # S has none
     if entry is not None:
         data = entry.sweep.data
     sample = _residuals_of_sample(candidate, entry, searched)
-    of_h = law if candidate.learns == "hamiltonian" and entry is None else None
+    of_h = law if entry is None else None
     if not stalled and of_h is not None and not of_h.misfit:
         # The search for H ended before it met the noise.
         stalled = _noise_by_neighbours(sample) is True and leaves_white(of_h.flow, data)
@@ -311,7 +310,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     rows, sequence = sample.rows, sample.sequence
     taken = candidate.num_parameters / (data.training.size * 2 * data.dim)
     noise = state_noise(candidate.map, data.pairs.take(rows[: OPTIONS.noise_pairs]), taken)
-    if law is not None and law.noise is not None and candidate.learns == "hamiltonian":
+    if law is not None and law.noise is not None:
         # Along an arc what the law misses adds up, and looks like noise.
         noise = np.minimum(law.noise, noise)
     known_noise = data.noise_of_channels
@@ -319,7 +318,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         return _beside_known(noise, known_noise)
     own, names = "", coordinate_names(data.dim)
     sizes_of_noise = ", ".join(f"{s:.1e} ({n})" for n, s in zip(names, noise, strict=True))
-    if candidate.learns == "map" and entry is not None and entry.sweep.linear:
+    if law is None and entry is not None and entry.sweep.linear:
         part = entry.sweep.error_by_noise(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))
         if part > OPTIONS.own_error:
             message = (
@@ -336,8 +335,8 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
             "parameter, a drive)"
         )
         reason += ", or something that the states do not hold"
-    of_law = law if candidate.learns == "hamiltonian" and not hidden else None
-    if of_law is not None and not of_law.misfit and leaves_white(of_law.flow, searched.data):
+    alone = law is not None and not (hidden or law.misfit)
+    if law is not None and alone and leaves_white(law.flow, searched.data):
         message = (
             "the residuals of H are white: these pairs do not contradict H. They are noise of "
             f"about {sizes_of_noise}"

@@ -197,11 +197,12 @@ class Choice:
     def line(self) -> str:
         """The chosen map, its error and the tolerance."""
         best = self.chosen
+        unit = "of the spread" if self.asked.relative else "in the data's units"
         return (
             f"{best.chart} {best.label}, {best.num_parameters:,} parameters: one-step error "
-            f"{self.asked.size_of(best):.2e} (≤ {best.validation_bound:.2e} at 95 %), tolerance "
-            f"{self.tolerance:g} {'met' if self.met else 'not met'}, {self.num_pairs:,} pairs, "
-            f"{self.seconds:.1f} s"
+            f"{best.validation_rms:.2e} in the data's units, {best.validation_relative:.2e} of the "
+            f"spread; 95 % bound {best.validation_bound:.2e}, tolerance {self.tolerance:g} {unit}: "
+            f"{'met' if self.met else 'not met'}; {self.num_pairs:,} pairs, {self.seconds:.1f} s"
         )
 
     @property
