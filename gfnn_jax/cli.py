@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from gfnn_jax import processes
-from gfnn_jax.cli_parser import OF_COLUMNS, column_options, fit_options, masses, names_roles, parser
+from gfnn_jax.cli_parser import OF_COLUMNS, column_options, fit_options, names_roles, parser
 from gfnn_jax.cli_summary import (
     comparison_table,
     print_forecasts,
@@ -199,7 +199,7 @@ def _run_file(arguments: argparse.Namespace) -> None:
     _refuse_given(arguments, others, "not for the law of a recording")
     columns |= given | ({"dt": arguments.dt} if arguments.dt is not None else {})
     options = fit_options(arguments)
-    options |= {"mass": masses(arguments), "despite": arguments.despite}
+    options |= {"mass": dict(arguments.mass or ()), "despite": arguments.despite}
     with _output(arguments) as output:
         from gfnn_jax.jobs.run_record import run_record
 
@@ -243,7 +243,7 @@ def _look(arguments: argparse.Namespace) -> None:
     if figure is None and not arguments.json:
         figure = Path("runs") / f"look-{paths[0].stem}.png"
     options = column_options(arguments)
-    given = {"dt": arguments.dt, "mass": masses(arguments)}
+    given = {"dt": arguments.dt, "mass": dict(arguments.mass or ())}
     options |= {name: value for name, value in given.items() if value}
     if len(named) == 1:
         options = named[0][1] | options
@@ -317,7 +317,7 @@ def _fit_recording(
         columns["dt"] = arguments.dt
     if is_law:
         _refuse_given(arguments, _OF_MAPS, "not for the law of a recording")
-        options["mass"] = masses(arguments)
+        options["mass"] = dict(arguments.mass or ())
     with _output(arguments) as output:
         from gfnn_jax.jobs.fit import fit_recording
 

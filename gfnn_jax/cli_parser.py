@@ -458,7 +458,7 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
         group.add(name, about, "A,B", type=_names)
 
     def pairs(name: str, about: str, read: Callable[[str], Any], metavar: str) -> None:
-        group.add(name, about, metavar, type=read, action="append")
+        group.add(name, about, metavar, type=read, action="extend")
 
     for role in ROLES:
         names(f"--{role}", f"columns of {role}")
@@ -491,13 +491,8 @@ def column_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """The options that were given, as keywords of `gfnn_jax.read`; ``mass`` is none of them."""
     given = {name: getattr(arguments, name) for name in (*ROLES, *OF_COLUMNS)}
     for name, option in (*((n, n) for n in ("std", "observe", "guess")), ("events", "event")):
-        given[name] = dict(pair for pairs in getattr(arguments, option) or () for pair in pairs)
+        given[name] = dict(getattr(arguments, option) or ())
     return {name: value for name, value in given.items() if value not in (None, {})}
-
-
-def masses(arguments: argparse.Namespace) -> dict[str, float]:
-    """The known masses by name of a position."""
-    return dict(pair for pairs in arguments.mass or () for pair in pairs)
 
 
 def names_roles(options: dict[str, Any]) -> bool:

@@ -47,6 +47,16 @@ class Coordinates:
     inverse: Callable = _identity
     names: tuple[str, ...] = ()
 
+    @property
+    def plain(self) -> bool:
+        """Return whether the inner coordinates are the user's own."""
+        return self.forward is _identity
+
+    @property
+    def user_angles(self) -> tuple[int, ...]:
+        """The angles among the user's coordinates."""
+        return self.angles if self.plain else ()
+
 
 CARTESIAN = Coordinates("cartesian")
 # Of a log-canonical bracket: not canonical, but its bracket is constant in log z.

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.coordinates import CARTESIAN, Coordinates, lift, lift_sites, to_inner, to_user
+from gfnn_jax.coordinates import Coordinates, lift, lift_sites, to_inner, to_user
 from gfnn_jax.dataset.split import Split, split_rows
 from gfnn_jax.dataset.structures import Structure
 from gfnn_jax.errors import FitError
@@ -137,7 +137,7 @@ class Dataset:
         if self.noise is None or self.noise.ndim == 1 or not np.ptp(self.noise, axis=0).any():
             return None
         relative = self.noise / self.noise_of_channels
-        if self.before or self.after or self.coordinates.forward is not CARTESIAN.forward:
+        if self.before or self.after or not self.coordinates.plain:
             relative = np.sqrt(np.mean(relative**2, axis=1, keepdims=True))
         return np.broadcast_to(1.0 / relative, self.y0.shape)
 
@@ -185,8 +185,7 @@ class Dataset:
     @property
     def user_angles(self) -> tuple[int, ...]:
         """The angles among the user's coordinates."""
-        plain = self.coordinates.forward is CARTESIAN.forward
-        return self.coordinates.angles if plain else ()
+        return self.coordinates.user_angles
 
     def given(self, rows) -> tuple[Any, Any]:
         """(dt, args) of these rows."""

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
 from gfnn_jax.candidates.assemble import stepped
-from gfnn_jax.coordinates import CARTESIAN, nearest_image
+from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.rows import of_halves, of_pairs
 from gfnn_jax.dataset.runs import next_of
@@ -89,7 +89,7 @@ def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
     """
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     width, size = z0.shape[1], sizes(z0)
-    residual = _difference(map_, z1, _images(map_, pairs, z0))
+    residual = nearest_image(z1 - _images(map_, pairs, z0), map_.angles_of_z)
     jacobian = np.empty((len(z0), width, width))
     for j, apart in enumerate(OPTIONS.apart * size):
         offset = apart * (np.arange(width) == j)
@@ -107,7 +107,7 @@ def noise_of_sites(map_: SymplecticMap, pairs: Pairs) -> np.ndarray:
     """
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     dim, size, rng = pairs.dim, sizes(z0), np.random.default_rng(0)
-    residual = _difference(map_, z1, _images(map_, pairs, z0))
+    residual = nearest_image(z1 - _images(map_, pairs, z0), map_.angles_of_z)
     halves = np.arange(2 * dim) // dim
     grown = np.zeros((2, len(z0), 2 * dim))
     for half in (0, 1):
@@ -128,12 +128,7 @@ def _change(map_: SymplecticMap, pairs: Pairs, offset) -> np.ndarray:
     second order."""
     z0 = np.asarray(pairs.z0)
     ahead, behind = (_images(map_, pairs, z0 + sign * offset) for sign in (1, -1))
-    return _difference(map_, ahead, behind) / 2
-
-
-def _difference(map_: SymplecticMap, one, other) -> np.ndarray:
-    plain = map_.coordinates.forward is CARTESIAN.forward
-    return nearest_image(one - other, map_.coordinates.angles if plain else ())
+    return nearest_image(ahead - behind, map_.angles_of_z) / 2
 
 
 def is_noise(z, residual, run, place) -> bool | None:

@@ -217,18 +217,7 @@ def _of_law(
     yield Section(
         "What to record next",
         heads=("release from rest at", "what it tells"),
-        rows=[
-            (
-                m.start_text,
-                f"{m.apart:.2g} standard deviations between this law and its nearest rival"
-                if m.apart
-                else "standard errors smaller, "
-                + ", ".join(
-                    f"{in_letters(t)}: {min(g, 1000):.3g}×" for t, g in [*m.gains.items()][:4]
-                ),
-            )
-            for m in law.next_motions
-        ],
+        rows=[(motion.start_text, motion.tells) for motion in law.next_motions],
     )
     yield Section("The data", lines=[*notes, *_faults(fit, law)])
 

@@ -29,7 +29,6 @@ from gfnn_jax.jobs.measure import (
     NUM_STEPS,
     NUM_TRAJECTORIES,
     Rollouts,
-    angles_of_z,
     map_rollouts,
     measure,
     step_rollouts,
@@ -110,7 +109,7 @@ def learn_and_roll(
         },
         "map": about,
     }
-    return part, roll(data.z0, data.num_steps)
+    return part, roll(data.z0, NUM_STEPS)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -157,7 +156,7 @@ def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollout
         },
         "map": _map_part(fit.map, data) | {"chart_determinant_min": fit.model_determinant_min},
     }
-    return part, map_rollouts(fit.map, data.z0, data.num_steps)
+    return part, map_rollouts(fit.map, data.z0, NUM_STEPS)
 
 
 def _map_part(map_: SymplecticMap, data: SharedData) -> dict[str, Any]:
@@ -176,7 +175,7 @@ def _map_part(map_: SymplecticMap, data: SharedData) -> dict[str, Any]:
 
 def _rms(data: SharedData, images) -> float:
     """RMS per component of the one-step state error on fresh pairs, angles modulo 2π."""
-    return one_step_rms(np.asarray(images), data.fresh.z1, angles_of_z(data.scene))
+    return one_step_rms(np.asarray(images), data.fresh.z1, data.scene.coordinates.user_angles)
 
 
 _NUM_FRESH = 2_000
@@ -213,10 +212,6 @@ class SharedData:
     quick: bool
 
     @property
-    def num_steps(self) -> int:
-        return NUM_STEPS
-
-    @property
     def num_pairs(self) -> int:
         """Number of pairs of D₂: a hundred thousand, for the standard map a million."""
         if self.quick:
@@ -234,7 +229,8 @@ class SharedData:
         num = self.num_pairs // 4 if few else self.num_pairs
         z = np.asarray(sample_sequences(self.scene, num, length, self.key(length)))
         z = z[np.isfinite(z).all(axis=(1, 2))]  # a state that collides has no image
-        return Sequences(z, self.scene.dt, angles_of_z(self.scene), separable(self.scene))
+        angles = self.scene.coordinates.user_angles
+        return Sequences(z, self.scene.dt, angles, separable(self.scene))
 
     @functools.cached_property
     def fresh(self) -> Pairs:
@@ -254,7 +250,7 @@ class SharedData:
     @functools.cached_property
     def reference(self) -> np.ndarray:
         """Reference trajectories from z0, (B, 1 + num_steps, 2d)."""
-        return np.asarray(reference_trajectories(self.scene, self.z0, self.num_steps))
+        return np.asarray(reference_trajectories(self.scene, self.z0, NUM_STEPS))
 
 
 CAP, QUICK_CAP = 60.0, 2.0  # seconds, at the rate below

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,28 +17,17 @@ BINS = 50  # bins of the histograms that KL divergences compare
 OURS, AFFINE = "GFNN", "affine map of the same pairs"
 
 
-class Beside(NamedTuple):
-    """Companions of a run's errors in their figure: their band (B, L), and the errors (B, L)
-    of a linear regression of the same pairs, where there are any."""
-
-    band: np.ndarray | None = None
-    affine: np.ndarray | None = None
-
-
-_NOTHING = Beside()
-
-
 def figures_of_run(
-    fit: Fit, scene: Scene, measured: Measured, reference, beside: Beside = _NOTHING
+    fit: Fit, scene: Scene, measured: Measured, reference, band=None, affine=None
 ) -> dict[str, Any]:
-    """Draw a run's figures, by file name."""
+    """Draw a run's figures, by file name. In that of errors, where there are any: band (B, L), and
+    affine (B, L), the errors of a linear regression of the same pairs."""
     steps, predicted = measured.steps, measured.predicted
     drawn = _errors(scene, {OURS: measured}, reference)
-    band = None if beside.band is None else (steps, beside.band)
-    errors = {OURS: measured.error} | ({} if beside.affine is None else {AFFINE: beside.affine})
-    drawn["error"] = figures.error_growth(
-        {name: (steps, error) for name, error in errors.items()}, band=band
-    ).figure
+    errors = {OURS: (steps, measured.error)}
+    errors |= {} if affine is None else {AFFINE: (steps, affine)}
+    band = None if band is None else (steps, band)
+    drawn["error"] = figures.error_growth(errors, band=band).figure
     candidates = figures.candidates_figure(fit)
     drawn |= {} if candidates is None else {"candidates": candidates}
     both = {"reference": reference, OURS: predicted}

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gfnn_jax.coordinates import CARTESIAN, nearest_image
+from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.evaluate import metrics, report
 from gfnn_jax.maps.rollout import rollout
 from gfnn_jax.maps.symplectic_map import SymplecticMap
@@ -83,7 +83,7 @@ def without_runaways(rollouts: Rollouts, reference) -> Rollouts:
 def affine_errors(pairs: Pairs, scene: Scene, reference: np.ndarray) -> np.ndarray:
     """Position errors (B, L) of the simplest map: the linear regression Z = A z + b of the same
     pairs, rolled out from the reference's first states."""
-    angles = angles_of_z(scene)
+    angles = scene.coordinates.user_angles
     table = np.column_stack([pairs.z0, np.ones(len(pairs.z0))])
     moved = nearest_image(np.asarray(pairs.z1) - pairs.z0, angles)
     a = np.linalg.lstsq(table, moved, rcond=None)[0]
@@ -112,7 +112,7 @@ def measure(rollouts: Rollouts, scene: Scene, reference: np.ndarray, params=None
     params: (B, k), for a scene that has parameters.
     """
     predicted, steps = rollouts.states, np.arange(reference.shape[1])
-    error = metrics.position_error(predicted, reference, angles_of_z(scene))
+    error = metrics.position_error(predicted, reference, scene.coordinates.user_angles)
     energy, drift = None, None
     conserved = scene.hamiltonian if scene.period is None else None
     hamiltonian = scene.invariants.get("energy", conserved)
@@ -142,12 +142,7 @@ def _along(invariant, states, params):
     return jax.vmap(jax.vmap(lambda z, a: invariant(z, 0.0, a), (0, None)))(states, params)
 
 
-def angles_of_z(scene: Scene) -> tuple[int, ...]:
-    """Indices of the user's coordinates that are angles."""
-    coordinates = scene.coordinates
-    return coordinates.angles if coordinates.forward is CARTESIAN.forward else ()
-
-
 def plane_of(scene: Scene) -> tuple[tuple[str, str], bool]:
     """Names of the coordinates of one degree of freedom in figures, and True where modulo 2π."""
-    return ((r"$\theta$", "$p$"), True) if angles_of_z(scene) else (("$q$", "$p$"), False)
+    modulo = bool(scene.coordinates.user_angles)
+    return (r"$\theta$" if modulo else "$q$", "$p$"), modulo

@@ -12,7 +12,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.evaluate import figures
 from gfnn_jax.evaluate.page import About, write_page
 from gfnn_jax.evaluate.report import PAGE
-from gfnn_jax.jobs.figures import Beside, figures_of_run
+from gfnn_jax.jobs.figures import figures_of_run
 from gfnn_jax.jobs.measure import (
     NUM_STEPS,
     NUM_TRAJECTORIES,
@@ -134,9 +134,10 @@ def run(
             write_page(fitted, folder / PAGE, about=about)
             # Samples are stepped by a program of their own, which takes as long to compile.
             band = None if quick else _band(fitted.map, z0, measured.predicted, given)
-            plain = scene.parameters or scene.any_phase
-            beside = Beside(band, None if plain else affine_errors(pairs, scene, reference))
-            for file, figure in figures_of_run(fitted, scene, measured, reference, beside).items():
+            varied = scene.parameters or scene.any_phase
+            affine = None if varied else affine_errors(pairs, scene, reference)
+            drawn = figures_of_run(fitted, scene, measured, reference, band, affine)
+            for file, figure in drawn.items():
                 figures.save(figure, folder / f"{file}.png")
     return Ran(fitted, output.out, result)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from gfnn_jax.budget import SOLVE, Budget, within
 from gfnn_jax.candidates.assemble import Candidate, stepped
-from gfnn_jax.coordinates import CARTESIAN, nearest_image
+from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.diagnosis.residuals import (
     differs_between_sequences,
     hidden_friction,
@@ -135,7 +135,7 @@ def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
     compiled = candidate.microseconds_per_step is not None
     if lossy or not compiled or data.varied or not candidate.validation_relative > OPTIONS.roundoff:
         return []
-    if data.coordinates.forward is not CARTESIAN.forward:
+    if not data.coordinates.plain:
         return []
     sample = _residuals_of_sample(candidate, None, searched, OPTIONS.friction_pairs)
     found = hidden_friction(sample.image, sample.residual, data.user_angles)

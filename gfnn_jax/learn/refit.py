@@ -20,7 +20,7 @@ import numpy as np
 
 from gfnn_jax.budget import FLOW, RATES, ROWS
 from gfnn_jax.candidates.assemble import Candidate, stepped, with_error
-from gfnn_jax.coordinates import CARTESIAN, nearest_image, to_inner, whole_turns
+from gfnn_jax.coordinates import nearest_image, to_inner, whole_turns
 from gfnn_jax.dataset.measured_error import Tolerance, one_step_error
 from gfnn_jax.dataset.rows import of_rows, residual_weight
 from gfnn_jax.errors import FitWarning
@@ -321,14 +321,13 @@ class RowsOfRefit:
         return {name: np.asarray(given[name], float) for name in self.map.parameters.names}
 
     def _close(self, z1, images) -> np.ndarray:
-        return np.all(np.abs(self._difference(images - z1)) <= self.task["most"], axis=1)
+        off = nearest_image(images - z1, self.map.angles_of_z)
+        return np.all(np.abs(off) <= self.task["most"], axis=1)
 
     def error(self, map_: SymplecticMap, pairs: Pairs, tolerance: Tolerance):
         """The one-step error of a map on pairs."""
-        images = self._images(map_, pairs)
-        return one_step_error(
-            self._difference(images - np.asarray(pairs.z1)), self.spread, tolerance
-        )
+        off = self._images(map_, pairs) - np.asarray(pairs.z1)
+        return one_step_error(nearest_image(off, map_.angles_of_z), self.spread, tolerance)
 
     def resolving(self, held: Pairs) -> dict[str, Any]:
         """Steps of the law that resolve the pairs held out, and the error up to which others count
@@ -460,10 +459,6 @@ class RowsOfRefit:
         z, dt, args = np.asarray(pairs.z0), self._own_dt(pairs), self._args(pairs)
         steps = stepped(map_, z, dt, args, timed=False)
         return np.where(steps.failed[:, None], np.nan, steps.images)
-
-    def _difference(self, difference) -> np.ndarray:
-        plain = self.map.coordinates.forward is CARTESIAN.forward
-        return nearest_image(difference, self.map.coordinates.angles if plain else ())
 
     def _as_fitted(self, pairs: Pairs, images) -> _Rows:
         """Pairs as the fitted piece sees them: inner coordinates, the angles of z1 lifted to the

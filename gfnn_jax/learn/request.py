@@ -150,7 +150,7 @@ def _check_structured(
     learn, terms, chart = options.learn, options.terms, options.chart
     coordinates = scene.coordinates if scene is not None else CARTESIAN
     bodies, angles = structure.startswith("bodies"), options.angles or coordinates.angles
-    own = coordinates.forward is not CARTESIAN.forward or coordinates.cyclic
+    own = not coordinates.plain or coordinates.cyclic
     refused = {
         "it has its own terms: expected no family or base": (options.family, options.base)
         != ("auto", None),
@@ -179,8 +179,6 @@ def _check_structured(
 def unlike_the_scene(pairs: Pairs, scene: Scene) -> list[str]:
     """Warnings where the pairs are of another size than the scene's states: 1/r₁ and the like know
     where the scene's bodies are, in its units."""
-    import jax  # loaded when first used
-
     if isinstance(scene.sampling, AroundOrbit):
         states = np.asarray(scene.sampling.start)[None, :]
     else:
@@ -218,7 +216,7 @@ def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
 def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
     """Warnings where what is declared an angle hardly is one: it runs over more than two turns, and
     moves by more than half a turn in a step. For fits that came out badly."""
-    if coordinates.forward is not CARTESIAN.forward:
+    if not coordinates.plain:
         return []
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     range_, move = np.ptp(z0, axis=0), np.abs(z1 - z0).max(axis=0)
@@ -235,7 +233,7 @@ def wrapped(pairs: Pairs, coordinates: Coordinates) -> list[int]:
     """Indices in z of what jumps by 2π, as an angle does that is wrapped and was not named: its
     values lie within one turn, some moves are beyond half a turn, and those are moves of the size
     of the others where 2π is taken from them."""
-    if coordinates.forward is not CARTESIAN.forward:
+    if not coordinates.plain:
         return []
     z0, move = np.asarray(pairs.z0), np.asarray(pairs.z1) - np.asarray(pairs.z0)
     found = []

@@ -25,7 +25,7 @@ from jax.core import Tracer
 
 from gfnn_jax.arrays import pytree
 from gfnn_jax.brackets import Bracket
-from gfnn_jax.coordinates import CARTESIAN, Coordinates
+from gfnn_jax.coordinates import Coordinates
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.flows.damped import DampedFlow
 from gfnn_jax.flows.flow import Flow
@@ -513,7 +513,7 @@ class SymplecticMap:
     @property
     def angles_of_z(self) -> tuple[int, ...]:
         """Indices of the user's coordinates that are angles."""
-        return self.coordinates.angles if self.coordinates.forward is CARTESIAN.forward else ()
+        return self.coordinates.user_angles
 
     def _followed(self, *given):
         """The law of a recording as it is followed with its dry friction on the numbers ``given``,

@@ -64,15 +64,19 @@ class NextMotion(NamedTuple):
             f"{second:.3g} and {first:.3g} for {period / 2:.3g} s each"
         )
 
-    def __str__(self) -> str:
-        at = self.start_text
+    @property
+    def tells(self) -> str:
+        """What its readings tell, as text."""
         if self.apart:
             return (
-                f"release from rest at {at}. Its readings together put {self.apart:.2g} standard "
-                "deviations between the law and its nearest rival"
+                f"its readings together put {self.apart:.2g} standard deviations between the law "
+                "and its nearest rival"
             )
-        best = ", ".join(f"of {t} {min(g, 1000):.3g}×" for t, g in [*self.gains.items()][:3])
-        return f"release from rest at {at}. Standard errors shrink: {best}"
+        best = ", ".join(f"of {t} {min(g, 1000):.3g}×" for t, g in [*self.gains.items()][:4])
+        return f"standard errors shrink: {best}"
+
+    def __str__(self) -> str:
+        return f"release from rest at {self.start_text}: {self.tells}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
