@@ -65,10 +65,8 @@ def _without_minor_ticks(*axes: Axes) -> None:
             axis.set_minor_locator(NullLocator())
 
 
-_LETTERS_PER_INCH, _OF_HANDLE = (
-    13,
-    8,
-)  # of a legend, and the letters that a handle takes the place of
+# Of a legend, and the letters that a handle takes the place of.
+_LETTERS_PER_INCH, _OF_HANDLE = 13, 8
 
 
 def _legend_above(ax, ncols=3, **options) -> None:

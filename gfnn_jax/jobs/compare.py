@@ -29,6 +29,7 @@ from gfnn_jax.jobs.measure import (
     NUM_STEPS,
     NUM_TRAJECTORIES,
     Rollouts,
+    finite_pairs,
     map_rollouts,
     measure,
     step_rollouts,
@@ -42,7 +43,7 @@ from gfnn_jax.maps.saved import versions
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, sizes, symplecticity_defect
 from gfnn_jax.scenes import Scene
-from gfnn_jax.scenes.draws import sample_pairs, sample_sequences, sample_test_states
+from gfnn_jax.scenes.draws import sample_sequences, sample_test_states
 from gfnn_jax.scenes.trajectories import reference_trajectories
 from gfnn_jax.solve.status import NOT_CONVERGED
 from gfnn_jax.storage.outputs import (
@@ -235,10 +236,7 @@ class SharedData:
     @functools.cached_property
     def fresh(self) -> Pairs:
         """Pairs that no method learns from."""
-        pairs = sample_pairs(self.scene, _NUM_FRESH, self.key(0))
-        z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
-        known = np.isfinite(z1).all(axis=1)
-        return Pairs(z0[known], z1[known], pairs.dt)
+        return finite_pairs(self.scene, _NUM_FRESH, self.key(0))
 
     @functools.cached_property
     def z0(self) -> np.ndarray:

@@ -5,17 +5,18 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gfnn_jax.budget import READING
+from gfnn_jax.budget import READING, within
 from gfnn_jax.data.files import iterate_pairs, read_trajectories, summary
 from gfnn_jax.data.recording import parameters_of, read
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.data.sample import read_sample
-from gfnn_jax.errors import FitError, InputError, OutOfTime, WorkError
+from gfnn_jax.errors import FitError, InputError, WorkError
 from gfnn_jax.evaluate.report import PAGE, About
 from gfnn_jax.families.told import anything_told
 from gfnn_jax.fitting import row_blocks
@@ -35,7 +36,6 @@ from gfnn_jax.jobs.output import (
 from gfnn_jax.learn.fit import fit as learn_fit
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.learn.refit import (
-    can_be_refitted,
     help_refit,
     not_refitted,
     refit,
@@ -124,29 +124,24 @@ def fit(
                 spent=reading,
                 kept=(kept_in, job),
             )
-            told = fitted.chosen.learns == "hamiltonian" and anything_told(asked.terms)
-            if large and not told and can_be_refitted(fitted.map):
+            why, again = why_not(fitted.map), None
+            if fitted.chosen.learns == "hamiltonian" and anything_told(asked.terms):
+                why = "a refit keeps nothing that is told of coefficients"
+            if large and not why:
                 assert trajectories.sampled is not None
                 seconds = work_of_refit(fitted, trajectories.sampled, reading)
-                try:
-                    with fitted.budget.last(_TO_ALL, READING, seconds, decides=True):
-                        progress.status("fitting the chosen model to all pairs")
-                        with failures_of_arithmetic(), row_blocks.on_devices(own):
-                            fitted = refit(
-                                fitted,
-                                pairs,
-                                fitted.validation_pairs,
-                                test=fitted.test_pairs,
-                                scene=scene,
-                                group=group,
-                            )
-                except OutOfTime:
-                    group.broadcast({})
-                    fitted = not_refitted(fitted, f"no time, it would take about {seconds:.2g} s")
-            else:
+                why = f"no time, it would take about {seconds:.2g} s"
+                apart = {"test": fitted.test_pairs, "scene": scene, "group": group}
+                last = fitted.budget.last(_TO_ALL, READING, seconds, decides=True)
+                progress.status("fitting the chosen model to all pairs")
+                with failures_of_arithmetic(), row_blocks.on_devices(own):
+                    again = within(
+                        last, partial(refit, fitted, pairs, fitted.validation_pairs, **apart)
+                    )
+            if again is None:
                 group.broadcast({})
-                why = "a refit keeps nothing that is told of coefficients" if told else None
-                fitted = not_refitted(fitted, why or why_not(fitted.map)) if large else fitted
+                again = not_refitted(fitted, why) if large else fitted
+            fitted = again
             progress.status("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
             result = fitted.report(

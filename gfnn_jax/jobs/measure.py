@@ -3,6 +3,7 @@ energy, growth. The same for every method."""
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable
 from functools import partial
@@ -17,11 +18,19 @@ from gfnn_jax.maps.rollout import rollout
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, sizes
 from gfnn_jax.scenes import Scene
+from gfnn_jax.scenes.draws import sample_pairs
 from gfnn_jax.solve.status import NON_FINITE, OK
 
 NUM_STEPS, NUM_TRAJECTORIES = 1_000, 100
 RUNAWAY = 100.0  # a prediction this many times larger than any reference is lost
 _ROUNDINGS = 64  # a first step that differs from the reference by so many is roundoff
+
+
+def finite_pairs(scene: Scene, num_pairs: int, key: Any) -> Pairs:
+    """Pairs of a scene in NumPy, without states that collide and have no image."""
+    pairs = sample_pairs(scene, num_pairs, key)
+    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
+    return dataclasses.replace(pairs, z0=z0, z1=z1).take(np.isfinite(z1).all(axis=1))
 
 
 class Rollouts(NamedTuple):

@@ -17,6 +17,7 @@ from gfnn_jax.jobs.measure import (
     NUM_STEPS,
     NUM_TRAJECTORIES,
     affine_errors,
+    finite_pairs,
     map_rollouts,
     measure,
 )
@@ -33,9 +34,8 @@ from gfnn_jax.jobs.output import (
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.maps.posterior import bands
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.phase_space import Pairs
 from gfnn_jax.scenes import Scene
-from gfnn_jax.scenes.draws import sample_pairs, sample_params, sample_t0, sample_test_states
+from gfnn_jax.scenes.draws import sample_params, sample_t0, sample_test_states
 from gfnn_jax.scenes.trajectories import reference_trajectories
 from gfnn_jax.storage.outputs import atomic_folder
 
@@ -109,7 +109,7 @@ def run(
     with output.unfinished(job) as kept_in:
         progress.status(f"reference data: {num_pairs} pairs, {num_trajectories} trajectories")
         key_pairs, key_test = _keys(asked.seed)
-        pairs = _finite(sample_pairs(scene, num_pairs, key_pairs))
+        pairs = finite_pairs(scene, num_pairs, key_pairs)
         z0 = np.asarray(sample_test_states(scene, num_trajectories, key_test))
         given: dict[str, Any] = {
             "params": sample_params(scene, num_trajectories, key_test, test=True),
@@ -147,13 +147,6 @@ def _keys(seed):
     """Keys of the pairs and of the test states."""
     of_pairs, of_test = jax.random.split(jax.random.key(seed))
     return of_pairs, of_test
-
-
-def _finite(pairs: Pairs) -> Pairs:
-    """Convert pairs to NumPy, without states that collide and have no image."""
-    z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
-    known = np.isfinite(z1).all(axis=1)
-    return dataclasses.replace(pairs, z0=z0, z1=z1).take(known)
 
 
 def _band(map_: SymplecticMap, z0, predicted, given: dict[str, Any]) -> np.ndarray | None:

@@ -65,17 +65,14 @@ OPTIONS = RefitOptions()
 _OF_TASK = "task "  # before the names of a task, in what processes are told
 
 
-def can_be_refitted(map_: SymplecticMap) -> bool:
-    """Return whether `refit` knows what to do: S or H is linear in its coefficients. A network is
-    not."""
-    index = fitted_piece(map_.pieces)
-    return index is not None and hasattr(map_.pieces[index].family, "term_gradients")
-
-
 def why_not(map_: SymplecticMap) -> str:
-    """Return why `refit` cannot be done of this map, as a message says it."""
-    if fitted_piece(map_.pieces) is None:
+    """Return why `refit` cannot be done of this map, as a message says it; "" where it can: S or H
+    is linear in its coefficients. A network is not."""
+    index = fitted_piece(map_.pieces)
+    if index is None:
         return "there was no time for a better model (a larger --max-seconds gives it)"
+    if hasattr(map_.pieces[index].family, "term_gradients"):
+        return ""
     return "a refit needs a family that is linear in its coefficients (polynomial, features, sines)"
 
 
@@ -286,7 +283,7 @@ class RowsOfRefit:
         self.map, self.task = map_, task
         pieces = jax.tree.map(np.asarray, map_).pieces
         index = fitted_piece(pieces)
-        assert index is not None  # `can_be_refitted`
+        assert index is not None  # `why_not`
         self.index = index
         self.before, self.piece, self.after = pieces[:index], pieces[index], pieces[index + 1 :]
         self.spread, self.dt = np.asarray(map_.scale), float(np.asarray(map_.dt))
