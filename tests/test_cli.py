@@ -29,7 +29,6 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import FitError, FitWarning
 from gfnn_jax.generating.charts import CHARTS
-from gfnn_jax.jobs import fit as jobs_fit
 from gfnn_jax.jobs import output, progress
 from gfnn_jax.learn import fit as learn_fit
 from gfnn_jax.learn.options import MODELS, OPTIONS
@@ -492,7 +491,7 @@ def test_a_recording_without_a_law_is_one_line(error, status, line, tmp_path, ca
     def fail(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr(jobs_fit, "learn_fit", fail)
+    monkeypatch.setattr(output, "fit", fail)
     data = recording_file(tmp_path / "swing.csv")
     assert gfnn("fit", data, "--out", tmp_path / "m") == status
     assert capsys.readouterr().err.splitlines()[-1] == line

@@ -53,20 +53,17 @@ def _made(fit: Fit, scene: str | None, seed: int | None) -> dict[str, Any]:
 def assemble(
     fit: Fit,
     *,
-    scene: str | None = None,
-    seed: int | None = None,
     data: dict[str, Any] | None = None,
     rollout: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Assemble the report of a fit, and of rollouts with it (see `rollout_part`) where there are.
 
-    scene, seed: where these are not the fit's own. data: facts about the pairs beside their
+    data: facts about the pairs beside their
     number: source, digest, precision, units.
     """
     chosen = fit.chosen
-    lent = fit.scene.name if fit.scene is not None else None
     return {
-        **_made(fit, scene or lent, fit.seed if seed is None else seed),
+        **_made(fit, None if fit.scene is None else fit.scene.name, fit.seed),
         "data": {
             "num_pairs": fit.num_pairs,
             "symplecticity_defect": fit.data_defect,

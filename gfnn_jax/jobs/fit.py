@@ -16,7 +16,7 @@ from gfnn_jax.data.files import iterate_pairs, read_trajectories, summary
 from gfnn_jax.data.recording import parameters_of, read
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.data.sample import read_sample
-from gfnn_jax.errors import FitError, InputError, WorkError
+from gfnn_jax.errors import InputError, WorkError
 from gfnn_jax.evaluate.report import PAGE, About
 from gfnn_jax.families.told import anything_told
 from gfnn_jax.fitting import row_blocks
@@ -25,7 +25,6 @@ from gfnn_jax.jobs.output import (
     Output,
     Ran,
     failures_of_arithmetic,
-    line,
     publish,
     refusals,
     scene_named,
@@ -33,7 +32,7 @@ from gfnn_jax.jobs.output import (
     units_of,
     write,
 )
-from gfnn_jax.learn.fit import fit as learn_fit
+from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.learn.options import FitOptions
 from gfnn_jax.learn.refit import (
     help_refit,
@@ -145,8 +144,6 @@ def fit(
             progress.status("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
             result = fitted.report(
-                seed=asked.seed,
-                scene=scene_name,
                 data={
                     "source": trajectories.source,
                     "digest": trajectories.digest,
@@ -221,32 +218,28 @@ def fit_recording(
     job = {"command": "fit", "data": recording.source, **asked.deciding, **units_of(recording)}
     job["reading"] = {n: columns[n] for n in ("columns", "dt", "time") if n in columns}
     is_law, names = asked.learn != "map" and not of_states, list(recording.positions)
-    refused: FitError | None = None
+    refused: Exception | None = None
     progress.line(f"learning from {recording.source}")
-    with refusals(), failures_of_arithmetic():
-        try:
-            fitted = learn_fit(
-                recording,
-                options=asked,
-                on_progress=progress.status if asked.learn == "map" else progress.line,
-                on_candidate=lambda candidate: progress.line(line(candidate)),
-            )
-        except FitError as error:
-            if of_states:
-                typed = ["gfnn", "fit", *data, "--positions", ",".join(names), "--out", output.out]
-                for name in ("time", "dt"):
-                    typed += [f"--{name}", columns[name]] if name in columns else []
-                message = str(error).replace("gfnn.fit(recording)", shlex.join(map(str, typed)))
-                raise FitError(message, error.verdict) from error
-            if not keep or error.fit is None:
-                raise
-            fitted, refused = error.fit, error
+    shown = progress if asked.learn == "map" else Progress(progress.line, progress.line)
+    try:
+        fitted = search(recording, None, asked, progress=shown)
+    except (InputError, WorkError) as error:
+        if of_states:
+            typed = ["gfnn", "fit", *data, "--positions", ",".join(names), "--out", output.out]
+            for name in ("time", "dt"):
+                typed += [f"--{name}", columns[name]] if name in columns else []
+            message = str(error).replace("gfnn.fit(recording)", shlex.join(map(str, typed)))
+            raise type(error)(message) from error.__cause__
+        kept = getattr(error.__cause__, "fit", None) if keep else None
+        if kept is None:
+            raise
+        fitted, refused = kept, error
     if is_law:
         result = fitted.report(source=recording.source, seed=asked.seed)
     else:
         progress.status("the report: the derivative of a step")
         fitted, own = fitted.settled(), {"states" if of_states else "positions": names}
-        result = fitted.report(seed=asked.seed, data={"source": recording.source, **own})
+        result = fitted.report(data={"source": recording.source, **own})
         job |= {**own, "angles": list(recording.angles)}
         job |= {"parameters": parameters_of(recording)} if of_states else {}
     with atomic_folder(output.out) as folder:

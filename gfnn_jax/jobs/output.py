@@ -157,7 +157,7 @@ BEST = "best"
 
 
 def search(
-    pairs: Pairs,
+    data: Pairs | Recording,
     scene: Scene | None,
     options: FitOptions,
     *,
@@ -165,7 +165,7 @@ def search(
     spent: float = 0.0,
     kept: tuple[Path, dict[str, Any]] | None = None,
 ) -> Fit:
-    """Fit these pairs.
+    """Fit pairs, or a recording.
 
     spent: seconds of the budget that are gone already. kept: folder for checkpoints of a training,
     factors, and the best map so far, and the job that they belong to. Raises InputError for data or
@@ -178,7 +178,7 @@ def search(
         on_better = partial(_keep, kept_in / BEST, scene, job)
     with refusals(), failures_of_arithmetic():
         return fit(
-            pairs,
+            data,
             scene,
             options=options,
             spent=spent,

@@ -122,8 +122,6 @@ def run(
         rollouts = map_rollouts(fitted.map, z0, **given)
         measured = measure(rollouts, scene, reference, given["params"])
         result = fitted.report(
-            seed=asked.seed,
-            scene=name,
             rollout=measured.report,
             data={"source": "reference data of the scene", "digest": pairs_digest(pairs)},
         )
