@@ -50,10 +50,8 @@ def print_summary(ran: Any, out: Path) -> None:
         for loss in report["hamiltonian"]["friction"]:
             print(f"friction {loss['term']}: {loss['coefficient']:.6g} ± {loss['std']:.1g}")
     if report["bracket"] is not None:
-        print(f"bracket: {ran.fit.bracket}")
-        print(f"Casimirs: {'; '.join(report['bracket']['casimirs']) or 'none'}")
-        for message in ran.fit.messages:
-            print(message)
+        for line in (*ran.fit.bracket_lines, *ran.fit.messages):
+            print(line)
     if ran.fit.damping is not None:
         print(ran.fit.damping.line(float(ran.fit.map.dt)))
     in_formula = report["hamiltonian"] is not None and report["hamiltonian"]["symmetries"]

@@ -321,17 +321,14 @@ def _faults(fit: Fit, law: LearnedLaw) -> Iterator[str]:
 
 
 def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
-    law, bracket = found.law, []
-    if fit.bracket is not None:
-        casimirs = "; ".join(casimir.formula for casimir in fit.casimirs) or "none"
-        bracket = [f"Bracket: {fit.bracket}.", f"Casimirs: {casimirs}."]
+    law = found.law
     if law is not None and law.formula:
         with_formula = "Lagrangian" not in law.formula
         shown = as_mathml(law.formula) if with_formula else f"<mtext>{escape(law.formula)}</mtext>"
         yield Section(
             "Law",
             formulas=[("Hamiltonian", f"{defines('H')} <math><mrow>{shown}</mrow></math>")],
-            lines=[*bracket, *law.notes],
+            lines=[*fit.bracket_lines, *law.notes],
             heads=("term", "coefficient"),
             rows=[(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms],
         )

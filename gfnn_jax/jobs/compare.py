@@ -138,23 +138,12 @@ def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollout
             FitOptions(tolerance=tolerance, learn="map", seed=data.seed),
             progress=progress,
         )
-    chosen = fit.chosen
+    told = fit.replaced(defect_known=False).report()  # the defect is that of all methods' states
+    error = _rms(data, fit.map.step(data.fresh.z0)[0])
     part = {
-        "model": {name: getattr(chosen, name) for name in _MODEL},
+        "model": told["model"],
         "data": {"num_pairs": fit.num_pairs, "sequence_length": 2},
-        "fit": {
-            "seconds": chosen.fit_seconds,
-            "compile_seconds": fit.compile_seconds,
-            "total_seconds": fit.seconds,
-            "train_rms": chosen.train_rms,
-            "validation_rms": _rms(data, fit.map.step(data.fresh.z0)[0]),
-            "tolerance": tolerance,
-            "tolerance_met": fit.met,
-            "ended": fit.ended,
-            "cap": None,
-            "capped": False,
-            "messages": list(fit.messages),
-        },
+        "fit": {**told["fit"], "validation_rms": error, "cap": None, "capped": False},
         "map": _map_part(fit.map, data) | {"chart_determinant_min": fit.model_determinant_min},
     }
     return part, map_rollouts(fit.map, data.z0, NUM_STEPS)

@@ -109,7 +109,7 @@ def fit(
         options.refuse_others(known, "a recording, without momenta", InputError)
         with one_thread():
             if of_map:
-                return learn_positions(pairs, options, watch)
+                return _told(learn_positions(pairs, options, watch))
             try:
                 law = fit_recording(
                     pairs,

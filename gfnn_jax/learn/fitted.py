@@ -330,6 +330,13 @@ class Fit:
         return () if self.bracket is None else self.bracket.casimirs
 
     @property
+    def bracket_lines(self) -> list[str]:
+        """The bracket and its Casimirs, a line each; [] of canonical data."""
+        casimirs = "; ".join(casimir.formula for casimir in self.casimirs) or "none"
+        told = [f"bracket: {self.bracket}", f"Casimirs: {casimirs}"]
+        return [] if self.bracket is None else told
+
+    @property
     def lagrangian(self) -> Formula | None:
         """L with its terms, of a recording."""
         return getattr(self.found, "lagrangian", None)

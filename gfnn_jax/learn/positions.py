@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -24,7 +23,7 @@ from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, one_step_er
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.dataset.split import Split, split_rows
 from gfnn_jax.dataset.structures import Sites, structure_of
-from gfnn_jax.errors import FitError, FitWarning
+from gfnn_jax.errors import FitError
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
@@ -133,10 +132,7 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
             f"{len(triples)} triples of positions gave no S(q, Q) whose step can be solved. Add "
             "positions, or raise --max-seconds"
         )
-    fit = sweep.learned(sweep.without_noise(best), left_out, options.seed)
-    for message in fit.messages:
-        warnings.warn(message, FitWarning, stacklevel=3)
-    return fit
+    return sweep.learned(sweep.without_noise(best), left_out, options.seed)
 
 
 class _Found(NamedTuple):
