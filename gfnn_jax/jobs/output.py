@@ -100,9 +100,14 @@ def _recorded(model: Path, what: str) -> Any:
 
 def pairs_digest(pairs: Pairs) -> str:
     """SHA-256 of the pairs' states, and of the parameters where there are any."""
-    digest = hashlib.sha256(np.ascontiguousarray(pairs.z0).data)
-    for array in (pairs.z1, *(pairs.args or {}).values()):
-        digest.update(np.ascontiguousarray(array).data)
+    return digest_of(pairs.z0, pairs.z1, *(pairs.args or {}).values())
+
+
+def digest_of(*arrays: Any) -> str:
+    """SHA-256 of arrays, one after another; those that are None count nothing."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(b"" if array is None else np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +24,7 @@ from gfnn_jax.data.predictions import (
 )
 from gfnn_jax.data.recording import args_of
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.jobs.output import Output, read_in_units, refuse_other_units
+from gfnn_jax.jobs.output import Output, digest_of, read_in_units, refuse_other_units
 from gfnn_jax.maps import saved
 from gfnn_jax.maps.lanes import Lanes
 from gfnn_jax.maps.posterior import bands, horizon
@@ -104,13 +103,6 @@ class _Begin(NamedTuple):
             self.z0[lanes], None if self.params is None else self.params[lanes], of_samples
         )
 
-    def digest(self) -> str:
-        found = hashlib.sha256()
-        for array in self:
-            if array is not None:
-                found.update(np.ascontiguousarray(array).data)
-        return found.hexdigest()
-
 
 def predict(
     model: Path, initial: Path, output: Output, asked: Steps, share: Share | None = None
@@ -158,7 +150,7 @@ def predict(
             drawn = Sharded(drawn, stepped.devices)
     identity = {
         "model": saved.digest(model),
-        "initial": begin.digest(),
+        "initial": digest_of(*begin),
         "outside": asked.outside or "continue",
         **({} if drawn is None else {"samples": asked.samples, "horizon_size": asked.horizon}),
         **({"block": stepped.block} if isinstance(stepped, Sharded) else {}),
