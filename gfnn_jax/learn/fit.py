@@ -148,11 +148,10 @@ def fit(
             jumps=bool(wrapped(request.pairs, request.coordinates)),
         )
         warn(about_pairs)
-        looked_at = len(looked_for_errors(len(request.pairs)))
-        if looked_at < len(request.pairs):
-            count = len(request.pairs)
+        count = len(request.pairs)
+        if not_looked_at := count - len(looked_for_errors(count)):
             budget.leave_out(
-                f"the search for outliers in {count - looked_at:,} of {count:,} pairs",
+                f"the search for outliers in {not_looked_at:,} of {count:,} pairs",
                 "those that the final map misses by far are found at the end",
             )
         data = data.divided(options.seed)

@@ -124,24 +124,23 @@ def fit_monitors(
     if len(steps) and np.abs(steps - turn).max() > _OPTIONS.even * turn:
         raise InputError(f"{recording.source}: expected a row for every turn, {turn:g} s apart")
     dt = turn / len(places)
-    fits: list[Fit | None] = []
-    maps: list[SymplecticMap | None] = []
-    for k, matrix in enumerate(known):
-        one = None if matrix is not None else fit(_pairs(states, k, dt), learn="map", **options)
-        fits.append(one)
-        maps.append(None if one is None else one.map)
-    like = next(m for m in maps if m is not None)
+    pairs = [_pairs(states, k, dt) for k in range(len(places))]
+    stretches = list(zip(pairs, known, strict=True))
+    learned = {
+        k: fit(own, learn="map", **options)
+        for k, (own, matrix) in enumerate(stretches)
+        if matrix is None
+    }
+    first, one = next(iter(learned.items()))
     whole = [
-        map_ if map_ is not None else _linear(matrix, _pairs(states, k, dt), like)
-        for k, (map_, matrix) in enumerate(zip(maps, known, strict=True))
+        learned[k].map if matrix is None else _linear(matrix, own, one.map)
+        for k, (own, matrix) in enumerate(stretches)
     ]
-    noise, unknown = None, [k for k, one in enumerate(fits) if one is not None]
-    k = unknown[0]
-    stretch = fits[k]
-    if len(places) == 2 and stretch is not None and not stretch.met:
-        better = _of_latent_readings(whole[k], runs, known, k)
+    noise, fits = None, map(learned.get, range(len(places)))
+    if len(places) == 2 and not one.met:
+        better = _of_latent_readings(one.map, runs, known, first)
         if better is not None:
-            whole[k], noise = better
+            whole[first], noise = better
     return Monitors(places, tuple(whole), tuple(fits), noise, known)
 
 
@@ -249,9 +248,8 @@ def _pairs(states: list[list[np.ndarray]], k: int, dt: float) -> Pairs:
     return Pairs(z0, z1, dt, run=run, place=place)
 
 
-def _linear(matrix: np.ndarray | None, pairs: Pairs, like: SymplecticMap) -> SymplecticMap:
+def _linear(matrix: np.ndarray, pairs: Pairs, like: SymplecticMap) -> SymplecticMap:
     """The map of a known stretch, in the coordinates of a learned one."""
-    assert matrix is not None
     none = np.zeros(len(matrix))
     return SymplecticMap(
         pieces=(Affine(matrix, none, none),),

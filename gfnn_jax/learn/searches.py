@@ -65,16 +65,10 @@ class Searched(NamedTuple):
 def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
     """Every candidate. Raises FitError where there is none."""
     diagnosis = taken
-    tolerance, budget, on_progress, on_candidate = (
-        request.tolerance,
-        request.budget,
-        request.watch.on_progress,
-        request.watch.on_candidate,
-    )
+    tolerance, budget, watch = request.tolerance, request.budget, request.watch
     options, scene, charts = request.options, request.scene, diagnosis.charts
-    on_better = request.watch.on_better
-    better = _Better(on_better) if on_better is not None else None
-    given = tolerance.bound, budget, on_progress, on_candidate, better
+    better = None if watch.on_better is None else _Better(watch.on_better)
+    given = tolerance.bound, budget, watch.on_progress, watch.on_candidate, better
     # Small sizes first: a map is then there, however long the search for H.
     # S is a sum of terms of pairs with parameters, and over sites.
     sites = isinstance(data.structure, Sites) and data.own_dt is None
@@ -89,7 +83,7 @@ def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
         budget,
         scene=scene,
         terms=options.terms,
-        on_progress=on_progress,
+        on_progress=watch.on_progress,
         partly=request.partly,
     )
     law = None
@@ -102,7 +96,7 @@ def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
     if wanted and options.family == "auto":
         try:
             of_terms = SumOfTerms(
-                diagnosis.data, tolerance, scene, options.chart, budget, on_progress
+                diagnosis.data, tolerance, scene, options.chart, budget, watch.on_progress
             ).beside(law)
             if of_terms is not None and law is not None:  # which misses the tolerance
                 no_better = (
@@ -129,7 +123,7 @@ def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
     lossy = diagnosis.damping is not None or (law is not None and bool(law.friction))
     # Pairs of H's flow are drawn, and factored out, at one dt.
     if law is not None and not data.varied and not lossy:
-        helper = LawMapSearch(law, problem, on_candidate, better, options.seed)
+        helper = LawMapSearch(law, problem, watch.on_candidate, better, options.seed)
         found, charts = helper.improved(LawMaps(found, charts), climb.sweeps, dearest)
     known = [f.candidate for f in (law, of_terms, *found.ranking[:1]) if f is not None]
     best = min((c.validation_bound for c in known), default=np.inf)
@@ -137,7 +131,7 @@ def searched(request: Request, data: Dataset, taken: Diagnosis) -> Searched:
     if budget.over and best > tolerance.bound:
         linear = linear_map(diagnosis.plain, tolerance)
         if linear is not None and linear.validation_bound < best:
-            on_candidate(linear)
+            watch.on_candidate(linear)
         elif known:
             linear = None
     if not known and linear is None:
