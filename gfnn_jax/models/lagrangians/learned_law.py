@@ -66,7 +66,7 @@ class NextMotion(NamedTuple):
 
     @property
     def tells(self) -> str:
-        """What its readings tell, as text."""
+        """Line about what its readings tell."""
         if self.apart:
             return (
                 f"its readings together put {self.apart:.2g} standard deviations between the law "
