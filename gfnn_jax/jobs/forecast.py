@@ -203,6 +203,6 @@ def _write(out: Path, found: dict[str, Forecast]) -> None:
         return rows
 
     stream, of_runs = io.BytesIO(), {"times": times, "values": values, "std": std}
-    arrays = {name: padded(each) for name, each in of_runs.items()}
+    arrays: dict[str, Any] = {name: padded(each) for name, each in of_runs.items()}
     np.savez(stream, runs=np.array(list(found)), columns=np.array(names), **arrays)
     atomic_write(out, stream.getvalue())

@@ -497,6 +497,8 @@ class Fit:
         }
         for what in (what for what, given in refused.items() if given):
             raise FitError(f"accelerate: expected {what}")
+        assert law is not None
+        assert pairs is not None
         dt = float(np.asarray(self.map.dt)) if dt is None else dt
         if not (isinstance(dt, (int, float)) and 0 < dt < np.inf):
             raise FitError(f"expected a time step that is finite and above 0, got {dt!r}")
