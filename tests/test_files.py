@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from gfnn_jax.data import files
-from gfnn_jax.data.blocks import LARGEST
+from gfnn_jax.data.blocks import BLOCK_ROWS, LARGEST
 from gfnn_jax.data.files import DataWarning, summary
 from gfnn_jax.errors import InputError
 
@@ -555,3 +555,11 @@ def test_a_summary_says_what_is_there(tmp_path):
     assert "; sequences: 1, each of 30 states; gaps: 1; " in summary(gap)[0]
     drawn = summary(dataclasses.replace(gap, sampled=900))[0]
     assert drawn == "29 pairs (a sample of 900), d = 1, dt = 0.1 to 1.1; gaps: 1; copies: 0"
+
+
+def test_a_parameter_that_changes_between_two_blocks_of_a_sequence_is_refused(tmp_path):
+    rows = np.random.default_rng(0).normal(size=(BLOCK_ROWS + 9, 2))
+    length = np.where(np.arange(len(rows)) < BLOCK_ROWS, 1.0, 2.0)
+    path = csv(tmp_path / "a.csv", "t,q1,p1,l", table(np.c_[rows, length]))
+    with pytest.raises(InputError, match=rf"line {BLOCK_ROWS + 2}: .* found 2 after 1"):
+        files.read_trajectories(path)

@@ -105,12 +105,12 @@ class Fault:
 
     @property
     def wrong(self) -> bool:
-        """Whether a fit must not begin."""
+        """True where a fit must not begin."""
         return self.kind in WRONG
 
     @property
     def remedy(self) -> str:
-        """What mends it, with the options to type."""
+        """Remedy, with the options to type."""
         return advised(self.advice, self.options)
 
     def __str__(self) -> str:

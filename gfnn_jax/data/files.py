@@ -366,7 +366,7 @@ def _is_recording(path: Path, with_roles: bool) -> bool:
 
 
 def _odd_columns(states: np.ndarray, going: np.ndarray) -> Iterator[str]:
-    """What looks odd in states (T, 2d), of which the rows ``going`` are followed by the next."""
+    """Odd things in states (T, 2d), of which the rows ``going`` are followed by the next."""
     dim = states.shape[1] // 2
     if np.array_equal(states[going + 1], states[going]):
         yield "every state equals the one before it"

@@ -49,15 +49,15 @@ class Table:
 class Rows(NamedTuple):
     """Rows to keep: between two times, in the unit of a file, every so many of them."""
 
-    start: float = -np.inf
-    stop: float = np.inf
-    every: int = 1
+    start: float
+    stop: float
+    every: int
 
     def kept(
         self, columns: Mapping[str, np.ndarray], times: Sequence[str], begin: int = 0
     ) -> np.ndarray:
-        """Which rows of columns (n,) to keep, (n,), by the first of these columns of times, where
-        there is one. ``begin``: rows of the table before these."""
+        """Mask (n,) of the rows of columns (n,) to keep, by the first of these columns of times, if
+        any. ``begin``: rows of the table before these."""
         keep = (begin + np.arange(len(next(iter(columns.values()), ())))) % self.every == 0
         for name in times[:1]:
             keep &= ~((columns[name] < self.start) | (columns[name] > self.stop))

@@ -424,7 +424,7 @@ def from_text(
     columns: Sequence[str] = (),
     *,
     time: str | None = None,
-    rows: Rows = Rows(),
+    rows: Rows,
     words: Collection[str] = (),
 ) -> Table:
     """The columns of a text file, in these rows.
