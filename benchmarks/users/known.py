@@ -171,8 +171,8 @@ def wrapped_angle() -> Case:
         fresh,
         max_seconds=20.0,
         meets=False,
-        words=("jumps of 2π", "--angles 0"),
-        never=("noise", "contradict", "gross"),
+        words=("jumps of 2π", "angles"),
+        never=("(?<!behind )noise", "contradict", "gross"),
     )
 
 

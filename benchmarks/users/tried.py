@@ -414,7 +414,7 @@ def noisy_wrapped() -> Case:
         pairs,
         max_seconds=20.0,
         meets=False,
-        words=("jumps of 2π", "--angles 0"),
+        words=("jumps of 2π", "angles"),
         never=("noise", "contradict", "gross"),
     )
 
