@@ -519,7 +519,7 @@ def test_stribecks_friction_is_found_with_the_speed_over_which_it_fades():
     assert set(fit.which_friction.kinds) == {"linear", "dry", "stribeck"}
     given = given_terms([f"R: {fit.friction.formula}"], ["x"], ["v"]).friction
     assert given == tuple(law_of(fit.map).form.friction.rows())
-    assert next(w for _, kind, w in given if kind == STRIBECK) == pytest.approx(width, rel=0.06)
+    assert next(w for _, kind, w in given if kind == STRIBECK) == pytest.approx(width, rel=0.02)
     truth = viscous / 2, begin, -share * begin
     for term, expected in zip(fit.friction.terms, truth, strict=True):
         assert abs(term.coefficient - expected) < 4 * term.std

@@ -103,13 +103,15 @@ def fades(direction: Sequence[int], problem: ArcProblem) -> list[float]:
 
 def as_it_fades(row: Loss, fit: LawFit) -> Loss:
     """Stribeck's friction as a fit has it. Of one that has dry friction alone, with the speed over
-    which it would be seen best: with another one it may not be seen at all."""
+    which it would be seen best beside linear friction, which a slow fading would imitate: with
+    another one it may not be seen at all."""
     along = {one[1]: one for one in fit.structure.friction if one[0] == row[0]}
     if STRIBECK in along or DRY not in along:
         return along.get(STRIBECK, row)
     tried = [("loss", (*row[:2], speed)) for speed in fades(row[0], fit.problem)]
-    larger = fit.structure.plus(tried)
-    one = fit.problem.linearised(larger, fit).added(*places(larger, fit.structure, tried))
+    beside = fit.structure.plus([] if LINEAR in along else [("loss", (row[0], LINEAR, 0.0))])
+    larger = beside.plus(tried)
+    one = fit.problem.linearised(larger, fit).added(*places(larger, beside, tried))
     return tried[int(np.argmax(one.value * one.size))][1]
 
 

@@ -422,12 +422,12 @@ class TermSearch:
             return fit, FrictionChoice(fit.structure.friction, {}, {}, gains=False)
         problem, options, begun = fit.problem, fit.problem.options, fit
         fit = with_fading(fit)
-        frictions = self._may_rub(fit)
         third = problem.systems.a_third(problem.nodes)
         length = max(options.fewest, min(fit.arcs.t.shape[1], third))
         arcs = arcs_of(problem.nodes, length)
         if arcs.t.shape != fit.arcs.t.shape:
             fit = fit.again(arcs=arcs)
+        frictions = self._may_rub(fit)
         choice = chosen(table_of(fit, frictions), options.choose_friction)
         tried = [(fit, choice)]
         for _ in range(options.choices):
