@@ -205,7 +205,7 @@ def search_hidden(problem: ArcProblem) -> SearchResult:
 
 
 def _spent(cap: Counted) -> str:
-    """What a search has taken, where that was all it might."""
+    """The text of what a search has taken, where that was all it might, else ""."""
     return f" after {cap.most:.0e} operations" if cap.spent > cap.most else ""
 
 
