@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax.cli_parser import add_column_options, column_options, masses, names_roles
+from gfnn_jax.cli_parser import add_column_options, column_options, names_roles
 from gfnn_jax.data.files import are_recordings
 from gfnn_jax.data.recording import parameters_of
 from gfnn_jax.data.roles import symbols
@@ -369,7 +369,7 @@ def test_options_of_the_command_line_are_keywords_of_read():
     assert names_roles(options)
     assert not names_roles(column_options(parser.parse_args(["--angles", "0,2"])))
     assert column_options(parser.parse_args(["--angles", "0,2"]))["angles"] == (0, 2)
-    assert masses(parser.parse_args(["--mass", "x=2,y=3"])) == {"x": 2.0, "y": 3.0}
+    assert dict(parser.parse_args(["--mass", "x=2,y=3"]).mass) == {"x": 2.0, "y": 3.0}
 
 
 def test_names_with_blanks_are_one_word_of_the_command_that_is_told():
