@@ -284,7 +284,6 @@ def test_a_drive_that_nobody_recorded_is_found_named_and_forecast(tmp_path):
     assert np.abs(ahead.values["x"][0] - x[until:]).max() < 0.01
 
 
-@pytest.mark.slow
 def test_a_drive_between_two_frequencies_that_are_tried_is_found_beside_an_own_one():
     """A line of the spring's own leaves less at the frequencies tried, and more between them."""
     t, omega = 0.02 * np.arange(1_800), 1.99
