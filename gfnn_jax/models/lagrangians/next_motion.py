@@ -125,9 +125,9 @@ def _after(here: np.ndarray, each: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     here, each = (columns / np.where(scale > 0, scale, 1.0) for columns in (here, each))
     known = here.T @ here
     least = OPTIONS.known * np.linalg.eigvalsh(known)[-1] * np.eye(len(known))
-    before = np.linalg.inv(known + least)
-    after = np.linalg.inv(known + least + each.swapaxes(1, 2) @ each)
-    left = np.einsum("cij,sjk,cik->sc", each, after, each)
+    before, told = np.linalg.inv(known + least), each.swapaxes(1, 2) @ each
+    after = np.linalg.inv(known + least + told)
+    left = np.tensordot(after, told, axes=([1, 2], [1, 2]))  # traces of products
     gains = np.sqrt(np.diag(before) / np.diagonal(after, axis1=1, axis2=2))
     return np.mean(np.log(np.maximum(left, 1e-300)), axis=1), gains
 
