@@ -251,7 +251,8 @@ class _Screen:
         near, keys, fixed = fit.problem.linearised(larger, fit), larger.keys(), protected(larger)
         size = np.linalg.norm(near.columns, axis=0)
         columns = near.columns / np.where(size > 0, size, 1.0)
-        own = [i for i, key in enumerate(keys) if key in set(fit.structure.keys())]
+        within = set(fit.structure.keys())
+        own = [i for i, key in enumerate(keys) if key in within]
         return cls(
             fit,
             larger,

@@ -123,13 +123,13 @@ class Structure:
         part that nothing sets in motion belongs to the first. One part where systems differ."""
         rows = [self._acted_on(row) for row in self.terms]
         rows += [list(map(bool, row[0])) for row in self.friction]
-        part = np.arange(self.dim) if self.powers is None else np.zeros(self.dim, int)
+        part = list(range(self.dim)) if self.powers is None else [0] * self.dim
         for row in rows:
-            axes = np.flatnonzero(row)
-            part[np.isin(part, part[axes])] = min(part[axes], default=0)
-        moved = [i for row in self.terms for i in range(self.dim) if self._is_inertia(row, i)]
-        part[~np.isin(part, part[moved])] = 0
-        return tuple(tuple(np.flatnonzero(part == i).tolist()) for i in np.unique(part))
+            joined = {part[i] for i, acts in enumerate(row) if acts}
+            part = [min(joined) if i in joined else i for i in part]
+        moved = {part[i] for row in self.terms for i in range(self.dim) if self._is_inertia(row, i)}
+        part = [i if i in moved else 0 for i in part]
+        return tuple(tuple(k for k, own in enumerate(part) if own == i) for i in sorted(set(part)))
 
     @functools.cached_property
     def given(self) -> tuple[int, ...]:
