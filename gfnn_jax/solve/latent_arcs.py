@@ -17,6 +17,11 @@ alone. The arc's own δx_0 is eliminated by its own QR; what remains of all arcs
 Where it converges the defects are zero, and each arc is an orbit of the model. Residuals enter in
 units of the noise through a robust loss (`solve.noise`). The noise may be estimated on the way.
 Where it is not white, a *whitening* (`solve.noise`) mixes residuals along an arc into white ones.
+
+Where the least residuals lie in a canyon that bends, as of coefficients that act on what nothing
+shows, a straight step soon leaves it. A step of a *curved* fit bends as it does: δ + ½ a, a the
+acceleration that keeps the linearised residuals (geodesic acceleration: Transtrum & Sethna,
+arXiv:1207.4999). It needs one further evaluation, without derivatives.
 """
 
 from __future__ import annotations
@@ -129,6 +134,15 @@ class Following(Protocol):
         ...
 
 
+@runtime_checkable
+class Stepping(Protocol):
+    """A model whose defects can be told without their derivatives, as a curved fit asks."""
+
+    def closing(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """c_n (A, L − 1, m) of states x (A, L, m)."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Options of Gauss–Newton over latent arcs (benchmarks/random_recordings.py)."""
@@ -148,6 +162,8 @@ class Options:
     # times the defects of an arc that stays, at the most, by a step of the coefficients
     grown: float = 2.0
     block_bytes: int = 64 * 2**20  # of the sensitivities of a block of arcs
+    probed: float = 0.1  # of a step, over which its curvature is told
+    bent: float = 1.5  # times a step, that its acceleration may be: Transtrum and Sethna's 2 · ¾
 
 
 OPTIONS = Options()
@@ -208,6 +224,7 @@ class Readings:
 
     y: NaN where nothing was measured. sigma: (k,) or (A, L, k), their noise. loss: of residuals in
     units of it. whitening: (A, k, L, L) of these residuals, by channel; None: they are white.
+    curved: steps of coefficients bend, of a `Stepping` model.
     """
 
     model: Model | Known
@@ -215,6 +232,7 @@ class Readings:
     sigma: np.ndarray
     loss: Loss = SOFT_L1
     whitening: np.ndarray | None = None
+    curved: bool = False
 
     def fit(
         self,
@@ -238,7 +256,8 @@ class Readings:
         is known.
         """
         measured = np.isfinite(self.y)
-        data = _Data(self.model, measured, np.where(measured, self.y, 0.0), least, tolerance)
+        known, curved = np.where(measured, self.y, 0.0), self.curved and len(p) > 0
+        data = _Data(self.model, measured, known, least, tolerance, curved)
         here = data.at(p, x, _Units(self.sigma, state_scale, self.loss, self.whitening))
         start = _AtStates(data, here, here)
         if not np.isfinite(here.cost):
@@ -283,7 +302,8 @@ class _Data(NamedTuple):
     """Data that arcs are fitted to.
 
     measured, known: which of y (A, L, k) was measured, and y, 0 where it was not. least: what of
-    the residuals is no noise; None: the noise is known. tolerance: of the cost.
+    the residuals is no noise; None: the noise is known. tolerance: of the cost. curved: whether
+    steps bend.
     """
 
     model: Model | Known
@@ -291,6 +311,7 @@ class _Data(NamedTuple):
     known: np.ndarray
     least: np.ndarray | None
     tolerance: float
+    curved: bool
 
     def at(self, p: np.ndarray, x: np.ndarray, units: _Units) -> _Iterate:
         """The residuals and defects of coefficients p and states x."""
@@ -310,6 +331,23 @@ class _Data(NamedTuple):
         with np.errstate(all="ignore"):
             found = evaluated(self.model.take(arcs), here.p, x)
         return self._with(here, arcs, x, *found)
+
+    def bending(self, here: _Iterate, dp: np.ndarray, dx: np.ndarray) -> _Iterate:
+        """The same iterate with second derivatives along a step, of what is measured and of the
+        defects, in place of its residuals and defects."""
+        assert isinstance(self.model, Stepping)
+        part, shown, closing = OPTIONS.probed, here.observed, here.defects.closing
+        p, x = here.p + part * dp, here.x + part * dx
+        along = (shown.by_state @ dx[..., None])[..., 0] + shown.by_coefficients @ dp
+        with np.errstate(all="ignore"):
+            values = self.model.observe(p, x).values - shown.values - part * along
+            defects = self.model.closing(p, x) - (1 - part) * closing  # a whole step closes them
+        return dataclasses.replace(
+            here,
+            defects=here.defects._replace(closing=2 / part**2 * defects),
+            off=np.where(self.measured, -2 / part**2 * values, 0.0),
+            weighted=here.weights,
+        )
 
     def mixed(self, here: _Iterate, other: _Iterate, arcs: np.ndarray) -> _Iterate:
         """The same iterate, but that these arcs (indices, n) are as in the other."""
@@ -351,6 +389,8 @@ class _AtStates:
         if not np.isfinite(self._rows.factor).all():  # derivatives along an arc have overflowed
             return Tried(here, -np.inf, damping, hopeless=True)
         dp, dx = _solve(self._rows, here.defects, damping)
+        if self.data.curved and self.closed(here):
+            return self._curved(dp, dx, damping)
         there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
         decrease = self._decrease(there, share, np.zeros(len(here.x), bool))
         if (len(here.x) > 1 and not len(here.p)) or not decrease > 0:
@@ -360,6 +400,20 @@ class _AtStates:
                 there, stays = self._begun_anew(there, stays)
                 decrease = self._decrease(there, share, stays)
         return Tried(there, decrease, damping)
+
+    def _curved(self, dp: np.ndarray, dx: np.ndarray, damping: float) -> Tried:
+        """The end of a whole step that bends, or of the straight one where it would bend by more
+        than is small; where it fails, damping alone makes the next one shorter."""
+        here = self.here
+        p, x, bending = here.p + dp, here.x + dx, self.data.bending(here, dp, dx)
+        rows = _reduced(bending)
+        if np.isfinite(rows.factor).all():
+            ddp, ddx = _solve(rows, bending.defects, damping)
+            scale = np.linalg.norm(self._rows.triangle, axis=0)
+            if np.linalg.norm(scale * ddp) < OPTIONS.bent * np.linalg.norm(scale * dp):
+                p, x = p + 0.5 * ddp, x + 0.5 * ddx
+        there = self.data.at(p, x, here.units)
+        return Tried(there, self._decrease(there, 1.0, np.zeros(len(x), bool)), damping)
 
     def _decrease(self, there: _Iterate, share: float, stays: np.ndarray) -> float:
         """Decrease of the cost by this share of a step, or of the defects while they matter: of
@@ -471,7 +525,8 @@ class _Units(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Iterate:
-    """State of an iteration. off: residuals (A, L, k) in the units of y."""
+    """State of an iteration. off: residuals (A, L, k) in the units of y. weighted: the roots of
+    their weights (A, L, k), where these are not those of the loss."""
 
     p: np.ndarray
     x: np.ndarray
@@ -480,6 +535,14 @@ class _Iterate:
     measured: np.ndarray
     off: np.ndarray
     units: _Units
+    weighted: np.ndarray | None = None
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """Roots (A, L, k) of the weights of the residuals, 0 of what was not measured."""
+        if self.weighted is not None:
+            return self.weighted
+        return np.where(self.measured, np.sqrt(self.units.loss.weights(self.white)), 0.0)
 
     @cached_property
     def residuals(self) -> np.ndarray:
@@ -569,6 +632,11 @@ class _Rows(NamedTuple):
     leverage: np.ndarray
     rows: np.ndarray
 
+    @property
+    def triangle(self) -> np.ndarray:
+        """(n + 1, n), of p alone."""
+        return self.factor[:, :-1]
+
 
 def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
     num_arcs, length, k, m = at.observed.by_state.shape
@@ -615,8 +683,7 @@ def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
     J /= sigma[..., None]
     J[..., -1] = residuals - J[..., -1]
     J = at.units.white(J, block)
-    weight = np.where(at.measured[block], np.sqrt(at.units.loss.weights(at.white[block])), 0.0)
-    J *= weight[..., None]
+    J *= at.weights[block][..., None]
     return J.reshape(num_arcs, length * k, -1), S[:, -1]
 
 

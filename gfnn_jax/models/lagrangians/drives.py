@@ -12,7 +12,7 @@ tells is whether the law with the drive leaves noise.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -64,9 +64,12 @@ class DriveOptions:
 OPTIONS = DriveOptions()
 
 
-def hidden_frequency(problem: ArcProblem, stiff: bool) -> float | None:
+def hidden_frequency(
+    problem: ArcProblem, stiff: bool, known: Sequence[float] = ()
+) -> float | None:
     """The angular frequency of a drive that the record shows beside a library of terms, in rad/s:
-    of a force, and of a stiffness where it may be ``stiff``; None where it shows none."""
+    of a force, and of a stiffness where it may be ``stiff``; None where it shows none, or one that
+    is ``known``, of which no other search finds more."""
     left, count, waves = _left_of(problem, stiff)
     if not count > OPTIONS.windows:
         return None
@@ -84,7 +87,9 @@ def hidden_frequency(problem: ArcProblem, stiff: bool) -> float | None:
     chance = np.log(len(tried)) + 0.5 * waves * np.log(max(count, 1.0))
     is_line = gain > OPTIONS.stands_out * others
     is_seen = is_line and 0.5 * count * gain > EVIDENCE.logarithm + chance
-    return float(found.x) if is_seen and not _repeats(problem, float(found.x)) else None
+    omega = float(found.x)
+    is_known = any(abs(omega - one) < OPTIONS.spacing * turn for one in known)
+    return omega if is_seen and not is_known and not _repeats(problem, omega) else None
 
 
 def _lowest(

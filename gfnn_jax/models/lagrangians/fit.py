@@ -16,7 +16,7 @@ from gfnn_jax.families.lagrangian import INPUTS
 from gfnn_jax.fitting.evidence import EVIDENCE, Evidence, correlation_time, criterion
 from gfnn_jax.fitting.linearised import Linearised, without_each
 from gfnn_jax.fitting.triangle import Triangle
-from gfnn_jax.flows.motion import Form
+from gfnn_jax.flows.motion import Form, Step
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
@@ -61,20 +61,28 @@ class LawOnArcs:
             return self.form, coefficients, None
         return self.form.in_systems(coefficients, self.args)
 
-    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
+    def _stepped(self, whole: np.ndarray, x: np.ndarray, order: int) -> tuple[Step, Any]:
+        """Steps from all states x (A, L, m) but the last of each arc, with derivatives as of
+        `Form.step`, and those of the form's coefficients as of `_of_arcs`."""
         arcs, length, m = x.shape
-        whole, num = self.full(p), arcs * (length - 1)
-        self.allowance.spend(num * self.u.shape[2] * m * (1 + m + len(self.free)))
+        num = arcs * (length - 1)
+        columns = (0, m, m + len(self.free))[order]
+        self.allowance.spend(num * self.u.shape[2] * m * (1 + columns))
         form, coefficients, turn = self._of_arcs(whole)
         if turn is not None:
             coefficients = np.repeat(coefficients, length - 1, axis=0)
-        step = form.step(
-            coefficients,
-            x[:, :-1].reshape(num, m),
-            self.h.reshape(num),
-            self.u.reshape(num, *self.u.shape[2:]),
-            order=2 if len(self.free) else 1,
-        )
+        before, h = x[:, :-1].reshape(num, m), self.h.reshape(num)
+        u = self.u.reshape(num, *self.u.shape[2:])
+        return form.step(coefficients, before, h, u, order), turn
+
+    def closing(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """The defects (A, L − 1, m) without derivatives."""
+        return self._stepped(self.full(p), x, 0)[0].states.reshape(x[:, 1:].shape) - x[:, 1:]
+
+    def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
+        arcs, length, m = x.shape
+        whole, num = self.full(p), arcs * (length - 1)
+        step, turn = self._stepped(whole, x, 2 if len(self.free) else 1)
         of_step = step.by_coefficients
         if turn is not None and len(self.free):
             of_step = (of_step.reshape(arcs, -1, turn.shape[1]) @ turn).reshape(num, m, -1)
@@ -345,7 +353,8 @@ class ArcProblem:
     def readings(self, law: LawOnArcs, arcs: Arcs, sigma: np.ndarray) -> Readings:
         """The readings of arcs, beside a law on them."""
         noise, loss = sigma * arcs.noise, self.observation.loss
-        return Readings(law, arcs.y, noise, loss, self.whitening(arcs))
+        curved = self.observation.hidden is not None
+        return Readings(law, arcs.y, noise, loss, self.whitening(arcs), curved)
 
     def state_scale(self, sigma: np.ndarray) -> np.ndarray:
         """The defect (2d,) that counts as one standard deviation of the channels."""

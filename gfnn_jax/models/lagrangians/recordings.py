@@ -738,14 +738,15 @@ def _with_hidden_drive(
     except FitError as error:
         missed, problem, loud = error, samples_of(recording).problem, np.inf
     seen = not recording.inputs and problem.observation.hidden is None
-    searches = loud > OPTIONS.above_noise and seen
+    searches, tried = loud > OPTIONS.above_noise and seen, list[float]()
     for stiff in (False, True) if searches else ():
-        if (omega := hidden_frequency(problem, stiff)) is None:
+        if (omega := hidden_frequency(problem, stiff, tried)) is None:
             continue
         driven = recording.driven_by(wave_names(omega))
         if found is not None and not stiff and _louder_with(found.fit, driven, loud):
             continue
         problem.on_progress(f"a drive that was not recorded: {omega:.5g} rad/s")
+        tried.append(omega)
         with contextlib.suppress(FitError):
             _, law = searched(driven, "band")
             if law.fit.loudest < OPTIONS.explained * loud:
