@@ -145,3 +145,41 @@ def test_arcs_of_a_body_that_sticks_are_closed():
     np.testing.assert_array_equal(fit.open, 0)
     errors = np.sqrt(np.diag(np.linalg.inv(fit.triangle.T @ fit.triangle)))
     assert np.all(np.abs(fit.p - true) < 3 * errors)
+
+
+class _Canyon:
+    """A state that does not move and is seen, beside Rosenbrock's two residuals, 30 (q − p²) and
+    p, of the coefficients p and q. ``evaluations``: that were made with derivatives."""
+
+    def __init__(self):
+        self.evaluations = 0
+
+    def take(self, arcs):
+        return self
+
+    def closing(self, p, x):
+        return x[:, :-1] - x[:, 1:]
+
+    def defects(self, p, x):
+        self.evaluations += 1
+        shape = (len(x), x.shape[1] - 1, 1)
+        return Defects(self.closing(p, x), np.ones((*shape, 1)), np.zeros((*shape, 2)))
+
+    def observe(self, p, x):
+        some, slopes = np.zeros((*x.shape[:2], 3)), np.zeros((*x.shape[:2], 3, 2))
+        some[..., 0], some[..., 1], some[..., 2] = x[..., 0], 30 * (p[1] - p[0] ** 2), p[0]
+        slopes[..., 1, :], slopes[..., 2, 0] = (-60 * p[0], 30.0), 1.0
+        return Observed(some, np.eye(3)[:, :1] * np.ones((*x.shape[:2], 1, 1)), slopes)
+
+
+def test_steps_that_bend_follow_a_canyon():
+    y, x, unit, found = np.zeros((1, 4, 3)), np.zeros((1, 4, 1)), np.ones(1), {}
+    y[..., 2] = 1.0
+    for curved in (False, True):
+        model = _Canyon()
+        fit = Readings(model, y, np.full(3, 0.01), curved=curved).fit(
+            np.array([-1.2, 1.0]), x, 0.01 * unit, max_iterations=200, tolerance=1e-9
+        )
+        np.testing.assert_allclose(fit.p, 1.0, rtol=1e-4)
+        found[curved] = model.evaluations
+    assert found[True] < 0.2 * found[False]

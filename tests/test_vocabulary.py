@@ -294,9 +294,11 @@ def test_a_drive_between_two_frequencies_that_are_tried_is_found_beside_an_own_o
     x = solve_ivp(rates, (0, t[-1]), [1.01, 0.0], t_eval=t, rtol=1e-9, atol=1e-9).y[0]
     x += 1e-3 * x.std() * np.random.default_rng(0).normal(size=len(x))
     recording = gfnn.Recording({"t": t, "x": x}, positions=["x"], angles=[])
-    found = hidden_frequency(samples_of(recording).problem, stiff=False)
+    problem = samples_of(recording).problem
+    found = hidden_frequency(problem, stiff=False)
     assert found is not None
     assert_allclose(found, omega, rtol=1e-3)
+    assert hidden_frequency(problem, stiff=False, known=[1.0, found]) is None
 
 
 def test_terms_with_inputs_move_by_the_compiled_law_as_by_the_lagrangian():

@@ -64,9 +64,7 @@ class DriveOptions:
 OPTIONS = DriveOptions()
 
 
-def hidden_frequency(
-    problem: ArcProblem, stiff: bool, known: Sequence[float] = ()
-) -> float | None:
+def hidden_frequency(problem: ArcProblem, stiff: bool, known: Sequence[float] = ()) -> float | None:
     """The angular frequency of a drive that the record shows beside a library of terms, in rad/s:
     of a force, and of a stiffness where it may be ``stiff``; None where it shows none, or one that
     is ``known``, of which no other search finds more."""

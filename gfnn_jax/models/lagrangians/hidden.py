@@ -235,14 +235,20 @@ def _along_short_arcs(problem: ArcProblem) -> Iterator[LawFit]:
 
 
 def _along_longer_arcs(fit: LawFit) -> LawFit:
-    """A start along longer and longer arcs, as far as it follows them."""
-    for periods in fit.problem.options.periods[1:]:
+    """A start along longer and longer arcs, as far as it follows them, with all powers from where
+    those it has leave more than noise."""
+    lengths = map(fit.problem.length, fit.problem.options.periods[1:])
+    for length in [n for n in lengths if n > fit.arcs.t.shape[1]]:
         if misfit(fit) > STARTS.followed:  # along longer arcs it would leave more
             break
-        if (longer := to_longer_arcs(fit, fit.problem.length(periods))) is None:
+        if (longer := to_longer_arcs(fit, length)) is None:
             break
         fit = longer
-    return fit
+    richer = _with_powers(fit, OPTIONS.degrees[-1])
+    if fit.problem.angles or misfit(fit) < STARTS.white or len(richer) == len(fit.structure.terms):
+        return fit
+    other = fit.again(dataclasses.replace(fit.structure, terms=richer))
+    return _along_longer_arcs(other) if misfit(other) < misfit(fit) else fit
 
 
 class _Shape(NamedTuple):
@@ -280,7 +286,7 @@ def _of_modes(problem: ArcProblem) -> list[LawFit]:
     values = {**plain.values, **{("term", row): 0.5 for row in masses}}
     rich = plain
     for degrees in OPTIONS.degrees:
-        terms = (*linear.terms, *_powers(d, degrees))
+        terms = _with_powers(rich, degrees)
         whole = dataclasses.replace(linear, terms=terms, friction=friction)
         rich = rich.again(whole, {**values, **rich.values}, rescale=False)
         if misfit(rich) < STARTS.noise:
@@ -291,14 +297,15 @@ def _of_modes(problem: ArcProblem) -> list[LawFit]:
     return [fit for fit in (rich, plain) if fit.follows][:1]
 
 
-def _powers(d: int, degrees: Iterable[int]) -> list[Row]:
-    """Powers of the modes, and of several of them together, of these degrees."""
-    none = (0,) * d
-    return [
-        (none, libraries.unit(d, *axes), none, 0.0)
+def _with_powers(fit: LawFit, degrees: Iterable[int]) -> tuple[Row, ...]:
+    """The terms of a fit, and the powers of modes, alone and together, of these degrees."""
+    none, own = (0,) * fit.problem.dim, fit.structure.terms
+    powers = (
+        (none, libraries.unit(fit.problem.dim, *axes), none, 0.0)
         for degree in degrees
-        for axes in combinations_with_replacement(range(d), degree)
-    ]
+        for axes in combinations_with_replacement(range(fit.problem.dim), degree)
+    )
+    return (*own, *(row for row in powers if row not in own))
 
 
 def _of_pendulums(problem: ArcProblem) -> list[LawFit]:
