@@ -135,7 +135,7 @@ class Following(Protocol):
 
 
 @runtime_checkable
-class Stepping(Protocol):
+class Stepping(Model, Protocol):
     """A model whose defects can be told without their derivatives, as a curved fit asks."""
 
     def closing(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
