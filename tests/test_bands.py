@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from analytic import henon_heiles_pairs
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
@@ -209,9 +210,8 @@ def test_a_map_without_posterior_says_so(noisy):
 
 
 def test_the_posterior_of_s_covers_the_held_out_misfit():
-    pairs = gfnn.sample_pairs(henon_heiles(), 400, jax.random.key(0))
+    pairs, fresh = henon_heiles_pairs(400, 0), henon_heiles_pairs(200, 1)
     fit = gfnn.fit(pairs, learn="map", family="polynomial", chart="midpoint", tolerance=1e-3)
-    fresh = gfnn.sample_pairs(henon_heiles(), 200, jax.random.key(1))
     states = np.asarray(fit.sample(jax.random.key(1), 50).rollout(fresh.z0, 1)[0])[:, :, 1]
     mean = np.asarray(fit.map.step(fresh.z0)[0])
     error = np.abs(mean - np.asarray(fresh.z1))
@@ -220,7 +220,7 @@ def test_the_posterior_of_s_covers_the_held_out_misfit():
 
 
 def test_residual_of_s_moves_with_the_states_as_its_derivatives_say():
-    pairs = gfnn.sample_pairs(henon_heiles(), 100, jax.random.key(0))
+    pairs = henon_heiles_pairs(100)
     data = Dataset.of(pairs, CARTESIAN).trained_on(np.arange(80)).validated_on(np.arange(80, 100))
     for chart in (MIDPOINT, TYPE2):
         sweep = LinearSweep(data, Tolerance(1e-6), chart, Linear("polynomial"))

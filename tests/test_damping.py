@@ -34,7 +34,7 @@ def learned():
     z = states_of(1_000, 0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return gfnn.fit(Pairs(z, damped_standard_map(z), 1.0), angles=(0,))
+        return gfnn.fit(Pairs(z, damped_standard_map(z), 1.0), angles=(0,), learn="map")
 
 
 @pytest.mark.slow

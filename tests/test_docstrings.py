@@ -2,11 +2,9 @@
 
 import ast
 import re
-from pathlib import Path
 
-import gfnn_jax
+from test_import_order import modules, statements
 
-PACKAGE = Path(gfnn_jax.__file__).parent
 FRAGMENTS = {
     "as",
     "before",
@@ -49,13 +47,12 @@ FRAGMENTS = {
 
 def openings():
     """List (place, first word) of the docstrings of all modules, classes and functions."""
-    for path in sorted(PACKAGE.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for module, tree in modules():
+        for node in (tree, *statements(tree)):
             if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
-                text = ast.get_docstring(node)
+                text = ast.get_docstring(node, clean=False)
                 word = re.search(r"\w[\w'’]*", text or "")
-                name = getattr(node, "name", "")
-                yield f"{path.relative_to(PACKAGE)} {name}", word[0].lower() if word else ""
+                yield f"{module} {getattr(node, 'name', '')}", word[0].lower() if word else ""
 
 
 def test_no_docstring_opens_with_a_fragment():

@@ -134,10 +134,10 @@ def test_steps_are_those_of_the_law(d, powers, dry, own):
     modes = found.modes[:, form.friction.jumps]
     slides = ((np.abs(speeds) > 0.1) & (modes == np.sign(speeds))).all(axis=1)
     assert slides.mean() > (0.3 if dry else 0.99)
-    for k in np.flatnonzero(slides):
-        law = lane_of(form, p, k) if own else form.lagrangian(p)
-        expected = stepped(law, x[k : k + 1], h[k : k + 1], u[k : k + 1])
-        np.testing.assert_allclose(found.states[k], expected[0], atol=2e-14)
+    rows = np.flatnonzero(slides)
+    for k in np.split(rows[:12], len(rows[:12])) if own else [rows]:
+        law = lane_of(form, p, k[0]) if own else form.lagrangian(p)
+        np.testing.assert_allclose(found.states[k], stepped(law, x[k], h[k], u[k]), atol=2e-14)
     by_state, by_coefficients = differences(form, p, x, h, u)
     np.testing.assert_allclose(found.by_state[slides], by_state[slides], atol=1e-8)
     np.testing.assert_allclose(found.by_coefficients, by_coefficients, atol=1e-8)

@@ -140,25 +140,27 @@ def test_pairs_of_tangents_see_what_is_not_symplectic():
 
 def test_a_ring_of_many_sites(tmp_path):
     """The formula, roundoff, a defect, the domain, and the same bits from a saved model."""
-    family, params = springs(40)
-    pairs = drawn(40, 20, family, params, 0.1)
+    dim = 18
+    family, params = springs(dim)
+    pairs = drawn(dim, 20, family, params, 0.1)
     fit = gfnn.fit(pairs.take(slice(12)), structure="ring", tolerance=1e-12)
     assert str(fit.hamiltonian) == "Σ_i 0.5 p_i² + 0.5 (q_{i+1} - q_i)² + 0.25 (q_{i+1} - q_i)⁴"
-    bond = "(q(Mod(i, 40) + 1) - q(i))"
+    bond = f"(q(Mod(i, {dim}) + 1) - q(i))"
     springs_of = f"0.5*{bond}**2 + 0.25*{bond}**4"
-    assert fit.formula == f"Sum(0.5*p(i)**2, (i, 1, 40)) + Sum({springs_of}, (i, 1, 40))"
+    assert fit.formula == f"Sum(0.5*p(i)**2, (i, 1, {dim})) + Sum({springs_of}, (i, 1, {dim}))"
     assert fit.met
     assert fit.symplecticity_defect < 1e-14
     z = pairs.z0[12:]
     np.testing.assert_allclose(fit.map.step(z)[0], pairs.z1[12:], atol=1e-13)
     energy = fit.map.hamiltonian(z)
-    states, _ = fit.map.rollout(z, 50)
-    np.testing.assert_allclose(fit.map.hamiltonian(states[:, -1]), energy, rtol=1e-13)
     fit.map.save(tmp_path / "model")
-    again, _ = gfnn.load(tmp_path / "model").map.rollout(z, 50)
-    np.testing.assert_array_equal(again, states)
+    loaded, state = gfnn.load(tmp_path / "model").map, z
+    for _ in range(50):
+        state = loaded.step(state)[0]
+    np.testing.assert_allclose(fit.map.hamiltonian(state), energy, rtol=1e-13)
+    np.testing.assert_array_equal(loaded.step(z)[0], fit.map.step(z)[0])
     # Where the ring is as a whole matters to no force: it is no part of the domain.
-    moved = z + np.repeat([100.0, 0.0], 40)
+    moved = z + np.repeat([100.0, 0.0], dim)
     np.testing.assert_array_equal(fit.map.step(moved)[1].status, 0)
     far = z.copy()
     far[:, 5] += 5.0

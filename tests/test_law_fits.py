@@ -650,7 +650,13 @@ def test_the_friction_that_a_record_shows(swing):
     assert max(without.which_friction.limits.values()) < 1e-3
 
 
-@pytest.mark.parametrize("asked", ["dry+linear", "linear+uniform", "quadratic"])
+@pytest.mark.parametrize(
+    "asked",
+    [
+        "quadratic",
+        *(pytest.param(a, marks=pytest.mark.slow) for a in ("dry+linear", "linear+uniform")),
+    ],
+)
 def test_friction_that_is_asked_for_dissipates_or_is_said_to_be_none(asked):
     """Of a record without any: ρ ≥ 0 at its bound, with a limit."""
     with pytest.warns(gfnn.FitWarning, match="friction was requested, and the record shows none"):

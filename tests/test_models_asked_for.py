@@ -44,7 +44,10 @@ def test_times_and_positions(law):
     assert law.map.sensors.positions == ("x1",)
 
 
-@pytest.mark.parametrize("kind", ["recording", "table", "arrays", "file"])
+@pytest.mark.parametrize(
+    "kind",
+    ["table", "file", *(pytest.param(k, marks=pytest.mark.slow) for k in ("recording", "arrays"))],
+)
 def test_any_form_of_the_same_data(kind, law, tmp_path):
     table = pd.DataFrame({"t": T, "x1": X})
     path = tmp_path / "swing.csv"

@@ -283,22 +283,25 @@ def test_unrolled_derivative_of_an_unfinished_solve_is_wrong_and_the_implicit_on
     assert np.abs(by_theorem[:, 0] - difference).max() > 1e-3
 
 
+BENT = PerLane(lambda b, theta, x: x + b * jnp.sin(x) - theta)
+
+
+@jax.jit
+def slopes_of_bent(bend, theta):
+    def solve(theta):
+        guess = 1.3 * theta + 0.1
+        x, _, info = iterate(BENT, bend, theta, guess, most=40, gather=False)
+        return x, info.status
+
+    _, slope, status = jax.jvp(solve, (theta,), (jnp.ones_like(theta),), has_aux=True)
+    return slope, status
+
+
 @pytest.mark.parametrize(("bend", "dtype"), [(0.0, "float64"), (8.0, "float64"), (8.0, "float32")])
 def test_unrolled_derivative_of_a_damped_solve_is_finite(bend, dtype):
     """Check also where a step is exactly straight (bend 0), or leads to a straight one."""
-    bent = PerLane(lambda b, theta, x: x + b * jnp.sin(x) - theta)
-
-    @jax.jit
-    def slopes(theta):
-        def solve(theta):
-            guess = 1.3 * theta + 0.1
-            x, _, info = iterate(bent, theta.dtype.type(bend), theta, guess, most=40, gather=False)
-            return x, info.status
-
-        _, slope, status = jax.jvp(solve, (theta,), (jnp.ones_like(theta),), has_aux=True)
-        return slope, status
-
-    slope, status = slopes(np.linspace(-4, 4, 2_001, dtype=dtype)[:, None])
+    theta = np.linspace(-4, 4, 2_001, dtype=dtype)[:, None]
+    slope, status = slopes_of_bent(theta.dtype.type(bend), theta)
     ok = np.asarray(status) == OK
     assert ok.mean() > 0.9
     assert np.isfinite(np.asarray(slope)[ok]).all()
@@ -384,7 +387,7 @@ def test_no_lane_is_ok_with_a_residual_that_is_not_small(chart, seed, strength, 
 def test_rough_steps_that_converge_are_common_enough_to_be_a_test():
     rng = np.random.default_rng(0)
     params, z = 10 * rng.standard_normal((4, 5)), rng.standard_normal((LANES, 2))
-    counts = np.bincount(rough_steps(TYPE2, params, z)[1].status, minlength=5)
+    counts = np.bincount(rough_steps(MIDPOINT, params, z)[1].status, minlength=5)
     assert counts[OK] > 16
     assert counts[NOT_CONVERGED] > 4
 

@@ -12,14 +12,20 @@ import gfnn_jax as gfnn
 SCENE = own_module.double_well()
 
 
+def pairs_of(num, seed):
+    """Of the double well, whose states are drawn by the scene."""
+    z0 = np.asarray(own_module.draw(jax.random.key(seed), num))
+    return gfnn.Pairs(z0, moved(lambda _, z: [z[1], z[0] - z[0] ** 3], z0, SCENE.dt), SCENE.dt)
+
+
 @pytest.fixture(scope="module")
 def pairs():
-    return gfnn.sample_pairs(SCENE, 400, jax.random.key(0))
+    return pairs_of(400, 0)
 
 
 @pytest.fixture(scope="module")
 def fresh():
-    return gfnn.sample_pairs(SCENE, 200, jax.random.key(1))
+    return pairs_of(200, 1)
 
 
 def error_of(map_, pairs):

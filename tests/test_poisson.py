@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from analytic import states_in_motion
-from test_brackets_found import heavy, lorenz, populations, runs_of, top
+from test_brackets_found import cross, heavy, lorenz, populations, runs_of, top
 from test_exports import by_c, by_c_with, compiled, needs_cc
 
 import gfnn_jax as gfnn
@@ -227,8 +227,9 @@ def test_a_driven_spin(tmp_path):
     """The field along y turns with the period 7.5; runs begin at times of their own."""
 
     def rates(z):  # the time is one more state
-        field = np.array([0.3, 0.4 * np.cos(2 * np.pi * z[3] / 7.5), 0.2])
-        return np.append(np.cross(z[:3], field + np.array([1.0, 0.5, 0.2]) * z[:3]), 1.0)
+        turned = 0.4 * np.cos(2 * np.pi * z[3] / 7.5)
+        by = 0.3 + z[0], turned + 0.5 * z[1], 0.2 + 0.2 * z[2]
+        return np.append(cross(z, by), 0 * z[:1] + 1.0, axis=0)
 
     rng = np.random.default_rng(0)
     starts = np.column_stack([rng.normal(size=(30, 3)), rng.uniform(0, 30, 30)])
@@ -252,7 +253,10 @@ def test_tops_whose_moment_differs_from_run_to_run(tmp_path, capsys):
     rng = np.random.default_rng(0)
     starts = np.column_stack([rng.normal(size=(20, 3)), rng.uniform(0.5, 1.5, 20)])
     data = runs_of(
-        lambda z: np.append(np.cross(z[:3], z[:3] * [0.5, 0.7, 1 / z[3]]), 0.0), starts, 0.2, 20
+        lambda z: np.append(cross(z, (0.5 * z[0], 0.7 * z[1], z[2] / z[3])), 0 * z[:1], axis=0),
+        starts,
+        0.2,
+        20,
     )
     columns = dict(zip(("L1", "L2", "L3", "inertia"), data.z0.T, strict=True))
     path = tmp_path / "tops.csv"

@@ -42,11 +42,17 @@ def summary(columns, **options):
     return gfnn.Recording({"t": T, **columns}, **options).summary()
 
 
+def seeds(count):
+    """Draws of so many systems, of which half are slow."""
+    half = count // 2
+    return [*range(half), *(pytest.param(n, marks=pytest.mark.slow) for n in range(half, count))]
+
+
 def kinds(found):
     return [fault.kind for fault in found.faults if fault.kind != "reading"]
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", seeds(6))
 def test_an_angle_by_its_accelerations(seed):
     rng = np.random.default_rng(seed)
     x = noisy(rng, pendulum(rng, rng.uniform(2.0, 2.8)))
@@ -56,7 +62,7 @@ def test_an_angle_by_its_accelerations(seed):
     assert kinds(summary({"theta": x})) == []
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", seeds(6))
 def test_a_length_by_its_accelerations(seed):
     rng = np.random.default_rng(seed)
     x = noisy(rng, spring(rng, rng.uniform(3.0, 5.0)))
@@ -64,7 +70,7 @@ def test_a_length_by_its_accelerations(seed):
     assert kinds(summary({"x": x})) == []
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_small_motions_propose_nothing(seed):
     rng = np.random.default_rng(seed)
     for x in (pendulum(rng, 0.4), spring(rng, 0.4)):
@@ -72,7 +78,7 @@ def test_small_motions_propose_nothing(seed):
         assert kinds(summary({"theta": noisy(rng, x)})) == []
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_points_on_a_circle_are_an_angle_and_the_command_has_it(seed):
     rng = np.random.default_rng(seed)
     x0, y0, length = rng.uniform(-3, 3), rng.uniform(-3, 3), rng.uniform(0.3, 3)
@@ -112,7 +118,7 @@ def test_an_orbit_is_no_pendulum(seed):
     assert "circle" not in kinds(summary({n: noisy(rng, x) for n, x in free.items()}))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_a_hand_that_lets_go_and_one_that_catches(seed):
     rng = np.random.default_rng(seed)
     free = pendulum(rng, rng.uniform(0.6, 1.2))

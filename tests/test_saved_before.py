@@ -42,7 +42,7 @@ def test_every_archive_has_its_numbers():
 # One of each structure is tried each time; of what else a folder may hold, all are slow.
 OTHERS = {"base-map", "drive", "features", "mlp", "parameters-map", "pendulum-angle", "recording"}
 OTHERS |= {"recording-inputs", "recording-parameters", "recording-two", "ring-map", "scene-polar"}
-OTHERS |= {"sines", "type3"}
+OTHERS |= {"sines", "type3", "fourier", "type1", "textbook", "mlp-hamiltonian", "recording-dry"}
 
 
 @pytest.mark.parametrize(

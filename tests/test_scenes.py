@@ -229,6 +229,10 @@ LONG = (
     "pcr3bp",
     "toda",
     "fput",
+    "froeschle",
+    "henon-heiles-section",
+    "driven-pendulum",
+    "pendulum-length",
 )
 
 

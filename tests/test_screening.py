@@ -71,9 +71,15 @@ def named(pairs, angles=()):
     return gross_errors(data, steps_between(identified(pairs).pairs) > 0, np.zeros(len(data), bool))
 
 
-@pytest.mark.parametrize("size", ["box", "noise"])
-@pytest.mark.parametrize(("length", "part"), [(50, 0.1), (2, 0.1)])
-@pytest.mark.parametrize(("make", "angles"), [(henon_heiles, ()), (swings, (0,))])
+@pytest.mark.parametrize(
+    ("make", "angles", "length", "part", "size"),
+    [
+        pytest.param(make, angles, length, 0.1, size, marks=pytest.mark.slow if slow else ())
+        for make, angles, alike in ((henon_heiles, (), "noise"), (swings, (0,), "box"))
+        for length, size in itertools.product((50, 2), ("box", "noise"))
+        for slow in [length == 50 and size == alike]
+    ],
+)
 def test_gross_errors_are_named_and_no_others(make, angles, length, part, size):
     """Of 20 to 200 times the noise, or as large as the data; two in a hundred may stay."""
     states, wrong = spoilt(make(length), part, size)

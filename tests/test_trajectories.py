@@ -27,6 +27,8 @@ ALIKE = (
     "henon-heiles-section",
     "pendulum-length",
     "driven-pendulum-phase",
+    "n-body",
+    "toda",
 )
 
 
