@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from analytic import henon_heiles_pairs
+from analytic import generated, henon_heiles_pairs, map_of
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
@@ -11,6 +11,7 @@ from gfnn_jax.data.files import read_initial_noise
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.errors import InputError
+from gfnn_jax.families.terms import given_terms
 from gfnn_jax.fitting import uncertainty
 from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.generating.charts import MIDPOINT, TYPE2
@@ -296,13 +297,14 @@ def test_predictions_hold_bands(noisy, tmp_path, monkeypatch):
     np.testing.assert_array_equal(predicted("z0.npy", "c.npz")["std"], clean["std"])
 
 
-def test_what_is_no_noise_of_initial_states_is_refused(noisy, tmp_path):
+def test_what_is_no_noise_of_initial_states_is_refused(tmp_path):
     path = tmp_path / "z0.npz"
     for bad in (np.zeros((2, 3)), np.full((2, 4), -1.0), np.full((2, 4), np.nan)):
         np.savez(path, z0=np.zeros((2, 4)), z0_std=bad)
         with pytest.raises(InputError, match="z0_std"):
             read_initial_noise(path, (2, 4))
-    noisy[1].map.save(tmp_path / "model")
+    piece = generated(given_terms(1, ["q1**2", "p1**2"]), np.ones(2), MIDPOINT, 0.3)
+    map_of(piece, np.ones((3, 2))).save(tmp_path / "model")
     with pytest.raises(InputError, match="horizon= needs samples="):
         predict(tmp_path / "model", path, Output(tmp_path / "o.npz"), Steps(2, horizon=1.0))
 

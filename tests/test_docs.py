@@ -32,6 +32,7 @@ SLOW = {
     "own-family": ("test_own_models",),
     "own-parts": ("test_own_models",),
     "positions-alone": ("test_positions", "test_monitors"),
+    "storage-ring": ("test_maps", "test_args"),
     "scaling": ("test_sharded", "test_fit_on_devices", "test_distributed_fit"),
     "your-own-data": ("test_readme",),
 }

@@ -121,7 +121,7 @@ def test_friction_is_noticed():
     z = disc(400)
     damped = gfnn.Pairs(z, pendulum(z) * np.array([[1.0, 0.5]]), 0.4)
     with pytest.raises(LookedAt), pytest.warns(gfnn.FitWarning, match="do not look symplectic"):
-        gfnn.fit(damped, learn="hamiltonian", terms=["p1**2", "cos(q1)"], on_candidate=stop)
+        gfnn.fit(damped, learn="hamiltonian", max_operations=10**6, on_candidate=stop)
 
 
 @pytest.mark.slow

@@ -83,7 +83,7 @@ def test_uniform_friction_multiplies_the_form(newton, substeps):
 
 def test_the_form_is_kept_however_long_the_step():
     """The error of one step of 2 is large, its defect is roundoff."""
-    coarse = flow(Uniform(H), np.append(C, GAMMA), stages=2, newton=True, dt=2.0)
+    coarse = flow(Uniform(H), np.append(C, GAMMA), stages=3, newton=True, dt=2.0)
     map_ = SymplecticMap((coarse,), CARTESIAN, covering(Z), np.ones(4), np.zeros(0), 2.0)
     finer = flow(Uniform(H), np.append(C, GAMMA), substeps=8, dt=2.0).image(Z)
     assert np.abs(coarse.image(Z) - finer).max() > 1e-5
