@@ -9,6 +9,7 @@ correct it. Laws with as many coefficients have odds by the sums of their square
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import shlex
 from collections import Counter
@@ -42,7 +43,7 @@ from gfnn_jax.models.lagrangians.libraries import (
     textbook,
     torques,
 )
-from gfnn_jax.models.lagrangians.structure import Loss, Row, Structure, is_constant
+from gfnn_jax.models.lagrangians.structure import Key, Loss, Row, Structure, is_constant
 from gfnn_jax.models.lagrangians.weak_form import weak_share, weak_start
 
 
@@ -78,6 +79,7 @@ SENSORS = (  # of a position q with the velocity v
     ),
     ("is smoothed, as by a low-pass", "{q} + smooth*{q}_ddot"),
     ("is late", "{q} - late*{v} + 0.5*late**2*{q}_ddot"),
+    ("is late, as by a low-pass", "{q} - late*{v} + late**2*{q}_ddot"),
 )
 
 
@@ -256,43 +258,60 @@ def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
 
 
 def of_a_sensor(fit: LawFit) -> str:
-    """A line on a sensor of one coordinate beside which plain terms, the textbook's and springs
-    between angles, are as likely as a law that leaves noise, or likelier than one that leaves more
-    (Schwarz's criterion); "" where there is none, or the law has such terms and leaves noise. Of
-    several coordinates whose law leaves noise one may be late."""
+    """A line on a sensor of one coordinate beside which a plainer law follows a record; "" where
+    there is none. It is clearly likelier (Schwarz's criterion) than a law that leaves more than
+    noise, and not clearly less likely than one that leaves noise. Plain are the textbook's terms
+    and springs between angles, with linear friction; plainer is also a law without those of its
+    other terms that are not significant beside the sensor."""
     problem, seen, d = fit.problem, fit.problem.observation, fit.structure.dim
     terms = textbook(d, problem.angles)
     terms += springs(d, problem.within_a_turn) if d > 1 else []
-    is_noise = fit.loudest < OPTIONS.noise
-    is_plain = set(fit.structure.terms) <= set(terms)
-    if not seen.is_plain or problem.parameters or (is_noise and is_plain):
-        return ""
-    friction, count, best = losses(d, (LINEAR,), 0.0)[:d], fit.independent, ""
-    least = fit.criterion()
-    least += problem.options.evidence.deciding if is_noise else -OPTIONS.clearly
+    friction = losses(d, (LINEAR,), 0.0)[:d]
     plain = dataclasses.replace(fit.structure, terms=tuple(terms), friction=tuple(friction))
     plain = dataclasses.replace(plain, zeros=())
-    if is_noise and len(plain.keys()) > len(fit.p):
-        return ""  # a law of more coefficients is not likelier than one that leaves noise
-    try:
-        known = weak_start(plain, problem, prune=False)[1]
-    except FitError:
+    odd = {key for key in fit.values if key[0] in ("term", "loss")} - set(plain.keys())
+    is_noise = fit.loudest < OPTIONS.noise
+    if not seen.is_plain or problem.parameters or (is_noise and not odd):
         return ""
+    known, count, best = {}, fit.independent, ""
+    if not is_noise or len(plain.keys()) <= len(fit.p):  # else it is not as likely
+        with contextlib.suppress(FitError):
+            known = weak_start(plain, problem, prune=False)[1]
+    least = fit.criterion() + OPTIONS.clearly * (1 if is_noise else -1)
+    alone = d == 1 and not problem.num_inputs  # and may be late unseen
     for i, name in enumerate(seen.coordinates):
         q, v = symbols((name, seen.speeds[i]))
-        for what, sensor in SENSORS[-1:] if is_noise and d > 1 else SENSORS:
+        for what, sensor in SENSORS[:2] if alone else SENSORS:
             text = sensor.format(q=q, v=v) + " + zero" * (i in fit.structure.zeros)
             shown = observed({name: text}, seen.coordinates, seen.speeds, {}, columns=seen.channels)
             shown = dataclasses.replace(shown, loss=seen.loss)
             other = dataclasses.replace(problem, observation=shown)
-            own = dataclasses.replace(plain, sensors=other.sensors)
-            again = other.fit(own, known, fit.followed, fit.sigma, rescale=False)
-            unlikely = again.criterion(count)
-            early = what == "is late" and again.values["sensor", "late"] < 0  # and another late
-            if again.follows and again.is_definite and unlikely < least and not early:
-                typed, least = shlex.quote(f"{name} = {text}"), unlikely
-                best = f"a plainer law follows the record where {name} {what}: --observe {typed}"
+            fewer = _without_needless(fit, other, odd)
+            tried = [(plain, known)] * bool(known) + [(fewer, fit.values)] * bool(fewer)
+            for structure, start in tried:
+                own = dataclasses.replace(structure, sensors=other.sensors)
+                again = other.fit(own, start, fit.followed, fit.sigma, rescale=False)
+                unlikely = again.criterion(count)
+                early = again.values.get(("sensor", "late"), 0.0) < 0  # and another late
+                if again.follows and again.is_definite and unlikely < least and not early:
+                    typed, least = shlex.quote(f"{name} = {text}"), unlikely
+                    best = (
+                        f"a plainer law follows the record where {name} {what}: --observe {typed}"
+                    )
     return best
+
+
+def _without_needless(fit: LawFit, other: ArcProblem, odd: set[Key]) -> Structure | None:
+    """The structure of a fit without those of its odd terms that are not significant beside the
+    sensors of another problem, close to the fit; None where all are."""
+    zeros = tuple(i for i in fit.structure.zeros if i in other.observation.direct)
+    sensors = tuple((name, 0.0) for name, _ in other.sensors)
+    own = dataclasses.replace(fit.structure, zeros=zeros, sensors=sensors)
+    near = other.linearised(own, fit)
+    z = dataclasses.replace(near, p=near.p + near.step()).significance
+    least = fit.problem.options.evidence.significant
+    needless = {k for k, one in zip(own.keys(), z, strict=True) if k in odd and one < least}
+    return own.without(needless) if needless else None
 
 
 def _powers(fit: LawFit) -> list[float]:
