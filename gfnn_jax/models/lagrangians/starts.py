@@ -125,7 +125,8 @@ def best_start(problem: ArcProblem) -> LawFit:
         some.add(_Library(first, 2))
     some.add_central(textbook.rows, 3, across=False)
     if 1 < len(problem.lengths) <= libraries.FEW:
-        some.add_rubbing(ISOTROPIC, [textbook])
+        thrown = [row for row in libraries.uncoupled(d, angles) if sum(row[1]) < 2]
+        some.add_rubbing(ISOTROPIC, [textbook, _Library(thrown, equal=True)])
         some.add_central(textbook.rows, 3, across=False, rubs=ISOTROPIC)
     for degree in (3, 4):
         some.add_bodies(degree)
@@ -283,12 +284,13 @@ class _Starts:
     def add_rubbing(self, kind: int, some: Sequence[_Library]) -> None:
         """Start from plain libraries beside a kind of friction where the residuals of all starts
         are more than noise: what stops a body, and holds it, many terms imitate, and the drag of a
-        plane masses that differ."""
+        plane masses that differ, which leave nearly noise along a short flight."""
         d = self.problem.dim
         if d > 1 and kind == DRY and not self.problem.angles:
             some = [*some, _Library(libraries.bodies(d, (), 3), 2, apart=True, equal=True)]
         for library in some:
-            if not self.are_noise and not self.one_valued:
+            least = OPTIONS.white if kind == ISOTROPIC else OPTIONS.noise
+            if not self.least < least and not self.one_valued:
                 self.add(library._replace(rubs=kind))
 
     def add_led(self, rows: Sequence[Row], rank: int) -> None:
