@@ -12,6 +12,7 @@ import numpy as np
 
 from gfnn_jax.budget import UNBOUNDED, Allowance
 from gfnn_jax.dataset.stretches import Arcs, Nodes, Scales, arcs_of, with_noise, with_states
+from gfnn_jax.families.friction import STRIBECK
 from gfnn_jax.families.lagrangian import INPUTS
 from gfnn_jax.fitting.evidence import EVIDENCE, Evidence, correlation_time, criterion
 from gfnn_jax.fitting.linearised import Linearised, without_each
@@ -25,7 +26,7 @@ from gfnn_jax.models.lagrangians.text import Names, word_of
 from gfnn_jax.solve.latent_arcs import Defects, Fitted, Observed, Readings
 from gfnn_jax.solve.noise import Wander
 
-_SMALL = 0.01  # of a step, over which velocities are differenced
+_SMALL = 0.01  # of a step, or of a speed, over which is differenced
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -492,8 +493,23 @@ class LawFit:
 
     @functools.cached_property
     def linearised(self) -> Linearised:
-        """The problem close to p, in which correlated residuals count once."""
-        return Linearised.of_arcs(self.fitted, self.correlation)
+        """The problem close to p, in which correlated residuals count once; the speeds over which
+        friction of kinds that were tried fades are at their best for each p, as they were
+        fitted."""
+        tried = "stribeck" in self.problem.options.frictions
+        fading = [row for row in self.structure.friction if tried and row[1] == STRIBECK]
+        if not (fading and self.follows):
+            return Linearised.of_arcs(self.fitted, self.correlation)
+        ends = [("loss", (*r[:2], r[2] * by)) for r in fading for by in (1 + _SMALL, 1 - _SMALL)]
+        larger = self.structure.plus(ends)
+        own, others = places(larger, self.structure, ends)
+        turn = np.zeros((len(larger.keys()), len(fading) + len(own)))
+        for k, row in enumerate(fading):
+            turn[others[2 * k : 2 * k + 2], k] = self.values["loss", row] * np.array([1, -1])
+        turn[own, len(fading) + np.arange(len(own))] = 1.0
+        whole = self.problem.linearised(larger, self).combined(turn).triangle
+        triangle = Triangle(whole.factor[len(fading) :, len(fading) :], whole.rows)
+        return Linearised(self.p, triangle, self.correlation)
 
     @property
     def significance(self) -> dict[Key, float]:

@@ -105,6 +105,8 @@ def fit_given(given: Given, scale: float, problem: ArcProblem) -> SearchResult:
     """
     d, options = problem.dim, problem.options
     linear = tuple(libraries.losses(d, (LINEAR,), 0.0)[:d])
+    if given.friction is not None:
+        problem = dataclasses.replace(problem, options=dataclasses.replace(options, frictions=()))
     friction = linear if given.friction is None else given.friction
     whole = Structure(d, given.terms, friction, (), problem.num_inputs, problem.sensors)
     held, bounds = told_in(given, whole, scale)
