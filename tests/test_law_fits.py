@@ -37,7 +37,7 @@ from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.libraries import central, textbook
 from gfnn_jax.models.lagrangians.recordings import samples_of
-from gfnn_jax.models.lagrangians.rivals import other_powers, with_likeliest_power
+from gfnn_jax.models.lagrangians.rivals import of_a_sensor, other_powers, with_likeliest_power
 from gfnn_jax.models.lagrangians.search import search, search_on
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.text import Names, speed_names, terms_of
@@ -523,6 +523,68 @@ def test_stribecks_friction_is_found_with_the_speed_over_which_it_fades():
     truth = viscous / 2, begin, -share * begin
     for term, expected in zip(fit.friction.terms, truth, strict=True):
         assert abs(term.coefficient - expected) < 4 * term.std
+
+
+def test_errors_of_stribecks_friction_hold_that_of_the_speed_over_which_it_fades():
+    """Against the change of fits with other speeds, whose error is that by the least cost."""
+    width, t = 0.3, np.arange(0, 20, 0.05)
+
+    def rates(_, z):
+        falls = 0.03 * np.sign(z[1]) * (1 - np.exp(-abs(z[1]) / width))
+        return [z[1], -z[0] - 0.05 * z[1] / np.hypot(z[1], 0.1) + falls - 0.02 * z[1]]
+
+    x = solve_ivp(rates, (0, 20), [1.2, 0], t_eval=t, rtol=1e-8, max_step=0.05).y[0]
+    x = x + 1e-4 * np.random.default_rng(4).normal(size=len(t))
+    problem = samples_of(gfnn.Recording({"t": t, "x": x}, positions=["x"])).problem
+
+    def law(by):
+        friction = (((1,), LINEAR, 0.0), ((1,), DRY, 0.1), ((1,), STRIBECK, width * by))
+        return Structure(1, tuple(textbook(1, ())), friction)
+
+    known = {("term", ((0,), (2,), (0,), 0.0)): -0.5}
+    losses = [("loss", row) for row in law(1.0).friction]
+    known |= dict(zip(losses, (0.02, 0.05, -0.03), strict=True))
+    fit = problem.fit(law(1.0), known, problem.arcs(2.0), problem.scales.sigma)
+
+    def other(by):
+        known = dict(zip(law(by).keys(), fit.p, strict=True))
+        return fit.again(law(by), known, rescale=False).again(rescale=False)
+
+    change = 0.2  # of the logarithm of the speed
+    low, here, high = (other(np.exp(by * change)) for by in (-1, 0, 1))
+    bend = (low.fitted.cost - 2 * here.fitted.cost + high.fitted.cost) / change**2
+    slope = (high.p - low.p) / (2 * change)
+    alone = Linearised.of_arcs(fit.fitted, fit.correlation).errors
+    expected = np.sqrt(alone**2 + slope**2 * fit.correlation / (0.5 * bend))
+    assert expected[3] > 3 * alone[3]
+    np.testing.assert_allclose(fit.linearised.errors, expected, rtol=0.05)
+
+
+def test_a_low_pass_that_a_force_across_imitates_is_named():
+    """Two bodies on springs, one read behind a low-pass: five linear equations."""
+    dt, tau = 0.15, 0.2
+    rates = np.zeros((5, 5))
+    rates[[0, 1], [2, 3]] = 1.0
+    rates[2, :2], rates[3, :2] = [-1.0, 0.25], [0.25, -1.9]
+    rates[[2, 3], [2, 3]] = -0.01
+    rates[4, [1, 4]] = np.array([1, -1]) / tau
+    z = [np.array([1.0, 0.3, 0.4, -0.2, 0.3])]
+    for _ in range(400):
+        z.append(expm(rates * dt) @ z[-1])
+    x = np.array(z)[20:, [0, 4]]
+    x = x + 1e-3 * x.std(axis=0) * np.random.default_rng(1).normal(size=x.shape)
+    columns = {"t": dt * np.arange(len(x)), "a": x[:, 0], "b": x[:, 1]}
+    problem = samples_of(gfnn.Recording(columns, positions=["a", "b"])).problem
+    across = ((0, 1), (1, 0), (0, 0), 0.0)
+    friction = (((1, 0), LINEAR, 0.0), ((0, 1), LINEAR, 0.0))
+    law = Structure(2, (*textbook(2, ()), across), friction)
+    law = law.without({("term", row) for row in law.terms if sum(row[1]) == 1 and not any(row[0])})
+    known = {("term", row): -0.5 for row in law.terms if 2 in row[1]}
+    known[("term", ((0, 2), (0, 0), (0, 0), 0.0))] = 0.5
+    fit = problem.fit(law, known, problem.arcs(2.0), problem.scales.sigma)
+    assert fit.loudest < 1.1
+    assert fit.significance["term", across] > 20
+    assert "b is late" in of_a_sensor(fit)
 
 
 def test_a_power_of_the_distance_that_others_imitate_is_one_of_several():
