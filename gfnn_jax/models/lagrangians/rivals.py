@@ -262,7 +262,7 @@ def of_a_sensor(fit: LawFit) -> str:
     there is none. It is clearly likelier (Schwarz's criterion) than a law that leaves more than
     noise, and not clearly less likely than one that leaves noise. Plain are the textbook's terms
     and springs between angles, with linear friction; plainer is also a law without those of its
-    other terms that are not significant beside the sensor."""
+    other terms that are no more than chance beside the sensor."""
     problem, seen, d = fit.problem, fit.problem.observation, fit.structure.dim
     terms = textbook(d, problem.angles)
     terms += springs(d, problem.within_a_turn) if d > 1 else []
@@ -302,15 +302,16 @@ def of_a_sensor(fit: LawFit) -> str:
 
 
 def _without_needless(fit: LawFit, other: ArcProblem, odd: set[Key]) -> Structure | None:
-    """The structure of a fit without those of its odd terms that are not significant beside the
-    sensors of another problem, close to the fit; None where all are."""
+    """The structure of a fit without those of its odd terms that are significant, and no more than
+    chance beside the sensors of another problem, close to the fit; None where there are none."""
     zeros = tuple(i for i in fit.structure.zeros if i in other.observation.direct)
     sensors = tuple((name, 0.0) for name, _ in other.sensors)
     own = dataclasses.replace(fit.structure, zeros=zeros, sensors=sensors)
-    near = other.linearised(own, fit)
+    near, evidence = other.linearised(own, fit), fit.problem.options.evidence
     z = dataclasses.replace(near, p=near.p + near.step()).significance
-    least = fit.problem.options.evidence.significant
-    needless = {k for k, one in zip(own.keys(), z, strict=True) if k in odd and one < least}
+    seen = {key for key in odd if abs(fit.significance.get(key, 0.0)) > evidence.significant}
+    beside = zip(own.keys(), z, strict=True)
+    needless = {key for key, one in beside if key in seen and one < evidence.chance}
     return own.without(needless) if needless else None
 
 
