@@ -287,7 +287,8 @@ def of_a_sensor(fit: LawFit) -> str:
             shown = dataclasses.replace(shown, loss=seen.loss)
             other = dataclasses.replace(problem, observation=shown)
             fewer = _without_needless(fit, other, odd)
-            tried = [(plain, known)] * bool(known) + [(fewer, fit.values)] * bool(fewer)
+            tried = [(plain, known)] if known else []
+            tried += [(fewer, fit.values)] if fewer else []
             for structure, start in tried:
                 own = dataclasses.replace(structure, sensors=other.sensors)
                 again = other.fit(own, start, fit.followed, fit.sigma, rescale=False)
