@@ -18,7 +18,14 @@ from gfnn_jax.scenes.draws import sample_sequences
 from gfnn_jax.scenes.trajectories import flow_step, reference_trajectories
 
 RECIPE = Recipe(batch_size=50, epochs=2, epoch_length=3, rate=1e-2, schedule="cosine")
-LONGER = ("srnn-5", "onet-5", "srnn-2", "vfnn")  # the others learn as these do
+LONGER = (
+    "srnn-5",
+    "onet-5",
+    "srnn-2",
+    "vfnn",
+    "la-sympnet",
+    "p-sympnet",
+)  # the others learn as these do
 
 
 def oscillator(num, length, dt=0.1, seed=0):

@@ -139,7 +139,7 @@ def test_jacobian_of_the_residual_and_determinant_are_those_of_the_formulas(char
 def test_derivatives_of_step_and_rollout_in_state_and_parameters(chart):
     """Forward = reverse = through the iterations = finite difference, along a random direction."""
     flat, unravel = ravel_pytree((random_params(chart), STATES[0, :2]))
-    direction = np.random.default_rng(2).standard_normal(flat.size)
+    direction, weights = np.random.default_rng(2).standard_normal(flat.size), np.array([1, 0.7, -2])
 
     def rollout(theta, *, unrolled=False):
         """A number after each of three steps."""
@@ -156,14 +156,15 @@ def test_derivatives_of_step_and_rollout_in_state_and_parameters(chart):
     def derivatives(theta):
         value, forward = jax.jvp(rollout, (theta,), (direction,))
         through = jax.jvp(functools.partial(rollout, unrolled=True), (theta,), (direction,))[1]
-        return value, forward, through, jax.jacrev(rollout)(theta) @ direction
+        backward = jax.vjp(rollout, theta)[1](weights)[0]
+        return value, forward, through, backward @ direction
 
     _, forward, through, backward = derivatives(flat)
     step = 1e-5
     above, below = (derivatives(flat + sign * step * direction)[0] for sign in (1, -1))
     assert np.abs(forward).min() > 0.05
     np.testing.assert_allclose(through, forward, rtol=1e-10)
-    np.testing.assert_allclose(backward, forward, rtol=1e-10)
+    np.testing.assert_allclose(backward, weights @ forward, rtol=1e-10)
     np.testing.assert_allclose((above - below) / (2 * step), forward, rtol=1e-6)
 
 

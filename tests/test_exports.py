@@ -155,14 +155,15 @@ def of_positions(part, both, angles=()):
     return map_of(piece, z, scale=np.full(2 * dim, SIZE)), z
 
 
+DAMPING = Damping(np.asarray(0.9), np.full(1, 0.05))
 QUICK = {
     "positions both ways": lambda: of_positions(0.0, True, (0,)),
     "type 2, angles": lambda: map_in(TYPE2, 1, 4, angles=(0, 1)),
-    "type 3, base map": lambda: map_in(TYPE3, 1, 4, around=(turning(1),)),
-    "damping": lambda: map_in(TYPE2, 1, 4, around=(Damping(np.asarray(0.9), np.full(1, 0.05)),)),
+    "type 3, base map, damping": lambda: map_in(TYPE3, 1, 4, around=(turning(1), DAMPING)),
 }
 MAPS = {
     **QUICK,
+    "damping": lambda: map_in(TYPE2, 1, 4, around=(DAMPING,)),
     "positions": lambda: of_positions(0.5, False),
     "type 1": lambda: map_in(TYPE1, 1, 4, predicted=False),
     "midpoint": lambda: map_in(MIDPOINT, 2, 3),

@@ -62,7 +62,7 @@ LINEAR = {
 }
 
 # Each like two others: what is before a piece, and a map backwards.
-ALIKE = ("a flow before", "type 1, backwards", "type 1")
+ALIKE = ("a flow before", "type 1, backwards", "type 1", "type 2")
 
 
 @pytest.mark.parametrize(

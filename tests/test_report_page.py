@@ -1,7 +1,9 @@
 """The report page, the physical quantities of a law, its equation of motion, objects of a fit."""
 
+import contextlib
 import dataclasses
 import functools
+import io
 import json
 import re
 import shutil
@@ -39,6 +41,17 @@ def discovered():
     return gfnn.discover(table, positions=["x"])
 
 
+@pytest.fixture(scope="module")
+def command_ran(tmp_path_factory):
+    """What ``gfnn swing.csv`` says, and the folder that it writes."""
+    folder, shown = tmp_path_factory.mktemp("swing"), io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(shown):
+        swung = np.stack(swing(), axis=1)
+        np.savetxt("swing.csv", swung, "%.5f", ",", header="t,x", comments="")
+        assert command("swing.csv") == 0
+    return shown.getvalue(), folder / "runs" / "swing"
+
+
 @pytest.mark.slow
 def test_quantities_are_those_of_the_oscillator():
     by_name = {q.name: q for q in physics(discovered().law).quantities}
@@ -56,8 +69,8 @@ def test_quantities_are_those_of_the_oscillator():
     assert by_name["small swings: frequency"].unit == "Hz"
 
 
-def test_quadratic_friction_alone_has_no_damping_ratio():
-    system = _System.of(discovered().law)
+def test_quadratic_friction_alone_has_no_damping_ratio(command_ran):
+    system = _System.of(gfnn.load(command_ran[1] / "model").law)
     drag = Friction(np.array([[1]]), np.array([QUADRATIC]), np.zeros(1))
     law = dataclasses.replace(system.law, friction=drag, losses=np.array([0.1]), uniform=0.0)
     system = system._replace(law=law, root=np.zeros((0, _count(law))))
@@ -160,15 +173,11 @@ def test_a_refusal_has_its_page(tmp_path, monkeypatch):
     assert (told["verdict"], told["error"]) == ("not fitted", str(refused.value))
 
 
-def test_one_command_writes_the_report(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    t, x = swing()
-    np.savetxt("swing.csv", np.stack([t, x], axis=1), "%.5f", ",", header="t,x", comments="")
-    assert command("swing.csv") == 0
-    shown = capsys.readouterr().out
+def test_one_command_writes_the_report(command_ran):
+    shown, folder = command_ran
     assert "runs/swing/report.html" in shown
     assert "small swings: frequency = 0.477" in shown
-    text = (tmp_path / "runs/swing/report.html").read_text(encoding="utf-8")
+    text = (folder / "report.html").read_text(encoding="utf-8")
     assert "gfnn swing.csv" in text
 
 

@@ -43,6 +43,7 @@ def test_every_archive_has_its_numbers():
 OTHERS = {"base-map", "drive", "features", "mlp", "parameters-map", "pendulum-angle", "recording"}
 OTHERS |= {"recording-inputs", "recording-parameters", "recording-two", "ring-map", "scene-polar"}
 OTHERS |= {"sines", "type3", "fourier", "type1", "textbook", "mlp-hamiltonian", "recording-dry"}
+OTHERS |= {"polynomial"}
 
 
 @pytest.mark.parametrize(

@@ -171,7 +171,7 @@ def test_a_foucault_pendulum_has_its_field_and_its_hamiltonian():
     def acceleration(q, v):
         return -q + 2 * turn * np.array([v[1], -v[0]])
 
-    fit = gfnn.fit(recorded(acceleration, [1.0, 0.2, 0.0, 0.3], 60))
+    fit = gfnn.fit(recorded(acceleration, [1.0, 0.2, 0.0, 0.3], 40, 500))
     exact = {"v1**2": 0.5, "v2**2": 0.5, "x1**2": -0.5, "x2**2": -0.5, "v2*x1": 2 * turn}
     within_errors(fit.lagrangian, exact)
     assert fit.verdict == "identified"
