@@ -98,6 +98,20 @@ def test_oscillators_of_different_friction_keep_no_multiple_of_the_form():
     assert np.abs(error).max() < 1e-12
 
 
+@pytest.mark.parametrize("share", [0.0, 0.05])
+def test_a_factor_that_differs_over_phase_space_is_a_mean(share):
+    """Of p a step keeps b + share sin q, which is by what it multiplies areas."""
+    z = states_of(600, 0)
+    q, p = z.T
+    p = (B + share * np.sin(q)) * p + K * np.sin(q)
+    data = Dataset.of(Pairs(z, np.stack([q + p, p], axis=-1), 1.0), CARTESIAN).divided(0)
+    found = damping.diagnosed(data, "auto", None, 0, may_lose=True).damping
+    assert found is not None
+    assert abs(found.factor - B) < (0.02 if share else 1e-12)
+    assert ("at q1" in found.differs) == (share > 0)
+    assert ("one factor for all states" in str(found)) == (share == 0)
+
+
 # A factor that depends on a parameter
 
 

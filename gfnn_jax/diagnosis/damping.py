@@ -72,6 +72,7 @@ class Options:
     at_roundoff: float = 1e-14
     fewer: float = 1.1  # of the held-out residual: what fewer functions of the args may leave
     explained: float = 0.3  # of the factors' variance, by one coordinate that is named
+    errors: float = 3.0  # of the Jacobians, above which what D_b leaves of their defect is real
 
 
 OPTIONS = Options()
@@ -84,7 +85,7 @@ class LearnedDamping:
 
     Where b depends on the args, factor, std and shift have an axis of coefficients before these,
     one for each of the ``functions``. names: of the args. extremes: the lowest and the highest b at
-    the pairs' own args.
+    the pairs' own args. differs: what is known of where b differs, if it is no constant but a mean.
     """
 
     factor: np.ndarray
@@ -93,6 +94,7 @@ class LearnedDamping:
     functions: FunctionsOfArgs | None = None
     names: tuple[str, ...] = ()
     extremes: tuple[np.ndarray, ...] = ()
+    differs: str = ""
 
     @property
     def piece(self) -> Damping:
@@ -121,6 +123,11 @@ class LearnedDamping:
             each = zip(*map(np.ravel, self.extremes), strict=True)
             factors = [f"{low:.6g} to {high:.6g}" for low, high in each]
         by = f", depending on {', '.join(self.names)}" if self.names else ""
+        if self.differs:
+            means = ", ".join(f"{b:.4g}" for b in self.factor.ravel())
+            return (
+                f"steps multiply areas by {means} in the mean, not alike everywhere.{self.differs}"
+            )
         if self.uniform:
             return f"every step multiplies areas by {factors[0]}{by}, one factor for all states"
         planes = [f"{factor} in (q{i}, p{i})" for i, factor in enumerate(factors, 1)]
@@ -132,6 +139,8 @@ class LearnedDamping:
     def line(self, dt: float) -> str:
         """Line about what was learned, with the rate γ of p' = −γ p where one factor b = e^(−γ dt)
         shrinks all areas."""
+        if self.differs:
+            return f"{self}. The map has the mean"
         if self.functions is not None or not self.uniform or not self.factor < 1:
             return f"{self}. The map has it"
         rate, std = -float(np.log(self.factor)) / dt, float(self.std / self.factor) / dt
@@ -462,13 +471,16 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
     defect, messages, damping = data_defect(jacobians, plain.scale), _thin(plain), None
     if may_lose:
         damping = learn_damping(plain, jacobians, error, chart, reversor)
+    at = plain.y0 if plain.args is None else np.concatenate([plain.y0, plain.args], axis=1)
+    at = centres(at, jacobians, seed)
+    differing = where_areas_differ(jacobians, at, plain.scale, plain.parameters)
     if damping is not None:
         jacobians = damping.undone(jacobians)
         data = plain = plain.without(None, damping.piece)
+        if data_defect(jacobians, data.scale) > OPTIONS.errors * error:
+            unknown = " No coordinate tells where by itself"
+            damping = dataclasses.replace(damping, differs=differing or unknown)
     elif not look_symplectic(jacobians, error, plain.scale):
-        at = plain.y0 if plain.args is None else np.concatenate([plain.y0, plain.args], axis=1)
-        at = centres(at, jacobians, seed)
-        differing = where_areas_differ(jacobians, at, plain.scale, plain.parameters)
         messages.append(
             f"{NOT_SYMPLECTIC}: ‖MᵀJM − J‖ is {defect:.2g} ± {error:.1g} (M: local "
             "Jacobians, coordinates in units of their spread) where a symplectic map has 0. Check "
