@@ -34,7 +34,7 @@ def sequences(dt: float, quick: bool) -> Numbers:
     tube of 95 % holds at each step."""
     scene = dataclasses.replace(henon_heiles(), dt=dt)
     test = np.asarray(gfnn.sample_test_states(scene, TESTED, jax.random.key(100 + SEED)))
-    reference = references(scene, test[None])[0]
+    reference = references(scene, test)
     every = np.asarray(gfnn.reference_trajectories(scene, test[:STATES], WHOLE))
     runs, found, held = [], [], []
     for seed in range(SEED, SEED + (1 if quick else FITS)):
