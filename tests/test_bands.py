@@ -1,5 +1,7 @@
 """Posterior of the coefficients, maps drawn from it, bands of predictions."""
 
+from unittest import mock
+
 import jax
 import numpy as np
 import pytest
@@ -18,9 +20,10 @@ from gfnn_jax.generating.charts import MIDPOINT, TYPE2
 from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.predict import Steps, predict
 from gfnn_jax.maps.posterior import bands, horizon
+from gfnn_jax.models.generating_functions import sweeps
 from gfnn_jax.models.generating_functions.map_of_terms import SumOfTerms
 from gfnn_jax.models.generating_functions.sweeps import Linear, LinearSweep
-from gfnn_jax.scenes import henon_heiles
+from gfnn_jax.scenes import henon_heiles, two_body
 
 NOISE = 1e-3
 
@@ -243,6 +246,29 @@ def test_residual_of_s_moves_with_the_states_as_its_derivatives_say():
             ]
             for whole, column in zip(found, by, strict=True):
                 np.testing.assert_allclose(whole[:, :, j], column, rtol=0, atol=1e-7)
+
+
+def test_noise_that_differs_between_coordinates_is_told_from_misfit():
+    """A radial momentum of circular orbits has thirty times the noise of an angle, ÷ spreads; the
+    part of noise is what the same size leaves less of the pairs without noise."""
+    scene, rng, found, true = two_body(), np.random.default_rng(0), [], []
+    clean = gfnn.sample_pairs(scene, 400, jax.random.key(0))
+    spread = np.std(clean.z0, axis=0)
+    for rows in np.split(np.arange(400), 4):
+        squares = []
+        for noise in (0.0, 1e-4 * spread):
+            states = (z[rows] + noise * rng.normal(size=(100, 4)) for z in (clean.z0, clean.z1))
+            data = Dataset.of(gfnn.Pairs(*states, scene.dt), scene.coordinates)
+            data = data.trained_on(np.arange(80)).validated_on(np.arange(80, 100))
+            sweep = LinearSweep(data, Tolerance(1e-6), MIDPOINT, Linear("polynomial"))
+            size = sweep.sizes[2]
+            left = sweep.factors(size.group).train.residual_norm(size.family.num_parameters)
+            squares.append(left**2)
+        with mock.patch.object(sweeps, "part_of_noise", wraps=sweeps.part_of_noise) as part:
+            sweep.root(size)
+        found.append(sweeps.part_of_noise(*part.call_args.args))
+        true.append(1 - squares[0] / squares[1])
+    assert np.mean(found) == pytest.approx(np.mean(true), abs=0.15)
 
 
 def test_bands_compare_angles_modulo_turns():

@@ -469,7 +469,9 @@ class LinearSweep(Generates):
     def root(self, size: Size) -> np.ndarray:
         """(m, m): rootᵀ root is the covariance of the size's coefficients.
 
-        What of the residual is noise, a larger size tells: it leaves that too.
+        What of the residual is noise, a larger size tells: it leaves that too. A radial momentum
+        may have thirty times the noise of an angle, ÷ their spreads, and terms that move it then
+        explain more noise than others; fewer pairs than coordinates do not tell theirs apart.
         """
         train = self.factors(size.group).train
         family, solved = size.family, self.solve(size)[0]
@@ -481,9 +483,9 @@ class LinearSweep(Generates):
         slopes = self._slopes(family, w, *args)
         residual = slopes @ solved.coefficients - target * self._weight
         states = None
-        if goes_on.any() and self.moved_by_states:
+        if self.moved_by_states and (goes_on.any() or len(residual) >= self._width):
             states = (residual, *self.by_states(family, params, w, *args), goes_on)
-        scores = uncertainty.scores(slopes, *states) if states else None
+        scores = uncertainty.scores(slopes, *states) if states and goes_on.any() else None
         noise = self._noise(size, larger, data, states) if larger is not None else None
         return uncertainty.root(
             train,
