@@ -61,3 +61,12 @@ def test_rows_of_roundoff_and_far_steps_of_large_errors_are_not_judged(relative,
     for cell, expected in zip(cells(found), judged, strict=False):
         assert cell == expected if isinstance(expected, str) else isinstance(cell, expected)
     assert (cells(found)[-1] == "large") == (relative == 0.06)
+
+
+@pytest.mark.parametrize(("outside", "decided"), [(0, True), (3, False), (5, True)])
+def test_chance_decides_within_one_standard_error_only(outside, decided):
+    """Of twenty data sets none, three or five lie outside: 100, 85 ± 8, 75 ± 10 %."""
+    found = row(data_sets(20, lambda k: 3.0 if k < outside else 0.01))
+    assert [cell.decided for cell in cells(found) if isinstance(cell, Cell)] == (
+        [decided] * (len(STEPS) - (outside > 0))
+    )
