@@ -29,7 +29,7 @@ from gfnn_jax.families.expressions import (
     to_text,
     with_leaves,
 )
-from gfnn_jax.families.friction import DRY, LINEAR, STRIBECK
+from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, STRIBECK
 from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
 from gfnn_jax.maps.observation import observed
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, places
@@ -140,6 +140,26 @@ def with_fading(fit: LawFit) -> LawFit:
         found: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 0.01})
         fit = of(found.x) if found.fun < fit.fitted.cost else fit
     return fit if fit is begun else fit.again()
+
+
+def with_viscous_as_it_fades(fit: LawFit) -> LawFit:
+    """The fit with linear friction in place of quadratic beside Stribeck's, or the other way round,
+    where it is likelier with the speed over which that fades then: at the speed that suits one of
+    them the other is not."""
+    viscous = {LINEAR: QUADRATIC, QUADRATIC: LINEAR}
+    for row in fit.structure.friction:
+        along = [one[1] for one in fit.structure.friction if one[0] == row[0]]
+        if row[1] not in viscous or viscous[row[1]] in along or STRIBECK not in along:
+            continue
+        known = {**fit.values, ("loss", (row[0], viscous[row[1]], 0.0)): 0.0}
+        turned = tuple(
+            (row[0], viscous[row[1]], 0.0) if one == row else one for one in fit.structure.friction
+        )
+        structure = dataclasses.replace(fit.structure, friction=turned)
+        other = with_fading(fit.again(structure, known, rescale=False))
+        if other.follows and other.criterion(fit.independent) < fit.criterion():
+            fit = other
+    return fit
 
 
 def with_a_shape(fit: LawFit) -> LawFit:

@@ -43,6 +43,7 @@ from gfnn_jax.models.lagrangians.rivals import (
     with_constant,
     with_fading,
     with_likeliest_power,
+    with_viscous_as_it_fades,
 )
 from gfnn_jax.models.lagrangians.starts import OPTIONS, best_start, leading, misfit
 from gfnn_jax.models.lagrangians.structure import (
@@ -444,6 +445,9 @@ class TermSearch:
         else:
             if options.choose_friction:
                 fit, choice = likeliest(tried)
+        if options.choose_friction:
+            fit = with_viscous_as_it_fades(fit)
+            frictions = self._may_rub(fit)
         rows = fit.structure.friction
         if set(choice.rows) != set(rows):
             choice = chosen(table_of(fit, frictions), options.choose_friction, rows=rows)
