@@ -37,7 +37,12 @@ from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.libraries import central, textbook
 from gfnn_jax.models.lagrangians.recordings import samples_of
-from gfnn_jax.models.lagrangians.rivals import of_a_sensor, other_powers, with_likeliest_power
+from gfnn_jax.models.lagrangians.rivals import (
+    of_a_sensor,
+    other_powers,
+    with_likeliest_power,
+    with_viscous_as_it_fades,
+)
 from gfnn_jax.models.lagrangians.search import search, search_on
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.text import Names, speed_names, terms_of
@@ -525,9 +530,10 @@ def test_stribecks_friction_is_found_with_the_speed_over_which_it_fades():
         assert abs(term.coefficient - expected) < 4 * term.std
 
 
-def test_errors_of_stribecks_friction_hold_that_of_the_speed_over_which_it_fades():
-    """Against the change of fits with other speeds, whose error is that by the least cost."""
-    width, t = 0.3, np.arange(0, 20, 0.05)
+def fading(viscous, width=0.3, by=1.0):
+    """A fit of a body on a spring that dry friction stops which falls with speed, with a kind of
+    viscous friction, and ``by`` times the width."""
+    t = np.arange(0, 20, 0.05)
 
     def rates(_, z):
         falls = 0.03 * np.sign(z[1]) * (1 - np.exp(-abs(z[1]) / width))
@@ -536,15 +542,28 @@ def test_errors_of_stribecks_friction_hold_that_of_the_speed_over_which_it_fades
     x = solve_ivp(rates, (0, 20), [1.2, 0], t_eval=t, rtol=1e-8, max_step=0.05).y[0]
     x = x + 1e-4 * np.random.default_rng(4).normal(size=len(t))
     problem = samples_of(gfnn.Recording({"t": t, "x": x}, positions=["x"])).problem
+    friction = (((1,), viscous, 0.0), ((1,), DRY, 0.1), ((1,), STRIBECK, width * by))
+    known = {("term", ((0,), (2,), (0,), 0.0)): -0.5}
+    losses = [("loss", row) for row in friction]
+    known |= dict(zip(losses, (0.02, 0.05, -0.03), strict=True))
+    law = Structure(1, tuple(textbook(1, ())), friction)
+    return problem.fit(law, known, problem.arcs(2.0), problem.scales.sigma)
+
+
+def test_viscous_friction_beside_stribecks_is_judged_with_the_speed_that_suits_it():
+    found = with_viscous_as_it_fades(fading(QUADRATIC, by=0.7))
+    assert [row[1] for row in found.structure.friction] == [LINEAR, DRY, STRIBECK]
+    assert found.structure.friction[-1][2] == pytest.approx(0.3, rel=0.1)
+
+
+def test_errors_of_stribecks_friction_hold_that_of_the_speed_over_which_it_fades():
+    """Against the change of fits with other speeds, whose error is that by the least cost."""
+    fit = fading(LINEAR)
+    linear, dry, (direction, kind, width) = fit.structure.friction
 
     def law(by):
-        friction = (((1,), LINEAR, 0.0), ((1,), DRY, 0.1), ((1,), STRIBECK, width * by))
-        return Structure(1, tuple(textbook(1, ())), friction)
-
-    known = {("term", ((0,), (2,), (0,), 0.0)): -0.5}
-    losses = [("loss", row) for row in law(1.0).friction]
-    known |= dict(zip(losses, (0.02, 0.05, -0.03), strict=True))
-    fit = problem.fit(law(1.0), known, problem.arcs(2.0), problem.scales.sigma)
+        turned = (linear, dry, (direction, kind, width * by))
+        return dataclasses.replace(fit.structure, friction=turned)
 
     def other(by):
         known = dict(zip(law(by).keys(), fit.p, strict=True))
