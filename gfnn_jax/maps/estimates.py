@@ -488,13 +488,17 @@ def _with_zeros(
     near: (B, L, K) covariance of the rows' values with the zeros, those of the k channels first.
     variance: of the zeros, in units of σ². Of c = ``near``, rows J for the first state and r of the
     residuals, and P = (JᵀJ)⁻¹: the zeros are cᵀr, their covariance is that of no samples less
-    cᵀc − cᵀJ P Jᵀc, and with the first state −P Jᵀc.
+    cᵀc − cᵀJ P Jᵀc, and with the first state −P Jᵀc. Where derivatives overflow it is 1e100 of
+    each, as `Fitted.last_covariance` has it.
     """
     (lanes, length, rows), k = near.shape, len(sigma)
     c = (near[..., None] * np.eye(rows)).reshape(lanes, length * rows, rows)[..., :k]
-    J, r = found.rows[..., :-1], found.rows[..., -1:]
+    known = np.isfinite(found.rows.sum(axis=(1, 2)) + found.transports.sum(axis=(1, 2)))
+    finite = known[:, None, None]
+    J, r = np.split(np.where(finite, found.rows, 0.0), [-1], axis=-1)
     Q, R = np.linalg.qr(J)
-    root, own = found.transports @ np.linalg.pinv(R), Q.swapaxes(1, 2) @ c
+    root = np.where(finite, found.transports, 0.0) @ np.linalg.pinv(R)
+    own = Q.swapaxes(1, 2) @ c
     across = -root @ own * sigma
     open_ = variance * np.eye(k) - c.swapaxes(1, 2) @ c + own.swapaxes(1, 2) @ own
     covariance = np.block(
@@ -503,6 +507,7 @@ def _with_zeros(
             [across.swapaxes(1, 2), sigma[:, None] * open_ * sigma],
         ]
     )
+    covariance[~known] = 1e100 * np.eye(covariance.shape[1])
     zeros = (c.swapaxes(1, 2) @ r)[..., 0] * sigma
     return np.concatenate([found.x[:, -1], zeros], axis=1), covariance
 
