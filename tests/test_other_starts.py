@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
+from gfnn_jax.maps.estimates import _with_zeros
 from gfnn_jax.models.lagrangians.structure import SINE, Structure
 from gfnn_jax.solve.latent_arcs import Fitted
 
@@ -253,6 +254,20 @@ def test_a_state_whose_derivatives_overflow_is_not_known():
     known, unknown = fitted.last_covariance()
     np.testing.assert_allclose(known, np.diag([0.25, 0.0625]))
     np.testing.assert_array_equal(unknown, 1e100 * np.eye(2))
+
+
+def test_a_state_whose_derivatives_overflow_is_not_known_with_zeros_that_wander_either():
+    rows = np.tile([[2.0, 0.0, 0.3], [0.0, 4.0, -0.1]], (2, 1, 1))
+    rows[1, 0, 0] = np.inf
+    fitted = Fitted(
+        **dict.fromkeys([field.name for field in dataclasses.fields(Fitted)], np.zeros(0))
+        | {"rows": rows, "transports": np.tile(np.eye(2), (2, 1, 1)), "x": np.ones((2, 1, 2))}
+        | {"cost": 0.0, "iterations": 0, "converged": True}
+    )
+    states, covariance = _with_zeros(fitted, np.full((2, 2, 1), 0.1), 0.5, np.ones(1))
+    assert np.isfinite(states).all()
+    np.testing.assert_allclose(covariance[0, :2, :2], np.diag([0.25, 0.0625]))
+    np.testing.assert_array_equal(covariance[1], 1e100 * np.eye(3))
 
 
 def test_the_zero_of_an_angle_takes_the_place_of_its_sine():
