@@ -539,7 +539,9 @@ def without_degeneracies(fit: LawFit) -> LawFit:
 
 
 def _leaves_little_more(less: LawFit, fit: LawFit) -> bool:
-    """Return whether a fit of fewer coefficients leaves little more than one."""
+    """Return whether a fit of fewer coefficients leaves little more than one, along orbits."""
+    if not less.follows:  # residuals of states that are no orbit tell nothing
+        return False
     rise = np.max(np.log(np.maximum(less.rms(), 1e-300) / np.maximum(fit.rms(), 1e-300)))
     return bool(fit.independent * rise < fit.problem.options.evidence.significant**2)
 
@@ -560,7 +562,7 @@ def with_equal_masses(fit: LawFit, least: float = np.inf) -> LawFit:
         return free
     equal = free.again(dataclasses.replace(free.structure, held=held))
     stands = _leaves_little_more(equal, free)
-    stands |= equal.loudest < OPTIONS.noise and not free.is_definite
+    stands |= equal.follows and equal.loudest < OPTIONS.noise and not free.is_definite
     return equal if stands else free
 
 
