@@ -168,7 +168,7 @@ def hard_and_easy(count, seed=0):
     return theta, guess
 
 
-@pytest.mark.parametrize("count", [1, 33, 3_000])
+@pytest.mark.parametrize("count", [1, pytest.param(33, marks=pytest.mark.slow), 3_000])
 def test_lanes_that_are_taken_out_of_a_batch_end_as_they_do_alone(count):
     """Compare gathered lanes with the loop in which all wait for the last: no lane is forgotten,
     mixed up, or led elsewhere."""

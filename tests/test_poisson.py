@@ -184,7 +184,7 @@ def swings(amplitudes, sigma, rate=np.sin):
     return pairs_of(runs_of(law, starts, 0.1, 300, noise=sigma))
 
 
-@pytest.mark.parametrize("sigma", [0.0, 0.1])
+@pytest.mark.parametrize("sigma", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_a_sinusoid_of_one_amplitude_is_of_several_laws(sigma):
     fit = gfnn.fit(swings([1.0, 1.0, 1.0], sigma, rate=lambda x: 1.69 * x))
     assert [t.term for t in fit.law.terms] == ["z1²", "z2²"]

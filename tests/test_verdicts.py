@@ -178,7 +178,7 @@ def test_a_small_unrecorded_force_leaves_the_gain_of_an_input(seed):
     assert abs(found - gain) < max(0.2 * gain, 4 * std)
 
 
-@pytest.mark.parametrize("noise", [1e-5, 1e-3, 0.03])
+@pytest.mark.parametrize("noise", [1e-5, pytest.param(1e-3, marks=pytest.mark.slow), 0.03])
 def test_a_pendulum_is_none_of_these(noise):
     x = orbit(lambda _, z: [z[1], -9 * np.sin(z[0]) - 0.05 * z[1]], [1.2, 0.0])[:, 0]
     x += noise * np.random.default_rng(1).normal(size=len(x))
