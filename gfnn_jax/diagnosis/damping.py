@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -208,7 +209,7 @@ def learn_damping(
     return problem.as_learned(found)
 
 
-def where_areas_differ(jacobians, centres, scale, parameters: tuple[str, ...] = ()) -> str:
+def where_areas_differ(centres, scale, parameters: tuple[str, ...], jacobians) -> str:
     """Along which coordinate the factor of areas differs, as a sentence; "" where along none.
 
     centres: (n, 2d + k), the states at which the Jacobians are, and the ``parameters`` there.
@@ -472,20 +473,22 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
     if may_lose:
         damping = learn_damping(plain, jacobians, error, chart, reversor)
     at = plain.y0 if plain.args is None else np.concatenate([plain.y0, plain.args], axis=1)
-    at = centres(at, jacobians, seed)
-    differing = where_areas_differ(jacobians, at, plain.scale, plain.parameters)
+    differing = partial(
+        where_areas_differ, centres(at, jacobians, seed), plain.scale, plain.parameters
+    )
     if damping is not None:
-        jacobians = damping.undone(jacobians)
-        data = plain = plain.without(None, damping.piece)
-        if data_defect(jacobians, data.scale) > OPTIONS.errors * error:
-            unknown = " No coordinate tells where by itself"
-            damping = dataclasses.replace(damping, differs=differing or unknown)
+        undone = damping.undone(jacobians)
+        if data_defect(undone, plain.scale) > OPTIONS.errors * error:
+            where = differing(jacobians) or " No coordinate tells where by itself"
+            damping = dataclasses.replace(damping, differs=where)
+        jacobians, plain = undone, plain.without(None, damping.piece)
+        data = plain
     elif not look_symplectic(jacobians, error, plain.scale):
         messages.append(
             f"{NOT_SYMPLECTIC}: ‖MᵀJM − J‖ is {defect:.2g} ± {error:.1g} (M: local "
             "Jacobians, coordinates in units of their spread) where a symplectic map has 0. Check "
             "the order q1…qd, p1…pd, and look for friction or a drive. If p are velocities, learn "
-            f"the law of a recording (--positions, --velocities; gfnn.Recording).{differing}"
+            f"the law of a recording (--positions, --velocities; gfnn.Recording).{differing(jacobians)}"
         )
     charts = choose_charts(chart, data, reversor, jacobians)
     if charts.half is not None:

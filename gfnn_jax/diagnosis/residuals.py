@@ -210,7 +210,7 @@ def _by_friction(images, residual, angles) -> tuple[float, float] | None:
     inverse = np.linalg.pinv(design, rcond=1e-10)
     target = (residual / size).ravel()
     left = (target - design @ (inverse @ target)).reshape(count, width)
-    own = inverse[-(width // 2) :] / norms[:, None]
+    own = inverse[-(width // 2) :] / np.where(norms > 0, norms, np.inf)[:, None]
     weights = own.sum(axis=0).reshape(count, width)
     rho, scores = float(np.sum(weights.ravel() * target)), np.sum(weights * left, axis=1)
     freedom = max(1.0 - design.shape[1] / design.shape[0], 0.1)
