@@ -373,6 +373,16 @@ def test_noise_is_not_learned(noisy_fit):
     assert "no more accurate" in noisy_fit.ended
 
 
+def test_a_law_that_explains_less_than_half_of_the_steps_is_none():
+    """A harmonic law of a pendulum, and the same error beside steps that are hardly larger."""
+    model = gfnn.Hamiltonian(terms=["p1**2", "q1**2"])
+    found = quiet_fit(pendulum_pairs(300), model=model).found
+    assert found.verdict.startswith("partly: ")
+    z0 = found.pairs.z0
+    pairs = gfnn.Pairs(z0, z0 + 1.2 * found.chosen.deviations, 0.4)
+    assert dataclasses.replace(found, pairs=pairs).verdict.startswith("no law: ")
+
+
 def test_noise_is_told_in_the_units_of_each_coordinate(noisy_pairs, noisy_fit):
     """The choice, and whether there is noise, do not depend on units; how much is in those."""
     unit = np.array([1e9, 1e-9])

@@ -48,6 +48,7 @@ class _Options:
     # Noise in a step, of the spread, under which laws differ by less than it: `benchmarks/laws.py`
     hides: float = 0.2
     states: int = 4_096  # about: at which H is compared
+    explains: float = 0.5  # of the squares of steps, under which it is no law
 
 
 _OPTIONS = _Options()
@@ -163,6 +164,8 @@ class Choice:
         if law is None:
             return "map" if self.met else f"map: {missed}"
         if not (self.met or self.white):
+            if (share := max(0.0, self._explained)) < _OPTIONS.explains:
+                return f"no law: the best explains {share:.0%} of the squares of steps: {missed}"
             return f"partly: {missed}"
         # Sums over sites have terms that vanish or add up to nothing, whatever the data.
         if law.null_terms and not isinstance(law.flow.family, Sums):
@@ -179,6 +182,20 @@ class Choice:
         if rivals:
             return f"one of several: {'; '.join(rivals)} is as likely"
         return f"one of several: {ONE_LEVEL}" if self._on_one_level(law) else "identified"
+
+    @property
+    def _explained(self) -> float:
+        """The share of the squares of z1 − z0, in units of their spread, that is no error; 1 where
+        there are no pairs."""
+        if self.pairs is None:
+            return 1.0
+        size = np.std(self.pairs.z0, axis=0)
+        moved = np.mean((self.pairs.z1 - self.pairs.z0) ** 2, axis=0)
+        left, whole = (
+            float(np.sum(square[size > 0] / size[size > 0] ** 2))
+            for square in (self.chosen.deviations**2, moved)
+        )
+        return 1 - left / whole
 
     def _on_one_level(self, law: LearnedHamiltonian) -> bool:
         """Return whether all states of noisy sequences are of one H."""
@@ -292,8 +309,9 @@ class Fit:
     @property
     def verdict(self) -> str | None:
         """Verdict of the data, ``KIND`` or ``KIND: reason``. KIND is identified, one of several,
-        partly, or map, of a generated map without a law; no law and not mechanical are those of a
-        `FitError`. None where a folder holds none."""
+        partly, no law, of one that explains less than half of the steps, or map, of a generated map
+        without a law; no law and not mechanical are those of a `FitError` too. None where a folder
+        holds none."""
         verdict = self.stored.get("verdict", None if self.found is None else self.found.verdict)
         return None if verdict is None else said(verdict)
 
