@@ -181,6 +181,8 @@ def test_a_pendulum_on_a_pendulum_is_told_by_the_first(tmp_path):
     for name, value in (("cos(theta_seen)", g), ("cos(theta_hidden)", g * c)):
         assert values[name] == pytest.approx(value, rel=0.02)
     assert "theta_hidden is a pendulum on theta_seen" in fit.law.gauge
+    started = fit.law.map.sensors.observation.hidden.states(t[seen], q[0, seen])[0]
+    assert np.mean(np.abs(started[:, 1] - true[1, seen])) < 0.3 * true[1].std()
     fit.save(tmp_path / "law")
     ahead = gfnn.load(tmp_path / "law").map.forecast(recording, t[~seen])
     off = ahead.values["theta"][0] - true[0, ~seen]

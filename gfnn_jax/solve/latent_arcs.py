@@ -259,7 +259,7 @@ class Readings:
         known, curved = np.where(measured, self.y, 0.0), self.curved and len(p) > 0
         data = _Data(self.model, measured, known, least, tolerance, curved)
         here = data.at(p, x, _Units(self.sigma, state_scale, self.loss, self.whitening))
-        start = _AtStates(data, here, here)
+        start = _AtStates(data, here, here, np.arange(len(x)))
         if not np.isfinite(here.cost):
             return start.fitted(0, converged=False)
         found = descended(start, _DAMPING, max_iterations)
@@ -365,7 +365,8 @@ class _Data(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _AtStates:
-    """The problem of all arcs where a descent stands, and the best iterate that it came by.
+    """The problem of all arcs where a descent stands, the best iterate that it came by, and which
+    arcs are ``moving`` (indices): of those that share nothing, the ones that have not settled.
 
     While defects matter a step has to close them; then it has to lower the cost.
     """
@@ -373,6 +374,12 @@ class _AtStates:
     data: _Data
     here: _Iterate
     best: _Iterate
+    moving: np.ndarray
+
+    @property
+    def _apart(self) -> bool:
+        """Whether arcs share nothing, neither coefficients nor noise."""
+        return not len(self.here.p) and self.data.least is None
 
     @cached_property
     def _rows(self) -> _Rows:
@@ -386,6 +393,8 @@ class _AtStates:
         """A step of p and x; each that failed halves the next. Where it fails, or arcs share no p,
         each arc halves its own: one that is hard to follow holds back no other."""
         here, share = self.here, 0.5**failures
+        if self._apart:
+            return self._each()
         if not np.isfinite(self._rows.factor).all():  # derivatives along an arc have overflowed
             return Tried(here, -np.inf, damping, hopeless=True)
         dp, dx = _solve(self._rows, here.defects, damping)
@@ -400,6 +409,17 @@ class _AtStates:
                 there, stays = self._begun_anew(there, stays)
                 decrease = self._decrease(there, share, stays)
         return Tried(there, decrease, damping)
+
+    def _each(self) -> Tried:
+        """A step of arcs that share nothing, each as far as is best for it."""
+        here, arcs = self.here, self.moving
+        if not len(arcs):
+            return Tried(here, -np.inf, 0.0, hopeless=True)
+        defects, dx = Defects(*(part[arcs] for part in here.defects)), np.zeros_like(here.x)
+        dx[arcs] = _solve(_reduced(here, arcs), defects, 0.0)[1]
+        there = self.data.moved(here, arcs, here.x[arcs] + dx[arcs])
+        there, _ = self._alone(there, 1.0, dx)
+        return Tried(there, np.sum(here.merits - there.merits), 0.0, hopeless=True)
 
     def _curved(self, dp: np.ndarray, dx: np.ndarray, damping: float) -> Tried:
         """The end of a whole step that bends, or of the straight one where it would bend by more
@@ -442,7 +462,8 @@ class _AtStates:
             if not len(worse):
                 break
             x = here.x[worse] + share * part * dx[worse] if part else here.x[worse]
-            other = self.data.moved(there, worse, x)
+            back = not part and not len(here.p)
+            other = here if back else self.data.moved(there, worse, x)
             better = (left(other)[worse] < now[worse]) | ~np.isfinite(now[worse])
             there = self.data.mixed(there, other, worse[better])
             if of_gaps and part == 0:
@@ -467,6 +488,13 @@ class _AtStates:
         """The problem at the end of a step, in units of the noise that its residuals tell; settled
         where it gained little and, where the noise is estimated, that is the same."""
         before, best, least = self.here, self.best, self.data.least
+        if self._apart:
+            gained, most = before.merits - there.merits, OPTIONS.closed**2 * there.x[0].size
+            cost = before.merits - before.gaps / OPTIONS.defect**2
+            ended = np.maximum(before.gaps, there.gaps) <= most
+            ended &= gained <= self.data.tolerance * cost
+            moving = self.moving[~(ended | (gained <= 0))[self.moving]]
+            return _AtStates(self.data, there, there, moving), bool(ended.all())
         settled = self.closed(before) and self.closed(there)
         settled &= before.merit - there.merit <= self.data.tolerance * before.cost
         here = there
@@ -476,7 +504,8 @@ class _AtStates:
             settled &= bool(np.allclose(here.units.sigma, sigma, rtol=OPTIONS.settled, atol=0))
         elif self.closed(here) and (not self.closed(best) or here.merit < best.merit):
             best = here
-        return _AtStates(self.data, here, best), settled or not np.isfinite(here.cost)
+        settled |= not np.isfinite(here.cost)
+        return dataclasses.replace(self, here=here, best=best), settled
 
     def fitted(self, iterations: int, converged: bool) -> Fitted:
         """The fit that ends here."""
@@ -515,7 +544,7 @@ class _Units(NamedTuple):
     loss: Loss
     whitening: np.ndarray | None = None
 
-    def white(self, rows: np.ndarray, block: slice = slice(None)) -> np.ndarray:
+    def white(self, rows: np.ndarray, block: slice | np.ndarray = slice(None)) -> np.ndarray:
         """Rows (a, L, k, ...) of a block of arcs, mixed along each arc into white ones."""
         if self.whitening is None:
             return rows
@@ -638,14 +667,18 @@ class _Rows(NamedTuple):
         return self.factor[:, :-1]
 
 
-def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
+def _reduced(
+    at: _Iterate, arcs: np.ndarray | None = None, *, leverage: bool = False
+) -> _Rows:
+    """Rows of these arcs (indices), of all unless given."""
     num_arcs, length, k, m = at.observed.by_state.shape
+    num_arcs = num_arcs if arcs is None else len(arcs)
     n = at.observed.by_coefficients.shape[-1]
     size = max(1, OPTIONS.block_bytes // (8 * length * max(k, m) * (m + n + 1)))
     factor, parts = np.zeros((0, n + 1)), []
     for first in range(0, num_arcs, size):
         block = slice(first, first + size)
-        J, last = _linearised(at, block)
+        J, last = _linearised(at, block if arcs is None else arcs[block])
         R = np.asarray(np.linalg.qr(J, mode="r"))
         rest = R[:, m:, m:]
         stack = np.concatenate([factor, rest.reshape(-1, n + 1)])
@@ -661,7 +694,7 @@ def _reduced(at: _Iterate, *, leverage: bool = False) -> _Rows:
     return _Rows(arcs, factor, scores, *others)
 
 
-def _linearised(at: _Iterate, block: slice) -> tuple[np.ndarray, np.ndarray]:
+def _linearised(at: _Iterate, block: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weighted rows (a, L k, m + n + 1) of [δx_0, δp, r] of these arcs, and δx_{L−1}
     (a, m, m + n + 1) by δx_0, by δp, and by the defects before it."""
     defects = Defects(*(part[block] for part in at.defects))

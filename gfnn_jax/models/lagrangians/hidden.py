@@ -196,8 +196,10 @@ def search_hidden(problem: ArcProblem) -> SearchResult:
     best = min(found, key=misfit)
     fewer = partial(TermSearch(best.structure, None).prune, best)
     fit = within(contextlib.nullcontext(), fewer) or best
-    freed = dataclasses.replace(fit.problem, allowance=problem.allowance)
-    fit = dataclasses.replace(fit, problem=freed)
+    sensor = _following(fit)
+    observation = dataclasses.replace(fit.problem.observation, formulas=(sensor,))
+    freed = {"allowance": problem.allowance, "observation": observation}
+    fit = dataclasses.replace(fit, problem=dataclasses.replace(fit.problem, **freed))
     choice = FrictionChoice(fit.structure.friction, {}, {}, False)
     ended = _spent(cap) and (
         f"the search ended{_spent(cap)}: terms that the record does not show may be left in the law"
@@ -218,6 +220,18 @@ def _from(problem: ArcProblem, found: Oscillations) -> ArcProblem:
     periods = tuple(slow * n for n in OPTIONS.periods)
     options = dataclasses.replace(problem.options, periods=periods)
     return dataclasses.replace(problem, observation=observation, options=options)
+
+
+def _following(fit: LawFit) -> Hidden:
+    """The sensor whose states start as the orbits of a fit have them, by least squares."""
+    sensor, (rest,), rows = _sensor_of(fit.problem), fit.sensors, []
+    for n in fit.problem.nodes:
+        found = sensor.oscillations.parts(n.t, n.y[:, 0] - rest)
+        own = np.split(n.x, 2, axis=1)
+        rows += [np.concatenate(pair, axis=1) for pair in zip(found, own, strict=True)]
+    known, shown = np.split(np.concatenate(rows), 2, axis=1)
+    shapes = np.linalg.lstsq(known, shown)[0]
+    return dataclasses.replace(sensor, shapes=tuple(map(tuple, shapes.tolist())))
 
 
 def _sensor_of(problem: ArcProblem) -> Hidden:
