@@ -378,7 +378,7 @@ class _AtStates:
 
     @property
     def _apart(self) -> bool:
-        """Whether arcs share nothing, neither coefficients nor noise."""
+        """Return whether arcs share nothing, neither coefficients nor noise."""
         return not len(self.here.p) and self.data.least is None
 
     @cached_property
@@ -390,8 +390,8 @@ class _AtStates:
         return at.gap <= OPTIONS.closed * math.sqrt(self.here.x.size)
 
     def tried(self, damping: float, failures: int) -> Tried:
-        """A step of p and x; each that failed halves the next. Where it fails, or arcs share no p,
-        each arc halves its own: one that is hard to follow holds back no other."""
+        """A step of p and x; each that failed halves the next. Where it fails, each arc halves its
+        own: one that is hard to follow holds back no other."""
         here, share = self.here, 0.5**failures
         if self._apart:
             return self._each()
@@ -402,7 +402,7 @@ class _AtStates:
             return self._curved(dp, dx, damping)
         there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
         decrease = self._decrease(there, share, np.zeros(len(here.x), bool))
-        if (len(here.x) > 1 and not len(here.p)) or not decrease > 0:
+        if not decrease > 0:
             there, stays = self._alone(there, share, dx)
             decrease = self._decrease(there, share, stays)
             if not decrease > 0 and stays.any():
@@ -667,9 +667,7 @@ class _Rows(NamedTuple):
         return self.factor[:, :-1]
 
 
-def _reduced(
-    at: _Iterate, arcs: np.ndarray | None = None, *, leverage: bool = False
-) -> _Rows:
+def _reduced(at: _Iterate, arcs: np.ndarray | None = None, *, leverage: bool = False) -> _Rows:
     """Rows of these arcs (indices), of all unless given."""
     num_arcs, length, k, m = at.observed.by_state.shape
     num_arcs = num_arcs if arcs is None else len(arcs)
