@@ -53,17 +53,8 @@ def gfnn(*arguments):
 
 
 def predict(model, out, *more, num_steps=50):
-    return gfnn(
-        "predict",
-        model,
-        "--initial",
-        model.parent / "z0.npy",
-        "--num-steps",
-        num_steps,
-        "--out",
-        out,
-        *more,
-    )
+    initial = ("--initial", model.parent / "z0.npy")
+    return gfnn("predict", model, *initial, "--num-steps", num_steps, "--out", out, *more)
 
 
 def files(folder):

@@ -143,12 +143,6 @@ def test_the_papers_schedule(recipe):
         assert float(rate) == pytest.approx(first * 0.95 ** (k // 100), rel=1e-12)
 
 
-def test_the_papers_recipe():
-    assert (PAPER.batch_size, PAPER.epochs, PAPER.dtype) == (200, 20, "float32")
-    assert PAPER_STANDARD_MAP.batch_size == 1000
-    assert PAPER.epoch_length is None
-
-
 @pytest.mark.parametrize("recipe", [DEFAULT, QUICK])
 def test_the_cosine_rises_and_falls(recipe):
     rates = np.asarray(jax.vmap(lambda k: recipe.rate_at(k, 1000))(np.arange(1000.0)))

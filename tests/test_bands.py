@@ -111,19 +111,6 @@ def test_directions_that_no_row_tells_are_not_sampled():
 
 
 @pytest.mark.slow
-def test_noise_leaves_the_six_terms_of_the_law(told_nothing):
-    scene, fit = told_nothing
-    assert fit.chosen.num_parameters == 6
-    np.testing.assert_allclose(fit.noise, NOISE, rtol=0.1)
-    z0 = np.asarray(gfnn.sample_test_states(scene, 50, jax.random.key(9)))
-    reference = np.asarray(gfnn.reference_trajectories(scene, z0, 100))
-    error = np.asarray(fit.map.rollout(z0, 100)[0]) - reference
-    rms = np.sqrt(np.mean(error**2, axis=(0, 2)))
-    assert rms[1] < 3e-5
-    assert rms[100] < 6e-4
-
-
-@pytest.mark.slow
 def test_bands_hold_the_true_error_of_a_noisy_law(noisy):
     scene, fit = noisy
     z0 = np.asarray(gfnn.sample_test_states(scene, 30, jax.random.key(9)))

@@ -9,7 +9,6 @@ import gfnn_jax as gfnn
 from gfnn_jax.brackets import Bracket
 from gfnn_jax.errors import FitError
 from gfnn_jax.models.brackets.algebra import analysed, changed
-from gfnn_jax.models.brackets.beside import Beside
 from gfnn_jax.models.brackets.find import sparse_rows
 from gfnn_jax.models.brackets.search import Data, law_of
 from gfnn_jax.phase_space import sizes
@@ -77,20 +76,6 @@ def learned(field, starts, dt=0.2, steps=20, noise=0.0):
     return law_of(data.take(~held), data.take(held), names), starts
 
 
-def test_a_moment_that_differs_from_run_to_run():
-    def rates(z):  # the moment is one more state
-        return np.append(cross(z, (0.5 * z[0], 0.7 * z[1], z[2] / z[3])), 0 * z[:1], axis=0)
-
-    rng = np.random.default_rng(0)
-    starts = np.column_stack([rng.normal(size=(20, 3)), rng.uniform(0.5, 1.5, 20)])
-    data = runs_of(rates, starts, 0.2, 20)
-    data = data._replace(beside=Beside(("m",), data.z0[:, 3:]))
-    law = law_of(data.take(data.run < 16), data.take(data.run >= 16), ("a", "b", "c"))
-    assert law.bracket.blocks == ("so3",)
-    assert law.field.library.term_names == ("b²", "c²", "c² (1/m)")  # H less L² / 4
-    assert law.error < 1e-13
-
-
 def field_error(law, field, states):
     reference = field(states.T).T
     off = law.field.rate(law.fit.c, states) - reference
@@ -114,11 +99,6 @@ def test_brackets_of_clean_pairs(name):
     assert law.name == name
     assert field_error(law, field, draw(rng)) < 5e-14
     assert law.error < 1e-12
-
-
-def test_several_brackets_are_said_to_be():
-    law, _ = learned(top, np.random.default_rng(0).normal(size=(16, 3)))
-    assert "one of a family of 2 brackets" in " ".join(law.notes)
 
 
 @pytest.mark.slow
@@ -147,14 +127,6 @@ def test_noisy_sequences():
     assert law.name == "so(3)"
     assert law.sigma == pytest.approx(np.full(3, 1e-3), rel=0.15)
     assert field_error(law, top, rng.normal(size=(50, 3))) < 3e-3
-
-
-def test_a_known_bracket():
-    data = runs_of(populations, np.random.default_rng(0).uniform(0.5, 1.5, (20, 4)), 0.2, 20)
-    known = Bracket.log([[0, 1, 0, -0.9], [-1, 0, 0.7, 0], [0, -0.7, 0, 1.3], [0.9, 0, -1.3, 0]])
-    law = law_of(data.take(slice(100, None)), data.take(slice(100)), known.labels, bracket=known)
-    assert law.error < 1e-12
-    assert law.field.library.num_parameters == 8
 
 
 def test_no_bracket_is_claimed_where_there_is_none():

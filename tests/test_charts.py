@@ -24,7 +24,6 @@ EVERY = pytest.mark.parametrize(
     [*CHARTS.values(), pytest.param(SKEW, marks=pytest.mark.slow)],
     ids=lambda chart: chart.name,
 )
-NEAR_IDENTITY = [TYPE2, TYPE3, MIDPOINT, SKEW]
 DT, BATCH = 0.3, 16
 
 
@@ -168,33 +167,6 @@ def test_derivatives_of_step_and_rollout_in_state_and_parameters(chart):
     np.testing.assert_allclose((above - below) / (2 * step), forward, rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_second_derivative_through_the_step():
-    piece = random_piece(random_params(MIDPOINT), MIDPOINT)
-
-    @jax.jit
-    def derivatives(z):
-        def position(z):
-            return piece.step(z[None])[0][0, 0]
-
-        return jax.grad(position)(z), jax.hessian(position)(z)
-
-    z, step = STATES[0, :2], 1e-5
-    hessian = derivatives(z)[1]
-    ends = np.stack(
-        [derivatives(z + move)[0] for move in step * np.vstack([np.eye(2), -np.eye(2)])]
-    )
-    np.testing.assert_allclose(hessian, (ends[:2] - ends[2:]) / (2 * step), rtol=0, atol=1e-8)
-    np.testing.assert_allclose(hessian, hessian.T, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("chart", NEAR_IDENTITY, ids=lambda chart: chart.name)
-def test_reverse_is_minus_skew_and_minus_dt(chart):
-    back, dt = chart.reverse(DT)
-    assert (back.skew, dt) == (-chart.skew, -DT)
-    assert back.reverse(dt) == (chart, DT)
-
-
 # Oracles: S := H.
 
 
@@ -247,27 +219,6 @@ def test_types_2_and_3_of_a_separable_hamiltonian_are_symplectic_euler():
     third = images(generated(separable, 1.0, TYPE3, 0.4), z.T)
     moved = q + 0.4 * p
     np.testing.assert_allclose(third, np.stack([moved, p - 0.4 * np.sin(moved)], 1), atol=1e-15)
-
-
-def test_midpoint_rule_is_of_second_order():
-    start, time = np.array([0.1, -0.2, 0.3, 0.25]), 1.6
-    reference = scipy.integrate.solve_ivp(
-        lambda t, z: henon_heiles_field(z),
-        (0, time),
-        start,
-        method="DOP853",
-        rtol=1e-13,
-        atol=1e-14,
-    ).y[:, -1]
-    counts, errors = np.array([8, 16, 32]), []
-    for count in counts:
-        piece, z = generated(henon_heiles, None, MIDPOINT, time / count, 2), np.tile(start, (5, 1))
-        for _ in range(count):
-            z = stepped(piece, z)[0]
-        errors.append(np.linalg.norm(np.asarray(z)[0] - reference))
-    assert min(errors) > 1e-6  # far above roundoff
-    slope = -np.polyfit(np.log(counts), np.log(errors), 1)[0]
-    assert abs(slope - 2) < 0.1
 
 
 @from_function

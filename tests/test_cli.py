@@ -240,61 +240,19 @@ def test_usage_is_refused_before_jax_is_loaded():
 
 
 REPORT_KEYS = {
-    "": {
-        "scene",
-        "dt",
-        "seed",
-        "dtype",
-        "device",
-        "versions",
-        "data",
-        "model",
-        "fit",
-        "map",
-        "hamiltonian",
-        "rollout",
-        "candidates",
-    },
-    "data": {"num_pairs"},
-    "model": {"learns", "family", "chart", "num_parameters", "label"},
-    "fit": {
-        "seconds",
-        "total_seconds",
-        "compile_seconds",
-        "train_rms",
-        "validation_rms",
-        "validation_relative",
-        "tolerance",
-        "tolerance_met",
-        "ended",
-        "operations",
-        "max_operations",
-    },
-    "map": {"symplecticity_defect", "chart_determinant_min", "newton_iterations_max"},
-    "rollout": {
-        "num_trajectories",
-        "num_excluded",
-        "num_steps",
-        "seconds",
-        "microseconds_per_step",
-        "status_counts",
-        "error",
-        "error_median",
-        "growth_exponent",
-        "energy_drift",
-    },
+    "": "scene dt seed dtype device versions data model fit map hamiltonian rollout candidates",
+    "data": "num_pairs",
+    "model": "learns family chart num_parameters label",
+    "fit": "seconds total_seconds compile_seconds train_rms validation_rms validation_relative "
+    "tolerance tolerance_met ended operations max_operations",
+    "map": "symplecticity_defect chart_determinant_min newton_iterations_max",
+    "rollout": "num_trajectories num_excluded num_steps seconds microseconds_per_step "
+    "status_counts error error_median growth_exponent energy_drift",
 }
-CANDIDATE_KEYS = {
-    "learns",
-    "family",
-    "chart",
-    "num_parameters",
-    "validation_rms",
-    "validation_relative",
-    "microseconds_per_step",
-    "fit_seconds",
-    "chosen",
-}
+CANDIDATE_KEYS = (
+    "learns family chart num_parameters validation_rms validation_relative microseconds_per_step "
+    "fit_seconds chosen"
+)
 
 
 def read_report(folder):
@@ -304,8 +262,8 @@ def read_report(folder):
     report = json.loads((folder / "report.json").read_text(), parse_constant=refuse)
     for part, keys in REPORT_KEYS.items():
         found = report[part] if part else report
-        assert (part == "rollout" and found is None) or keys <= set(found)
-    assert all(set(candidate) >= CANDIDATE_KEYS for candidate in report["candidates"])
+        assert (part == "rollout" and found is None) or {*keys.split()} <= set(found)
+    assert all(set(candidate) >= {*CANDIDATE_KEYS.split()} for candidate in report["candidates"])
     assert [c["chosen"] for c in report["candidates"]].count(True) == 1
     law = report["hamiltonian"]
     keys = {"formula", "terms", "friction", "dropped", "search_cut_short"}
@@ -339,7 +297,7 @@ def test_pairs_from_plain_numpy(suffix, num_pairs, tolerance, num_steps, tmp_pat
     if suffix == "npz":
         pairs_file(data, orbits)
     else:
-        csv_file(data, orbits, "sequence,t,q1,q2,p1,p2")
+        csv_file(data, orbits, "sequence,t,q1 [m],q2,p1,p2")
     assert gfnn("fit", data, "--out", tmp_path / "m", "--tolerance", tolerance) == 0
     told = capsys.readouterr()
     assert "midpoint" in told.out
@@ -349,27 +307,15 @@ def test_pairs_from_plain_numpy(suffix, num_pairs, tolerance, num_steps, tmp_pat
     assert report["rollout"] is None
     assert report["scene"] is None
     assert report["data"]["num_pairs"] == num_pairs
+    assert suffix == "npz" or report["data"]["units"] == {"q1": "m"}
     assert report["fit"]["validation_relative"] <= tolerance
     assert report["fit"]["tolerance_met"]
     assert report["map"]["symplecticity_defect"] <= 1e-12
 
     orbits = kepler_orbits(20, DT * np.arange(num_steps + 1), seed=1)
     np.save(tmp_path / "z0.npy", orbits[:, 0])
-    assert (
-        gfnn(
-            "predict",
-            tmp_path / "m",
-            "--initial",
-            tmp_path / "z0.npy",
-            "--num-steps",
-            num_steps,
-            "--save-every",
-            5,
-            "--out",
-            tmp_path / "p.npz",
-        )
-        == 0
-    )
+    steps = ("--num-steps", num_steps, "--save-every", 5, "--out", tmp_path / "p.npz")
+    assert gfnn("predict", tmp_path / "m", "--initial", tmp_path / "z0.npy", *steps) == 0
     with np.load(tmp_path / "p.npz") as predicted:
         assert predicted["dt"] == pytest.approx(DT, rel=1e-13)  # of text: the mean of many steps
         np.testing.assert_array_equal(predicted["steps"], np.arange(0, num_steps + 1, 5))
@@ -378,18 +324,6 @@ def test_pairs_from_plain_numpy(suffix, num_pairs, tolerance, num_steps, tmp_pat
     np.testing.assert_array_equal(trajectories[:, 0], orbits[:, 0])
     error = np.sqrt(np.mean((trajectories - orbits[:, ::5]) ** 2, axis=(0, 2)))
     assert (error <= 3 * tolerance * np.maximum(1, np.arange(0, num_steps + 1, 5))).all()
-
-
-@pytest.mark.slow
-def test_fit_of_csv(tmp_path):
-    sequences = oscillator(60, DT * np.arange(4))
-    data = csv_file(tmp_path / "d.csv", sequences, "sequence,t,q1 [m],p1")
-    assert gfnn("fit", data, "--out", tmp_path / "m", "--chart", "midpoint") == 0
-    report = read_report(tmp_path / "m")
-    assert report["data"]["num_pairs"] == 180
-    assert report["data"]["units"] == {"q1": "m"}
-    assert report["fit"]["tolerance"] == 1e-6
-    assert report["fit"]["validation_rms"] < 1e-12  # a quadratic S is exact
 
 
 @pytest.mark.slow
@@ -469,15 +403,6 @@ def test_parts_tell_the_time_left():
     assert progress._so_far("compiling (about 9 s)", 4.0).endswith("4 s so far, about 5 s left")
     assert progress._so_far("compiling (about 9 s)", 9.0).endswith("9 s so far")
     assert Budget(dim=1).compilation == " (about 3 s)"
-
-
-def test_failing_arithmetic_is_one_line(tmp_path, capsys, monkeypatch):
-    def fail(*args, **kwargs):
-        raise np.linalg.LinAlgError("SVD did not converge")
-
-    monkeypatch.setattr(output, "fit", fail)
-    assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 1
-    assert capsys.readouterr().err.strip().endswith("the fit failed: SVD did not converge")
 
 
 @pytest.mark.parametrize(

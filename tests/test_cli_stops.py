@@ -223,18 +223,8 @@ def test_a_prediction_backwards_comes_back(model, tmp_path, capsys):
         ahead = there["trajectories"][:2]
     np.save(tmp_path / "end.npy", ahead[:, -1])
     with stopped_after(3, interrupt):
-        back = (
-            "predict",
-            model,
-            "--initial",
-            tmp_path / "end.npy",
-            "--num-steps",
-            -40,
-            "--save-every",
-            2,
-            "--out",
-            tmp_path / "back.npz",
-        )
+        back = ("predict", model, "--initial", tmp_path / "end.npy", "--num-steps", -40)
+        back = (*back, "--save-every", 2, "--out", tmp_path / "back.npz")
         assert gfnn(*back) == 130
     assert gfnn(*back, "--resume") == 0
     assert "2 trajectories of 40 steps backwards" in capsys.readouterr().out
@@ -302,22 +292,9 @@ def test_a_changed_model_is_refused(model, tmp_path, capsys):
 def test_killed_predictions_resume(model, tmp_path):
     """Twenty SIGKILLs at random moments of a prediction: the same bits in the end."""
     num_steps = 3_000_000
-    command = [
-        sys.executable,
-        "-m",
-        "gfnn_jax",
-        "predict",
-        model,
-        "--initial",
-        model.parent / "z0.npy",
-        "--num-steps",
-        num_steps,
-        "--save-every",
-        1_000,
-        "--resume",
-        "--out",
-    ]
-    command = [str(c) for c in command]
+    steps = f"--num-steps {num_steps} --save-every 1000 --resume --out"
+    initial = ("--initial", str(model.parent / "z0.npy"))
+    command = [sys.executable, "-m", "gfnn_jax", "predict", str(model), *initial, *steps.split()]
     assert subprocess.run([*command, tmp_path / "whole.npz"], check=False).returncode == 0
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -402,25 +379,10 @@ def test_memory_of_a_long_prediction(lanes, num_steps, save_every, model, tmp_pa
     """Ten million steps of one trajectory, and an output of 2 GB: each within 1 GB of memory."""
     z0, out = tmp_path / "z0.npy", tmp_path / "p.npz"
     np.save(z0, np.random.default_rng(0).uniform(-0.5, 0.5, (lanes, 2)))
-    command = [
-        sys.executable,
-        "-c",
-        MEASURE,
-        sys.executable,
-        "-m",
-        "gfnn_jax",
-        "predict",
-        model,
-        "--initial",
-        z0,
-        "--num-steps",
-        num_steps,
-        "--save-every",
-        save_every,
-        "--out",
-        out,
-    ]
-    done = subprocess.run([str(c) for c in command], check=True, stdout=subprocess.PIPE)
+    own = [sys.executable, "-m", "gfnn_jax", "predict", model, "--initial", z0, "--out", out]
+    steps = ("--num-steps", num_steps, "--save-every", save_every)
+    command = [str(c) for c in (sys.executable, "-c", MEASURE, *own, *steps)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE)
     bytes_per_unit = 1 if sys.platform == "darwin" else 1024
     assert int(done.stdout) * bytes_per_unit < 1e9
     assert out.stat().st_size > lanes * num_steps // save_every * 16

@@ -387,18 +387,6 @@ def moved_alike(one, other):
     np.testing.assert_allclose(moved[0], moved[1], rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_two_processes_fit_one_map(data, undisturbed):
-    """Each on its own number of devices."""
-    found = ended(fitting(data / "two", data / "pairs.npz", *OPTIONS, "--devices", 1, count=2))
-    assert [status for status, *_ in found] == [0, 0], found
-    assert "written to" in found[0][1]
-    assert "process 1 of 2: " in found[1][1]
-    moved_alike(undisturbed.map, saved.load(data / "two"))
-    assert saved.record(data / "two")["data"]["num_pairs"] == PAIRS
-    assert not any("is kept" in message for message in undisturbed.messages)
-
-
 # JAX tells others that the first process is gone at once, and of another after ten seconds.
 @pytest.mark.slow
 @pytest.mark.parametrize("killed", [0, 1])

@@ -5,44 +5,11 @@ import re
 
 from test_import_order import modules, statements
 
-FRAGMENTS = {
-    "as",
-    "before",
-    "between",
-    "but",
-    "by",
-    "for",
-    "from",
-    "how",
-    "if",
-    "in",
-    "its",
-    "no",
-    "none",
-    "not",
-    "of",
-    "on",
-    "or",
-    "so",
-    "some",
-    "than",
-    "that",
-    "their",
-    "these",
-    "this",
-    "those",
-    "to",
-    "what",
-    "when",
-    "where",
-    "whether",
-    "which",
-    "who",
-    "whose",
-    "why",
-    "with",
-    "without",
-}
+WORDS = """
+    as before between but by for from how if in its no none not of on or so some than that their
+    these this those to what when where whether which who whose why with without
+"""
+FRAGMENTS = WORDS.split()
 
 
 def openings():

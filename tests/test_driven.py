@@ -333,14 +333,8 @@ def test_files_of_pairs_and_of_trajectories(tmp_path):
     np.savez(tmp_path / "u.npz", trajectories=rows, times=times, period=PERIOD)
     sequence = np.repeat(np.arange(60), 4)
     table = np.column_stack([sequence, times.ravel(), rows.reshape(-1, 2), 0 * sequence + PERIOD])
-    np.savetxt(
-        tmp_path / "c.csv",
-        table,
-        delimiter=",",
-        header="sequence,t,q1,p1,period",
-        comments="",
-        fmt="%.17g",
-    )
+    about = {"header": "sequence,t,q1,p1,period", "comments": ""}
+    np.savetxt(tmp_path / "c.csv", table, "%.17g", ",", **about)
     for name in ("t.npz", "u.npz", "c.csv"):
         data = read_trajectories(tmp_path / name)
         assert data.period == data.pairs().period == PERIOD

@@ -13,16 +13,8 @@ def swings(omega2, friction, start, seconds):
     def rates(_, z):
         return [z[1], -omega2 * np.sin(z[0]) - friction(z[1])]
 
-    return solve_ivp(
-        rates,
-        (0, seconds),
-        [start, 0.0],
-        method="DOP853",
-        events=lambda _, z: z[0],
-        dense_output=True,
-        rtol=1e-10,
-        atol=1e-12,
-    )
+    options = {"method": "DOP853", "dense_output": True, "rtol": 1e-10, "atol": 1e-12}
+    return solve_ivp(rates, (0, seconds), [start, 0.0], events=lambda _, z: z[0], **options)
 
 
 def gate(friction, noise=1e-4, start=0.9):

@@ -217,13 +217,6 @@ def test_the_home_of_the_docs_has_a_picture_three_starts_and_links_to_every_note
     assert notebooks == set(re.findall(r"\.\./notebooks/([\w]+\.ipynb)", home))
 
 
-def test_the_reference_has_what_fits_and_forecasts_return():
-    shown = (DOCS / "reference.md").read_text(encoding="utf-8")
-    for name in ("LearnedLaw", "Forecast", "estimate, forecast", "gfnn_jax.Fit\n"):
-        assert name in shown
-    assert "!^tree_" in (DOCS.parent / "mkdocs.yml").read_text(encoding="utf-8")
-
-
 def test_the_notebook_of_ones_own_data_reads_a_file_by_public_names():
     text = (DOCS.parent / "notebooks" / "your_own_data.ipynb").read_text(encoding="utf-8")
     code = "\n".join(

@@ -240,17 +240,6 @@ def test_the_table_shows_all_candidates_and_marks_the_chosen(pendulum_fit):
     assert any("~" in line for line in lines)  # estimates are told from what was measured
 
 
-@pytest.mark.slow
-def test_one_seed_chooses_one_map(pendulum_fit):
-    told = []
-    again = quiet_fit(pendulum_pairs(), tolerance=1e-7, learn="map", on_candidate=told.append)
-    names = [(c.chart, c.label, c.validation_rms) for c in pendulum_fit.candidates]
-    assert names == [(c.chart, c.label, c.validation_rms) for c in again.candidates]
-    assert len(told) == len(again.candidates)
-    z = disc(200, seed=2)
-    np.testing.assert_array_equal(again.map.step(z)[0], pendulum_fit.map.step(z)[0])
-
-
 def test_an_absolute_tolerance_is_in_the_users_units(pendulum_fit):
     unit = np.array([1e3, 1e3])
     pairs = pendulum_pairs()
@@ -406,16 +395,6 @@ def test_friction_that_is_left_over_is_told_from_noise():
 
 
 # What must come out
-
-
-@pytest.mark.slow
-def test_the_standard_map_is_found_to_roundoff():
-    scene = gfnn.scenes.standard_map()
-    pairs = gfnn.sample_pairs(scene, 300, jax.random.key(0))
-    fresh = gfnn.sample_pairs(scene, 300, jax.random.key(1))
-    fit = quiet_fit(pairs, scene, tolerance=1e-12)
-    assert fit.chosen.chart == "type2"
-    assert rms(fit.map, fresh.z0, fresh.z1) < 1e-13
 
 
 @pytest.mark.slow

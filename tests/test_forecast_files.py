@@ -148,13 +148,8 @@ def swings(tmp_path_factory):
     swing, _ = states_in_motion(lambda q, v: -9 * np.sin(q) - 0.1 * v, [0.8, 0], t)
     theta = swing + 1e-4 * rng.normal(size=SEEN)
     for unit, factor in (("deg", 180 / np.pi), ("rad", 1.0), ("mrad", 1e3)):
-        np.savetxt(
-            folder / f"{unit}.csv",
-            np.stack([t, factor * theta], axis=1),
-            delimiter=",",
-            header=f"t [s],theta [{unit}]",
-            comments="",
-        )
+        about = {"delimiter": ",", "header": f"t [s],theta [{unit}]", "comments": ""}
+        np.savetxt(folder / f"{unit}.csv", np.stack([t, factor * theta], axis=1), **about)
     return folder
 
 
@@ -194,13 +189,8 @@ def test_a_velocity_in_another_unit_is_not_left_out_in_silence(tmp_path, capsys)
     x, v = np.exp(-0.05 * t) * np.stack([np.cos(3 * t), -3 * np.sin(3 * t) - 0.05 * np.cos(3 * t)])
     x, v = x + 1e-2 * rng.normal(size=SEEN), v + 1e-2 * rng.normal(size=SEEN)
     for name, unit, factor in (("both", "m/s", 1.0), ("other", "mm/s", 1e3)):
-        np.savetxt(
-            tmp_path / f"{name}.csv",
-            np.stack([t, x, factor * v], axis=1),
-            delimiter=",",
-            header=f"t [s],x [m],v [{unit}]",
-            comments="",
-        )
+        about = {"delimiter": ",", "header": f"t [s],x [m],v [{unit}]", "comments": ""}
+        np.savetxt(tmp_path / f"{name}.csv", np.stack([t, x, factor * v], axis=1), **about)
     columns = ["--positions", "x", "--velocities", "v", "--friction", "linear"]
     model = str(tmp_path / "model")
     assert main(["fit", str(tmp_path / "both.csv"), *columns, "--out", model]) == 0

@@ -13,61 +13,19 @@ import gfnn_jax
 PACKAGE = Path(gfnn_jax.__file__).parent
 
 # A module imports only from rooms before its own; the modules of a room share its place.
-ORDER = (
-    "arrays",
-    "errors",
-    "phase_space",
-    "coordinates",
-    "brackets",
-    "compiling",
-    "threads",
-    "processes",
-    "budget",
-    "storage",
-    "signals",
-    "data",
-    "records",
-    "scenes",
-    "families",
-    "solve",
-    "generating",
-    "flows",
-    "maps",
-    "dataset",
-    "exports",
-    "fitting",
-    "candidates",
-    "diagnosis",
-    "models.model",
-    "models.parameters",
-    "models.arms",
-    "models.positions",
-    "models.lagrangians",
-    "models.textbook",
-    "models.brackets",
-    "models.generating_functions",
-    "models.hamiltonians",
-    "search",
-    "models.maps_of_laws",
-    "learn",
-    "baselines",
-    "evaluate",
-    "jobs",
-    "cli_parser",
-    "cli_summary",
-    "cli",
-    "__main__",
-)
+ROOMS = """
+    arrays errors phase_space coordinates brackets compiling threads processes budget storage
+    signals data records scenes families solve generating flows maps dataset exports fitting
+    candidates diagnosis models.model models.parameters models.arms models.positions
+    models.lagrangians models.textbook models.brackets models.generating_functions
+    models.hamiltonians search models.maps_of_laws learn baselines evaluate jobs cli_parser
+    cli_summary cli __main__
+"""
+ORDER = ROOMS.split()
 # A method that is a shorthand for a function of another module imports it when called.
 SHORTHANDS = {
     ("maps.symplectic_map", f"maps.{name}")
-    for name in (
-        "saved",
-        "estimates",
-        "forecasts",
-        "events",
-        "laws",
-    )
+    for name in ("saved", "estimates", "forecasts", "events", "laws")
 }
 SHORTHANDS |= {
     ("data.recording", "data.recording_summary"),

@@ -89,19 +89,8 @@ def test_the_misfit_is_of_the_kind_that_its_errors_are(kind):
     rng, phase = np.random.default_rng(0), np.linspace(0, 40, 400)
     amplitude = np.exp(-phase / 20)
     x = np.stack([amplitude * np.cos(phase) + 2 * np.pi, -amplitude * np.sin(phase)], axis=1)
-    sensors = Sensors(
-        ("theta",),
-        (),
-        ("theta",),
-        1e-4 * np.ones(1),
-        1.0,
-        1.0,
-        "hold",
-        0.0,
-        np.ones(1),
-        np.ones((1, 1)),
-        middle=np.zeros(1),
-    )
+    rest = (1.0, 1.0, "hold", 0.0, np.ones(1), np.ones((1, 1)))
+    sensors = Sensors(("theta",), (), ("theta",), 1e-4 * np.ones(1), *rest, middle=np.zeros(1))
     reach = np.sqrt(np.mean(sensors.distances(x) ** 2, axis=0))
     sensors = dataclasses.replace(sensors, reach=reach)
     law = 1e-3 * (1.5 + np.sin(3 * phase))[:, None, None] * np.ones((400, 3, 1))

@@ -746,23 +746,6 @@ def test_friction_that_is_asked_for_dissipates_or_is_said_to_be_none(asked):
     assert 0 < max(fit.which_friction.limits.values()) < 1e-3
 
 
-def test_friction_that_is_asked_for_and_is_there_needs_no_word(swing, recwarn):
-    recording, _ = swing
-    fit = gfnn.fit(recording, friction="linear")
-    assert len(fit.friction.terms) == 1
-    assert not [w for w in recwarn if "asked for" in str(w.message)]
-
-
-@pytest.mark.slow
-def test_linear_friction_of_one_mass_is_uniform(swing):
-    """The map keeps a multiple of the symplectic form."""
-    _, fit = swing
-    (loss,) = fit.friction.terms
-    multiplier = float(fit.map.multiplier())
-    assert multiplier == pytest.approx(np.exp(-2 * loss.coefficient * float(fit.map.dt)), rel=1e-9)
-    assert float(fit.map.defect(np.array([0.3, 0.5]))) < 1e-14
-
-
 @pytest.mark.slow
 def test_uniform_friction_of_a_double_pendulum(tmp_path):
     fit = gfnn.fit(chain(runs=2, end=8.0, uniform=0.04))
@@ -900,9 +883,11 @@ def test_a_double_pendulum_has_its_five_terms():
 
 
 @pytest.mark.slow
-def test_a_known_mass_scales_the_law():
+def test_a_known_mass_scales_the_law(recwarn):
+    """And nothing is said of friction that is asked for and is there."""
     t, theta = pendulum(end=15.0)
     fit = gfnn.fit(recorded(t, theta), friction="linear", mass={"theta": 3.0})
+    assert not [w for w in recwarn if "requested" in str(w.message)]
     assert fit.lagrangian.terms[0].coefficient == pytest.approx(1.5)
     assert fit.lagrangian.terms[1].coefficient == pytest.approx(6.0, rel=0.01)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import sympy
 from analytic import henon_heiles_pairs, moved
-from command_line import gfnn as command
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
@@ -68,12 +67,6 @@ def test_h_can_be_evaluated_and_does_not_drift(law, pairs):
 def test_a_coefficient_multiplies_all_of_a_users_sum():
     terms = (Term("q1**2 - q2**2", 0.5, 0.0), Term("sin(q1 - q2)", -2.0, 0.0))
     assert formula(terms) == "0.5 (q1**2 - q2**2) - 2 sin(q1 - q2)"
-
-
-def test_a_saved_law_is_the_same_map(law, pairs, tmp_path):
-    law.map.save(tmp_path / "m")
-    again = gfnn.load(tmp_path / "m").map
-    np.testing.assert_array_equal(again.step(pairs.z0)[0], law.map.step(pairs.z0)[0])
 
 
 def test_the_report_holds_the_formula(law):
@@ -261,17 +254,6 @@ def test_what_a_law_leaves_over_is_diagnosed():
         later[30 * i : 30 * i + 29] = z[30 * i + 1 : 30 * i + 30]
     fit = gfnn.fit(gfnn.Pairs(z, later, 0.2), tolerance=1e-10, learn="hamiltonian")
     assert "differs between the sequences" in fit.ended
-
-
-@pytest.mark.slow
-def test_the_command_prints_the_formula(tmp_path, capsys, pairs):
-    data = tmp_path / "d.npz"
-    np.savez(data, z0=pairs.z0, z1=pairs.z1, dt=0.5)
-    assert command("fit", data, "--out", tmp_path / "m", "--learn", "hamiltonian") == 0
-    assert "H = 0.5*q1**2 + 0.5*q2**2" in capsys.readouterr().out
-    np.save(tmp_path / "z0.npy", pairs.z0[:3])
-    predict = ("predict", tmp_path / "m", "--initial", tmp_path / "z0.npy", "--num-steps", 10)
-    assert command(*predict, "--out", tmp_path / "p.npz") == 0
 
 
 @pytest.mark.slow

@@ -105,18 +105,3 @@ def test_a_fit_stands_for_its_map_for_one_version(generated):
         assert generated.chosen.family == "polynomial"  # of what was found: its own
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = generated.nothing
-
-
-def test_a_newer_format_is_refused(generated, tmp_path):
-    generated.save(tmp_path / "m")
-    path = tmp_path / "m" / "model.json"
-    path.write_text(path.read_text().replace('"format": 3', '"format": 4'))
-    with pytest.raises(gfnn.InputError, match="has format 4"):
-        gfnn.load(tmp_path / "m")
-
-
-def test_an_existing_folder_is_kept(generated, tmp_path):
-    generated.save(tmp_path / "m")
-    with pytest.raises(gfnn.InputError, match="exists"):
-        generated.save(tmp_path / "m")
-    generated.save(tmp_path / "m", overwrite=True)

@@ -239,16 +239,8 @@ def test_section_crossings_of_henon_heiles_saved_coarsely(energy, bound):
     on_section.direction = 1
     start = [0, 0.1, np.sqrt(2 * (energy - 0.1**2 / 2 + 0.1**3 / 3)), 0]
     times = 0.5 * np.arange(601)
-    solution = solve_ivp(
-        field,
-        (0, 300),
-        start,
-        method="DOP853",
-        rtol=1e-12,
-        atol=1e-13,
-        events=on_section,
-        t_eval=times,
-    )
+    options = {"rtol": 1e-12, "atol": 1e-13, "events": on_section}
+    solution = solve_ivp(field, (0, 300), start, "DOP853", times, **options)
     crossing_times = solution.t_events[0]
     inside = (crossing_times > times[7]) & (crossing_times < times[-8])
     crossings = metrics.section_crossings(solution.y.T, index=0)

@@ -11,7 +11,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps
 from gfnn_jax.models.hamiltonians.sequences import FlowOnArcs
-from gfnn_jax.models.textbook.noisy_search import NoisyTextbook, weak_gradients
+from gfnn_jax.models.textbook.noisy_search import weak_gradients
 from gfnn_jax.phase_space import apply_j
 
 
@@ -115,17 +115,6 @@ def test_steps_with_a_constant_inside_have_its_derivative():
 
 
 # The search
-
-
-@pytest.mark.slow
-def test_matching_finds_the_terms_behind_noise():
-    z, noise = noisy(radial_orbits(), 1e-3)
-    weak = weak_gradients(list(z), 0.1, noise)
-    assert weak is not None
-    found = NoisyTextbook(weak).formulas()
-    names = [set(f.family(f.constants).term_names) for f in found]
-    assert names[0] >= {"p1²", "1/q1", "1/q1**2"}
-    assert found[0].left == pytest.approx(1.0, abs=0.15)
 
 
 def test_a_fit_of_noisy_sequences_finds_morses_law_with_the_errors_of_its_numbers():

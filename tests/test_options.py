@@ -21,22 +21,8 @@ def test_each_is_a_keyword_of_the_fit_with_its_default():
 
 
 def test_the_command_line_reads_what_python_takes():
-    given = [
-        "--tolerance",
-        "1e-3",
-        "--terms",
-        "p1**2; cos(q1)",
-        "--seed",
-        "7",
-        "--devices",
-        "all",
-        "--max-seconds",
-        "5",
-        "--max-operations",
-        "9",
-        "--structure",
-        "ring:2",
-    ]
+    given = ["--tolerance", "1e-3", "--seed", "7", "--devices", "all", "--max-seconds", "5"]
+    given += ["--max-operations", "9", "--structure", "ring:2", "--terms", "p1**2; cos(q1)"]
     arguments = cli_parser.parser().parse_args(["fit", "data.npz", "--out", "model", *given])
     assert gfnn.FitOptions(**cli_parser.fit_options(arguments)) == gfnn.FitOptions(
         tolerance=1e-3,

@@ -231,12 +231,6 @@ def test_forecasts_are_in_the_degrees_of_the_file():
     assert 0.5 < np.abs(ahead.values[name]).max() < 30
 
 
-def test_a_fit_without_float64_says_so_at_once():
-    t, x = swing(2.0)
-    with jax.enable_x64(False), pytest.raises(RuntimeError, match="jax_enable_x64"):
-        gfnn.fit(t, x)
-
-
 @pytest.mark.slow
 def test_options_of_columns_serve_the_one_command(tmp_path, monkeypatch, capsys):
     """What `gfnn look` proposes, `gfnn FILE` takes."""

@@ -52,15 +52,6 @@ def test_what_stands_still_is_left_out():
         assert np.std(whole.q[np.isin(whole.t, left)]) < 1.5 * NOISE
 
 
-def test_what_moves_is_kept():
-    t = np.arange(0, 40, DT)
-    x = np.sin(t) + NOISE * np.random.default_rng(0).normal(size=len(t))
-    found = stretches(gfnn.Recording({"t": t, "x": x}, positions=["x"]))
-    parts, *seconds = without_rests(found, measure(found))
-    assert seconds == [0, 0]
-    np.testing.assert_array_equal(parts[0].t, found[0].t)
-
-
 def test_what_creeps_at_the_end_is_left_out():
     """A body that friction holds creeps by more than the noise, and turns no more; one that swings
     as little is kept."""

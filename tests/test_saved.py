@@ -97,24 +97,6 @@ def test_loads_the_same_bits(name, saved, tmp_path):
     assert models.record(tmp_path / "m") == {"note": "θ"}
 
 
-@pytest.mark.parametrize(
-    ("name", "saved"),
-    [
-        pytest.param(
-            name, saved, marks=pytest.mark.slow if name in ("polar", "predictor", "mlp") else ()
-        )
-        for name, saved in some_maps()
-        if name in ("type2", "polar", "mlp", "base map", "predictor")  # others run these programs
-    ],
-    ids=lambda x: x if type(x) is str else "",
-)
-def test_a_loaded_map_steps_to_the_same_bits(name, saved, tmp_path):
-    saved.save(tmp_path / "m")
-    before, after = saved.step(STATES)[0], models.load(tmp_path / "m").step(STATES)[0]
-    assert np.isfinite(np.asarray(before)).all()
-    assert np.asarray(before).tobytes() == np.asarray(after).tobytes()
-
-
 def test_the_description_is_for_humans(tmp_path):
     models.save(a_map(*polynomial()), tmp_path / "m")
     text = (tmp_path / "m" / "model.json").read_text()

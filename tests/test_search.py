@@ -41,32 +41,18 @@ class Sweep:
 
     def estimate(self, size, budget, on_progress):
         self.judged.append(size.operations)
-        return Candidate(
-            f"{self.family} {size.operations:g}",
-            self.family,
-            self.chart,
-            3,
-            size.operations,
-            size.estimate,
-            size.estimate,
-            size.estimate,
-            np.ones(2),
-            size.estimate,
-            0.0,
-        )
+        about = (self.named(size), self.family, self.chart, 3, size.operations)
+        return Candidate(*about, *[size.estimate] * 3, np.ones(2), size.estimate, 0.0)
 
     def at(self, order):
         return f"{self.family} {order:g}"
 
     def validate(self, size, judged, budget, say):
         self.validated.append(size.operations)
-        return dataclasses.replace(
-            judged,
-            validation_rms=size.error,
-            validation_relative=size.error,
-            validation_bound=size.error,
-            validated=True,
+        told = dict.fromkeys(
+            ("validation_rms", "validation_relative", "validation_bound"), size.error
         )
+        return dataclasses.replace(judged, **told, validated=True)
 
 
 def found_in(*sweeps, bound=1e-6, budget=None, told=None, on_validated=None):

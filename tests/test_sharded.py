@@ -147,16 +147,6 @@ def alone(folder):
     return (folder / "alone.npz").read_bytes()
 
 
-@pytest.mark.slow
-def test_two_processes_write_one_result(folder, alone):
-    found = ended(predicting(folder, folder / "two.npz"))
-    assert [status for status, *_ in found] == [0, 0], found
-    assert "700 trajectories" in found[0][1]
-    assert "process 1 of 2: 444 trajectories" in found[1][1]
-    assert (folder / "two.npz").read_bytes() == alone
-    assert not [*folder.glob("two.part*")]
-
-
 # JAX tells others that the first process is gone at once, and of another after ten seconds.
 @pytest.mark.slow
 @pytest.mark.parametrize("killed", [0, 1])
@@ -205,6 +195,7 @@ def test_a_killed_job_resumes_to_the_same_bits(folder, alone, monkeypatch):
     found = ended(predicting(folder, folder / "again.npz", "--resume"))
     assert [status for status, *_ in found] == [0, 0], found
     assert (folder / "again.npz").read_bytes() == alone
+    assert not [*folder.glob("again.part*")]
 
 
 def test_parts_of_everything_that_a_prediction_can_hold(tmp_path):

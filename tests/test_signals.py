@@ -210,15 +210,8 @@ def test_differences_are_recognised():
 
 
 def motion(force, start, t, sigma=1e-4):
-    z = solve_ivp(
-        lambda _, z: [*z[len(z) // 2 :], *force(z)],
-        (0, t[-1]),
-        start,
-        "DOP853",
-        t,
-        rtol=1e-10,
-        atol=1e-12,
-    ).y
+    rates = lambda _, z: [*z[len(z) // 2 :], *force(z)]  # noqa: E731
+    z = solve_ivp(rates, (0, t[-1]), start, "DOP853", t, rtol=1e-10, atol=1e-12).y
     q = z[: len(z) // 2]
     fits = local_fits([t], q + sigma * RNG.standard_normal(q.shape), 21, 4)
     period = energy.mean_period(fits, 1)

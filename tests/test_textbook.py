@@ -334,20 +334,6 @@ def test_a_good_approximation_is_no_formula():
     assert searched(pairs_of(gradient, z0, dt=0.2)) is None
 
 
-@pytest.mark.slow
-def test_a_law_outside_of_the_dictionary_is_no_formula_and_the_closest_are_told():
-    pairs = outside_pairs(150)
-    search = Textbook(
-        Problem(pairs.z0, pairs.z1, pairs.dt, sizes(pairs.z0)), np.arange(len(pairs.z0))
-    )
-    assert search.law(products=False) is None
-    left = [law.left for law in search.partial]
-    assert len(left) == 3
-    assert left == sorted(left)
-    assert 1e-12 < left[0] < 1e-2
-    assert search.law(products=True) is None
-
-
 def test_noise_is_no_formula():
     pairs = morse_pairs(100)
     rng = np.random.default_rng(0)

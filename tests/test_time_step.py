@@ -106,18 +106,8 @@ def test_saved_and_predicted_at_any_dt(learned, tmp_path, capsys):
     np.testing.assert_array_equal(loaded.step(z, dt=dt)[0], learned.map.step(z, dt=dt)[0])
     assert loaded.step(z, dt=0.9)[1].status.tolist() == [1, 1, 1]
     np.save(tmp_path / "z.npy", z)
-    given = [
-        "predict",
-        str(tmp_path / "m"),
-        "--initial",
-        str(tmp_path / "z.npy"),
-        "--num-steps",
-        "5",
-        "--out",
-        str(tmp_path / "p.npz"),
-        "--dt",
-        "0.25",
-    ]
+    given = ["predict", str(tmp_path / "m"), "--initial", str(tmp_path / "z.npy"), "--dt", "0.25"]
+    given += ["--num-steps", "5", "--out", str(tmp_path / "p.npz")]
     assert cli.main(given) == 0
     predicted = np.load(tmp_path / "p.npz")
     assert predicted["dt"] == 0.25

@@ -64,20 +64,9 @@ def test_innovations_whiten_as_the_matrix_does(rng):
 def free_body(sigma, wander):
     """A law without forces, known exactly, q = q0 + v t; residuals of any size count in full."""
     law = mechanics([((2,), (0,), (0,), 0.0, 0.5)])
-    sensors = Sensors(
-        ("x",),
-        (),
-        (),
-        np.array([sigma]),
-        1.0,
-        10.0,
-        "hold",
-        0.0,
-        np.array([1.0]),
-        np.zeros((1, 1)),
-        dataclasses.replace(Observation.plain(["x"]), loss=SoftL1(1e6)),
-        wander,
-    )
+    seen = dataclasses.replace(Observation.plain(["x"]), loss=SoftL1(1e6))
+    rest = (1.0, 10.0, "hold", 0.0, np.array([1.0]), np.zeros((1, 1)), seen, wander)
+    sensors = Sensors(("x",), (), (), np.array([sigma]), *rest)
     return law_in_use(law, None, sensors)
 
 
