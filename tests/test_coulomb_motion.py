@@ -13,18 +13,6 @@ from coulomb_motion import Body
 OPTIONS = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-12}
 
 
-def test_a_block_on_a_spring_loses_twice_the_friction_in_each_half_period_and_stops():
-    """ẍ = −x − 0.3 sign ẋ from x = 1.45 at rest: it turns at −0.85 and at 0.25, where it stays."""
-    block = Body(lambda q: np.eye(1), lambda q, v, u: -q, np.eye(1), np.array([0.3]))
-    t = np.linspace(0, 12, 601)
-    x = block.follow(np.array([1.45, 0.0]), t, **OPTIONS)
-    first, second = t <= np.pi, (t > np.pi) & (t <= 2 * np.pi)
-    np.testing.assert_allclose(x[first, 0], 0.3 + 1.15 * np.cos(t[first]), atol=1e-9)
-    np.testing.assert_allclose(x[second, 0], -0.3 + 0.55 * np.cos(t[second]), atol=1e-9)
-    np.testing.assert_allclose(x[t > 2 * np.pi, 0], 0.25, atol=1e-9)
-    assert np.all(x[t > 2 * np.pi, 1] == 0)
-
-
 def test_a_block_that_sticks_is_let_go_by_the_force_that_it_can_hold():
     """A force 0.5 t on a block with friction 1: at rest until t = 2, then v = (t − 2)²/4."""
 

@@ -15,7 +15,7 @@ from scipy.stats import norm
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
 from gfnn_jax.errors import InputError
-from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, STRIBECK, UNIFORM, Friction
+from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, STRIBECK, Friction
 from gfnn_jax.families.lagrangian import Terms
 from gfnn_jax.fitting.evidence import Comparison
 from gfnn_jax.fitting.linearised import Linearised
@@ -137,53 +137,6 @@ def test_rows_of_arcs_tell_the_residuals_of_other_coefficients():
             expected = np.sum((y[arc, seen] - states[seen] @ start) ** 2) / sigma**2
             found = np.sum((rows[arc] @ [-change, 1.0]) ** 2)
             np.testing.assert_allclose(found, expected, rtol=0.01)
-
-
-def test_steps_have_the_derivatives_of_finite_differences():
-    rows = [
-        ((2, 0), (0, 0), (0, 0), 0.0),
-        ((1, 1), (0, 0), (1, -1), 0.0),
-        ((0, 2), (1, 1), (0, 0), 0.0),
-        ((0, 2), (0, 0), (0, 0), 0.0),
-        ((0, 0), (0, 0), (1, 0), 0.2),
-    ]
-    friction = [
-        ((1, 0), LINEAR, 0),
-        ((-1, 1), QUADRATIC, 0),
-        ((0, 1), DRY, 0.2),
-        ((0, 0), UNIFORM, 0),
-    ]
-    friction = Friction.of(friction, 2)
-    form = Form(Terms.of(rows, 2), np.zeros(5), np.eye(5), friction, 1)
-    p = np.array([0.5, 0.2, 0.02, 0.4, 2.0, 0.1, 0.05, 0.1, 0.05, 1.0, -0.5])
-    rng = np.random.default_rng(0)
-    x, u, h = rng.normal(size=(3, 4)), rng.normal(size=(3, 2, 6, 1)), np.full(3, 0.1)
-    step = form.step(p, x, h, u)
-    e = 1e-6
-    by_state = [
-        form.step(p, x + e * d, h, u).states - form.step(p, x - e * d, h, u).states
-        for d in np.eye(4)
-    ]
-    by_p = [
-        form.step(p + e * d, x, h, u).states - form.step(p - e * d, x, h, u).states
-        for d in np.eye(len(p))
-    ]
-    np.testing.assert_allclose(step.by_state, np.stack(by_state, -1) / (2 * e), atol=1e-8)
-    np.testing.assert_allclose(step.by_coefficients, np.stack(by_p, -1) / (2 * e), atol=1e-8)
-
-    law = form.lagrangian(p)
-
-    def rate(_, state):
-        a = law.acceleration(state[None, :2], state[None, 2:], u[0, 0, 0][None])
-        return [*state[2:], *a[0]]
-
-    exact = solve_ivp(rate, (0, 0.1), x[0], rtol=1e-12, atol=1e-13).y[:, -1]
-    errors = []
-    for substeps in (4, 8):
-        held = np.broadcast_to(u[:1, :1, :1], (1, substeps, 6, 1))
-        errors.append(np.abs(form.step(p, x[:1], h[:1], held).states[0] - exact).max())
-    assert errors[0] < 1e-6
-    assert errors[1] < errors[0] / 8  # friction that is not smooth costs order
 
 
 def test_local_cubics_measure_the_noise_and_follow_the_motion():

@@ -103,20 +103,6 @@ def test_torsion_of_a_radian_is_no_series_of_cosines(periodic):
 
 
 @pytest.mark.slow
-def test_two_pendulums_in_one_file_have_their_laws():
-    both = recorded(
-        lambda q, v: -np.array([1.0, 2.3]) * np.sin(q) - 0.01 * v,
-        [1, 1.7, 0, 0],
-        ["a", "b"],
-        angles=["a", "b"],
-    )
-    found = coefficients(gfnn.fit(both).lagrangian)
-    assert found["cos(a)"] == pytest.approx(1.0, rel=1e-4)
-    assert found["cos(b)"] == pytest.approx(2.3, rel=1e-4)
-    assert len(found) == 4
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("turns", [True, False])
 def test_five_bodies_with_springs_between_neighbours(turns):
     """Pendulums, or bodies on quartic springs, of which two at a time are in a term."""

@@ -41,21 +41,6 @@ def test_a_stand_in_is_not_blamed_on_its_family(sampled):
     assert "needs a family that is linear" in why_not(found.map)
 
 
-@pytest.mark.slow
-def test_all_pairs_fit_better_than_the_sample(sampled):
-    pairs, held, fit = sampled
-    again = refit(fit, [pairs], held)
-    assert again.met
-    assert again.num_pairs == 3_000
-    assert again.chosen.label == fit.chosen.label
-    assert len(again.candidates) == len(fit.candidates)
-    z = np.random.default_rng(1).uniform(-0.9, 0.9, (200, 2))
-    exact = gfnn.Pairs(z, standard(z), 1.0)
-    errors = [np.sqrt(np.mean((moved(f, exact) - exact.z1) ** 2)) for f in (fit, again)]
-    # Ten times the pairs: the error that the noise leaves falls by about √10.
-    assert errors[1] < 0.7 * errors[0]
-
-
 def test_pairs_in_chunks_give_the_same_map(sampled):
     pairs, held, fit = sampled
     chunks = (pairs.take(slice(first, first + 700)) for first in range(0, 3_000, 700))

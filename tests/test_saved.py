@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -167,3 +168,12 @@ def test_a_foreign_description(change, message, tmp_path):
     save_model(tmp_path / "m", arrays, description)
     with pytest.raises(InputError, match=message):
         models.load(tmp_path / "m")
+
+
+def test_every_type_that_is_known_is_where_it_is_said_to_be():
+    from gfnn_jax.learn import saved  # noqa: F401, which knows more
+
+    own = {path for path in models._NAMES if path.partition(".")[0] not in sys.modules}
+    assert len(own) > 80
+    for path in own:
+        assert models._path(models._type(models._NAMES[path])) == path

@@ -9,27 +9,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from gfnn_jax.candidates.assemble import Candidate
-from gfnn_jax.dataset.measured_error import Tolerance
-from gfnn_jax.diagnosis.damping import LearnedDamping
-from gfnn_jax.diagnosis.local_jacobians import ChartDeterminant
-from gfnn_jax.diagnosis.symmetries import SymmetryOfPairs
-from gfnn_jax.exports.symbolic import Formula
-from gfnn_jax.families.text import Term
-from gfnn_jax.fitting.evidence import Rival
-from gfnn_jax.fitting.triangle import Triangle
-from gfnn_jax.learn.fitted import Choice, Fit, OfPositions
+from gfnn_jax.learn.fitted import Choice, Fit
 from gfnn_jax.maps import saved as maps
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.models.arms.identify import BaseParameters, Columns, Identified, Prior
 from gfnn_jax.models.arms.learned_arm import LearnedArm
-from gfnn_jax.models.hamiltonians.fitted_law import Dropped, PartialLaw
-from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
-from gfnn_jax.models.lagrangians.calibration import Horizon
-from gfnn_jax.models.lagrangians.friction_choice import WhichFriction
-from gfnn_jax.models.lagrangians.learned_law import Hamiltonian, LearnedLaw, NextMotion
-from gfnn_jax.models.lagrangians.residuals import OfInput, Whiteness
-from gfnn_jax.models.lagrangians.velocities import Velocity
+from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 from gfnn_jax.scenes.scene import Scene
 
 
@@ -46,35 +30,20 @@ class WithoutMap:
         return kind(map=map_, **self.fields)
 
 
-for _kind in (
-    BaseParameters,
-    Choice,
-    Candidate,
-    ChartDeterminant,
-    Columns,
-    Dropped,
-    Hamiltonian,
-    Horizon,
-    Identified,
-    LearnedDamping,
-    LearnedHamiltonian,
-    NextMotion,
-    OfInput,
-    OfPositions,
-    SymmetryOfPairs,
-    Tolerance,
-    Velocity,
-    Whiteness,
-    Formula,
-    PartialLaw,
-    Prior,
-    Rival,
-    Term,
-    Triangle,
-    WhichFriction,
-    WithoutMap,
-):
-    maps.register(_kind)
+_KNOWN = """
+    candidates.assemble.Candidate dataset.measured_error.Tolerance
+    diagnosis.damping.LearnedDamping diagnosis.local_jacobians.ChartDeterminant
+    diagnosis.symmetries.SymmetryOfPairs exports.symbolic.Formula families.text.Term
+    fitting.evidence.Rival fitting.triangle.Triangle learn.fitted.Choice learn.fitted.OfPositions
+    learn.saved.WithoutMap models.arms.identify.BaseParameters models.arms.identify.Columns
+    models.arms.identify.Identified models.arms.identify.Prior
+    models.hamiltonians.fitted_law.Dropped models.hamiltonians.fitted_law.PartialLaw
+    models.hamiltonians.learned_law.LearnedHamiltonian models.lagrangians.calibration.Horizon
+    models.lagrangians.friction_choice.WhichFriction models.lagrangians.learned_law.Hamiltonian
+    models.lagrangians.learned_law.NextMotion models.lagrangians.residuals.OfInput
+    models.lagrangians.residuals.Whiteness models.lagrangians.velocities.Velocity
+"""
+maps.know(_KNOWN)
 
 
 def save(

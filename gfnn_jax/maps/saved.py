@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import importlib
 import json
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,119 +19,42 @@ from typing import Any
 import jax
 import numpy as np
 
-from gfnn_jax import brackets
 from gfnn_jax.coordinates import CARTESIAN, LOG, Coordinates
 from gfnn_jax.errors import InputError
-from gfnn_jax.families import lagrangian
-from gfnn_jax.families.displacements import OfDisplacement
-from gfnn_jax.families.friction import Friction
 from gfnn_jax.families.inputs import Inputs
-from gfnn_jax.families.lagrangian import Lagrangian
-from gfnn_jax.families.mlp import Ensemble, Mlp
-from gfnn_jax.families.products import Products
-from gfnn_jax.families.rigid_bodies import Bodies
-from gfnn_jax.families.sines import Sines
-from gfnn_jax.families.sums import Groups, Part, Sums, Windows
-from gfnn_jax.families.terms import Terms
-from gfnn_jax.families.time_step import OfTimeStep
-from gfnn_jax.flows import lifts
-from gfnn_jax.flows.bodies import OfBodies
-from gfnn_jax.flows.collective import Casimirs, Collective
-from gfnn_jax.flows.damped import DampedFlow, Dilations, InRestingFrame
-from gfnn_jax.flows.flow import Flow
-from gfnn_jax.flows.forces import Forced
-from gfnn_jax.flows.legendre import Legendre
-from gfnn_jax.flows.lie import LieFlow, LieGenerated
-from gfnn_jax.flows.systems import OfSystems
-from gfnn_jax.flows.uniform import Uniform
-from gfnn_jax.generating.charts import Chart, TypeOne
-from gfnn_jax.generating.generated import Generated
-from gfnn_jax.generating.predictor import PolynomialModel, Predictor
-from gfnn_jax.maps.domain import Domain, Ranges
-from gfnn_jax.maps.inputs import Signals
-from gfnn_jax.maps.observation import Crossing, Hidden, Observation
-from gfnn_jax.maps.parameters import Parameters
-from gfnn_jax.maps.piece import Affine, Damping, FunctionsOfArgs
-from gfnn_jax.maps.posterior import Posterior
-from gfnn_jax.maps.sensors import OtherLaw, Sensors
-from gfnn_jax.maps.stroboscopic import OverPhases
 from gfnn_jax.maps.symplectic_map import SymplecticMap
-from gfnn_jax.maps.unseen import Swing
 from gfnn_jax.scenes import SCENES
 from gfnn_jax.scenes.scene import Scene
-from gfnn_jax.solve.noise import Biweight, SoftL1, Wander
 from gfnn_jax.storage.checkpoints import load_model, save_model
 from gfnn_jax.storage.outputs import ensure_new
 
-_TYPES: dict[str, type] = {
-    kind.__name__: kind
-    for kind in (
-        SymplecticMap,
-        Generated,
-        Predictor,
-        PolynomialModel,
-        Affine,
-        Bodies,
-        Chart,
-        TypeOne,
-        Domain,
-        Products,
-        Sines,
-        Mlp,
-        Inputs,
-        Flow,
-        Terms,
-        Parameters,
-        OverPhases,
-        Posterior,
-        Sums,
-        Part,
-        Windows,
-        Groups,
-        Ranges,
-        OfTimeStep,
-        Ensemble,
-        Uniform,
-        Forced,
-        Legendre,
-        Friction,
-        Signals,
-        OfSystems,
-        Sensors,
-        OtherLaw,
-        Lagrangian,
-        Wander,
-        Observation,
-        OfBodies,
-        Crossing,
-        Hidden,
-        Swing,
-        SoftL1,
-        Biweight,
-        Damping,
-        FunctionsOfArgs,
-        OfDisplacement,
-        brackets.Constant,
-        brackets.Log,
-        brackets.LieAlgebra,
-        brackets.Magnetic,
-        Collective,
-        Casimirs,
-        LieGenerated,
-        LieFlow,
-        DampedFlow,
-        Dilations,
-        InRestingFrame,
-        lifts.Itself,
-        lifts.Logarithms,
-        lifts.Quadratic,
-        lifts.Shear,
-    )
-} | {"LagrangianTerms": lagrangian.Terms}
-_NAMES = {kind: name for name, kind in _TYPES.items()}
+# Types of the package that maps may hold, each imported where one is saved or loaded.
+_KNOWN = """
+    brackets.Constant brackets.LieAlgebra brackets.Log brackets.Magnetic
+    families.displacements.OfDisplacement families.friction.Friction families.inputs.Inputs
+    families.lagrangian.Lagrangian families.mlp.Ensemble families.mlp.Mlp
+    families.products.Products families.rigid_bodies.Bodies families.sines.Sines
+    families.sums.Groups families.sums.Part families.sums.Sums families.sums.Windows
+    families.terms.Terms families.time_step.OfTimeStep flows.bodies.OfBodies
+    flows.collective.Casimirs flows.collective.Collective flows.damped.DampedFlow
+    flows.damped.Dilations flows.damped.InRestingFrame flows.flow.Flow flows.forces.Forced
+    flows.legendre.Legendre flows.lie.LieFlow flows.lie.LieGenerated flows.lifts.Itself
+    flows.lifts.Logarithms flows.lifts.Quadratic flows.lifts.Shear flows.systems.OfSystems
+    flows.uniform.Uniform generating.charts.Chart generating.charts.TypeOne
+    generating.generated.Generated generating.predictor.PolynomialModel
+    generating.predictor.Predictor maps.domain.Domain maps.domain.Ranges maps.inputs.Signals
+    maps.observation.Crossing maps.observation.Hidden maps.observation.Observation
+    maps.parameters.Parameters maps.piece.Affine maps.piece.Damping maps.piece.FunctionsOfArgs
+    maps.posterior.Posterior maps.sensors.OtherLaw maps.sensors.Sensors
+    maps.stroboscopic.OverPhases maps.symplectic_map.SymplecticMap maps.unseen.Swing
+    solve.noise.Biweight solve.noise.SoftL1 solve.noise.Wander
+"""
+_TYPES: dict[str, type] = {}  # those that were looked up or registered, by name
+# Name -> where the type is, and the reverse. Damping was DampingOfArgs in maps that 0.3 saved.
+_HOMES = {"LagrangianTerms": "families.lagrangian.Terms", "DampingOfArgs": "maps.piece.Damping"}
+_NAMES = {"families.lagrangian.Terms": "LagrangianTerms"}
 # What stands beside the items of a dict; and a field of laws that 0.4.0 saved.
 _ASIDE = {("dict", "keys"), ("LearnedHamiltonian", "proposals")}
-_TYPES["DampingOfArgs"] = Damping  # in maps that 0.3 saved
 
 
 def register(kind: type) -> type:
@@ -143,11 +67,33 @@ def register(kind: type) -> type:
     """
     if not (isinstance(kind, type) and (dataclasses.is_dataclass(kind) or _is_tuple(kind))):
         raise InputError(f"expected a dataclass to register, got {kind!r}")
-    name = kind.__name__
-    if _TYPES.get(name, kind).__module__ != kind.__module__:
+    name, path = kind.__name__, _path(kind)
+    if _HOMES.get(name, path) != path:
         raise InputError(f"another type is registered as {name}: choose another name")
-    _TYPES[name], _NAMES[kind] = kind, name
+    _TYPES[name], _HOMES[name], _NAMES[path] = kind, path, name
     return kind
+
+
+def know(paths: str) -> None:
+    """Make types of the package known, by their paths in it, which blanks separate."""
+    for path in paths.split():
+        name = path.rpartition(".")[2]
+        _HOMES[name], _NAMES[path] = path, name
+
+
+know(_KNOWN)
+
+
+def _path(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__name__}".removeprefix("gfnn_jax.")
+
+
+def _type(name: str) -> type | None:
+    """The type that is saved under a name; None where it is not known."""
+    if name not in _TYPES and name in _HOMES:
+        module, _, kind = _HOMES[name].rpartition(".")
+        _TYPES[name] = getattr(importlib.import_module(f"gfnn_jax.{module}"), kind)
+    return _TYPES.get(name)
 
 
 def _is_tuple(kind: type) -> bool:
@@ -325,14 +271,14 @@ def _encode(value: Any) -> tuple[Any, Any]:
         known = {CARTESIAN.forward: None, LOG.forward: LOG.name}
         change = known.get(value.forward, _OF_SCENE)
         return {"type": "Coordinates", **text, "change": change}, None
-    if type(value) in _NAMES:
+    if (path := _path(type(value))) in _NAMES:
         names = _fields_of(type(value))
         items = {name: getattr(value, name) for name in names}
         if items.get("features") is not None:
             items["features"] = _OF_SCENE  # _lender has found whose they are
-        return _encode_all(items, {"type": _NAMES[type(value)]})
+        return _encode_all(items, {"type": _NAMES[path]})
     if isinstance(value, tuple) and any(
-        type(item) in _NAMES or isinstance(item, dict) or _is_array(item) for item in value
+        _path(type(item)) in _NAMES or isinstance(item, dict) or _is_array(item) for item in value
     ):  # items that need places of their own among the arrays
         return _encode_all({str(i): item for i, item in enumerate(value)}, {"type": "tuple"})
     if isinstance(value, tuple):
@@ -391,12 +337,12 @@ def _decode(text: Any, arrays: Any, scene: Scene | None) -> Any:
         return tuple(items[str(i)] for i in range(len(items)))
     if kind == "dict":
         return {key: items[str(i)] for i, key in enumerate(text["keys"])}
-    if kind not in _TYPES:
+    if (made := _type(kind)) is None:
         raise InputError(
             f"holds a {kind}, which is not known: import the module that registers it "
             "(gfnn_jax.register)"
         )
-    return _TYPES[kind](**items)
+    return made(**items)
 
 
 def _decode_coordinates(text: dict[str, Any], scene: Scene | None) -> Coordinates:
