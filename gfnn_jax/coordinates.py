@@ -102,7 +102,23 @@ def to_user(coordinates: Coordinates, y) -> np.ndarray:
     return _batch(coordinates.inverse, y)
 
 
-def _batch(change: Callable, z) -> np.ndarray:
+def inner_slopes(coordinates: Coordinates, z) -> np.ndarray:
+    """Compute ∂y/∂z (..., 2d, 2d) of y = forward(z) at states z (..., 2d), NumPy float64. Of
+    coordinates that are not the user's own."""
+    return _batch(coordinates.forward, z, _slopes)
+
+
+@partial(jax.jit, static_argnames="change")
+def _changed(z, *, change):
+    return jax.vmap(change)(z)
+
+
+@partial(jax.jit, static_argnames="change")
+def _slopes(z, *, change):
+    return jax.vmap(jax.jacfwd(change))(z)
+
+
+def _batch(change: Callable, z, of: Callable = _changed) -> np.ndarray:
     z = np.array(z, dtype=np.float64)
     if change is _identity or z.size == 0:
         return z
@@ -111,13 +127,9 @@ def _batch(change: Callable, z) -> np.ndarray:
     for first in range(0, len(flat), size):
         part = flat[first : first + size]
         padded = np.concatenate([part, np.repeat(part[:1], size - len(part), axis=0)])
-        done.append(np.asarray(_changed(padded, change=change))[: len(part)])
-    return np.concatenate(done).reshape(z.shape)
-
-
-@partial(jax.jit, static_argnames="change")
-def _changed(z, *, change):
-    return jax.vmap(change)(z)
+        done.append(np.asarray(of(padded, change=change))[: len(part)])
+    found = np.concatenate(done)
+    return found.reshape(*z.shape[:-1], *found.shape[1:])
 
 
 def whole_turns(angle):

@@ -131,9 +131,9 @@ def test_the_size_of_smallest_expected_error_is_that_of_the_true_s():
     free = (Budget(), lambda message: None)
     most = next(s for s in plain.sizes if s.family.degree == 6)
     size = best_size(plain, plain.sizes[0], most, *free).size
-    deviations = plain.state_deviations(size) * plain.data.scale
+    deviations = plain.state_deviations(size)
     np.testing.assert_allclose(deviations, SIGMA, rtol=0.1)
-    sweep = NoisySweep(plain, plain, size, plain.state_deviations(size))
+    sweep = NoisySweep(plain, plain, size, deviations)
     found = best_size(sweep, size, most, *free)
     assert found.size.family.degree == 4
     assert found.noise == pytest.approx(1.0, abs=0.08)

@@ -21,6 +21,13 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.coordinates import (
+    CARTESIAN,
+    Coordinates,
+    inner_slopes,
+    nearest_image,
+    to_inner,
+)
 from gfnn_jax.generating.charts import AnyChart
 from gfnn_jax.solve.latent_arcs import Defects, Observed, observed_whole
 
@@ -92,6 +99,8 @@ class GeneratedOnArcs:
     wanted: F is then that of S = 0, its derivatives in the states stay those of S, and Γ is in the
     coefficients of this family. None: no coefficient is free. joint: F is that of S all the same,
     where ``along`` is its own family: `Readings.fit` then moves states and coefficients together.
+    coordinates: of S, where the arcs' states are the user's, whose noise is independent: that of
+    p_r and of φ is not.
     """
 
     family: Any
@@ -101,6 +110,7 @@ class GeneratedOnArcs:
     ends: tuple[Sequence[Any], Sequence[Any]] = ((), ())
     along: Any = None
     joint: bool = False
+    coordinates: Coordinates = CARTESIAN
 
     def defects(self, p: np.ndarray, x: np.ndarray) -> Defects:
         width, free = x.shape[-1], 0 if self.along is None else self.along.num_parameters
@@ -115,6 +125,11 @@ class GeneratedOnArcs:
     def _linearised(self, p: np.ndarray, y0: np.ndarray, y1: np.ndarray) -> np.ndarray:
         """[c, Φ, Γ] (n, 2d, 1 + 2d + free) of steps from z to Z (n, 2d)."""
         before, after = self._of_states(y0.shape[-1])
+        own = None
+        if not self.coordinates.plain:
+            own = [inner_slopes(self.coordinates, y) for y in (y0, y1)]
+            y0, y1 = (to_inner(self.coordinates, y) for y in (y0, y1))
+            y1 = y0 + nearest_image(y1 - y0, self.coordinates.angles)
         for piece in self.ends[0]:
             y0 = piece.image(y0)
         for piece in reversed(self.ends[1]):
@@ -122,11 +137,14 @@ class GeneratedOnArcs:
         w, target = self.chart.evaluation_point(y0, y1), self.chart.target_gradient(y0, y1, self.dt)
         gradient, hessian = self.family.gradient_and_hessian(self.family.unflatten(p), w)
         miss = -target if self.along is not None and not self.joint else gradient - target
-        parts = [miss[..., None], hessian @ before[0] - before[1]]
+        first, second = (hessian @ of[0] - of[1] for of in (before, after))
+        if own is not None:
+            first, second = first @ own[0], second @ own[1]
+        parts = [miss[..., None], first]
         if self.along is not None:
             parts.append(self.along.term_gradients(w))
         # F + ∂F/∂z δz + ∂F/∂Z δZ + ∇φ δc = 0, for δZ.
-        return -np.linalg.solve(hessian @ after[0] - after[1], np.concatenate(parts, axis=-1))
+        return -np.linalg.solve(second, np.concatenate(parts, axis=-1))
 
     def observe(self, p: np.ndarray, x: np.ndarray) -> Observed:
         return observed_whole(x, 0 if self.along is None else self.along.num_parameters)

@@ -162,16 +162,13 @@ def _corrected(rivals: list[Entry], request: Request) -> Entry:
     estimated: list[tuple[NoisySweep, Expected, Size]] = []
     deviations = None
     for entry in rivals:
-        most = entry.sweep.largest_known
-        # Of much noise the measured points ask for more terms than any states near them follow.
-        for start in (best_size(entry.sweep, entry.size, most, *given).size, entry.size):
-            # The same for all, so that their distances have one unit.
-            unit = entry.sweep.state_deviations(start) if deviations is None else deviations
-            with contextlib.suppress(np.linalg.LinAlgError):
-                sweep = NoisySweep(entry.sweep, entry.sweep, start, unit)
-                estimated.append((sweep, best_size(sweep, start, most, *given), most))
-                deviations = unit
-                break
+        start, most = entry.size, entry.sweep.largest_known
+        # The same for all, so that their distances have one unit.
+        unit = entry.sweep.state_deviations(start) if deviations is None else deviations
+        with contextlib.suppress(np.linalg.LinAlgError):
+            sweep = NoisySweep(entry.sweep, entry.sweep, start, unit)
+            estimated.append((sweep, best_size(sweep, start, most, *given), most))
+            deviations = unit
     if deviations is None:
         raise np.linalg.LinAlgError("expected a chart that is regular at all pairs")
     floor = min(expected.noise for _, expected, _ in estimated)
@@ -186,10 +183,12 @@ def _corrected(rivals: list[Entry], request: Request) -> Entry:
     with contextlib.suppress(np.linalg.LinAlgError):
         again = NoisySweep(sweep.plain, sweep, size, deviations)
         sweep, size = again, best_size(again, size, most, *given).size
-    free = Budget()
-    candidate = sweep.validate(
-        size, sweep.estimate(size, free, request.watch.on_progress), free, request.watch.on_progress
-    )
+    free = Budget(), request.watch.on_progress
+    # Noise puts measured states beyond all true ones, where the step of a large S may have no root.
+    for size in reversed(sweep.sizes[: sweep.sizes.index(size) + 1]):
+        candidate = sweep.validate(size, sweep.estimate(size, *free), *free)
+        if np.isfinite(candidate.validation_relative):
+            break
     return Entry(candidate, sweep, size)
 
 
@@ -197,7 +196,7 @@ class NoisySweep(LinearSweep):
     """The sizes of a sweep, in rows of the states that its arcs most likely had.
 
     plain: the sweep. near: one whose solution of ``size`` says where those states are. deviations:
-    (2d,) of the noise of each coordinate, ÷ its scale.
+    (2d,) of the noise of each of the user's coordinates.
     """
 
     def __init__(self, plain: LinearSweep, near: LinearSweep, size: Size, deviations: np.ndarray):
@@ -210,14 +209,15 @@ class NoisySweep(LinearSweep):
             z0, z1, longest, steps = _chained(data, rows)
             arcs = arcs_of_pairs(z0, z1, longest, steps)
             assert arcs is not None
-            sigma = deviations * data.scale
+            sigma = deviations
             if data.weight is not None:
                 own = sigma / data.weight[rows]
                 along = arcs_of_pairs(own, own, longest, steps)
                 assert along is not None
                 sigma = np.where(np.isfinite(along.states), along.states, sigma)
+            ends = data.before, data.after
             model = GeneratedOnArcs(
-                size.family, self.chart, data.dt, arcs.moves, (data.before, data.after)
+                size.family, self.chart, data.dt, arcs.moves, ends, coordinates=data.coordinates
             )
             return NearestArcs.of(model, coefficients, arcs, sigma)
 
@@ -301,12 +301,14 @@ class NoisySweep(LinearSweep):
 
 
 def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:
-    """Arguments of `arcs_of_pairs` for these rows: inner coordinates without a base map, angles
-    lifted along an arc. A p of period 2π is none to S: its pairs are arcs of their own."""
+    """Arguments of `arcs_of_pairs` for these rows: the user's states, angles lifted along an arc. A
+    p of period 2π is none to S: its pairs are arcs of their own."""
+    steps, angles = onward(data.pairs, rows), list(data.user_angles)
+    if not data.coordinates.plain:
+        return data.pairs.z0[rows], data.pairs.z1[rows], LONGEST, steps
     z0, z1 = data.y0[rows], data.whole_image(data.y1[rows], rows)
     for piece in reversed(data.before):
         z0 = piece.inverse().image(z0)
-    steps, angles = onward(data.pairs, rows), list(data.coordinates.angles)
     if angles:
         steps = np.where(max(angles) < data.dim, steps == 1, False).astype(int)
         turns = np.round((z1[:-1] - z0[1:])[:, angles] / (2 * np.pi)) * steps[:, None]

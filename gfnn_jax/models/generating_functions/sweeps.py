@@ -23,6 +23,7 @@ import numpy as np
 
 from gfnn_jax.budget import Budget
 from gfnn_jax.candidates.assemble import Candidate, refined_images, validated, with_predictor
+from gfnn_jax.coordinates import inner_slopes
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance, estimated_error
 from gfnn_jax.dataset.rows import inputs_of, of_pairs, of_rows, rows_of, weighted_rows_of
@@ -517,15 +518,24 @@ class LinearSweep(Generates):
         return train.image_norm(one - other) / (2 * np.sqrt(train.rows))
 
     def state_deviations(self, size: Size) -> np.ndarray:
-        """(2d,) standard deviation of each coordinate's noise, ÷ its scale, from what this size
-        leaves of a sample of the training pairs."""
-        (w, target, *args), goes_on = self._sample(OPTIONS.noise_pairs)
+        """(2d,) standard deviation of the noise of each of the user's coordinates, from what this
+        size leaves of a sample of the training pairs."""
+        data = self.data
+        places, goes_on = looked_at(data.pairs, data.training, OPTIONS.noise_pairs)
+        w, target, *args = (a[places] for a in self._train)
         solved, params = self.solve(size)
         slopes = self._slopes(size.family, w, *args)
         residual = slopes @ solved.coefficients - target * self._weight
         first, second = self.by_states(size.family, params, w, *args)
+        unit = data.scale
+        if not data.coordinates.plain:
+            rows, unit = data.training[places], data.spread
+            first, second = (
+                by @ (inner_slopes(data.coordinates, z[rows]) * unit / data.scale[:, None])
+                for by, z in ((first, data.pairs.z0), (second, data.pairs.z1))
+            )
         step = np.linalg.solve(second, np.concatenate([residual[..., None], -first], axis=-1))
-        return of_pairs(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
+        return unit * of_pairs(step[..., 0], step[..., 1:], np.flatnonzero(goes_on))
 
     def degrees_of_freedom(self, near: Size, most: Size, counts: Sequence[int]) -> list[float]:
         """Degrees of freedom that noise takes of a fit of so many of the leading terms of a size:
