@@ -1,15 +1,17 @@
 """S of noisy pairs: no bias of noisy evaluation points, its size, and misfit near the noise."""
 
+import dataclasses
 from types import SimpleNamespace
 from typing import cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.budget import Budget
-from gfnn_jax.coordinates import CARTESIAN
+from gfnn_jax.coordinates import CARTESIAN, Coordinates, to_user
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import arcs_of_pairs
@@ -25,6 +27,7 @@ from gfnn_jax.learn.noisy_sweeps import NoisySweep, best_size
 from gfnn_jax.maps.piece import Affine
 from gfnn_jax.models.generating_functions.map_arcs import NearestArcs
 from gfnn_jax.models.generating_functions.sweeps import Linear, LinearSweep, Size
+from gfnn_jax.search.search import Entry
 
 SIGMA, DT = 0.03, 0.5
 
@@ -82,17 +85,26 @@ def test_rows_of_the_nearest_states_have_no_bias(chart):
     assert variance == pytest.approx(1.0, abs=0.05)  # in units of the noise
 
 
+BENT = Coordinates(
+    "bent",
+    forward=lambda z: jnp.stack([z[0], z[1] + 0.3 * z[0] ** 2]),
+    inverse=lambda y: jnp.stack([y[0], y[1] - 0.3 * y[0] ** 2]),
+)
+
+
+@pytest.mark.parametrize("coordinates", [CARTESIAN, BENT], ids=["plain", "bent"])
 @pytest.mark.parametrize("chart", [MIDPOINT, TYPE2], ids=["midpoint", "type2"])
-def test_an_arc_is_linearised_as_its_steps_change(chart):
+def test_an_arc_is_linearised_as_its_steps_change(chart, coordinates):
     """Φ and c of the defect beside finite differences of the map that S generates, with a turn as
-    its base map."""
+    its base map, in the user's coordinates."""
     z0, z1, family, params = generated_pairs(chart, 40)
     turn = np.array([[0.8, 0.6], [-0.6, 0.8]])
     half = Affine(turn, np.zeros(2), np.zeros(2))
-    z0, z1 = half.inverse().image(z0), half.image(z1)
-    model = GeneratedOnArcs(family, chart, DT, np.ones((40, 1), bool), ((half,), (half,)))
-    w = chart.evaluation_point(half.image(z0), half.inverse().image(z1))
-    p = coefficients_of(family, params, w)
+    p = coefficients_of(family, params, chart.evaluation_point(z0, z1))
+    inner = half.inverse().image(z0), half.image(z1)
+    z0, z1 = (to_user(coordinates, y) for y in inner)
+    moves, ends = np.ones((40, 1), bool), ((half,), (half,))
+    model = GeneratedOnArcs(family, chart, DT, moves, ends, coordinates=coordinates)
     at = model.defects(p, np.stack([z0, z1], axis=1))
     np.testing.assert_allclose(at.closing, 0, atol=1e-9)
     moved = 1e-6 * np.random.default_rng(3).normal(size=(2, 40, 2))
@@ -137,6 +149,39 @@ def test_the_size_of_smallest_expected_error_is_that_of_the_true_s():
     found = best_size(sweep, size, most, *free)
     assert found.size.family.degree == 4
     assert found.noise == pytest.approx(1.0, abs=0.08)
+
+
+def test_a_size_whose_step_has_no_root_leaves_a_smaller_one(monkeypatch):
+    plain, *_ = sweep_of(MIDPOINT, SIGMA)
+    free = (Budget(), lambda message: None)
+    size = next(s for s in plain.sizes if s.family.degree == 3)
+    most = next(s for s in plain.sizes if s.family.degree == 6)
+    plain.factors(most.group, *free)
+    validate = NoisySweep.validate
+
+    def rootless(self, size, *others):
+        found = validate(self, size, *others)
+        fails = size.family.degree == 4  # which is the true one
+        return dataclasses.replace(found, validation_relative=np.inf) if fails else found
+
+    monkeypatch.setattr(NoisySweep, "validate", rootless)
+    request = SimpleNamespace(budget=free[0], watch=SimpleNamespace(on_progress=free[1]))
+    entry = noisy_sweeps._corrected([Entry(plain.estimate(size, *free), plain, size)], request)
+    assert entry.size.family.degree == 3
+    assert np.isfinite(entry.candidate.validation_relative)
+
+
+def test_noise_behind_polar_coordinates_is_that_of_the_users():
+    """The noise of the radial momentum is mostly that of the positions."""
+    scene = gfnn.scenes.two_body()
+    clean, rng = gfnn.sample_pairs(scene, 1_000, jax.random.key(0)), np.random.default_rng(0)
+    noise = np.array([2.0, 2.0, 1.0, 1.0]) * 1e-4
+    z0, z1 = (np.asarray(z) + noise * rng.normal(size=z.shape) for z in (clean.z0, clean.z1))
+    data = Dataset.of(gfnn.Pairs(z0, z1, scene.dt), scene.coordinates)
+    data = data.trained_on(np.arange(100, 1_000)).validated_on(np.arange(100))
+    sweep = LinearSweep(data, Tolerance(1e-6), MIDPOINT, Linear("polynomial"))
+    size = next(s for s in sweep.sizes if s.family.degree == 5)
+    np.testing.assert_allclose(sweep.state_deviations(size), noise, rtol=0.25)
 
 
 @pytest.mark.parametrize(("misfit", "count"), [(1.0, 3), (2.0, 6), (4.0, 6)])

@@ -185,7 +185,8 @@ def _corrected(rivals: list[Entry], request: Request) -> Entry:
         sweep, size = again, best_size(again, size, most, *given).size
     free = Budget(), request.watch.on_progress
     # Noise puts measured states beyond all true ones, where the step of a large S may have no root.
-    for size in reversed(sweep.sizes[: sweep.sizes.index(size) + 1]):
+    place = sweep.sizes.index(size)
+    for size in sweep.sizes[place::-1]:
         candidate = sweep.validate(size, sweep.estimate(size, *free), *free)
         if np.isfinite(candidate.validation_relative):
             break
