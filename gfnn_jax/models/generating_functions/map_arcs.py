@@ -11,6 +11,7 @@ there, without the moves of the states, are explicit and linear in their coeffic
 minimises the squared distance of the arcs from the map's graph to first order (orthogonal distance
 regression: Britt & Luecke, Technometrics 15 (1973) 233; Boggs, Byrd & Schnabel, SIAM J. Sci. Stat.
 Comput. 8 (1987) 1052). Residuals have variance one where noise is all that is left, in any chart.
+States are the user's, whose noise is independent: coordinates that mix them share it.
 
 Two monitors across a known linear stretch read y = (q, Q) = T z, T = [[1, 0], [A, B]]. Their noise
 is that of the momenta too, divided by B and the same in both of a turn's readings, so that neither
