@@ -1,12 +1,17 @@
 """Maps whose generating functions are known in closed form: tests of what is done with a map need
 no fit. And motion by SciPy's integrators, pairs of Hénon and Heiles among it."""
 
+import dataclasses
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.families import from_function
+from gfnn_jax.families.family import DifferentiatedByJax
 from gfnn_jax.families.friction import Friction
 from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.generating.generated import Generated
@@ -121,3 +126,72 @@ def states_in_motion(acceleration, start, t, **options):
         return np.concatenate([z[d:], acceleration(z[:d], z[d:])])
 
     return solve_ivp(rates, (t[0], t[-1]), start, t_eval=t, **options).y
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=("amplitude",), meta_fields=())
+@dataclasses.dataclass(frozen=True)
+class Network(DifferentiatedByJax):
+    """Network of one hidden layer of tanh, with its gradient in closed form."""
+
+    amplitude: float = 1.0
+    name = label = "tanh"
+    operations = (0, 0)
+
+    def value(self, params, w, args=None):
+        return self.amplitude * (self._hidden(params, w) @ params["outer"])
+
+    def gradient(self, params, w, args=None):
+        slope = (1 - self._hidden(params, w) ** 2) * self._row(params["outer"], w)
+        return self.amplitude * (slope @ params["inner"].T)
+
+    def _hidden(self, params, w):
+        inner = w.astype(params["inner"].dtype) @ params["inner"]
+        return jnp.tanh(inner + self._row(params["bias"], w))
+
+    def _row(self, vector, w):
+        return vector.reshape((1,) * (w.ndim - 1) + vector.shape)
+
+
+def network_params(seed=0, width=11, size=None):
+    """Weights of a ``Network``, those of its last layer divided by a size."""
+    rng = np.random.default_rng(seed)
+    inner, bias, outer = (rng.standard_normal(shape) for shape in ((2, width), width, width))
+    params = {"inner": inner, "bias": bias, "outer": outer / (size or np.sqrt(width))}
+    return jax.tree.map(jnp.asarray, params)
+
+
+def gradient_data(function, num, seed):
+    """(w, ∇function(w)) for num points of the square (−1, 1)²."""
+    w = np.random.default_rng(seed).uniform(-1, 1, (num, 2))
+    return w, np.asarray(jax.jit(jax.vmap(jax.grad(function)))(w))
+
+
+def steep_pendulum(w):
+    return 0.5 * w[1] ** 2 - jnp.cos(2 * w[0])
+
+
+def disc(num, radius=1.0, seed=0):
+    """States (num, 2), uniform in a disc."""
+    rng = np.random.default_rng(seed)
+    r, angle = radius * np.sqrt(rng.uniform(size=num)), rng.uniform(0, 2 * np.pi, num)
+    return np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)
+
+
+def rms(map_, z0, z1):
+    """RMS error of the images of a map."""
+    return float(np.sqrt(np.mean((np.asarray(map_.step(z0)[0]) - np.asarray(z1)) ** 2)))
+
+
+def block_on_a_spring(q, v, t, held):
+    """Positions and velocities (2, T) of q̈ = −q − held sgn q̇ in closed form: half turns about
+    ±held, until it stops."""
+    found, begun = np.full((2, len(t)), np.nan), 0.0
+    while side := np.sign(v) or -np.sign(q) * (abs(q) > held):
+        about = -side * held
+        size, angle = np.hypot(q - about, v), np.arctan2(-v, q - about)
+        left = ((0.0 if side > 0 else np.pi) - angle) % (2 * np.pi)  # until it turns
+        now = (t >= begun) & (t <= begun + left)
+        phase = angle + t[now] - begun
+        found[:, now] = about + size * np.cos(phase), -size * np.sin(phase)
+        q, v, begun = about + size * np.cos(angle + left), 0.0, begun + left
+    return np.where(np.isnan(found), [[q], [0.0]], found)

@@ -9,59 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from analytic import Network, gradient_data, network_params, steep_pendulum
 
-from gfnn_jax.families.family import DifferentiatedByJax
 from gfnn_jax.fitting.adam import DEFAULT, PAPER, PAPER_STANDARD_MAP, QUICK, Recipe, Training
 
 WEIGHT = np.array([0.5, 0.1])
 
 
-def pendulum(w):
-    return 0.5 * w[1] ** 2 - jnp.cos(2 * w[0])
-
-
-@partial(jax.tree_util.register_dataclass, data_fields=("amplitude",), meta_fields=())
-@dataclasses.dataclass(frozen=True)
-class Network(DifferentiatedByJax):
-    """Network of one hidden layer of tanh, with its gradient in closed form."""
-
-    amplitude: float = 1.0
-    operations = (0, 0)
-
-    def value(self, params, w, args=None):
-        hidden = jnp.tanh(self._cast(params, w) @ params["inner"] + self._row(params["bias"], w))
-        return self.amplitude * (hidden @ params["outer"])
-
-    def gradient(self, params, w, args=None):
-        hidden = jnp.tanh(self._cast(params, w) @ params["inner"] + self._row(params["bias"], w))
-        slope = (1 - hidden**2) * self._row(params["outer"], w)
-        return self.amplitude * (slope @ params["inner"].T)
-
-    def _row(self, vector, w):
-        return vector.reshape((1,) * (w.ndim - 1) + vector.shape)
-
-    def _cast(self, params, w):
-        return w.astype(params["inner"].dtype)
-
-
 NETWORK = Network()
+start = partial(network_params, size=4)
 
 
-def start(seed=0):
-    rng = np.random.default_rng(seed)
-    return {
-        "inner": jnp.asarray(rng.standard_normal((2, 11))),
-        "bias": jnp.asarray(rng.standard_normal(11)),
-        "outer": jnp.asarray(rng.standard_normal(11) / 4),
-    }
-
-
-def gradient_data(num, seed):
-    w = np.random.default_rng(seed).uniform(-1, 1, (num, 2))
-    return w, np.asarray(jax.jit(jax.vmap(jax.grad(pendulum)))(w))
-
-
-TRAIN, VALIDATION = gradient_data(330, 1), gradient_data(40, 2)
+TRAIN, VALIDATION = (gradient_data(steep_pendulum, *of) for of in ((330, 1), (40, 2)))
 SHORT = Recipe(batch_size=50, epochs=6, rate=0.02, schedule="cosine", dtype="float64")
 
 
@@ -226,7 +185,7 @@ def test_any_loss_of_a_batch():
 def test_a_second_fit_of_the_same_shapes_compiles_nothing(compilations):
     """Other data, another start, other leaves of the family, another key."""
     fit()
-    key, other, data = jax.random.key(11), start(seed=4), gradient_data(330, 5)
+    key, other, data = jax.random.key(11), start(seed=4), gradient_data(steep_pendulum, 330, 5)
     with compilations() as found:
         training = Training(SHORT, key)
         result = training.of_gradients(Network(amplitude=2.0), other, data, VALIDATION, WEIGHT)

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from analytic import rotated
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
@@ -261,14 +262,13 @@ def test_a_bound_of_exact_and_of_too_few():
 def test_the_stated_error_is_of_pairs_that_chose_nothing():
     rng = np.random.default_rng(0)
     z = rng.uniform(-1, 1, (200, 2))
-    c, s = np.cos(0.3), np.sin(0.3)
-    pairs = gfnn.Pairs(z, z @ np.array([[c, -s], [s, c]]) + 1e-3 * rng.normal(size=z.shape), 0.3)
+    pairs = gfnn.Pairs(z, rotated(z, 0.3) + 1e-3 * rng.normal(size=z.shape), 0.3)
     fit = gfnn.fit(pairs, tolerance=1e-2, learn="map")
     assert fit.stated_by == "20 pairs that took no part in the fit or its choices"
     few = gfnn.fit(pairs.take(slice(50)), tolerance=1e-2, learn="map")
     assert "cross-validation" in few.stated_by
     fresh = rng.uniform(-1, 1, (1_000, 2))
-    image = fresh @ np.array([[c, -s], [s, c]]) + 1e-3 * rng.normal(size=fresh.shape)
+    image = rotated(fresh, 0.3) + 1e-3 * rng.normal(size=fresh.shape)
     for one in (fit, few):
         error = (np.asarray(one.map.step(fresh)[0]) - image) / np.std(z, axis=0)
         assert 0.5 < one.chosen.validation_relative / np.sqrt(np.mean(error**2)) < 2
@@ -321,8 +321,7 @@ def test_the_error_of_few_runs_is_stated_by_all_of_them(scale):
 def test_noise_that_was_given_is_told_from_what_a_map_cannot_represent():
     rng = np.random.default_rng(0)
     z = rng.uniform(-1, 1, (400, 2))
-    c, s = np.cos(0.3), np.sin(0.3)
-    image = z @ np.array([[c, -s], [s, c]]) + 1e-3 * rng.normal(size=z.shape)
+    image = rotated(z, 0.3) + 1e-3 * rng.normal(size=z.shape)
     said = {}
     for std in (1e-3, 1e-4):
         # Of each coordinate, or of each value, half of them larger: the same mean square.

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from analytic import disc, rms, rotated
 
 import gfnn_jax as gfnn
 from gfnn_jax.candidates.assemble import Assembled
@@ -29,12 +30,6 @@ def pendulum(z, num_steps=50, dt=0.4):
     return np.stack([q, p], axis=1)
 
 
-def disc(num, radius=1.0, seed=0):
-    rng = np.random.default_rng(seed)
-    r, angle = radius * np.sqrt(rng.uniform(size=num)), rng.uniform(0, 2 * np.pi, num)
-    return np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)
-
-
 def pendulum_pairs(num=400, seed=0):
     z = disc(num, seed=seed)
     return gfnn.Pairs(z, pendulum(z), 0.4)
@@ -44,10 +39,6 @@ def quiet_fit(*arguments, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", gfnn.FitWarning)
         return gfnn.fit(*arguments, **options)
-
-
-def rms(map_, z0, z1):
-    return float(np.sqrt(np.mean((np.asarray(map_.step(z0)[0]) - np.asarray(z1)) ** 2)))
 
 
 @pytest.fixture(scope="module")
@@ -507,8 +498,7 @@ def test_a_base_map_is_found_where_it_is_needed():
 def test_a_linear_map_far_from_the_identity_needs_a_base_map():
     """A turn by 3 radians: the midpoint chart's determinant is cos²(1.5) = 0.005."""
     z = disc(300)
-    c, s = math.cos(3.0), math.sin(3.0)
-    fit = quiet_fit(gfnn.Pairs(z, z @ np.array([[c, -s], [s, c]]), 3.0), tolerance=1e-10)
+    fit = quiet_fit(gfnn.Pairs(z, rotated(z, 3.0), 3.0), tolerance=1e-10)
     assert fit.base_map
     assert fit.met
     assert fit.symplecticity_defect < 1e-12

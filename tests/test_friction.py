@@ -4,7 +4,7 @@ quadratic or dry."""
 import numpy as np
 import pytest
 import scipy.integrate
-from analytic import mechanics
+from analytic import block_on_a_spring, mechanics
 
 import gfnn_jax as gfnn
 from gfnn_jax.families.friction import DRY, LINEAR, ONE_SIDED, POWER, QUADRATIC, Friction
@@ -144,27 +144,8 @@ def test_quadratic_friction_is_told_from_pairs():
 
 
 def block(z, dt, held=0.05):
-    """Images of states (N, 2) of a block on a spring, q̈ = −q − 0.05 sgn q̇, in closed form: half
-    turns about ±0.05, until it stops."""
-    images = []
-    for q, v in z:
-        left = dt
-        while True:
-            side = np.sign(v) or -np.sign(q) * (abs(q) > held)
-            if not side:
-                break
-            about = -side * held
-            angle, size = np.arctan2(-v, q - about), np.hypot(q - about, v)
-            turn = (np.pi if side < 0 else 2 * np.pi) - (angle % (2 * np.pi))
-            turn = turn if turn > 1e-12 else np.pi
-            step = min(left, turn)
-            q, v = about + size * np.cos(angle + step), -size * np.sin(angle + step)
-            left -= step
-            if left <= 0:
-                break
-            v = 0.0
-        images.append([q, v])
-    return np.array(images)
+    """Images of states (N, 2)."""
+    return np.stack([block_on_a_spring(*one, np.array([dt]), held)[:, 0] for one in z])
 
 
 @pytest.mark.slow

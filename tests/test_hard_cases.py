@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from analytic import disc, rms, rotated
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import Coordinates
@@ -22,25 +23,12 @@ from gfnn_jax.solve.status import OK
 DT, K = 0.4, 0.6
 
 
-def disc(num, radius=1.0, seed=0):
-    rng = np.random.default_rng(seed)
-    r, angle = radius * np.sqrt(rng.uniform(size=num)), rng.uniform(0, 2 * np.pi, num)
-    return np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)
-
-
 def kick_and_drift(z):
     """An exact symplectic map near the identity: half a kick, a drift, half a kick."""
     q, p = np.asarray(z).T
     p = p - DT / 2 * np.sin(q)
     q = q + DT * p
     return np.stack([q, p - DT / 2 * np.sin(q)], axis=1)
-
-
-def turned(z, angle):
-    """The oscillator's exact map."""
-    q, p = np.asarray(z).T
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([q * c + p * s, p * c - q * s], axis=1)
 
 
 def fit(z0, z1, dt=DT, *, tolerance, **options):
@@ -51,10 +39,6 @@ def fit(z0, z1, dt=DT, *, tolerance, **options):
             gfnn.Pairs(z0, z1, dt), family="polynomial", absolute_tolerance=tolerance, **options
         )
     return fitted, "; ".join(fitted.messages)
-
-
-def rms(map_, z0, z1):
-    return float(np.sqrt(np.mean((np.asarray(map_.step(z0)[0]) - z1) ** 2)))
 
 
 @pytest.fixture(scope="module")
@@ -145,8 +129,8 @@ def test_standard_map_stays_on_its_curve_and_comes_back(exact):
 def oscillated(angle, chart):
     """Fit of the oscillator's map at dt = ``angle``: (error on fresh states, fit, messages)."""
     z0, z = disc(300, seed=9), disc(100, seed=10)
-    fitted, said = fit(z0, turned(z0, angle), angle, chart=chart, tolerance=1e-8)
-    return rms(fitted.map, z, turned(z, angle)), fitted, said
+    fitted, said = fit(z0, rotated(z0, angle), angle, chart=chart, tolerance=1e-8)
+    return rms(fitted.map, z, rotated(z, angle)), fitted, said
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
-from analytic import mechanics
+from analytic import block_on_a_spring, mechanics
 
 import gfnn_jax as gfnn
 from gfnn_jax.families.friction import DRY, LINEAR
@@ -188,16 +188,9 @@ def on_a_spring(friction, width):
 
 
 def block(turn, friction, time):
-    """A block on a spring, ẍ = −x, let go at ``turn``: half turns about ±μ until dry friction holds
-    it (exact). Its positions, and where it stops."""
-    expected = np.zeros(len(time))
-    for n, t in enumerate(time):
-        if n and int(t // np.pi) > int(time[n - 1] // np.pi) and abs(turn) > friction:
-            turn = 2 * friction * np.sign(turn) - turn
-        centre = friction * np.sign(turn)
-        moving = abs(turn) > friction
-        expected[n] = centre + (turn - centre) * np.cos(t % np.pi) if moving else turn
-    return expected, turn
+    """Positions of a block that is let go at ``turn``, and where it stops."""
+    found = block_on_a_spring(turn, 0.0, time, friction)[0]
+    return found, found[-1]
 
 
 def test_a_forecast_and_its_band_across_a_stop():

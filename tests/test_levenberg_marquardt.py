@@ -1,6 +1,5 @@
 """Levenberg–Marquardt on S: exact where S is representable, equal to SciPy's optimum, resumable."""
 
-import dataclasses
 from contextlib import nullcontext
 from functools import partial
 
@@ -9,59 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from analytic import Network, gradient_data, network_params, steep_pendulum
 from jax.flatten_util import ravel_pytree
 
 from gfnn_jax.errors import OutOfTime
-from gfnn_jax.families.family import DifferentiatedByJax, from_function
+from gfnn_jax.families.family import from_function
 from gfnn_jax.fitting import levenberg_marquardt as lm
 from gfnn_jax.fitting.levenberg_marquardt import BLOCK, GradientFit, Limits
-
-
-@partial(jax.tree_util.register_dataclass, data_fields=("amplitude",), meta_fields=())
-@dataclasses.dataclass(frozen=True)
-class Network(DifferentiatedByJax):
-    """Network of one hidden layer of tanh, with its gradient in closed form."""
-
-    amplitude: float = 1.0
-    name = label = "tanh"
-    operations = (0, 0)
-
-    def value(self, params, w, args=None):
-        hidden = jnp.tanh(w @ params["inner"] + self._row(params["bias"], w))
-        return self.amplitude * (hidden @ params["outer"])
-
-    def gradient(self, params, w, args=None):
-        hidden = jnp.tanh(w @ params["inner"] + self._row(params["bias"], w))
-        slope = (1 - hidden**2) * self._row(params["outer"], w)
-        return self.amplitude * (slope @ params["inner"].T)
-
-    def _row(self, vector, w):
-        return vector.reshape((1,) * (w.ndim - 1) + vector.shape)
-
 
 NETWORK = Network()
 
 
-def network_params(seed, width, inputs=2):
-    rng = np.random.default_rng(seed)
-    return {
-        "inner": jnp.asarray(rng.standard_normal((inputs, width))),
-        "bias": jnp.asarray(rng.standard_normal(width)),
-        "outer": jnp.asarray(rng.standard_normal(width) / np.sqrt(width)),
-    }
-
-
-def gradient_data(function, num, seed, inputs=2):
-    """(w, ∇function(w)) for num points of the cube (−1, 1)^inputs."""
-    w = np.random.default_rng(seed).uniform(-1, 1, (num, inputs))
-    return w, np.asarray(jax.jit(jax.vmap(jax.grad(function)))(w))
-
-
-def pendulum(w):
-    return 0.5 * w[1] ** 2 - jnp.cos(2 * w[0])
-
-
-TRAINING, VALIDATION = gradient_data(pendulum, 130, 0), gradient_data(pendulum, 50, 1)
+TRAINING, VALIDATION = gradient_data(steep_pendulum, 130, 0), gradient_data(steep_pendulum, 50, 1)
 
 
 def fit_pendulum(*, chunk=40, resume=None, **limits):
@@ -147,7 +105,7 @@ def test_resuming_is_bit_identical_to_never_having_stopped():
 def test_a_second_fit_of_the_same_shapes_compiles_nothing(compilations):
     """Other data, another start, other leaves of the family."""
     fit_pendulum(max_iterations=2)
-    w, target = gradient_data(pendulum, 130, 8)
+    w, target = gradient_data(steep_pendulum, 130, 8)
     start = network_params(5, 13)
     with compilations() as found:
         result = GradientFit(w, target, validation=VALIDATION, limits=Limits(2), chunk=40).train(

@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+from analytic import rotated
 
 import gfnn_jax as gfnn
 
@@ -12,8 +13,7 @@ import gfnn_jax as gfnn
 def kicked(num=60, seed=0):
     """Pairs of the flow of ½p² + ½q² over 0.3, which is a rotation."""
     z = np.random.default_rng(seed).normal(size=(num, 2))
-    c, s = np.cos(0.3), np.sin(0.3)
-    return gfnn.Pairs(z, z @ np.array([[c, -s], [s, c]]), 0.3)
+    return gfnn.Pairs(z, rotated(z, 0.3), 0.3)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from analytic import rotated
 
 import gfnn_jax as gfnn
 from gfnn_jax import cli_parser
@@ -47,8 +48,7 @@ def test_a_job_is_identified_by_what_decides_its_model():
 
 def test_given_whole_or_by_name():
     z = np.random.default_rng(0).normal(size=(40, 2))
-    c, s = np.cos(0.3), np.sin(0.3)
-    pairs = gfnn.Pairs(z, z @ np.array([[c, -s], [s, c]]), 0.3)
+    pairs = gfnn.Pairs(z, rotated(z, 0.3), 0.3)
     asked = gfnn.FitOptions(learn="map", chart="midpoint", tolerance=1e-3)
     whole = gfnn.fit(pairs, options=asked)
     changed = gfnn.fit(pairs, options=dataclasses.replace(asked, tolerance=1.0), tolerance=1e-3)

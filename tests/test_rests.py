@@ -4,26 +4,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from analytic import block_on_a_spring
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import measure, stretches, without_rests
 
 HELD, NOISE, DT = 0.1, 1e-3, 0.05
-
-
-def block(q, v, t):
-    """Positions of a block on a spring, q̈ = −q − 0.1 sgn q̇, in closed form: half turns about ±0.1,
-    until it stops."""
-    found, begun = np.full_like(t, np.nan), 0.0
-    while side := np.sign(v) or -np.sign(q) * (abs(q) > HELD):
-        about = -side * HELD
-        size, angle = np.hypot(q - about, v), np.arctan2(-v, q - about)
-        left = ((0.0 if side > 0 else np.pi) - angle) % (2 * np.pi)  # until it turns
-        now = (t >= begun) & (t <= begun + left)
-        found[now] = about + size * np.cos(angle + t[now] - begun)
-        q, v, begun = about + size * np.cos(angle + left), 0.0, begun + left
-    return np.where(np.isnan(found), q, found)
 
 
 def record(seed=0):
@@ -33,7 +20,7 @@ def record(seed=0):
         {
             "run": np.full(len(t), str(k)),
             "t": t,
-            "x": block(*start, t) + NOISE * rng.normal(size=len(t)),
+            "x": block_on_a_spring(*start, t, HELD)[0] + NOISE * rng.normal(size=len(t)),
         }
         for k, start in enumerate(((1.0, 0.0), (0.7, 0.2), (-0.8, 0.5)))
     ]
