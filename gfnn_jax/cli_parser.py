@@ -244,12 +244,8 @@ def _run(command: _Command) -> None:
     command.add("--out", "folder (default runs/NAME)", "DIR", type=Path)
     command.flag("--open", "open the report in a browser")
     command.flag("--quick", "of a scene: fewer pairs and rollouts")
-    command.add(
-        "--dt",
-        "another time step; of a file without times: the one between rows",
-        "H",
-        type=_positive,
-    )
+    about = "another time step; of a file without times: the one between rows"
+    command.add("--dt", about, "H", type=_positive)
     command.add_fit(tolerance="of a scene its own, close to the best attainable; else 1e-6")
     add_column_options(command.parser)
     _add_despite(command)
@@ -288,93 +284,50 @@ def _fit(command: _Command) -> None:
 
 
 def _add_despite(command: _Command) -> None:
-    command.add(
-        "--despite",
+    about = (
         "of a recording: fit although gfnn look finds these mistakes, by kind (in brackets after "
-        "the word wrong), joined by commas",
-        "KIND",
-        type=_split,
-        default=(),
+        "the word wrong), joined by commas"
     )
+    command.add("--despite", about, "KIND", type=_split, default=())
 
 
 def _predict(command: _Command) -> None:
     command.add("model", "folder that `gfnn fit` wrote", "MODEL", type=Path)
-    command.add(
-        "--initial",
+    about = (
         "initial states; or a trajectory file, whose sequences continue from their last states; or "
         "a recording, whose runs continue from the states estimated at their ends (of a map of "
-        "positions, from their last two positions)",
-        "FILE",
-        type=Path,
-        required=True,
+        "positions, from their last two positions)"
     )
-    command.add(
-        "--to",
-        "of a recording: forecast from time T, in the file's unit, as if it ended there",
-        "T",
-        dest="stop",
-        type=finite,
-    )
+    command.add("--initial", about, "FILE", type=Path, required=True)
+    about = "of a recording: forecast from time T, in the file's unit, as if it ended there"
+    command.add("--to", about, "T", dest="stop", type=finite)
     command.add("--num-steps", "steps to predict, backwards where N < 0", "N", type=_steps)
-    command.add(
-        "--estimate-from",
-        "of a recording: estimate the state at its end from the last K samples",
-        "K",
-        type=_count,
-    )
-    command.add(
-        "--inputs",
-        "of a recording: file of the inputs after its end, at the times of the forecast",
-        "FILE",
-        type=Path,
-    )
-    command.add(
-        "--compare",
-        "of a recording: file of what was measured after its end; prints the errors",
-        "FILE",
-        type=Path,
-    )
+    about = "of a recording: estimate the state at its end from the last K samples"
+    command.add("--estimate-from", about, "K", type=_count)
+    about = "of a recording: file of the inputs after its end, at the times of the forecast"
+    command.add("--inputs", about, "FILE", type=Path)
+    about = "of a recording: file of what was measured after its end; prints the errors"
+    command.add("--compare", about, "FILE", type=Path)
     saved = "save the state of every K-th step (default %(default)s)"
     command.add("--save-every", saved, "K", type=_count, default=1)
-    command.add(
-        "--dt",
+    about = (
         "time step, for a model that serves others than that of its data: H, or S of pairs with "
-        "several time steps",
-        "H",
-        type=_positive,
+        "several time steps"
     )
-    command.add(
-        "--out",
-        "file to write: .npz, or for the forecast of a recording .npz or .csv",
-        "FILE",
-        type=Path,
-        required=True,
-    )
-    command.add(
-        "--samples",
-        "maps drawn from the model's posterior: adds std and quantiles to FILE",
-        "N",
-        type=_count,
-    )
-    command.add(
-        "--horizon",
+    command.add("--dt", about, "H", type=_positive)
+    about = "file to write: .npz, or for the forecast of a recording .npz or .csv"
+    command.add("--out", about, "FILE", type=Path, required=True)
+    about = "maps drawn from the model's posterior: adds std and quantiles to FILE"
+    command.add("--samples", about, "N", type=_count)
+    about = (
         "with --samples: adds the first step at which the band of the position (two standard "
-        "deviations of its distance) exceeds SIZE, in the data's unit",
-        "SIZE",
-        type=_positive,
+        "deviations of its distance) exceeds SIZE, in the data's unit"
     )
-    command.add(
-        "--outside",
-        "what to do where a trajectory leaves the data's domain (default continue)",
-        choices=("continue", "stop"),
-    )
-    command.add(
-        "--devices",
-        "number of devices that share the trajectories; on a CPU these are its cores",
-        "all|N",
-        type=_devices,
-    )
+    command.add("--horizon", about, "SIZE", type=_positive)
+    about = "what to do where a trajectory leaves the data's domain (default continue)"
+    command.add("--outside", about, choices=("continue", "stop"))
+    about = "number of devices that share the trajectories; on a CPU these are its cores"
+    command.add("--devices", about, "all|N", type=_devices)
     command.flag(
         "--distributed",
         "this is one of several processes that srun or another launcher has started",
@@ -384,14 +337,12 @@ def _predict(command: _Command) -> None:
 
 def _export(command: _Command) -> None:
     command.add("model", "folder that `gfnn fit` wrote", "MODEL", type=Path)
-    command.add(
-        "--to",
+    about = (
         "c: C99 for one state at a time; of a law c-taylor: the same, "
         "js: JavaScript, jax, casadi, fmu: FMI 3.0, mjcf and urdf: a chain of links, latex; "
-        "stablehlo: batches by jax.export, of any map",
-        choices=EXPORTS,
-        required=True,
+        "stablehlo: batches by jax.export, of any map"
     )
+    command.add("--to", about, choices=EXPORTS, required=True)
     command.add("--out", "default: beside MODEL, of its name", "FILE", type=Path)
     command.flag("--overwrite", "replace an existing output")
 
