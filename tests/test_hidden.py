@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from types import SimpleNamespace as Some
 from typing import Any
 
@@ -13,8 +14,9 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.budget import Counted
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.models.lagrangians import hidden
+from gfnn_jax.models.lagrangians import hidden, recordings
 from gfnn_jax.models.lagrangians.hidden import with_hidden, with_number
+from gfnn_jax.models.lagrangians.nature import NO_COLUMN
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.signals.oscillations import Oscillations, oscillations
 
@@ -27,6 +29,14 @@ def followed(rates, start, seconds):
     options = {"t_eval": t, "rtol": 1e-10, "atol": 1e-12}
     q = solve_ivp(rates, (0, t[-1]), start, **options).y[: len(start) // 2]
     return t, q + 1e-3 * q.std() * np.random.default_rng(0).normal(size=q.shape), q
+
+
+def pendulums(g, c, m, _, s):
+    """Rates of L = ½v² + c v w cos(q − p) + ½m w² + g cos q + g c cos p."""
+    q, p, v, w = s
+    turn, k = c * np.sin(q - p), c * np.cos(q - p)
+    forces = [-turn * w * w - g * np.sin(q) - 0.01 * v, turn * v * v - g * c * np.sin(p)]
+    return [v, w, *np.linalg.solve([[1, k], [k, m]], forces)]
 
 
 def test_oscillations_are_the_parts_of_a_sum():
@@ -154,6 +164,17 @@ def test_the_work_of_a_search_is_counted_and_ends_with_what_was_found(monkeypatc
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("leaves_noise", [False, True])
+def test_a_sensor_beside_which_a_law_leaves_more_than_noise_is_not_all(monkeypatch, leaves_noise):
+    t, (x, _), _ = followed(partial(pendulums, 9.8, 0.05, 0.05), [0.6, -0.3, 0.0, 0.0], 15)
+    monkeypatch.setattr(recordings, "of_a_sensor", lambda fit: ("x is smoothed", leaves_noise))
+    law = recordings.fit_recording(gfnn.Recording({"t": t, "theta": x}), hidden=0)
+    assert law.flaws
+    assert "x is smoothed" in law.nature
+    assert (NO_COLUMN in law.nature) != leaves_noise  # where it is, hidden coordinates are tried
+
+
+@pytest.mark.slow
 def test_what_has_no_second_oscillation_has_no_hidden_coordinate():
     t = STEP * np.arange(400)
     recording = gfnn.Recording({"t": t, "x": np.cos(2 * t)}, positions=["x"], angles=[])
@@ -163,15 +184,8 @@ def test_what_has_no_second_oscillation_has_no_hidden_coordinate():
 
 @pytest.mark.slow
 def test_a_pendulum_on_a_pendulum_is_told_by_the_first(tmp_path):
-    g, c, m = 9.8, 0.4, 0.35  # L = ½v² + c v w cos(q − p) + ½m w² + g cos q + g c cos p
-
-    def rates(_, s):
-        q, p, v, w = s
-        turn, k = c * np.sin(q - p), c * np.cos(q - p)
-        forces = [-turn * w * w - g * np.sin(q) - 0.01 * v, turn * v * v - g * c * np.sin(p)]
-        return [v, w, *np.linalg.solve([[1, k], [k, m]], forces)]
-
-    t, q, true = followed(rates, [0.8, -0.5, 0.0, 0.0], 40)
+    g, c = 9.8, 0.4
+    t, q, true = followed(partial(pendulums, g, c, 0.35), [0.8, -0.5, 0.0, 0.0], 40)
     seen = t < 30
     recording = gfnn.Recording({"t": t[seen], "theta": q[0, seen]})
     fit = gfnn.fit(recording)  # one column, told nothing

@@ -284,13 +284,14 @@ def fit_recording(
     data, found, of_drive = _with_hidden_drive(recording, searched, _rules(recording, input_hold))
     recording = data.recording
     missed = no_law(data.problem.scales) if _misses(found.fit) else None
+    explained = False
     try:
         best, findings = _findings(recording, data, found, (*left_out, *of_drive), steps)
         findings = findings._replace(seconds=time.process_time() - started)
         law = in_words(recording, best, findings)
         if not terms and not hidden:
             messages = (*law.messages, *_with_constants(best.fit))
-            sensor = of_a_sensor(best.fit)
+            sensor, explained = of_a_sensor(best.fit)
             rival = law.rival or sensor or _other_shapes(best.fit)
             law = dataclasses.replace(law, rival=rival, nature=sensor, messages=messages)
             law = law if law.flaws else _with_rivals(law, recording, data, best.fit)
@@ -301,7 +302,7 @@ def fit_recording(
     lost = _loses_a_channel(law)
     if _is_no_law(law) or (hidden and lost):
         missed = missed or no_law(data.problem.scales)
-    if missed is None and (law.flaws or lost) and not hidden and (lost or not law.nature):
+    if missed is None and (law.flaws or lost) and not hidden and (lost or not explained):
         what = _nature(data)
         if law.nature:  # a sensor, beside which the law may leave much too
             law = dataclasses.replace(law, nature=f"{law.nature}; {what.reason}")

@@ -277,12 +277,13 @@ def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
     )
 
 
-def of_a_sensor(fit: LawFit) -> str:
-    """A line on a sensor of one coordinate beside which a plainer law follows a record; "" where
-    there is none. It is clearly likelier (Schwarz's criterion) than a law that leaves more than
-    noise, and not clearly less likely than one that leaves noise. Plain are the textbook's terms
-    and springs between angles, with linear friction; plainer is also a law without those of its
-    other terms that are no more than chance beside the sensor."""
+def of_a_sensor(fit: LawFit) -> tuple[str, bool]:
+    """A line on a sensor of one coordinate beside which a plainer law follows a record, "" where
+    there is none, and whether that law leaves noise alone. It is clearly likelier (Schwarz's
+    criterion) than a law that leaves more than noise, and not clearly less likely than one that
+    leaves noise. Plain are the textbook's terms and springs between angles, with linear friction;
+    plainer is also a law without those of its other terms that are no more than chance beside the
+    sensor."""
     problem, seen, d = fit.problem, fit.problem.observation, fit.structure.dim
     terms = textbook(d, problem.angles)
     terms += springs(d, problem.within_a_turn) if d > 1 else []
@@ -292,8 +293,8 @@ def of_a_sensor(fit: LawFit) -> str:
     odd = {key for key in fit.values if key[0] in ("term", "loss")} - set(plain.keys())
     is_noise = fit.loudest < OPTIONS.noise
     if not seen.is_plain or problem.parameters or (is_noise and not odd):
-        return ""
-    known, count, best = {}, fit.independent, ""
+        return "", False
+    known, count, best, enough = {}, fit.independent, "", False
     if not is_noise or len(plain.keys()) <= len(fit.p):  # else it is not as likely
         with contextlib.suppress(FitError):
             known = weak_start(plain, problem, prune=False)[1]
@@ -316,10 +317,11 @@ def of_a_sensor(fit: LawFit) -> str:
                 early = again.values.get(("sensor", "late"), 0.0) < 0  # and another late
                 if again.follows and again.is_definite and unlikely < least and not early:
                     typed, least = shlex.quote(f"{name} = {text}"), unlikely
+                    enough = again.loudest < OPTIONS.noise
                     best = (
                         f"a plainer law follows the record where {name} {what}: --observe {typed}"
                     )
-    return best
+    return best, enough
 
 
 def _without_needless(fit: LawFit, other: ArcProblem, odd: set[Key]) -> Structure | None:
