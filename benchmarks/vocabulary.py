@@ -309,6 +309,35 @@ def stribeck_friction(rng: np.random.Generator) -> System:
     )
 
 
+def jointed_arm(rng: np.random.Generator) -> System:
+    """Two links, the angle of the second from the first, whose joints rub less as they move, the
+    first turned by a torque that is recorded."""
+    first, second, both = rng.uniform(0.7, 1.0), rng.uniform(0.15, 0.3), rng.uniform(0.3, 0.6)
+    weight, width = rng.uniform(3, 6), rng.uniform(0.2, 0.5)
+    friction = {}
+    for v in ("v1", "v2"):
+        rest = rng.uniform(0.1, 0.4)
+        fallen = f"(abs({v}) + {width}*exp(-abs({v})/{width}))"
+        friction |= {f"abs({v})": rest, fallen: -0.4 * rest}
+    return System(
+        {
+            "v1**2": first,
+            "v1*v2": 2 * second,
+            "v2**2": second,
+            "v1**2*cos(x2)": both,
+            "v1*v2*cos(x2)": both,
+            "cos(x1)": 2 * weight,
+            "cos(x1 + x2)": weight,
+        },
+        ((rng.uniform(-1.2, 1.2), rng.uniform(-1.2, 1.2)), (0.0, 0.0)),
+        (0, 1),
+        friction,
+        period=1.5,
+        push=("4*u1", "0"),
+        dwell=20,
+    )
+
+
 def load_friction(rng: np.random.Generator) -> System:
     """Dry friction in proportion to the force that drives, as of a wedge."""
     friction = {"v1**2": rng.uniform(0.01, 0.03), "abs(u1)*abs(v1)": rng.uniform(0.15, 0.4)}
@@ -386,7 +415,7 @@ SYSTEMS: dict[str, Callable[[np.random.Generator], System]] = {
         *(motor_cart, motor_arm, magnet_on_a_spring, parametric_drive),
         *(spherical_pendulum, body_in_a_bowl, orbit_that_turns, stribeck_friction),
         *(elastic_on_video, orbit_off_the_origin),
-        load_friction,
+        *(load_friction, jointed_arm),
     )
 }
 

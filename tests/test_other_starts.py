@@ -13,6 +13,8 @@ from numpy.testing import assert_allclose
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
 from gfnn_jax.maps.estimates import _with_zeros
+from gfnn_jax.models.lagrangians.recordings import samples_of
+from gfnn_jax.models.lagrangians.starts import best_start
 from gfnn_jax.models.lagrangians.structure import SINE, Structure
 from gfnn_jax.solve.latent_arcs import Fitted
 
@@ -299,3 +301,25 @@ def test_equal_masses_are_not_held_where_they_leave_the_motion(monkeypatch):
     rng = np.random.default_rng([list(SYSTEMS).index("carts"), 20])
     draw = record(SYSTEMS["carts"], rng)
     assert draw.right(draw.error(gfnn.fit(draw.recording)))
+
+
+@pytest.mark.slow
+def test_an_arm_whose_joints_rub_starts_from_angles_between_links():
+    """Friction that falls with speed makes up for much of a wrong M: the angle of the second link
+    is from the first one."""
+
+    def acceleration(q, v):
+        c, s = 0.337 * np.cos(q[1]), 0.337 * np.sin(q[1])
+        mass = np.array([[1.862 + 2 * c, 0.438 + c], [0.438 + c, 0.438]])
+        spin = s * np.array([-v[1] * (2 * v[0] + v[1]), v[0] ** 2])
+        weight = np.array([10.181 * np.sin(q[0]), 0]) + 4.228 * np.sin(q.sum())
+        rubs = np.array([0.3, 0.2]) * np.tanh(v / 1e-3) * (1 + 0.7 * np.exp(-np.abs(v) / 0.3))
+        return np.linalg.solve(mass, -spin - weight - rubs)
+
+    names, t = ["q1", "q2"], np.linspace(0, 6, 600)
+    q = motion(acceleration, [0.95, -0.6, 0, 0], t, method="LSODA", rtol=1e-8)
+    q += 1e-3 * np.random.default_rng(5).normal(size=(2, 600))
+    record = gfnn.Recording({"t": t, "q1": q[0], "q2": q[1]}, positions=names, angles=names)
+    terms = best_start(samples_of(record).problem).structure.terms
+    assert {row[2] for row in terms if any(row[0]) and any(row[2])} == {(0, 1)}
+    assert {row[2] for row in terms if not any(row[0])} == {(1, 0), (1, 1)}

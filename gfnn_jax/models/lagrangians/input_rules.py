@@ -26,7 +26,7 @@ import numpy as np
 from gfnn_jax.dataset.stretches import Arcs, arcs_of
 from gfnn_jax.families.expressions import Expression, parameter, to_text, with_leaves
 from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
-from gfnn_jax.fitting.evidence import Comparison
+from gfnn_jax.fitting.evidence import Comparison, criterion
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.structure import Key, Row, Structure
 
@@ -77,6 +77,10 @@ class InputModel(NamedTuple):
         """The held-out cost (A,), in units of σ, the same for all that are compared."""
         return dataclasses.replace(self.fit, sigma=sigma).cross_validate()
 
+    def followed(self, sigma: np.ndarray) -> np.ndarray:
+        """The cost (A,) of the arcs that were fitted, in units of σ."""
+        return dataclasses.replace(self.fit, sigma=sigma).held_out(self.fit.arcs)
+
 
 def choose_rule(
     problem: ArcProblem,
@@ -96,7 +100,15 @@ def choose_rule(
     of_arcs = [one.held_out(sigma) for one in found]
     costs = np.array([np.sum(cost) for cost in of_arcs])
     least = of_arcs[int(np.argmin(costs))]
-    alike = [k for k, cost in enumerate(of_arcs) if not Comparison.of(cost, least).is_higher()]
+    # Held-out arcs of one third agree by chance: the errors of its coefficients are theirs all.
+    seen = [np.sum(one.followed(sigma)) for one in found]
+    above = [criterion(cost, found[0].fit.independent, 0) for cost in seen]
+    likely = min(above) + problem.options.evidence.deciding
+    alike = [
+        k
+        for k, cost in enumerate(of_arcs)
+        if above[k] < likely or not Comparison.of(cost, least).is_higher()
+    ]
     best = min(alike, key=lambda k: (found[k].delay != 0, costs[k]))
     others = {one.hold: float(c / costs[best]) for one, c in zip(found, costs, strict=True)}
     return found[best]._replace(others={h: c for h, c in others.items() if h != found[best].hold})

@@ -55,7 +55,8 @@ class RivalOptions:
     series of a shape. constants: inside a shape, times the range of the motion, where it begins;
     apart: relative, over which it is differentiated; corrections: of it; furthest: relative, of
     each; settled: standard errors, within which it is found. noise: times it, that is no more;
-    fades: of a speed's rms, between which Stribeck's friction does. clearly: of Schwarz's
+    fades: of a speed's rms, between which Stribeck's friction does; speeds: tried between these;
+    as_fast: relative, within which it is found. clearly: of Schwarz's
     criterion, that a sensor gains where a law leaves more.
     """
 
@@ -66,6 +67,8 @@ class RivalOptions:
     corrections: int = 6
     furthest: float = 0.3
     settled: float = 0.1
+    as_fast: float = 0.01
+    speeds: int = 19
     noise: float = 2.0
     fades: tuple[float, ...] = (0.01, 0.025, 0.06, 0.15, 0.37, 0.9)
     clearly: float = 10.0
@@ -119,27 +122,40 @@ def as_it_fades(row: Loss, fit: LawFit) -> Loss:
 
 def with_fading(fit: LawFit) -> LawFit:
     """The fit with the speeds over which its Stribeck friction fades that leave least, to three
-    digits."""
+    digits: by the linearised problem, then by fits."""
     begun = fit
     for row in fit.structure.friction:
         if row[1] != STRIBECK or not fit.follows:
             continue
-
-        def of(log: float, row: Loss = row, fit: LawFit = fit) -> LawFit:
-            other = (row[0], STRIBECK, float(f"{np.exp(log):.3g}"))
+        for _ in range(OPTIONS.corrections):
+            other = (*row[:2], float(f"{_best_speed(fit, row):.3g}"))
             turned = tuple(other if one == row else one for one in fit.structure.friction)
             known = {("loss", other) if k == ("loss", row) else k: c for k, c in fit.values.items()}
             structure = dataclasses.replace(fit.structure, friction=turned)
-            return fit.again(structure, known, rescale=False)
-
-        def cost(log: float, of=of) -> float:
-            found = of(log)
-            return found.fitted.cost if found.follows else np.inf
-
-        ends = np.log([fades(row[0], fit.problem)[k] for k in (0, -1)])
-        found: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 0.01})
-        fit = of(found.x) if found.fun < fit.fitted.cost else fit
+            found = fit.again(structure, known, rescale=False)
+            if not found.follows or not found.fitted.cost < fit.fitted.cost:
+                break
+            change, fit, row = abs(np.log(other[2] / row[2])), found, other
+            if change < OPTIONS.as_fast:
+                break
     return fit if fit is begun else fit.again()
+
+
+def _best_speed(fit: LawFit, row: Loss) -> float:
+    """The speed over which Stribeck friction of a fit would fade where the linearised problem
+    leaves least."""
+    slow, *_, fast = fades(row[0], fit.problem)
+    speeds = np.geomspace(slow, fast, OPTIONS.speeds)
+    tried = [("loss", (*row[:2], float(speed))) for speed in speeds]
+    larger, others = fit.structure.plus(tried), fit.structure.without({("loss", row)})
+    near = fit.problem.linearised(larger, fit)
+    whole = dataclasses.replace(near, triangle=near.triangle.rebased(-near.p))
+    left = whole.added(*places(larger, others, tried)).left ** 2
+    best = int(np.clip(np.argmin(left), 1, len(left) - 2))
+    low, least, high = left[best - 1 : best + 2]
+    bend = low - 2 * least + high
+    shift = (low - high) / (2 * bend) if bend > 0 else np.sign(low - high)
+    return float(speeds[best] * (speeds[1] / speeds[0]) ** np.clip(shift, -1, 1))
 
 
 def with_viscous_as_it_fades(fit: LawFit) -> LawFit:

@@ -117,8 +117,9 @@ def best_start(problem: ArcProblem) -> LawFit:
     if many:
         some.add(_Library(libraries.side_by_side(d, angles), equal=True))
         some.add_bodies(4)
-    if 1 < d == len(angles) and not (many and some.are_noise):
-        some.add(_Library(libraries.relative(d, angles)))
+    links = [_Library(libraries.relative(d, angles))] if 1 < d == len(angles) else []
+    if links and not (many and some.are_noise):
+        some.add(*links)
     some.add_richer([*textbook.rows, *pulls], 1)
     some.add_richer(libraries.spun(d, angles), 1)
     if not (many and some.are_noise):
@@ -131,8 +132,8 @@ def best_start(problem: ArcProblem) -> LawFit:
     for degree in (3, 4):
         some.add_bodies(degree)
     some.add_richer(libraries.on_a_surface(d, angles), 3)
-    some.add_rubbing(DRY, [textbook, _Library(first, 2)])
-    some.add_rubbing(STRIBECK, [textbook])
+    some.add_rubbing(DRY, [textbook, *links, _Library(first, 2)])
+    some.add_rubbing(STRIBECK, [textbook, *links])
     if inputs := problem.num_inputs:
         some.add_rubbing(LOADED, [textbook])
         driven = libraries.driven(d, angles, inputs, problem.squares)
