@@ -118,8 +118,8 @@ def best_start(problem: ArcProblem) -> LawFit:
         some.add(_Library(libraries.side_by_side(d, angles), equal=True))
         some.add_bodies(4)
     links = [_Library(libraries.relative(d, angles))] if 1 < d == len(angles) else []
-    if links and not (many and some.are_noise):
-        some.add(*links)
+    for library in [] if many and some.are_noise else links:
+        some.add(library)
     some.add_richer([*textbook.rows, *pulls], 1)
     some.add_richer(libraries.spun(d, angles), 1)
     if not (many and some.are_noise):
