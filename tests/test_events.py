@@ -170,7 +170,7 @@ def test_derivatives_of_a_crossing():
 def test_a_lag_of_a_channel_with_a_clock_of_its_own():
     rng, every = np.random.default_rng(1), 0.07
     motion = swings(12.0, lambda v: 0.1 * v, 1.0, 45.0).sol
-    one, two = every * (1 + np.arange(600)), 1.0301 * every * (1 + np.arange(550))
+    one, two = every * (1 + np.arange(600)), 1.03 * every * (1 + np.arange(550))
     t = np.concatenate([one, two])
     shown = np.concatenate([motion(one)[0], motion(two - 0.7 * every)[0]])
     shown += 1e-3 * shown.std() * rng.normal(size=len(t))

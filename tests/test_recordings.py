@@ -5,6 +5,7 @@ import argparse
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_array_equal
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli_parser import add_column_options, column_options, names_roles
@@ -126,6 +127,20 @@ def test_a_row_out_of_place_is_no_run_and_has_its_line(tmp_path, moved):
     row = int(np.flatnonzero(np.diff(moved) < 0)[0]) + 1
     with pytest.raises(InputError, match=f"line {row + 2}: t = {moved[row]} runs back .* sort"):
         gfnn.read(write(tmp_path / "r.csv", text))
+
+
+def test_rows_of_two_clocks_that_meet_are_one(tmp_path):
+    """Where a column has two values of one time nothing says which: the row has its line."""
+    lines = ["t,x,y", "0.0,1,", "0.1,2,", "0.1,,5", "0.2,,6", "0.3,3,"]
+    path = tmp_path / "two.csv"
+    path.write_text("\n".join(lines))
+    recording = gfnn.read(path, positions=["x", "y"])
+    assert_array_equal(recording.times("0"), [0, 0.1, 0.2, 0.3])
+    assert_array_equal(recording.values("x", "0"), [1, 2, np.nan, 3])
+    assert_array_equal(recording.values("y", "0"), [np.nan, 5, 6, np.nan])
+    path.write_text("\n".join([*lines, "0.3,4,"]))
+    with pytest.raises(InputError, match="line 7"):
+        gfnn.read(path, positions=["x", "y"])
 
 
 def test_a_second_column_of_times_is_named():

@@ -66,10 +66,17 @@ class Rows(NamedTuple):
 
 def rows_of(table: Table, rows: Rows) -> Table:
     """The table with these rows alone."""
-    keep = rows.kept(table.columns, table.times)
+    return _kept(table, rows.kept(table.columns, table.times))
+
+
+def _kept(table: Table, keep: np.ndarray) -> Table:
+    """The table with the rows of a mask (n,) alone, which stand where they stood."""
     columns = {n: v[keep] for n, v in table.columns.items()}
     text = {n: v[keep] if len(v) else v for n, v in table.text.items()}
-    return dataclasses.replace(table, columns=columns, text=text)
+    places = np.flatnonzero(keep)
+    return dataclasses.replace(
+        table, columns=columns, text=text, locate=lambda row: table.locate(int(places[row]))
+    )
 
 
 def with_events(table: Table, names: Collection[str]) -> Table:
@@ -216,6 +223,7 @@ def runs_of(
     found: dict[str, tuple[np.ndarray, dict[str, np.ndarray]]] = {}
     stems = [Path(table.source).stem for table in tables]
     for table, stem in zip(tables, stems, strict=True):
+        table = _joined(table) if dt is None else table
         length = len(next(iter(table.columns.values()), ()))
         if length == 0:
             raise InputError(f"{table.source}: holds no rows")
@@ -234,6 +242,25 @@ def runs_of(
                     raise InputError(f"{table.source}: {table.locate(row)}, {n}: infinite")
             found[name] = (times, values)
     return found
+
+
+def _joined(table: Table) -> Table:
+    """The table with rows of one time as one row, where no column has two values then: as of
+    sensors with clocks of their own, which meet."""
+    if not table.times:
+        return table
+    columns = {name: values.copy() for name, values in table.columns.items()}
+    times, run = columns[table.times[0]], columns.get(_run_column(table) or "")
+    kept, cells = np.full(len(times), True), [n for n in columns if not (is_time(n) or is_run(n))]
+    for row in np.flatnonzero(np.diff(times) == 0) + 1:
+        first = row - 1 - int(np.argmax(kept[row - 1 :: -1]))
+        both = any(np.isfinite(columns[n][[first, row]]).all() for n in cells)
+        if both or (run is not None and run[first] != run[row]):
+            continue  # refused where its runs are known
+        for n in cells:
+            columns[n][first] = columns[n][row if np.isnan(columns[n][first]) else first]
+        kept[row] = False
+    return _kept(dataclasses.replace(table, columns=columns), kept)
 
 
 def _run_column(table: Table) -> str | None:
