@@ -392,3 +392,12 @@ def test_names_with_blanks_are_one_word_of_the_command_that_is_told():
     table = {"t": t, "frame": np.sin(7.3 * t), "pendulum angle": np.cos(t) + 0.1 * np.sin(9 * t)}
     with pytest.raises(InputError, match=r"positions=\['frame', 'pendulum angle'\], or some"):
         gfnn.Recording(table)
+
+
+def test_a_sensor_that_another_name_explains_names_no_velocity():
+    t = np.arange(0, 5, 0.1)
+    table = {"t": t, "theta": np.cos(t), "gyro": 0.1 - np.sin(t)}
+    given = gfnn.Recording(table, observe={"gyro": "omega + b"}, guess={"b": 0})
+    assert (given.velocities, given.sensors) == ((), ("gyro",))
+    own = gfnn.Recording(table, observe={"gyro": "gyro + b"}, guess={"b": 0})
+    assert (own.velocities, own.sensors) == (("gyro",), ())

@@ -8,12 +8,13 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from analytic import motion
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import measure, stretches
 from gfnn_jax.exports.symbolic import Formula
-from gfnn_jax.models.lagrangians.nature import nature
+from gfnn_jax.models.lagrangians.nature import _jumps, nature
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
 from certificates import NOISES
@@ -296,3 +297,17 @@ def test_friction_that_yields_before_it_slips_is_named(way):
     table = gfnn.Recording({"t": t, "x": x, "u": u}, positions=["x"], inputs=["u"])
     found = stretches(table)
     assert ("memory" in nature(found, measure(found), ()).verdict) == (way > 0)
+
+
+def test_readings_between_those_of_another_clock_are_no_impacts():
+    t = np.concatenate([np.arange(0, 40, 0.05), np.arange(0.41, 39.9, 0.08)])
+    t = np.unique(np.round(t, 6))
+    x = motion(lambda q, v: -9 * np.sin(q) - 0.05 * v, [1.2, 0.0], t)[0]
+    x += 1e-3 * np.random.default_rng(1).normal(size=len(x))
+    found = stretches(gfnn.Recording({"t": t, "theta": x}, positions=["theta"], angles=["theta"]))
+    own = np.abs(t / 0.05 - np.round(t / 0.05)) < 1e-6
+    gone = [
+        dataclasses.replace(s, q=np.where(np.isin(s.t, t[own])[:, None], s.q, np.nan))
+        for s in found
+    ]
+    assert _jumps(gone)[0] < 0.1

@@ -34,7 +34,15 @@ from gfnn_jax.data.columns import (
     with_crossings,
     with_sigmas,
 )
-from gfnn_jax.data.roles import ROLES, coordinates_in, is_run, unit_in, wave
+from gfnn_jax.data.roles import (
+    ROLES,
+    coordinates_in,
+    is_run,
+    symbols,
+    unit_in,
+    wave,
+    words_in,
+)
 from gfnn_jax.data.tables import (
     ARRAYS,
     Rows,
@@ -201,6 +209,12 @@ class Recording:
             named = {name for of_role in given.values() for name in of_role}
             given["sensors"] += tuple(name for name in observe if name not in named)
         roles, decided = roles_of(source, numbers, given, runs, units)
+        # A column that another name explains is a sensor: it gives the velocity no name of its own.
+        shown = [n for n in roles["velocities"] if n not in given["velocities"]]
+        shown = [
+            n for n in shown if (of := words_in(observe.get(n))) and symbols((n,))[0] not in of
+        ]
+        roles["velocities"] = tuple(n for n in roles["velocities"] if n not in shown)
         others = [name for of_role in roles.values() for name in of_role]
         more = (name for name in observe if name not in others)
         roles = {**roles, "sensors": (*roles["sensors"], *more)}

@@ -164,12 +164,16 @@ def role_of(name: str) -> str | None:
     return role
 
 
+def words_in(formula: object) -> list[str]:
+    """The names in the formula of a sensor; of one that is no text none."""
+    return re.findall(r"[^\W\d]\w*", formula) if isinstance(formula, str) else []
+
+
 def coordinates_in(formulas: Iterable[object]) -> tuple[str, ...]:
     """The coordinates that formulas of sensors speak of, by the usual names: theta and x, also as
     omega, v, theta_dot or x_ddot; of formulas that are no text none."""
-    text = " ".join(one for one in formulas if isinstance(one, str))
     found = []
-    for name in re.findall(r"[^\W\d]\w*", text):
+    for name in (name for one in formulas for name in words_in(one)):
         of = re.sub(r"(_d*dot)$", "", name)
         speed = re.fullmatch(r"(omega|v)(\w*)", of)
         if speed:

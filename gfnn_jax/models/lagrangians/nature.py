@@ -222,17 +222,18 @@ def _power(columns: Sequence[np.ndarray]) -> float:
     longest = min(OPTIONS.lags, max(map(len, columns)) // 4)
     if longest < 4:
         return 2.0
-    apart = ([c[lag:] - c[:-lag] for c in columns] for lag in range(1, longest + 1))
-    squares = np.array([np.nanmean(np.concatenate(one) ** 2) for one in apart])
+    apart = [np.concatenate([c[n:] - c[:-n] for c in columns]) for n in range(1, longest + 1)]
+    told = [n for n, one in enumerate(apart) if np.isfinite(one).any()]
+    squares = np.array([np.nanmean(apart[n] ** 2) for n in told])
     whole = 2 * float(np.nanvar(np.concatenate(columns)))
     count = sum(len(column) for column in columns)
     if np.all(np.abs(1 - squares / whole) < 5 / np.sqrt(count)):
         return 0.0  # white
     early = squares < OPTIONS.early * whole
-    last = longest if early.all() else int(np.argmin(early))
+    last = len(told) if early.all() else int(np.argmin(early))
     if last < 4:
         return 2.0
-    lags, squares = np.arange(1.0, last + 1), squares[:last]
+    lags, squares = 1.0 + np.array(told[:last]), squares[:last]
     powers, left = np.arange(0.1, 2.05, 0.05), []
     for power in powers:
         rows = np.stack([np.ones(last), lags**power], axis=1) / squares[:, None]
@@ -360,21 +361,26 @@ def _lasts(found: Sequence[Stretch]) -> bool:
 
 
 def _jumps(found: Sequence[Stretch]) -> tuple[float, float]:
-    """The share of the squares of second differences in narrow peaks, and when the largest is; of
-    the column that has the largest share."""
+    """The share of the squares of accelerations in narrow peaks, and when the largest is; of the
+    column that has the largest share. Those of readings that are close count for less: their
+    noise does."""
     best, width = (0.0, 0.0), OPTIONS.width
     for k in range(found[0].q.shape[1]):
         whole, times, peaks = 0.0, [], []
-        for s in found:
-            size = np.abs(np.nan_to_num(np.diff(s.q[:, k], 2)))
+        read = [(s.t[seen], s.q[seen, k]) for s in found if sum(seen := np.isfinite(s.q[:, k])) > 2]
+        usual = np.median(np.concatenate([np.diff(t) for t, _ in read])) if read else 0.0
+        for t, q in read:
+            steps = np.diff(t)
+            near = np.minimum(np.minimum(steps[1:], steps[:-1]), usual)
+            size = np.abs(np.diff(np.diff(q) / steps)) * near**2 / (steps[1:] + steps[:-1])
             beside = np.pad(size, width)
             beside = np.maximum(beside[: -2 * width], beside[2 * width :])
             whole += float(np.sum(size**2))
             peaks.append(np.where(beside < size / 4, size, 0.0) ** 2)
-            times.append(s.t[1:-1])
-        square = np.concatenate(peaks)
+            times.append(t[1:-1])
+        square = np.concatenate([[0.0], *peaks])
         share = float(np.sum(square)) / max(whole, 1e-300)
-        best = max(best, (share, float(np.concatenate(times)[np.argmax(square)])))
+        best = max(best, (share, float(np.concatenate([[0.0], *times])[np.argmax(square)])))
     return best
 
 

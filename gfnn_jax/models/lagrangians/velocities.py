@@ -152,7 +152,10 @@ def _colour(left: np.ndarray) -> float:
     """The largest correlation of noise (A, L) with that of near nodes, of either sign."""
     power = np.nanmean(left**2)
     near = range(1, min(OPTIONS.near, left.shape[1] - 1) + 1)
-    return max(abs(float(np.nanmean(left[:, k:] * left[:, :-k]) / power)) for k in near)
+    beside = [left[:, k:] * left[:, :-k] for k in near]
+    return max(
+        (abs(float(np.nanmean(b) / power)) for b in beside if np.isfinite(b).any()), default=0.0
+    )
 
 
 def _copied(recording: Recording, place: int, name: str) -> bool:
