@@ -401,3 +401,6 @@ def test_a_sensor_that_another_name_explains_names_no_velocity():
     assert (given.velocities, given.sensors) == ((), ("gyro",))
     own = gfnn.Recording(table, observe={"gyro": "gyro + b"}, guess={"b": 0})
     assert (own.velocities, own.sensors) == (("gyro",), ())
+    other = gfnn.Recording(table, observe={"gyro": "omegas + b"}, guess={"b": 0})
+    assert other.coordinates == ("thetas",)
+    assert any("theta: not used" in note for note in other.notes)

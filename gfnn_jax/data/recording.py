@@ -38,6 +38,7 @@ from gfnn_jax.data.roles import (
     ROLES,
     coordinates_in,
     is_run,
+    role_of,
     symbols,
     unit_in,
     wave,
@@ -203,12 +204,16 @@ class Recording:
         if not coordinate_names and not given["positions"]:
             implied = coordinates_in(observe.values())
             coordinate_names = () if {*implied} & {*numbers} else implied
+        named = {name for of_role in given.values() for name in of_role}
         if coordinate_names and not given["positions"]:
             given["positions"] = tuple(name for name in coordinate_names if name in numbers)
         if coordinate_names and not given["positions"]:
-            named = {name for of_role in given.values() for name in of_role}
             given["sensors"] += tuple(name for name in observe if name not in named)
         roles, decided = roles_of(source, numbers, given, runs, units)
+        unseen = ", ".join(name for name in coordinate_names if name not in numbers)
+        beside = [n for n in numbers if role_of(n) == "positions" and n not in (*observe, *named)]
+        if unseen and beside and not by_name.get("coordinates"):
+            decided = [*decided, f"{', '.join(beside)}: not used, for observe speaks of {unseen}"]
         # A column that another name explains is a sensor: it gives the velocity no name of its own.
         shown = [n for n in roles["velocities"] if n not in given["velocities"]]
         shown = [
