@@ -488,7 +488,7 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
             f"{NOT_SYMPLECTIC}: ‖MᵀJM − J‖ is {defect:.2g} ± {error:.1g} (M: local "
             "Jacobians, coordinates in units of their spread) where a symplectic map has 0. Check "
             "the order q1…qd, p1…pd, and look for friction or a drive. If p are velocities, learn "
-            f"the law of a recording (--positions, --velocities; gfnn.Recording)."
+            "the law of a recording (--positions, --velocities; gfnn.Recording)."
             + differing(jacobians)
         )
     charts = choose_charts(chart, data, reversor, jacobians)
