@@ -268,8 +268,8 @@ def fit_recording(
         steps.append(line)
         on_progress(line)
 
-    recording, left_out = without_wrong_values(recording)
-    for line in left_out:
+    notes, (recording, left_out) = recording.notes, without_wrong_values(recording)
+    for line in (*notes, *left_out):
         note(line)
     recording = with_hidden(recording, hidden) if hidden else recording
 
