@@ -247,12 +247,13 @@ def runs_of(
 def _joined(table: Table) -> Table:
     """The table with rows of one time as one row, where no column has two values then: as of
     sensors with clocks of their own, which meet."""
-    if not table.times:
+    same = np.flatnonzero(np.diff(table.columns[table.times[0]]) == 0) + 1 if table.times else ()
+    if not len(same):
         return table
     columns = {name: values.copy() for name, values in table.columns.items()}
     times, run = columns[table.times[0]], columns.get(_run_column(table) or "")
     kept, cells = np.full(len(times), True), [n for n in columns if not (is_time(n) or is_run(n))]
-    for row in np.flatnonzero(np.diff(times) == 0) + 1:
+    for row in same:
         first = row - 1 - int(np.argmax(kept[row - 1 :: -1]))
         both = any(np.isfinite(columns[n][[first, row]]).all() for n in cells)
         if both or (run is not None and run[first] != run[row]):

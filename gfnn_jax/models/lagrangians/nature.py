@@ -224,6 +224,8 @@ def _power(columns: Sequence[np.ndarray]) -> float:
         return 2.0
     apart = [np.concatenate([c[n:] - c[:-n] for c in columns]) for n in range(1, longest + 1)]
     told = [n for n, one in enumerate(apart) if np.isfinite(one).any()]
+    if len(told) < 4:
+        return 2.0
     squares = np.array([np.nanmean(apart[n] ** 2) for n in told])
     whole = 2 * float(np.nanvar(np.concatenate(columns)))
     count = sum(len(column) for column in columns)
