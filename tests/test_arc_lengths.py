@@ -99,9 +99,7 @@ def test_arcs_that_no_orbit_follows_are_not_taken(longest, followed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "search", [pytest.param(search, marks=pytest.mark.slow), partial(fit_given, GIVEN, 1.0)]
-)
+@pytest.mark.parametrize("search", [search, partial(fit_given, GIVEN, 1.0)])
 def test_shorter_arcs_tell_more_where_unknown_torques_act(search):
     """The oracle are the pulls that made the data: the law of shorter arcs is nearer to them."""
     # Of these runs two processors take the same terms; of those of seed 0 one leaves friction out.

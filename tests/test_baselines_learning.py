@@ -117,9 +117,7 @@ def test_every_method_ends_in_a_step(name, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "share"), [("hnn", 0.2), pytest.param("srnn-5", 0.1, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("name", "share"), [("hnn", 0.2), ("srnn-5", 0.1)])
 def test_learns_an_oscillator(name, share, monkeypatch):
     """RMS error in four steps, as a share of how far the states move. HNN's is that of finite
     differences: (φ − 1)/dt is the field up to dt/2."""

@@ -77,10 +77,8 @@ def wide(casimirs, number, lanes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steps", [1_000, pytest.param(10_000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "spins" else n for n in SYSTEMS]
-)
+@pytest.mark.parametrize("steps", [1_000, 10_000])
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_step(name, steps, tmp_path):
     """The step is the flow of B∇H, exactly Poisson by the derivative of what ran; Casimirs stay;
     it is undone by its inverse and saved."""
@@ -112,9 +110,7 @@ def test_step(name, steps, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["top", *(pytest.param(n, marks=pytest.mark.slow) for n in SYSTEMS)]
-)
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_long_rollouts(name):
     """Compiled steps are those of JAX; Casimirs stay to the last digit."""
     map_, z = made(name, stages=STAGES)

@@ -145,9 +145,7 @@ def damped_heavy(z):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("field", "width"), [(damped_top, 3), pytest.param(damped_heavy, 6, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("field", "width"), [(damped_top, 3), (damped_heavy, 6)])
 def test_uniform_friction(field, width, tmp_path):
     """The rate and the motion to roundoff; the bracket is multiplied by e^(−λ dt); saved."""
     data = runs_of(field, np.random.default_rng(0).normal(size=(8 * width - 8, width)), 0.2, 20)

@@ -298,9 +298,7 @@ FITS = QUICK | SLOW
 
 @pytest.mark.slow
 @QUIETLY
-@pytest.mark.parametrize(
-    "what", [*QUICK, *(pytest.param(what, marks=pytest.mark.slow) for what in SLOW)]
-)
+@pytest.mark.parametrize("what", [*QUICK, *SLOW])
 def test_without_a_budget_no_decision_looks_at_a_clock(what, monkeypatch):
     """Neither at the budget's, nor past it at the machine's."""
     data, options = FITS[what]
@@ -330,7 +328,7 @@ def test_a_bound_on_operations_puts_none_on_the_clock_unless_told():
 
 @pytest.mark.slow
 @QUIETLY
-@pytest.mark.parametrize("learn", ["map", pytest.param("auto", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("learn", ["map", "auto"])
 def test_a_faster_clock_ends_at_an_earlier_unit_which_operations_reproduce(learn):
     """A clock that ticks at every look at it: so many looks fit, whatever the machine does."""
     pairs, found = kepler(), []

@@ -131,7 +131,7 @@ def test_samples_are_symplectic(fit):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [0.0, pytest.param(1e-2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("noise", [0.0, 1e-2])
 def test_bands_hold_the_true_error(fit, noise):
     if noise:
         with pytest.warns(gfnn.FitWarning):

@@ -268,10 +268,7 @@ def with_length(kind):
 
 @pytest.mark.slow
 @needs_cc
-@pytest.mark.parametrize(
-    "kind",
-    [pytest.param("midpoint", marks=pytest.mark.slow), "type 2", "damped"],
-)
+@pytest.mark.parametrize("kind", ["midpoint", "type 2", "damped"])
 def test_c_of_a_map_with_parameters(kind, tmp_path):
     map_, z, args = with_length(kind)
     z = np.concatenate([z, z[:20], z[:2]])
@@ -344,14 +341,7 @@ def pushed(hold, delay=0.0, uniform=0.0):
 @pytest.mark.slow
 @needs_cc
 @pytest.mark.parametrize(
-    ("hold", "delay"),
-    [
-        ("linear", 0.013),
-        *(
-            pytest.param(h, d, marks=pytest.mark.slow)
-            for h, d in (("hold", 0.0), ("hold", 0.02), ("band", 0.013))
-        ),
-    ],
+    ("hold", "delay"), [("linear", 0.013), ("hold", 0.0), ("hold", 0.02), ("band", 0.013)]
 )
 def test_c_of_a_map_with_inputs(hold, delay, tmp_path):
     """Steps of one state under samples of a force are a rollout, and the inverse undoes each."""

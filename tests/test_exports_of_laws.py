@@ -319,7 +319,7 @@ def chain(relative=False):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("to", ["mjcf", "urdf"])
-@pytest.mark.parametrize("relative", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("relative", [False, True])
 def test_mujoco_moves_a_chain_of_links_as_its_law_does(relative, to, tmp_path):
     mujoco = pytest.importorskip("mujoco", reason="MuJoCo is an extra")
     map_, z = chain(relative)

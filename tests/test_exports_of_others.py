@@ -113,9 +113,9 @@ def test_names_with_commas_go_through_every_option():
     ("head", "columns", "options"),
     [
         (None, (T, SWING), ["--columns", "t,x"]),
-        pytest.param("x", (SWING,), ["--dt", "0.02"], marks=pytest.mark.slow),
+        ("x", (SWING,), ["--dt", "0.02"]),
         ("lap,x", (T, SWING), ["--time", "lap"]),
-        pytest.param("t,#,x", (T, T, SWING), ["--columns", "t,x"], marks=pytest.mark.slow),
+        ("t,#,x", (T, T, SWING), ["--columns", "t,x"]),
     ],
 )
 def test_predict_reads_a_file_as_fit_did(tmp_path, capsys, head, columns, options):

@@ -160,7 +160,7 @@ def test_a_ring_of_many_sites(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ends", ["free", pytest.param("fixed", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("ends", ["free", "fixed"])
 def test_the_ends_of_a_chain_and_a_term_that_a_user_knows(ends):
     pinned = Part(Terms(1, ("p1", "1/(1 + q1**2)"), ((2, 0), (0, 1))), Windows(ends, 0))
     family = Sums(20, (pinned, Part(Terms(2, ("q2 - q1",), ((2,), (4,))), Windows(ends, 1))))

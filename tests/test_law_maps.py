@@ -13,7 +13,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.families.friction import DRY, LINEAR
 from gfnn_jax.maps.energy import ledger
 from gfnn_jax.maps.estimates import Window, law_in_use, propagate
-from gfnn_jax.maps.inputs import Signals
+from gfnn_jax.maps.inputs import HOLDS, Signals
 from gfnn_jax.maps.laws import law_of_map, map_of_law, states_of, velocities_of
 from gfnn_jax.maps.sensors import Sensors
 
@@ -55,7 +55,7 @@ def forecast(z, input_at):
 @pytest.mark.parametrize(
     ("hold", "input_at"),
     [
-        pytest.param("hold", lambda t: U[int(t / DT + 1e-6), 0], marks=pytest.mark.slow),
+        ("hold", lambda t: U[int(t / DT + 1e-6), 0]),
         ("linear", lambda t: np.interp(t, TIMES, U[:, 0])),
     ],
 )
@@ -332,9 +332,7 @@ def test_samples_of_a_law_that_sticks():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "hold", ["hold", *(pytest.param(hold, marks=pytest.mark.slow) for hold in ("linear", "band"))]
-)
+@pytest.mark.parametrize("hold", HOLDS)
 def test_a_rollout_with_inputs_and_turns(hold):
     """A pendulum with dry friction that a motor turns over: what JAX's steps of a narrower width
     tend to, angles counted, inputs by their rule, with parameters of the system."""

@@ -53,9 +53,7 @@ def coefficients_of(family, params, w):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "chart", [MIDPOINT, pytest.param(TYPE2, marks=pytest.mark.slow)], ids=["midpoint", "type2"]
-)
+@pytest.mark.parametrize("chart", [MIDPOINT, TYPE2], ids=["midpoint", "type2"])
 def test_rows_of_the_nearest_states_have_no_bias(chart):
     """Coefficients of 40,000 noisy pairs against the S that made them, in standard errors."""
     z0, z1, family, params = generated_pairs(chart, 40_000)

@@ -239,7 +239,7 @@ def tumbling(rng, count, noise=0.01):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_rates_of_a_body_are_no_positions(seed):
     begin, w = tumbling(np.random.default_rng(seed), 6)
     for names in (("wx", "wy", "wz"), ("x", "y", "z")):

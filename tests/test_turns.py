@@ -74,7 +74,7 @@ def test_a_step_that_is_too_long_is_named(dt, said):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gfnn_jax.errors.FitWarning")
-@pytest.mark.parametrize("dt", [4.0, pytest.param(5.5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dt", [4.0, 5.5])
 def test_a_law_of_few_terms_is_found_beyond_half_a_turn_and_that_is_said(dt):
     """Its quadratic part has aliases; with the cubic term only one of them is a polynomial."""
     family = given_terms(1, ["0.5*q**2 + 0.5*p**2 + 0.1*q**3"])
