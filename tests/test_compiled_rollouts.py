@@ -45,12 +45,12 @@ def arms(kind, driven=False):
 )
 def test_steps_are_those_of_jax(kind, driven):
     map_, z = arms(kind, driven)
-    inputs = np.sin(np.arange(301) / 30)[:, None] if driven else None
-    states, info = map_.rollout(z, 300, save_every=3, inputs=inputs)
-    args = map_._schedule(None, z, None, inputs, 300)
-    expected, other = lanes.roll_out(map_, z, args, lanes.Saving(100, 3))
+    inputs = np.sin(np.arange(100) / 30)[:, None] if driven else None
+    states, info = map_.rollout(z, 99, save_every=3, inputs=inputs)
+    args = map_._schedule(None, z, None, inputs, 99)
+    expected, other = lanes.roll_out(map_, z, args, lanes.Saving(33, 3))
     assert Stepper.of(map_.pieces[0], 2 * driven) is not None
-    np.testing.assert_allclose(states[:, :34], expected[:, :34], rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(states, expected, rtol=1e-11, atol=1e-11)
     np.testing.assert_array_equal(info.left_at, other.left_at)
     np.testing.assert_array_equal(info.status, other.status)
 

@@ -33,6 +33,7 @@ SLOW = {
     "own-parts": ("test_own_models",),
     "positions-alone": ("test_positions", "test_monitors"),
     "storage-ring": ("test_maps", "test_args"),
+    "runs-that-differ": ("test_systems", "test_recordings"),
     "scaling": ("test_sharded", "test_fit_on_devices", "test_distributed_fit"),
     "your-own-data": ("test_readme",),
 }

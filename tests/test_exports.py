@@ -2,12 +2,12 @@
 
 import ctypes
 import dataclasses
+import functools
 import json
 import re
 import shutil
 import subprocess
 import zipfile
-from functools import partial
 
 import jax
 import numpy as np
@@ -69,7 +69,11 @@ def map_in(chart, dim, degree, *, angles=(), predicted=True, around=()):
         Z, info = map_.step(z)
         good = np.asarray(info.status) <= LEFT_DOMAIN
         found = fit_predictors(
-            chart, z[good], np.asarray(Z)[good], DT, partial(box_inputs, angles=tuple(own))
+            chart,
+            z[good],
+            np.asarray(Z)[good],
+            DT,
+            functools.partial(box_inputs, angles=tuple(own)),
         )
         piece = dataclasses.replace(piece, predictor=found[-1].predictor)
     return dataclasses.replace(map_, pieces=(*around, piece, *around)), z
@@ -142,19 +146,19 @@ def of_positions(part, both, angles=()):
     z = np.concatenate([q, -DT * gradient[:, :dim]], axis=1)
     piece = Generated(family, params, TYPE1, DT, np.full(2 * dim, SIZE))
     image = np.concatenate([w[:, dim:], DT * gradient[:, dim:]], axis=1)
-    found = fit_predictors(TYPE1, z, image, DT, partial(box_inputs, angles=tuple(angles)))
+    found = fit_predictors(TYPE1, z, image, DT, functools.partial(box_inputs, angles=tuple(angles)))
     piece = dataclasses.replace(piece, predictor=found[-1].predictor)
     return map_of(piece, z, scale=np.full(2 * dim, SIZE)), z
 
 
 DAMPING = Damping(np.asarray(0.9), np.full(1, 0.05))
 QUICK = {
-    "positions both ways": lambda: of_positions(0.0, True, (0,)),
     "type 2, angles": lambda: map_in(TYPE2, 1, 4, angles=(0, 1)),
     "type 3, base map, damping": lambda: map_in(TYPE3, 1, 4, around=(turning(1), DAMPING)),
 }
 MAPS = {
     **QUICK,
+    "positions both ways": lambda: of_positions(0.0, True, (0,)),
     "damping": lambda: map_in(TYPE2, 1, 4, around=(DAMPING,)),
     "positions": lambda: of_positions(0.5, False),
     "type 1": lambda: map_in(TYPE1, 1, 4, predicted=False),
@@ -212,19 +216,31 @@ def scattered(map_, z):
     return np.concatenate([found, turned, wrong])
 
 
+@functools.cache
+def made(kind):
+    map_, z = law() if kind == "law" else MAPS[kind]()
+    return map_, scattered(map_, z)
+
+
+@functools.cache
+def by_itself(kind, name):
+    """Images and statuses by the map's own step or inverse."""
+    map_, z = made(kind)
+    images, info = getattr(map_, name)(z)
+    return np.asarray(images), np.asarray(info.status)
+
+
 @needs_cc
 @pytest.mark.parametrize(
     "kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in MAPS]
 )
 def test_c_is_the_maps_own_step(kind, tmp_path):
-    map_, z = MAPS[kind]()
-    z = scattered(map_, z)
+    map_, z = made(kind)
     library = compiled(gfnn.export(map_, "c", tmp_path / "own.c"))
-    for function, own in ((library.own_step, map_.step), (library.own_inverse, map_.inverse)):
+    for name, function in (("step", library.own_step), ("inverse", library.own_inverse)):
         images, status = by_c(function, z)
-        expected, info = own(z)
-        expected = np.asarray(expected)
-        np.testing.assert_array_equal(status, info.status)
+        expected, own_status = by_itself(kind, name)
+        np.testing.assert_array_equal(status, own_status)
         assert {OK, LEFT_DOMAIN, NON_FINITE} <= {*status.tolist()} or "angles" in kind
         inside = status == OK
         assert inside.sum() > 30
@@ -431,22 +447,22 @@ def test_the_tolerance_is_told_as_it_was_asked_for(relative, told, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "kind", ["type 2", *(pytest.param(k, marks=pytest.mark.slow) for k in ("an angle", "law"))]
+    "kind",
+    ["type 2, angles", *(pytest.param(k, marks=pytest.mark.slow) for k in ("an angle", "law"))],
 )
 def test_stablehlo_is_the_maps_own_step(kind, tmp_path):
-    map_, z = law() if kind == "law" else MAPS[kind]()
+    map_, many = made(kind)
     with zipfile.ZipFile(gfnn.export(map_, "stablehlo", tmp_path / "own.zip")) as archive:
         assert json.loads(archive.read("about.json"))["dim"] == map_.dim
         loaded = {
             name: jax_export.deserialize(bytearray(archive.read(f"{name}.jax")))
             for name in ("step", "inverse")
         }
-    many = scattered(map_, z)
-    for name, own, batch in (("step", map_.step, many), ("inverse", map_.inverse, many[:3])):
-        images, status = loaded[name].call(batch)
-        expected, info = own(batch)
-        np.testing.assert_array_equal(status, info.status)
-        good = np.asarray(status) == OK
+    for name, count in (("step", len(many)), ("inverse", 3)):
+        images, status = map(np.asarray, loaded[name].call(many[:count]))
+        expected, own_status = (of[:count] for of in by_itself(kind, name))
+        np.testing.assert_array_equal(status, own_status)
+        good = status == OK
         np.testing.assert_allclose(images[good], expected[good], rtol=1e-14, atol=1e-14)
 
 

@@ -102,10 +102,14 @@ def with_inputs():
     return map_, z, np.random.default_rng(1).normal(size=(len(z), 2))
 
 
+@jax.jit
+def stepped(piece, z, args):
+    return piece.step(z, args)[0]
+
+
 def expected(map_, z, args):
     """Images of the exact flow, by the piece itself: args as C has them."""
-    piece = exactly(map_).pieces[0]
-    return np.asarray(piece.step(z, args)[0])
+    return np.asarray(stepped(exactly(map_).pieces[0], z, args))
 
 
 def by_javascript(path, calls):
@@ -165,7 +169,7 @@ def test_javascript_is_the_flow(kind, tmp_path):
         family, params = map_.pieces[0].family, 1.1 * np.asarray(map_.pieces[0].params)
         other = dataclasses.replace(exactly(map_).pieces[0], params=params, dt=-0.013)
         calls = [[state, -0.013, [], params.tolist()] for state in z[:50].tolist()]
-        wanted = np.asarray(other.step(z[:50], None)[0])
+        wanted = stepped(other, z[:50], None)
         np.testing.assert_allclose(by_javascript(path, calls), wanted, rtol=1e-14, atol=1e-14)
         assert family.num_parameters == len(params)
 
@@ -276,7 +280,7 @@ def test_steps_of_other_tools_are_the_maps(to, kind, tmp_path):
     if to == "casadi":
         pytest.importorskip("casadi", reason="CasADi is an extra")
     path = gfnn.export(map_, to, tmp_path / f"own{SUFFIXES[to]}")
-    wanted = expected(map_, z, args) if to == "fmu" else np.asarray(map_.pieces[0].step(z, args)[0])
+    wanted = expected(map_, z, args) if to == "fmu" else stepped(map_.pieces[0], z, args)
     atol = 1e-9 if (to, kind) == ("fmu", "inputs that change") else 1e-13
     np.testing.assert_allclose(one_step(to, path, map_)(z, args), wanted, rtol=1e-13, atol=atol)
 

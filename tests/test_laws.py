@@ -346,9 +346,11 @@ def test_a_known_law_leaves_little_to_learn(tmp_path):
     np.testing.assert_allclose(back, fresh.z0, rtol=0, atol=1e-10)
 
 
-def test_a_law_holds_outside_the_states_that_it_was_fitted_to(law, pairs):
-    candidates = {c.learns: c for c in law.candidates if c.outside is not None}
-    assert candidates["hamiltonian"].outside < 1e-13
+def test_a_law_holds_outside_the_states_that_it_was_fitted_to(law):
+    assert law.chosen.outside < 1e-13
+
+
+@pytest.mark.slow
+def test_a_map_holds_less_outside_the_states_that_it_was_fitted_to(pairs):
     few = gfnn.fit(pairs, learn="map", tolerance=1e-4)
-    assert few.chosen.outside is not None
     assert few.chosen.outside > 2 * few.chosen.validation_relative

@@ -70,6 +70,7 @@ def test_gradients_pass_through_steps(example):
     np.testing.assert_allclose(jax.grad(later)(jax.numpy.asarray(z)), differences, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_your_own_data_by_commands(tmp_path, monkeypatch):
     """Pairs of an oscillator, in a folder of their own."""
     monkeypatch.chdir(tmp_path)

@@ -46,7 +46,7 @@ def command_ran(tmp_path_factory):
     """What ``gfnn swing.csv`` says, and the folder that it writes."""
     folder, shown = tmp_path_factory.mktemp("swing"), io.StringIO()
     with contextlib.chdir(folder), contextlib.redirect_stdout(shown):
-        swung = np.stack(swing(), axis=1)
+        swung = np.stack(swing(12.0), axis=1)
         np.savetxt("swing.csv", swung, "%.5f", ",", header="t,x", comments="")
         assert command("swing.csv") == 0
     return shown.getvalue(), folder / "runs" / "swing"

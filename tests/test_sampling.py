@@ -94,7 +94,7 @@ def test_a_law_of_random_times_and_missing_cells():
 
 def test_a_law_of_many_short_runs():
     rng, runs = np.random.default_rng(4), []
-    for _ in range(40):
+    for _ in range(24):
         t = 0.15 * np.arange(rng.integers(6, 11))
         start = rng.uniform(-1.2, 1.2), rng.uniform(-2, 2)
         seen = swing(np.append(t, 2.0), start)[:-1, 0] + NOISE * rng.normal(size=len(t))

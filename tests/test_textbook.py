@@ -375,8 +375,6 @@ def test_a_fit_told_nothing_finds_keplers_law():
     assert np.sqrt(np.mean(error**2)) < 1e-13
     of_p1, of_p2, _ = (term.coefficient for term in fit.hamiltonian.terms)
     assert abs(of_p1 - of_p2) <= 2e-15  # a rotation turns one into the other
-    again = gfnn.fit(pairs, tolerance=1e-8, max_operations=fit.operations)
-    assert again.formula == fit.formula
 
 
 @pytest.mark.slow
