@@ -330,7 +330,7 @@ SIGMA = 1e-3
 
 @pytest.fixture(scope="module")
 def noisy_pairs():
-    pairs = pendulum_pairs(1_000)
+    pairs = pendulum_pairs(500)
     noise = SIGMA * np.random.default_rng(7).normal(size=(2, *pairs.z0.shape))
     return gfnn.Pairs(pairs.z0 + noise[0], pairs.z1 + noise[1], 0.4)
 
@@ -347,7 +347,7 @@ def test_noise_is_not_learned(noisy_fit):
     assert np.all((noisy_fit.noise > 0.5 * SIGMA) & (noisy_fit.noise < 2 * SIGMA))
     z = disc(200, radius=0.9, seed=8)
     assert rms(noisy_fit.map, z, pendulum(z)) < SIGMA
-    states, info = noisy_fit.map.rollout(z[:20], 2_000)
+    states, info = noisy_fit.map.rollout(z[:20], 500)
     assert np.all(np.asarray(info.status) <= 1)
     assert np.abs(states).max() < 1.5
     assert "no more accurate" in noisy_fit.ended
@@ -356,7 +356,7 @@ def test_noise_is_not_learned(noisy_fit):
 def test_a_law_that_explains_less_than_half_of_the_steps_is_none():
     """A harmonic law of a pendulum, and the same error beside steps that are hardly larger."""
     model = gfnn.Hamiltonian(terms=["p1**2", "q1**2"])
-    found = quiet_fit(pendulum_pairs(300), model=model).found
+    found = quiet_fit(pendulum_pairs(100), model=model).found
     assert found.verdict.startswith("partly: ")
     z0 = found.pairs.z0
     pairs = gfnn.Pairs(z0, z0 + 1.2 * found.chosen.deviations, 0.4)

@@ -13,7 +13,7 @@ from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs.output import read_in_units
 
-DT, SEEN, AHEAD = 0.05, 400, 60
+DT, SEEN, AHEAD = 0.05, 240, 60
 
 
 @pytest.fixture(scope="module")
@@ -95,9 +95,9 @@ def test_times_are_in_the_unit_of_each_files_header(motion, folder, initial, inp
     [
         ("metres.csv", "u_s.csv", "x in mm"),
         ("ms.csv", "u_mV.csv", "u in V"),
-        ("ms.csv", "u_short.csv", "from 21.45 to 22.95 s"),
-        ("ms.csv", "u_later.csv", "from 19.95 to 21 s"),
-        ("ms.csv", "u_before.csv", "from 19.95 to 22.95 s"),
+        ("ms.csv", "u_short.csv", "from 13.45 to 14.95 s"),
+        ("ms.csv", "u_later.csv", "from 11.95 to 13 s"),
+        ("ms.csv", "u_before.csv", "from 11.95 to 14.95 s"),
     ],
 )
 def test_other_units_and_inputs_that_end_early_are_refused(folder, initial, inputs, told, capsys):
@@ -125,10 +125,10 @@ def test_inputs_ahead_may_be_coarse_or_lack_values(motion, folder, plan, capsys)
 
 def test_a_comparison_may_be_in_another_unit_of_time(folder, capsys):
     out = folder / "c.csv"
-    to = f"--to 18 --compare {folder / 'ms.csv'} --out {out}"
+    to = f"--to 10 --compare {folder / 'ms.csv'} --out {out}"
     assert typed(f"predict {folder / 'model'} --initial {folder / 's.csv'} {to}") == 0
     told = capsys.readouterr().out
-    assert "up to t = 19.95 s" in told
+    assert "up to t = 11.95 s" in told
     rms = float(told.split("x: RMS error ")[1].split(" mm")[0])
     assert rms < 0.1
 
@@ -154,10 +154,10 @@ def swings(tmp_path_factory):
 
 
 def fitted(folder, unit):
-    """The model of the first 15 s of the swing in this unit, fitted when first asked for."""
+    """The model of the first 9 s of the swing in this unit, fitted when first asked for."""
     model = folder / f"model-{unit}"
     if not model.exists():
-        to = f"--to 15 --friction linear --out {model}"
+        to = f"--to 9 --friction linear --out {model}"
         with contextlib.redirect_stderr(io.StringIO()):
             assert typed(f"fit {folder}/{unit}.csv {to}") == 0
     return model
@@ -168,7 +168,7 @@ def fitted(folder, unit):
 @pytest.mark.parametrize(("initial", "compare"), [("deg", "rad"), ("rad", "deg")])
 def test_degrees_and_radians_go_together(swings, model, initial, compare, capsys):
     """What is compared is in the unit of the file that is compared with."""
-    to = f"--to 15 --compare {swings}/{compare}.csv --out {swings}/f.csv --overwrite"
+    to = f"--to 9 --compare {swings}/{compare}.csv --out {swings}/f.csv --overwrite"
     assert typed(f"predict {fitted(swings, model)} --initial {swings}/{initial}.csv {to}") == 0
     told = capsys.readouterr().out
     rms, unit = told.split("theta: RMS error ")[1].split(",")[0].split(" ")
