@@ -247,22 +247,26 @@ def test_polar_coordinates_are_inside_only():
 
 
 def test_angles_keep_their_turns_and_the_map_does_not_see_them():
-    turns = np.array([0, 1, -3, 1000])[:, None] * [[2 * np.pi, 0.0]]
-    images, info = ROTATING.step(Z[:4] + turns)
-    expected = np.asarray(ROTATING.step(Z[:4])[0]) + turns
+    turns = np.resize([0, 1, -3, 1000], 16)[:, None] * [[2 * np.pi, 0.0]]
+    images, info = ROTATING.step(Z + turns)
+    images = np.asarray(images)
+    expected = np.asarray(ROTATING.step(Z)[0]) + turns
     # n times float64's 2π is not n turns: 2.4e-16 n are missing.
-    np.testing.assert_allclose(images[:3], expected[:3], rtol=1e-15, atol=2e-15)
-    np.testing.assert_allclose(images[3], expected[3], rtol=1e-15, atol=3e-13)
+    far = turns[:, 0] > 100
+    np.testing.assert_allclose(images[~far], expected[~far], rtol=1e-15, atol=2e-15)
+    np.testing.assert_allclose(images[far], expected[far], rtol=1e-15, atol=3e-13)
     assert (info.status == OK).all()
     back, _ = ROTATING.inverse(images)
-    np.testing.assert_allclose(back, Z[:4] + turns, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(back, Z + turns, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("angle", [1e17, 1e300])
 def test_angle_without_a_meaning_is_not_a_state(angle):
     """The domain ignores an angle, so that nothing but its own size can tell."""
-    _, info = ROTATING.step(np.array([[angle, 0.1], [0.1, 0.1]]))
-    np.testing.assert_array_equal(info.status, [NON_FINITE, OK])
+    z = Z.copy()
+    z[0, 0] = angle
+    _, info = ROTATING.step(z)
+    np.testing.assert_array_equal(info.status, [NON_FINITE, *[OK] * 15])
 
 
 # A user's own transforms.

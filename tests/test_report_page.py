@@ -173,8 +173,22 @@ def test_a_refusal_has_its_page(tmp_path, monkeypatch):
     assert (told["verdict"], told["error"]) == ("not fitted", str(refused.value))
 
 
-def test_one_command_writes_the_report(command_ran):
+def test_one_command_writes_the_report(command_ran, capsys, monkeypatch):
+    """The law of two thirds of a file, and what it says of the third that it has not seen."""
     shown, folder = command_ran
+    assert "which no fit has seen: median error of x 0.00" in shown
+    found = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    assert found["data"]["num_samples"] == pytest.approx(200, abs=1)
+    assert found["forecasts"]["begin"] == pytest.approx(8.0, abs=0.1)
+    assert max(found["forecasts"]["median"]["x"]) < 2e-3  # noise of 1e-3, the law's own on top
+    assert found["forecasts"]["within_two_deviations"] > 0.85
+    assert (folder / "forecasts.png").stat().st_size > 10_000
+    assert gfnn.load(folder / "model").map.sensors.positions == ("x",)
+    monkeypatch.chdir(folder.parent.parent)
+    assert command("swing.csv") == 2  # exists already
+    assert command("swing.csv", "--overwrite", "--tolerance", "1e-3") == 2
+    assert "--tolerance" in capsys.readouterr().err
+    assert json.loads((folder / "report.json").read_text(encoding="utf-8")) == found
     assert "runs/swing/report.html" in shown
     assert "small swings: frequency = 0.477" in shown
     text = (folder / "report.html").read_text(encoding="utf-8")
