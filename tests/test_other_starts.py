@@ -14,6 +14,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
 from gfnn_jax.maps.estimates import _with_zeros
 from gfnn_jax.models.lagrangians.recordings import samples_of
+from gfnn_jax.models.lagrangians.search import with_equal_masses
 from gfnn_jax.models.lagrangians.starts import best_start
 from gfnn_jax.models.lagrangians.structure import SINE, Structure
 from gfnn_jax.solve.latent_arcs import Fitted
@@ -317,3 +318,22 @@ def test_an_arm_whose_joints_rub_starts_from_angles_between_links():
     terms = best_start(samples_of(record).problem).structure.terms
     assert {row[2] for row in terms if any(row[0]) and any(row[2])} == {(0, 1)}
     assert {row[2] for row in terms if not any(row[0])} == {(1, 0), (1, 1)}
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+def test_two_carts_have_their_law_in_any_units(unit):
+    """The start has a product of velocities too, and linear motion leaves its coefficient and the
+    second mass open together."""
+
+    def acceleration(q, v):
+        between = 5 * (q[1] - q[0])
+        return np.array([-8 * q[0] + between - 0.05 * v[0], -(6 * q[1] + between + 0.1 * v[1]) / 1.7])
+
+    t = np.arange(0, 40, 0.04)
+    q = motion(acceleration, [0.1, -0.05, 0, 0], t, rtol=1e-10)
+    q += 5e-5 * np.random.default_rng(3).normal(size=q.shape)
+    record = gfnn.Recording({"t": t, "x1": unit * q[0], "x2": q[1]}, positions=["x1", "x2"])
+    found = with_equal_masses(best_start(samples_of(record).problem))
+    terms = {k[1][:2]: v for k, v in found.values.items() if k[0] == "term"}
+    law = {((0, 2), (0, 0)): 0.85 * unit**2, ((0, 0), (2, 0)): -6.5, ((0, 0), (1, 1)): 5 * unit}
+    assert terms == pytest.approx(law | {((0, 0), (0, 2)): -5.5 * unit**2}, rel=0.01)

@@ -549,7 +549,9 @@ def _leaves_little_more(less: LawFit, fit: LawFit) -> bool:
 def with_equal_masses(fit: LawFit, least: float = np.inf) -> LawFit:
     """The fit with the masses of lengths that stand less than ``least`` standard errors from zero
     held at that of the first, where that leaves little more, and with the others free: bodies that
-    little couples, or that swing together, move alike whatever the ratio of their masses."""
+    little couples, or that swing together, move alike whatever the ratio of their masses. Where M
+    has products of velocities too, linear motion leaves their coefficients and the masses open
+    together: the fit without products, of free masses, comes first."""
     if fit.problem.angles or fit.problem.parameters or not fit.follows:
         return fit
     free = dataclasses.replace(fit.structure, held=())
@@ -560,6 +562,11 @@ def with_equal_masses(fit: LawFit, least: float = np.inf) -> LawFit:
     held = tuple(Held(k[1], 0.5, None, AS_EQUAL) for k in z if k in masses and z[k] < least)
     if not held or (free.is_definite and _far_from(free, held)):
         return free
+    across = {("term", row) for row in free.structure.terms if max(row[0]) == 1 and is_constant(row)}
+    if across:
+        apart = free.again(free.structure.without(across))
+        if apart.is_definite and _leaves_little_more(apart, free):
+            return apart
     equal = free.again(dataclasses.replace(free.structure, held=held))
     stands = _leaves_little_more(equal, free)
     stands |= equal.follows and equal.loudest < OPTIONS.noise and not free.is_definite

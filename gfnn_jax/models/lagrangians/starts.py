@@ -113,6 +113,9 @@ def best_start(problem: ArcProblem) -> LawFit:
         some = min(some, other, key=lambda one: min(map(misfit, one.fits), default=np.inf))
     if problem.observation.crossed and some.fits:  # times of one event tell no more
         return some.fits[0]
+    if any(not fit.is_definite for fit in some.fits):  # as products of speeds may make it
+        apart = [row for row in textbook.rows if max(row[0]) != 1 or not is_constant(row)]
+        some.add(_Library(apart))
     many = d > libraries.FEW  # whose larger libraries take long
     if many:
         some.add(_Library(libraries.side_by_side(d, angles), equal=True))

@@ -174,7 +174,9 @@ def weak_start(
     """
     keys, X, Y, keep, masses, _ = _Equations.of(structure, problem, equal)
     fixed, evidence = protected(structure), problem.options.evidence
-    weight = np.ones(structure.dim)
+    # A coordinate's equation times its speed is a power, whatever its unit.
+    speed = np.sqrt(np.mean(problem.states[:, structure.dim :] ** 2, axis=0))
+    weight = unit = np.where(speed > 0, speed, 1.0)
     while True:
         for _ in range(2):  # each coordinate's rows in units of their own residual
             c, residual, inverse = _solve(X[..., keep] * weight[:, None], Y * weight)
@@ -184,7 +186,8 @@ def weak_start(
                     "terms: a combination of them vanishes all along the recording, so that their "
                     "coefficients are not determined. Leave one out, or add a force"
                 )
-            weight = np.maximum(weight / size, np.max(weight / size) / OPTIONS.apart)
+            told = weight / size / unit
+            weight = unit * np.maximum(told, np.max(told) / OPTIONS.apart)
         error = np.sqrt(OPTIONS.overlap * np.mean(residual**2)) * np.linalg.norm(inverse, axis=1)
         z = [
             np.inf if keys[k] in fixed else abs(value) / e
