@@ -167,7 +167,7 @@ def test_the_work_of_a_search_is_counted_and_ends_with_what_was_found(monkeypatc
 @pytest.mark.parametrize("leaves_noise", [False, True])
 def test_a_sensor_beside_which_a_law_leaves_more_than_noise_is_not_all(monkeypatch, leaves_noise):
     t, (x, _), _ = followed(partial(pendulums, 9.8, 0.05, 0.05), [0.6, -0.3, 0.0, 0.0], 15)
-    monkeypatch.setattr(recordings, "of_a_sensor", lambda fit: ("x is smoothed", leaves_noise))
+    monkeypatch.setattr(recordings, "of_a_sensor", lambda *_: ("x is smoothed", leaves_noise))
     law = recordings.fit_recording(gfnn.Recording({"t": t, "theta": x}), hidden=0)
     assert law.flaws
     assert "x is smoothed" in law.nature

@@ -221,15 +221,23 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
     }
     rms, noise = best.fit.along_periods.rms(), best.fit.problem.scales.sigma
     missed = np.sqrt(np.maximum(rms**2 - noise**2, 0.0)) / best.fit.spread
-    flaws |= {
-        f"the residuals of {name} are correlated, {size:.2g} rms where its readings scatter by "
-        f"{sigma:.1g}, and {one.fit_percent:.1f} % of its variation is followed": "a force, an "
-        "input or a term is missing. law.png (fit.traces) shows when"
-        for (name, one), size, sigma, share in zip(found.items(), rms, noise, missed, strict=True)
-        if not one.white
-        and OPTIONS.followed <= one.fit_percent < OPTIONS.nearly
-        and (size > OPTIONS.beyond * sigma or share > OPTIONS.missed)
-    }
+    scales = best.fit.problem.scales
+    for (name, one), size, sigma, share in zip(found.items(), rms, noise, missed, strict=True):
+        much = size > OPTIONS.beyond * sigma or share > OPTIONS.missed
+        if one.white or not OPTIONS.followed <= one.fit_percent < OPTIONS.nearly or not much:
+            continue
+        over, remedy = one.smoothed_over(scales.period), ""
+        if over:
+            remedy = (
+                f"its readings look smoothed, over {over:.2g} s. Learn from those before they were, "
+                f"or from readings that are further apart (--every {round(over / scales.dt)})"
+            )
+        flaws[
+            f"the residuals of {name} are correlated, {size:.2g} rms where its readings scatter by "
+            f"{sigma:.1g}, and {one.fit_percent:.1f} % of its variation is followed"
+        ] = remedy or (
+            "a force, an input or a term is missing. law.png (fit.traces) shows when"
+        )
     least = np.min(best.calibration.median, axis=0, initial=np.inf)
     beyond = np.isfinite(least) & (least > OPTIONS.lost)
     if beyond.any() and np.max(best.fit.sigma / best.fit.spread) < OPTIONS.lost / 2:

@@ -291,7 +291,9 @@ def fit_recording(
         law = in_words(recording, best, findings)
         if not terms and not hidden:
             messages = (*law.messages, *_with_constants(best.fit))
-            sensor, explained = of_a_sensor(best.fit)
+            coloured = [one for one in law.whiteness.values() if law.flaws and not one.white]
+            over = [one.smoothed_over(data.problem.scales.period) for one in coloured]
+            sensor, explained = of_a_sensor(best.fit, any(over) and all(over))
             rival = law.rival or sensor or _other_shapes(best.fit)
             law = dataclasses.replace(law, rival=rival, nature=sensor, messages=messages)
             law = law if law.flaws else _with_rivals(law, recording, data, best.fit)

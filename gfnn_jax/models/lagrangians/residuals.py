@@ -20,11 +20,13 @@ class WhitenessOptions:
     """Limits of the test (`benchmarks/as_a_user.py`).
 
     lags: nodes, up to which residuals are correlated. beyond: standard deviations of a correlation
-    that is no accident, of the largest of many.
+    that is no accident, of the largest of many. brief: of a period, that correlations of smoothed
+    readings take at most.
     """
 
     lags: int = 20
     beyond: float = 3.0
+    brief: float = 0.125
 
 
 OPTIONS = WhitenessOptions()
@@ -69,6 +71,15 @@ class Whiteness(NamedTuple):
     white: bool
     inputs: dict[str, OfInput]
     fit_percent: float
+
+    def smoothed_over(self, period: float) -> float:
+        """The time (s) over which the readings are smoothed, where the residuals are correlated for
+        less than an eighth of a period: a force that is missing moves for longer. Else 0."""
+        rho = self.autocorrelation[1:]
+        chance = self.bound * np.sqrt(1 + 2 * np.sum(rho**2))
+        beyond = np.flatnonzero(np.abs(rho) > chance)
+        first = beyond[-1] + 2 if len(beyond) and beyond[-1] + 2 < len(self.lags) else 0
+        return float(self.lags[first]) if self.lags[first] < OPTIONS.brief * period else 0.0
 
     @property
     def text(self) -> str:

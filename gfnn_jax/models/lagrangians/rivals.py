@@ -293,11 +293,11 @@ def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
     )
 
 
-def of_a_sensor(fit: LawFit) -> tuple[str, bool]:
+def of_a_sensor(fit: LawFit, smoothed: bool = False) -> tuple[str, bool]:
     """A line on a sensor of one coordinate beside which a plainer law follows a record, "" where
-    there is none, and whether that law leaves noise alone. It is clearly likelier (Schwarz's
-    criterion) than a law that leaves more than noise, and not clearly less likely than one that
-    leaves noise. Plain are the textbook's terms and springs between angles, with linear friction;
+    there is none, and whether the record is explained: that law leaves noise alone, or readings are
+    ``smoothed``, of which it cannot. It is clearly likelier (Schwarz's criterion) than a law that
+    leaves more than noise, and not clearly less likely than one that leaves noise. Plain are the textbook's terms and springs between angles, with linear friction;
     plainer is also a law without those of its other terms that are no more than chance beside the
     sensor."""
     problem, seen, d = fit.problem, fit.problem.observation, fit.structure.dim
@@ -307,10 +307,10 @@ def of_a_sensor(fit: LawFit) -> tuple[str, bool]:
     plain = dataclasses.replace(fit.structure, terms=tuple(terms), friction=tuple(friction))
     plain = dataclasses.replace(plain, zeros=())
     odd = {key for key in fit.values if key[0] in ("term", "loss")} - set(plain.keys())
-    is_noise = fit.loudest < OPTIONS.noise
+    is_noise = fit.loudest < OPTIONS.noise or smoothed
     if not seen.is_plain or problem.parameters or (is_noise and not odd):
-        return "", False
-    known, count, best, enough = {}, fit.independent, "", False
+        return "", smoothed
+    known, count, best, enough = {}, fit.independent, "", smoothed
     if not is_noise or len(plain.keys()) <= len(fit.p):  # else it is not as likely
         with contextlib.suppress(FitError):
             known = weak_start(plain, problem, prune=False)[1]
@@ -333,7 +333,7 @@ def of_a_sensor(fit: LawFit) -> tuple[str, bool]:
                 early = again.values.get(("sensor", "late"), 0.0) < 0  # and another late
                 if again.follows and again.is_definite and unlikely < least and not early:
                     typed, least = shlex.quote(f"{name} = {text}"), unlikely
-                    enough = again.loudest < OPTIONS.noise
+                    enough = smoothed or again.loudest < OPTIONS.noise
                     best = (
                         f"a plainer law follows the record where {name} {what}: --observe {typed}"
                     )
