@@ -56,3 +56,14 @@ def test_values_that_are_missing_count_as_nothing(rng):
     of = whiteness(traces(residuals, np.zeros(500)), ["x"], ["u"])["x"]
     assert of.bound == pytest.approx(3 / np.sqrt(300))
     assert of.white
+
+
+def test_smoothed_readings_are_no_force_that_is_missing(rng):
+    noise, none = rng.normal(size=(2, 1_000))
+    smoothed = np.convolve(noise, np.ones(4) / 2, mode="same")
+    forced = noise + 3 * np.sin(2 * np.pi * STEP * np.arange(1_000))  # of one period
+    over = [
+        whiteness(traces(r, none), ["x"], ["u"])["x"].smoothed_over(2.0)
+        for r in (noise, smoothed, forced)
+    ]
+    assert over == pytest.approx([0, 4 * STEP, 0])
