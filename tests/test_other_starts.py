@@ -327,7 +327,8 @@ def test_two_carts_have_their_law_in_any_units(unit):
 
     def acceleration(q, v):
         between = 5 * (q[1] - q[0])
-        return np.array([-8 * q[0] + between - 0.05 * v[0], -(6 * q[1] + between + 0.1 * v[1]) / 1.7])
+        forces = np.array([between - 8 * q[0] - 0.05 * v[0], -between - 6 * q[1] - 0.1 * v[1]])
+        return forces / [1, 1.7]
 
     t = np.arange(0, 40, 0.04)
     q = motion(acceleration, [0.1, -0.05, 0, 0], t, rtol=1e-10)

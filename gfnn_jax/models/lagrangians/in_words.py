@@ -235,9 +235,7 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
         flaws[
             f"the residuals of {name} are correlated, {size:.2g} rms where its readings scatter by "
             f"{sigma:.1g}, and {one.fit_percent:.1f} % of its variation is followed"
-        ] = remedy or (
-            "a force, an input or a term is missing. law.png (fit.traces) shows when"
-        )
+        ] = remedy or ("a force, an input or a term is missing. law.png (fit.traces) shows when")
     least = np.min(best.calibration.median, axis=0, initial=np.inf)
     beyond = np.isfinite(least) & (least > OPTIONS.lost)
     if beyond.any() and np.max(best.fit.sigma / best.fit.spread) < OPTIONS.lost / 2:

@@ -562,7 +562,9 @@ def with_equal_masses(fit: LawFit, least: float = np.inf) -> LawFit:
     held = tuple(Held(k[1], 0.5, None, AS_EQUAL) for k in z if k in masses and z[k] < least)
     if not held or (free.is_definite and _far_from(free, held)):
         return free
-    across = {("term", row) for row in free.structure.terms if max(row[0]) == 1 and is_constant(row)}
+    across = {
+        ("term", row) for row in free.structure.terms if max(row[0]) == 1 and is_constant(row)
+    }
     if across:
         apart = free.again(free.structure.without(across))
         if apart.is_definite and _leaves_little_more(apart, free):
