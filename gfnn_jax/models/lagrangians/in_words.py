@@ -229,8 +229,8 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
         over, remedy = one.smoothed_over(scales.period), ""
         if over:
             remedy = (
-                f"its readings look smoothed, over {over:.2g} s. Learn from those before they were, "
-                f"or from readings that are further apart (--every {round(over / scales.dt)})"
+                f"its readings look smoothed, over {over:.2g} s. Learn from those before they "
+                f"were, or from readings further apart (--every {round(over / scales.dt)})"
             )
         flaws[
             f"the residuals of {name} are correlated, {size:.2g} rms where its readings scatter by "

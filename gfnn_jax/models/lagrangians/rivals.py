@@ -297,9 +297,9 @@ def of_a_sensor(fit: LawFit, smoothed: bool = False) -> tuple[str, bool]:
     """A line on a sensor of one coordinate beside which a plainer law follows a record, "" where
     there is none, and whether the record is explained: that law leaves noise alone, or readings are
     ``smoothed``, of which it cannot. It is clearly likelier (Schwarz's criterion) than a law that
-    leaves more than noise, and not clearly less likely than one that leaves noise. Plain are the textbook's terms and springs between angles, with linear friction;
-    plainer is also a law without those of its other terms that are no more than chance beside the
-    sensor."""
+    leaves more than noise, and not clearly less likely than one that leaves noise. Plain are the
+    textbook's terms and springs between angles, with linear friction; plainer is also a law without
+    those of its other terms that are no more than chance beside the sensor."""
     problem, seen, d = fit.problem, fit.problem.observation, fit.structure.dim
     terms = textbook(d, problem.angles)
     terms += springs(d, problem.within_a_turn) if d > 1 else []
