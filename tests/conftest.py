@@ -1,7 +1,6 @@
 """Strict numerics for every test: float64, no silent rank or dtype promotion."""
 
 import contextlib
-import fcntl
 import gc
 import importlib
 import itertools
@@ -22,46 +21,12 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
-# The compiled kernels, kept on disk: steps of free particles, as a fit and as a rollout makes them.
-KERNEL = """
-import jax
-import numpy as np
-from gfnn_jax.families.friction import Friction
-from gfnn_jax.families.lagrangian import Terms
-from gfnn_jax.families.terms import given_terms
-from gfnn_jax.flows.compiled_steps import Stepper
-from gfnn_jax.flows.flow import Flow
-from gfnn_jax.flows.motion import Form
-
-terms, friction = Terms.of([((2,), (0,), (0,), 0.0)], 1), Friction.of([], 1)
-form = Form(terms, np.zeros(1), np.eye(1), friction, 0)
-form.step(np.ones(1), np.ones((1, 2)), np.full(1, 0.1), np.zeros((1, 1, 6, 0)))
-jax.config.update("jax_enable_x64", True)
-stepper = Stepper.of(Flow(given_terms(1, ("p1**2",)), np.ones(1), 0.1, np.ones(2), 2))
-stepper.steps(stepper.begun(np.ones((1, 2)), np.zeros((1, 2))), 1, None)
-"""
-
 # Most of the suite's time goes into compiling programs that run once: this halves it. A program
 # that is split to be compiled by several threads takes half as much again of a processor's time.
 SOON_COMPILED = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
     " --xla_cpu_parallel_codegen_split_count=1"
 )
-
-
-def compile_after(lock):
-    """Before numba looks for what it has compiled, wait until no process holds the lock."""
-    from numba.core import event
-
-    class Waiting(event.Listener):
-        def on_start(self, event):
-            with open(lock) as file:
-                fcntl.flock(file, fcntl.LOCK_SH)
-
-        def on_end(self, event):
-            pass
-
-    event.register("numba:compiler_lock", Waiting())
 
 
 def pytest_addoption(parser):
@@ -78,8 +43,9 @@ def pytest_configure(config):
     if config.getoption("typecheck"):
         from jaxtyping import install_import_hook
 
-        # Numba compiles and keeps plain functions, no wrappers of them.
+        # Plain functions are compiled and kept, no wrappers of them.
         importlib.import_module("gfnn_jax.flows.kernel")
+        importlib.import_module("gfnn_jax.flows.compiled_steps")
         install_import_hook("gfnn_jax", "typechecker.checked")
     if "XLA_FLAGS" not in os.environ:  # which JAX reads when it is first used
         # XLA ends a process that asks for what it does not know: that of another release might.
@@ -99,16 +65,6 @@ def pytest_configure(config):
     for name, value in shared.items():
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
-    # Several workers would compile the kernels at once: a process does while they begin, which
-    # keeps a file locked, and a worker that is about to compile waits for it.
-    lock = config.cache.mkdir("compiled") / "kernels.lock"
-    if getattr(config.option, "numprocesses", None):
-        with open(lock, "w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            compiles = [sys.executable, "-c", KERNEL]
-            subprocess.Popen(compiles, stderr=subprocess.DEVNULL, pass_fds=[file.fileno()])
-    elif "PYTEST_XDIST_WORKER" in os.environ:
-        compile_after(lock)
     # Each operation that is traced keeps where it was called from: a twentieth of the time.
     with contextlib.suppress(ImportError, AttributeError):  # no part of JAX's interface
         from jax._src.lib import _jax

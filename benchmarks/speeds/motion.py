@@ -205,7 +205,8 @@ def of_checkout(checkout: Path, quick: bool) -> dict[str, float]:
         runs += [[name] for name in DRAWN]
     found = {}
     with tempfile.TemporaryDirectory() as cache:
-        environment = {**os.environ, "PYTHONPATH": str(checkout), "NUMBA_CACHE_DIR": cache}
+        caches = {"NUMBA_CACHE_DIR": cache, "XDG_CACHE_HOME": cache}  # of either compiler
+        environment = {**os.environ, **caches, "PYTHONPATH": str(checkout)}
         for run in runs:
             command = [sys.executable, str(Path(__file__).resolve()), *run]
             done = subprocess.run(

@@ -8,8 +8,7 @@ its own.
 States stay on a lift from the first step to the last, with what rounding loses of them. The momenta
 of its fibres, quadratic in w, are what Casimirs are made of, and are kept to twice the digits.
 Stages begin with the polynomial nearest to all stages of the two steps before: that halves the
-iterations, and changes nothing that they converge to. This module imports numba.
-"""
+iterations, and changes nothing that they converge to."""
 
 from __future__ import annotations
 
@@ -29,8 +28,8 @@ from gfnn_jax.families.sums import matrix_free
 from gfnn_jax.flows.collective import Casimirs
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
-from gfnn_jax.flows.kernel import cached, function
 from gfnn_jax.flows.lifts import Itself
+from gfnn_jax.flows.translated import compiled, function
 from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform
 
 STAGES = 8  # a constant of the compiled loops, as many as processors do at once
@@ -480,19 +479,15 @@ def _turned(w, place, centre):
     return turns
 
 
-@cached("rollouts of laws", 5)
-def roll(law, task, substeps, inputs, moving):
-    """Follow the lanes of a `Task`."""
+@compiled("rollouts of laws", 1)
+def roll(law, task, room, sizes):
+    """Follow the lanes of a `Task`. room: of one lane. sizes: substeps, inputs,
+    moving and stages."""
     code, constants, ends, rule, weights, before, entries, values = law[:8]
     fibres, unit, decay, angles, centre = law[8:]
-    lanes, steps, width, count = task.out.shape[0], task.out.shape[1], len(unit), 0
-    stages = np.count_nonzero(weights)
-    for e in range(len(entries)):
-        count = max(count, entries[e, 0] + 1)
-    v, now = np.zeros((len(code), STAGES)), np.zeros((width, STAGES))
-    moved, part = np.zeros(width), np.zeros(width)
-    along, system = np.zeros((count, width)), np.zeros((count, count + 2))
-    given = task.given.shape
+    (substeps, inputs, moving, stages), given = sizes, task.given.shape
+    lanes, steps, width = task.out.shape[0], task.out.shape[1], len(unit)
+    v, now, moved, part, along, system = room
     for lane in range(lanes):
         w, slopes, most, n = task.w[lane], task.slopes[lane], 0, 0
         goes = True
@@ -647,7 +642,10 @@ class Stepper:
             np.zeros(num, np.int64),
             np.zeros(num, np.int64),
         )
-        roll(self.law, task, self.flow.substeps, *self.sizes)  # pyright: ignore[reportCallIssue]
+        width, count = len(self.law.unit), 1 + max(self.law.entries[:, 0], default=-1)
+        shapes = ((len(self.law.code), STAGES), (width, STAGES), (width,), (width,))
+        room = tuple(map(np.zeros, (*shapes, (count, width), (count, count + 2))))
+        roll(self.law, task, room, (self.flow.substeps, *self.sizes, self.flow.stages))
         return task
 
     def _given(self, args: Any) -> np.ndarray:

@@ -32,26 +32,17 @@ A direction that sticks has lost the error of its speed. All loops are bounded: 
 events than can be followed, a singular M or a motion that diverges ends with NaN and a status.
 
 Whole numbers of a law stand in rows of one array n; all its other numbers, and what is computed of
-one lane, in rows of another, f. A kernel of two arrays is compiled in seconds, one of fifty in
-minutes. This module alone imports numba; the first step of a law imports it.
+one lane, in rows of another, f.
 """
 
 from __future__ import annotations
 
-import gc
 import math
-import os
-import sys
-import tempfile
-from pathlib import Path
 from typing import NamedTuple
 
-import numba
 import numpy as np
-from numba.core import config, event
-from numba.core.llvm_bindings import llvm
 
-from gfnn_jax import compiling
+from gfnn_jax.flows.translated import compiled, function
 
 FINE, UNFINISHED, LOST = range(3)  # status of a lane: followed; too many events; not finite
 # Kinds of friction; COULOMB: dry, without a width.
@@ -90,8 +81,8 @@ NUM_SIZES = 28
 # begin, modes (1 or −1 where it slides, 0 where it sticks), directions that turned, that are
 # carried, and speeds along the modes at the end; a row of derivatives; operands of operations, and
 # a row as long as the stack; powers of coordinates with derivatives; rates and inputs at the
-# stages; the tableau of Dormand and Prince. Numbers of other modules would stay as they were in the
-# cache of numba, which looks at this file alone.
+# stages; the tableau of Dormand and Prince. Numbers of other modules would stay as they were in
+# compiled code, which is known by this file.
 X0, X1, X, A, A_FIRST, FORCE, MOMENTUM, THETA, COS_PHASE, SIN_PHASE, FACTOR, ALONG = range(12)
 COSINE, SINE, PARTS, LOSSES, WIDTHS, PULL, HELD, LIMIT, HELD_FIRST, LIMIT_FIRST = range(12, 22)
 MODES, TURNED, CARRIED, AFTER, ROW, POWER, POWER_BY, POWER_BY_TWO = range(22, 30)
@@ -126,92 +117,6 @@ class Task(NamedTuple):
     by: np.ndarray
     after: np.ndarray
     status: np.ndarray
-
-
-# Compilation optimises a function with all that it calls, again in each that calls it: the
-# large ones call no large ones, but for `follow`.
-function = numba.njit(  # pyright: ignore[reportCallIssue]: three options lack in its types
-    error_model="numpy",
-    nogil=True,
-    no_cpython_wrapper=True,
-    no_cfunc_wrapper=True,
-    no_rewrites=True,
-)
-
-
-class _Compilation(event.Listener):
-    """Says what is compiled, where no cache holds it, and sets options of LLVM meanwhile, of which
-    numba has none of a function; who compiles holds its lock. The loops of `follow` are not
-    unrolled: short as they are that is a third of the time, and makes them slower. In other
-    functions four numbers are done at once where lines of them stand side by side. Garbage is not
-    collected meanwhile: numba makes millions of objects, and keeps most of them."""
-
-    def on_start(self, event: event.Event) -> None:
-        compiled = (event.data or {}).get("dispatcher")
-        if compiled not in _said:
-            return
-        compiling.say(f"compiling, once on this machine, {_said[compiled]}")
-        self._collects = gc.isenabled()
-        gc.disable()
-        if compiled is follow:
-            llvm.create_pipeline_tuning_options = _rolled
-        else:
-            config.SLP_VECTORIZE = 1  # pyright: ignore[reportAttributeAccessIssue]
-
-    def on_end(self, event: event.Event) -> None:
-        compiled = (event.data or {}).get("dispatcher")
-        if compiled not in _said:
-            return
-        compiling.say("")
-        if self._collects:
-            gc.enable()
-        if compiled is follow:
-            llvm.create_pipeline_tuning_options = _options
-        else:
-            config.SLP_VECTORIZE = 0  # pyright: ignore[reportAttributeAccessIssue]
-
-
-_options = llvm.create_pipeline_tuning_options
-_said: dict = {}  # functions of which it is said that they are compiled -> what, and how long
-
-
-def _rolled(*arguments, **options):
-    """The options of LLVM's passes, without the unrolling of loops."""
-    made = _options(*arguments, **options)
-    made.loop_unrolling = False
-    return made
-
-
-def cached(what: str, seconds: int):
-    """Compile with a cache on disk; where that is done, say what it is and how long it takes."""
-
-    def kept(whole):
-        compiled = _kept(whole)
-        _said[compiled] = f"{what} (about {seconds} s)"
-        return compiled
-
-    return kept
-
-
-def _kept(whole):
-    """Compile with a cache on disk: numba's own, or a temporary folder where neither the package
-    nor the user's cache can be written; without one where that cannot be either."""
-    options = {"error_model": "numpy", "nogil": True}
-    try:
-        return numba.njit(cache=True, **options)(whole)
-    except RuntimeError:
-        user = getattr(os, "getuid", int)()
-        folder = Path(tempfile.gettempdir()) / f"gfnn_jax-{user}"
-    try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-        made = folder.stat()
-        if made.st_uid != user or made.st_mode & 0o022:  # of others, who might change what runs
-            raise RuntimeError
-        config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
-        return numba.njit(cache=True, **options)(whole)
-    except (OSError, RuntimeError):
-        print("no folder can be written: the motion of laws is compiled anew", file=sys.stderr)
-        return numba.njit(**options)(whole)
 
 
 @function
@@ -985,14 +890,13 @@ def _store(n, f, task, place, fine):
         task.after[lane, m, k] = f[MODES, k] if fine else np.nan
 
 
-@cached("the motion of laws", 15)
+@compiled("the motion of laws", 3)
 def follow(n, f, laws, task, order):
     """Follow all lanes of a task, with derivatives in the state (``order`` 1) and in the
     coefficients (2). laws: the coefficients (R, ·) and the cosines and sines of the phases (R', 2
     P), of all lanes or of each."""
     (lanes, steps), substeps = task.h.shape, task.u.shape[2]
-    zero = 0 * order  # numba compiles a function once more for a number that is written out
-    first, inside, last, rates = U + zero, INSIDE + zero, INSIDE + _STAGES - 1 + zero, zero - 1
+    last = INSIDE + _STAGES - 1
     d, begin, end = n[SIZES, DIM], n[SIZES, D0], n[SIZES, D1]
     dry, rows = n[SIZES, COULOMBS], 2 * d if order > 0 else 0
     for lane in range(lanes):
@@ -1012,12 +916,12 @@ def follow(n, f, laws, task, order):
                 again = dry + 1 if begins else 0
                 begins = False
                 while again > 0:  # directions that start at rest and are not held
-                    _smooth(n, f, 0.0, rates, first)
+                    _smooth(n, f, 0.0, -1, U)
                     again = again - 1 if _released(n, f) else 0
                 if dry > 0 and order > 0 and _stuck(n, f) > 0:
                     for i in range(2 * d):
                         f[X, i] = f[X0, i]
-                    _smooth(n, f, 0.0, rates, first)
+                    _smooth(n, f, 0.0, -1, U)
                     _forget(n, f)
                 for k in range(n[SIZES, FRICTIONS]):
                     f[TURNED, k] = 0.0
@@ -1026,21 +930,21 @@ def follow(n, f, laws, task, order):
                     events -= 1
                     part, event, left, turning = 1.0, 0, 1.0 - done, np.inf
                     _within(n, f, done, 1.0)
-                    _smooth(n, f, left * h, order, inside)
+                    _smooth(n, f, left * h, order, INSIDE)
                     if dry > 0:
                         _carried(n, f)
                         if _changes(n, f):
                             for i in range(2 * d):
                                 f[X, i] = f[X1, i]
-                            _smooth(n, f, 0.0, rates, last)
+                            _smooth(n, f, 0.0, -1, last)
                             part, event = _first_event(n, f, left * h)
                     cut = part < 1.0
                     for once in range(2 if cut else 0):  # the cubic's root; Newton's step from it
                         _within(n, f, done, done + part * left)
-                        _smooth(n, f, part * left * h, order * once, inside)
+                        _smooth(n, f, part * left * h, order * once, INSIDE)
                         for i in range(2 * d):
                             f[X, i] = f[X1, i]
-                        _smooth(n, f, 0.0, rates, last)
+                        _smooth(n, f, 0.0, -1, last)
                         turning = _speed(n, f, event, A, 0)
                         if f[MODES, event] == 0.0 or turning == 0.0:
                             turning = np.inf  # let go, where nothing jumps
@@ -1050,7 +954,7 @@ def follow(n, f, laws, task, order):
                         _turn(n, f, event)
                         again = dry + 1
                         while again > 0:
-                            _smooth(n, f, 0.0, rates, last)
+                            _smooth(n, f, 0.0, -1, last)
                             again = again - 1 if _released(n, f) else 0
                         if order > 0:
                             _jump(n, f, event, turning)
@@ -1073,6 +977,3 @@ def follow(n, f, laws, task, order):
                     break
             _store(n, f, task, (lane, m), status == FINE)
         task.status[lane] = status
-
-
-event.register("numba:compile", _Compilation())

@@ -97,7 +97,7 @@ class Form:
 
     @cached_property
     def _tables(self) -> Tables:
-        from gfnn_jax.flows.tables import Tables  # loads numba: not before a law is followed
+        from gfnn_jax.flows.tables import Tables  # loads LLVM: not before a law is followed
 
         return Tables.of(self.terms, self.basis, self.friction, self.num_inputs)
 
@@ -187,5 +187,5 @@ class Form:
 
 
 def _owned(values: np.ndarray) -> np.ndarray:
-    """Contiguous numbers that may be written: numba takes read-only arrays for another type."""
+    """Contiguous numbers that may be written, as compiled code takes them."""
     return np.require(values, np.float64, ["C", "W"])

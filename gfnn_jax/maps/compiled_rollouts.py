@@ -28,7 +28,7 @@ def roll_out(map_, z, args, saving: Saving) -> tuple[Any, RolloutInfo] | None:
         return None
     if lanes > _MOST_LANES and jax.default_backend() != "cpu":
         return None
-    from gfnn_jax.flows.compiled_steps import Stepper  # loads numba
+    from gfnn_jax.flows.compiled_steps import Stepper  # loads LLVM
 
     bare, given = jax.tree.map(np.asarray, (map_, args))
     known = _args(bare, given, lanes, np.arange(1))

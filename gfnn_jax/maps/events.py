@@ -62,7 +62,7 @@ class Followed:
         return jax.device_put(self._advanced(lanes, args, saving))
 
     def _advanced(self, lanes: Lanes, args, saving: Saving) -> tuple[Lanes, np.ndarray]:
-        from gfnn_jax.flows import kernel  # loads numba: not before a law is followed
+        from gfnn_jax.flows import kernel  # loads LLVM: not before a law is followed
 
         args, coefficients = jax.tree.map(np.asarray, self._split(args))
         form, p = self.law.form, self.law.p

@@ -1,0 +1,99 @@
+"""Compiled loops against the same functions in Python, which checks every place in an array."""
+
+import numpy as np
+import pytest
+from test_kernel import lanes_of, law_of
+
+from gfnn_jax.flows import kernel
+from gfnn_jax.flows.translated import compiled, function
+
+LIMIT = 3
+
+
+class Checked(np.ndarray):
+    """An array of which no place may be counted from its end."""
+
+    def __getitem__(self, at):
+        assert min(at if isinstance(at, tuple) else (at,)) >= 0
+        return super().__getitem__(at)
+
+    def __setitem__(self, at, value):
+        assert min(at if isinstance(at, tuple) else (at,)) >= 0
+        super().__setitem__(at, value)
+
+
+@pytest.mark.parametrize(("d", "order"), [(2, 2), (2, 0), (3, 1)])
+def test_steps_are_those_of_python(monkeypatch, d, order):
+    """To the last bit, within all arrays."""
+    (form, p), (x, h, u) = law_of(d, True, True, shapes=True), lanes_of(d, 6)
+    found, whole = form.step(p, x, h, u[:, :1], order), kernel.follow.plain
+    assert (found.modes == 0).any()  # friction that holds
+
+    def plain(*arguments):
+        def checked(one):
+            if isinstance(one, tuple):
+                items = map(checked, one)
+                return one._make(items) if hasattr(one, "_make") else tuple(items)
+            return one.view(Checked) if isinstance(one, np.ndarray) else one
+
+        with np.errstate(all="ignore"):
+            whole(*map(checked, arguments))
+
+    monkeypatch.setattr(kernel, "follow", plain)
+    for one, other in zip(form.step(p, x, h, u[:, :1], order), found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@function
+def shared(values, k):
+    """Two numbers of a row."""
+    if k > LIMIT:
+        return 0, 1.5
+    return k, values[k, 0] / 2
+
+
+@compiled("a test", 1)
+def loops(whole, rows, pair):
+    (one, other), total, seen = pair, 0, False
+    count, width = rows.shape
+    one[:] = -1
+    for k in range(count - 1, -1, -2):
+        if k == LIMIT - 1:
+            continue
+        size, half = shared(rows, k)
+        total += size
+        rows[k, 0] = rows[k, -k + k] + half if not seen else -half
+        rows[k, 1] = max(rows[k, 1], k, 2.5) - min(abs(-k), 4)
+        seen = seen or k not in (9, count - 1)
+        other[k], one[k] = one[k], 1 < k <= 4
+        row = rows[k]
+        row[1] -= len(row) - width if total else np.inf
+    while True:
+        total -= 1
+        if total < -5:
+            break
+    whole[0] = int(rows[1, 0]) + total
+    whole[1], whole[2] = whole[0] * (-2), 3**2 if seen else 0
+
+
+def test_what_is_written_in_python_means_the_same():
+    rng, found = np.random.default_rng(0), []
+    rows = rng.normal(size=(7, 2))
+    for loop in (loops, loops.plain):
+        given = np.zeros(3, np.int64), rows.copy(), (np.zeros(7), np.zeros(7))
+        loop(*given)
+        found.append([given[0], given[1], *given[2]])
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@compiled("a test", 1)
+def listed(rows):
+    rows[0] = sum([k for k in rows])
+
+
+def test_what_has_no_code_is_refused():
+    with pytest.raises(TypeError, match=r"listed, line \d+: \[k for k in rows\] has no code"):
+        listed(np.zeros(3))
+    with pytest.raises(ValueError, match="contiguous"):
+        loops(np.zeros(3, np.int64), np.zeros((2, 7)).T, (np.zeros(7), np.zeros(7)))
