@@ -156,8 +156,7 @@ def network_params(seed=0, width=11, size=None):
     """Weights of a ``Network``, those of its last layer divided by a size."""
     rng = np.random.default_rng(seed)
     inner, bias, outer = (rng.standard_normal(shape) for shape in ((2, width), width, width))
-    params = {"inner": inner, "bias": bias, "outer": outer / (size or np.sqrt(width))}
-    return jax.tree.map(jnp.asarray, params)
+    return {"inner": inner, "bias": bias, "outer": outer / (size or np.sqrt(width))}
 
 
 def gradient_data(function, num, seed):

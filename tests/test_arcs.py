@@ -81,6 +81,7 @@ def test_angles_go_on_over_their_turns():
     np.testing.assert_allclose(moved, turned, atol=1e-12)
 
 
+@pytest.mark.slow
 @QUIETLY
 def test_arcs_tell_the_law_better_than_steps(monkeypatch):
     def error(fit):

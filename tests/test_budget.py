@@ -427,6 +427,7 @@ def test_ended_names_the_clock_where_the_maps_ended_by_themselves(monkeypatch):
     assert fit.ended in " ".join(fit.messages)
 
 
+@pytest.mark.slow
 @QUIETLY
 def test_the_words_of_a_search_that_was_cut_off():
     fit = gfnn.fit(
@@ -439,7 +440,7 @@ def test_the_words_of_a_search_that_was_cut_off():
 
 @QUIETLY
 def test_the_posterior_is_computed_when_it_is_asked_for():
-    fit = gfnn.fit(kepler(), learn="map", tolerance=1e-4, max_seconds=None)
+    fit = gfnn.fit(oscillators(), learn="map", tolerance=1e-4, max_seconds=None)
     assert not fit.map.posterior.known
     assert not fit.map.reversed().posterior.known
     fit.sample(jax.random.key(0), 2)

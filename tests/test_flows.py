@@ -113,7 +113,7 @@ def test_derivatives_in_everything_forward_and_reverse(newton):
         np.testing.assert_allclose(f.reshape(4, -1)[:, 0], numeric, atol=1e-9)
 
 
-@pytest.mark.parametrize("newton", [False, True])
+@pytest.mark.parametrize("newton", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_bad_lane_changes_no_other(newton):
     learned = map_of(flow(newton=newton))
     bad = Z.copy()

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from gfnn_jax.cli import main
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import InputError
-from gfnn_jax.jobs.output import read_in_units
+from gfnn_jax.jobs.output import read_in_units, refuse_other_units
 
 DT, SEEN, AHEAD = 0.05, 240, 60
 
@@ -147,7 +147,7 @@ def swings(tmp_path_factory):
     t = DT * np.arange(SEEN)
     swing, _ = states_in_motion(lambda q, v: -9 * np.sin(q) - 0.1 * v, [0.8, 0], t)
     theta = swing + 1e-4 * rng.normal(size=SEEN)
-    for unit, factor in (("deg", 180 / np.pi), ("rad", 1.0), ("mrad", 1e3)):
+    for unit, factor in (("deg", 180 / np.pi), ("rad", 1.0)):
         about = {"delimiter": ",", "header": f"t [s],theta [{unit}]", "comments": ""}
         np.savetxt(folder / f"{unit}.csv", np.stack([t, factor * theta], axis=1), **about)
     return folder
@@ -176,28 +176,21 @@ def test_degrees_and_radians_go_together(swings, model, initial, compare, capsys
     assert float(rms) < 5e-3 * (180 / np.pi if compare == "deg" else 1)
 
 
-@pytest.mark.parametrize("model", ["deg", pytest.param("rad", marks=pytest.mark.slow)])
-def test_parts_of_a_radian_are_refused(swings, model, capsys):
-    to = f"--num-steps 5 --out {swings}/m.csv"
-    assert typed(f"predict {fitted(swings, model)} --initial {swings}/mrad.csv {to}") == 2
-    line = capsys.readouterr().err.splitlines()[-1]
-    assert all(word in line for word in ("theta", model, "mrad"))
-
-
-def test_a_velocity_in_another_unit_is_not_left_out_in_silence(tmp_path, capsys):
-    rng, t = np.random.default_rng(2), DT * np.arange(SEEN)
-    x, v = np.exp(-0.05 * t) * np.stack([np.cos(3 * t), -3 * np.sin(3 * t) - 0.05 * np.cos(3 * t)])
-    x, v = x + 1e-2 * rng.normal(size=SEEN), v + 1e-2 * rng.normal(size=SEEN)
-    for name, unit, factor in (("both", "m/s", 1.0), ("other", "mm/s", 1e3)):
-        about = {"delimiter": ",", "header": f"t [s],x [m],v [{unit}]", "comments": ""}
-        np.savetxt(tmp_path / f"{name}.csv", np.stack([t, x, factor * v], axis=1), **about)
-    columns = ["--positions", "x", "--velocities", "v", "--friction", "linear"]
-    model = str(tmp_path / "model")
-    assert main(["fit", str(tmp_path / "both.csv"), *columns, "--out", model]) == 0
-    to = f"--num-steps 5 --out {tmp_path}/f.csv"
-    assert typed(f"predict {model} --initial {tmp_path}/other.csv {to}") == 2
-    line = capsys.readouterr().err.splitlines()[-1]
-    assert all(word in line for word in ("other.csv", "v", "mm/s"))
+@pytest.mark.parametrize(
+    ("header", "roles", "known"),
+    [
+        ("theta [mrad]", {"positions": "theta"}, {"theta": "deg"}),
+        ("theta [mrad]", {"positions": "theta"}, {"theta": "rad"}),
+        ("x [m],v [mm/s]", {"positions": "x", "velocities": "v"}, {"x": "m", "v": "m/s"}),
+    ],
+)
+def test_a_column_in_another_unit_is_refused(header, roles, known, tmp_path):
+    rows = np.arange(12.0 * (2 + header.count(","))).reshape(12, -1) / 10
+    path = tmp_path / "other.csv"
+    np.savetxt(path, rows, "%.3f", ",", header=f"t [s],{header}", comments="")
+    name, unit = header.split(",")[-1].strip("]").split(" [")
+    with pytest.raises(InputError, match=f"expected {name} in {known[name]}, .* got {unit}"):
+        refuse_other_units(read_in_units(path, {}, roles), {"units": known})
 
 
 def test_a_header_that_is_silent_is_read_in_the_units_of_the_model(tmp_path):

@@ -130,9 +130,10 @@ def test_pairs_of_tangents_see_what_is_not_symplectic():
     assert defect_of_pairs(u, shear, scale) > 1e-4
 
 
-def test_a_ring_of_many_sites(tmp_path):
-    """The formula, roundoff, a defect, the domain, and the same bits from a saved model."""
-    dim = 18
+@pytest.mark.parametrize("dim", [8, pytest.param(18, marks=pytest.mark.slow)])
+def test_a_ring_of_many_sites(dim, tmp_path):
+    """The formula, roundoff, a defect, the domain, and the same bits from a saved model, with
+    matrices and without."""
     family, params = springs(dim)
     pairs = drawn(dim, 20, family, params, 0.1)
     fit = gfnn.fit(pairs.take(slice(12)), structure="ring", tolerance=1e-12)
@@ -153,7 +154,9 @@ def test_a_ring_of_many_sites(tmp_path):
     np.testing.assert_array_equal(loaded.step(z)[0], fit.map.step(z)[0])
     # Where the ring is as a whole matters to no force: it is no part of the domain.
     moved = z + np.repeat([100.0, 0.0], dim)
-    np.testing.assert_array_equal(fit.map.step(moved)[1].status, 0)
+    status = np.asarray(fit.map.step(z)[1].status)
+    assert np.mean(status == 0) > 0.8
+    np.testing.assert_array_equal(fit.map.step(moved)[1].status, status)
     far = z.copy()
     far[:, 5] += 5.0
     assert (np.asarray(fit.map.step(far)[1].status) == 1).all()

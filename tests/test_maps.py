@@ -42,6 +42,7 @@ def test_one_state_and_a_batch_take_the_same_step():
     assert PENDULUM.dim == 1
 
 
+@pytest.mark.slow
 def test_reversing_twice_gives_the_map():
     again, _ = PENDULUM.reversed().reversed().step(Z)
     np.testing.assert_array_equal(again, PENDULUM.step(Z)[0])
@@ -142,6 +143,7 @@ def in_units(units, w):
     return pendulum(1.0, x) + 0.1 * x[0] ** 3 * x[1]
 
 
+@pytest.mark.slow
 def test_defect_is_in_units_of_the_scale():
     """Compare the map with itself in units where q is 10⁶ times larger and p as much smaller."""
     units = np.array([1e6, 1e-6])

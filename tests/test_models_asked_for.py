@@ -33,32 +33,23 @@ def test_an_object_is_its_keywords(model, options):
     np.testing.assert_array_equal(found.map.step(Z)[0], same.map.step(Z)[0])
 
 
-@pytest.fixture(scope="module")
-def law():
-    return gfnn.fit(T, X, model=LAW)
-
-
-def test_times_and_positions(law):
+def test_times_and_positions():
+    law = gfnn.fit(T, X, model=LAW)
     assert law.verdict == "identified"
     assert [t.term for t in law.lagrangian.terms] == ["v1**2", "x1**2"]
     assert law.map.sensors.positions == ("x1",)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["table", "file", *(pytest.param(k, marks=pytest.mark.slow) for k in ("recording", "arrays"))],
-)
-def test_any_form_of_the_same_data(kind, law, tmp_path):
+def test_any_form_of_the_same_data(tmp_path):
     table = pd.DataFrame({"t": T, "x1": X})
     path = tmp_path / "swing.csv"
     table.to_csv(path, index=False)
-    data = {
-        "recording": gfnn.Recording(table, positions=["x1"]),
-        "table": table,
-        "arrays": {"t": T, "x1": X},
-        "file": path,
-    }[kind]
-    assert gfnn.fit(data, model=LAW).lagrangian == law.lagrangian
+    recording = gfnn.Recording(table, positions=["x1"])
+    for data in ((T, X), recording, table, {"t": T, "x1": X}, path, str(path)):
+        found, _ = as_pairs_or_recording(data)
+        assert found.positions == ("x1",)
+        np.testing.assert_array_equal(found.times("0"), T)
+        np.testing.assert_array_equal(found.values("x1", "0"), X)
 
 
 def test_several_positions():

@@ -62,7 +62,7 @@ LINEAR = {
 }
 
 # Each like two others: what is before a piece, and a map backwards.
-ALIKE = ("a flow before", "type 1, backwards", "type 1", "type 2")
+ALIKE = ("a flow before", "type 1, backwards", "type 1", "type 2", "type 3, backwards")
 
 
 @pytest.mark.parametrize(
