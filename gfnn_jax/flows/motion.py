@@ -188,4 +188,6 @@ class Form:
 
 def _owned(values: np.ndarray) -> np.ndarray:
     """Contiguous numbers that may be written, as compiled code takes them."""
+    if values.dtype == np.float64 and values.flags.carray:  # as most are: NumPy takes ten times
+        return values
     return np.require(values, np.float64, ["C", "W"])

@@ -59,11 +59,12 @@ _LANES = 4  # numbers that a processor works on at once: rows of derivatives are
 
 class Tables(NamedTuple):
     """A law but for the values of its coefficients and phases: whole numbers, the number of rows
-    of all others, and those of them that the law is made of, by rows."""
+    of all others, and those of them that the law is made of, by rows; and rooms of each width."""
 
     whole: np.ndarray
     rows: int
     numbers: tuple[tuple[int, np.ndarray], ...]
+    rooms: dict[int, np.ndarray]
 
     @classmethod
     def of(cls, terms: Terms, basis: np.ndarray, friction: Friction, num_inputs: int) -> Tables:
@@ -145,11 +146,13 @@ class Tables(NamedTuple):
         columns_of = zip(directions.tolist(), friction.directions.T.astype(float), strict=True)
         stages = zip(range(row.STAGES, row.NODES), STAGES, strict=True)
         tableau = (*stages, (row.NODES, NODES), (row.WEIGHTS, WEIGHTS))
-        return cls(whole, int(places[-1]), (*parts, *columns_of, *tableau))
+        return cls(whole, int(places[-1]), (*parts, *columns_of, *tableau), {})
 
     def room(self, width: int) -> np.ndarray:
         """Room for the numbers of one lane, with ``width`` derivatives of each part of its
         state."""
+        if width in self.rooms:
+            return self.rooms[width].copy()
         sizes = self.whole[row.SIZES]
         d, most = int(sizes[row.DIM]), int(sizes[: row.MASSES].max()) + 1
         longest = max(width, 2 * d, most, *(len(values) for _, values in self.numbers))
@@ -157,7 +160,8 @@ class Tables(NamedTuple):
         numbers[row.COSINE, 0] = 1.0
         for place, values in self.numbers:
             numbers[place, : len(values)] = values
-        return numbers
+        self.rooms[width] = numbers
+        return numbers.copy()
 
 
 Operation = tuple[int, float]
