@@ -53,7 +53,7 @@ import pandas as pd
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
-from gfnn_jax.exports.export import SUFFIXES
+from gfnn_jax.exports import SUFFIXES
 from gfnn_jax.families.friction import LINEAR, Friction
 from gfnn_jax.families.lagrangian import Lagrangian, Terms
 from gfnn_jax.families.terms import given_terms

@@ -359,18 +359,8 @@ def _hold_to(strict: bool, model: Path) -> None:
 # for steps of a map, and for the forecast of a recording.
 _OF_FILES = ("despite", *ROLES, *OF_COLUMNS, "std", "observe", "event", "guess", "mass")
 _OF_MAPS = (
-    "tolerance",
-    "absolute_tolerance",
-    "strict",
-    "family",
-    "chart",
-    "ensemble",
-    "scene",
-    "devices",
-    "max_seconds",
-    "max_operations",
-    "resume",
-    "distributed",
+    *("tolerance", "absolute_tolerance", "strict", "family", "chart", "ensemble", "scene"),
+    *("devices", "max_seconds", "max_operations", "resume", "distributed"),
 )
 _OF_STEPS = ("dt", "samples", "horizon", "outside", "devices", "distributed", "resume")
 _OF_FORECAST = ("stop", "estimate_from", "inputs", "compare")

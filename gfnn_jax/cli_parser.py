@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 from gfnn_jax.data.recording import SECONDS
 from gfnn_jax.data.roles import ROLES
 from gfnn_jax.errors import InputError
+from gfnn_jax.exports import SUFFIXES
 from gfnn_jax.learn.options import (
     COUNT,
     DEVICES,
@@ -31,18 +32,6 @@ from gfnn_jax.learn.options import (
     Lagrangian,
 )
 
-EXPORTS = (  # those of `exports.export`, whose import would load JAX
-    "c",
-    "c-taylor",
-    "js",
-    "jax",
-    "casadi",
-    "fmu",
-    "mjcf",
-    "urdf",
-    "latex",
-    "stablehlo",
-)
 WORKFLOW = """\
 all in one:
   gfnn FILE --open              look, learn from two thirds, forecast the rest, write the report
@@ -174,67 +163,57 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = found.add_subparsers(required=True, metavar="COMMAND")
 
-    def command(name: str, about: str, description: str = "", epilog: str = EXIT_STATUS):
-        given = {}
-        if description:
-            shown = f"{textwrap.fill(description, 79)}\n\n{EXAMPLES[name]}"
-            given = {"description": shown, "epilog": epilog, **plain}
-        made = commands.add_parser(name, help=about, **given)
-        made.set_defaults(command=name)
-        return _Command(made)
-
-    command("scenes", "list the scenes")
-    command("records", "list the measured records of the package")
-    _run(
-        command(
-            "run",
+    commands.add_parser("scenes", help="list the scenes").set_defaults(command="scenes")
+    about = "list the measured records of the package"
+    commands.add_parser("records", help=about).set_defaults(command="records")
+    for add, about, description, epilog in (
+        (
+            _run,
             "a scene from reference data to figures, or a measured record to forecasts",
             "Reference data of a scene, fit, rollouts, metrics, figures, report.json. Of a "
             "measured record, or of your own recording: the law of its first two thirds, and "
             "forecasts of its last third.",
             f"{WORDS}\n\n{EXIT_STATUS}",
-        )
-    )
-    _look(
-        command(
-            "look",
+        ),
+        (
+            _look,
             "what a recording holds, before anything is learned",
             "Runs, rates, gaps, noise, friction and mistakes of a recording, found in the file "
             "itself: text of any dialect, .gz, .zip, .npz, .npy, .mat, .xlsx, .xls, .ods.",
-        )
-    )
-    _fit(
-        command(
-            "fit",
+            EXIT_STATUS,
+        ),
+        (
+            _fit,
             "learn from your own recording, or from states q, p",
             "Learn from a recording (positions over time: a law with friction and inputs) or from "
             "states q, p (a symplectic map, or H). The columns decide which of them a file is.",
             f"{WORDS}\n\n{EXIT_STATUS}\n{DISTRIBUTED_STATUS}",
-        )
-    )
-    _predict(
-        command(
-            "predict",
+        ),
+        (
+            _predict,
             "predict with a learned map",
             "Predict from initial states (.npy, .npz with z0, a trajectory file), or forecast from "
             "the end of a recording.",
             f"{EXIT_STATUS}\n{DISTRIBUTED_STATUS}",
-        )
-    )
-    _export(
-        command(
-            "export",
+        ),
+        (
+            _export,
             "write a learned map for other programs",
             "One file: step, inverse and status of a learned map, in C or as StableHLO.",
-        )
-    )
-    _compare(
-        command(
-            "compare",
+            EXIT_STATUS,
+        ),
+        (
+            _compare,
             "the same data through other methods",
             "A scene learned by GFNN and by the methods that the paper compares with.",
-        )
-    )
+            EXIT_STATUS,
+        ),
+    ):
+        name = add.__name__.removeprefix("_")
+        shown = f"{textwrap.fill(description, 79)}\n\n{EXAMPLES[name]}"
+        made = commands.add_parser(name, help=about, description=shown, epilog=epilog, **plain)
+        made.set_defaults(command=name)
+        add(_Command(made))
     return found
 
 
@@ -342,7 +321,7 @@ def _export(command: _Command) -> None:
         "js: JavaScript, jax, casadi, fmu: FMI 3.0, mjcf and urdf: a chain of links, latex; "
         "stablehlo: batches by jax.export, of any map"
     )
-    command.add("--to", about, choices=EXPORTS, required=True)
+    command.add("--to", about, choices=SUFFIXES, required=True)
     command.add("--out", "default: beside MODEL, of its name", "FILE", type=Path)
     command.flag("--overwrite", "replace an existing output")
 

@@ -23,16 +23,8 @@ _TYPED = re.compile(rf"--([a-z][a-z-]+)(?: {_VALUE})?")
 _IN_PYTHON = {"from": "start", "event": "events", "states": "positions"}
 _FLAGS = ("overwrite", "resume", "keep", "strict", "quick")
 _TEXTS = (
-    "learn",
-    "structure",
-    "chart",
-    "family",
-    "time",
-    "time_unit",
-    "friction",
-    "to",
-    "scene",
-    "base",
+    *("learn", "structure", "chart", "family", "time", "time_unit"),
+    *("friction", "to", "scene", "base"),
 )
 _FORMULAS = ("observe", "events")  # one for each column
 _PAIRS = ("guess", "mass", "std")

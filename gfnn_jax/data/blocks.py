@@ -36,7 +36,6 @@ _OF_DAMAGE = (
     ValueError,
     tokenize.TokenError,
     SyntaxError,
-    NotImplementedError,
     RuntimeError,
     MemoryError,
 )

@@ -31,20 +31,8 @@ from gfnn_jax.signals.steps import drift
 from gfnn_jax.signals.wrong_values import TURN
 
 WRONG = (
-    "constant",
-    "repeated",
-    "order",
-    "time unit",
-    "no derivative",
-    "degrees",
-    "sign",
-    "factor",
-    "wrapped",
-    "interpolated jump",
-    "clipped",
-    "drifting clock",
-    "different systems",
-    "circle",
+    *("constant", "repeated", "order", "time unit", "no derivative", "degrees", "sign", "factor"),
+    *("wrapped", "interpolated jump", "clipped", "drifting clock", "different systems", "circle"),
     "first order",
 )
 PROPOSED = ("kind", "let go", "caught", "rounded times", "roles")
@@ -509,10 +497,6 @@ def _of_other_systems(traits: Traits) -> list[str]:
     return [recording.runs[r] for r, is_apart in zip(runs, apart, strict=True) if is_apart]
 
 
-def _reading(traits: Traits) -> Iterator[Fault]:
-    return (Fault("reading", note) for note in traits.recording.notes)
-
-
 _CHECKS = (
     _constant,
     _repeated,
@@ -527,5 +511,5 @@ _CHECKS = (
     _missing,
     _wrong_values,
     _coarse,
-    _reading,
+    lambda traits: (Fault("reading", note) for note in traits.recording.notes),
 )

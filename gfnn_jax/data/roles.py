@@ -24,33 +24,16 @@ RUNS = ("run", "trial", "sequence", "seq", "episode", "experiment", "trajectory"
 _GREEK = {letter: unicodedata.name(letter).split()[3].lower() for letter in "αβγθφψωτ"}
 _GREEK |= {"ϕ": "phi", "ϑ": "theta"}
 _ANGLES = (
-    "theta",
-    "phi",
-    "psi",
-    "alpha",
-    "beta",
-    "gamma",
-    "angle",
-    "winkel",
-    "yaw",
-    "pitch",
-    "roll",
+    *("theta", "phi", "psi", "alpha", "beta", "gamma"),
+    *("angle", "winkel", "yaw", "pitch", "roll"),
 )
 _WORDS = {
     "positions": (*_ANGLES, "q", "x", "y", "z", "r", "position", "pos", "displacement"),
     "velocities": ("v", "omega", "velocity", "vel", "speed", "qdot", "qd", "gyro", "dq"),
     "momenta": ("p", "momentum"),
     "inputs": (
-        "u",
-        "tau",
-        "torque",
-        "force",
-        "input",
-        "voltage",
-        "current",
-        "motor",
-        "drive",
-        "command",
+        *("u", "tau", "torque", "force", "input"),
+        *("voltage", "current", "motor", "drive", "command"),
     ),
 }
 _ROLE_OF = {word: role for role, words in _WORDS.items() for word in words}

@@ -22,6 +22,8 @@ STEPS_REPORTED = (1, 10, 100, 1000)
 _LABELS = ("learns", "family", "label", "chart", "num_parameters")
 _ERRORS = ("validation_rms", "validation_relative", "validation_bound", "outside")
 _OF_LAW = ("terms", "friction", "constants", "symmetries", "rivals", "notes", "dropped")
+_OF_FRICTION = ("kinds", "odds", "limits")
+_OF_PAIRS = ("validation_rms", "validation_relative", "tolerance", "tolerance_met")
 _COSTS = ("operations", "microseconds_per_step", "fit_seconds", "rank", "condition", "chosen")
 
 
@@ -36,6 +38,11 @@ def device() -> str:
     """Name of the device that JAX computes on by default."""
     first = jax.devices()[0]
     return f"{first.platform}: {first.device_kind}"
+
+
+def _of(result: Any, *names: str) -> dict[str, Any]:
+    """Attributes of a result, by name."""
+    return {name: getattr(result, name) for name in names}
 
 
 def _made(fit: Fit, scene: str | None, seed: int | None) -> dict[str, Any]:
@@ -72,22 +79,17 @@ def assemble(
             **(data or {}),
         },
         "model": {
-            **{name: getattr(chosen, name) for name in _LABELS},
+            **_of(chosen, *_LABELS),
             "base_map": fit.base_map,
         },
         "fit": {
             "seconds": chosen.fit_seconds,
-            "compile_seconds": fit.compile_seconds,
             "total_seconds": fit.seconds,
-            **{name: getattr(chosen, name) for name in ("train_rms", *_ERRORS[:3], "deviations")},
-            "stated_by": fit.stated_by,
-            "tolerance": fit.tolerance,
             "tolerance_is_relative": fit.asked.relative,
             "tolerance_met": fit.met,
-            "ended": fit.ended,
-            "operations": fit.operations,
-            "max_operations": fit.max_operations,
-            "messages": fit.messages,
+            **_of(chosen, "train_rms", *_ERRORS[:3], "deviations"),
+            **_of(fit, "compile_seconds", "stated_by", "tolerance", "ended"),
+            **_of(fit, "operations", "max_operations", "messages"),
         },
         "hamiltonian": _hamiltonian(fit),
         "bracket": _bracket(fit),
@@ -102,10 +104,7 @@ def assemble(
             "newton_iterations_max": chosen.newton_iterations_max,
         },
         "rollout": rollout,
-        "candidates": [
-            {name: getattr(c, name) for name in (*_LABELS, *_ERRORS, *_COSTS)}
-            for c in fit.candidates
-        ],
+        "candidates": [_of(c, *_LABELS, *_ERRORS, *_COSTS) for c in fit.candidates],
     }
 
 
@@ -116,16 +115,12 @@ def _damping(fit: Fit) -> dict[str, Any] | None:
     damping = fit.damping
     if damping is None:
         return None
-    found: dict[str, Any] = {name: getattr(damping, name) for name in ("factor", "std", "shift")}
-    if damping.functions is not None:
-        low, high = damping.extremes
-        found |= {
-            "parameters": damping.names,
-            "degrees": damping.functions.degrees,
-            "low": low,
-            "high": high,
-        }
-    return found
+    found = _of(damping, "factor", "std", "shift")
+    if damping.functions is None:
+        return found
+    low, high = damping.extremes
+    degrees = damping.functions.degrees
+    return {**found, "parameters": damping.names, "degrees": degrees, "low": low, "high": high}
 
 
 def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
@@ -136,9 +131,9 @@ def _hamiltonian(fit: Fit) -> dict[str, Any] | None:
     which = law.which_friction
     return {
         "formula": fit.formula,
-        "which_friction": which and {**_kinds(which), "text": str(which)},
+        "which_friction": which and {**_of(which, *_OF_FRICTION), "text": str(which)},
         "search_cut_short": law.ended or None,
-        **{name: getattr(law, name) for name in _OF_LAW},
+        **_of(law, *_OF_LAW),
     }
 
 
@@ -175,23 +170,12 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
             "compile_seconds": 0.0,
             "total_seconds": fit.seconds,
             "train_rms": fit.residual,
-            "validation_rms": None,
-            "validation_relative": None,
-            "tolerance": None,
-            "tolerance_met": None,
-            "ended": fit.ended,
-            "messages": fit.messages,
-            "steps": fit.steps,
-            "alike": fit.alike,
-            "next_motions": fit.next_motions,
+            **dict.fromkeys(_OF_PAIRS),
+            **_of(fit, "ended", "messages", "steps", "alike", "next_motions"),
         },
         "hamiltonian": None if fit.hamiltonian is None else _law(fit.hamiltonian),
-        "lagrangian": {**_law(fit.lagrangian), "text": str(fit.lagrangian)},
-        "friction": {
-            **_law(fit.friction),
-            "text": str(fit.friction),
-            **_kinds(fit.which_friction),
-        },
+        "lagrangian": _law(fit.lagrangian),
+        "friction": {**_law(fit.friction), **_of(fit.which_friction, *_OF_FRICTION)},
         "rivals": fit.rivals,
         "inputs": {
             "hold": sensors.hold,
@@ -208,14 +192,9 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
         "observe": fit.observe,
         "sensors": {name: {"value": c, "std": s} for name, (c, s) in fit.sensors.items()},
         "noise": {n: {"sigma": s, "residual": fit.residual[n]} for n, s in fit.noise.items()},
-        "units": fit.units,
         "friction_level": sensors.level,
         "wander": sensors.wander,
-        "velocities": fit.velocities,
-        "whiteness": fit.whiteness,
-        "gauge": fit.gauge,
-        "energy": fit.energy,
-        "horizon": fit.horizon,
+        **_of(fit, "units", "velocities", "whiteness", "gauge", "energy", "horizon"),
         "map": {
             "multiplier": map_.multiplier(),
             "symplecticity_defect": None,
@@ -228,12 +207,7 @@ def assemble_law(fit: Fit, *, source: str | None = None, seed: int = 0) -> dict[
 
 
 def _law(expression: Any) -> dict[str, Any]:
-    return {"formula": expression.formula, "terms": expression.terms}
-
-
-def _kinds(friction: Any) -> dict[str, Any]:
-    """The kinds of friction that were found, the odds of each, the limits of the others."""
-    return {name: getattr(friction, name) for name in ("kinds", "odds", "limits")}
+    return {**_of(expression, "formula", "terms"), "text": str(expression)}
 
 
 def rollout_part(*, seconds: float, status, statistics, growth, drift) -> dict[str, Any]:

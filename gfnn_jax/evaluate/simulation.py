@@ -51,7 +51,7 @@ def simulation(law: LearnedLaw, recording: Recording, begin: float) -> str | Non
     if sensors.observation is not None and not sensors.observation.is_plain:
         return None
     try:
-        source = javascript(law.map)
+        source = javascript(law.map, "law", {})
         before = recording.slice(stop=begin)
         z, _ = law.map.estimate(before)
     except InputError:

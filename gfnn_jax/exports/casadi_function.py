@@ -11,7 +11,7 @@ import numpy as np
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.exports.graph import graph_of
-from gfnn_jax.exports.jax_source import FUNCTIONS, rates_of
+from gfnn_jax.exports.jax_source import IN_NUMPY, rates_of
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
@@ -33,7 +33,7 @@ def casadi_function(map_: SymplecticMap, name: str, about: Mapping[str, Any]) ->
         raise InputError("expected CasADi: pip install 'gfnn-jax[machines]'") from None
     graph, piece = graph_of(map_, sharp=False), map_.pieces[0]
     rule, width = gauss(piece.stages), len(graph.rates)
-    functions = {own: getattr(casadi, other, None) for own, other in FUNCTIONS.items()}
+    functions = {own: getattr(casadi, other, None) for own, other in IN_NUMPY.items()}
     functions["fabs"] = casadi.fabs
     functions["clip"] = lambda x, low, high: casadi.fmin(casadi.fmax(x, low), high)
     functions["pow"] = lambda x, exponent: x**exponent

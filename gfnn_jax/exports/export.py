@@ -15,6 +15,7 @@ import numpy as np
 from jax import export as exporting
 
 from gfnn_jax.errors import InputError
+from gfnn_jax.exports import SUFFIXES
 from gfnn_jax.exports.c_source import c_source
 from gfnn_jax.exports.casadi_function import casadi_function
 from gfnn_jax.exports.fmu import fmu
@@ -29,19 +30,6 @@ from gfnn_jax.maps import saved
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import require_x64
 from gfnn_jax.storage.outputs import atomic_write, ensure_new
-
-SUFFIXES = {
-    "c": ".c",
-    "c-taylor": ".c",
-    "js": ".js",
-    "jax": ".py",
-    "casadi": ".casadi",
-    "fmu": ".fmu",
-    "mjcf": ".xml",
-    "urdf": ".urdf",
-    "latex": ".tex",
-    "stablehlo": ".zip",
-}
 
 
 def _c_of_law(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:

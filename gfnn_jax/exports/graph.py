@@ -75,7 +75,7 @@ class LawGraph:
     @property
     def sticks(self) -> bool:
         """Return whether bodies stick: dry friction acts that has no width."""
-        return any(not _is_zero(limit) for limit in self.limits)
+        return any(isinstance(limit, Symbol) or limit != 0 for limit in self.limits)
 
     @property
     def num_given(self) -> int:
@@ -222,7 +222,3 @@ def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
     speeds = [own.directions[k] @ v for k in signed]
     limits = [losses[k] if sharp[k] else 0.0 for k in signed]
     return [*v, *forces], speeds, limits, own.directions[signed]
-
-
-def _is_zero(value: Any) -> bool:
-    return not isinstance(value, Symbol) and value == 0

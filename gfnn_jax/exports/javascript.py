@@ -43,7 +43,7 @@ def _in_javascript(text: str) -> str:
     return re.sub(r"(?m)^( +)(?:double|int) ([^;]*);", declared, text)
 
 
-def javascript(map_: SymplecticMap, name: str = "law", about: Mapping[str, Any] = {}) -> str:
+def javascript(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     """Write the law of a map as JavaScript, a constant of this name with a function ``step``:
 
         law.step(z, h, u, p)     z a time h later: an array of 2d numbers, NaN where no motion is
@@ -60,17 +60,13 @@ def javascript(map_: SymplecticMap, name: str = "law", about: Mapping[str, Any] 
     followed. Raises InputError for a map without a law, or with one that is no formula.
     """
     graph = graph_of(map_)
-    about = {
-        "variables": list(graph.names),
-        "arguments": list(graph.arguments),
-        "terms": list(graph.terms),
-    }
-    listed = "\n".join(
-        f"    {key}: {json.dumps(value, ensure_ascii=False)}," for key, value in about.items()
-    )
+    lists = {"variables": graph.names, "arguments": graph.arguments, "terms": graph.terms}
+    shown = {key: json.dumps(names, ensure_ascii=False) for key, names in lists.items()}
+    listed = "\n".join(f"    {key}: {names}," for key, names in shown.items())
     fewest = len(graph.series)
     signs = ", new Float64Array(FRICTIONS)" if graph.speeds else ""
-    comment = "\n".join(f"   {key}: {value}" for key, value in about.items()).replace("*/", "* /")
+    comment = "\n".join(f"   {key}: {value}" for key, value in {**about, **shown}.items())
+    comment = comment.replace("*/", "* /")
     return f"""\
 /* The law of a motion: {name}.step(z, h, u, p) is z a time h later, to roundoff.
 

@@ -12,14 +12,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from gfnn_jax.exports.graph import LawGraph, graph_of
-from gfnn_jax.exports.symbols import Tape
+from gfnn_jax.exports.symbols import FUNCTIONS, Tape
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
-FUNCTIONS = {  # of C -> of NumPy's namespaces
-    **{name: name for name in ("cos", "sin", "tan", "exp", "log", "sqrt", "sinh", "cosh", "tanh")},
-    **{"atan": "arctan", "fabs": "abs", "pow": "power", "clip": "clip", "sign": "sign"},
-}
+IN_NUMPY = {own: name for name, own in FUNCTIONS.items()}  # of functions of C
+IN_NUMPY |= {"fabs": "abs", "pow": "power", "clip": "clip", "sign": "sign"}
 
 
 def rates_of(graph: LawGraph, inputs: Mapping[str, Any], functions: Mapping[str, Any]) -> list[Any]:
@@ -35,7 +33,7 @@ def rates_on_tape(graph: LawGraph) -> tuple[Tape, list[Any]]:
     tape = Tape()
     sizes = {"z": len(graph.rates), "u": len(graph.arguments), "p": len(graph.values)}
     inputs = {name: tape.inputs(name, max(size, 1))[0] for name, size in sizes.items()}
-    functions = {own: (lambda *a, own=own: tape.made(own, *a)) for own in FUNCTIONS}
+    functions = {own: (lambda *a, own=own: tape.made(own, *a)) for own in IN_NUMPY}
     return tape, rates_of(graph, inputs, functions)
 
 
@@ -51,7 +49,7 @@ def jax_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     tape, found = rates_on_tape(graph)
     lines = tape.lines({f"r{i}": rate for i, rate in enumerate(found)})
     lines = (line.removeprefix("const double ").removesuffix(";") for line in lines)
-    named = (re.sub(r"\b([a-z]+)\(", lambda n: f"jnp.{FUNCTIONS[n[1]]}(", line) for line in lines)
+    named = (re.sub(r"\b([a-z]+)\(", lambda n: f"jnp.{IN_NUMPY[n[1]]}(", line) for line in lines)
     body = "\n".join(f"    {line}" for line in named)
     rule = gauss(piece.stages)
     comment = "\n".join(f"{key}: {value}" for key, value in about.items())

@@ -27,18 +27,8 @@ _ARITHMETIC: dict[str, Callable] = {
     "negative": operator.neg,
 }
 # NumPy's names of functions, which it calls as methods of objects, and those of C.
-_FUNCTIONS = {
-    "cos": "cos",
-    "sin": "sin",
-    "tan": "tan",
-    "exp": "exp",
-    "log": "log",
-    "sqrt": "sqrt",
-    "sinh": "sinh",
-    "cosh": "cosh",
-    "tanh": "tanh",
-    "arctan": "atan",
-}
+FUNCTIONS = {n: n for n in ("cos", "sin", "tan", "exp", "log", "sqrt", "sinh", "cosh", "tanh")}
+FUNCTIONS["arctan"] = "atan"
 
 
 class Symbol:
@@ -96,7 +86,7 @@ class Symbol:
         return self.tape.made("clip", self, low, high)
 
 
-for _name, _function in _FUNCTIONS.items():
+for _name, _function in FUNCTIONS.items():
     setattr(Symbol, _name, lambda self, function=_function: self.tape.made(function, self))
 
 

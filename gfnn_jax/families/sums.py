@@ -25,7 +25,6 @@ from gfnn_jax.families.terms import Terms, exponents, given_terms, joined
 from gfnn_jax.families.text import added
 from gfnn_jax.phase_space import split
 
-ENDS = ("ring", "free", "fixed")
 _LONGEST = 4  # sites of a window that a user's own terms may name
 _DENSE = 32  # 2d up to which matrices (2d, 2d) are cheaper than products with them
 

@@ -88,22 +88,20 @@ PAPER = Recipe(batch_size=200, epochs=20, rate=0.01, schedule="staircase")
 PAPER_STANDARD_MAP = dataclasses.replace(PAPER, batch_size=1000, rate=0.001)
 # As many iterations whatever the number of pairs.
 DEFAULT = Recipe(batch_size=200, epochs=160, rate=0.02, schedule="cosine", epoch_length=500)
-QUICK = dataclasses.replace(DEFAULT, epochs=30)
 
 
 class AdamFit(NamedTuple):
     """params: those of the epoch with the lowest validation error, of the recipe's dtype.
 
     train_rms, validation_rms: of that epoch, per component of the loss; the first is a mean over
-    its batches, while parameters moved. history: both of every epoch, (epochs,) each.
-    seconds: without compilation. operations: counted, of an epoch. stopped_because: "epochs", or
-    words that say that the cap was reached, or where numbers ceased to be finite.
+    its batches, while parameters moved. seconds: without compilation. operations: counted, of an
+    epoch. stopped_because: "epochs", or words that say that the cap was reached, or where numbers
+    ceased to be finite.
     """
 
     params: Any
     train_rms: float
     validation_rms: float
-    history: dict[str, np.ndarray]
     epochs: int
     seconds: float
     compile_seconds: float
@@ -213,7 +211,6 @@ class Training:
             raise ValueError("the loss is not finite on the validation rows at the start")
         epoch, seconds = 0, 0.0
         best = {"params": _copied(params), "train_rms": math.nan, "validation_rms": start}
-        history: dict[str, list[float]] = {"train_rms": [], "validation_rms": []}
         capped = epochs < recipe.epochs
         stopped_because = f"the cap of {cap:.3g} operations" if capped else "epochs"
         while epoch < epochs:
@@ -223,8 +220,6 @@ class Training:
             held = _validate(carry[0], given, validation, loss=loss)
             now = {"train_rms": rms(value), "validation_rms": rms(held)}
             seconds += time.perf_counter() - started
-            for name, column in history.items():
-                column.append(now[name])
             if not all(map(math.isfinite, now.values())):
                 stopped_because = f"not finite in epoch {epoch}: try a lower rate"
                 break
@@ -233,10 +228,7 @@ class Training:
             if self.on_epoch is not None:
                 self.on_epoch(epoch, now["train_rms"], now["validation_rms"])
         return AdamFit(
-            params=jax.tree.map(jnp.asarray, best["params"]),
-            train_rms=best["train_rms"],
-            validation_rms=best["validation_rms"],
-            history={name: np.array(column) for name, column in history.items()},
+            **{**best, "params": jax.tree.map(jnp.asarray, best["params"])},
             epochs=epoch,
             seconds=seconds,
             compile_seconds=compile_seconds,

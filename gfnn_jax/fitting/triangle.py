@@ -226,6 +226,11 @@ class Spectrum:
         deviation one; 0 along directions that the rows do not tell."""
         return self.vt.T / self.column[:, None] * np.sqrt(self._inverse_square(ridge))
 
+    @property
+    def told(self) -> np.ndarray:
+        """G (n, n): the plain solution is Gᵀ Uᵀt, and Gᵀ G its covariance as of ``root``."""
+        return self.inverse[:, None] * self.vt / self.column
+
     def degrees_of_freedom(self, ridge: float = 0.0) -> float:
         """Effective degrees of freedom of the solution: Σ s² / (s² + (ridge s₀)²)."""
         return float(np.sum(self._inverse_square(ridge) * self.s**2))

@@ -130,7 +130,8 @@ class Logarithms(Itself):
     def pulled_twice(self, w, g, hessian):
         """Hessian of H∘exp."""
         z = self.argument(w)
-        return z[..., :, None] * z[..., None, :] * hessian + _diagonal(z * g)
+        unit = as_row(np.eye(z.shape[-1]), z[..., None])
+        return z[..., :, None] * z[..., None, :] * hessian + (z * g)[..., None] * unit
 
 
 @pytree("blocks")
@@ -366,20 +367,11 @@ def _times(q, a):
     )
 
 
-def _diagonal(values):
-    """Diagonal matrices (..., n, n)."""
-    return values[..., None] * as_row(np.eye(values.shape[-1]), values[..., None])
-
-
 def _up_scaled(y):
     """(q, p) (..., 1) of (a, b) (..., 2)."""
     q = namespace(y).sqrt(y[..., :1])
     return q, 2.0 * y[..., 1:] / q
 
 
-def _up_still(y):
-    """(q, p) = (y, 1) of a Casimir y = q p (..., 1)."""
-    return y, namespace(y).ones_like(y)
-
-
-_UP = {"so3": _up_spin, "se3": _up_top, "aff": _up_scaled, "centre": _up_still}
+_UP = {"so3": _up_spin, "se3": _up_top, "aff": _up_scaled}
+_UP["centre"] = lambda y: (y, namespace(y).ones_like(y))  # (q, p) of a Casimir y = q p

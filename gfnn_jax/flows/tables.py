@@ -193,14 +193,11 @@ def operations(tree: Expression, slots: list[int], at: int = 0) -> list[Operatio
         return [*inner, (_POWERS.get(operands[1], row.RAISED), operands[1])]
     if (own := own_function(kind)) is not None:
         for k, piece in enumerate(traced_pieces(own.derivatives), 1):
-            inner += _of_place(operations(piece, [0], at + k), at)
+            # The variable is the number on the stack.
+            code = operations(piece, [0], at + k)
+            inner += [(row.COPY, at) if o == row.VARIABLE else (o, c) for o, c in code]
     known = _BINARY | _FUNCTIONS | {"select": row.SELECT}
     return [*inner, (row.COMPOSE if own else known[kind], 0.0)]
-
-
-def _of_place(code: list[Operation], at: int) -> list[Operation]:
-    """Operations on a variable as those on a number of the stack."""
-    return [(row.COPY, at) if o == row.VARIABLE else (o, c) for o, c in code]
 
 
 def _chebyshev(n: int, x: Expression) -> Expression:

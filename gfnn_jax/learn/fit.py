@@ -182,8 +182,9 @@ def fit(
     if damping is not None:  # a fact, not a warning
         messages.append(damping.line(data.dt))
     num_states = min(STATES_MEASURED, block_of(2 * data.dim))
-    some = chosen.data.pairs.take(chosen.data.validation[:num_states])
-    choice = Choice(
+    choice = Choice.of(
+        budget,
+        chosen.data.pairs.take(chosen.data.validation[:num_states]),
         candidates=_all_candidates(chosen, found),
         asked=request.tolerance,
         num_pairs=len(data),
@@ -195,10 +196,7 @@ def fit(
         noise=conclusion.noise,
         messages=tuple(messages),
         ended=conclusion.ended,
-        seconds=budget.seconds,
         compile_seconds=chosen.compile_seconds,
-        test_states=np.asarray(some.z0),
-        test_args=some.args,
         model_determinant_min=_smallest_determinant(chosen),
         pairs=data.pairs,
         scene=scene,
@@ -207,8 +205,6 @@ def fit(
         partial_laws=() if found.met_by_law else tuple(request.partial_laws),
         stated_by=chosen.stated_by,
         test_pairs=data.pairs.take(data.test) if len(data.test) else None,
-        operations=budget.operations,
-        budget=budget,
         white=conclusion.white,
         seed=options.seed,
     )

@@ -142,6 +142,13 @@ class Choice:
     seed: int = 0
     several: str = ""
 
+    @classmethod
+    def of(cls, budget: Budget, tested: Pairs, **known: Any) -> Choice:
+        """Make the one that this budget paid for, with the pairs that its map is measured at."""
+        spent = {"seconds": budget.seconds, "operations": budget.operations, "budget": budget}
+        args, states = tested.args, np.asarray(tested.z0)
+        return cls(test_states=states, test_args=args, **spent, **known)
+
     @property
     def law(self) -> LearnedHamiltonian | None:
         """H, where one was found that meets the tolerance or was chosen."""

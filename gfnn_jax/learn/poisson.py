@@ -126,7 +126,9 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         messages.append(tolerance.missed_by(candidate, ended))
         warnings.warn(messages[-1], FitWarning, stacklevel=4)
     tested = tested.take(slice(min(STATES_MEASURED, block_of(n))))
-    choice = Choice(
+    choice = Choice.of(
+        budget,
+        tested,
         candidates=(candidate,),
         asked=tolerance,
         num_pairs=len(pairs) - len(test),
@@ -134,16 +136,11 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         noise=sigma,
         messages=tuple(messages),
         ended=ended,
-        seconds=budget.seconds,
         compile_seconds=steps.compile_seconds,
-        test_states=np.asarray(tested.z0),
-        test_args=tested.args,
         pairs=pairs,
         stated_by=f"{len(test):,} pairs that were not fitted to",
         validation_pairs=pairs.take(split.validation),
         test_pairs=pairs.take(split.test) if len(split.test) else None,
-        operations=budget.operations,
-        budget=budget,
         white=white,
         seed=options.seed,
         several=learned.law.several if learned.law else "",

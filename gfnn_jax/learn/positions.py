@@ -349,22 +349,20 @@ class _Sweep:
         part = "took no part in the fit or its choices" if test is self.split.test else "also chose"
         tested = states.take(test[: min(STATES_MEASURED, block_of(2 * map_.dim))])
         determinant = np.asarray(map_.determinant(tested.z0))
-        choice = Choice(
+        choice = Choice.of(
+            self.budget,
+            tested,
             candidates=tuple(sorted([*others, chosen], key=lambda c: c.operations)),
             asked=self.tolerance,
             num_pairs=best.about.num_triples,
             messages=tuple(messages),
             ended=ended,
-            seconds=self.budget.seconds,
             compile_seconds=steps.compile_seconds,
-            test_states=np.asarray(tested.z0),
             model_determinant_min=float(determinant[np.argmin(np.abs(determinant))]),
             pairs=states,
             positions=best.about,
             stated_by=f"{len(test):,} triples that {part}",
             validation_pairs=states.take(self.split.validation),
-            operations=self.budget.operations,
-            budget=self.budget,
             seed=seed,
         )
         return Fit(map_, choice)

@@ -610,7 +610,7 @@ def propagate(
     channels, ahead = _channels(laws, which, orbit, at), times - last[:, None]
     values, modes = channels.values, channels.by_state @ spread
     if sensors.wander is not None:
-        left = sensors.wander.fading(ahead)[..., None]
+        left = np.exp(-ahead / sensors.wander.time)[..., None]
         values = values + left * zeros[:, None]
         modes[..., : root.shape[-1]] += left[..., None] * root[:, None, own:]
     orbits = Orbits(values, orbit, spread @ spread.swapaxes(2, 3), modes, sensors.sigma)

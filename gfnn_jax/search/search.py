@@ -470,9 +470,6 @@ def decay_of(sizes: Sequence[tuple[float, float]]) -> Decay | None:
     if len(gains) == 1:
         return Decay(first, order, error, 0.0, 1.0)
     ends = [j for j in range(1, len(gains)) if j >= len(gains) - 2 and (j > 1 or len(gains) == 2)]
-    rates = (_rate(gains[max(j - 2, 0)], gains[j]) for j in ends)
+    pairs = ((gains[max(j - 2, 0)], gains[j]) for j in ends)
+    rates = (math.log(a[1] / b[1]) / (b[0] - a[0]) for a, b in pairs)
     return Decay(first, order, error, max(rates), order - gains[-2][0])
-
-
-def _rate(one: tuple[float, float], other: tuple[float, float]) -> float:
-    return math.log(one[1] / other[1]) / (other[0] - one[0])

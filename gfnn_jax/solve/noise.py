@@ -141,7 +141,3 @@ class Wander:
         """Covariance (A, n, k) of each value, in units of its own noise, with b at the last time of
         its row, in units of its channel's."""
         return self.covariance(t[:, -1:] - t)[..., None] / noise
-
-    def fading(self, ahead: np.ndarray) -> np.ndarray:
-        """Part of b that is left after times ``ahead``."""
-        return np.exp(-ahead / self.time)

@@ -10,6 +10,7 @@ import numpy as np
 
 from gfnn_jax.brackets import Bracket, standard_constants
 from gfnn_jax.fitting.evidence import EVIDENCE
+from gfnn_jax.fitting.triangle import Spectrum
 from gfnn_jax.models.brackets.algebra import changed
 from gfnn_jax.models.brackets.poisson_field import PoissonField
 from gfnn_jax.solve.latent_arcs import (
@@ -195,12 +196,7 @@ def fit_arcs(
 def _root(fitted: Fitted) -> np.ndarray:
     """Root of the covariance of p where directions that nothing tells, as of a change of z that
     keeps the motion, are held."""
-    factor = fitted.triangle
-    units = np.linalg.norm(factor, axis=0)
-    units = np.where(units > 0, units, 1.0)
-    _, s, vt = np.linalg.svd(factor / units)
-    told = s > 1e-6 * s[0]
-    return np.where(told, 1 / np.where(told, s, 1.0), 0.0)[:, None] * vt / units
+    return Spectrum.of(fitted.triangle, np.zeros(len(fitted.triangle)), 0.0, 1e-6).told
 
 
 def arcs_of(z0: np.ndarray, z1: np.ndarray, run: np.ndarray, place: np.ndarray) -> list[np.ndarray]:

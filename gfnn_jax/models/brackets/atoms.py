@@ -108,15 +108,11 @@ def with_shapes(
         if least is best or least.relative > 0.5 * best.relative:
             break
         best = least
-    rounded = best.field.with_constants(np.array([_short(t) for t in best.field.constants]))
+    # The constants in six digits, which they may be in truth.
+    rounded = best.field.with_constants(np.array([float(f"{t:.6g}") for t in best.field.constants]))
     left = path_of(rounded, best.c, *pairs, sizes(np.concatenate([z0, z1]))).relative
     field = rounded if left <= max(best.relative, OPTIONS.exact) else best.field
     return field.library, best.c
-
-
-def _short(theta: float) -> float:
-    """The constant in six digits, which it may be in truth."""
-    return float(f"{theta:.6g}")
 
 
 def text(atom: Factor, names: tuple[str, ...]) -> str:

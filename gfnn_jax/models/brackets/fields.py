@@ -19,6 +19,7 @@ from scipy.linalg import qr
 
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting.triangle import Spectrum
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.phase_space import sizes
 
@@ -337,13 +338,9 @@ def _least(columns, target, spread) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     free = columns.shape[1] != target.shape[1]  # the same columns for each component
     matrix = columns[:, 0] if free else (columns / spread[:, None]).reshape(target.size, -1)
     right = target if free else (target / spread).ravel()
-    units = np.linalg.norm(matrix, axis=0)
-    units = np.where(units > 0, units, 1.0)
-    u, s, vt = np.linalg.svd(matrix / units, full_matrices=False)
-    kept = s > OPTIONS.dependent * s[0]
-    inverse = np.where(kept, 1 / np.where(kept, s, 1.0), 0.0)
-    one = (inverse[:, None] * vt) / units
-    solved = one.T @ (u.T @ right)
+    spectrum = Spectrum.of(matrix, right, 0.0, OPTIONS.dependent)
+    one = spectrum.told
+    solved = one.T @ spectrum.along
     left = right - matrix @ solved
     if free:
         return solved.T.ravel(), np.kron(np.diag(spread), one), left
@@ -353,7 +350,6 @@ def _least(columns, target, spread) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 def undetermined(field: FreeField, z: np.ndarray, floor: float) -> np.ndarray:
     """Combinations (m, K) of the library that vanish at all states z (N, n), to ``floor`` or to
     roundoff: relations that the runs have in common, as one value of an invariant."""
-    matrix = field.library.term_values(z)
-    units = np.linalg.norm(matrix, axis=0)
-    _, s, vt = np.linalg.svd(matrix / units, full_matrices=False)
-    return vt[s <= max(OPTIONS.undetermined, floor) * s[0]] / units
+    values, cutoff = field.library.term_values(z), max(OPTIONS.undetermined, floor)
+    spectrum = Spectrum.of(values, values[:, 0], 0.0, cutoff)
+    return spectrum.vt[~spectrum.known] / spectrum.column

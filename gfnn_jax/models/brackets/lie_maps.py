@@ -19,6 +19,7 @@ from gfnn_jax.arrays import matmul
 from gfnn_jax.brackets import Constant, LieAlgebra
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products, number_of_terms
+from gfnn_jax.fitting.triangle import Spectrum
 from gfnn_jax.flows.lie import LieGenerated, lie_generated, mean_of_arc
 from gfnn_jax.phase_space import sizes
 
@@ -140,12 +141,9 @@ class _Pairs:
 
 def _solved(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Least squares of least norm, in units of the columns, without small singular values."""
-    unit = np.linalg.norm(rows, axis=0)
-    unit = np.where(unit > 0, unit, 1.0)
-    factor = np.asarray(np.linalg.qr(np.column_stack([rows / unit, target]), mode="r"))
-    u, s, v = np.linalg.svd(factor[:, :-1], full_matrices=False)
-    kept = s > OPTIONS.truncated * s[0]
-    return (v[kept].T @ ((u.T @ factor[:, -1])[kept] / s[kept])) / unit
+    factor = np.asarray(np.linalg.qr(np.column_stack([rows, target]), mode="r"))
+    found = Spectrum.of(factor[:, :-1], factor[:, -1], 0.0, OPTIONS.truncated)
+    return found.solution(found.inverse)
 
 
 def _carried(family: Products, c, larger: Products) -> np.ndarray:

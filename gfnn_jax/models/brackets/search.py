@@ -18,6 +18,7 @@ from scipy.integrate import cumulative_simpson
 from gfnn_jax.brackets import Bracket, canonical
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms
+from gfnn_jax.fitting.triangle import Spectrum
 from gfnn_jax.models.brackets.arcs import arcs_of, equal_arcs, fit_arcs, lagged
 from gfnn_jax.models.brackets.atoms import with_shapes
 from gfnn_jax.models.brackets.beside import NOTHING, Beside
@@ -380,11 +381,10 @@ def _hidden_relations(train: Data, names: tuple[str, ...], sigma: np.ndarray) ->
     """Number of relations, beyond one, among functions of degree 2 that noise hides."""
     library = polynomials(names, 2)
     values = library.term_values(train.z0)
-    units = np.linalg.norm(values, axis=0)
-    _, s, vt = np.linalg.svd(values / units, full_matrices=False)
-    slopes = np.einsum("njk,mk->nmj", library.term_gradients(train.z0), vt / units)
+    found = Spectrum.of(values, values[:, 0], 0.0, 0.0)
+    slopes = np.einsum("njk,mk->nmj", library.term_gradients(train.z0), found.vt / found.column)
     by_noise = np.sqrt(np.sum((slopes * sigma) ** 2, axis=(0, 2)))
-    return int(np.sum(s <= OPTIONS.hidden * by_noise))
+    return int(np.sum(found.s <= OPTIONS.hidden * by_noise))
 
 
 def _of_populations(train: Data, held: Data, names, sigma, error: float) -> PoissonLaw | None:

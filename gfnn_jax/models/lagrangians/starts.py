@@ -151,7 +151,11 @@ def best_start(problem: ArcProblem) -> LawFit:
     some.add_central(textbook.rows, 4, across=True)
     some.add_richer([row for row in every if sum(row[0]) < 2 or row in first], 5)
     some.add_richer(every, 6)
-    some.add_led([*first, *libraries.couplings(d, angles)], 7)
+    # Coordinates that drive others and are not moved by them: a cart whose motor holds its course.
+    led = _Library([*first, *libraries.couplings(d, angles)], 7, apart=True)
+    for leaders in leading(some.problem):
+        if not some.are_noise:
+            some.add(led._replace(leaders=leaders))
     if not some.fits or (some.one_valued and not some.followed):
         raise no_law(problem.scales)
     return some.best_along(some.likeliest() if some.least < OPTIONS.white else some.plainest())
@@ -296,13 +300,6 @@ class _Starts:
             least = OPTIONS.white if kind == ISOTROPIC else OPTIONS.noise
             if not self.least < least and not self.one_valued:
                 self.add(library._replace(rubs=kind))
-
-    def add_led(self, rows: Sequence[Row], rank: int) -> None:
-        """Start from coordinates that drive others and are not moved by them, as a cart whose motor
-        holds its course moves a pendulum, where the residuals of all starts are more than noise."""
-        for leaders in leading(self.problem):
-            if not self.are_noise:
-                self.add(_Library(rows, rank, apart=True, leaders=leaders))
 
     def add_central(
         self, textbook: Sequence[Row], rank: int, across: bool, rubs: int | None = None

@@ -56,11 +56,6 @@ def cosine_of(row: Row) -> Row | None:
     return (*row[:3], 0.0, *more) if alone and phase == SINE else None
 
 
-def _touched(row: Row) -> list[bool]:
-    """Return whether a term is one of each coordinate or of its velocity."""
-    return [bool(k or f) for k, f in zip(row[0], coordinates_in(row), strict=True)]
-
-
 AT_BOUND = "is held at its bound: the record alone would put its coefficient beyond"
 AS_EQUAL = "is hardly determined: it has the coefficient of equal masses"
 
@@ -147,7 +142,7 @@ class Structure:
 
     def _acted_on(self, row: Row) -> list[bool]:
         """Return whether a term acts on each coordinate."""
-        touched = _touched(row)
+        touched = [bool(k or f) for k, f in zip(row[0], coordinates_in(row), strict=True)]
         if any(own and i not in self.leaders for i, own in enumerate(touched)):
             return [own and i not in self.leaders for i, own in enumerate(touched)]
         return touched
