@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from itertools import combinations_with_replacement
 from typing import Any, dataclass_transform
 
 import numpy as np
@@ -77,3 +78,12 @@ def matmul(a: Any, b: Any) -> Any:
     """
     xp = namespace(a, b)
     return a @ b if xp is np else xp.matmul(a, b, precision="highest")
+
+
+def products(x: np.ndarray, degree: int) -> np.ndarray:
+    """Products (N, m) of the columns of x (N, k), of degrees 0 to ``degree`` in turn."""
+    found: dict[tuple[int, ...], np.ndarray] = {(): np.ones(len(x))}
+    for n in range(1, degree + 1):
+        for term in combinations_with_replacement(range(x.shape[1]), n):
+            found[term] = found[term[:-1]] * x[:, term[-1]]
+    return np.stack(list(found.values()), axis=1)

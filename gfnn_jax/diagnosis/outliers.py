@@ -20,11 +20,11 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator
-from itertools import combinations_with_replacement
 
 import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from gfnn_jax.arrays import products
 from gfnn_jax.coordinates import Coordinates, nearest_image
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.runs import Identified, first_occurrences, steps_between
@@ -328,11 +328,7 @@ class _Model:
                 columns += [np.cos(y[:, i]), np.sin(y[:, i])]
             elif i not in self._free:
                 columns.append(x[:, i])
-        products: dict[tuple[int, ...], np.ndarray] = {(): np.ones(len(y))}
-        for k in range(1, self._degree + 1):
-            for term in combinations_with_replacement(range(len(columns)), k):
-                products[term] = products[term[:-1]] * columns[term[-1]]
-        return np.stack(list(products.values()), axis=1)
+        return products(np.reshape(columns, (-1, len(y))).T, self._degree)
 
 
 def _models(data: Dataset, known: np.ndarray) -> Iterator[_Model]:

@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from itertools import combinations_with_replacement
 
 import numpy as np
 from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
+from gfnn_jax.arrays import products
 from gfnn_jax.candidates.assemble import stepped
 from gfnn_jax.coordinates import nearest_image
 from gfnn_jax.dataset.dataset import Dataset
@@ -70,10 +70,6 @@ class Options:
     across: float = 3.0
     # A cubic law is fitted where there are so many pairs for each of its terms.
     pairs_per_term: int = 10
-    # The changes of volume of the inner half of the states and of the outer: within a factor, or
-    # by so many standard errors, they are the same.
-    alike: float = 3.0
-    halves_apart: float = 2.0
     pairs_of_misfit: int = 50  # pairs that a library is fitted to; as many judge it
     quiet: float = 0.75  # of the sample, that moves least
 
@@ -217,66 +213,14 @@ def _by_friction(images, residual, angles) -> tuple[float, float] | None:
     return -rho, float(np.linalg.norm(scores) / freedom)
 
 
-def volume_change(z, residual) -> tuple[float, float]:
-    """(change of phase-space volume per step, its standard error) that a symplectic fit left over.
-
-    z, residual: (N, 2d), states and Z − Z_predicted. The residual of a symplectic map is noise or
-    has no divergence; friction is linear in z to first order, and its trace is the rate at which
-    volumes shrink. The fit takes up a part of it, by a field without divergence that is not linear:
-    the divergence is the mean of a cubic law's over the states, or a linear law's where the pairs
-    are few. (0, inf) where the law explains less than half of the residual.
-
-    Friction holds everywhere; a misfit may be concentrated where states are few, and a law fitted
-    to it then has any divergence. The change is 0 where the inner half of the states and the outer
-    one, by their distance from the mean in units of the spread, do not agree on it.
-    """
+def is_smooth(z, residual) -> bool:
+    """Return whether a cubic function of the state, a linear one where the pairs are few, explains
+    half of the residual. z, residual: (N, 2d)."""
     z, residual = np.asarray(z), np.asarray(residual)
-    change, error = _divergence(z, residual)
-    if not np.isfinite(error):
-        return change, error
-    distance = np.linalg.norm((z - z.mean(axis=0)) / sizes(z), axis=1)
-    inside = distance <= np.median(distance)
-    (one, its), (other, others) = (_divergence(z[h], residual[h]) for h in (inside, ~inside))
-    alike = 1 / OPTIONS.alike <= one / other <= OPTIONS.alike if other else False
-    agree = alike or abs(one - other) <= OPTIONS.halves_apart * np.hypot(its, others)
-    return (change if agree else 0.0), error
-
-
-def _divergence(z, residual) -> tuple[float, float]:
-    """The mean divergence of the law that explains these residuals, and its standard error; (0,
-    inf) where it explains less than half of them."""
-    width = z.shape[1]
-    size = sizes(z)
-    x = (z - z.mean(axis=0)) / size
-    few = len(z) < OPTIONS.pairs_per_term * math.comb(width + 3, 3)
-    degrees = range(2 if few else 4)
-    terms = [t for k in degrees for t in combinations_with_replacement(range(width), k)]
-
-    def monomials(terms):
-        return np.stack([np.prod(x[:, list(term)], axis=1) for term in terms], axis=1)
-
-    design = monomials(terms)
-    coefficients = np.linalg.lstsq(design, residual, rcond=None)[0]
-    rest = residual - design @ coefficients
-    if np.mean(rest**2) > 0.5 * np.mean(residual**2):
-        return 0.0, np.inf
-    covariance = np.linalg.pinv(design.T @ design)
-    change, variance = 0.0, 0.0
-    for i in range(width):
-        own = [j for j, term in enumerate(terms) if i in term]
-        powers = np.array([terms[j].count(i) for j in own])
-        lowered = monomials([_without(terms[j], i) for j in own])
-        slope = np.zeros(len(terms))  # of each term, in direction i
-        slope[own] = powers * lowered.mean(axis=0) / size[i]
-        change += slope @ coefficients[:, i]
-        variance += slope @ covariance @ slope * rest[:, i].var()
-    return float(change), float(np.sqrt(variance))
-
-
-def _without(term: tuple[int, ...], i: int) -> tuple[int, ...]:
-    """The term with one factor of the i-th coordinate less."""
-    place = term.index(i)
-    return term[:place] + term[place + 1 :]
+    few = len(z) < OPTIONS.pairs_per_term * math.comb(z.shape[1] + 3, 3)
+    design = products((z - z.mean(axis=0)) / sizes(z), 1 if few else 3)
+    rest = residual - design @ np.linalg.lstsq(design, residual, rcond=None)[0]
+    return bool(np.mean(rest**2) <= 0.5 * np.mean(residual**2))
 
 
 def differs_between_sequences(z, residual, sequence) -> bool:

@@ -14,12 +14,11 @@ from gfnn_jax.diagnosis.residuals import (
     differs_between_sequences,
     hidden_friction,
     is_noise,
+    is_smooth,
     noise_of_sites,
     state_noise,
-    volume_change,
 )
 from gfnn_jax.families.expressions import coordinate_names
-from gfnn_jax.fitting.significance import CERTAIN
 from gfnn_jax.learn.choose import Chosen
 from gfnn_jax.learn.request import Request, not_radians, proposed, wrapped
 from gfnn_jax.learn.searches import Searched
@@ -138,7 +137,7 @@ def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
     if not data.coordinates.plain:
         return []
     sample = _residuals_of_sample(candidate, None, searched, OPTIONS.friction_pairs)
-    found = hidden_friction(sample.image, sample.residual, data.user_angles)
+    found = hidden_friction(sample.image, sample.residual, sample.angles)
     if found is None:
         return []
     change, error = found
@@ -202,7 +201,7 @@ class _LeftOver(NamedTuple):
 
 class _Sample(NamedTuple):
     """Rows of training pairs (n,), their states, predicted images and residuals (n, 2d), sizes of
-    these (2d,), the sequence that each is of and its place there (n,)."""
+    these (2d,), the sequence that each is of and its place there (n,); angles: of the states."""
 
     rows: np.ndarray
     y0: np.ndarray
@@ -211,6 +210,7 @@ class _Sample(NamedTuple):
     scale: np.ndarray
     sequence: np.ndarray
     place: np.ndarray
+    angles: tuple[int, ...]
 
 
 def _residuals_of_sample(
@@ -226,22 +226,23 @@ def _residuals_of_sample(
     if entry is not None:
         y0, scale = data.y0[rows], data.scale
         image, solved = entry.sweep.images(entry.size, rows)
-        residual = data.y1[rows] - image
+        residual, angles = data.y1[rows] - image, data.coordinates.angles
     else:
         pairs, scale = data.pairs.take(rows), data.spread
         y0 = np.asarray(pairs.z0)
         steps = stepped(candidate.map, y0, pairs.dt, pairs.args, timed=False)
         image = steps.images
-        residual = nearest_image(np.asarray(pairs.z1) - image, data.user_angles)
+        angles = data.user_angles
+        residual = nearest_image(np.asarray(pairs.z1) - image, angles)
         solved = ~steps.failed & np.isfinite(residual).all(axis=1)
     rows, y0, image, residual = rows[solved], y0[solved], image[solved], residual[solved]
     place = np.asarray(data.pairs.place)[rows]
-    return _Sample(rows, y0, image, residual, scale, data.run[rows], place)
+    return _Sample(rows, y0, image, residual, scale, data.run[rows], place, angles)
 
 
 def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     """Describe these residuals, where they are something else than noise."""
-    _, y0, _, residual, scale, sequence, _ = sample
+    _, y0, image, residual, scale, sequence, _, _ = sample
     if differs_between_sequences(y0 / scale, residual / scale, sequence):
         message = (
             "the residuals are alike within a sequence and differ between sequences: a quantity "
@@ -253,17 +254,18 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
         )
     if not stalled:
         return _LeftOver(None, [])
-    change, error = volume_change(y0, residual)
+    some, size = slice(OPTIONS.friction_pairs), float(np.sqrt(np.mean((residual / scale) ** 2)))
+    found = hidden_friction(image[some], residual[some], sample.angles)
     # Friction shrinks every coordinate by a part of what is left over of it.
-    size = float(np.sqrt(np.mean((residual / scale) ** 2)))
-    if abs(change) > max(CERTAIN * error, OPTIONS.share * residual.shape[1] * size):
+    if found is not None and abs(found[0]) > OPTIONS.share * residual.shape[1] * size:
+        change, error = found
         message = (
             f"the residuals are no noise: phase-space volumes change by {change:.2g} ± {error:.1g} "
             "(relative) in a step, as by friction, and a symplectic map keeps them. The law of a "
             "recording of the positions has friction (--positions, gfnn.Recording)"
         )
         return _LeftOver(None, [message], "volumes of phase space change, as by friction")
-    if np.isfinite(error) or _noise_by_neighbours(sample) is False:
+    if is_smooth(y0, residual) or _noise_by_neighbours(sample) is False:
         message = (
             "the residuals are no noise: neighbouring pairs have similar ones. Either the terms "
             "tried cannot represent the motion (give known ones: --terms), or it is not "
@@ -275,7 +277,7 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
 
 def _noise_by_neighbours(sample: _Sample) -> bool | None:
     """Return whether the residuals are noise; None where the pairs lie too far apart to tell."""
-    _, y0, _, residual, scale, sequence, place = sample
+    _, y0, _, residual, scale, sequence, place, _ = sample
     return is_noise(y0 / scale, residual / scale, sequence, place)
 
 

@@ -10,7 +10,6 @@ of a pair: to O(dt²) that is where the fit through the flow starts.
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from gfnn_jax.fitting.triangle import Triangle
 from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.models.hamiltonians.fitted_law import FittedLaw
 from gfnn_jax.models.hamiltonians.problem import OPTIONS, LawProblem
-from gfnn_jax.models.lagrangians.libraries import SINE, modes, unit
+from gfnn_jax.models.lagrangians.libraries import SINE, modes, powers
 from gfnn_jax.phase_space import split
 
 
@@ -69,16 +68,12 @@ def library(dim: int, angles: tuple[int, ...]) -> Terms:
     waves = [none, *sorted(modes(dim, angles, OPTIONS.shortest))]
 
     def functions(degree: int) -> list[tuple]:
-        powers = [
-            unit(dim, *axes)
-            for n in range(degree + 1)
-            for axes in combinations_with_replacement(lengths, n)
-        ]
         phases = {wave: (0.0, SINE) if any(wave) else (0.0,) for wave in waves}
-        return [(n, wave, phase) for n in powers for wave in waves for phase in phases[wave]]
+        products = powers(dim, lengths, *range(degree + 1))
+        return [(n, wave, phase) for n in products for wave in waves for phase in phases[wave]]
 
-    speeds = [unit(dim, *pair) for pair in combinations_with_replacement(range(dim), 2)]
-    masses = [(speed, *rest) for speed in speeds for rest in functions(OPTIONS.shortest)]
+    speeds, others = powers(dim, range(dim), 2), functions(OPTIONS.shortest)
+    masses = [(speed, *rest) for speed in speeds for rest in others]
     potentials = [(none, *rest) for rest in functions(OPTIONS.potential)]
     return Terms.of([*masses, *(row for row in potentials if any(row[1]) or any(row[2]))], dim)
 

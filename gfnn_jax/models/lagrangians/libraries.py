@@ -50,6 +50,22 @@ def unit(dim: int, *axes: int) -> tuple[int, ...]:
     return tuple(axes.count(i) for i in range(dim))
 
 
+def powers(dim: int, axes: Iterable[int], *degrees: int) -> list[tuple[int, ...]]:
+    """Exponents of the products of these coordinates, of one degree after another."""
+    axes = tuple(axes)
+    return [unit(dim, *own) for n in degrees for own in combinations_with_replacement(axes, n)]
+
+
+def potentials(dim: int, axes: Iterable[int], *degrees: int) -> list[Row]:
+    """Potentials that are such products."""
+    none = (0,) * dim
+    return [(none, own, none, 0.0) for own in powers(dim, axes, *degrees)]
+
+
+def _lengths(dim: int, angles: tuple[int, ...]) -> list[int]:
+    return [i for i in range(dim) if i not in angles]
+
+
 def textbook(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """Pendulums in a chain, bodies on springs: masses, v_i v_j cos(q_i − q_j), cos q_i; lengths to
     degree 2. Where it explains a record as well as more does, small swings cannot imitate it."""
@@ -79,12 +95,8 @@ def uncoupled(dim: int, angles: tuple[int, ...]) -> list[Row]:
 
 def bodies(dim: int, angles: tuple[int, ...], highest: int = 4) -> list[Row]:
     """The same, and potentials of lengths to a degree: bodies with masses of their own."""
-    rows, none = uncoupled(dim, angles), (0,) * dim
-    lengths = [i for i in range(dim) if i not in angles]
-    for degree in range(2, highest + 1):
-        for axes in combinations_with_replacement(lengths, degree):
-            rows.append((none, unit(dim, *axes), none, 0.0))
-    return list(dict.fromkeys(rows))
+    richer = potentials(dim, _lengths(dim, angles), *range(2, highest + 1))
+    return list(dict.fromkeys([*uncoupled(dim, angles), *richer]))
 
 
 def relative(dim: int, angles: tuple[int, ...]) -> list[Row]:
@@ -117,9 +129,7 @@ def side_by_side(dim: int, angles: tuple[int, ...], highest: int = 2) -> list[Ro
                 (none, none, tuple((i == pair[0]) - (i == pair[1]) for i in range(dim)), 0.0)
             )
         lengths = [i for i in pair if i not in angles]
-        for degree in range(2, highest + 1):
-            powers = combinations_with_replacement(lengths, degree)
-            rows += [(none, unit(dim, *axes), none, 0.0) for axes in powers]
+        rows += potentials(dim, lengths, *range(2, highest + 1))
     return list(dict.fromkeys(rows))
 
 
@@ -131,8 +141,8 @@ def by_twos(
     for pair in combinations(range(dim), 2):
         at = [pair.index(i) if i in pair else 2 for i in range(dim)]
         for *parts, phase in of(2, tuple(k for k, i in enumerate(pair) if i in angles)):
-            powers = (tuple((*part, 0)[k] for k in at) for part in parts)
-            rows[(*powers, phase)] = None  # pyright: ignore[reportArgumentType]
+            placed = (tuple((*part, 0)[k] for k in at) for part in parts)
+            rows[(*placed, phase)] = None  # pyright: ignore[reportArgumentType]
     return list(rows)
 
 
@@ -140,34 +150,23 @@ def first(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """The first library; its first term is v₁²."""
     if dim > FEW:
         return by_twos(first, dim, angles)
-    none = (0,) * dim
-    lengths = [i for i in range(dim) if i not in angles]
-    waves = modes(dim, angles, 1)
+    none, waves = (0,) * dim, modes(dim, angles, 1)
     rows: list[Row] = []
-    for pair in combinations_with_replacement(range(dim), 2):
-        speeds = unit(dim, *pair)
+    for speeds in powers(dim, range(dim), 2):
         rows.append((speeds, none, none, 0.0))
         rows += [(speeds, none, m, 0.0) for m in waves if dim > 1]
     rows += [(none, none, m, 0.0) for m in waves]
-    for degree in (1, 2):
-        for axes in combinations_with_replacement(lengths, degree):
-            rows.append((none, unit(dim, *axes), none, 0.0))
-    return rows
+    return rows + potentials(dim, _lengths(dim, angles), 1, 2)
 
 
 def gyroscopic(dim: int, angles: tuple[int, ...], degree: int) -> list[Row]:
     """v_j f(q), of forces at right angles to the motion: powers of lengths and modes up to
     ``degree``, of which some coordinate comes before the j-th. a(q) and a + ∇χ move alike, and so
     each field has one representative among them."""
-    none, lengths = (0,) * dim, [i for i in range(dim) if i not in angles]
-    powers = [
-        unit(dim, *axes)
-        for n in range(1, degree + 1)
-        for axes in combinations_with_replacement(lengths, n)
-    ]
-    rows: list[Row] = []
+    none, rows = (0,) * dim, list[Row]()
+    products = powers(dim, _lengths(dim, angles), *range(1, degree + 1))
     for j in range(1, dim):
-        rows += [(unit(dim, j), n, none, 0.0) for n in powers if any(n[:j])]
+        rows += [(unit(dim, j), n, none, 0.0) for n in products if any(n[:j])]
         waves = [m for m in modes(dim, angles, degree) if any(m[:j])]
         rows += [(unit(dim, j), none, m, phase) for m in waves for phase in (0.0, SINE)]
     return rows
@@ -175,8 +174,7 @@ def gyroscopic(dim: int, angles: tuple[int, ...], degree: int) -> list[Row]:
 
 def couplings(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """Masses of second modes, of which a turning arm makes centrifugal forces."""
-    speeds = [unit(dim, *pair) for pair in combinations_with_replacement(range(dim), 2)]
-    none, twice = (0,) * dim, [unit(dim, i, i) for i in angles]
+    speeds, none, twice = powers(dim, range(dim), 2), (0,) * dim, [unit(dim, i, i) for i in angles]
     return [(k, none, m, phase) for k in speeds for m in twice for phase in (0.0, SINE)]
 
 
@@ -192,30 +190,22 @@ def spun(dim: int, angles: tuple[int, ...]) -> list[Row]:
 def on_a_surface(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """The textbook's terms, and v_i v_j q_i q_j of lengths: a body on a surface whose height is of
     degree 2 in them moves up and down too."""
-    none, lengths = (0,) * dim, [i for i in range(dim) if i not in angles]
-    pairs = [unit(dim, *axes) for axes in combinations_with_replacement(lengths, 2)]
+    none, pairs = (0,) * dim, powers(dim, _lengths(dim, angles), 2)
     return [*textbook(dim, angles), *((two, two, none, 0.0) for two in pairs)]
 
 
 def more(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """Modes up to |m| = 3 and their sines in V, up to 2 in T; powers of lengths up to 6 in V, 2 in
     T."""
-    none = (0,) * dim
-    lengths = [i for i in range(dim) if i not in angles]
-    of_masses = [
-        axes for degree in (1, 2) for axes in combinations_with_replacement(lengths, degree)
-    ]
+    none, lengths = (0,) * dim, _lengths(dim, angles)
     rows: list[Row] = []
-    for pair in combinations_with_replacement(range(dim), 2):
-        speeds = unit(dim, *pair)
+    for speeds in powers(dim, range(dim), 2):
         for m in modes(dim, angles, 2):
             rows += [(speeds, none, m, 0.0), (speeds, none, m, SINE)]
-        rows += [(speeds, unit(dim, *axes), none, 0.0) for axes in of_masses]
+        rows += [(speeds, own, none, 0.0) for own in powers(dim, lengths, 1, 2)]
     for m in modes(dim, angles, 3):
         rows += [(none, none, m, 0.0), (none, none, m, SINE)]
-    for degree in range(3, HIGHEST + 1):
-        for axes in combinations_with_replacement(lengths, degree):
-            rows.append((none, unit(dim, *axes), none, 0.0))
+    rows += potentials(dim, lengths, *range(3, HIGHEST + 1))
     for i in lengths:
         for m in modes(dim, angles, 1):
             rows += [(none, unit(dim, i), m, 0.0), (none, unit(dim, i), m, SINE)]
@@ -250,14 +240,12 @@ def shaped(shape: str, constant: float, times: str = "1") -> list[Row]:
 
 def springs(dim: int, angles: Sequence[int]) -> list[Row]:
     """Potentials of degree 2 of angles that stay within a turn: torsion."""
-    none = (0,) * dim
-    pairs = combinations_with_replacement(angles, 2)
-    return [(none, unit(dim, *axes), none, 0.0) for axes in pairs]
+    return potentials(dim, angles, 2)
 
 
 def torques(dim: int, angles: Sequence[int]) -> list[Row]:
     """Constant torques on angles: of a motor, on which V falls with every turn."""
-    return [((0,) * dim, unit(dim, i), (0,) * dim, 0.0) for i in angles]
+    return potentials(dim, angles, 1)
 
 
 def driven(dim: int, angles: Sequence[int], inputs: int, squares: bool) -> list[Row]:
@@ -285,8 +273,7 @@ def every(dim: int, angles: tuple[int, ...]) -> list[Row]:
 
 def without_forces(rows: Sequence[Row], axes: Sequence[int]) -> tuple[Row, ...]:
     """The rows without constant forces along these axes, whose zero is where the force is none."""
-    dim = len(rows[0][0])
-    forces = [((0,) * dim, unit(dim, i), (0,) * dim, 0.0) for i in axes]
+    forces = potentials(len(rows[0][0]), axes, 1)
     return tuple(row for row in rows if row not in forces)
 
 

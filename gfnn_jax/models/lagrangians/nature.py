@@ -25,11 +25,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.arrays import products
 from gfnn_jax.dataset.stretches import Scales, Stretch
 from gfnn_jax.signals.local_polynomials import smooth
 from gfnn_jax.signals.splines import Splines
@@ -290,12 +290,7 @@ def _variables(q: np.ndarray, angles: Sequence[int]) -> np.ndarray:
 
 def _products(x: np.ndarray, degree: int) -> np.ndarray:
     """Products of columns x (n, k) up to a degree, of two for many columns."""
-    degree = degree if x.shape[1] <= 6 else min(degree, 2)
-    rows = [np.ones(len(x))]
-    for size in range(1, degree + 1):
-        for chosen in combinations_with_replacement(range(x.shape[1]), size):
-            rows.append(np.prod(x[:, list(chosen)], axis=1))
-    return np.stack(rows, axis=1)
+    return products(x, degree if x.shape[1] <= 6 else min(degree, 2))
 
 
 def _best(
