@@ -255,7 +255,8 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
     if not stalled:
         return _LeftOver(None, [])
     some, size = slice(OPTIONS.friction_pairs), float(np.sqrt(np.mean((residual / scale) ** 2)))
-    found = hidden_friction(image[some], residual[some], sample.angles)
+    smooth = is_smooth(y0, residual)
+    found = hidden_friction(image[some], residual[some], sample.angles) if smooth else None
     # Friction shrinks every coordinate by a part of what is left over of it.
     if found is not None and abs(found[0]) > OPTIONS.share * residual.shape[1] * size:
         change, error = found
@@ -265,7 +266,7 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
             "recording of the positions has friction (--positions, gfnn.Recording)"
         )
         return _LeftOver(None, [message], "volumes of phase space change, as by friction")
-    if is_smooth(y0, residual) or _noise_by_neighbours(sample) is False:
+    if smooth or _noise_by_neighbours(sample) is False:
         message = (
             "the residuals are no noise: neighbouring pairs have similar ones. Either the terms "
             "tried cannot represent the motion (give known ones: --terms), or it is not "

@@ -19,6 +19,7 @@ from gfnn_jax.budget import ROWS, Budget, within
 from gfnn_jax.candidates.assemble import Candidate
 from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import OneStepError, Tolerance, measured_error
+from gfnn_jax.dataset.rows import rows_of
 from gfnn_jax.diagnosis.local_jacobians import SINGULAR
 from gfnn_jax.errors import FitError, OutOfTime
 from gfnn_jax.families.family import at_time
@@ -219,15 +220,14 @@ def _of_sites(data: Dataset, tolerance: Tolerance, attempt) -> Iterator[_Tried]:
 
 
 def _data(chart: AnyChart, family: Terms | Sums, data: Dataset, rows):
-    """(w, target gradient, args in the middle of the step) of these rows."""
-    y0, y1 = data.y0[rows], data.y1[rows]
-    w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, data.dt)
-    return w, target, at_time(family, data.given(rows)[1], 0.5 * data.dt)
+    """(w, target gradient, args in the middle of the step, weight) of these rows."""
+    (w, target, *_), weight = rows_of(data, chart, rows)
+    return w, target, at_time(family, data.given(rows)[1], 0.5 * data.dt), weight
 
 
 def _fitted(chart: AnyChart, family: Terms | Sums, data: Dataset, tolerance: Tolerance) -> _Tried:
     """The library's S by least squares, and the error of its steps on the held-out pairs."""
-    w, target, args = _data(chart, family, data, data.training)
+    w, target, args, _ = _data(chart, family, data, data.training)
     c = fitted_gradients(family, w, target, data.scale, args)
     return _validated(Generated(family, c, chart, data.dt, data.scale), data, tolerance)
 
@@ -244,21 +244,15 @@ def _validated(piece: Generated, data: Dataset, tolerance: Tolerance) -> _Tried:
         folds = not (determinant > SINGULAR).all() and not (determinant < -SINGULAR).all()
     images = data.users_image(images, (off < OPTIONS.solved) & (not folds), rows)
     error = measured_error(data, tolerance, images)
-    w, target, args = _data(piece.chart, family, data, data.training)
-    left = (family.gradient(params, w, args) - target) * _weight(data)
+    w, target, args, weight = _data(piece.chart, family, data, data.training)
+    left = (family.gradient(params, w, args) - target) * weight
     return _Tried(piece, error, float(np.sqrt(np.mean(left**2))))
-
-
-def _weight(data: Dataset) -> np.ndarray:
-    """h over the scale of what each entry of ∇S changes (2d,)."""
-    return data.dt / np.roll(data.scale, data.dim)
 
 
 def _covariance_root(piece: Generated, data: Dataset) -> np.ndarray:
     """Root of the covariance. A larger library tells the noise in the residual, which it leaves."""
     family, count = piece.family, piece.family.num_parameters
-    w, target, args = _data(piece.chart, family, data, data.training)
-    weight = _weight(data)
+    w, target, args, weight = _data(piece.chart, family, data, data.training)
     aim = (target * weight).ravel()
     slopes = (family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
     residual, noise = slopes @ np.asarray(piece.params) - aim, None
@@ -294,8 +288,7 @@ def _sparse(full: _Tried, data: Dataset, tolerance: Tolerance, noisy: bool) -> _
     """Drop the terms that the pairs do not ask for, as far as the held-out error allows. noisy:
     whether what is left over is noise, so that only terms go that it explains."""
     piece = full.piece
-    w, target, args = _data(piece.chart, piece.family, data, data.training)
-    weight = _weight(data)
+    w, target, args, weight = _data(piece.chart, piece.family, data, data.training)
     terms = (piece.family.term_gradients(w, args) * weight[:, None]).reshape(target.size, -1)
     residual = terms @ piece.params - (target * weight).ravel()
     triangle = Triangle.of(np.column_stack([terms, residual]))
