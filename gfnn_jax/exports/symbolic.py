@@ -6,6 +6,7 @@ import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
+from xml.dom.minidom import parseString
 
 from gfnn_jax.families.text import GREEK, Term, added, digits, in_letters, measured
 
@@ -102,26 +103,19 @@ def as_latex(text: str) -> str:
 
 def as_mathml(text: str) -> str:
     """The formula as presentation MathML; names as `as_latex` writes them."""
-    import sympy
-    from sympy.printing.mathml import mathml
+    from sympy.printing.mathml import MathMLPresentationPrinter
 
-    expression = as_sympy(text)
-    shown, names = {}, sorted(expression.free_symbols, key=str)
-    for place, symbol in enumerate(names):  # sympy would split names into indices
-        shown[f"<mi>X{_letters(place)}</mi>"] = _typeset(symbol.name, _MATHML)
-    plain = [sympy.Symbol(f"X{_letters(place)}") for place in range(len(names))]
-    typeset = mathml(expression.xreplace(dict(zip(names, plain, strict=True))), "presentation")
-    for placeholder, name in shown.items():
-        typeset = typeset.replace(placeholder, name)
+    class Printer(MathMLPresentationPrinter):
+        def _print_Symbol(self, sym, style="plain"):
+            return parseString(_typeset(sym.name, _MATHML)).documentElement
+
+    tree: Any = Printer()._print(as_sympy(text))
+    typeset = tree.toxml()
     # Names of several letters stand apart.
     typeset = typeset.replace("<mo>&InvisibleTimes;</mo>", '<mspace width="0.2em"/>')
     typeset = typeset.replace("<mo>(</mo>", '<mo stretchy="false">(</mo>')
     typeset = typeset.replace("<mo>)</mo>", '<mo stretchy="false">)</mo>')
     return typeset.replace("<mi>sign</mi>", "<mi>sgn</mi>")
-
-
-def _letters(place: int) -> str:
-    return "".join(chr(ord("a") + int(digit)) for digit in str(place))
 
 
 class _Notation(NamedTuple):
