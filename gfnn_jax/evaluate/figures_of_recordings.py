@@ -140,9 +140,11 @@ def law_figure(fit: LearnedLaw, recording: Recording) -> Figure:
     channels = list(fit.whiteness)[: _OPTIONS.most_rows]
     sheet = _Sheet(recording, len(channels) + 1, 3)
     run = max(recording.runs, key=lambda name: np.ptp(recording.times(name)))
+    own, t = recording.slice(run=run), recording.times(run)
+    first_third = own.slice(stop=t[0] + np.ptp(t) / 3)
     for place, name in enumerate(channels):
         forecast, residuals, whiteness = sheet.axes[place]
-        _forecast(forecast, sheet, fit, run, name)
+        draw_forecast(forecast, sheet, fit, first_third, own, name)
         for trace in fit.traces:
             missed = trace.measured[:, place] - trace.fitted[:, place]
             residuals.plot(trace.t, missed, ".", ms=2, color=_BLUE)
@@ -218,13 +220,6 @@ def swings_figure(swings: Swings, label: str) -> Figure:
         ax.fill_between(swings.amplitude, value - 2 * std, value + 2 * std, alpha=0.25)
         ax.set(xlabel=f"amplitude of {label}", ylabel=name)
     return figure
-
-
-def _forecast(ax, sheet: _Sheet, fit: LearnedLaw, run: str, name: str) -> None:
-    """Draw two thirds of a run, forecast from the state that the first third tells."""
-    t = sheet.recording.times(run)
-    own = sheet.recording.slice(run=run)
-    draw_forecast(ax, sheet, fit, own.slice(stop=t[0] + np.ptp(t) / 3), own, name)
 
 
 def draw_forecast(

@@ -122,11 +122,6 @@ class Damaged(InputError):
     """Error of a folder that is incomplete or has changed since it was saved."""
 
 
-# ---------------------------------------------------------------------------------------------
-# One folder
-# ---------------------------------------------------------------------------------------------
-
-
 def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
     named, _ = jax.tree_util.tree_flatten_with_path(tree)
     leaves, stored = [], {}
