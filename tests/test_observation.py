@@ -231,6 +231,7 @@ def test_sigmas_that_do_not_fit_are_refused():
 # The command line, with the units of the file
 
 
+@pytest.mark.slow
 def test_a_file_in_degrees_and_milliseconds_is_forecast_in_them(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     t, theta, _, noise = swing()

@@ -24,7 +24,7 @@ def pairs_of(data, **more):
 
 @pytest.fixture(scope="module")
 def heavy_top():
-    starts = np.random.default_rng(0).normal(size=(30, 6))
+    starts = np.random.default_rng(0).normal(size=(20, 6))
     return gfnn.fit(pairs_of(runs_of(heavy, starts, 0.2, 20))), starts
 
 

@@ -51,7 +51,7 @@ def recorded(q, names, angles=(), dt=1.0):
 
 @pytest.fixture(scope="module")
 def lifted():
-    recording = recorded(turns(2_000, 2, 0), ["theta"], ["theta"])
+    recording = recorded(turns(600, 2, 0), ["theta"], ["theta"])
     return gfnn.fit(recording, learn="map", tolerance=1e-12)
 
 
