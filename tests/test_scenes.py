@@ -224,7 +224,7 @@ def exponents(scene, states):
 
 LONG_ONES = """
     henon-heiles-printed henon-heiles-regular henon-heiles-chaotic henon-heiles-section pcr3bp
-    toda fput froeschle driven-pendulum pendulum-length
+    toda fput froeschle driven-pendulum driven-pendulum-phase pendulum-length
 """
 LONG = LONG_ONES.split()
 

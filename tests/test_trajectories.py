@@ -19,8 +19,8 @@ INTEGRATED = ("henon-heiles-regular", "henon-heiles-printed", "pcr3bp")
 # Each like another, but for the energy, a term of H or the parameters, or drawn by other tests:
 # and long to compile.
 LIKE_OTHERS = """
-    henon-heiles-printed henon-heiles-chaotic henon-heiles-section pcr3bp driven-pendulum driven-
-    pendulum-phase fput pendulum-length n-body toda
+    henon-heiles-regular henon-heiles-printed henon-heiles-chaotic henon-heiles-section pcr3bp
+    driven-pendulum driven-pendulum-phase fput pendulum-length n-body toda
 """
 ALIKE = LIKE_OTHERS.split()
 
