@@ -427,17 +427,6 @@ def test_ended_names_the_clock_where_the_maps_ended_by_themselves(monkeypatch):
     assert fit.ended in " ".join(fit.messages)
 
 
-@pytest.mark.slow
-@QUIETLY
-def test_the_words_of_a_search_that_was_cut_off():
-    fit = gfnn.fit(
-        kepler(), learn="hamiltonian", tolerance=1e-9, max_seconds=None, max_operations=30 * 10**7
-    )
-    said = " ".join([*fit.messages, fit.ended])
-    assert "promised" not in said
-    assert "no operations for more after step" in said
-
-
 @QUIETLY
 def test_the_posterior_is_computed_when_it_is_asked_for():
     fit = gfnn.fit(oscillators(), learn="map", tolerance=1e-4, max_seconds=None)

@@ -35,7 +35,7 @@ SLOW = {
     "storage-ring": ("test_maps", "test_args"),
     "runs-that-differ": ("test_systems", "test_recordings"),
     "scaling": ("test_sharded", "test_fit_on_devices", "test_distributed_fit"),
-    "your-own-data": ("test_readme",),
+    "your-own-data": ("test_cli", "test_exports_of_others"),
 }
 sys.path.insert(0, str(ROOT / "benchmarks"))
 INSTALL = ("python3 -m venv ", ".venv/bin/pip install ")

@@ -42,12 +42,6 @@ def test_one_state_and_a_batch_take_the_same_step():
     assert PENDULUM.dim == 1
 
 
-@pytest.mark.slow
-def test_reversing_twice_gives_the_map():
-    again, _ = PENDULUM.reversed().reversed().step(Z)
-    np.testing.assert_array_equal(again, PENDULUM.step(Z)[0])
-
-
 def test_one_map_after_another_is_a_map():
     other = with_numbers(PENDULUM, 2.0, 0.1)
     both = PENDULUM.then(other)

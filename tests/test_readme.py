@@ -70,23 +70,6 @@ def test_gradients_pass_through_steps(example):
     np.testing.assert_allclose(jax.grad(later)(jax.numpy.asarray(z)), differences, atol=1e-6)
 
 
-@pytest.mark.slow
-def test_your_own_data_by_commands(tmp_path, monkeypatch):
-    """Pairs of an oscillator, in a folder of their own."""
-    monkeypatch.chdir(tmp_path)
-    c, s = np.cos(0.1), np.sin(0.1)
-    z0 = np.random.default_rng(0).uniform(-1, 1, (200, 2))
-    np.savez("data.npz", z0=z0, z1=z0 @ np.array([[c, -s], [s, c]]), dt=0.1)
-    np.save("start.npy", z0[:5])
-    assert cli.main(shlex.split("fit data.npz --out model --tolerance 1e-6")) == 0
-    predict = "predict model --initial start.npy --num-steps 1000 --save-every 100"
-    assert cli.main(shlex.split(f"{predict} --out prediction.npz")) == 0
-    with np.load("prediction.npz") as done:
-        assert done["trajectories"].shape == (5, 11, 2)
-    states, _ = gfnn_jax.load("model").map.rollout(z0, num_steps=1_000)
-    assert states.shape == (200, 1001, 2)
-
-
 def test_links_lead_somewhere():
     local = re.findall(r"\]\((?!https?:)([^)#]+)\)", README)
     missing = [path for path in local if not (ROOT / path).exists()]
