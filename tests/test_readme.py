@@ -21,10 +21,10 @@ def blocks(language):
 
 @pytest.fixture(scope="module")
 def example():
-    """The text of the example and the names that it leaves behind, after a hundredth of its steps:
+    """The text of the example and the names that it leaves behind, after some of its steps:
     the programs of the tests are compiled quickly, and step slowly."""
     _, code = blocks("python")
-    fewer = code.replace("num_steps=100_000, save_every=100", "num_steps=1_000, save_every=1")
+    fewer = code.replace("num_steps=100_000, save_every=100", "num_steps=300, save_every=1")
     assert fewer != code
     names: dict = {}
     strict = jax.config.jax_numpy_dtype_promotion
@@ -39,7 +39,7 @@ def example():
 
 def test_the_example_runs(example):
     code, names = example
-    assert names["states"].shape == (10, 1001, 4)
+    assert names["states"].shape == (10, 301, 4)
     assert not np.any(names["info"].status)
     assert names["fit"].met
     assert f"# {names['fit'].hamiltonian}\n" in code

@@ -93,7 +93,8 @@ def test_a_step_after_another_is_within_the_range_of_both(learned):
 
 def test_the_derivative_in_dt_is_the_velocity(learned):
     z = np.array([0.5, 0.3])
-    velocity = jax.jit(jax.jacfwd(lambda h: learned.map.step(z, dt=h)[0]))(0.4)
+    ahead, behind = (np.asarray(learned.map.step(z, dt=0.4 + h)[0]) for h in (1e-5, -1e-5))
+    velocity = (ahead - behind) / 2e-5
     q, p = learned.map.step(z, dt=0.4)[0]
     np.testing.assert_allclose(velocity, [p, -2 * np.sin(q)], atol=1e-4)
 
