@@ -1,5 +1,8 @@
 """Two laws by the errors of their forecasts, against chance."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -7,10 +10,10 @@ from gfnn_jax.models.lagrangians.calibration import Calibration
 
 
 def calibration(errors: np.ndarray) -> Calibration:
-    """Of errors (8, n) of forecasts from the parts of a record."""
+    """Of errors (8, n) of forecasts from the parts of a record, 1, 2, … s ahead."""
     parts = np.stack([np.median(np.delete(errors, k, axis=0), axis=0) for k in range(8)])
-    none: list = []
-    return Calibration(None, none, np.median(errors, axis=0)[:, None], parts[..., None])
+    law: Any = SimpleNamespace(sensors=SimpleNamespace(leads=1.0 + np.arange(errors.shape[1])))
+    return Calibration(law, [], np.median(errors, axis=0)[:, None], parts[..., None])
 
 
 def errs_more(one: Calibration, other: Calibration) -> bool:
@@ -34,3 +37,12 @@ def test_errors_at_times_that_one_part_alone_shows_say_nothing_of_chance():
     assert errs_more(other, one)
     assert not errs_more(one, other)
     assert not errs_more(calibration(np.zeros((8, 0))), calibration(np.zeros((8, 0))))
+
+
+def test_errors_soon_after_the_start_count_only_where_they_are_asked_for():
+    """Half as large at two times ahead, which tell the state, a tenth larger at three later ones."""
+    one = np.ones((8, 5))
+    other = one * [0.5, 0.5, 1.1, 1.1, 1.1]
+    assert calibration(other).against(calibration(one)).cost == pytest.approx(0.8, rel=0.01)
+    assert calibration(other).against(calibration(one), 3.0).cost == pytest.approx(1.1)
+    assert calibration(other).against(calibration(one), 6.0).cost == 1.0

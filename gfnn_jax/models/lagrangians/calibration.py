@@ -89,14 +89,15 @@ class Calibration(NamedTuple):
     median: np.ndarray
     parts: np.ndarray
 
-    def against(self, other: Calibration) -> Comparison:
-        """Median errors as a multiple of another's, in the geometric mean, and the standard error
-        of this ratio, of the jackknife over parts of the record; 1 where they are of other
-        times."""
-        if self.median.shape != other.median.shape or not self.median.size:
+    def against(self, other: Calibration, after: float = 0.0) -> Comparison:
+        """Median errors as a multiple of another's, in the geometric mean over times ahead from
+        ``after`` (s) on, and the standard error of this ratio, of the jackknife over parts of the
+        record; 1 where they are of other times, or of none."""
+        late = np.flatnonzero(self.law.sensors.leads[: len(self.median)] >= after)
+        if self.median.shape != other.median.shape or not self.median[late].size:
             return Comparison(1.0, 1.0, 0.0, 0.0)
-        ratio = float(np.exp(np.mean(np.log(self.median / other.median))))
-        logs = np.nanmean(np.log(self.parts / other.parts), axis=(1, 2))
+        ratio = float(np.exp(np.mean(np.log(self.median / other.median)[late])))
+        logs = np.nanmean(np.log(self.parts / other.parts)[:, late], axis=(1, 2))
         error = np.sqrt((len(logs) - 1) * np.mean((logs - logs.mean()) ** 2))
         return Comparison(ratio, 1.0, ratio - 1.0, float(error))
 

@@ -40,6 +40,7 @@ from gfnn_jax.maps.laws import map_of_law, smoothed
 from gfnn_jax.maps.observation import Observation, observed
 from gfnn_jax.maps.sensors import OtherLaw
 from gfnn_jax.maps.symplectic_map import SymplecticMap
+from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.dependence import search_of_systems
 from gfnn_jax.models.lagrangians.drives import hidden_frequency, with_frequency
 from gfnn_jax.models.lagrangians.exchange import leaves_open, other_terms, rivals
@@ -143,19 +144,18 @@ class RecordingOptions:
 
     missed: of a channel's variation: no law that leaves as much follows the recording. followed: %
     of it, of which a law that is one follows more, unless the rest is noise.
-    above_noise: times: such a rest is no noise. clearly: share by which errors of forecasts are
-    smaller, which chance does not make. imitated: share of what a sensor's parameter changes that
-    no coefficient of the law does, below which it is not identifiable. still: range of a position
-    over its size, at which it does not move: roundoff. periods_of_events: lengths of arcs where
-    only events are read, two in a period. early: of a sample, that inputs may act before they were
-    measured: rounding.
+    above_noise: times: such a rest is no noise. ahead: periods, from which errors of forecasts are
+    the law's. imitated: share of what a sensor's parameter changes that no coefficient of the law
+    does, below which it is not identifiable. still: range of a position over its size, at which it
+    does not move: roundoff. periods_of_events: lengths of arcs where only events are read, two in a
+    period. early: of a sample, that inputs may act before they were measured: rounding.
     """
 
     missed: float = 0.8
     followed: float = 70.0
     above_noise: float = 3.0
     explained: float = 0.5
-    clearly: float = 0.2
+    ahead: float = 0.5
     imitated: float = 1e-4
     still: float = 1e-14
     periods_of_events: tuple[float, ...] = (32.0, 1e4)
@@ -746,7 +746,7 @@ def _with_hidden_drive(
         if (omega := hidden_frequency(problem, stiff, tried)) is None:
             continue
         driven = recording.driven_by(wave_names(omega))
-        if found is not None and not stiff and _louder_with(found.fit, driven, loud):
+        if found is not None and _louder_with(found.fit, driven, stiff):
             continue
         problem.on_progress(f"a drive that was not recorded: {omega:.5g} rad/s")
         tried.append(omega)
@@ -762,13 +762,17 @@ def _with_hidden_drive(
     return data, found, ()
 
 
-def _louder_with(fit: LawFit, driven: Recording, loud: float) -> bool:
-    """Return whether a law leaves much of what it left by itself with the forces of a drive too."""
+def _louder_with(fit: LawFit, driven: Recording, stiff: bool) -> bool:
+    """Return whether a law leaves much of what it left by itself with the forces of a drive too,
+    and with the stiffnesses that it may drive."""
     problem = samples_of(driven).problem.by_rule("band")
     structure = dataclasses.replace(fit.structure, num_inputs=problem.num_inputs)
+    if stiff:
+        rows = libraries.driven(problem.dim, problem.angles, problem.num_inputs, problem.squares)
+        structure = structure.plus([("term", row) for row in rows])
     arcs = arcs_of(problem.nodes, fit.arcs.t.shape[1])
     more = problem.fit(structure, fit.values, arcs, fit.sigma)
-    return not more.loudest < OPTIONS.explained * loud
+    return not more.loudest < OPTIONS.explained * fit.loudest
 
 
 def _misses(fit: LawFit) -> bool:
@@ -784,15 +788,19 @@ def _forecasting_best(
     found: SearchResult, data: RecordingData
 ) -> tuple[SearchResult, list[CalibratedLaw]]:
     """The law of the longest arcs, or that of shorter ones which tell its coefficients better where
-    it clearly errs less in forecasts of held-out data; and both, ready for forecasts."""
+    it errs less, by more than chance makes, in forecasts of held-out data half a period and more
+    ahead: before that errors are those of the states that forecasts begin with. And both, ready for
+    forecasts."""
     if found.shorter is None:
         return found, []
     longer, shorter = (CalibratedLaw.of(data, f.fit, f.choice) for f in (found, found.shorter))
-    apart = shorter.calibration.against(longer.calibration)
+    ahead = OPTIONS.ahead * data.problem.scales.period
+    apart = shorter.calibration.against(longer.calibration, ahead)
     data.problem.on_progress(
-        f"the law of shorter arcs: held-out forecasts err by {apart.cost:.3g} times as much"
+        f"the law of shorter arcs: held-out forecasts err by {apart.cost:.3g} times as much "
+        f"(standard error {apart.error:.2g})"
     )
-    if apart.is_lower(OPTIONS.clearly):
+    if apart.apart < -apart.error:
         model = found.shorter.model._replace(others=found.model.others)
         found = found.shorter._replace(model=model)
     return found, [longer, shorter]
