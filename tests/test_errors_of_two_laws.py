@@ -40,7 +40,7 @@ def test_errors_at_times_that_one_part_alone_shows_say_nothing_of_chance():
 
 
 def test_errors_soon_after_the_start_count_only_where_they_are_asked_for():
-    """Half as large at two times ahead, which tell the state, a tenth larger at three later ones."""
+    """Half as large at two times ahead, where they are the state's, larger at three later ones."""
     one = np.ones((8, 5))
     other = one * [0.5, 0.5, 1.1, 1.1, 1.1]
     assert calibration(other).against(calibration(one)).cost == pytest.approx(0.8, rel=0.01)
