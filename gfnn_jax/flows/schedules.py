@@ -114,12 +114,12 @@ def _band_limited(t: np.ndarray, u: np.ndarray, at: np.ndarray) -> np.ndarray:
     x = (at - t[0]) / step
     places, which = np.unique(np.floor(x).astype(int), return_inverse=True)
     near = u[np.clip(places[:, None] + np.arange(1 - TAPS, TAPS + 1), 0, len(t) - 1)]
-    of_places = np.einsum("nkj,mk->njm", near, _of_weights())
+    of_places = _of_weights() @ near
     found = np.empty((len(at), u.shape[1]))
     for first in range(0, len(at), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
         powers = chebvander(2 * (x[some] - places[which[some]]) - 1, _DEGREE)
-        found[some] = np.einsum("nm,njm->nj", powers, of_places[which[some]])
+        found[some] = (powers[:, None] @ of_places[which[some]])[:, 0]
     return found
 
 
