@@ -31,6 +31,7 @@ from gfnn_jax.dataset.stretches import (
     without_rests,
 )
 from gfnn_jax.errors import FitError, InputError
+from gfnn_jax.families.friction import LINEAR
 from gfnn_jax.families.lagrangian import INPUTS, Lagrangian
 from gfnn_jax.families.text import measured
 from gfnn_jax.fitting.evidence import Rival
@@ -764,12 +765,14 @@ def _with_hidden_drive(
 
 def _louder_with(fit: LawFit, driven: Recording, stiff: bool) -> bool:
     """Return whether a law leaves much of what it left by itself with the forces of a drive too,
-    and with the stiffnesses that it may drive."""
+    with the stiffnesses that it may drive, and with linear friction, which is not seen beside
+    forces that a law lacks."""
     problem = samples_of(driven).problem.by_rule("band")
-    structure = dataclasses.replace(fit.structure, num_inputs=problem.num_inputs)
-    if stiff:
-        rows = libraries.driven(problem.dim, problem.angles, problem.num_inputs, problem.squares)
-        structure = structure.plus([("term", row) for row in rows])
+    d, count = problem.dim, problem.num_inputs
+    rows = libraries.driven(d, problem.angles, count, problem.squares) if stiff else []
+    rubs = libraries.losses(d, (LINEAR,), 0.0)[:d]
+    new = [("term", row) for row in rows] + [("loss", row) for row in rubs]
+    structure = dataclasses.replace(fit.structure, num_inputs=count).plus(new)
     arcs = arcs_of(problem.nodes, fit.arcs.t.shape[1])
     more = problem.fit(structure, fit.values, arcs, fit.sigma)
     return not more.loudest < OPTIONS.explained * fit.loudest
