@@ -1,5 +1,12 @@
 """Compiled loops against the same functions in Python, which checks every place in an array."""
 
+import ast
+import importlib
+import inspect
+import linecache
+import sys
+import textwrap
+
 import numpy as np
 import pytest
 from test_kernel import lanes_of, law_of
@@ -73,7 +80,7 @@ def loops(whole, rows, pair):
         if total < -5:
             break
     whole[0] = int(rows[1, 0]) + total
-    whole[1], whole[2] = whole[0] * (-2), 3**2 if seen else 0
+    whole[1], whole[2] = whole[0] * (-2), whole[0] // 4 if seen else 0
 
 
 def test_what_is_written_in_python_means_the_same():
@@ -87,13 +94,60 @@ def test_what_is_written_in_python_means_the_same():
         np.testing.assert_array_equal(one, other)
 
 
-@compiled("a test", 1)
-def listed(rows):
-    rows[0] = sum([k for k in rows])
+def other(rows, k):
+    """Statements that no code stands for, one after another."""
+    (
+        rows[0] // 3,
+        rows.shape[0] // 3,
+        rows.shape[0] // -2,
+        rows.shape[0] // rows.shape[0],
+        rows.shape[0] % 2,
+        k**2,
+        k or 1,
+        rows[-1],
+        rows[0:2],
+        rows[0.5],
+        max(1, 2, key=abs),
+        sum(rows),
+        [k],
+        rows + 1,
+    )
+    rows[1:] = 0.0
+    for i in range(0, 3, k):
+        rows[i] = 0.0
+    for row in rows:
+        rows[0] = row
+    for i in range(2):
+        rows[i] = 0.0
+    else:
+        rows[0] = 1.0
+    while k < 0:
+        k += 1
+    else:
+        k = 0
+    k = rows
+    LIMIT(k)
+    if k > 2:
+        return k
 
 
-def test_what_has_no_code_is_refused():
-    with pytest.raises(TypeError, match=r"listed, line \d+: \[k for k in rows\] has no code"):
-        listed(np.zeros(3))
+TREE = ast.parse(textwrap.dedent(inspect.getsource(other))).body[0].body
+WRITTEN = [ast.unparse(node) for node in [*TREE[1].value.elts, *TREE[2:]]]
+
+
+@pytest.mark.parametrize("written", WRITTEN)
+def test_what_has_no_code_is_refused(tmp_path, monkeypatch, written):
+    text = f"LIMIT = 3\ndef refused(rows, k):\n{textwrap.indent(written, '    ')}\n"
+    (tmp_path / "refused_loops.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "refused_loops", raising=False)
+    importlib.invalidate_caches()
+    linecache.clearcache()
+    plain = importlib.import_module("refused_loops").refused
+    with pytest.raises(TypeError, match=r"(?s)^refused, line \d+: .* has no code$"):
+        compiled("a test", 1)(plain)(np.zeros(3), 2)
+
+
+def test_arrays_that_are_not_contiguous_are_refused():
     with pytest.raises(ValueError, match="contiguous"):
         loops(np.zeros(3, np.int64), np.zeros((2, 7)).T, (np.zeros(7), np.zeros(7)))

@@ -3,7 +3,9 @@
 Functions marked by `function`, and the one that Python calls, marked by `compiled`, are written in
 a small part of Python: whole and floating numbers, contiguous arrays of both, tuples of them, and
 loops over them. What they mean is what Python means by them, except that no place in an array is
-checked, and that none counts from the end; called from Python, a `function` is plain Python still.
+checked, that none counts from the end, and that division by zero and functions outside their domain
+make what NumPy makes of them; all else is refused. Called from Python, a `function` is plain Python
+still.
 Arrays that are written to overlap no others.
 
 The code of one such function and of all that it calls is written down for LLVM as one module,
@@ -117,8 +119,10 @@ class Compiled:
         machine = _machine()
         if not code:
             compiling.say(f"compiling, once on this machine, {self._said}")
-            code = _optimised(_module(self.plain, arguments), machine)
-            compiling.say("")
+            try:
+                code = _optimised(_module(self.plain, arguments), machine)
+            finally:
+                compiling.say("")
             if kept is not None:
                 _keep(kept, code)
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
@@ -338,14 +342,16 @@ class _Translator:
         while before != (self.types, self.returned):
             before = dict(self.types), self.returned
             self.lines: list[str] = []
-            self.count, self.open, self.loops = 0, True, []
+            self.count, self.open, self.bare, self.loops = 0, True, False, []
             self.names: dict[str, Any] = {}
             for argument, value in self.arguments.items():
                 self.assign_name(argument, value)
             self.body(self.tree.body)
         kind = self.returned
+        if kind is not None and (self.open or self.bare):
+            raise self.refused(self.tree)  # it returns a number at some ends alone
         if self.open:
-            self.lines.append("ret void" if kind is None else "unreachable")
+            self.lines.append("ret void")
         listed = ", ".join(f"{of} {at}" for of, at in self.given)
         rooms = [f"%v.{at} = alloca {of}" for at, of in self.types.items()]
         head = f"define internal {_struct(kind)} @{name}({listed}) nounwind {{"
@@ -415,12 +421,20 @@ class _Translator:
                     self.assign(target, found)
             case ast.AugAssign(target=target, op=op, value=value):
                 begun = self.value(target)
-                self.assign(target, self.arithmetic(type(op), begun, self.value(value)))
+                self.assign(target, self.operated(node, type(op), begun, self.value(value)))
             case ast.If(test=test, body=body, orelse=other):
                 self.chosen(test, lambda: self.body(body), lambda: self.body(other))
-            case ast.For(target=ast.Name(id=name), iter=ast.Call(args=bounds), body=body):
-                self.counted(name, [self.value(bound) for bound in bounds], body)
-            case ast.While(test=test, body=body):
+            case ast.For(
+                target=ast.Name(id=name),
+                iter=ast.Call(func=ast.Name(id="range"), args=bounds, keywords=[]),
+                body=body,
+                orelse=[],
+            ):
+                values = [self.value(bound) for bound in bounds]
+                if any(value.type == FLOAT for value in values) or not _is_step(values[2:]):
+                    raise self.refused(node.iter)
+                self.counted(name, values, body)
+            case ast.While(test=test, body=body, orelse=[]):
                 begin, inside, end = self.label(), self.label(), self.label()
                 self.begin(begin)
                 self.branch(self.value(test), inside, end)
@@ -482,6 +496,7 @@ class _Translator:
     def give(self, value: Any) -> None:
         """Return a value."""
         if value is None:
+            self.bare = True
             self.lines.append("ret void")
         elif isinstance(value, Parts):
             kinds, whole = tuple(item.type for item in value.items), "undef"
@@ -499,11 +514,14 @@ class _Translator:
     def assign(self, target: Any, value: Any) -> None:
         match target:
             case ast.Name(id=name):
+                number = isinstance(value, Number)
+                if value is None or name in self.names or (name in self.types and not number):
+                    raise self.refused(target)  # names of arrays stand for one array
                 self.assign_name(name, value)
             case ast.Tuple(elts=targets):
                 for one, item in zip(targets, value.items, strict=True):
                     self.assign(one, item)
-            case ast.Subscript(value=of, slice=ast.Slice()):
+            case ast.Subscript(value=of, slice=ast.Slice(lower=None, upper=None, step=None)):
                 self.fill(self.value(of), value)
             case ast.Subscript():
                 array, place = self.place(self.value(target.value), target.slice)
@@ -548,7 +566,7 @@ class _Translator:
 
     def value(self, node: Any) -> Any:
         match node:
-            case ast.Constant(value=value):
+            case ast.Constant(value=int() | float() as value):
                 return _constant(value)
             case ast.Name(id=name):
                 return self.named(name, node)
@@ -564,7 +582,7 @@ class _Translator:
             case ast.Subscript():
                 return self.taken(node)
             case ast.BinOp(left=left, op=op, right=right):
-                return self.arithmetic(type(op), self.value(left), self.value(right))
+                return self.operated(node, type(op), self.value(left), self.value(right))
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
                 return _constant(-value)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
@@ -577,10 +595,10 @@ class _Translator:
             case ast.Compare(left=left, ops=ops, comparators=others):
                 return self.compared(self.value(left), ops, others)
             case ast.BoolOp(op=op, values=values):
-                return self.both(isinstance(op, ast.And), values)
+                return self.both(node, isinstance(op, ast.And), values)
             case ast.IfExp(test=test, body=body, orelse=other):
                 return self.either(test, body, other)
-            case ast.Call(func=of, args=arguments):
+            case ast.Call(func=of, args=arguments, keywords=[]):
                 return self.call(node, of, [self.value(argument) for argument in arguments])
         raise self.refused(node)
 
@@ -598,6 +616,9 @@ class _Translator:
         """Find what is left of an array at a place, and where that is."""
         index = self.value(node)
         places = index.items if isinstance(index, Parts) else (index,)
+        fits = isinstance(array, Array) and len(places) <= len(array.shape)
+        if not fits or any(k.type != WHOLE or k.name.startswith("-") for k in places):
+            raise self.refused(node)
         at = places[0]
         rest = array.shape[len(places) :]
         for other, length in zip(places[1:], array.shape[1:], strict=False):
@@ -613,14 +634,26 @@ class _Translator:
             match node.slice:
                 case ast.Constant(value=int(k)):
                     return of.items[k]
-                case ast.Slice(lower=None, upper=ast.Constant(value=int(k))):
+                case ast.Slice(lower=None, upper=ast.Constant(value=int(k)), step=None):
                     return Parts(of.items[:k])
-                case ast.Slice(lower=ast.Constant(value=int(k)), upper=None):
+                case ast.Slice(lower=ast.Constant(value=int(k)), upper=None, step=None):
                     return Parts(of.items[k:])
+            raise self.refused(node)
         array, place = self.place(of, node.slice)
         if array.shape:
             return array._replace(place=place)
         return Number(array.type, self.put(f"load {array.type}, ptr {place}"))
+
+    def operated(self, node: Any, op: type, one: Any, two: Any) -> Number:
+        """Do what is written: of // the half, the quarter and so on of whole numbers alone."""
+        if isinstance(one, Number) and isinstance(two, Number):
+            floats = FLOAT in (one.type, two.type)
+            halves = two.name.isdigit() and int(two.name).bit_count() == 1
+            if op in _WORDS or op is ast.Div or (floats if op is ast.Pow else False):
+                return self.arithmetic(op, one, two)
+            if op is ast.FloorDiv and halves and not floats:
+                return self.arithmetic(op, one, two)
+        raise self.refused(node)
 
     def arithmetic(self, op: type, one: Number, two: Number) -> Number:
         if op is ast.Pow or op is ast.Div:
@@ -630,7 +663,7 @@ class _Translator:
             return Number(FLOAT, self.put(f"fdiv double {one.name}, {two.name}"))
         kind = _widest(one.type, two.type, WHOLE)
         one, two = self.cast(one, kind), self.cast(two, kind)
-        if op is ast.FloorDiv and kind == WHOLE and two.name.isdigit():
+        if op is ast.FloorDiv:
             return Number(WHOLE, self.put(f"ashr i64 {one.name}, {int(two.name).bit_length() - 1}"))
         word = _WORDS[op]
         word = f"f{word} double" if kind == FLOAT else f"{word} nsw i64"
@@ -654,20 +687,22 @@ class _Translator:
         return found
 
     def ordered(self, op: type, one: Number, two: Number) -> Number:
-        kind, (one, two) = self.alike(one, two)
-        order = _ORDERS[op]
+        kind = _widest(one.type, two.type, WHOLE)
+        one, two, order = self.cast(one, kind), self.cast(two, kind), _ORDERS[op]
         if kind == FLOAT:
             word = f"fcmp {'u' if order == 'ne' else 'o'}{order}"
         else:
             word = f"icmp {'' if order in ('eq', 'ne') else 's'}{order}"
         return Number(BOOL, self.put(f"{word} {kind} {one.name}, {two.name}"))
 
-    def both(self, all_of: bool, values: list[Any]) -> Number:
+    def both(self, node: Any, all_of: bool, values: list[Any]) -> Number:
         """Tell whether all, or one, of values are true: as soon as one is known."""
         self.count += 1
         name, end = f"both.{self.count}", self.label()
         for value in values:
-            found, further = self.cast(self.value(value), BOOL), self.label()
+            found, further = self.value(value), self.label()
+            if found.type != BOOL:  # Python gives one of the numbers
+                raise self.refused(node)
             self.assign_name(name, found)
             self.branch(found, *((further, end) if all_of else (end, further)))
             self.begin(further)
@@ -692,14 +727,20 @@ class _Translator:
 
     def call(self, node: Any, of: Any, values: list[Any]) -> Any:
         match of:
-            case ast.Attribute(attr=name):
+            case ast.Attribute(value=ast.Name(id="np" | "math"), attr=name):
                 pass
             case ast.Name(id=name):
                 plain: Any = self.plain.__globals__.get(name)
                 if getattr(plain, "compiled", False):
                     return self.called(plain, values)
+                if plain is not None or name in self.types or name in self.names:
+                    raise self.refused(node)  # a name that shadows Python's own
+            case _:
+                raise self.refused(node)
         if name == "len":
             return values[0].shape[0]
+        if name == "int" and values[0].type == FLOAT:
+            return self.of_c("llvm.fptosi.sat.i64.f64", values, WHOLE)  # 0 of NaN
         if name == "int":
             return self.cast(values[0], WHOLE)
         if name in ("min", "max"):
@@ -728,12 +769,12 @@ class _Translator:
     def select(self, test: Number, yes: Number, no: Number) -> str:
         return self.put(f"select i1 {test.name}, {yes.type} {yes.name}, {no.type} {no.name}")
 
-    def of_c(self, name: str, values: list[Number]) -> Number:
+    def of_c(self, name: str, values: list[Number], kind: str = FLOAT) -> Number:
         """A function of C's library."""
         kinds = ", ".join(FLOAT for _ in values)
-        self.unit.declared.add(f"declare double @{name}({kinds}) nounwind willreturn memory(none)")
+        self.unit.declared.add(f"declare {kind} @{name}({kinds}) nounwind willreturn memory(none)")
         listed = ", ".join(f"double {value.name}" for value in values)
-        return Number(FLOAT, self.put(f"call double @{name}({listed})"))
+        return Number(kind, self.put(f"call {kind} @{name}({listed})"))
 
     def called(self, plain: Callable, values: list[Any]) -> Any:
         name, kind = self.unit.of(plain, tuple(values))
@@ -755,6 +796,11 @@ def _constant(value: Any) -> Number:
     if isinstance(value, int):
         return Number(WHOLE, str(value))
     return Number(FLOAT, f"0x{struct.unpack('<Q', struct.pack('<d', value))[0]:016X}")
+
+
+def _is_step(by: list[Number]) -> bool:
+    """Tell whether the step of a range, if it has one, is a constant but zero."""
+    return not by or (by[0].name.lstrip("-").isdigit() and int(by[0].name) != 0)
 
 
 def _widest(*kinds: str) -> str:
