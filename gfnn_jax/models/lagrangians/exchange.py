@@ -81,9 +81,7 @@ def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
     deciding = fit.problem.options.evidence.deciding
     for _ in range(OPTIONS.rounds):
         near = [_leaner(one, fit) for one in _near(fit, every)]
-        coloured = fit.correlation > OPTIONS.coloured
-        cost = fit.fitted.cost * (OPTIONS.explained if coloured else np.inf)
-        near = [one for one in near if len(one.fit.p) <= len(fit.p) and one.fit.fitted.cost < cost]
+        near = [one for one in near if len(one.fit.p) <= len(fit.p) and _explains(one.fit, fit)]
         found = [Exchanged(fit, 0.0), *near]
         least = min(one.above for one in found)
         likely = [one for one in found if one.above < least + deciding]
@@ -94,6 +92,13 @@ def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
         fit.problem.on_progress(f"  {other_terms(before, fit)}")
         fit = fit.again()
     return fit
+
+
+def _explains(other: LawFit, fit: LawFit) -> bool:
+    """Return whether, where residuals of a fit are correlated, another one explains much of them,
+    or leaves white ones, as chance does not."""
+    white = min(fit.correlation, other.correlation) < OPTIONS.coloured
+    return white or other.fitted.cost < OPTIONS.explained * fit.fitted.cost
 
 
 def other_terms(fit: LawFit, other: LawFit) -> str:

@@ -248,6 +248,7 @@ class TermSearch:
         d, within = self.every.dim, fit.problem.within_a_turn
         rows = libraries.springs(d, [i for i in within if fit.structure.has_powers(i)])
         rows += libraries.torques(d, fit.problem.angles)
+        rows += libraries.driven(d, fit.problem.angles, fit.problem.num_inputs, False)
         rubs = self.every.friction if self.frictions is None else tuple(self._may_rub(fit))
         every = dataclasses.replace(self.every, friction=rubs)
         return every.plus([("term", row) for row in rows])
@@ -321,7 +322,8 @@ class TermSearch:
         other = with_exchanges(fit, self.every_beside(fit))
         if other is fit:
             return fit, choice
-        other = self.prune(other, friction=False)
+        terms = dataclasses.replace(self.every_beside(other), friction=())
+        other = self.prune(self.grow(other, terms), friction=False)
         table = table_of(other, self._may_rub(other))
         return other, chosen(table, rows=other.structure.friction)
 
