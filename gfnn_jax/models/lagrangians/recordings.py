@@ -387,7 +387,10 @@ def _nature(data: RecordingData) -> Nature:
     names = problem.observation.channels
     runs = [channels_of(recording, names, run)[0] for run in recording.runs]
     field = plain_field(problem, symbols(recording.coordinates))
-    return nature(data.segments, problem.scales, problem.angles, runs, field)
+    what = nature(data.segments, problem.scales, problem.angles, runs, field)
+    unused = [name for name in recording.ignored if name in recording.factors]
+    option = f"(--inputs {','.join(unused)})" if unused else "(--inputs)"
+    return what._replace(reason=what.reason.replace("(--inputs)", option))
 
 
 def _with_nature(error: FitError, data: RecordingData) -> FitError:
