@@ -46,7 +46,8 @@ class ExchangeOptions:
     far: the same where terms only leave, for laws along which masses and springs are nearly
     collinear are far apart. rounds: exchanges in a row. coloured: neighbours among which a residual
     counts as one, above which the residuals are motion that the law lacks: an exchange then leaves
-    at most the share ``explained`` of the cost. listed: rivals, at most.
+    at most the share ``explained`` of the cost, or correlations over the share ``whiter`` of these
+    neighbours. listed: rivals, at most.
     """
 
     most: int = 2
@@ -61,6 +62,7 @@ class ExchangeOptions:
     rounds: int = 4
     coloured: float = 2.0
     explained: float = 0.5
+    whiter: float = 0.25
     listed: int = 5
 
 
@@ -95,10 +97,13 @@ def with_exchanges(fit: LawFit, every: Structure) -> LawFit:
 
 
 def _explains(other: LawFit, fit: LawFit) -> bool:
-    """Return whether, where residuals of a fit are correlated, another one explains much of them,
-    or leaves white ones, as chance does not."""
-    white = min(fit.correlation, other.correlation) < OPTIONS.coloured
-    return white or other.fitted.cost < OPTIONS.explained * fit.fitted.cost
+    """Return whether another fit explains much of the residuals of one, where these are correlated:
+    of their squares, or of their correlation, as chance does not."""
+    return (
+        fit.correlation < OPTIONS.coloured
+        or other.fitted.cost < OPTIONS.explained * fit.fitted.cost
+        or other.correlation < OPTIONS.whiter * fit.correlation
+    )
 
 
 def other_terms(fit: LawFit, other: LawFit) -> str:
