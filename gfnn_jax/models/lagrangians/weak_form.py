@@ -300,6 +300,8 @@ def centre_of_forces(problem: ArcProblem) -> np.ndarray:
             rows.append([across(bent), *field, *drag])
             targets.append(-summed(bumps.slope, spin))
     parts, Y = [np.concatenate(part) for part in zip(*rows, strict=True)], np.concatenate(targets)
+    if not len(Y):  # runs are shorter than a window
+        return np.zeros(d)
     found = []
     for taken in ((0,), (0, 3, 4), (0, 1, 2), (0, 1, 2, 3, 4)):
         X = np.concatenate([parts[k] for k in taken], axis=1)
@@ -309,7 +311,7 @@ def centre_of_forces(problem: ArcProblem) -> np.ndarray:
     plain = [one for one in found if one[1] < OPTIONS.torque]
     error, share, c = plain[0] if plain else min(found, key=lambda one: one[0])
     near = max(OPTIONS.far * np.linalg.norm(spread), problem.options.evidence.significant * error)
-    return c if share < OPTIONS.some and np.linalg.norm(c) > near else 0 * c
+    return c if share < OPTIONS.some and np.linalg.norm(c) > near else np.zeros(d)
 
 
 def weak_rows(form: Form, node: Nodes, length: float) -> tuple[np.ndarray, np.ndarray]:
