@@ -322,6 +322,7 @@ class TermSearch:
         other = with_exchanges(fit, self.every_beside(fit))
         if other is fit:
             return fit, choice
+        assert self.every is not None  # terms are searched
         terms = dataclasses.replace(self.every, friction=())
         other = self.prune(self.grow(other, terms), friction=False)
         table = table_of(other, self._may_rub(other))
