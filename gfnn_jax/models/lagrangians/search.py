@@ -9,6 +9,7 @@ all that is fitted.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -569,7 +570,11 @@ def with_equal_masses(fit: LawFit, least: float = np.inf) -> LawFit:
         ("term", row) for row in free.structure.terms if max(row[0]) == 1 and is_constant(row)
     }
     if across:
-        apart = free.again(free.structure.without(across))
+        apart = free.structure.without(across)
+        known = free.values_within(apart)
+        with contextlib.suppress(FitError):  # M of the fit may be far from one without them
+            known = weak_start(apart, free.problem, prune=False)[1]
+        apart = free.again(apart, known)
         if apart.is_definite and _leaves_little_more(apart, free):
             return apart
     equal = free.again(dataclasses.replace(free.structure, held=held))
