@@ -78,13 +78,13 @@ def test_finite_differences():
 
 
 def test_the_loss_of_a_sequence():
-    """Squared distances along the sequence, at a rate that moves nothing: written out."""
+    """Squared distances along the sequence, at a rate that moves hardly anything: written out."""
     sequences = oscillator(50, 4)
 
     def step(params, z):
         return z * params
 
-    still = dataclasses.replace(RECIPE, rate=1e-30, epochs=1, epoch_length=1, batch_size=45)
+    still = dataclasses.replace(RECIPE, rate=1e-7, epochs=1, epoch_length=1, batch_size=45)
     learned = learn_map(
         step, jnp.array([0.9, 1.1]), sequences, still, Budget(jax.random.key(0)), "scaled"
     )
@@ -95,7 +95,7 @@ def test_the_loss_of_a_sequence():
             z = factor * z
             total += np.sum((z - wanted) ** 2)
     expected = np.sqrt(total / (45 * 3 * 2))
-    assert learned.training.history["train_rms"][0] == pytest.approx(expected, rel=1e-5)
+    assert learned.training.train_rms == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize(
