@@ -298,6 +298,19 @@ def test_equal_masses_are_not_held_where_they_leave_the_motion(monkeypatch):
     assert draw.right(draw.error(gfnn.fit(draw.recording)))
 
 
+def test_pendulums_that_nothing_couples_are_tried_where_one_is_only_led():
+    """Few samples of two pendulums: in the weak form one, ever so light, is led by the other."""
+
+    def acceleration(q, v):
+        return -np.array([0.32, 0.118]) * np.sin(q)
+
+    names, t = ["q1", "q2"], 0.616 * np.arange(174)
+    q = motion(acceleration, [1.738, 1.864, 0, 0], t)
+    q += 1.3e-4 * np.random.default_rng(0).normal(size=q.shape)
+    record = gfnn.Recording({"t": t, "q1": q[0], "q2": q[1]}, positions=names, angles=names)
+    assert len(best_start(samples_of(record).problem).structure.uncoupled) == 2
+
+
 @pytest.mark.slow
 def test_an_arm_whose_joints_rub_starts_from_angles_between_links():
     """Friction that falls with speed makes up for much of a wrong M: the angle of the second link

@@ -462,6 +462,15 @@ class LawFit:
         return bool(np.linalg.eigvalsh(scaled).min() > self.problem.options.singular)
 
     @property
+    def least_share(self) -> float:
+        """The least share of the kinetic energy that a coordinate has by its own motion."""
+        q, v = np.split(self.problem.states, 2, axis=1)
+        law = self.form.lagrangian(self.p[: self.form.count]).at(self.problem.args)
+        masses = np.diagonal(law.masses(q), axis1=-2, axis2=-1)
+        energies = np.mean(masses * v**2, axis=0)
+        return float(energies.min() / energies.max())
+
+    @property
     def followed(self) -> Arcs:
         """The arcs with the states of the fit."""
         return dataclasses.replace(self.arcs, x=self.fitted.x)

@@ -43,7 +43,8 @@ class StartOptions:
     are tried. far: zero of an angle, in radians, that a fit from 0 may not reach. few: samples a
     period, below which more of them are the remedy. plain: times the residual of the larger
     library, that a plainer one's may have. noise: residual, times the noise, that is no more;
-    white: that lacks no term. exponents: of the distance, where a power of it begins; beside: up to
+    white: that lacks no term. light: share of the kinetic energy that a coordinate may have which is
+    only driven by the others, and so perhaps coupled to none. exponents: of the distance, where a power of it begins; beside: up to
     which it is then found; rounded: up to which it is a half, or whole, or none.
     """
 
@@ -54,6 +55,7 @@ class StartOptions:
     plain: float = 1.5
     noise: float = 2.0
     white: float = 1.1
+    light: float = 1e-2
     exponents: tuple[float, ...] = (-3.0, -2.0, -1.0, -0.5, 0.5, 1.0, 1.5, 3.0, 4.0)
     beside: float = 0.6
     rounded: float = 0.1
@@ -123,6 +125,8 @@ def best_start(problem: ArcProblem) -> LawFit:
     links = [_Library(libraries.relative(d, angles))] if 1 < d == len(angles) else []
     for library in [] if many and some.are_noise else links:
         some.add(library)
+    if any(fit.least_share < OPTIONS.light for fit in some.fits):
+        some.add(_Library(libraries.uncoupled(d, angles), apart=True))
     some.add_richer([*textbook.rows, *pulls], 1)
     some.add_richer(libraries.spun(d, angles), 1)
     if not (many and some.are_noise):
