@@ -138,7 +138,8 @@ def calibrated(
     leads = np.array([0.5, 1.0]) * reach
     windows = np.repeat(tried, len(some))
     errors = _forecasts(thirds, found, some * len(tried), windows, leads)[0]
-    with np.errstate(all="ignore"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # windows whose forecasts all diverge
         sizes = (np.abs(errors) / spread).reshape(len(tried), -1)
         middle = np.nan_to_num(np.nanmedian(sizes, axis=1), nan=np.inf)
     best = float(tried[np.argmin(middle)])
