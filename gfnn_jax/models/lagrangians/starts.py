@@ -43,9 +43,10 @@ class StartOptions:
     are tried. far: zero of an angle, in radians, that a fit from 0 may not reach. few: samples a
     period, below which more of them are the remedy. plain: times the residual of the larger
     library, that a plainer one's may have. noise: residual, times the noise, that is no more;
-    white: that lacks no term. light: share of the kinetic energy that a coordinate may have which is
-    only driven by the others, and so perhaps coupled to none. exponents: of the distance, where a power of it begins; beside: up to
-    which it is then found; rounded: up to which it is a half, or whole, or none.
+    white: that lacks no term. light: share of the kinetic energy, that a coordinate may have which
+    is only led by others, and perhaps coupled to none. exponents: of the distance, where a power of
+    it begins; beside: up to which it is then found; rounded: up to which it is a half, or whole, or
+    none.
     """
 
     followed: float = 10.0
