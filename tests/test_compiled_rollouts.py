@@ -1,13 +1,15 @@
 """Rollouts of laws by compiled steps, against the same steps by JAX."""
 
 import jax
+import mpmath
 import numpy as np
 import pytest
 from analytic import mechanics
 
 from gfnn_jax.families.friction import LINEAR, QUADRATIC, Friction
 from gfnn_jax.families.lagrangian import Lagrangian, Terms
-from gfnn_jax.flows.compiled_steps import CONSTANT, INVERSE, JOINED, SIN, Stepper, program
+from gfnn_jax.flows.compiled_steps import CONSTANT, INVERSE, JOINED, SIN, Stepper, _turns, program
+from gfnn_jax.flows.translated import compiled
 from gfnn_jax.maps import lanes
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import map_of_law
@@ -53,6 +55,36 @@ def test_steps_are_those_of_jax(kind, driven):
     np.testing.assert_allclose(states, expected, rtol=1e-11, atol=1e-11)
     np.testing.assert_array_equal(info.left_at, other.left_at)
     np.testing.assert_array_equal(info.status, other.status)
+
+
+def test_a_lane_does_not_depend_on_those_beside_it():
+    """To the last bit, of more lanes than are followed at once, of which one fails."""
+    map_, _ = arms("alone")
+    z = np.random.default_rng(1).normal(size=(45, 4))
+    z[7, 2:] = 1e200
+    states, _ = map_.rollout(z, 300)
+    assert np.flatnonzero(np.isnan(states[:, -1, 0])).tolist() == [7]
+    for lane in (0, 8, 44):
+        np.testing.assert_array_equal(states[lane], map_.rollout(z[lane], 10_000)[0][:301])
+
+
+@compiled("a test", 1)
+def sines(x, sine, cosine):
+    _turns(x, sine, cosine, len(x))
+
+
+@pytest.mark.parametrize("size", [1e-9, 1.0, 50.0, 9e5, 1e9])
+def test_sines_are_right_to_their_last_digit(size):
+    x = size * np.random.default_rng(0).uniform(-1, 1, 500)
+    x = np.concatenate([x, np.rint(x / np.pi * 2) * np.pi / 2])
+    found = np.empty_like(x), np.empty_like(x)
+    sines(x, *found)
+    with mpmath.workprec(200):
+        for values, of in zip(found, (mpmath.sin, mpmath.cos), strict=True):
+            off = [float(of(a) - b) for a, b in zip(x.tolist(), values.tolist(), strict=True)]
+            assert np.max(abs(np.array(off)) / np.spacing(abs(values))) < 0.8
+    sines(x := np.full(8, np.inf), *(found := (np.empty(8), np.empty(8))))
+    assert np.isnan(found).all()
 
 
 @pytest.mark.slow

@@ -2,8 +2,9 @@
 
 The field of a law, ∇H or with its forces, is written down as a list of sums and products, by
 running its family, and of a bracket its lift, in NumPy on arrays of `Node`s; a compiled loop reads
-the list at all stages of a step at once. So no law is compiled, and no family or lift needs code of
-its own.
+the list at all stages of a step at once, of as many lanes as a processor's nearest memory holds. So
+no law is compiled, and no family or lift needs code of its own. What becomes of a lane does not
+depend on those beside it.
 
 States stay on a lift from the first step to the last, with what rounding loses of them. The momenta
 of its fibres, quadratic in w, are what Casimirs are made of, and are kept to twice the digits.
@@ -32,7 +33,7 @@ from gfnn_jax.flows.lifts import Itself
 from gfnn_jax.flows.translated import compiled, function
 from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform
 
-STAGES = 8  # a constant of the compiled loops, as many as processors do at once
+STAGES = 8  # at the most; a multiple of the numbers that processors do at once, too
 _MOST = 100  # iterations
 _BEFORE = 2  # steps, by whose stages those of a step begin
 _FLOOR, _SETTLED = 1.1e-17, 1.8e-12  # as in `flows.flow`: 0.05 eps, eps^¾
@@ -255,7 +256,12 @@ def program(field: Callable[[np.ndarray, Any], Any], width: int, given: int) -> 
 
     def write(place: int) -> None:
         kind, a, b, c = tape.rows[place]
-        if place in tape.forms:
+        both = [tape.known.get((of, a, 0, 0.0)) for of in (SIN, COS)]
+        if kind in (SIN, COS) and {*both} <= {*used}:
+            for share, of in enumerate(both, 1):
+                at[of] = len(rows)
+                rows.append((tape.rows[of][0], at[a], share, 0, 0.0))
+        elif place in tape.forms:
             form = tape.forms[place]
             first = next((of for of, by in form.items() if by == 1 and of not in inside), None)
             at[place] = zero if first is None else at[first]
@@ -275,10 +281,12 @@ def program(field: Callable[[np.ndarray, Any], Any], width: int, given: int) -> 
             at[place] = len(rows) - 1
 
     for place in (place for place in used if place not in moving):  # once in a step
-        write(place)
+        if place not in at:
+            write(place)
     still = len(rows)
     for place in (place for place in used if place in moving):
-        write(place)
+        if place not in at:  # as a cosine that was written beside its sine
+            write(place)
     code, constants = np.array([row[:4] for row in rows]), np.array([float(row[4]) for row in rows])
     return Program(code, constants, np.array([at[end] for end in ends]), inputs, still)
 
@@ -304,67 +312,112 @@ def _two_product(a, b):
 
 
 @function
-def _run(code, constants, v, places, stages):
-    """Run the operations of these places at the states in v, one a column. Sums and products are
-    done four columns at once, functions one by one: of the ``stages`` that there are."""
-    begin, end = places
+def _turns(x, sine, cosine, columns):
+    """Sines and cosines of x, to 0.8 of their last digit: by their power series at y, what a
+    multiple of π/2 leaves of x, in arithmetic that processors do on several columns at once."""
+    far = 0
+    for k in range(columns):
+        far += abs(x[k]) > 1e6  # where the product of the multiple and 33 digits would be rounded
+    if far > 0:
+        for k in range(columns):
+            sine[k], cosine[k] = math.sin(x[k]), math.cos(x[k])
+        return
+    for k in range(columns):
+        quarters = np.rint(x[k] * 0.6366197723675814)
+        # π/2 is the sum of three numbers, the first two of 33 digits (Cody & Waite).
+        part, by = x[k] - quarters * 1.5707963267341256, quarters * 6.077100506303966e-11
+        near, lost = _two_sum(part, -by)
+        lost -= quarters * 2.0222662487959506e-21
+        y, rest = _two_sum(near, lost)
+        z, zz = y * y, y * y * (y * y)
+        of_sine = (1 / 6227020800 - z * (1 / 1307674368000)) + zz * (1 / 355687428096000)
+        of_sine = (1 / 362880 - z * (1 / 39916800)) + zz * of_sine
+        of_sine = (1 / 120 - z * (1 / 5040)) + zz * of_sine
+        of_cosine = (1 / 20922789888000 - z * (1 / 6402373705728000)) * zz
+        of_cosine = (1 / 479001600 - z * (1 / 87178291200)) + of_cosine
+        of_cosine = (1 / 40320 - z * (1 / 3628800)) + zz * of_cosine
+        of_cosine = (1 / 24 - z * (1 / 720)) + zz * of_cosine
+        cube, begun, lost = z * y, 1.0 - 0.5 * z, (1.0 - (1.0 - 0.5 * z)) - 0.5 * z
+        sin = y - ((z * (0.5 * rest - cube * of_sine) - rest) + cube * (1 / 6))
+        cos = begun + (lost + (zz * of_cosine - y * rest))
+        turned = quarters - 4.0 * np.rint(0.25 * quarters)
+        odd, behind = abs(turned) == 1.0, abs(turned) == 2.0
+        first, second = cos if odd else sin, sin if odd else cos
+        sine[k] = -first if behind or turned == -1.0 else first
+        cosine[k] = -second if behind or turned == 1.0 else second
+
+
+@function
+def _of(kind, x, c):
+    if kind == EXP:
+        return math.exp(x)
+    if kind == LOG:
+        return math.log(x)
+    if kind == POWER:
+        return x**c
+    if kind == ROOT:
+        return math.sqrt(x)
+    if kind == ABS:
+        return abs(x)
+    if kind == TAN:
+        return math.tan(x)
+    if kind == SINH:
+        return math.sinh(x)
+    if kind == COSH:
+        return math.cosh(x)
+    if kind == TANH:
+        return math.tanh(x)
+    return math.atan(x)
+
+
+@function
+def _run(law, v, places, shape):
+    """Run the operations of these places at the states in v, one a column, those of a lane side by
+    side. shape: of how many lanes, columns of each, and stages: functions are done of these."""
+    (begin, end), (count, length, stages), code = places, shape, law.code
+    columns = (count * length + (STAGES - 1)) // STAGES * STAGES
     for i in range(begin, end):
-        kind, a, c = code[i, 0], code[i, 1], constants[i]
+        kind, a, c = code[i, 0], code[i, 1], law.constants[i]
         if kind == JOINED:
             b, d = code[i, 2], code[i, 3]
-            for s in range(0, STAGES, 4):
+            for s in range(0, columns, 4):
                 one = v[a, s] + c * v[b, s] * v[d, s]
                 two = v[a, s + 1] + c * v[b, s + 1] * v[d, s + 1]
                 three = v[a, s + 2] + c * v[b, s + 2] * v[d, s + 2]
                 four = v[a, s + 3] + c * v[b, s + 3] * v[d, s + 3]
                 v[i, s], v[i, s + 1], v[i, s + 2], v[i, s + 3] = one, two, three, four
         elif kind == CONSTANT:
-            for s in range(STAGES):
+            for s in range(columns):
                 v[i, s] = c
         elif kind == INVERSE:
-            for s in range(STAGES):
+            for s in range(columns):
                 v[i, s] = 1.0 / v[a, s]
+        elif kind == SIN:
+            _turns(v[a], v[i], v[i + 1 if code[i, 2] > 0 else len(code)], columns)
+        elif kind == COS:
+            if code[i, 2] == 0:
+                _turns(v[a], v[len(code)], v[i], columns)
         else:
-            for s in range(stages):
-                x = v[a, s]
-                if kind == SIN:
-                    v[i, s] = math.sin(x)
-                elif kind == COS:
-                    v[i, s] = math.cos(x)
-                elif kind == EXP:
-                    v[i, s] = math.exp(x)
-                elif kind == LOG:
-                    v[i, s] = math.log(x)
-                elif kind == POWER:
-                    v[i, s] = x**c
-                elif kind == ROOT:
-                    v[i, s] = math.sqrt(x)
-                elif kind == ABS:
-                    v[i, s] = abs(x)
-                elif kind == TAN:
-                    v[i, s] = math.tan(x)
-                elif kind == SINH:
-                    v[i, s] = math.sinh(x)
-                elif kind == COSH:
-                    v[i, s] = math.cosh(x)
-                elif kind == TANH:
-                    v[i, s] = math.tanh(x)
-                else:
-                    v[i, s] = math.atan(x)
+            for g in range(count):
+                for s in range(g * length, g * length + stages):
+                    v[i, s] = _of(kind, v[a, s], c)
 
 
 @function
-def _weighted(out, matrix, x):
-    """Put Σ_t x_it matrix_t into the rows i of out, four columns at once."""
+def _weighted(out, first, begin, matrix, x):
+    """Put begin_i + Σ_t x_it matrix_t into the rows i of out, from the column ``first`` on, four at
+    once."""
     for i in range(len(x)):
-        for s in range(0, STAGES, 4):
+        for s in range(0, matrix.shape[1], 4):
             one, two, three, four = 0.0, 0.0, 0.0, 0.0
             for t in range(len(matrix)):
                 one += x[i, t] * matrix[t, s]
                 two += x[i, t] * matrix[t, s + 1]
                 three += x[i, t] * matrix[t, s + 2]
                 four += x[i, t] * matrix[t, s + 3]
-            out[i, s], out[i, s + 1], out[i, s + 2], out[i, s + 3] = one, two, three, four
+            at = first + s
+            out[i, at], out[i, at + 1] = begin[i] + one, begin[i] + two
+            out[i, at + 2], out[i, at + 3] = begin[i] + three, begin[i] + four
 
 
 @function
@@ -479,86 +532,131 @@ def _turned(w, place, centre):
     return turns
 
 
+@function
+def _begun(law, task, room, inputs, at):
+    """Begin a substep of a lane: its args, and its stages by those of the steps before. at: the
+    lane, its place in the room, the step and its substep."""
+    (lane, g, n, part_of), length, width = at, law.rule.shape[1], len(law.unit)
+    row, column = min(lane, task.given.shape[0] - 1), min(n, task.given.shape[1] - 1)
+    for i in range(width, inputs):
+        for s in range(length):
+            room.v[i, g * length + s] = task.given[row, column, part_of, i - width, s]
+    for i in range(width):
+        room.unit[g, i] = STAGES / (abs(task.w[lane, 0, i]) + law.unit[i])
+    room.change[g], now = np.inf, room.now[g]
+    if np.isnan(task.slopes[lane, 0, len(law.before) - 1]):
+        now[:] = 0.0
+    else:
+        _weighted(now, 0, room.nought, law.before, task.slopes[lane])
+
+
+@function
+def _closer(law, room, g, stages):
+    """Put what the stages in v move a lane by into ``now``; whether it has to be done again."""
+    first, change, whole, last = g * law.rule.shape[1], 0.0, 0.0, room.change[g]
+    for i in range(len(law.unit)):
+        off, total = 0.0, 0.0
+        for s in range(stages):
+            value = law.weights[s] * room.v[law.ends[i], first + s]
+            total += value
+            off = max(off, abs(value - room.now[g, i, s]))
+            room.now[g, i, s] = value
+        whole += total
+        change = max(change, off * room.unit[g, i])
+    finite = abs(whole) < np.inf
+    room.change[g] = change if finite else np.inf
+    return finite and not (change <= _FLOOR or (change <= _SETTLED and change > 0.5 * last))
+
+
+@function
+def _solved(law, task, room, shape, at):
+    """Iterate the stages of lanes, from the lane ``at`` on, each until it has settled. The
+    operations from the place after it on are done."""
+    (first, moving), (count, length, stages), iterations, left = at, shape, 0, 1
+    while left > 0 and iterations < _MOST:
+        iterations, left = iterations + 1, 0
+        for g in range(count):
+            if room.open[g] > 0:
+                _weighted(room.v, g * length, task.w[first + g, 0], law.rule, room.now[g])
+        _run(law, room.v, (moving, len(law.code)), shape)
+        for g in range(count):
+            if room.open[g] > 0:
+                task.most[first + g] = max(task.most[first + g], iterations)
+                room.open[g] = _closer(law, room, g, stages)
+                left += room.open[g]
+
+
+@function
+def _moved(law, w, slopes, now, room):
+    """End a substep of a lane."""
+    length = law.rule.shape[1]
+    for i in range(len(law.unit)):
+        room.moved[i] = 0.0
+        for s in range(length):
+            room.moved[i] += now[i, s]
+            slopes[i, length + s] = (1.0 + law.decay[i]) * slopes[i, s]
+            slopes[i, s] = (1.0 + law.decay[i]) * now[i, s]
+        room.moved[i] += law.decay[i] * (w[0, i] + room.moved[i])
+    _kept(w, room.moved, law.entries, law.values, room.along, room.system)
+
+
+@function
+def _ended(law, task, w, lane, n):
+    """End a step of a lane."""
+    slopes = task.slopes[lane]
+    for e in range(len(law.fibres)):
+        if law.fibres[e, 2]:
+            _sheared(w, slopes, law.fibres[e, 0], law.fibres[e, 1])
+        else:
+            _balanced(w, slopes, law.fibres[e, 0], law.fibres[e, 1])
+    for e in range(len(law.angles)):
+        task.turns[lane, n, e] = _turned(w, law.angles[e], law.centre[e])
+    for i in range(len(law.unit)):
+        task.out[lane, n, 0, i], task.out[lane, n, 1, i] = w[0, i], w[1, i]
+    task.fine[lane] += 1
+
+
 @compiled("rollouts of laws", 1)
 def roll(law, task, room, sizes):
-    """Follow the lanes of a `Task`. room: of one lane. sizes: substeps, inputs,
-    moving and stages."""
-    code, constants, ends, rule, weights, before, entries, values = law[:8]
-    fibres, unit, decay, angles, centre = law[8:]
-    (substeps, inputs, moving, stages), given = sizes, task.given.shape
-    lanes, steps, width = task.out.shape[0], task.out.shape[1], len(unit)
-    v, now, moved, part, along, system = room
-    for lane in range(lanes):
-        w, slopes, most, n = task.w[lane], task.slopes[lane], 0, 0
-        goes = True
-        while goes and n < steps:
+    """Follow the lanes of a `Task`, as many at once as there is `Room` for. sizes: substeps,
+    inputs, moving and stages."""
+    (substeps, inputs, moving, stages), (lanes, steps), first = sizes, task.out.shape[:2], 0
+    length = law.rule.shape[1]
+    while first < lanes:
+        count, n = min(len(room.going), lanes - first), 0
+        left, shape = count, (count, length, stages)
+        for g in range(count):
+            room.going[g] = 1
+        for i in range(len(law.unit)):  # columns of no lane are like those of the first
+            for s in range(count * length, room.v.shape[1]):
+                room.v[i, s] = task.w[first, 0, i]
+        while left > 0 and n < steps:
             for part_of in range(substeps):
-                row, column = min(lane, given[0] - 1), min(n, given[1] - 1)
-                for i in range(width, inputs):
-                    for s in range(STAGES):
-                        v[i, s] = task.given[row, column, part_of, i - width, s]
-                _run(code, constants, v, (inputs, moving), stages)
-                for i in range(width):
-                    part[i] = STAGES / (abs(w[0, i]) + unit[i])
-                if np.isnan(slopes[0, len(before) - 1]):
-                    now[:] = 0.0
-                else:
-                    _weighted(now, before, slopes)
-                last, change, iterations = np.inf, np.inf, 0
-                while iterations < _MOST:
-                    iterations += 1
-                    _weighted(v, rule, now)
-                    for i in range(width):
-                        for s in range(STAGES):
-                            v[i, s] += w[0, i]
-                    _run(code, constants, v, (moving, len(code)), stages)
-                    change, whole = 0.0, 0.0
-                    for i in range(width):
-                        off, total = 0.0, 0.0
-                        for s in range(stages):
-                            value = weights[s] * v[ends[i], s]
-                            total += value
-                            off = max(off, abs(value - now[i, s]))
-                            now[i, s] = value
-                        whole += total
-                        change = max(change, off * part[i])
-                    if not abs(whole) < np.inf:
-                        goes = False
-                        break
-                    if change <= _FLOOR or (change <= _SETTLED and change > 0.5 * last):
-                        break
-                    last = change
-                most = max(most, iterations)
-                goes = goes and change <= _SETTLED
-                if not goes:
-                    break
-                for i in range(width):
-                    moved[i] = 0.0
-                    for s in range(STAGES):
-                        moved[i] += now[i, s]
-                        slopes[i, STAGES + s] = (1.0 + decay[i]) * slopes[i, s]
-                        slopes[i, s] = (1.0 + decay[i]) * now[i, s]
-                    moved[i] += decay[i] * (w[0, i] + moved[i])
-                _kept(w, moved, entries, values, along, system)
-            if not goes:
-                break
-            for e in range(len(fibres)):
-                if fibres[e, 2]:
-                    _sheared(w, slopes, fibres[e, 0], fibres[e, 1])
-                else:
-                    _balanced(w, slopes, fibres[e, 0], fibres[e, 1])
-            for e in range(len(angles)):
-                task.turns[lane, n, e] = _turned(w, angles[e], centre[e])
-            for i in range(width):
-                task.out[lane, n, 0, i], task.out[lane, n, 1, i] = w[0, i], w[1, i]
+                for g in range(count):
+                    room.open[g] = room.going[g]
+                    if room.going[g] > 0:
+                        _begun(law, task, room, inputs, (first + g, g, n, part_of))
+                _run(law, room.v, (inputs, moving), shape)
+                _solved(law, task, room, shape, (first, moving))
+                for g in range(count):
+                    if room.going[g] > 0 and room.change[g] <= _SETTLED:
+                        _moved(law, task.w[first + g], task.slopes[first + g], room.now[g], room)
+                    elif room.going[g] > 0:
+                        room.going[g], stays = 0, room.now[g]
+                        stays[:] = 0.0  # numbers that the lane's columns are run on further
+                        _weighted(room.v, g * length, task.w[first + g, 0], law.rule, stays)
+                        left -= 1
+            for g in range(count):
+                if room.going[g] > 0:
+                    _ended(law, task, task.w[first + g], first + g, n)
             n += 1
-        task.fine[lane], task.most[lane] = n, most
+        first += count
 
 
 class Task(NamedTuple):
     """N lanes: their states w (N, 2, W), whose second row is what rounding has lost, the stages
-    (N, W, 2 × STAGES) of the two steps before, the last one first, NaN of none, and the args (N or
-    1, M or 1, substeps, k, STAGES) of M steps; and what becomes of them: the states out (N, M, 2,
+    (N, W, 2 C) of the two steps before, the last one first, NaN of none, and the args (N or 1, M or
+    1, substeps, k, C) of M steps; and what becomes of them: the states out (N, M, 2,
     W), NaN from where a step fails, the turns (N, M, A) that angles made in each step, how many
     steps did not fail (N,), and the most iterations of one (N,)."""
 
@@ -569,6 +667,37 @@ class Task(NamedTuple):
     turns: np.ndarray
     fine: np.ndarray
     most: np.ndarray
+
+
+class Room(NamedTuple):
+    """Room for G lanes of C columns each: the values v of all operations, and of a cosine that none
+    asks for, a column for each stage; what each stage moves w by, ``now`` (G, W, C); in which unit
+    (G, W) its change (G,) is told; which lanes are going, and which stages are open (G,); what a
+    step moves a lane by, the slopes of its invariants and their system; and a state of zeros."""
+
+    v: np.ndarray
+    now: np.ndarray
+    unit: np.ndarray
+    change: np.ndarray
+    going: np.ndarray
+    open: np.ndarray
+    moved: np.ndarray
+    along: np.ndarray
+    system: np.ndarray
+    nought: np.ndarray
+
+    @classmethod
+    def of(cls, law: Law, lanes: int) -> Room:
+        """Room for so many lanes of a law, or for fewer that are followed at once."""
+        (rows, _), length = law.code.shape, len(law.weights)
+        width, count = len(law.unit), 1 + max(law.entries[:, 0], default=-1)
+        most = 2048 // (rows * length)  # half of the memory nearest to most processors
+        lanes = min(lanes, max(most, STAGES // length))
+        columns = -(-lanes * length // STAGES) * STAGES
+        numbers = (rows + 1, columns), (lanes, width, length), (lanes, width), lanes
+        flags = (np.zeros(lanes, np.int64) for _ in range(2))
+        rest = width, (count, width), (count, count + 2), width
+        return cls(*map(np.zeros, numbers), *flags, *map(np.zeros, rest))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -629,7 +758,7 @@ class Stepper:
         w = self.lift.up(np.asarray(z, np.longdouble) + lost)
         rounded = w.astype(float)
         w = np.stack([rounded, (w - rounded).astype(float)], axis=1)
-        return w, np.full((len(w), w.shape[2], _BEFORE * STAGES), np.nan)
+        return w, np.full((len(w), w.shape[2], len(self.law.before)), np.nan)
 
     def steps(self, lanes: tuple[np.ndarray, np.ndarray], count: int, args: Any) -> Task:
         """Follow lanes by ``count`` steps. args: (N or 1, M or 1, k) as each begins, or None."""
@@ -642,10 +771,8 @@ class Stepper:
             np.zeros(num, np.int64),
             np.zeros(num, np.int64),
         )
-        width, count = len(self.law.unit), 1 + max(self.law.entries[:, 0], default=-1)
-        shapes = ((len(self.law.code), STAGES), (width, STAGES), (width,), (width,))
-        room = tuple(map(np.zeros, (*shapes, (count, width), (count, count + 2))))
-        roll(self.law, task, room, (self.flow.substeps, *self.sizes, self.flow.stages))
+        sizes = self.flow.substeps, *self.sizes, self.flow.stages
+        roll(self.law, task, Room.of(self.law, num), sizes)
         return task
 
     def _given(self, args: Any) -> np.ndarray:
@@ -653,7 +780,8 @@ class Stepper:
         flow, family, shape = self.flow, self.flow.family, (1, 1)
         if args is not None:
             shape, args = args.shape[:2], args.reshape(-1, args.shape[-1])
-        found = np.zeros((*shape, flow.substeps, self.sizes[0] - len(self.law.unit), STAGES))
+        given, columns = self.sizes[0] - len(self.law.unit), len(self.law.weights)
+        found = np.zeros((*shape, flow.substeps, given, columns))
         h, rows = float(flow.dt) / flow.substeps, np.zeros((math.prod(shape), 1))
         for part in range(flow.substeps if found.size else 0):
             now, of = at_time(family, args, part * h) if args is not None else None, family
@@ -669,14 +797,15 @@ class Stepper:
 
 
 def _rule(stages: int, h: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Couplings, weights, and weights of the steps before, as `Law` has them; stages that Gauss's
-    rule lacks have none."""
-    rule, weights = gauss(stages), np.zeros(STAGES)
-    coupling, before = np.zeros((STAGES, STAGES)), np.zeros((_BEFORE, STAGES, STAGES))
+    """Couplings, weights, and weights of the steps before, as `Law` has them, in fours; stages that
+    Gauss's rule lacks have none."""
+    columns = -(-stages // 4) * 4
+    rule, weights = gauss(stages), np.zeros(columns)
+    coupling, before = np.zeros((columns, columns)), np.zeros((_BEFORE, columns, columns))
     coupling[:stages, :stages], weights[:stages] = rule.coupling.T, h * rule.weights
     degree = min(2 * stages - 1, stages + 3)  # higher ones amplify rounding
     times = rule.nodes, rule.nodes - 1
     known, sought = (chebvander(t, degree) for t in (np.concatenate(times), rule.nodes + 1))
     shares = (sought @ np.linalg.pinv(known)).T.reshape(_BEFORE, stages, stages)
     before[:, :stages, :stages] = shares / rule.weights[:, None] * rule.weights
-    return coupling, weights, before.reshape(-1, STAGES)
+    return coupling, weights, before.reshape(-1, columns)

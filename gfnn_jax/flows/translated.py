@@ -221,6 +221,8 @@ def _optimised(text: str, machine: Any) -> bytes:
     module.verify()
     options = llvm.create_pipeline_tuning_options(speed_level=2)
     options.slp_vectorization = True
+    options.loop_vectorization = True
+    options.loop_interleaving = False  # of short loops
     options.loop_unrolling = False
     passes = llvm.create_pass_builder(machine, options)
     passes.getModulePassManager().run(module, passes)
