@@ -793,6 +793,8 @@ class Stepper:
 
     def down(self, w: np.ndarray) -> np.ndarray:
         """States (..., n) of the lift's (..., 2, W), to their last digit."""
+        if isinstance(self.lift, Itself):
+            return w[..., 0, :]  # of a number and what rounding has lost of it, the nearest
         return self.lift.down(w.astype(np.longdouble).sum(axis=-2)).astype(float)
 
 

@@ -60,20 +60,19 @@ def _followed(stepper, map_, lanes: Lanes, args, saving: Saving) -> tuple[Any, R
     now, winding = stepper.begun(lanes.y, lost), lanes.winding.astype(float)
     while done < count and going.any():
         steps = min(count - done, max(1, _AT_ONCE // num))
-        numbers = done + 1 + np.arange(steps)
-        task = stepper.steps(now, steps, _args(map_, args, num, numbers - 1))
+        task = stepper.steps(now, steps, _args(map_, args, num, done + np.arange(steps)))
         most = np.maximum(lanes.iterations, task.most).astype(lanes.iterations.dtype)
         own = winding[:, None] + np.cumsum(task.turns, axis=1)
-        whole = numbers % saving.every == 0
+        whole = slice(-(done + 1) % saving.every, None, saving.every)  # of which states are saved
         states = stepper.down(task.out[:, whole])
-        y = states if whole.all() else stepper.lift.down(task.out[:, :, 0])  # to tell the domain
+        y = states if saving.every == 1 else stepper.lift.down(task.out[:, :, 0])  # for the domain
         fine = going & (np.arange(steps)[:, None] < task.fine)
         failed = np.where(task.most == stepper.MOST, NOT_CONVERGED, NON_FINITE)
         inside = contains(map_, y, of_runs).T
         lanes, over = judged(lanes, fine, inside, failed, saving.stop_outside)
         lanes = lanes._replace(iterations=most)
         states[over[whole].T] = np.nan
-        block = numbers[whole] // saving.every - 1
+        block = slice(done // saving.every, (done + steps) // saving.every)
         saved[:, block], turns[:, block] = states, own[:, whole]
         going = lanes.status <= LEFT_DOMAIN
         now[0][~going], winding, done = np.nan, own[:, -1], done + steps
