@@ -4,14 +4,17 @@ import ast
 import importlib
 import inspect
 import linecache
+import math
+import re
 import sys
 import textwrap
 
 import numpy as np
 import pytest
+from test_compiled_rollouts import arms
 from test_kernel import lanes_of, law_of
 
-from gfnn_jax.flows import kernel
+from gfnn_jax.flows import compiled_steps, kernel, translated
 from gfnn_jax.flows.translated import compiled, function
 
 LIMIT = 3
@@ -151,3 +154,40 @@ def test_what_has_no_code_is_refused(tmp_path, monkeypatch, written):
 def test_arrays_that_are_not_contiguous_are_refused():
     with pytest.raises(ValueError, match="contiguous"):
         loops(np.zeros(3, np.int64), np.zeros((2, 7)).T, (np.zeros(7), np.zeros(7)))
+
+
+@compiled("a test", 1)
+def calls(x):
+    for i in range(len(x)):
+        x[i] = math.sin(x[i]) + math.cos(x[i]) + math.exp(x[i]) ** x[i] + math.log(x[i])
+        x[i] += math.tan(x[i]) + math.sinh(x[i]) + math.cosh(x[i]) + math.tanh(x[i])
+        x[i] += math.atan(x[i]) + math.hypot(x[i], 2.0) + math.sqrt(x[i]) + np.rint(x[i])
+
+
+@pytest.mark.parametrize("loop", [kernel.follow, compiled_steps.roll, calls])
+def test_all_that_code_calls_is_known_beforehand(monkeypatch, loop):
+    """LLVM looks for other functions itself, and ends the process where there is none."""
+    texts, module = [], translated._module
+
+    def kept(*given):
+        texts.append(module(*given))
+        return texts[-1]
+
+    monkeypatch.setattr(translated, "_module", kept)
+    monkeypatch.setattr(translated, "_folder", lambda: None)
+    monkeypatch.setattr(loop, "made", {})
+    if loop is calls:
+        loop(np.ones(3))
+    elif loop is kernel.follow:
+        (form, p), (x, h, u) = law_of(2, True, True, shapes=True), lanes_of(2, 1)
+        form.step(p, x, h, u[:, :1], 2)
+    else:
+        arms("alone")[0].rollout(np.zeros(4), 10_000)
+    machine = translated._machine()
+    code = machine.emit_assembly(translated._optimised(texts[0], machine))
+    called = re.findall(r"(?:\$|:\w+:|\b(?:callq?|bl)[ \t]+)([A-Za-z_]\w*)(?![\w.])", code)
+    names, mac = translated._library(), sys.platform == "darwin"
+    called = {name[mac:] for name in called}
+    assert {"tan", "tanh"} <= called <= {*names}
+    declared = re.findall(r"^declare \w+ @(?:llvm\.)?(\w+)", texts[0], re.MULTILINE)
+    assert {*declared} <= {*names} | {"fptosi"}

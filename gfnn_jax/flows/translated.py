@@ -42,6 +42,8 @@ _WIDER = {BOOL: 0, WHOLE: 1, FLOAT: 2}
 _ELEMENTS = {"l": WHOLE, "q": WHOLE, "d": FLOAT}
 _INTRINSIC = {"fabs": "fabs"} | dict.fromkeys(("sin", "cos", "exp", "log", "sqrt", "rint"), "")
 _OF_C = {"tan": 1, "sinh": 1, "cosh": 1, "tanh": 1, "atan": 1, "hypot": 2}
+# What LLVM makes of loops, and of a sine beside a cosine: each platform has some of these.
+_OF_LLVM = ("sincos", "__sincos_stret", "memcpy", "memmove", "memset", "bzero", "__bzero")
 _WORDS = {ast.Add: "add", ast.Sub: "sub", ast.Mult: "mul"}
 _ORDERS = {ast.Lt: "lt", ast.LtE: "le", ast.Gt: "gt", ast.GtE: "ge", ast.Eq: "eq", ast.NotEq: "ne"}
 _lock = threading.RLock()  # of compilation
@@ -120,7 +122,7 @@ class Compiled:
         if not code:
             compiling.say(f"compiling, once on this machine, {self._said}")
             try:
-                code = _optimised(_module(self.plain, arguments), machine)
+                code = machine.emit_object(_optimised(_module(self.plain, arguments), machine))
             finally:
                 compiling.say("")
             if kept is not None:
@@ -199,13 +201,26 @@ def _keep(kept: Path, code: bytes) -> None:
 
 
 @cache
+def _library() -> dict[str, int]:
+    """Where C's functions stand that compiled code may call: LLVM ends the process where one that
+    it looks for itself is missing."""
+    files = ("ucrtbase.dll", "vcruntime140.dll") if os.name == "nt" else (None,)  # the process
+    libraries = [ctypes.CDLL(file) for file in files]
+    found = {}
+    for name in ("copysign", "pow", *_INTRINSIC, *_OF_C, *_OF_LLVM):
+        for library in libraries:
+            if hasattr(library, name):
+                found[name] = ctypes.cast(getattr(library, name), ctypes.c_void_p).value or 0
+    return found
+
+
+@cache
 def _machine() -> Any:
     """Describe this processor to LLVM."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    if os.name == "nt":  # elsewhere the process has them
-        for library in ("ucrtbase.dll", "vcruntime140.dll"):
-            llvm.load_library_permanently(library)
+    for name, place in _library().items():
+        llvm.add_symbol(name, place)
     target = llvm.Target.from_default_triple()
     return target.create_target_machine(
         cpu=llvm.get_host_cpu_name(),
@@ -215,8 +230,8 @@ def _machine() -> Any:
     )
 
 
-def _optimised(text: str, machine: Any) -> bytes:
-    """Machine code of a module."""
+def _optimised(text: str, machine: Any) -> Any:
+    """The module of a text, optimised for this processor."""
     module = llvm.parse_assembly(text)
     module.verify()
     options = llvm.create_pipeline_tuning_options(speed_level=2)
@@ -226,7 +241,7 @@ def _optimised(text: str, machine: Any) -> bytes:
     options.loop_unrolling = False
     passes = llvm.create_pass_builder(machine, options)
     passes.getModulePassManager().run(module, passes)
-    return machine.emit_object(module)
+    return module
 
 
 def _module(plain: Callable, arguments: tuple) -> str:
