@@ -68,7 +68,7 @@ def _followed(stepper, map_, lanes: Lanes, args, saving: Saving) -> tuple[Any, R
         y = states if saving.every == 1 else stepper.lift.down(task.out[:, :, 0])  # for the domain
         fine = going & (np.arange(steps)[:, None] < task.fine)
         failed = np.where(task.most == stepper.MOST, NOT_CONVERGED, NON_FINITE)
-        inside = contains(map_, y, of_runs).T
+        inside = _inside(map_, y, of_runs)
         lanes, over = judged(lanes, fine, inside, failed, saving.stop_outside)
         lanes = lanes._replace(iterations=most)
         states[over[whole].T] = np.nan
@@ -78,6 +78,14 @@ def _followed(stepper, map_, lanes: Lanes, args, saving: Saving) -> tuple[Any, R
         now[0][~going], winding, done = np.nan, own[:, -1], done + steps
     states = _outside(map_, saved, turns)
     return states, RolloutInfo(lanes.status, lanes.left_at, lanes.iterations)
+
+
+def _inside(map_, y: np.ndarray, of_runs) -> np.ndarray:
+    """Which states y (B, M, n) lie in the domain (M, B), so few at a time that their monomials stay
+    in a near memory."""
+    most = max(1, _AT_ONCE // (16 * len(y)))
+    parts = (y[:, first : first + most] for first in range(0, y.shape[1], most))
+    return np.concatenate([contains(map_, part, of_runs) for part in parts], axis=1).T
 
 
 def _args(map_, args, num: int, numbers: np.ndarray) -> Any:
