@@ -8,7 +8,8 @@ from analytic import mechanics
 
 from gfnn_jax.families.friction import LINEAR, QUADRATIC, Friction
 from gfnn_jax.families.lagrangian import Lagrangian, Terms
-from gfnn_jax.flows.compiled_steps import CONSTANT, INVERSE, JOINED, SIN, Stepper, _turns, program
+from gfnn_jax.flows.compiled_steps import CONSTANT, INVERSE, JOINED, SIN, Stepper, program
+from gfnn_jax.flows.sines import sines
 from gfnn_jax.flows.translated import compiled
 from gfnn_jax.maps import lanes
 from gfnn_jax.maps.inputs import Signals
@@ -69,8 +70,8 @@ def test_a_lane_does_not_depend_on_those_beside_it():
 
 
 @compiled("a test", 1)
-def sines(x, sine, cosine):
-    _turns(x, sine, cosine, len(x))
+def both(x, sine, cosine):
+    sines(x, sine, cosine, len(x))
 
 
 @pytest.mark.parametrize("size", [1e-9, 1.0, 50.0, 9e5, 1e9])
@@ -78,12 +79,12 @@ def test_sines_are_right_to_their_last_digit(size):
     x = size * np.random.default_rng(0).uniform(-1, 1, 500)
     x = np.concatenate([x, np.rint(x / np.pi * 2) * np.pi / 2])
     found = np.empty_like(x), np.empty_like(x)
-    sines(x, *found)
+    both(x, *found)
     with mpmath.workprec(200):
         for values, of in zip(found, (mpmath.sin, mpmath.cos), strict=True):
             off = [float(of(a) - b) for a, b in zip(x.tolist(), values.tolist(), strict=True)]
             assert np.max(abs(np.array(off)) / np.spacing(abs(values))) < 0.8
-    sines(x := np.full(8, np.inf), *(found := (np.empty(8), np.empty(8))))
+    both(x := np.full(8, np.inf), *(found := (np.empty(8), np.empty(8))))
     assert np.isnan(found).all()
 
 

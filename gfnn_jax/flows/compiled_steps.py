@@ -30,6 +30,7 @@ from gfnn_jax.flows.collective import Casimirs
 from gfnn_jax.flows.flow import Flow
 from gfnn_jax.flows.gauss import gauss
 from gfnn_jax.flows.lifts import Itself
+from gfnn_jax.flows.sines import sines, two_sum
 from gfnn_jax.flows.translated import compiled, function
 from gfnn_jax.flows.uniform import CaldirolaKanai, Uniform
 
@@ -292,13 +293,6 @@ def program(field: Callable[[np.ndarray, Any], Any], width: int, given: int) -> 
 
 
 @function
-def _two_sum(a, b):
-    total = a + b
-    rest = total - a
-    return total, (a - (total - rest)) + (b - rest)
-
-
-@function
 def _high(a):
     split = _SPLIT * a
     return split - (split - a)
@@ -309,42 +303,6 @@ def _two_product(a, b):
     total, high, other = a * b, _high(a), _high(b)
     low, below = a - high, b - other
     return total, ((high * other - total) + high * below + low * other) + low * below
-
-
-@function
-def _turns(x, sine, cosine, columns):
-    """Sines and cosines of x, to 0.8 of their last digit: by their power series at y, what a
-    multiple of π/2 leaves of x, in arithmetic that processors do on several columns at once."""
-    far = 0
-    for k in range(columns):
-        far += abs(x[k]) > 1e6  # where the product of the multiple and 33 digits would be rounded
-    if far > 0:
-        for k in range(columns):
-            sine[k], cosine[k] = math.sin(x[k]), math.cos(x[k])
-        return
-    for k in range(columns):
-        quarters = np.rint(x[k] * 0.6366197723675814)
-        # π/2 is the sum of three numbers, the first two of 33 digits (Cody & Waite).
-        part, by = x[k] - quarters * 1.5707963267341256, quarters * 6.077100506303966e-11
-        near, lost = _two_sum(part, -by)
-        lost -= quarters * 2.0222662487959506e-21
-        y, rest = _two_sum(near, lost)
-        z, zz = y * y, y * y * (y * y)
-        of_sine = (1 / 6227020800 - z * (1 / 1307674368000)) + zz * (1 / 355687428096000)
-        of_sine = (1 / 362880 - z * (1 / 39916800)) + zz * of_sine
-        of_sine = (1 / 120 - z * (1 / 5040)) + zz * of_sine
-        of_cosine = (1 / 20922789888000 - z * (1 / 6402373705728000)) * zz
-        of_cosine = (1 / 479001600 - z * (1 / 87178291200)) + of_cosine
-        of_cosine = (1 / 40320 - z * (1 / 3628800)) + zz * of_cosine
-        of_cosine = (1 / 24 - z * (1 / 720)) + zz * of_cosine
-        cube, begun, lost = z * y, 1.0 - 0.5 * z, (1.0 - (1.0 - 0.5 * z)) - 0.5 * z
-        sin = y - ((z * (0.5 * rest - cube * of_sine) - rest) + cube * (1 / 6))
-        cos = begun + (lost + (zz * of_cosine - y * rest))
-        turned = quarters - 4.0 * np.rint(0.25 * quarters)
-        odd, behind = abs(turned) == 1.0, abs(turned) == 2.0
-        first, second = cos if odd else sin, sin if odd else cos
-        sine[k] = -first if behind or turned == -1.0 else first
-        cosine[k] = -second if behind or turned == 1.0 else second
 
 
 @function
@@ -393,10 +351,10 @@ def _run(law, v, places, shape):
             for s in range(columns):
                 v[i, s] = 1.0 / v[a, s]
         elif kind == SIN:
-            _turns(v[a], v[i], v[i + 1 if code[i, 2] > 0 else len(code)], columns)
+            sines(v[a], v[i], v[i + 1 if code[i, 2] > 0 else len(code)], columns)
         elif kind == COS:
             if code[i, 2] == 0:
-                _turns(v[a], v[len(code)], v[i], columns)
+                sines(v[a], v[len(code)], v[i], columns)
         else:
             for g in range(count):
                 for s in range(g * length, g * length + stages):
@@ -432,12 +390,12 @@ def _kept(w, moved, entries, values, slopes, system):
         by, rest = _two_product(values[e], moved[a])
         slope = values[e]
         if b >= 0:
-            half, below = _two_sum(w[0, b], 0.5 * moved[b])
+            half, below = two_sum(w[0, b], 0.5 * moved[b])
             at = by
             by, more = _two_product(at, half)
             rest = more + (at * (below + w[1, b]) + rest * half)
             slope *= w[0, b] + moved[b]
-        system[k, count], error = _two_sum(system[k, count], by)
+        system[k, count], error = two_sum(system[k, count], by)
         system[k, count + 1] += error + rest
         slopes[k, a] += slope
     for k in range(count):
@@ -461,8 +419,8 @@ def _kept(w, moved, entries, values, slopes, system):
         lost = w[1, i]
         for k in range(count):
             lost -= system[k, count] * slopes[k, i]
-        begun, rest = _two_sum(w[0, i], moved[i])
-        w[0, i], w[1, i] = _two_sum(begun, lost + rest)
+        begun, rest = two_sum(w[0, i], moved[i])
+        w[0, i], w[1, i] = two_sum(begun, lost + rest)
 
 
 @function
@@ -478,9 +436,9 @@ def _sheared(w, slopes, q, p):
         return
     for i in range(4):
         by, rest = _two_product(-share, w[0, q + i])
-        total, error = _two_sum(w[0, p + i], by)
+        total, error = two_sum(w[0, p + i], by)
         rest += error - share * w[1, q + i] + w[1, p + i]
-        w[0, p + i], w[1, p + i] = _two_sum(total, rest)
+        w[0, p + i], w[1, p + i] = two_sum(total, rest)
         for s in range(slopes.shape[1]):
             slopes[p + i, s] -= share * slopes[q + i, s]
 
@@ -527,8 +485,8 @@ def _turned(w, place, centre):
     if turns == 0.0 or not abs(turns) < np.inf:
         return 0.0
     by, rest = _two_product(-turns, _TWO_PI)
-    total, error = _two_sum(w[0, place], by)
-    w[0, place], w[1, place] = _two_sum(total, error + rest - turns * _BEYOND + w[1, place])
+    total, error = two_sum(w[0, place], by)
+    w[0, place], w[1, place] = two_sum(total, error + rest - turns * _BEYOND + w[1, place])
     return turns
 
 

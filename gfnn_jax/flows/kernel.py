@@ -42,6 +42,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gfnn_jax.flows.sines import sines
 from gfnn_jax.flows.translated import compiled, function
 
 FINE, UNFINISHED, LOST = range(3)  # status of a lane: followed; too many events; not finite
@@ -79,10 +80,10 @@ NUM_SIZES = 28
 # the begin; forces; momenta ∂L/∂v; of terms θ, cos φ, sin φ, f, ∂f/∂q · v; cos and sin of each
 # wave; ∂θ/∂c without zeros; of friction ρ, ε, dr/ds, λ and the most that it can be, both at the
 # begin, modes (1 or −1 where it slides, 0 where it sticks), directions that turned, that are
-# carried, and speeds along the modes at the end; a row of derivatives; operands of operations, and
-# a row as long as the stack; powers of coordinates with derivatives; rates and inputs at the
-# stages; the tableau of Dormand and Prince. Numbers of other modules would stay as they were in
-# compiled code, which is known by this file.
+# carried, and speeds along the modes at the end; a row of derivatives, or of phases; operands of
+# operations, and a row as long as the stack; powers of coordinates with derivatives; rates and
+# inputs at the stages; the tableau of Dormand and Prince. Numbers of other modules would stay as
+# they were in compiled code, which is known by this file.
 X0, X1, X, A, A_FIRST, FORCE, MOMENTUM, THETA, COS_PHASE, SIN_PHASE, FACTOR, ALONG = range(12)
 COSINE, SINE, PARTS, LOSSES, WIDTHS, PULL, HELD, LIMIT, HELD_FIRST, LIMIT_FIRST = range(12, 22)
 MODES, TURNED, CARRIED, AFTER, ROW, POWER, POWER_BY, POWER_BY_TWO = range(22, 30)
@@ -117,6 +118,19 @@ class Task(NamedTuple):
     by: np.ndarray
     after: np.ndarray
     status: np.ndarray
+
+
+@function
+def _add(row, share, other):
+    """Add a share of another row to a row."""
+    for m in range(len(row)):
+        row[m] += share * other[m]
+
+
+@function
+def _copy(row, other):
+    for m in range(len(row)):
+        row[m] = other[m]
 
 
 @function
@@ -287,12 +301,15 @@ def _terms(n, f, gamma, u, order):
         f[MOMENTUM, i] = 0.0
         for k in range(d):
             f[masses + i, k] = 0.0
-    for wave in range(n[SIZES, NUM_WAVES]):
-        j, phase = n[WAVES, wave], 0.0
-        for i in range(n[COUNT, j]):
-            phase += n[modes + i, j] * f[X, n[COORDINATES + i, j]]
-        f[COSINE, wave + 1] = math.cos(phase)
-        f[SINE, wave + 1] = math.sin(phase)
+    waves = (n[SIZES, NUM_WAVES] + 8) // 8 * 8  # with that of no angle, and others of none
+    for wave in range(waves):
+        phase = 0.0
+        if 0 < wave <= n[SIZES, NUM_WAVES]:
+            j = n[WAVES, wave - 1]
+            for i in range(n[COUNT, j]):
+                phase += n[modes + i, j] * f[X, n[COORDINATES + i, j]]
+        f[ROW, wave] = phase
+    sines(f[ROW], f[SINE], f[COSINE], waves)
     for j in range(n[SIZES, TERMS]):
         degree, count = n[DEGREE, j], n[COUNT, j]
         powered, wave, product = n[POWERED, j] > 0, n[WAVE, j], 1.0
@@ -609,7 +626,6 @@ def _smooth(n, f, span, order, u):
     rows from u on; a and λ at its begin stay in A_FIRST and HELD_FIRST. With an ``order`` below 0
     the rates at X alone, with inputs in the row u."""
     d = n[SIZES, DIM]
-    width = _width(n, order)
     begin, end, stage, slopes = n[SIZES, D0], n[SIZES, D1], n[SIZES, D], n[SIZES, SLOPES]
     raw, response, rows = n[SIZES, RAW], n[SIZES, RESPONSE], 2 * d if order > 0 else 0
     for i in range(_STAGES + 1):
@@ -623,13 +639,11 @@ def _smooth(n, f, span, order, u):
                     share = f[shares, j]
                     f[x, k] += share * span * f[RATES + j, k]
             for k in range(rows):
-                for m in range(width):
-                    f[target + k, m] = f[begin + k, m]
+                _copy(f[target + k], f[begin + k])
                 for j in range(i):
                     share = span * f[shares, j]
                     if share != 0.0:
-                        for m in range(width):
-                            f[target + k, m] += share * f[slopes + 2 * d * j + k, m]
+                        _add(f[target + k], share, f[slopes + 2 * d * j + k])
         if last:
             return
         _rates(n, f, u + i, order)
@@ -645,22 +659,18 @@ def _smooth(n, f, span, order, u):
                 f[HELD_FIRST, k], f[LIMIT_FIRST, k] = f[HELD, k], f[LIMIT, k]
         slope = slopes + 2 * d * i
         for k in range(rows // 2):
-            for m in range(width):
-                f[slope + k, m] = f[stage + d + k, m]
+            _copy(f[slope + k], f[stage + d + k])
+            for m in range(f.shape[1]):
                 f[slope + d + k, m] = 0.0
         for k in range(rows // 2):
-            for m in range(width):
+            for m in range(f.shape[1]):
                 f[ROW, m] = f[raw + k, m] if m >= 2 * d else 0.0
             for j in range(2 * d):
-                by = f[raw + k, j]
-                if by != 0.0:
-                    for m in range(width):
-                        f[ROW, m] += by * f[stage + j, m]
+                if f[raw + k, j] != 0.0:
+                    _add(f[ROW], f[raw + k, j], f[stage + j])
             for j in range(d):
-                by = f[response + j, k]
-                if by != 0.0:
-                    for m in range(width):
-                        f[slope + d + j, m] -= by * f[ROW, m]
+                if f[response + j, k] != 0.0:
+                    _add(f[slope + d + j], -f[response + j, k], f[ROW])
 
 
 @function
@@ -963,8 +973,7 @@ def follow(n, f, laws, task, order):
                         f[X0, i] = f[X1, i]
                         size += abs(f[X0, i])
                     for i in range(rows):
-                        for k in range(f.shape[1]):
-                            f[begin + i, k] = f[end + i, k]
+                        _copy(f[begin + i], f[end + i])
                     done += part * left
                     if not size < np.inf:
                         status = LOST

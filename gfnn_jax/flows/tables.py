@@ -54,7 +54,7 @@ _FUNCTIONS = {
     "arctan": row.ARCTAN,
     "abs": row.ABS,
 }
-_LANES = 4  # numbers that a processor works on at once: rows of derivatives are filled up to it
+_LANES = 8  # numbers that a processor works on at once: rows of derivatives are filled up to it
 
 
 class Tables(NamedTuple):
@@ -157,7 +157,6 @@ class Tables(NamedTuple):
         d, most = int(sizes[row.DIM]), int(sizes[: row.MASSES].max()) + 1
         longest = max(width, 2 * d, most, *(len(values) for _, values in self.numbers))
         numbers = np.zeros((self.rows, -(-longest // _LANES) * _LANES))
-        numbers[row.COSINE, 0] = 1.0
         for place, values in self.numbers:
             numbers[place, : len(values)] = values
         self.rooms[width] = numbers
