@@ -8,6 +8,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.cli import main
 from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
 from gfnn_jax.errors import InputError
+from gfnn_jax.signals.short_runs import noise_of_one_law
 from gfnn_jax.signals.splines import splines
 
 NOISE = 1e-3
@@ -51,6 +52,58 @@ def test_runs_share_the_noise():
         y = np.cos(3 * t + rng.uniform(0, 6))[:, None]
         runs.append((t, y + NOISE * rng.normal(size=y.shape)))
     assert splines(runs).sigma[0] == pytest.approx(NOISE, rel=0.3)
+
+
+def short_runs_of_two_carts(rng, count=120):
+    """Runs (t, x (n, 2)) of 6 to 10 readings, and the noise in them: about ten readings in a period
+    of the faster of two modes, in units that differ."""
+    shape = np.linalg.qr(rng.normal(size=(2, 2)))[0] * [[1.0], [rng.choice([1.0, 1e3])]]
+    omega, step = np.array([1.0, rng.uniform(1.5, 2.5)]), rng.uniform(0.2, 0.4)
+    runs = []
+    for _ in range(count):
+        t = step * np.arange(rng.integers(6, 11))
+        sizes, phases = rng.uniform(0.3, 1, 2), rng.uniform(0, 2 * np.pi, 2)
+        runs.append((t, (sizes * np.cos(np.outer(t, omega) + phases)) @ shape.T))
+    sigma = 10 ** rng.uniform(-4, -2) * np.std(np.concatenate([x for _, x in runs]), axis=0)
+    return [(t, x + sigma * rng.normal(size=x.shape)) for t, x in runs], sigma
+
+
+def short_runs_of_a_spring(rng, count=120):
+    """The same of one that hardens."""
+    cubic, step = rng.uniform(0.5, 3), rng.uniform(0.25, 0.45)
+    runs = []
+    for _ in range(count):
+        t = step * np.arange(rng.integers(6, 11))
+        start, motion = rng.uniform(-1, 1, 2), lambda q, v: -q - cubic * q**3 - 0.02 * v
+        runs.append((t, states_in_motion(motion, start, t)[:1].T))
+    sigma = 10 ** rng.uniform(-4, -2) * np.std(np.concatenate([x for _, x in runs]), axis=0)
+    return [(t, x + sigma * rng.normal(size=x.shape)) for t, x in runs], sigma
+
+
+@pytest.mark.parametrize("draw", range(4))
+@pytest.mark.parametrize("make", [short_runs_of_two_carts, short_runs_of_a_spring])
+def test_the_law_of_short_runs_tells_their_noise(make, draw):
+    runs, sigma = make(np.random.default_rng(draw))
+    tables = [{"t": t, **{f"x{k}": x for k, x in enumerate(y.T)}} for t, y in runs]
+    recording = gfnn.Recording(tables, positions=[*tables[0]][1:], angles=[])
+    np.testing.assert_allclose(measure(stretches(recording)).sigma, sigma, rtol=0.15)
+
+
+def test_a_coordinate_that_does_not_show_is_not_taken_for_noise():
+    runs, _ = short_runs_of_two_carts(np.random.default_rng(0))
+    assert noise_of_one_law([(t, x[:, :1], x[:, :0]) for t, x in runs]) is None
+    assert noise_of_one_law([(t, x, x[:, :0]) for t, x in runs]) is not None
+    apart = [(t + 0.1 * np.sin(7 * t), x, x[:, :0]) for t, x in runs]
+    assert noise_of_one_law(apart) is None  # at uneven times
+
+
+def test_runs_whose_readings_nearly_coincide_have_splines():
+    rng = np.random.default_rng(0)
+    runs = []
+    for _ in range(60):
+        t = np.sort(np.append(rng.uniform(0, 2, 3), 0.6 + 1e-4 * np.arange(3)))
+        runs.append((t, np.cos(3 * t)[:, None] + NOISE * rng.normal(size=(len(t), 1))))
+    assert np.isfinite(splines(runs).sigma).all()
 
 
 def test_every_reading_is_used_and_nodes_stand_between():

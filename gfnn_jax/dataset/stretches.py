@@ -23,6 +23,7 @@ import numpy as np
 from gfnn_jax.data.recording import Recording, args_of, channels_of
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.signals.local_polynomials import Smooth, choose_half, smooth
+from gfnn_jax.signals.short_runs import noise_of_one_law
 from gfnn_jax.signals.splines import FEWEST, Splines, splines, with_rates
 
 GAP = 3.5  # median steps: a longer one ends a stretch, where sampling is even or inputs act
@@ -325,7 +326,7 @@ def by_rates(
 
 def measure(found: Sequence[Stretch]) -> Scales:
     """Noise, speeds and the fastest frequency, from local cubics at some two thousand samples, or
-    from splines."""
+    from splines; the noise of short runs from the law that they share."""
     every = max(1, sum(len(s.t) for s in found) // 2_000)
     if all(s.even for s in found):
         steps, half, sigma = _windows([(s.t, s.q) for s in found])
@@ -345,6 +346,10 @@ def measure(found: Sequence[Stretch]) -> Scales:
         raise InputError(f"position {still} does not move: leave it out of --positions")
     if not all(np.array_equal(s.y, s.q, equal_nan=True) for s in found):
         sigma = _noise_of_channels(found)
+    if isinstance(half, Splines) and np.median([len(s.t) for s in found]) < 2 * OPTIONS.shortest:
+        others = [np.concatenate([s.u, np.tile(s.args, (len(s.t), 1))], axis=1) for s in found]
+        told = noise_of_one_law([(s.t, s.y, o) for s, o in zip(found, others, strict=True)])
+        sigma = sigma if told is None else told
     moves = [
         np.concatenate([np.diff(s.y[have, k]) for s in found for have in [~np.isnan(s.y[:, k])]])
         for k in range(found[0].y.shape[1])

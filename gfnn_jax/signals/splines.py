@@ -17,6 +17,7 @@ its own noise needs, the other runs determine it. Readings of dy/dt are rows B' 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -160,9 +161,12 @@ class _Problem:
         """λ of the largest restricted likelihood, and σ there."""
         low, high, by = _OPTIONS.stiffness
         tried = 10.0 ** np.arange(low, high + by / 2, by)
-        found = [self._solved(stiffness) for stiffness in tried]
-        best = int(np.argmin([unlikely for unlikely, _, _ in found]))
-        return float(tried[best]), found[best][1]
+        found = []
+        for stiffness in tried.tolist():
+            with contextlib.suppress(np.linalg.LinAlgError):  # readings of a run nearly coincide
+                unlikely, sigma, _ = self._solved(stiffness)
+                found.append((unlikely, stiffness, sigma))
+        return min(found)[1:]
 
     def curve(self, stiffness: float) -> Any:
         """The curve of the first run."""
