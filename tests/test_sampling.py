@@ -1,13 +1,19 @@
 """Uneven, incomplete and short recordings, and sensors that show no position."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from analytic import states_in_motion
 
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
-from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
+from gfnn_jax.dataset.stretches import Nodes, measure, nodes_of, stretches
 from gfnn_jax.errors import InputError
+from gfnn_jax.models.lagrangians import weak_form
+from gfnn_jax.models.lagrangians import windows as windows_module
+from gfnn_jax.models.lagrangians.recordings import samples_of
+from gfnn_jax.models.lagrangians.starts import best_start
 from gfnn_jax.signals.short_runs import noise_of_one_law
 from gfnn_jax.signals.splines import splines
 
@@ -95,6 +101,33 @@ def test_a_coordinate_that_does_not_show_is_not_taken_for_noise():
     assert noise_of_one_law([(t, x, x[:, :0]) for t, x in runs]) is not None
     apart = [(t + 0.1 * np.sin(7 * t), x, x[:, :0]) for t, x in runs]
     assert noise_of_one_law(apart) is None  # at uneven times
+
+
+def test_all_libraries_of_a_start_share_the_windows(monkeypatch):
+    runs, _ = short_runs_of_a_spring(np.random.default_rng(0), 40)
+    tables = [{"t": t, "x": x[:, 0]} for t, x in runs]
+    problem = samples_of(gfnn.Recording(tables, positions=["x"], angles=[])).problem
+    made, tried = [], []
+    own, rows = Nodes.evenly, weak_form.weak_rows
+    monkeypatch.setattr(Nodes, "evenly", lambda node, *a: made.append(node) or own(node, *a))
+    monkeypatch.setattr(weak_form, "weak_rows", lambda *a: tried.append(a) or rows(*a))
+    best_start(problem)
+    assert len(tried) > 1
+    assert len(made) == len(problem.nodes)
+
+
+def test_windows_of_parts_of_the_nodes_add_up(monkeypatch):
+    runs, _ = short_runs_of_two_carts(np.random.default_rng(0), 40)
+    tables = [{"t": t, "x1": x[:, 0], "x2": x[:, 1]} for t, x in runs]
+    recording = gfnn.Recording(tables, positions=["x1", "x2"], angles=[])
+    windows = samples_of(recording).problem.windows
+    few = dataclasses.replace(windows_module.OPTIONS, most=100)
+    monkeypatch.setattr(windows_module, "OPTIONS", few)
+    parts = list(windows.parts(4))
+    assert len(parts) > 1
+    np.testing.assert_allclose(
+        sum(part.along(part.x) for part in parts), windows.along(windows.x), rtol=1e-9, atol=1e-12
+    )
 
 
 def test_runs_whose_readings_nearly_coincide_have_splines():

@@ -51,7 +51,7 @@ def noise_of_one_law(
     rows, told, follows = [], [], []
     for t, y, others in runs:
         even = np.abs(np.diff(t) / step - 1) < _OPTIONS.even
-        known = np.isfinite(np.concatenate([y, others], axis=1)).all(axis=1)
+        known = np.all(np.isfinite(np.concatenate([y, others], axis=1)), axis=1)
         first = np.flatnonzero(even[:-1] & even[1:] & known[:-2] & known[1:-1] & known[2:])
         rows.append(y[first[:, None] + np.arange(3)])
         told.append(np.concatenate([others[first + k] for k in range(3)], axis=1))

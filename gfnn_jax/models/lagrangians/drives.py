@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.sparse import block_diag, vstack
 
 from gfnn_jax.families.friction import LINEAR
 from gfnn_jax.fitting.evidence import EVIDENCE
@@ -27,7 +26,9 @@ from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit
 from gfnn_jax.models.lagrangians.input_rules import correction
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.models.lagrangians.weak_form import OPTIONS as WEAK
-from gfnn_jax.models.lagrangians.weak_form import Bumps, summed, weak_rows
+from gfnn_jax.models.lagrangians.weak_form import weak_rows
+from gfnn_jax.models.lagrangians.windows import OPTIONS as WINDOWS
+from gfnn_jax.models.lagrangians.windows import Windows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,23 +169,21 @@ def _left_of(problem: ArcProblem, stiff: bool) -> tuple[Callable[[float], float]
     terms = libraries.without_forces(rows, problem.observation.shifts())
     friction = tuple(libraries.losses(d, (LINEAR,), 0.0)[:d])
     form = Structure(d, terms, friction, (), problem.num_inputs).form(problem.gauge)
-    lengths = [length * problem.scales.period for length in WEAK.lengths]
-    parts = [weak_rows(form, n, length) for n in problem.nodes for length in lengths]
-    X, y = (np.concatenate(part) for part in zip(*parts, strict=True))
+    lengths = [np.full(len(problem.nodes), one * problem.scales.period) for one in WINDOWS.lengths]
+    windows = Windows.of(problem.nodes, lengths)
+    X, y = weak_rows(form, windows)
     X, y = X.reshape(-1, X.shape[-1]), y.reshape(-1)
     X = X[:, X.any(axis=0)]
     U, s, _ = np.linalg.svd(X / np.linalg.norm(X, axis=0), full_matrices=False)
     Q = U[:, s > OPTIONS.rank * np.max(s, initial=0.0)]
     y = y - Q @ (Q.T @ y)
-    t, q = np.concatenate([n.t for n in problem.nodes]), problem.states[:, :d]
-    bumps = [vstack([Bumps.of(n.t, length).phi for length in lengths]) for n in problem.nodes]
-    weights = block_diag(bumps, format="csr")
-    factors = _factors(q, angles, stiff).T[:, None]  # (n, 1, m)
+    factors = _factors(windows.x[:, :d], angles, stiff).T[:, None]  # (n, 1, m)
     many = 2 * factors.shape[-1]
 
     def left(omega: float) -> float:
-        waves = np.stack([np.cos(omega * t), np.sin(omega * t)], axis=1)[..., None]
-        both = summed(weights, waves * factors).reshape(-1, many)
+        turned = omega * windows.t
+        waves = np.stack([np.cos(turned), np.sin(turned)], axis=1)[..., None]
+        both = windows.along(waves * factors).reshape(-1, many)
         A = (both[:, None, None, :] * np.eye(d)[:, :, None]).reshape(len(y), many * d)
         A = A - Q @ (Q.T @ A)
         c = np.linalg.lstsq(A, y, rcond=OPTIONS.rank)[0]

@@ -23,6 +23,7 @@ from gfnn_jax.models.lagrangians.arc_inputs import ArcInputs
 from gfnn_jax.models.lagrangians.libraries import FRICTIONS
 from gfnn_jax.models.lagrangians.structure import Key, Structure, is_constant
 from gfnn_jax.models.lagrangians.text import Names, word_of
+from gfnn_jax.models.lagrangians.windows import Windows
 from gfnn_jax.solve.latent_arcs import Defects, Fitted, Observed, Readings
 from gfnn_jax.solve.noise import Wander
 
@@ -273,6 +274,11 @@ class ArcProblem:
     @functools.cached_property
     def systems(self) -> Systems:
         return Systems.of(self.parameters, self.nodes)
+
+    @functools.cached_property
+    def windows(self) -> Windows:
+        """The windows of weak forms."""
+        return Windows.of_record(self.nodes, self.scales)
 
     @property
     def states(self) -> np.ndarray:

@@ -243,9 +243,9 @@ class _Starts:
             return
         periods = problem.options.periods[0]
         rule = choose_rule(problem, structure, known, seen.arcs(periods), problem.scales.sigma)
-        # Inputs act so in the other libraries too.
         inputs = rule.fit.problem.inputs
-        self.problem = dataclasses.replace(problem, inputs=inputs, rules=(rule.hold,))
+        if inputs is not problem.inputs:  # which act so in the other libraries too
+            self.problem = dataclasses.replace(problem, inputs=inputs, rules=(rule.hold,))
         self.fits.append(rule.fit)
         self.ranks.append(library.rank)
         problem.on_progress(f"arcs of {periods:g} periods: {rule.fit}")

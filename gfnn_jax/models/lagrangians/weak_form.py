@@ -13,12 +13,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
 
-from gfnn_jax.dataset.stretches import Nodes
 from gfnn_jax.errors import FitError
 from gfnn_jax.families.friction import LINEAR, Friction
 from gfnn_jax.families.lagrangian import Terms, functions_of
@@ -34,15 +32,14 @@ from gfnn_jax.models.lagrangians.structure import (
     cosine_of,
     is_constant,
 )
+from gfnn_jax.models.lagrangians.windows import Windows
 
 
 @dataclasses.dataclass(frozen=True)
 class WeakOptions:
     """Options of the weak form (`benchmarks/random_recordings.py`).
 
-    lengths: of the windows, in periods. periods: of the longest run, below which windows are
-    shorter too, for there would be few of them, or none. fewest: samples of a window. spacing: of a
-    window's length, to the next. overlap: rows that share samples, of which as many count as one.
+    overlap: rows that share samples, of which as many count as one.
     apart: ratio of the weights of coordinates, at most, since a wrong library would make one of
     them all. rounding: residual of a coordinate to the sizes of its terms, below which a law
     without mass and force solves the equations. slow: of the rms speed of a coordinate, below which
@@ -53,10 +50,6 @@ class WeakOptions:
     forces times distances, that is none about it; some: that forces through one point leave.
     """
 
-    lengths: tuple[float, ...] = (0.5, 1.0)
-    periods: float = 2.0
-    fewest: int = 7
-    spacing: float = 0.25
     overlap: float = 3.0
     apart: float = 100.0
     rounding: float = 1e-9
@@ -98,36 +91,20 @@ class _Equations(NamedTuple):
     @classmethod
     def of(cls, structure: Structure, problem: ArcProblem, equal: bool) -> _Equations:
         """Make those of a structure, with ``equal`` masses where these are constant."""
-        d, nodes, uneven = structure.dim, problem.nodes, problem.scales.uneven
-        if uneven:
-            nodes = [n.evenly(problem.scales.nodes_of(np.ptp(n.t))) for n in nodes]
-        args = np.repeat([n.stretch.args for n in nodes], [len(n.t) for n in nodes], axis=0)
-        form = structure.form(np.concatenate([n.x[:, :d] for n in nodes]), args)
-        period = min(problem.scales.period, max(np.ptp(n.t) for n in nodes) / OPTIONS.periods)
-        lengths = [length * period for length in OPTIONS.lengths]
-        windows = [
-            # of a run that is shorter than a window, all of it
-            (node, min(length, 0.999 * np.ptp(node.t)) if uneven else length)
-            for node in nodes
-            for length in lengths
-        ]
-        rows, targets = zip(*(weak_rows(form, *window) for window in windows), strict=True)
-        bumps = [Bumps.of(n.t, length) for n, length in windows]
-        t = np.concatenate([one.t for one in bumps])
-        X, Y = np.concatenate(rows), -np.concatenate(targets)
+        d, windows = structure.dim, problem.windows
+        form = structure.form(windows.x[:, :d], windows.args)
+        X, fixed = weak_rows(form, windows)
+        Y = -fixed
         if np.any(form.friction.dry):
             least = OPTIONS.slow * np.sqrt(np.mean(problem.states[:, d:] ** 2, axis=0))
-            slow = [1.0 * (np.abs(n.x[:, d:]) < least) for n, _ in windows]
-            inside: list[Any] = [1.0 * (one.phi != 0) for one in bumps]
-            part = [W @ x / W.sum(axis=1)[:, None] for W, x in zip(inside, slow, strict=True)]
-            held = np.concatenate(part) > OPTIONS.held  # by any force up to that of sliding
-            X[held], Y[held] = 0.0, 0.0
+            held = windows.mean(1.0 * (np.abs(windows.x[:, d:]) < least)) > OPTIONS.held
+            X[held], Y[held] = 0.0, 0.0  # held by any force up to that of sliding
         keys = structure.keys()[: form.count]
         keep = [k for k in range(form.count) if np.any(X[..., k])]
         masses = [k for k in keep if equal and keys[k] in protected(structure)]
         keep = [k for k in keep if k not in masses]
         Y = Y - 0.5 * X[..., masses].sum(axis=-1)
-        return cls(keys, X, Y, keep, masses, t)
+        return cls(keys, X, Y, keep, masses, windows.mean(windows.t))
 
 
 def weak_share(structure: Structure, problem: ArcProblem) -> float:
@@ -211,15 +188,11 @@ def promising(fit: LawFit, every: Structure) -> Structure:
     rows = [row for row in every.terms if row not in fit.structure.terms]
     if len(rows) <= OPTIONS.many:
         return every
-    problem, d = fit.problem, every.dim
-    period = min(problem.scales.period, max(np.ptp(n.t) for n in problem.nodes) / OPTIONS.periods)
+    d, windows = every.dim, Windows.longest(fit.problem.nodes, fit.problem.scales)
 
     def columns(terms: Terms, friction: Friction, inputs: int = 0) -> np.ndarray:
         n = terms.count
-        form = Form(terms, np.zeros(n), np.eye(n), friction, inputs)
-        return np.concatenate(
-            [weak_rows(form, node, OPTIONS.lengths[-1] * period)[0] for node in problem.nodes]
-        )
+        return weak_rows(Form(terms, np.zeros(n), np.eye(n), friction, inputs), windows)[0]
 
     linear = [(tuple(axis), LINEAR, 0.0) for axis in np.eye(d, dtype=int).tolist()]
     friction = Friction.of([*fit.structure.friction, *linear], d)
@@ -276,29 +249,26 @@ def centre_of_forces(problem: ArcProblem) -> np.ndarray:
     (q − c) × (q̈ − g + γ q̇) = 0, which is linear in c, g, γ and in products of these. The plainest
     choice of these is taken that leaves hardly any torque, else that by which c is known best.
     """
-    d, period = problem.dim, problem.scales.period
+    d = problem.dim
     if len(problem.observation.direct) < d:
         return np.zeros(d)
-    period = min(period, max(np.ptp(n.t) for n in problem.nodes) / OPTIONS.periods)
-    planes, rows, targets, sizes = list(combinations(range(d), 2)), [], [], []
+    windows = Windows.longest(problem.nodes, problem.scales)
+    q, v = np.split(windows.x, 2, axis=1)
     middle, spread = (of(problem.states[:, :d], axis=0) for of in (np.mean, np.std))
-    for node in problem.nodes:
-        q, v = np.split(node.x, 2, axis=1)
-        bumps = Bumps.of(node.t, OPTIONS.lengths[-1] * period)
-        one = summed(bumps.phi, np.ones(len(q)))
-        bent, speed, place = -summed(bumps.slope, v), summed(bumps.phi, v), summed(bumps.phi, q)
-        sizes.append(np.sum((place / one[:, None] - middle) ** 2, axis=1) @ np.sum(bent**2, axis=1))
-        for at, (i, j) in enumerate(planes):
+    one, place = windows.along(np.ones(len(q))), windows.along(q)
+    bent, speed = -windows.changing(v), windows.along(v)
+    size = np.sum((place / one[:, None] - middle) ** 2, axis=1) @ np.sum(bent**2, axis=1)
+    planes, rows, targets = list(combinations(range(d), 2)), [], []
+    for at, (i, j) in enumerate(planes):
 
-            def across(x: np.ndarray, i: int = i, j: int = j) -> np.ndarray:
-                """Return the factors of a vector (d,) in the plane's part of its product with x."""
-                return np.outer(x[:, j], np.eye(d)[i]) - np.outer(x[:, i], np.eye(d)[j])
+        def across(x: np.ndarray, i: int = i, j: int = j) -> np.ndarray:
+            """Return the factors of a vector (d,) in the plane's part of its product with x."""
+            return np.outer(x[:, j], np.eye(d)[i]) - np.outer(x[:, i], np.eye(d)[j])
 
-            spin = q[:, i] * v[:, j] - q[:, j] * v[:, i]
-            field = [across(place), np.outer(one, np.eye(len(planes))[at])]
-            drag = [across(speed), summed(bumps.phi, spin)[:, None]]
-            rows.append([across(bent), *field, *drag])
-            targets.append(-summed(bumps.slope, spin))
+        spin = q[:, i] * v[:, j] - q[:, j] * v[:, i]
+        field = [across(place), np.outer(one, np.eye(len(planes))[at])]
+        rows.append([across(bent), *field, across(speed), windows.along(spin)[:, None]])
+        targets.append(-windows.changing(spin))
     parts, Y = [np.concatenate(part) for part in zip(*rows, strict=True)], np.concatenate(targets)
     if not len(Y):  # runs are shorter than a window
         return np.zeros(d)
@@ -307,73 +277,43 @@ def centre_of_forces(problem: ArcProblem) -> np.ndarray:
         X = np.concatenate([parts[k] for k in taken], axis=1)
         c, left, inverse = _solve(X[:, None], Y[:, None])
         error = np.sqrt(OPTIONS.overlap * np.mean(left**2)) * np.linalg.norm(inverse[:d])
-        found.append((error, np.sum(left**2) / max(sum(sizes), 1e-300), c[:d]))
+        found.append((error, np.sum(left**2) / max(size, 1e-300), c[:d]))
     plain = [one for one in found if one[1] < OPTIONS.torque]
     error, share, c = plain[0] if plain else min(found, key=lambda one: one[0])
     near = max(OPTIONS.far * np.linalg.norm(spread), problem.options.evidence.significant * error)
     return c if share < OPTIONS.some and np.linalg.norm(c) > near else np.zeros(d)
 
 
-def weak_rows(form: Form, node: Nodes, length: float) -> tuple[np.ndarray, np.ndarray]:
+def weak_rows(form: Form, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
     """Rows (windows, d, count) of the coefficients, and what the fixed part of the law gives
-    (windows, d); their sum with the coefficients is zero for the law. Along the nodes of one
-    segment; ``length`` of the windows in units of t."""
-    terms, d, t = form.terms, form.dim, node.t
-    q, v, u = node.x[:, :d], node.x[:, d:], node.stretch.u[node.at]
-    weights = np.ones(terms.count + form.friction.count)
+    (windows, d); their sum with the coefficients is zero for the law."""
+    terms, d = form.terms, form.dim
+    parts = [_integrals(form, part) for part in windows.parts(terms.count * d)]
+    of_terms, lost = (sum(part) for part in zip(*parts, strict=True))
     if form.powers is not None:
-        weights = functions_of(form.powers, node.stretch.args)[: len(weights)]
-    f, df, _ = terms.potentials(q, 1, u)
-    g, dg = terms.motion(v)
-    momentum = terms.acting(dg * f[..., None]).swapaxes(1, 2)  # (n, d, P)
-    force = terms.acting(df * g[..., None]).swapaxes(1, 2)
-    bumps = Bumps.of(t, length)
-    of_terms = -summed(bumps.slope, momentum) - summed(bumps.phi, force)
-    of_terms = of_terms * weights[: terms.count]
-    lost = summed(bumps.phi, form.friction.residuals(v, u).swapaxes(1, 2))
-    rows = [of_terms @ form.basis, lost * weights[terms.count :]]
+        weights = functions_of(form.powers, windows.systems)[:, None]
+        of_terms, lost = (
+            of_terms * weights[..., : terms.count],
+            lost * weights[..., terms.count : terms.count + form.friction.count],
+        )
+    rows = [of_terms @ form.basis, lost]
     if form.num_inputs:
-        push = -summed(bumps.phi, u[:, None])
+        push = -windows.along(windows.u)[:, None]
         rows.append(
-            (push[:, :, None] * np.eye(d)[:, :, None]).reshape(len(push), d, d * u.shape[1])
+            (push[:, :, None] * np.eye(d)[:, :, None]).reshape(len(push), d, d * push.shape[-1])
         )
     return np.concatenate(rows, axis=2), of_terms @ form.fixed
 
 
-def summed(weights: Any, values: np.ndarray) -> np.ndarray:
-    """Sums (windows, ...) of values (n, ...) by the weights of windows, a sparse array."""
-    shape = (weights.shape[0], *values.shape[1:])
-    return np.asarray(weights @ values.reshape(len(values), -1)).reshape(shape)
-
-
-class Bumps(NamedTuple):
-    """φ dt and φ̇ dt, each (windows, n), at times t (n,), in units of the noise that v brings; and
-    the mean time (windows,) of each window."""
-
-    phi: csr_array
-    slope: csr_array
-    t: np.ndarray
-
-    @classmethod
-    def of(cls, t: np.ndarray, length: float) -> Bumps:
-        """Make windows of this length along the times."""
-        starts = np.arange(t[0], t[-1] - length, OPTIONS.spacing * length)
-        first, last = np.searchsorted(t, starts), np.searchsorted(t, starts + length)
-        keep = last - first >= OPTIONS.fewest
-        starts, first, last = starts[keep], first[keep], last[keep]
-        ends = np.cumsum([0, *(last - first)])
-        window = np.repeat(np.arange(len(starts)), last - first)
-        at = np.arange(ends[-1]) + (first - ends[:-1])[window]
-        s, weight = (t[at] - starts[window]) / length, np.gradient(t)[at]
-        weight[ends[:-1]] = t[first + 1] - t[first]
-        weight[ends[1:] - 1] = t[last - 1] - t[last - 2]
-        bump = s * (1 - s)
-        phi, slope = bump**3 * weight, 3 * bump**2 * (1 - 2 * s) / length * weight
-        norm = np.sqrt(np.bincount(window, slope**2, len(starts)))[window]
-        mean = np.bincount(window, t[at], len(starts)) / (last - first)
-        shape = (len(starts), len(t))
-        phi, slope = (csr_array((x / norm, at, ends), shape) for x in (phi, slope))
-        return cls(phi, slope, mean)
+def _integrals(form: Form, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+    """What each term (windows, d, P) and each friction (windows, d, F) gives along nodes."""
+    terms, (q, v) = form.terms, np.split(windows.x, 2, axis=1)
+    f, df, _ = terms.potentials(q, 1, windows.u)
+    g, dg = terms.motion(v)
+    momentum = terms.acting(dg * f[..., None]).swapaxes(1, 2)  # (n, d, P)
+    force = terms.acting(df * g[..., None]).swapaxes(1, 2)
+    lost = form.friction.residuals(v, windows.u).swapaxes(1, 2)
+    return -windows.changing(momentum) - windows.along(force), windows.along(lost)
 
 
 def _solve(X: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
