@@ -306,7 +306,7 @@ def weak_rows(form: Form, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _integrals(form: Form, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
-    """What each term (windows, d, P) and each friction (windows, d, F) gives along nodes."""
+    """Return the integrals of each term (windows, d, P) and of each friction (windows, d, F)."""
     terms, (q, v) = form.terms, np.split(windows.x, 2, axis=1)
     f, df, _ = terms.potentials(q, 1, windows.u)
     g, dg = terms.motion(v)

@@ -81,16 +81,16 @@ class Windows:
         return cls.of(nodes, [OPTIONS.lengths[-1] * _period(spans, scales) + 0 * spans])
 
     def mean(self, values: np.ndarray) -> np.ndarray:
-        """Means (windows, ...) of values (n, ...) over the nodes inside each window."""
+        """Return the means (windows, ...) of values (n, ...) over the nodes inside each window."""
         inside: Any = 1.0 * (self.phi != 0)
         return ((inside @ values).T / inside.sum(axis=1)).T
 
     def along(self, values: np.ndarray) -> np.ndarray:
-        """∫ φ of values (n, ...): (windows, ...)."""
+        """Integrate φ times values (n, ...): (windows, ...)."""
         return _summed(self.phi, values)
 
     def changing(self, values: np.ndarray) -> np.ndarray:
-        """∫ φ̇ of values (n, ...): (windows, ...)."""
+        """Integrate φ̇ times values (n, ...): (windows, ...)."""
         return _summed(self.slope, values)
 
     def parts(self, width: int) -> Iterator[Windows]:
