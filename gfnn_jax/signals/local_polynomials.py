@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyvander
+from scipy.special import comb
 
 _WIDEST = 1.5  # of the median duration of windows of so many samples; wider ones hold a gap
 _MOST_NUMBERS = 60_000  # in the windows of one fit, for time and memory
@@ -101,12 +102,16 @@ def _windows(times: Sequence[np.ndarray], size: int) -> tuple[np.ndarray, np.nda
 class _Options:
     """halves: windows, samples on either side. samples: where the errors of a window are measured.
     tolerance: of the leave-one-out error, against the best window's. rounding: of a channel's
-    range, below which an error is that of a constant."""
+    range, below which an error is that of a constant. orders: of differences; fewest: of them that
+    tell noise; biased: share of the noise that cubics tell, below which that is theirs."""
 
     halves: tuple[int, ...] = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 64, 80)
     samples: int = 2_000
     tolerance: float = 1.05
     rounding: float = 1e-13
+    orders: tuple[int, ...] = tuple(range(4, 11))
+    fewest: int = 20
+    biased: float = 0.5
 
 
 _OPTIONS = _Options()
@@ -144,7 +149,7 @@ def smooth(
 def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np.ndarray]:
     """The window (samples to either side) for these stretches (t (n,), y (n, d)) of a recording,
     and the noise σ (d,) of the channels: the smallest leave-one-out error, less the cubic's own
-    part."""
+    part, or what is left of differences where that is much less."""
     total = sum(len(t) for t, _ in stretches)
     rounding = _OPTIONS.rounding * np.max([np.ptp(y, axis=0) for _, y in stretches], axis=0)
     every = max(1, total // _OPTIONS.samples)
@@ -165,4 +170,22 @@ def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np
     relative = np.array(errors) / np.maximum(np.min(errors, axis=0), 1e-300)
     score = relative.max(axis=1)
     good = np.flatnonzero(score <= _OPTIONS.tolerance * score.min())
-    return halves[good[-1]], np.min(sigmas, axis=0)
+    sigma = np.min(sigmas, axis=0)
+    by_differences = _by_differences([y for _, y in stretches], rounding)
+    told = by_differences < _OPTIONS.biased * sigma
+    return halves[good[-1]], np.where(told, by_differences, sigma)
+
+
+def _by_differences(each: Sequence[np.ndarray], rounding: np.ndarray) -> np.ndarray:
+    """σ (d,) of white noise by the differences of y (n, d) at even times that are least for their
+    order; infinite of few. Of a smooth motion they vanish with their order, faster than what a
+    cubic leaves."""
+    sigma = np.full(len(rounding), np.inf)
+    for order in _OPTIONS.orders:
+        left = np.concatenate([np.diff(y, order, axis=0) for y in each])
+        gain = np.sqrt(comb(2 * order, order))
+        left[np.abs(left) < rounding * gain] = np.nan
+        enough = np.isfinite(left).sum(axis=0) >= _OPTIONS.fewest
+        size = np.nanmedian(np.abs(left[:, enough]), axis=0) / (0.6745 * gain)
+        sigma[enough] = np.minimum(sigma[enough], size)
+    return sigma
