@@ -148,6 +148,18 @@ def test_local_cubics_measure_the_noise_and_follow_the_motion():
     assert np.sqrt(np.mean((found.v[50:-50, 0] - 2 * np.cos(2 * t[50:-50])) ** 2)) < 5e-3
 
 
+@pytest.mark.parametrize("samples", [10.0, 15.0, 30.0, 100.0])
+def test_noise_of_few_samples_a_period_is_not_what_cubics_leave(samples):
+    """Cubics leave many times the smaller noise there."""
+    rng = np.random.default_rng(3)
+    t = np.arange(600) / samples
+    motion = np.sin(2 * np.pi * t) + 0.3 * np.cos(2.6 * np.pi * t)
+    for noise in (1e-4, 1e-2):
+        y = (motion + noise * rng.normal(size=t.shape))[:, None]
+        np.testing.assert_allclose(choose_half([(t, y)])[1], noise, rtol=0.5)
+
+
+
 def test_inputs_between_samples():
     t = np.arange(0, 10, 0.1)
     u = np.sin(3 * t)[:, None]
