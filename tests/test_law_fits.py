@@ -159,7 +159,6 @@ def test_noise_of_few_samples_a_period_is_not_what_cubics_leave(samples):
         np.testing.assert_allclose(choose_half([(t, y)])[1], noise, rtol=0.5)
 
 
-
 def test_inputs_between_samples():
     t = np.arange(0, 10, 0.1)
     u = np.sin(3 * t)[:, None]
