@@ -47,7 +47,7 @@ class ExchangeOptions:
     collinear are far apart. rounds: exchanges in a row. coloured: neighbours among which a residual
     counts as one, above which the residuals are motion that the law lacks: an exchange then leaves
     at most the share ``explained`` of the cost, or correlations over the share ``whiter`` of these
-    neighbours. listed: rivals, at most.
+    other neighbours. listed: rivals, at most.
     """
 
     most: int = 2
@@ -102,7 +102,7 @@ def _explains(other: LawFit, fit: LawFit) -> bool:
     return (
         fit.correlation < OPTIONS.coloured
         or other.fitted.cost < OPTIONS.explained * fit.fitted.cost
-        or other.correlation < OPTIONS.whiter * fit.correlation
+        or other.correlation - 1 < OPTIONS.whiter * (fit.correlation - 1)
     )
 
 

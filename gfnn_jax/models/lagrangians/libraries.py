@@ -243,6 +243,15 @@ def springs(dim: int, angles: Sequence[int]) -> list[Row]:
     return potentials(dim, angles, 2)
 
 
+def springs_between(dim: int, angles: Sequence[int]) -> list[Row]:
+    """Springs (q_i − q_j)² between angles that stay within a turn, of many between neighbours: a
+    wave of the difference imitates them."""
+    none = (0,) * dim
+    pairs = [p for p in combinations(angles, 2) if dim <= FEW or p[1] == p[0] + 1]
+    shapes = (to_text(parse(f"(q{i + 1}-q{j + 1})**2", dim), dim) for i, j in pairs)
+    return [(none, none, none, 0.0, shape) for shape in shapes]
+
+
 def torques(dim: int, angles: Sequence[int]) -> list[Row]:
     """Constant torques on angles: of a motor, on which V falls with every turn."""
     return potentials(dim, angles, 1)

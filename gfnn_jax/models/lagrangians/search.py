@@ -233,7 +233,7 @@ class TermSearch:
         """The search among all that the coordinates of a problem may have."""
         d, shifted = problem.dim, problem.observation.shifts()
         of = libraries.textbook if problem.observation.crossed else libraries.every
-        rows = of(d, problem.angles)
+        rows = [*of(d, problem.angles), *libraries.springs_between(d, problem.within_a_turn)]
         terms, frictions = (
             libraries.without_forces(rows, shifted),
             frictions_tried(problem),
