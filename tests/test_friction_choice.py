@@ -8,6 +8,7 @@ import pytest
 import gfnn_jax as gfnn
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, QUADRATIC
+from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, Table, WhichFriction, chosen
 from gfnn_jax.models.lagrangians.search import likeliest, without_drives
 from gfnn_jax.models.lagrangians.structure import Structure
@@ -106,10 +107,15 @@ def test_friction_kept_against_odds_is_said_to_be_that_of_fewest_kinds():
     assert "kept" not in str(WhichFriction(("linear",), {"none": 1e7, "linear+dry": 30.0}, {}))
 
 
-def test_friction_that_falls_below_zero_by_longer_arcs_is_dropped():
-    """One at a time, the surest first, and the fit made anew: then the other is above zero."""
+@pytest.mark.parametrize(
+    ("choose", "rest", "left"), [(True, 0.1, 2), (True, 5e-3, 1), (False, 5e-3, 2)]
+)
+def test_friction_that_falls_below_zero_by_longer_arcs_is_dropped(choose, rest, left):
+    """One at a time, the surest first, and the fit made anew: then the other is above zero, or half
+    a standard error, which no one asked for."""
     rows = tuple(((1,), kind, 0.0) for kind in (LINEAR, QUADRATIC, DRY))
-    of = {rows: [0.2, -0.1, -0.2], rows[:2]: [0.2, 0.1]}
+    of = {rows: [0.2, -0.1, -0.2], rows[:2]: [0.2, rest], rows[:1]: [0.2]}
+    options = SimpleNamespace(choose_friction=choose, evidence=EVIDENCE)
 
     told = []
 
@@ -121,12 +127,14 @@ def test_friction_that_falls_below_zero_by_longer_arcs_is_dropped():
             significance={key: 100 * value for key, value in values.items()},
             follows=True,
             again=fit,
-            problem=SimpleNamespace(word=lambda key: key[1], on_progress=told.append),
+            problem=SimpleNamespace(
+                word=lambda key: key[1], on_progress=told.append, options=options
+            ),
         )
 
-    left = without_drives(fit(Structure(1, (((2,), (0,), (0,), 0.0),), rows, (), 0, ())))
-    assert left.structure.friction == rows[:2]
-    assert told == [f"  dropped {rows[2]}: -20.0 standard errors"]
+    found = without_drives(fit(Structure(1, (((2,), (0,), (0,), 0.0),), rows, (), 0, ())))
+    assert found.structure.friction == rows[:left]
+    assert told[0] == f"  dropped {rows[2]}: -20.0 standard errors"
 
 
 def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():

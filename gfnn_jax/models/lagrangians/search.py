@@ -609,12 +609,15 @@ def without_first_mass(fit: LawFit) -> LawFit:
 
 
 def without_drives(fit: LawFit) -> LawFit:
-    """The fit without friction whose coefficient has fallen below zero by other arcs than those
-    that chose it, the farthest below first: friction does not drive."""
+    """The fit without friction whose coefficient has fallen below zero, or of friction that nobody
+    asked for to nothing, by other arcs than those that chose it, the farthest below first: friction
+    does not drive."""
+    options = fit.problem.options
+    least = options.evidence.nothing if options.choose_friction else 0.0
 
     def driving(fit: LawFit) -> list[Key]:
         z = fit.significance if fit.follows else {}
-        return sorted((k for k in z if k[0] == "loss" and fit.values[k] < 0), key=lambda k: z[k])
+        return sorted((k for k in z if k[0] == "loss" and z[k] < least), key=lambda k: z[k])
 
     def without(fit: LawFit, key: Key) -> LawFit:
         _dropped(fit, key, f"{fit.significance[key]:.1f} standard errors")
