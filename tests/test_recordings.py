@@ -292,6 +292,18 @@ def test_every_column_has_its_unit(names, units):
     assert [recording.unit(name) for name in names] == units.split(",")
 
 
+def test_a_shaft_in_turns_is_an_angle_and_what_moves_it_an_input(tmp_path):
+    t = np.linspace(0, 9, 300)
+    turns = 0.3 * np.sin(2 * t)
+    text = "t,Motor Voltage [V],shaft_turns,thrust_N\n" + rows(
+        t, np.round(np.sin(t)), turns, np.cos(t)
+    )
+    recording = gfnn.read(write(tmp_path / "shaft.csv", text))
+    assert recording.angles == ("shaft_turns",)
+    assert set(recording.inputs) == {"Motor Voltage", "thrust_N"}
+    np.testing.assert_allclose(recording.values("shaft_turns", 0), 2 * np.pi * turns, rtol=1e-12)
+
+
 def test_names_as_they_can_stand_in_a_formula():
     names = ("θ₁", "Angle 1", "lambda", "x", "2nd", "a b", "a_b")
     assert symbols(names) == ("theta1", "Angle_1", "lambda_", "x", "q_2nd", "a_b", "a_b_7")

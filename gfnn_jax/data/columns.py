@@ -171,8 +171,8 @@ def _varied(runs: Runs, names: Sequence[str]) -> tuple[str, ...]:
 
 
 # Units of what moves, of its rate, and of what drives it.
-_OF_LENGTHS = re.compile(r"[nµumckd]?m|km|au|px|pixels?|(m?rad|deg|°|degrees?)")
-_OF_TURNING = re.compile(r"(rad|deg|°|degrees?) ?(/|per) ?(s|sec)|dps")
+_OF_LENGTHS = re.compile(r"[nµumckd]?m|km|au|px|pixels?|m?rad|deg|°|degrees?|turns?|revs?")
+_OF_TURNING = re.compile(r"(rad|deg|°|degrees?|turns?|revs?) ?(/|per) ?(s|sec)|dps")
 _OF_DRIVES = re.compile(r"[µumk]?V|[nµum]?A|[mk]?N|N ?·? ?m|Nm", re.IGNORECASE)
 
 
@@ -306,8 +306,9 @@ def angles_of(
     degrees: tuple[str, ...],
     by_names: bool,
     units: Mapping[str, str],
-) -> tuple[tuple[str, ...], set[str]]:
-    """(angles in the order of the positions, columns in degrees)."""
+) -> tuple[tuple[str, ...], dict[str, float]]:
+    """(angles in the order of the positions, radians in the unit of columns in degrees or turns).
+    """
     known = (*roles["positions"], *roles["velocities"])
     check_known(source, "angles", given, roles["positions"])
     check_known(source, "degrees", degrees, known)
@@ -315,8 +316,10 @@ def angles_of(
     if in_radians:
         name = in_radians[0]
         raise InputError(f"{source}: degrees: {name} is in {units[name]} by its header")
-    in_degrees = set(degrees) | {n for n in known if _unit(units, n).startswith(("deg", "°"))}
-    angles = set(given) | {n for n in roles["positions"] if n in in_degrees}
+    others = {n: _unit(units, n) for n in known if n not in degrees}
+    factors = {n: np.pi / 180 for n in known if others.get(n, "deg").startswith(("deg", "°"))}
+    factors |= {n: 2 * np.pi for n, unit in others.items() if unit.startswith(("turn", "rev"))}
+    angles = set(given) | {n for n in roles["positions"] if n in factors}
     if by_names:
         units_of_angles = ("deg", "°", "rad")
         angles |= {
@@ -324,7 +327,7 @@ def angles_of(
             for n in roles["positions"]
             if (is_angle(n) and not _unit(units, n)) or _unit(units, n).startswith(units_of_angles)
         }
-    return tuple(n for n in roles["positions"] if n in angles), in_degrees
+    return tuple(n for n in roles["positions"] if n in angles), factors
 
 
 def _unit(units: Mapping[str, str], name: str) -> str:

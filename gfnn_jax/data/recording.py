@@ -123,7 +123,8 @@ class Recording:
                 for each value (`sigma`), or None where it was not; in radians where the column is.
     units:      name -> unit, as the file gives it, in its header or at the end of the name; of all
                 columns: `unit`.
-    factors:    name -> value here ÷ number in the file: π/180 of a column in degrees, else 1.
+    factors:    name -> value here ÷ number in the file: π/180 of a column in degrees, 2π of one in
+                turns, else 1.
     time_unit:  of the file; `times` are in seconds, those of d or year as they are (`clock`).
                 time_unit_given: whether it was told, here or by the file, not taken to be s.
     coordinates: what moves, the positions unless other names were given.
@@ -228,7 +229,7 @@ class Recording:
         empty = [n for n in with_role if not any(np.isfinite(v[n]).any() for _, v in runs.values())]
         if empty:
             raise InputError(f"{source}: no value in column {', '.join(empty)}")
-        angular, in_degrees = angles_of(
+        angular, radians = angles_of(
             source,
             {**roles, "positions": coordinate_names},
             angles or (),
@@ -236,7 +237,7 @@ class Recording:
             angles is None,
             units,
         )
-        factors = {name: np.pi / 180 if name in in_degrees else 1.0 for name in numbers}
+        factors = {name: radians.get(name, 1.0) for name in numbers}
         factors |= {of: factors[name] for name, of in sigmas.items()}
         values = {
             run: {name: column * factors[name] for name, column in of_run.items()}

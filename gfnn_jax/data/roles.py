@@ -32,7 +32,7 @@ _WORDS = {
     "velocities": ("v", "omega", "velocity", "vel", "speed", "qdot", "qd", "gyro", "dq"),
     "momenta": ("p", "momentum"),
     "inputs": (
-        *("u", "tau", "torque", "force", "input"),
+        *("u", "tau", "torque", "force", "thrust", "input"),
         *("voltage", "current", "motor", "drive", "command"),
     ),
 }
@@ -41,7 +41,8 @@ _ROLE_OF = {word: role for role, words in _WORDS.items() for word in words}
 _INDEXED = re.compile(r"([a-z]+?)_?(\d+|[xyz])?")
 # A unit at the end of a name: theta_deg, omega_rad_s, x1_mm, v_mm_s, force_N, u_V.
 _UNIT = re.compile(
-    r"_((?i:deg|rad)|[µumcdk]?m|px|[mk]?N|Nm|[mk]?V|m?A)((?:_|_?per_?|/)(s|sec))?$", re.ASCII
+    r"_((?i:deg|rad|turns?|revs?)|[µumcdk]?m|px|[mk]?N|Nm|[mk]?V|m?A)((?:_|_?per_?|/)(s|sec))?$",
+    re.ASCII,
 )
 # A name with its unit in brackets.
 _BRACKETS = re.compile(r"^\s*([^\[(]*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))?\s*$")
@@ -141,7 +142,8 @@ def derivative_of(name: str) -> str | None:
 
 def role_of(name: str) -> str | None:
     """The role that a column of this name usually has; None where names do not tell."""
-    role = _ROLE_OF.get(_word(name)[0])
+    words = {_ROLE_OF.get(word) for word in _bare(name).split("_")}  # of "Motor Voltage", say
+    role = _ROLE_OF.get(_word(name)[0]) or (words.pop() if len(words) == 1 else None)
     if role is None and (of := derivative_of(name)) is not None and role_of(of) == "positions":
         return "velocities"
     return role
