@@ -572,6 +572,24 @@ def test_a_low_pass_that_a_force_across_imitates_is_named():
     assert leaves_noise
 
 
+@pytest.mark.parametrize("damping", [0.1, -0.1])
+def test_a_sensor_that_sharpens_or_that_is_not_seen_beside_a_drive_is_none(damping):
+    """A torsion pendulum, which small swings magnified 77 times imitate; and one that drives
+    itself, of which negative friction alone leaves noise."""
+    t = 0.04 * np.arange(600)
+    omega = np.sqrt(3.3 - damping**2 / 4)
+    x = np.exp(-damping * t / 2) * np.cos(omega * t) * (2.2 if damping > 0 else 0.2)
+    x = x + 6e-3 * np.random.default_rng(0).normal(size=len(x))
+    recording = gfnn.Recording({"t": t, "x": x}, positions=["x"], angles=["x"])
+    problem = samples_of(recording).problem
+    spring, rubs = ((0,), (2,), (0,), 0.0), ((1,), LINEAR, 0.0)
+    law = Structure(1, (((2,), (0,), (0,), 0.0), spring), (rubs,) * (damping > 0))
+    known = {("term", spring): -1.65, ("loss", rubs): 0.05}
+    fit = problem.fit(law, known, problem.arcs(4.0), problem.scales.sigma)
+    assert (fit.loudest < 1.1) == (damping > 0)
+    assert of_a_sensor(fit) == ("", False)
+
+
 def test_a_power_of_the_distance_that_others_imitate_is_one_of_several():
     """A hardening spring in the plane, V = ½ r² + 0.2 r⁴, along an orbit of few distances."""
     t = 0.1 * np.arange(250)

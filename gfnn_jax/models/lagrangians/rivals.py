@@ -32,6 +32,7 @@ from gfnn_jax.families.expressions import (
 from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, STRIBECK
 from gfnn_jax.families.lagrangian import INPUTS, has_inputs, shape_of, tree_of
 from gfnn_jax.maps.observation import observed
+from gfnn_jax.models.lagrangians.exchange import may_be_chosen
 from gfnn_jax.models.lagrangians.fit import ArcProblem, LawFit, places
 from gfnn_jax.models.lagrangians.libraries import (
     GAINS,
@@ -330,14 +331,26 @@ def of_a_sensor(fit: LawFit, smoothed: bool = False) -> tuple[str, bool]:
                 own = dataclasses.replace(structure, sensors=other.sensors)
                 again = other.fit(own, start, fit.followed, fit.sigma, rescale=False)
                 unlikely = again.criterion(count)
-                early = again.values.get(("sensor", "late"), 0.0) < 0  # and another late
-                if again.follows and again.is_definite and unlikely < least and not early:
+                if again.is_definite and unlikely < least and _is_a_sensor(again):
                     typed, least = shlex.quote(f"{name} = {text}"), unlikely
                     enough = smoothed or again.loudest < OPTIONS.noise
                     best = (
                         f"a plainer law follows the record where {name} {what}: --observe {typed}"
                     )
     return best, enough
+
+
+def _is_a_sensor(fit: LawFit) -> bool:
+    """Return whether a fit follows, beside a sensor that is seen and may be: late or smoothed, not
+    early (and another late) nor sharpened, by a part of the motion of which its series tells, and
+    no friction drives in its place."""
+    omega = fit.problem.scales.omega
+    tells = {"late": np.inf, "smooth": omega**-2}
+    sizes = {k: fit.values[k] for k in fit.values if k[0] == "sensor" and k[1] in tells}
+    least = fit.problem.options.evidence.significant
+    return may_be_chosen(fit) and all(
+        0 < size < tells[k[1]] and fit.significance[k] > least for k, size in sizes.items()
+    )
 
 
 def _without_needless(fit: LawFit, other: ArcProblem, odd: set[Key]) -> Structure | None:
