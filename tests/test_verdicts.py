@@ -246,13 +246,26 @@ def test_the_package_lists_public_names():
 
 
 @pytest.mark.slow
-def test_a_pendulum_whose_gravity_grows_is_named_so():
-    """By a fifth of its mean: the law found has no plainer one beside it."""
-    x = orbit(lambda t, z: [z[1], -4 * np.sin(z[0]) * (1 + 0.006 * t)], [1.0, 0.0])[:, 0]
-    table = {"t": np.arange(2_000) * 0.02, "theta": x}
+@pytest.mark.parametrize(
+    ("zero", "gravity", "friction", "named"),
+    [
+        (0.0, 0.006, [0.0, 0.0], "cos(theta) may change along the record, by +2"),
+        (0.2, 0.006, [0.05, 0.0], "cos(theta) may change along the record, by +2"),
+        (0.0, 0.0, [0.08, 0.05], "R: omega**2 may change along the record, by +"),
+    ],
+)
+def test_a_pendulum_that_ages_is_named_so(zero, gravity, friction, named):
+    """Its gravity grows by a fifth of its mean, also about another zero, or its friction: the law
+    found has no plainer one beside it."""
+
+    def rates(t, z):
+        drag = friction[0] * (1 + friction[1] * t)
+        return [z[1], -4 * np.sin(z[0] - zero) * (1 + gravity * t) - drag * z[1]]
+
+    table = {"t": np.arange(2_000) * 0.02, "theta": orbit(rates, [1.0, 0.0])[:, 0]}
     with pytest.warns(gfnn.FitWarning):
         fit = gfnn.fit(gfnn.Recording(table, positions=["theta"], angles=["theta"]))
-    assert "cos(theta) may change along the record, by +2" in fit.verdict
+    assert named in fit.verdict
 
 
 def test_what_flies_by_is_not_self_excited():

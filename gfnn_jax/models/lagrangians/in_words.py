@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,7 +57,8 @@ class WarningOptions:
     below which a motion of one coordinate shows M and V together only. hides: noise of an angle, in
     radians, above which other laws follow the record as well. lost: of the spread, by which half of
     the forecasts of held-out parts err, however short, of a law that fits its own record alone; of
-    half of it is noise that hides other laws.
+    half of it is noise that hides other laws. left, left_rubbing: of the squares of what a law
+    leaves of the equations of motion, that a force, or friction, leaves which changes in time.
     """
 
     clear: float = 3.0
@@ -69,6 +71,7 @@ class WarningOptions:
     complete: float = 99.999
     alike: float = 0.99
     left: float = 0.05
+    left_rubbing: float = 0.2
     hides: float = 0.2
     lost: float = 0.2
 
@@ -256,7 +259,7 @@ def _flaws(best: CalibratedLaw, found: Mapping[str, Whiteness]) -> dict[str, str
             else "if the system is driven, name its drive: --inputs NAME; if not, it "
             "excites itself, as friction below zero does, which is no term of R"
         )
-    return flaws | _trend(best.fit)
+    return flaws | _trend(best.fit, bool(flaws))
 
 
 HIDES = "hides what another law would leave"  # of noise
@@ -278,28 +281,33 @@ def _hidden(fit: LawFit, coordinates: Sequence[str], channels: Sequence[str]) ->
     )
 
 
-def _trend(fit: LawFit) -> dict[str, str]:
-    """A law or a plainer one with a coefficient that changes in time, which explains the motion as
-    the terms do that it lacks: with an amplitude that dies down these imitate what ages."""
+def _trend(fit: LawFit, flawed: bool) -> dict[str, str]:
+    """A law or a plainer one with a coefficient that changes in time, of a ``flawed`` one that of
+    friction too, which explains the motion as the terms do that it lacks: with an amplitude that
+    dies down these imitate what ages."""
     problem, structure = fit.problem, fit.structure
     parts = {id(n.stretch): n.stretch for n in problem.nodes}  # whose states no law has bent
-    problem = dataclasses.replace(problem, nodes=nodes_of([*parts.values()], problem.scales))
+    zero = np.concatenate([fit.zeros, 0 * fit.zeros])
+    nodes = nodes_of([*parts.values()], problem.scales)
+    nodes = [dataclasses.replace(n, x=n.x - zero) for n in nodes]
+    problem = dataclasses.replace(problem, nodes=nodes)
     constant = [row for row in structure.terms if sum(row[0]) < 2 or is_constant(row)]
     textbook = libraries.textbook(structure.dim, problem.angles)
-    for rows in map(tuple, (textbook, constant)):
-        if len(rows) > len(structure.terms) or problem.parameters:
+    for rubs, rows in product((False, True)[: 1 + flawed], map(tuple, (textbook, constant))):
+        fewer, own = len(rows) + 1 < len(structure.terms), {*rows} == {*structure.terms}
+        if not (fewer or own or flawed) or problem.parameters:
             continue
         plain = Structure(structure.dim, rows, structure.friction, (), structure.num_inputs)
         with contextlib.suppress(FitError):
-            found = trend(plain, problem)
-            if found is not None and found[2] < OPTIONS.left:
-                word, fewer = problem.word(found[0]), len(rows) < len(structure.terms)
-                flaw = f"{word} may change along the record, by {found[1]:+.1%} of it"
+            found = trend(plain, problem, rubs)
+            if found is not None and found[2] < (OPTIONS.left_rubbing if rubs else OPTIONS.left):
+                flaw = f"{problem.word(found[0])} may change along the record, by {found[1]:+.1%}"
+                flaw += " of it" + ", with fewer terms" * fewer
                 why = (
                     "a system that ages, or a clock that drifts, looks so. Fit its parts one by "
                     "one (--from, --to), and compare"
                 )
-                return {flaw + ", with fewer terms" * fewer: why}
+                return {flaw: why}
     return {}
 
 

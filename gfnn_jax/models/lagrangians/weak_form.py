@@ -114,21 +114,24 @@ def weak_share(structure: Structure, problem: ArcProblem) -> float:
     return _share(X[..., keep], Y)
 
 
-def trend(structure: Structure, problem: ArcProblem) -> tuple[Key, float, float] | None:
-    """The force whose coefficient, did it change in proportion to time, would leave least of the
-    equations of motion of a structure; its change from the record's begin to its end, relative to
-    its mean; and the share of the squares of the residuals that it leaves. None where there is no
-    force."""
+def trend(
+    structure: Structure, problem: ArcProblem, rubs: bool = False
+) -> tuple[Key, float, float] | None:
+    """The force, or where it ``rubs`` the friction, whose coefficient, did it change in proportion
+    to time and keep its sign, would leave least of the equations of motion of a structure; its
+    change from the record's begin to its end, relative to its mean; and the share of the squares of
+    the residuals that it leaves. None where there is none."""
     keys, X, Y, keep, _, t = _Equations.of(structure, problem, False)
     place = (t - np.mean(t)) / max(np.ptp(t), 1e-300)
     X, keys = X[..., keep], [keys[k] for k in keep]
     before, found = _share(X, Y), []
     for k, key in enumerate(keys):
-        if key[0] == "term" and not any(key[1][0]):
+        if key[0] == "loss" if rubs else key[0] == "term" and not any(key[1][0]):
             more = np.concatenate([X, X[..., [k]] * place[:, None, None]], axis=-1)
             c = _solve(more, Y)[0]
-            change = float(c[-1] / c[k]) if c[k] else np.inf
-            found.append((_share(more, Y) / max(before, 1e-300), key, change))
+            if abs(c[-1]) < 2 * abs(c[k]):
+                share = _share(more, Y) / max(before, 1e-300)
+                found.append((share, key, float(c[-1] / c[k])))
     if not found:
         return None
     share, key, change = min(found, key=lambda one: one[0])
