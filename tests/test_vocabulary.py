@@ -368,6 +368,20 @@ def test_a_magnet_pulls_by_its_current_squared_and_its_gap():
 
 
 @pytest.mark.slow
+def test_a_sensor_that_is_not_in_proportion_is_named():
+    """It would give a spring masses M(x), powers of x and dry friction."""
+    t = np.linspace(0, 30, 1_500)
+    x = np.exp(-0.02 * t) * np.cos(3.02 * t)
+    x = x + 0.05 * x**3 + NOISE * np.random.default_rng(0).normal(size=len(x))
+    data = {"t": t, "x": x}
+    formula = re.search(r"observe=\{'x': '(.*?)'\}", gfnn.fit(gfnn.Recording(data)).verdict)[1]
+    fit = gfnn.fit(gfnn.Recording(data, observe={"x": formula}))
+    within_errors(fit.lagrangian, {"v**2": 0.5, "x**2": -(3.02**2 + 0.02**2) / 2})
+    within_errors(fit.friction, {"v**2": 0.02})
+    assert fit.sensors["bend"][0] == pytest.approx(0.05, abs=4 * fit.sensors["bend"][1])
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "named"), [("shutter", "line by line"), ("filter", "smoothed")])
 def test_a_sensor_that_spoils_the_law_is_named(kind, named):
     """A pendulum seen line by line, and behind a low-pass of 1.5 samples; the command that is named

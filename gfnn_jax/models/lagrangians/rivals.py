@@ -77,6 +77,7 @@ class RivalOptions:
 
 OPTIONS = RivalOptions()
 SENSORS = (  # of a position q with the velocity v
+    ("is not in proportion to what moves", "{q} + bend*{q}**3"),
     (
         "is read later where it is larger, as line by line",
         "{q} + late*{q}*{v} + late**2*({q}*{v}**2 + 0.5*{q}**2*{q}_ddot)",
@@ -319,7 +320,7 @@ def of_a_sensor(fit: LawFit, smoothed: bool = False) -> tuple[str, bool]:
     alone = d == 1 and not problem.num_inputs  # and may be late unseen
     for i, name in enumerate(seen.coordinates):
         q, v = symbols((name, seen.speeds[i]))
-        for what, sensor in SENSORS[:2] if alone else SENSORS:
+        for what, sensor in SENSORS[:3] if alone else SENSORS:
             text = sensor.format(q=q, v=v) + " + zero" * (i in fit.structure.zeros)
             shown = observed({name: text}, seen.coordinates, seen.speeds, {}, columns=seen.channels)
             shown = dataclasses.replace(shown, loss=seen.loss)
@@ -344,12 +345,12 @@ def _is_a_sensor(fit: LawFit) -> bool:
     """Return whether a fit follows, beside a sensor that is seen and may be: late or smoothed, not
     early (and another late) nor sharpened, by a part of the motion of which its series tells, and
     no friction drives in its place."""
-    omega = fit.problem.scales.omega
-    tells = {"late": np.inf, "smooth": omega**-2}
+    least, fastest = fit.problem.options.evidence.significant, fit.problem.scales.omega
+    tells = {"late": (0, np.inf), "smooth": (0, fastest**-2), "bend": (-np.inf, np.inf)}
     sizes = {k: fit.values[k] for k in fit.values if k[0] == "sensor" and k[1] in tells}
-    least = fit.problem.options.evidence.significant
     return may_be_chosen(fit) and all(
-        0 < size < tells[k[1]] and fit.significance[k] > least for k, size in sizes.items()
+        tells[k[1]][0] < size < tells[k[1]][1] and fit.significance[k] > least
+        for k, size in sizes.items()
     )
 
 
