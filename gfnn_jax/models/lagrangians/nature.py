@@ -156,6 +156,8 @@ def nature(
         )
     rate = _rate_at_rest(state, a / v.std(axis=0), state.shape[1] - v.shape[1] - u.shape[1])
     excited = plain > OPTIONS.mostly and rate > OPTIONS.excited * scales.omega and _lasts(found)
+    slow, fast = np.quantile(v, (OPTIONS.early, 1 - OPTIONS.early), axis=0)
+    excited &= bool(np.all((slow < 0) & (fast > 0)))  # else what it does at rest is not known
     if excited:
         places = np.concatenate([_variables(q, angles), u], axis=1)
         excited = 1 - plain < OPTIONS.backwards * (1 - _reversible(places, v, a, block))
