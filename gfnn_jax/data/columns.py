@@ -307,8 +307,7 @@ def angles_of(
     by_names: bool,
     units: Mapping[str, str],
 ) -> tuple[tuple[str, ...], dict[str, float]]:
-    """(angles in the order of the positions, radians in the unit of columns in degrees or turns).
-    """
+    """(angles in the order of the positions, radians in the unit of columns in degrees or turns)."""
     known = (*roles["positions"], *roles["velocities"])
     check_known(source, "angles", given, roles["positions"])
     check_known(source, "degrees", degrees, known)

@@ -58,7 +58,8 @@ class RivalOptions:
     each; settled: standard errors, within which it is found. noise: times it, that is no more;
     fades: of a speed's rms, between which Stribeck's friction does; speeds: tried between these;
     as_fast: relative, within which it is found. clearly: of Schwarz's
-    criterion, that a sensor gains where a law leaves more.
+    criterion, that a sensor gains where a law leaves more; explains: of what that law leaves, the
+    share that the one beside the sensor may leave, where it is no noise.
     """
 
     most: int = 4
@@ -73,6 +74,7 @@ class RivalOptions:
     noise: float = 2.0
     fades: tuple[float, ...] = (0.01, 0.025, 0.06, 0.15, 0.37, 0.9)
     clearly: float = 10.0
+    explains: float = 0.5
 
 
 OPTIONS = RivalOptions()
@@ -332,7 +334,9 @@ def of_a_sensor(fit: LawFit, smoothed: bool = False) -> tuple[str, bool]:
                 own = dataclasses.replace(structure, sensors=other.sensors)
                 again = other.fit(own, start, fit.followed, fit.sigma, rescale=False)
                 unlikely = again.criterion(count)
-                if again.is_definite and unlikely < least and _is_a_sensor(again):
+                most = max(OPTIONS.noise, OPTIONS.explains * fit.loudest)
+                follows = smoothed or again.loudest < most
+                if again.is_definite and follows and unlikely < least and _is_a_sensor(again):
                     typed, least = shlex.quote(f"{name} = {text}"), unlikely
                     enough = smoothed or again.loudest < OPTIONS.noise
                     best = (
