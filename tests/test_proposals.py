@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.cli import main
 from gfnn_jax.cli_parser import column_options, parser
-from gfnn_jax.data.columns import first_order
+from gfnn_jax.data.columns import Undecided, first_order
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.errors import InputError
 
@@ -218,6 +218,27 @@ def test_rates_of_turning_without_an_angle(tmp_path, capsys, axes, options):
         assert column_options(typed) == options
     else:
         assert "--structure poisson --states 'Gyroscope x,Gyroscope y,Gyroscope z'" in command
+
+
+@pytest.mark.parametrize(
+    ("names", "moves", "shown"),
+    [
+        (["v (m/s)"], "x", {"v": "v + b"}),
+        (["Fahrt [cm/s]"], "x", {"Fahrt": "v + b"}),
+        (["omega"], "theta", {"omega": "omega + b"}),
+        (["omega1", "omega2"], "theta1 theta2", {"omega1": "omega1 + b1", "omega2": "omega2 + b2"}),
+        (["acc (m/s^2)"], "x", {"acc": "x_ddot + b"}),
+        (["ax (m/s²)", "az (m/s²)"], "theta", {"az": "A*omega**2 + G*cos(theta)"}),
+    ],
+)
+def test_what_shows_no_position_is_none(tmp_path, names, moves, shown):
+    """Speeds and accelerations, of which those about g are along a rod."""
+    columns = np.stack([T, np.cos(T), 9.8 + np.sin(1.7 * T)][: 1 + len(names)], axis=1)
+    head = ",".join(["t", *names])
+    np.savetxt(tmp_path / "a.csv", columns, "%.6f", ",", header=head, comments="", encoding="utf-8")
+    with pytest.raises(Undecided) as error:
+        gfnn.read(tmp_path / "a.csv")
+    assert error.value.options == {"coordinates": tuple(moves.split()), "observe": shown}
 
 
 def tumbling(rng, count, noise=0.01):

@@ -14,7 +14,15 @@ import numpy as np
 from scipy.integrate import cumulative_simpson
 from scipy.linalg import eigh
 
-from gfnn_jax.data.roles import OF_CALENDAR, ROLES, by_name, is_angle, is_rate_of_turning, plain
+from gfnn_jax.data.roles import (
+    OF_CALENDAR,
+    ROLES,
+    by_name,
+    derivative_of,
+    is_angle,
+    is_rate_of_turning,
+    plain,
+)
 from gfnn_jax.data.tables import Table
 from gfnn_jax.errors import InputError, advised, as_typed
 from gfnn_jax.signals.derivatives import derivatives, window
@@ -139,6 +147,8 @@ def roles_of(
     if not roles["positions"] and all(is_rate_of_turning(n) for n in roles["velocities"]):
         rest = [name for name in names if name in (*rest, *roles["velocities"])]
         roles["velocities"] = ()
+    if roles["velocities"] and not (roles["positions"] or roles["momenta"] or rest):
+        raise _of_speeds(source, roles["velocities"], units)
     if not any(roles[role] for role in ("positions", "velocities", "momenta")):
         if roles["inputs"] and not rest:
             sole = ", ".join(roles["inputs"])
@@ -173,6 +183,8 @@ def _varied(runs: Runs, names: Sequence[str]) -> tuple[str, ...]:
 # Units of what moves, of its rate, and of what drives it.
 _OF_LENGTHS = re.compile(r"[nµumckd]?m|km|au|px|pixels?|m?rad|deg|°|degrees?|turns?|revs?")
 _OF_TURNING = re.compile(r"(rad|deg|°|degrees?|turns?|revs?) ?(/|per) ?(s|sec)|dps")
+_OF_SPEEDS = re.compile(r"[mcdk]?m ?(/|per) ?(s|sec)")
+_OF_ACCELERATIONS = re.compile(r"[mc]?m ?/ ?s(\^2|²|\*\*2|2)")
 _OF_DRIVES = re.compile(r"[µumk]?V|[nµum]?A|[mk]?N|N ?·? ?m|Nm", re.IGNORECASE)
 
 
@@ -210,6 +222,12 @@ def _by_data(
     turning = turning or [n for n in rest if is_rate_of_turning(n)]
     if turning and not pairs:
         raise _of_rates(source, turning, np.stack([columns[name] for name in turning]), len(runs))
+    speeds = [n for n in rest if _OF_SPEEDS.fullmatch(units.get(n, ""))]
+    if speeds and len(speeds) == len(rest) and not pairs:
+        raise _of_speeds(source, speeds, units)
+    shaken = [n for n in rest if _OF_ACCELERATIONS.fullmatch(units.get(n, ""))]
+    if shaken and len(shaken) == len(rest) and not pairs:
+        raise _of_accelerations(source, {name: columns[name] for name in shaken})
     switches = [n for n in rest if len(np.unique(columns[n])) <= _OPTIONS.levels]
     switches = switches if len(switches) < len(rest) else []
     rest = [n for n in rest if n not in switches]
@@ -251,6 +269,41 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int)
         f"{source}: {shown}, and no column shows the angle. To learn its law, with an offset b of "
         "the sensor:",
         {"coordinates": ("theta",), "observe": {main: "omega + b"}},
+    )
+
+
+def _of_speeds(source: str, names: Sequence[str], units: Mapping[str, str]) -> Undecided:
+    """Options for velocities whose positions no column shows."""
+    turning = is_angle(str(derivative_of(names[0]))) or "omega" in plain(names[0])
+    turning |= bool(_OF_TURNING.fullmatch(units.get(names[0], "")))
+    place = [""] if len(names) == 1 else [str(i + 1) for i in range(len(names))]
+    q, v = ("theta", "omega") if turning else ("x", "v")
+    return Undecided(
+        f"{source}: {', '.join(names)}: velocities, and no column shows a position. To learn a "
+        "law, with offsets of the sensors:",
+        {
+            "coordinates": tuple(q + i for i in place),
+            "observe": {n: f"{v}{i} + b{i}" for n, i in zip(names, place, strict=True)},
+        },
+    )
+
+
+def _of_accelerations(source: str, columns: Mapping[str, np.ndarray]) -> Undecided:
+    """Options for accelerations whose positions no column shows: of gravity along a rod where one
+    is far from zero, else of a cart."""
+    away = {n: abs(np.nanmean(x)) / np.nanstd(x) for n, x in columns.items()}
+    name = max(away, key=lambda n: away[n])
+    if away[name] > 1:
+        what = "along the rod of a pendulum"
+        options = {"coordinates": ("theta",), "observe": {name: "A*omega**2 + G*cos(theta)"}}
+    else:
+        name = max(columns, key=lambda n: np.nanstd(columns[n]))
+        what = "of a cart, say, with an offset of the sensor"
+        options = {"coordinates": ("x",), "observe": {name: "x_ddot + b"}}
+    return Undecided(
+        f"{source}: {', '.join(columns)}: accelerations by their units, and no column shows a "
+        f"position. To learn a law from one of them, {what}:",
+        options,
     )
 
 
@@ -307,7 +360,7 @@ def angles_of(
     by_names: bool,
     units: Mapping[str, str],
 ) -> tuple[tuple[str, ...], dict[str, float]]:
-    """(angles in the order of the positions, radians in the unit of columns in degrees or turns)."""
+    """(angles in the order of the positions, radians in the units of columns in degrees, turns)."""
     known = (*roles["positions"], *roles["velocities"])
     check_known(source, "angles", given, roles["positions"])
     check_known(source, "degrees", degrees, known)
