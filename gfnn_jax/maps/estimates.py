@@ -648,16 +648,16 @@ def _followed(
         orbit.append(step.states)
         x, modes = step.states[:, -1], step.modes[:, -1]
         further = step.by_coefficients[..., :count] @ roots[:, None].swapaxes(2, 3)
-        of_steps = (part.swapaxes(0, 1) for part in (step.by_state, further))
-        for k, (by_state, pushed) in enumerate(zip(*of_steps, strict=True)):
-            spread = by_state @ spread
-            spread[..., size:] += pushed
-            if level.size:
-                push = step.by_coefficients[:, k, :, :count] @ friction[..., None]
-                spread[..., :size] += push @ of_level
-            if first + k + 1 == asked[len(spreads)]:
-                spreads.append(spread)
-    return np.concatenate(orbit, axis=1), np.stack(spreads, axis=1)
+        ends = np.zeros((1 + further.shape[1], *spread.shape))
+        ends[0], ends[1:, ..., size:] = spread, further.swapaxes(0, 1)
+        if level.size:
+            push = step.by_coefficients[..., :count] @ friction[:, None, :, None]
+            ends[1:, ..., :size] = (push @ of_level[:, None]).swapaxes(0, 1)
+        for by, here, there in zip(step.by_state.swapaxes(0, 1), ends[:-1], ends[1:], strict=True):
+            there += by @ here
+        spread = ends[-1]
+        spreads.append(ends[asked[(asked > first) & (asked < first + len(ends))] - first])
+    return np.concatenate(orbit, axis=1), np.concatenate(spreads).swapaxes(0, 1)
 
 
 def _side_by_side(

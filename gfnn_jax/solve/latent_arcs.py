@@ -531,6 +531,8 @@ class _AtStates:
 
 
 def _replaced(arcs: np.ndarray, every: np.ndarray, some: np.ndarray) -> np.ndarray:
+    if len(arcs) == len(every):
+        return some
     whole = every.copy()
     whole[arcs] = some
     return whole
