@@ -10,7 +10,8 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, QUADRATIC
 from gfnn_jax.fitting.evidence import EVIDENCE
 from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, Table, WhichFriction, chosen
-from gfnn_jax.models.lagrangians.search import likeliest, without_drives
+from gfnn_jax.models.lagrangians.recordings import samples_of
+from gfnn_jax.models.lagrangians.search import frictions_tried, likeliest, without_drives
 from gfnn_jax.models.lagrangians.structure import Structure
 from gfnn_jax.solve.latent_arcs import SOFT_L1
 
@@ -29,6 +30,28 @@ def table(seed, size=0.8, alike=0.0, correlation=1.0):
     friction[..., 3] = alike * friction[..., 0] + np.sqrt(1 - alike**2) * friction[..., 3]
     residuals = size * friction[..., :1] + rng.normal(size=(30, 20, 1, 1))
     return Table(CANDIDATES, np.concatenate([law, friction, residuals], axis=-1), correlation)
+
+
+@pytest.mark.parametrize(
+    ("names", "factors", "joint"),
+    [
+        (("x1_m", "x2_m"), (1, 1), (-1, 1)),
+        (("x1_mm", "x2_m"), (1e3, 1), (-1, 1000)),
+        (("x1_m", "x2_cm"), (1, 1e2), (-100, 1)),
+        (("a", "b"), (1, 1), (-1, 1)),
+        (("a", "b"), (1e3, 1), None),  # in units that nobody told
+        (("angle", "x_m"), (1, 1), None),
+        (("x1_m", "level_V"), (1, 1), None),
+    ],
+)
+def test_speeds_have_differences_in_one_unit(names, factors, joint):
+    t = 0.05 * np.arange(400)
+    x = np.stack([np.cos(2 * t), np.sin(2 * t) + 0.5 * np.cos(5 * t)], axis=1) * factors
+    x = x * (1 + 1e-3 * np.random.default_rng(0).normal(size=x.shape))
+    recording = gfnn.Recording({"t": t, **dict(zip(names, x.T, strict=True))}, positions=names)
+    tried = {row[0] for row in frictions_tried(samples_of(recording).problem)}
+    joints = {c for c in tried if len(set(map(np.sign, c)) - {0}) > 1}
+    assert joints == ({joint} if joint else set())
 
 
 def test_friction_that_is_not_there_is_not_taken_by_the_errors_of_other_coefficients():

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -149,6 +150,8 @@ class SearchOptions:
     term may leave. imitated: share of what a term changes, below which the fitted ones imitate it.
     least: noise of a channel, of its spread; rounding, truncation and printed digits are below it.
     singular: eigenvalue of M, its diagonal 1, of motion with no inertia to speak of.
+    beside: ratio of the speeds of two coordinates, from which on their difference is that of one.
+    lengths: units, by their size in that of the first.
     frictions: kinds that are tried; choose_friction: by held-out arcs, else all of these. partly:
     laws with hidden coordinates may leave more than noise.
     """
@@ -165,6 +168,8 @@ class SearchOptions:
     imitated: float = 0.03
     least: float = 1e-7
     singular: float = 1e-5
+    beside: float = 100.0
+    lengths: tuple[tuple[str, int], ...] = (("mm", 1), ("cm", 10), ("m", 1_000), ("km", 1_000_000))
     frictions: tuple[str, ...] = FRICTIONS
     choose_friction: bool = True
     partly: bool = True
@@ -239,7 +244,8 @@ class ArcProblem:
     channels, where they do. gauge: (n, d) positions over which the mean inertia is 1; those of the
     nodes unless given. inputs: `ArcInputs`, by the first of the rules unless given, or a function
     of arcs in their place where nothing else is asked of them. forces: names of the inputs.
-    allowance: what fits may take, in numbers of `LawOnArcs`.
+    allowance: what fits may take, in numbers of `LawOnArcs`. units: of the coordinates, "" of those
+    that are not known.
     """
 
     nodes: Sequence[Nodes]
@@ -255,6 +261,7 @@ class ArcProblem:
     inputs: Any = None
     forces: tuple[str, ...] = INPUTS
     allowance: Allowance = UNBOUNDED
+    units: tuple[str, ...] = ()
 
     def __post_init__(self):
         if self.gauge is None:
@@ -306,6 +313,25 @@ class ArcProblem:
     def lengths(self) -> tuple[int, ...]:
         """The coordinates that are no angles."""
         return tuple(i for i in range(self.dim) if i not in self.angles)
+
+    @property
+    def joints(self) -> list[tuple[int, ...]]:
+        """The directions of the relative speeds of neighbours, lengths in the unit of the shorter.
+        None of an angle and a length, of other units that differ, or of a coordinate that is so
+        much faster that it alone would make the difference."""
+        speed, found = np.sqrt(np.mean(self.states[:, self.dim :] ** 2, axis=0)), []
+        units = ["rad" if i in self.angles else u for i, u in enumerate(self.units)]
+        sizes = dict(self.options.lengths)
+        for i, (a, b) in enumerate(pairwise(units or [""] * self.dim)):
+            both = sizes.get(a, 1), sizes.get(b, 1)
+            alike = a == b or (a in sizes and b in sizes) or ("rad" not in (a, b) and not (a and b))
+            both = both if a in sizes and b in sizes else (1, 1)
+            c = np.zeros(self.dim, int)
+            c[i : i + 2] = np.array([-1, 1]) * both // np.gcd(*both)
+            least, most = sorted(np.abs(c * speed)[i : i + 2])
+            if alike and most < self.options.beside * least:
+                found.append(tuple(c.tolist()))
+        return found
 
     @property
     def squares(self) -> bool:

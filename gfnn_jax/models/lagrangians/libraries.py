@@ -306,22 +306,25 @@ def names_of(kinds: Iterable[int]) -> tuple[str, ...]:
 
 
 def losses(
-    dim: int, kinds: tuple[int, ...], width: float, lengths: Sequence[int] = (), inputs: int = 0
+    dim: int,
+    kinds: tuple[int, ...],
+    width: float,
+    lengths: Sequence[int] = (),
+    inputs: int = 0,
+    joints: Sequence[tuple[int, ...]] | None = None,
 ) -> list[Loss]:
-    """Friction of each coordinate, and of the relative speed of neighbours (a joint); uniform
-    friction has no direction. Rare kinds are those of single coordinates, one-sided friction of
-    either side, Stribeck's of the width 1, and by the load of each of so many ``inputs``. Isotropic
-    drag, as |v|², is that of the plane or the space of the ``lengths``."""
+    """Friction of each coordinate, and of relative speeds (``joints``; unless given of neighbours);
+    uniform friction has no direction. Rare kinds are those of single coordinates, one-sided
+    friction of either side, Stribeck's of the width 1, and by the load of each of so many
+    ``inputs``. Isotropic drag, as |v|², is that of the plane or the space of the ``lengths``."""
     directions = [unit(dim, i) for i in range(dim)]
     of_power = [(c, POWER, CUBIC) for c in directions if POWER in kinds]
     of_power += [(c, STRIBECK, 1.0) for c in directions if STRIBECK in kinds]
     loads = range(inputs * (LOADED in kinds))
     of_power += [(c, LOADED + j, width) for c in directions for j in loads]
     sides = [(tuple(side * i for i in c), ONE_SIDED, 0.0) for c in directions for side in (1, -1)]
-    for i in range(dim - 1):
-        wave = [0] * dim
-        wave[i], wave[i + 1] = -1, 1
-        directions.append(tuple(wave))
+    neighbours = [tuple((k == i + 1) - (k == i) for k in range(dim)) for i in range(dim - 1)]
+    directions += neighbours if joints is None else joints
     rows = [
         (c, kind, width if kind == DRY else 0.0)
         for kind in kinds

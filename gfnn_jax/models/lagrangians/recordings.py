@@ -636,6 +636,7 @@ def samples_of(
         options=options,
         on_progress=on_progress,
         forces=(*recording.inputs, *INPUTS[len(recording.inputs) :]),
+        units=tuple(recording.units.get(name, "") for name in observation.coordinates),
     )
     return RecordingData(recording, problem, found, messages=messages)
 

@@ -484,13 +484,15 @@ def with_a_spring(fit: LawFit, angle: int) -> LawFit:
 
 
 def frictions_tried(problem: ArcProblem) -> tuple[Loss, ...]:
-    """Friction of all the kinds that are asked for, in every direction; of many coordinates, where
-    there is a choice, no rare kind, and of two speeds none of their sum."""
+    """Friction of all the kinds that are asked for, in every direction; of many
+    coordinates, where there is a choice, no rare kind, and of two speeds none of their
+    sum."""
     dim, options = problem.dim, problem.options
     kinds = tuple(map(libraries.FRICTIONS.index, options.frictions))
     if dim == 1 and len(kinds) > 1:  # linear friction is uniform there
         kinds = tuple(kind for kind in kinds if kind != UNIFORM)
-    rows = libraries.losses(dim, kinds, 0.0, problem.lengths, problem.num_inputs)
+    inputs, joints = problem.num_inputs, problem.joints
+    rows = libraries.losses(dim, kinds, 0.0, problem.lengths, inputs, joints)
     rows = [(c, k, fades(c, problem)[-3]) if k == STRIBECK else (c, k, w) for c, k, w in rows]
     if not options.choose_friction and ISOTROPIC in kinds and ISOTROPIC not in kinds_of(rows):
         raise InputError(

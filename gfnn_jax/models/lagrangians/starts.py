@@ -212,7 +212,7 @@ class _Starts:
     def __init__(self, problem: ArcProblem):
         self.problem, self.fits, self.ranks = problem, [], []
         kinds = (LINEAR, QUADRATIC) if problem.observation.crossed else (LINEAR,)
-        self.linear = libraries.losses(problem.dim, kinds, 0.0)
+        self.linear = libraries.losses(problem.dim, kinds, 0.0, joints=problem.joints)
         self.always = self.linear if problem.observation.crossed else self.linear[: problem.dim]
         q, v = np.split(problem.states, 2, axis=1)
         self.one_valued = told_by_positions(q, v, problem.angles)
