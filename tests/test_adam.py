@@ -115,7 +115,7 @@ def test_the_cosine_rises_and_falls():
     assert rates[-1] < 1e-3 * DEFAULT.rate
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def test_computes_in_the_recipes_dtype(dtype):
     result = fit(dataclasses.replace(SHORT, epochs=1, dtype=dtype))
     assert {leaf.dtype for leaf in jax.tree.leaves(result.params)} == {jnp.dtype(dtype)}

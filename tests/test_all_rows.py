@@ -87,6 +87,7 @@ def test_test_pairs_take_no_size_away(few):
     assert 202 < max(c.num_parameters for c in fit.candidates) <= 228
 
 
+@pytest.mark.slow
 def test_plenty_of_pairs_stay_as_they_are():
     rng = np.random.default_rng(0)
     z = rng.uniform(-1, 1, (200, 2))

@@ -42,8 +42,8 @@ def arcs(pairs, coordinates=CARTESIAN):
     [
         (0.02, 1e-3, range(8, 30)),  # a step is a thirtieth of the spread, or less
         (0.02, 1e-5, range(0, 1)),  # which this noise leaves plain
-        (0.02, 0.0, range(0, 1)),
-        (0.5, 1e-3, range(0, 1)),
+        pytest.param(0.02, 0.0, range(0, 1), marks=pytest.mark.slow),
+        pytest.param(0.5, 1e-3, range(0, 1), marks=pytest.mark.slow),
         (0.001, 1e-3, range(29, 30)),  # half a sequence
     ],
 )

@@ -187,9 +187,14 @@ def test_what_a_motion_does_not_tell_is_said():
     ("inputs", "gains", "said"),
     [
         ((1, 2, 3), (1, -1, 1), r"of q2 .* -1 times .*gains=\[1, 1, 1\]"),
-        ((1, 2, 3), (-1, -1, -1), r"take energy .*gains=\[1, 1, 1\]"),
-        ((1, 2, 3), (1, 1e3, 1), r"q2 are 1e\+03 times .*gains=\[1, 1, 1\]"),
-        ((1, 2, 3), (4, 1, 1), r"q1 are 4 times .*gains=\[(1|0\.99\d*), 1, 1\]"),
+        *(
+            pytest.param((1, 2, 3), gains, said, marks=pytest.mark.slow)
+            for gains, said in (
+                ((-1, -1, -1), r"take energy .*gains=\[1, 1, 1\]"),
+                ((1, 1e3, 1), r"q2 are 1e\+03 times .*gains=\[1, 1, 1\]"),
+                ((4, 1, 1), r"q1 are 4 times .*gains=\[(1|0\.99\d*), 1, 1\]"),
+            )
+        ),
         ((1, 3, 2), (1, 1, 1), r"exchanged.*inputs=\['tau1', 'tau2', 'tau3'\]"),
         ((1,), None, r"inputs=\["),
     ],
@@ -201,7 +206,10 @@ def test_forces_that_do_not_go_with_the_motion_are_refused(inputs, gains, said):
         gfnn.fit(record, model=gfnn.Arm(axes=AXES, gains=gains))
 
 
-@pytest.mark.parametrize("wrong", [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)])
+@pytest.mark.parametrize(
+    "wrong",
+    [(1.0, -1.0), *(pytest.param(w, marks=pytest.mark.slow) for w in ((-1.0, -1.0), (-1.0, 1.0)))],
+)
 def test_signs_of_a_slow_log_are_told_by_its_friction(wrong):
     """Where gravity is most of the forces, a possible arm has those of the other sign too."""
     rng, kinematics = np.random.default_rng(0), from_axes(AXES[1:])

@@ -37,7 +37,9 @@ SYMPLECTIC = {
 }
 
 
-@pytest.mark.parametrize("name", SYMPLECTIC)
+@pytest.mark.parametrize(
+    "name", ["la", *(pytest.param(n, marks=pytest.mark.slow) for n in SYMPLECTIC if n != "la")]
+)
 def test_steps_are_symplectic_and_have_gradients_whatever_the_parameters(name):
     """Gradients that a training follows, along a direction, against finite differences."""
     step, init = SYMPLECTIC[name]
@@ -154,6 +156,7 @@ def test_integrators_are_of_second_order(step_of, make):
     assert errors[0] / errors[1] == pytest.approx(8, rel=0.1)
 
 
+@pytest.mark.slow
 def test_leapfrog_is_symplectic_and_reversible():
     step = hamiltonian_step(leapfrog, henon_heiles())(0.5)
     assert largest_defect(lambda z: step(None, z), 0.3 * STATES) < 1e-14

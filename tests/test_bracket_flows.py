@@ -124,7 +124,9 @@ def test_long_rollouts(name):
         assert np.max(abs(casimir(fine) / casimir(z) - 1)) < 6e-15
 
 
-@pytest.mark.parametrize("name", ["top", "rock-paper-scissors"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("top", marks=pytest.mark.slow), "rock-paper-scissors"]
+)
 def test_long_rollouts_of_short_steps_keep_the_energy(name):
     """Stages that begin close to their end are iterated to it all the same."""
     map_, z = made(name, dt=0.02, stages=STAGES)
@@ -170,9 +172,9 @@ def test_transformations():
 @pytest.mark.parametrize(
     ("name", "bad"),
     [
-        ("top", [1, 2, 3, 0, 0, 0]),
+        pytest.param("top", [1, 2, 3, 0, 0, 0], marks=pytest.mark.slow),
         ("rock-paper-scissors", [1, -1, 1]),
-        ("scalings", [-0.1, 1, 1]),
+        pytest.param("scalings", [-0.1, 1, 1], marks=pytest.mark.slow),
     ],
 )
 def test_states_without_a_step_have_a_status(name, bad):

@@ -91,7 +91,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in ("so(3)", "aff(1)^2 + R") else ())
+        for name in CASES
+    ],
+)
 def test_brackets_of_clean_pairs(name):
     field, draw = CASES[name]
     rng = np.random.default_rng(0)

@@ -383,6 +383,7 @@ def test_where_the_budget_does_not_pay_for_all_pairs_a_sample_is_fitted(monkeypa
     assert whole.num_pairs == 300
 
 
+@pytest.mark.slow
 @QUIETLY
 def test_a_fit_leaves_some_map_whatever_its_budget():
     pairs = kepler()
@@ -427,6 +428,7 @@ def test_ended_names_the_clock_where_the_maps_ended_by_themselves(monkeypatch):
     assert fit.ended in " ".join(fit.messages)
 
 
+@pytest.mark.slow
 @QUIETLY
 def test_the_posterior_is_computed_when_it_is_asked_for():
     fit = gfnn.fit(oscillators(), learn="map", tolerance=1e-4, max_seconds=None)

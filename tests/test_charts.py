@@ -131,7 +131,8 @@ def test_jacobian_of_the_residual_and_determinant_are_those_of_the_formulas(char
     np.testing.assert_allclose(np.abs(product), 1.0, rtol=1e-9)
 
 
-@pytest.mark.parametrize("chart", [pytest.param(TYPE1, marks=pytest.mark.slow), MIDPOINT], **NAMED)
+@pytest.mark.slow
+@pytest.mark.parametrize("chart", [TYPE1, MIDPOINT], **NAMED)
 def test_derivatives_of_step_and_rollout_in_state_and_parameters(chart):
     """Forward = reverse = through the iterations = finite difference, along a random direction."""
     flat, unravel = ravel_pytree((random_params(chart), STATES[0, :2]))
@@ -195,6 +196,7 @@ def images(piece, z):
     return np.asarray(out)
 
 
+@pytest.mark.slow
 def test_midpoint_chart_of_the_hamiltonian_is_the_implicit_midpoint_rule():
     z = 0.3 * np.random.default_rng(3).standard_normal((5, 4))
     found = images(generated(henon_heiles, None, MIDPOINT, 0.5, 2), z)

@@ -225,9 +225,8 @@ WORKER = textwrap.dedent(
 )
 
 
-@pytest.mark.parametrize(
-    "kills", [1, pytest.param(20, marks=pytest.mark.slow)], ids=["short", "twenty"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [1, 20], ids=["short", "twenty"])
 def test_sigkill(tmp_path, kills):
     """Killed at random moments and resumed, the training ends with the uninterrupted bits."""
     killed, rounds = 0, 0

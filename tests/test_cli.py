@@ -2,8 +2,6 @@
 
 import json
 import shlex
-import subprocess
-import sys
 import time
 import types
 import warnings
@@ -224,16 +222,6 @@ def test_refusals(typed, named, tmp_path, model, capsys, monkeypatch):
     assert lines[0].startswith("gfnn: ")
     assert named.format(**places) in lines[0]
     assert files(tmp_path) == before
-
-
-@pytest.mark.slow
-def test_usage_is_refused_before_jax_is_loaded():
-    code = "import sys; from gfnn_jax.cli import main; n = main(sys.argv[1:]); "
-    code += "print(n, 'jax' in sys.modules)"
-    command = [sys.executable, "-c", code, "fit", "nowhere.npz", "--out", "m"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.stdout == "2 False\n"
-    assert done.stderr == "gfnn: nowhere.npz: no such file or folder\n"
 
 
 # Fit and predict
@@ -458,6 +446,7 @@ def test_a_chart_that_folds_is_refused(tmp_path, capsys):
     assert not (tmp_path / "m").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outside", ["continue", "stop"])
 def test_leaving_the_domain_is_told(outside, model, tmp_path, capsys):
     assert predict(model, tmp_path / "p.npz", "--outside", outside) == 0
@@ -485,6 +474,7 @@ def check_run(folder, scene):
     return report
 
 
+@pytest.mark.slow
 def test_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     scene = "standard-map-regular"

@@ -104,6 +104,7 @@ def test_a_scene_with_parameters_is_not_compared(tmp_path):
         comparison.compare("pendulum-length", Output(tmp_path / "c"))
 
 
+@pytest.mark.slow
 def test_methods_that_apply():
     everywhere = comparison.chosen_methods((), scenes.make("two-body"))
     assert set(comparison.TITLES) - set(everywhere) == {"onet-2", "onet-5"}

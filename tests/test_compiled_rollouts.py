@@ -41,8 +41,8 @@ def arms(kind, driven=False):
 @pytest.mark.parametrize(
     ("kind", "driven"),
     [
-        ("friction", True),
-        pytest.param("alone", False, marks=pytest.mark.slow),
+        pytest.param("friction", True, marks=pytest.mark.slow),
+        ("alone", False),
         pytest.param("uniform", False, marks=pytest.mark.slow),
     ],
 )

@@ -2,6 +2,7 @@
 and against exact solutions."""
 
 import numpy as np
+import pytest
 import scipy.integrate
 import scipy.optimize
 
@@ -41,6 +42,7 @@ def followed(form, p, x, h, u):
     return np.array(found), np.array(passed)
 
 
+@pytest.mark.slow
 def test_bodies_that_stick_together_and_to_the_ground():
     """Friction of one mass on the ground and of both on each other, with linear friction beside."""
     h, count, losses = 0.1, 70, [0.3, 0.15, 0.2]

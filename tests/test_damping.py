@@ -47,6 +47,7 @@ def test_the_factor_and_the_drift_are_learned(learned):
     assert "multiplies areas by 0.9" in str(learned.damping)
 
 
+@pytest.mark.slow
 def test_a_step_is_the_maps_and_conformally_symplectic(learned):
     z, near = states_of(300, 1), 1e-6 * np.eye(2)
     z[1:3], z[3:5] = z[0] + near, z[0] - near
@@ -73,6 +74,7 @@ def test_the_rotation_number_of_its_attractor_is_the_maps(learned):
     assert abs(predicted.value - expected.value) < 1e-10
 
 
+@pytest.mark.slow
 def test_it_is_saved_and_loaded(learned, tmp_path):
     learned.map.save(tmp_path / "model")
     loaded = gfnn.load(tmp_path / "model").map
@@ -251,7 +253,7 @@ def test_a_periodic_orbit_closes_and_loses_area(learned):
         periodic_orbit(fit.map, np.array([np.nan, 0.0]), 1)
 
 
-@pytest.mark.parametrize("b", [1.0, 0.99])
+@pytest.mark.parametrize("b", [1.0, pytest.param(0.99, marks=pytest.mark.slow)])
 def test_of_many_pairs_a_sample_tells_whether_areas_are_lost(b, monkeypatch):
     """Jacobians that are certain of a change, by their own error, do not make a fit look at all
     pairs; what is lost indeed is learned from all of them."""

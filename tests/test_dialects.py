@@ -62,7 +62,7 @@ def tables(names):
 
 
 ANY = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 
 
@@ -95,7 +95,7 @@ def test_states_in_any_dialect_are_read_back_equal(tmp_path, values, dialect):
         assert data.units["p1"] == "kg m/s"
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(st.data(), dialects(), st.sampled_from([OF_RECORDING, OF_STATES]))
 def test_a_mutated_table_is_read_or_refused(tmp_path_factory, data, dialect, names):
     """Whatever is inserted, replaced or cut: no error but InputError, and that in one line."""

@@ -126,9 +126,8 @@ def test_derivatives_in_the_coefficients_and_in_the_time():
     np.testing.assert_allclose(slope[:, 0, 0], (ahead - behind)[0] / 2e-5, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "name", ["type2", *(pytest.param(n, marks=pytest.mark.slow) for n in ("type3", "midpoint"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["type2", "type3", "midpoint"])
 def test_s_is_that_of_the_time_in_the_middle(name):
     """Whichever way the step is made."""
     z, t0 = states(5)

@@ -22,12 +22,13 @@ def words(formula):
     return {term.term for term in formula.terms}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hardening", "end", "noise"),
     [
-        pytest.param(0.1, 50.0, 3e-2, marks=pytest.mark.slow),
+        (0.1, 50.0, 3e-2),
         (0.3, 100.0, 3e-2),
-        pytest.param(0.3, 100.0, 1e-4, marks=pytest.mark.slow),
+        (0.3, 100.0, 1e-4),
     ],
 )
 def test_a_law_beside_which_noise_leaves_others_is_one_of_several(hardening, end, noise, tmp_path):

@@ -151,12 +151,9 @@ def of_positions(part, both, angles=()):
 
 
 DAMPING = Damping(np.asarray(0.9), np.full(1, 0.05))
-QUICK = {
+MAPS = {
     "type 2, angles": lambda: map_in(TYPE2, 1, 4, angles=(0, 1)),
     "type 3, base map, damping": lambda: map_in(TYPE3, 1, 4, around=(turning(1), DAMPING)),
-}
-MAPS = {
-    **QUICK,
     "positions both ways": lambda: of_positions(0.0, True, (0,)),
     "damping": lambda: map_in(TYPE2, 1, 4, around=(DAMPING,)),
     "positions": lambda: of_positions(0.5, False),
@@ -231,7 +228,7 @@ def by_itself(kind, name):
 
 @needs_cc
 @pytest.mark.parametrize(
-    "kind", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in MAPS]
+    "kind", [k if k == "type 2, angles" else pytest.param(k, marks=pytest.mark.slow) for k in MAPS]
 )
 def test_c_is_the_maps_own_step(kind, tmp_path):
     map_, z = made(kind)

@@ -131,13 +131,8 @@ def with_one(kind: str) -> list:
     return [pytest.param(k, marks=() if k == kind else pytest.mark.slow) for k in SMOOTH]
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        *with_one("double pendulum with friction"),
-        pytest.param("bobs that attract", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [*SMOOTH, "bobs that attract"])
 def test_a_taylor_series_in_c_is_the_flow(kind, tmp_path):
     map_, z, args = SMOOTH[kind]() if kind in SMOOTH else (*attracting(), None)
     library = compiled(gfnn.export(map_, "c", tmp_path / "own.c"))
@@ -263,11 +258,12 @@ def one_step(to, path, map_):
 
 
 # An FMU holds the Taylor series in C, which is tested above with every kind.
+@pytest.mark.slow
 @needs_cc
 @pytest.mark.parametrize(
     ("to", "kind"),
     [
-        pytest.param(to, kind, marks=() if kind == "inputs that change" else pytest.mark.slow)
+        (to, kind)
         for to in ("jax", "casadi", "fmu")
         for kind in (list(SMOOTH)[2:] if to == "fmu" else SMOOTH)
     ],

@@ -57,13 +57,17 @@ OTHERS = ("angles and cyclic", "features")
 LINEAR = [(kind, inputs) for kind in ("products", "sines") for inputs in OTHERS]
 LINEAR += [("products", "one variable")]
 EVERY = [*LINEAR, ("mlp", "angles and cyclic"), ("from_function", "plain")]
+HEAVY = [("mlp", "angles and cyclic"), ("products", "features")]
 
 
 values = jax.jit(lambda family, params, w: (family(params, w), family.gradient(params, w)))
 closed = jax.jit(lambda family, params, w: family.gradient_and_hessian(params, w))
 
 
-@pytest.mark.parametrize(("kind", "inputs"), EVERY)
+@pytest.mark.parametrize(
+    ("kind", "inputs"),
+    [pytest.param(*case, marks=pytest.mark.slow if case in HEAVY else ()) for case in EVERY],
+)
 def test_derivatives_are_those_of_the_value_in_numpy_and_in_jax(kind, inputs):
     family, params = case(kind, inputs)
     assert isinstance(family, Family)
@@ -108,7 +112,7 @@ def test_closed_derivatives_are_those_of_autodiff(kind, inputs):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * (1 + np.abs(other).max()))
 
 
-@pytest.mark.parametrize("kind", ["products", "sines"])
+@pytest.mark.parametrize("kind", ["products", pytest.param("sines", marks=pytest.mark.slow)])
 def test_the_gradients_derivative_is_symmetric_to_the_last_bit(kind):
     """Compare it with JAX's as well, to rounding, in w and in the parameters."""
     family, params = case(kind, "angles and cyclic")

@@ -32,6 +32,9 @@ def legend(ax):
     return [text.get_text() for text in ax.get_legend().get_texts()]
 
 
+QUICK = ("energy_error", "phase_portrait", "work_precision")  # the others are made as these are
+
+
 def every_figure():
     """name -> a function that draws it; used for what must hold of all."""
     error = {"GFNN": (STEPS, power_laws()), "HNN": (STEPS, 10 * power_laws())}
@@ -57,7 +60,13 @@ def every_figure():
     }
 
 
-@pytest.mark.parametrize("name", list(every_figure()))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+        for name in every_figure()
+    ],
+)
 def test_every_figure_is_labelled_saved_and_leaves_matplotlib_as_it_was(name, tmp_path):
     before = dict(matplotlib.rcParams)
     axes = every_figure()[name]()
@@ -77,7 +86,7 @@ def test_every_figure_is_labelled_saved_and_leaves_matplotlib_as_it_was(name, tm
 
 
 def test_the_suffix_chooses_the_format(tmp_path):
-    figures.save(every_figure()["work_precision"]().figure, tmp_path / "figure.pdf")
+    figures.save(every_figure()["phase_portrait"]().figure, tmp_path / "figure.pdf")
     assert (tmp_path / "figure.pdf").read_bytes().startswith(b"%PDF")
 
 

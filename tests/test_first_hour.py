@@ -173,6 +173,7 @@ def test_help_of_every_command_has_an_example(name, capsys):
         assert places == sorted(places)
 
 
+@pytest.mark.slow
 def test_lanes_are_asked_for_where_states_are_given():
     map_ = discovered().map
     with pytest.raises(ValueError, match=r"map\.rollout takes these"):

@@ -108,6 +108,7 @@ def test_a_folded_chart_is_refused_with_advice():
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_friction_is_noticed():
     z = disc(400)
     damped = gfnn.Pairs(z, pendulum(z) * np.array([[1.0, 0.5]]), 0.4)
@@ -193,7 +194,6 @@ def test_too_many_degrees_of_freedom_for_so_few_pairs_are_answered_at_once():
 # The choice
 
 
-@pytest.mark.slow
 def test_the_choice_is_as_accurate_as_it_says(pendulum_fit):
     fit, z = pendulum_fit, disc(200, seed=3)
     assert fit.met
@@ -231,6 +231,7 @@ def test_the_table_shows_all_candidates_and_marks_the_chosen(pendulum_fit):
     assert any("~" in line for line in lines)  # estimates are told from what was measured
 
 
+@pytest.mark.slow
 def test_an_absolute_tolerance_is_in_the_users_units(pendulum_fit):
     unit = np.array([1e3, 1e3])
     pairs = pendulum_pairs()
@@ -341,6 +342,7 @@ def noisy_fit(noisy_pairs):
         return gfnn.fit(noisy_pairs, chart="midpoint", tolerance=1e-18)
 
 
+@pytest.mark.slow
 def test_noise_is_not_learned(noisy_fit):
     """Noise of size σ leaves an error of order σ, a symplectic map and bounded rollouts."""
     assert noisy_fit.noise is not None
@@ -353,6 +355,7 @@ def test_noise_is_not_learned(noisy_fit):
     assert "no more accurate" in noisy_fit.ended
 
 
+@pytest.mark.slow
 def test_a_law_that_explains_less_than_half_of_the_steps_is_none():
     """A harmonic law of a pendulum, and the same error beside steps that are hardly larger."""
     model = gfnn.Hamiltonian(terms=["p1**2", "q1**2"])
@@ -363,6 +366,7 @@ def test_a_law_that_explains_less_than_half_of_the_steps_is_none():
     assert dataclasses.replace(found, pairs=pairs).verdict.startswith("no law: ")
 
 
+@pytest.mark.slow
 def test_noise_is_told_in_the_units_of_each_coordinate(noisy_pairs, noisy_fit):
     """The choice, and whether there is noise, do not depend on units; how much is in those."""
     unit = np.array([1e9, 1e-9])
@@ -411,7 +415,8 @@ def test_a_degree_of_freedom_at_rest_does_no_harm():
     np.testing.assert_allclose(states[:, -1, [1, 3]], z0[:5][:, [1, 3]], atol=1e-10)
 
 
-@pytest.mark.parametrize("family", ["sines", pytest.param("mlp", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["sines", "mlp"])
 def test_other_families_fit_too(family):
     options = {"max_iterations": 60} if family == "mlp" else {}
     fit = quiet_fit(pendulum_pairs(), family=family, chart="midpoint", tolerance=1e-3, **options)

@@ -150,7 +150,8 @@ def test_each_has_its_device_for_itself(sharing):
     assert found == [((), i) for i in range(20)]  # in order, and nothing is shared out again
 
 
-@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2, 3])
 def test_operations_are_spent_as_by_one(count, sharing):
     """The budget ends a fit at the same step, whoever is faster."""
     pairs = quartic(5_000)

@@ -58,7 +58,11 @@ def test_known_coefficients():
     np.testing.assert_allclose(gauss(2).matrix, expected, atol=1e-17)
 
 
-OPTIONS = [{}, {"stages": 4, "substeps": 3}, {"newton": True, "stages": 5}]
+OPTIONS = [
+    {},
+    {"stages": 4, "substeps": 3},
+    pytest.param({"newton": True, "stages": 5}, marks=pytest.mark.slow),
+]
 
 
 @pytest.mark.parametrize("options", OPTIONS)

@@ -106,8 +106,9 @@ def test_rates_that_differ_are_no_uniform_friction():
         fit.accelerate()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
-@pytest.mark.parametrize("noise", [0.0, pytest.param(1e-5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("noise", [0.0, 1e-5])
 def test_a_system_that_keeps_its_energy_gets_no_friction(noise):
     pairs = pairs_of(henon_heiles([0.0, 0.0]), states(), 0.5)
     image = pairs.z1 + noise * np.random.default_rng(1).normal(size=pairs.z1.shape)

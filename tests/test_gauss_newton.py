@@ -86,7 +86,7 @@ def test_stages_that_no_fixed_point_finds_are_found_by_newton():
     assert images(stiff, np.array([0.5, 200.0]), z, 1.0, Steps(2, 1)).solved.all()
 
 
-@pytest.mark.parametrize("dt", [0.5, 1.0])
+@pytest.mark.parametrize("dt", [0.5, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_henon_heiles_told_nothing(dt):
     pairs = henon_heiles(100, dt)
     found, _, _ = learned(pairs)

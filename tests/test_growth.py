@@ -80,6 +80,7 @@ def test_a_given_term_is_multiplied_by_modes_and_momenta():
     assert found.candidate.validation_relative < 1e-14
 
 
+@pytest.mark.slow
 def test_a_given_term_is_multiplied_where_there_are_no_angles():
     term = "1/(1 + q1**2)"
     pairs = pairs_of([f"p1**2*{term}", "q1**2"], [0.5, 0.5], 100, 0.2)
@@ -90,6 +91,7 @@ def test_a_given_term_is_multiplied_where_there_are_no_angles():
     assert multiplied(own, Terms(1, ("p1",), ((1,), (2,)))).num_parameters == 4
 
 
+@pytest.mark.slow
 def test_growth_ends_where_nothing_gains_and_says_so():
     pairs = pairs_of(["p1**2", "cos(q1)"], [0.5, -1.0], 200, 0.2)
     noise = 1e-3 * np.random.default_rng(1).standard_normal(pairs.z1.shape)

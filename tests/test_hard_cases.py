@@ -63,6 +63,7 @@ def exact():
 # Bad conditions for the solver
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [3.0, 100.0, 1e6, 1e150, 1e300])
 def test_no_start_far_outside_is_ok(clean, factor):
     states, info = clean.rollout(factor * disc(30, seed=1) / 0.5, 20)

@@ -166,8 +166,9 @@ def test_each_library_has_one_home():
 
 def test_costs_no_jax():
     """Importing the package, and refusing bad usage, is a matter of milliseconds."""
-    refused = "import gfnn_jax.cli; gfnn_jax.cli.main(['run', 'two-body', '--dt', '-1'])"
-    code = f"import sys; {refused}; sys.exit('jax' in sys.modules)"
+    refused = "from gfnn_jax.cli import main; main(['run', 'two-body', '--dt', '-1'])"
+    refused += "; main(['fit', 'nowhere.npz', '--out', 'm'])"
+    code = f"import sys, gfnn_jax.data.files; {refused}; sys.exit('jax' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert done.returncode == 0
 

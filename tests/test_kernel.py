@@ -117,7 +117,7 @@ def differences(form, p, x, h, u, e=1e-6):
 @pytest.mark.parametrize("own", [False, True])
 @pytest.mark.parametrize("dry", [False, True])
 @pytest.mark.parametrize("powers", [False, True])
-@pytest.mark.parametrize("d", [1, 2, 3, 5])
+@pytest.mark.parametrize("d", [*(pytest.param(d, marks=pytest.mark.slow) for d in (1, 3)), 2, 5])
 def test_steps_are_those_of_the_law(d, powers, dry, own):
     """And derivatives are differences; bodies that turn or stop are those of test_coulomb.py."""
     num = 60

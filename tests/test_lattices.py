@@ -130,7 +130,8 @@ def test_pairs_of_tangents_see_what_is_not_symplectic():
     assert defect_of_pairs(u, shear, scale) > 1e-4
 
 
-@pytest.mark.parametrize("dim", [8, pytest.param(18, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dim", [8, 18])
 def test_a_ring_of_many_sites(dim, tmp_path):
     """The formula, roundoff, a defect, the domain, and the same bits from a saved model, with
     matrices and without."""

@@ -270,7 +270,8 @@ def test_a_damped_pendulum_from_noisy_angles(swing):
     assert abs(fit.energy["closure"]) < 0.01 * abs(fit.energy["stored"])
 
 
-@pytest.mark.parametrize("kind", [pytest.param("stuck", marks=pytest.mark.slow), "outliers"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["stuck", "outliers"])
 def test_wrong_values_are_left_out_of_a_fit_and_told(kind):
     """The law is that of the record in which they are missing."""
     t, x = pendulum(end=12.0)
@@ -354,7 +355,8 @@ RARE = {
 }
 
 
-@pytest.mark.parametrize("kind", [pytest.param("cubic", marks=pytest.mark.slow), "one-sided"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["cubic", "one-sided"])
 def test_friction_of_rare_kinds(kind):
     """An oscillator's, from noisy positions; and as terms that are given again."""
     force, truth = RARE[kind]
@@ -543,6 +545,7 @@ def test_errors_of_stribecks_friction_hold_that_of_the_speed_over_which_it_fades
     np.testing.assert_allclose(fit.linearised.errors, expected, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_a_low_pass_that_a_force_across_imitates_is_named():
     """Two bodies on springs, one read behind a low-pass: five linear equations."""
     dt, tau = 0.25, 0.2
@@ -590,6 +593,7 @@ def test_a_sensor_that_sharpens_or_that_is_not_seen_beside_a_drive_is_none(dampi
     assert of_a_sensor(fit) == ("", False)
 
 
+@pytest.mark.slow
 def test_a_power_of_the_distance_that_others_imitate_is_one_of_several():
     """A hardening spring in the plane, V = ½ r² + 0.2 r⁴, along an orbit of few distances."""
     t = 0.1 * np.arange(250)
@@ -715,13 +719,8 @@ def test_the_friction_that_a_record_shows(swing):
     assert max(without.which_friction.limits.values()) < 1e-3
 
 
-@pytest.mark.parametrize(
-    "asked",
-    [
-        "quadratic",
-        *(pytest.param(a, marks=pytest.mark.slow) for a in ("dry+linear", "linear+uniform")),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("asked", ["quadratic", "dry+linear", "linear+uniform"])
 def test_friction_that_is_asked_for_dissipates_or_is_said_to_be_none(asked):
     """Of a record without any: ρ ≥ 0 at its bound, with a limit."""
     with pytest.warns(gfnn.FitWarning, match="friction was requested, and the record shows none"):

@@ -319,6 +319,7 @@ def test_bodies_that_stick_to_each_other():
     assert np.diff(energy, axis=1).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_samples_of_a_law_that_sticks():
     map_, z = learned_block(), np.array([[0.42, 0.0], [0.03, 0.0]])
     drawn = map_.sample(jax.random.key(0), 3)

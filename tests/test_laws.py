@@ -197,6 +197,7 @@ def test_noise_does_not_make_a_series_of_a_cosine():
     assert [term.term for term in fit.hamiltonian.terms] == ["p1²", "cos(q1)"]
 
 
+@pytest.mark.slow
 def test_a_known_term_makes_a_hard_law_easy():
     """A rational potential, which no polynomial of few terms is."""
 

@@ -67,6 +67,7 @@ def test_finds_the_optimum_that_scipy_finds():
     np.testing.assert_allclose(result.train_rms**2, 2 * oracle.cost / target.size, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_training_error_falls_at_every_iteration_whatever_the_chunk():
     history = []
     whole = fit_pendulum(reports=(lambda state: history.append(state.train_rms),), chunk=1_000)
@@ -143,6 +144,7 @@ def test_a_step_into_non_finite_values_is_rejected():
     np.testing.assert_allclose(result.params, np.exp(-6.0), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_memory_is_bounded_by_the_chunk_and_not_by_the_pairs():
     theta, layout = lm.flattened(network_params(0, 50))
     w, target = (np.tile(a, (10, 1)) for a in TRAINING)

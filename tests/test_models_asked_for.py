@@ -21,7 +21,11 @@ LAW = gfnn.Lagrangian(terms=["v1**2", "V: x1**2"], friction="none")
     ("model", "options"),
     [
         (gfnn.Hamiltonian(terms=["q1**2", "p1**2"]), {"learn": "hamiltonian"}),
-        (gfnn.GeneratingFunction(chart="type2"), {"learn": "map", "chart": "type2"}),
+        pytest.param(
+            gfnn.GeneratingFunction(chart="type2"),
+            {"learn": "map", "chart": "type2"},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_an_object_is_its_keywords(model, options):

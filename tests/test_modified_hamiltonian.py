@@ -63,10 +63,11 @@ LINEAR = {
 
 # Each like two others: what is before a piece, and a map backwards.
 ALIKE = ("a flow before", "type 1, backwards", "type 1", "type 2", "type 3, backwards")
+HEAVY = (*ALIKE, "base map")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow if n in ALIKE else ()) for n in LINEAR]
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in HEAVY else ()) for n in LINEAR]
 )
 def test_of_a_linear_map_it_is_the_logarithm(name):
     map_ = LINEAR[name]

@@ -68,6 +68,7 @@ def test_the_network_is_h_up_to_a_constant_and_holds_at_any_dt(fit):
     assert np.sqrt(np.mean(error**2)) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_energy_stays(untrained):
     rolled, info = untrained.rollout(jnp.array([[1.0, 0.5]]), 300, save_every=300)
     assert (np.asarray(info.status) <= LEFT_DOMAIN).all()

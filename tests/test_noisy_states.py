@@ -169,6 +169,7 @@ def test_a_size_whose_step_has_no_root_leaves_a_smaller_one(monkeypatch):
     assert np.isfinite(entry.candidate.validation_relative)
 
 
+@pytest.mark.slow
 def test_noise_behind_polar_coordinates_is_that_of_the_users():
     """The noise of the radial momentum is mostly that of the positions."""
     scene = gfnn.scenes.two_body()

@@ -117,6 +117,7 @@ def test_steps_with_a_constant_inside_have_its_derivative():
 # The search
 
 
+@pytest.mark.slow
 def test_a_fit_of_noisy_sequences_finds_morses_law_with_the_errors_of_its_numbers():
     z, noise = noisy(morse_orbits(10), 1e-3)
     fit = gfnn.fit(pairs_of(z), learn="hamiltonian", tolerance=1e-3, max_seconds=None)

@@ -26,7 +26,9 @@ def test_masses_of_one_coordinate_are_told_by_several_energies(amplitudes, kind)
     assert fit.verdict.split()[0] == kind
 
 
-@pytest.mark.parametrize(("noise", "kind"), [(0.3, "one"), (0.03, "identified")])
+@pytest.mark.parametrize(
+    ("noise", "kind"), [(0.3, "one"), pytest.param(0.03, "identified", marks=pytest.mark.slow)]
+)
 def test_noise_of_a_large_part_of_a_radian_hides_other_laws(noise, kind):
     """A wheel that turns freely, with θ as far as 30 turns."""
     t, rng = np.linspace(0, 60, 400), np.random.default_rng(2)

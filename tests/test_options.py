@@ -47,6 +47,7 @@ def test_a_job_is_identified_by_what_decides_its_model():
     assert set(FIELDS) - set(options.deciding) == others
 
 
+@pytest.mark.slow
 def test_given_whole_or_by_name():
     z = np.random.default_rng(0).normal(size=(40, 2))
     pairs = gfnn.Pairs(z, rotated(z, 0.3), 0.3)

@@ -298,6 +298,7 @@ def test_equal_masses_are_not_held_where_they_leave_the_motion(monkeypatch):
     assert draw.right(draw.error(gfnn.fit(draw.recording)))
 
 
+@pytest.mark.slow
 def test_pendulums_that_nothing_couples_are_tried_where_one_is_only_led():
     """Few samples of two pendulums: in the weak form one, ever so light, is led by the other."""
 
@@ -333,6 +334,7 @@ def test_an_arm_whose_joints_rub_starts_from_angles_between_links():
     assert {row[2] for row in terms if not any(row[0])} == {(1, 0), (1, 1)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1.0, 1e3])
 def test_two_carts_have_their_law_in_any_units(unit):
     """The start has a product of velocities too, and linear motion leaves its coefficient and the

@@ -48,6 +48,7 @@ def kept(map_, folder):
     return gfnn.load(folder).map
 
 
+@pytest.mark.slow
 def test_a_family(pairs, fresh, tmp_path):
     def sizes(inputs):
         return (own_module.RadialBumps(inputs, n, width=0.5) for n in (20, 40, 80))

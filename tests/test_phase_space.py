@@ -33,7 +33,7 @@ def test_split_and_apply_j_agree_with_the_matrix():
     np.testing.assert_array_equal(apply_j(jnp.asarray(z)), z @ form.T)
 
 
-@pytest.mark.parametrize("dim", [1, 2, 4])
+@pytest.mark.parametrize("dim", [1, 2, pytest.param(4, marks=pytest.mark.slow)])
 def test_defect_of_symplectic_matrices_is_roundoff_and_of_others_is_not(dim):
     rng = np.random.default_rng(dim)
     batch = np.stack([random_symplectic(rng, dim) for _ in range(4)])

@@ -138,7 +138,11 @@ def test_exact_runs_that_are_too_few_to_bound_the_error_say_how_many_more_are_ne
             (31.0, 19.5),
             0.1,
         ),
-        ({"log(prey)": 0.3, "prey": -0.01, "predator": -0.01}, (120.0, 6.0), 0.2),  # an epidemic
+        pytest.param(  # an epidemic
+            {"log(prey)": 0.3, "prey": -0.01, "predator": -0.01},
+            *((120.0, 6.0), 0.2),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_one_noisy_orbit_of_two_populations(law, start, off):
@@ -191,6 +195,7 @@ def test_a_sinusoid_of_one_amplitude_is_of_several_laws(sigma):
     assert fit.verdict.startswith("one of several: H has one value along all runs")
 
 
+@pytest.mark.slow
 def test_noisy_swings_are_not_taken_for_harmonic_ones():
     fit = gfnn.fit(swings([0.4, 1.0, 1.5], 0.1))
     assert [t.term for t in fit.law.terms] == ["z1²", "z2²", "z1⁴"]

@@ -61,7 +61,8 @@ def wrapped():
     return gfnn.fit(recording, learn="map", tolerance=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["lifted", pytest.param("wrapped", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["lifted", "wrapped"])
 def test_the_standard_map_from_its_angle_alone(kind, request):
     learned = request.getfixturevalue(kind)
     assert learned.met
@@ -84,6 +85,7 @@ def test_a_lift_is_trusted(lifted):
     assert np.abs(np.asarray(states)[:, 1:3, :1] - read[:, 1:3]).max() < 1e-11
 
 
+@pytest.mark.slow
 def test_momenta_are_the_maps_own(lifted):
     """Of S = ½ (Q − q)² + ½ K (cos q + cos Q): p is the move less half a kick."""
     read = turns(50, 1, 3)
@@ -297,6 +299,7 @@ def test_forecasts_of_wrapped_readings_go_on_over_whole_turns(of_noisy):
     assert np.median(np.abs(off[:, 0])) < 1e-3
 
 
+@pytest.mark.slow
 def test_latent_positions_of_a_ring_of_equal_sites():
     """The coupling of a ring of six from noisy angles, given that it is a ring."""
     names = [f"theta{i}" for i in range(1, 7)]
@@ -427,6 +430,7 @@ def test_missing_readings_break_a_run():
     assert np.bincount(triples.run).tolist() == [5, 2, 5]
 
 
+@pytest.mark.slow
 def test_only_maps_of_positions_start_from_positions(lifted):
     scene = gfnn.scenes.standard_map()
     z = np.random.default_rng(0).uniform(0, 6, (200, 2))

@@ -115,7 +115,7 @@ def test_a_summary_in_python_names_python():
     assert "next: gfnn.fit(gfnn.Recording(table, degrees=['angle']))" in text
 
 
-@pytest.mark.parametrize("library", ["polars", "xarray"])
+@pytest.mark.parametrize("library", ["polars", pytest.param("xarray", marks=pytest.mark.slow)])
 def test_tables_of_other_libraries(library):
     module = pytest.importorskip(library)
     if library == "polars":

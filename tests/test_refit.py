@@ -11,6 +11,9 @@ from gfnn_jax.learn.refit import refit, why_not
 SIGMA = 1e-4
 
 
+pytestmark = pytest.mark.slow  # one fit of 3,000 pairs, and its programs
+
+
 def standard(z):
     theta, p = z.T
     p = p + 0.6 * np.sin(theta)
@@ -33,7 +36,6 @@ def moved(fit, pairs):
     return np.asarray(fit.map.step(pairs.z0)[0])
 
 
-@pytest.mark.slow
 def test_a_stand_in_is_not_blamed_on_its_family(sampled):
     """Where the time was over before any S, nobody has asked for a network."""
     *_, found = sampled

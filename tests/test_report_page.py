@@ -1,9 +1,7 @@
 """The report page, the physical quantities of a law, its equation of motion, objects of a fit."""
 
-import contextlib
 import dataclasses
 import functools
-import io
 import json
 import re
 import shutil
@@ -41,17 +39,6 @@ def discovered():
     return gfnn.discover(table, positions=["x"])
 
 
-@pytest.fixture(scope="module")
-def command_ran(tmp_path_factory):
-    """What ``gfnn swing.csv`` says, and the folder that it writes."""
-    folder, shown = tmp_path_factory.mktemp("swing"), io.StringIO()
-    with contextlib.chdir(folder), contextlib.redirect_stdout(shown):
-        swung = np.stack(swing(12.0), axis=1)
-        np.savetxt("swing.csv", swung, "%.5f", ",", header="t,x", comments="")
-        assert command("swing.csv") == 0
-    return shown.getvalue(), folder / "runs" / "swing"
-
-
 @pytest.mark.slow
 def test_quantities_are_those_of_the_oscillator():
     by_name = {q.name: q for q in physics(discovered().law).quantities}
@@ -69,8 +56,9 @@ def test_quantities_are_those_of_the_oscillator():
     assert by_name["small swings: frequency"].unit == "Hz"
 
 
-def test_quadratic_friction_alone_has_no_damping_ratio(command_ran):
-    system = _System.of(gfnn.load(command_ran[1] / "model").law)
+def test_quadratic_friction_alone_has_no_damping_ratio():
+    t, x = swing(12.0)
+    system = _System.of(gfnn.fit(gfnn.Recording({"t": t, "x": x}, positions=["x"])).law)
     drag = Friction(np.array([[1]]), np.array([QUADRATIC]), np.zeros(1))
     law = dataclasses.replace(system.law, friction=drag, losses=np.array([0.1]), uniform=0.0)
     system = system._replace(law=law, root=np.zeros((0, _count(law))))
@@ -173,9 +161,13 @@ def test_a_refusal_has_its_page(tmp_path, monkeypatch):
     assert (told["verdict"], told["error"]) == ("not fitted", str(refused.value))
 
 
-def test_one_command_writes_the_report(command_ran, capsys, monkeypatch):
+def test_one_command_writes_the_report(tmp_path, capsys, monkeypatch):
     """The law of two thirds of a file, and what it says of the third that it has not seen."""
-    shown, folder = command_ran
+    monkeypatch.chdir(tmp_path)
+    swung = np.stack(swing(12.0), axis=1)
+    np.savetxt("swing.csv", swung, "%.5f", ",", header="t,x", comments="")
+    assert command("swing.csv") == 0
+    shown, folder = capsys.readouterr().out, tmp_path / "runs" / "swing"
     assert "which no fit has seen: median error of x 0.00" in shown
     found = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     assert found["data"]["num_samples"] == pytest.approx(200, abs=1)
@@ -184,7 +176,6 @@ def test_one_command_writes_the_report(command_ran, capsys, monkeypatch):
     assert found["forecasts"]["within_two_deviations"] > 0.85
     assert (folder / "forecasts.png").stat().st_size > 10_000
     assert gfnn.load(folder / "model").map.sensors.positions == ("x",)
-    monkeypatch.chdir(folder.parent.parent)
     assert command("swing.csv") == 2  # exists already
     assert command("swing.csv", "--overwrite", "--tolerance", "1e-3") == 2
     assert "--tolerance" in capsys.readouterr().err

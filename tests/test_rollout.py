@@ -117,6 +117,7 @@ def test_rotating_standard_map_agrees_with_the_exact_map(coordinates):
     assert np.abs(error[0]).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_many_turns_of_a_free_rotor_lose_nothing():
     """θ after 20,000 steps is θ₀ + 20,000 p to a few roundings of p a step, not of θ."""
     learned = map_of(ROTOR, 30 * DISC, coordinates=CYLINDER)
@@ -136,6 +137,7 @@ def test_rounding_is_compensated():
     assert abs(float(last - exact)) <= np.spacing(float(exact))
 
 
+@pytest.mark.slow
 def test_float32_turns_do_not_drift():
     """2π in float32 is wrong by 1.7e-7: 3,000 turns of that would be 5e-4."""
     learned = map_of(ROTOR, 30 * DISC, coordinates=CYLINDER)
@@ -158,7 +160,9 @@ def first_outside(z, num_steps):
     return int(np.argmin(inside)) if not inside.all() else -1
 
 
-@pytest.mark.parametrize("stop", [False, True], ids=["continue", "stop"])
+@pytest.mark.parametrize(
+    "stop", [pytest.param(False, marks=pytest.mark.slow), True], ids=["continue", "stop"]
+)
 def test_leaving_the_domain(stop):
     z = np.array([[0.0, 0.25], [0.0, 0.0], [0.0, 0.5], [9.0, 0.1], [-0.5, 0.125]])
     states, info = SHEAR.rollout(z, 12, stop_outside=stop)

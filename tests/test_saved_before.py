@@ -47,10 +47,11 @@ OTHERS = {"base-map", "drive", "features", "mlp", "parameters-map", "pendulum-an
 OTHERS |= {"recording-inputs", "recording-parameters", "recording-two", "ring-map", "scene-polar"}
 OTHERS |= {"sines", "type3", "fourier", "type1", "textbook", "mlp-hamiltonian", "recording-dry"}
 OTHERS |= {"polynomial", "ensemble"}
+HEAVY = OTHERS | {"base", "time-step"}
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow if n in OTHERS else ()) for n in NUMBERS]
+    "name", [pytest.param(n, marks=pytest.mark.slow if n in HEAVY else ()) for n in NUMBERS]
 )
 def test_a_folder_of_0_3_0(name, tmp_path):
     fit = loaded(name, tmp_path)

@@ -124,7 +124,13 @@ HONEST = {
 }
 
 
-@pytest.mark.parametrize("make", HONEST.values(), ids=HONEST.keys())
+@pytest.mark.parametrize(
+    "make",
+    [
+        pytest.param(make, id=name, marks=pytest.mark.slow if name in ("columns", "swings") else ())
+        for name, make in HONEST.items()
+    ],
+)
 def test_honest_pairs_are_all_kept(make):
     assert len(named(make())) == 0
 

@@ -127,6 +127,7 @@ def test_the_return_map():
     assert 0 < tr.reference_error(scene, np.resize(z0, (10, 2)), 1) < 1e-13
 
 
+@pytest.mark.slow
 def test_integration_against_the_exact_kepler_solution():
     scene = scenes.two_body()
     z0 = draws.sample_states(scene, 10, jax.random.key(1))
@@ -150,6 +151,7 @@ def test_measured_error_of_the_reference():
     assert 0 < tr.reference_error(scenes.standard_map(), start, 100) < 1e-11
 
 
+@pytest.mark.slow
 def test_saving_less_changes_no_state():
     scene = scenes.henon_heiles()
     every = tr.reference_trajectories(scene, neighbours(scene), 10)

@@ -151,6 +151,7 @@ def test_lapack_is_never_given_arrays_of_another_shape():
         Triangle.empty(4).append(np.zeros((3, 4)))
 
 
+@pytest.mark.slow
 def test_nor_where_python_leaves_out_assertions():
     """``python -O``."""
     code = "import test_triangle as t; assert False; raise SystemExit(t.refused() - len(t.WRONG))"

@@ -51,7 +51,7 @@ def test_an_honest_velocity_is_used(record):
 @pytest.mark.parametrize(
     ("made", "what"),
     [
-        (lambda t, theta, omega: 0.97 * omega, "scale"),
+        pytest.param(lambda t, theta, omega: 0.97 * omega, "scale", marks=pytest.mark.slow),
         pytest.param(
             lambda t, theta, omega: np.interp(t - 0.02, t, omega), "lag", marks=pytest.mark.slow
         ),

@@ -103,7 +103,7 @@ def ball_between_walls():
         over = max(z[0] - 0.5, 0.0) - max(-z[0] - 0.5, 0.0)
         return [z[1], -4 * z[0] - 5e3 * over - (5.0 if over else 0.02) * z[1]]
 
-    return orbit(rates, [0.0, 4.0], max_step=2e-3)[:, :1]
+    return orbit(rates, [0.0, 4.0], max_step=1e-2)[:, :1]
 
 
 def pushed_at_random():
@@ -144,12 +144,14 @@ def held():
     ("make", "verdict"),
     [
         (spikes_of_chaos, ("no law: no certain cause", "no law: unrecorded")),
-        (square_wave, ("no law: no certain cause", "no law: unrecorded")),
+        pytest.param(
+            square_wave, ("no law: no certain cause", "no law: unrecorded"), marks=pytest.mark.slow
+        ),
         (held, "no law: steps"),
         (walk, "not mechanical: chance"),
         (prey_and_predators, "not mechanical: first order"),
         (van_der_pol, "not mechanical: self-excited"),
-        (growing_to_its_cycle, "not mechanical: self-excited"),
+        pytest.param(growing_to_its_cycle, "not mechanical: self-excited", marks=pytest.mark.slow),
         (ball_between_walls, "no law: impacts"),
         (pushed_at_random, "no law: unrecorded"),
     ],
@@ -179,7 +181,9 @@ def test_a_small_unrecorded_force_leaves_the_gain_of_an_input(seed):
     assert abs(found - gain) < max(0.2 * gain, 4 * std)
 
 
-@pytest.mark.parametrize("noise", [1e-5, pytest.param(1e-3, marks=pytest.mark.slow), 0.03])
+@pytest.mark.parametrize(
+    "noise", [1e-5, *(pytest.param(x, marks=pytest.mark.slow) for x in (1e-3, 0.03))]
+)
 def test_a_pendulum_is_none_of_these(noise):
     x = orbit(lambda _, z: [z[1], -9 * np.sin(z[0]) - 0.05 * z[1]], [1.2, 0.0])[:, 0]
     x += noise * np.random.default_rng(1).normal(size=len(x))
@@ -285,7 +289,7 @@ def test_what_flies_by_is_not_self_excited():
     assert "self-excited" not in nature(found, measure(found), ()).verdict
 
 
-@pytest.mark.parametrize("across", [0.5, 0.8])
+@pytest.mark.parametrize("across", [0.5, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_an_orbit_is_not_self_excited(across):
     """About a rod (log r): cubic polynomials told of negative friction at rest at its place."""
     x = orbit(lambda _, z: [*z[2:], *(-z[:2] / (z[:2] @ z[:2]))], [1.3, 0.0, 0.0, across])[::4, :2]
@@ -294,7 +298,7 @@ def test_an_orbit_is_not_self_excited(across):
     assert "self-excited" not in nature(found, measure(found), ()).verdict
 
 
-@pytest.mark.parametrize("way", [0.04, 0.25, 0.0])
+@pytest.mark.parametrize("way", [0.04, pytest.param(0.25, marks=pytest.mark.slow), 0.0])
 def test_friction_that_yields_before_it_slips_is_named(way):
     """Dahl's, by a force that is recorded; dry friction, which slips at once, has no memory."""
     t, rng = np.arange(700) * 0.14, np.random.default_rng(1)

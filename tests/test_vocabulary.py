@@ -117,7 +117,12 @@ def test_forces_through_a_point_that_is_not_the_origin(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("centre", "drag"), [([0.7, -0.4, 1.1], 0.05), ([-1.0, 0.5], 0.0), ([0, 0], 0)]
+    ("centre", "drag"),
+    [
+        pytest.param([0.7, -0.4, 1.1], 0.05, marks=pytest.mark.slow),
+        ([-1.0, 0.5], 0.0),
+        ([0, 0], 0),
+    ],
 )
 def test_the_point_about_which_forces_have_no_torque(centre, drag):
     """A spring of rest length 1 from there, a uniform field and drag, in the plane or in space."""
@@ -165,6 +170,7 @@ def test_a_wheel_with_a_motor_that_swings_has_its_torque():
     assert fit.verdict == "identified"
 
 
+@pytest.mark.slow
 def test_a_foucault_pendulum_has_its_field_and_its_hamiltonian():
     turn = 0.1
 
@@ -316,6 +322,7 @@ def test_a_drive_between_two_frequencies_that_are_tried_is_found_beside_an_own_o
     assert hidden_frequency(problem, stiff=False, known=[1.0, found]) is None
 
 
+@pytest.mark.slow
 def test_terms_with_inputs_move_by_the_compiled_law_as_by_the_lagrangian():
     """A support that moves and a magnet: ½v² − ½(x − u)² + i²/(0.4 + x); the oracle is SciPy."""
     given = given_terms(["V: (x - u)**2", "V: i**2/(0.4 + x)"], ["x"], ["v"], (), ["u", "i"])

@@ -19,7 +19,11 @@ import work_precision
 
 
 @pytest.mark.parametrize(
-    "name", ["two-body", "henon-heiles-regular", pytest.param("pcr3bp", marks=pytest.mark.slow)]
+    "name",
+    [
+        "henon-heiles-regular",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("two-body", "pcr3bp")),
+    ],
 )
 def test_the_fields_are_those_of_the_scenes(name):
     scene = gfnn.scenes.make(name)
