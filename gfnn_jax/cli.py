@@ -254,7 +254,7 @@ def _look(arguments: argparse.Namespace) -> None:
         print(json.dumps(summary.as_json(), indent=2, ensure_ascii=False))
     else:
         print_table(summary)
-        print(f"next: {summary.command}\nfigure: {figure}")
+        print(f"{summary.next}: {summary.command}\nfigure: {figure}")
     wrong = sum(fault.wrong for fault in summary.faults)
     if arguments.strict and wrong:
         raise WorkError(f"{paths[0]}: mistakes found: {wrong} (--strict)")

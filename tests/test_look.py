@@ -71,6 +71,15 @@ def test_the_command_to_type_mends_it(tmp_path, name):
     assert not [fault for fault in gfnn.read(path, **options).summary().faults if fault.wrong]
 
 
+@pytest.mark.parametrize("name", ["clipped", "drifting clock", "two systems", *MENDED])
+def test_the_next_command_is_none_that_is_refused(tmp_path, capsys, name):
+    wrong, has_runs = MISTAKES[name][1](MENDED.get(name, 0))
+    path = wrong.written(tmp_path / "r.csv", with_runs=has_runs)
+    assert main(["look", str(path), "--figure", str(tmp_path / "r.png")]) == 0
+    before = "next" if name in MENDED else "when that is mended"
+    assert f"\n{before}: gfnn fit" in capsys.readouterr().out
+
+
 def clean(t):
     return 0.8 * np.exp(-0.05 * t) * np.cos(4 * t)
 

@@ -298,6 +298,25 @@ def test_an_orbit_is_not_self_excited(across):
     assert "self-excited" not in nature(found, measure(found), ()).verdict
 
 
+def test_a_top_that_never_stands_still_is_not_self_excited():
+    """It nods and precesses, one way: polynomials told of negative friction where it does not."""
+
+    def rates(_, z):
+        sine, cosine = np.sin(z[0]), np.cos(z[0])
+        return [
+            *z[2:],
+            z[3] ** 2 * sine * cosine - (3.168 * z[3] - 3.177) * sine,
+            (3.168 - 2 * z[3] * cosine) * z[2] / sine,
+        ]
+
+    t = 0.02 * np.arange(600)
+    x = solve_ivp(rates, (0, 12), [0.65, 0, 0, 0], t_eval=t, rtol=1e-9, atol=1e-10).y[:2].T
+    x = x + 5e-4 * np.random.default_rng(0).normal(size=x.shape)
+    columns = {"t": t, "theta": x[:, 0], "phi": x[:, 1]}
+    found = stretches(gfnn.Recording(columns, angles=["theta", "phi"]))
+    assert "self-excited" not in nature(found, measure(found), (0, 1)).verdict
+
+
 @pytest.mark.parametrize("way", [0.04, pytest.param(0.25, marks=pytest.mark.slow), 0.0])
 def test_friction_that_yields_before_it_slips_is_named(way):
     """Dahl's, by a force that is recorded; dry friction, which slips at once, has no memory."""

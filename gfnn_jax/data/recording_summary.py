@@ -166,12 +166,18 @@ class RecordingSummary:
         console.print(self)
         return console
 
+    @property
+    def next(self) -> str:
+        """What stands before the command: it is refused where no option mends what is wrong."""
+        wrong = [fault.options for fault in self.faults if fault.wrong]
+        return "when that is mended" if wrong and not any(wrong) else "next"
+
     def __str__(self) -> str:
-        return f"{self._printed().export_text().rstrip()}\nnext: {self.call}"
+        return f"{self._printed().export_text().rstrip()}\n{self.next}: {self.call}"
 
     def _repr_html_(self) -> str:
         screen = self._printed().export_html(inline_styles=True, code_format=_NOTEBOOK)
-        return f"{screen}<pre>next: {html.escape(self.call)}</pre>"
+        return f"{screen}<pre>{self.next}: {html.escape(self.call)}</pre>"
 
 
 def summarise(
