@@ -257,7 +257,7 @@ def program(field: Callable[[np.ndarray, Any], Any], width: int, given: int) -> 
 
     def write(place: int) -> None:
         kind, a, b, c = tape.rows[place]
-        both = [tape.known.get((of, a, 0, 0.0)) for of in (SIN, COS)]
+        both = [tape.known.get((of, a, 0, 0.0), -1) for of in (SIN, COS)]
         if kind in (SIN, COS) and {*both} <= {*used}:
             for share, of in enumerate(both, 1):
                 at[of] = len(rows)

@@ -202,7 +202,7 @@ def _keep(kept: Path, code: bytes) -> None:
 
 @cache
 def _library() -> dict[str, int]:
-    """Where C's functions stand that compiled code may call: LLVM ends the process where one that
+    """Addresses of C's functions that compiled code may call: LLVM ends the process where one that
     it looks for itself is missing."""
     files = ("ucrtbase.dll", "vcruntime140.dll") if os.name == "nt" else (None,)  # the process
     libraries = [ctypes.CDLL(file) for file in files]

@@ -81,8 +81,8 @@ def _followed(stepper, map_, lanes: Lanes, args, saving: Saving) -> tuple[Any, R
 
 
 def _inside(map_, y: np.ndarray, of_runs) -> np.ndarray:
-    """Which states y (B, M, n) lie in the domain (M, B), so few at a time that their monomials stay
-    in a near memory."""
+    """Whether states y (B, M, n) lie in the domain (M, B), so few at a time that their monomials
+    stay in a near memory."""
     most = max(1, _AT_ONCE // (16 * len(y)))
     parts = (y[:, first : first + most] for first in range(0, y.shape[1], most))
     return np.concatenate([contains(map_, part, of_runs) for part in parts], axis=1).T
