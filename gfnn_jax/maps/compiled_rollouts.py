@@ -81,7 +81,7 @@ def _followed(stepper, map_, lanes: Lanes, args, saving: Saving) -> tuple[Any, R
 
 
 def _inside(map_, y: np.ndarray, of_runs) -> np.ndarray:
-    """Whether states y (B, M, n) lie in the domain (M, B), so few at a time that their monomials
+    """Return whether states y (B, M, n) lie in the domain (M, B), a few at a time: their monomials
     stay in a near memory."""
     most = max(1, _AT_ONCE // (16 * len(y)))
     parts = (y[:, first : first + most] for first in range(0, y.shape[1], most))
