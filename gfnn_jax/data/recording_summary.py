@@ -168,7 +168,7 @@ class RecordingSummary:
 
     @property
     def next(self) -> str:
-        """What stands before the command: it is refused where no option mends what is wrong."""
+        """Words before the command, which is refused where no option mends what is wrong."""
         wrong = [fault.options for fault in self.faults if fault.wrong]
         return "when that is mended" if wrong and not any(wrong) else "next"
 
