@@ -46,6 +46,16 @@ def test_correlated_residuals_beside_much_noise_are_a_law_that_lacks_something()
     assert fit.verdict.startswith("partly: ") or drawn.right(drawn.error(fit))
 
 
+def test_friction_that_is_not_seen_leaves_the_stiffness_open():
+    """A chain that slides off a table, for a second: x grows as by one exponent, of stiffness and
+    friction together."""
+    t, stiffness = np.linspace(0, 1, 200), 3.57
+    x = motion(lambda q, v: stiffness * q - 0.22 * v, [0.2, 0.0], t)[0]
+    fit = gfnn.fit(t, x + 0.01 * x.std() * np.random.default_rng(0).normal(size=200))
+    assert not fit.which_friction.kinds
+    assert fit.verdict.startswith("one of several")
+
+
 @pytest.mark.slow
 def test_sums_of_terms_that_meet_in_a_likelier_law_are_no_rivals():
     """Friction as strong in both joints: (v1 + v2)² + (v1 − v2)² is 2 v1² + 2 v2²."""

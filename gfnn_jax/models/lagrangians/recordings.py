@@ -73,7 +73,13 @@ from gfnn_jax.models.lagrangians.libraries import FRICTIONS, last_of_series, nam
 from gfnn_jax.models.lagrangians.nature import NO_COLUMN, Nature, nature
 from gfnn_jax.models.lagrangians.next_motion import next_motions, parting
 from gfnn_jax.models.lagrangians.residuals import Trace
-from gfnn_jax.models.lagrangians.rivals import constant_of, constants, of_a_sensor, other_powers
+from gfnn_jax.models.lagrangians.rivals import (
+    constant_of,
+    constants,
+    of_a_sensor,
+    other_powers,
+    unseen_friction,
+)
 from gfnn_jax.models.lagrangians.search import (
     SearchResult,
     TermSearch,
@@ -295,7 +301,7 @@ def fit_recording(
             coloured = [one for one in law.whiteness.values() if law.flaws and not one.white]
             over = [one.smoothed_over(data.problem.scales.period) for one in coloured]
             sensor, explained = of_a_sensor(best.fit, any(over) and all(over))
-            rival = law.rival or sensor or _other_shapes(best.fit)
+            rival = law.rival or sensor or _other_shapes(best.fit) or unseen_friction(best.fit)
             law = dataclasses.replace(law, rival=rival, nature=sensor, messages=messages)
             law = law if law.flaws else _with_rivals(law, recording, data, best.fit)
     except (FitError, np.linalg.LinAlgError):

@@ -297,6 +297,35 @@ def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
     )
 
 
+def unseen_friction(fit: LawFit) -> str:
+    """A line where linear friction, of which a record shows none, would move a coefficient by what
+    is significant if it were as large as two standard errors allow, "" elsewhere: what grows from
+    near rest in one second tells a stiffness by itself as little as friction."""
+    if fit.structure.friction or fit.problem.parameters:
+        return ""
+    own, least, lines = fit.values, fit.problem.options.evidence.significant, []
+    errors = dict(zip(fit.structure.keys(), fit.linearised.errors.tolist(), strict=True))
+    for row in losses(fit.problem.dim, (LINEAR,), 0.0)[: fit.problem.dim]:
+        larger = fit.structure.plus([("loss", row)])
+        near, keys = fit.problem.linearised(larger, fit), larger.keys()
+        at = keys.index(("loss", row))
+        most = float((near.p + near.step())[at] + 2 * near.errors[at])
+        moved = most * near.covariance[at] / near.covariance[at, at]
+        far = {
+            key: abs(float(change) / own[key])
+            for key, change in zip(keys, moved, strict=True)
+            if key[0] == "term" and abs(change) > least * errors[key] and most > 0
+        }
+        if far:
+            word, rubs = (
+                fit.problem.word(key) for key in (max(far, key=far.__getitem__), keys[at])
+            )
+            lines.append(
+                f"{rubs} as large as the record allows moves {word} by {max(far.values()):.2g}"
+            )
+    return f"no friction is seen, but {'; '.join(lines)} of itself" if lines else ""
+
+
 def of_a_sensor(fit: LawFit, smoothed: bool = False) -> tuple[str, bool]:
     """A line on a sensor of one coordinate beside which a plainer law follows a record, "" where
     there is none, and whether the record is explained: that law leaves noise alone, or readings are
