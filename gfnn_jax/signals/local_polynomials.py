@@ -103,7 +103,8 @@ class _Options:
     """halves: windows, samples on either side. samples: where the errors of a window are measured.
     tolerance: of the leave-one-out error, against the best window's. rounding: of a channel's
     range, below which an error is that of a constant. orders: of differences; fewest: of them that
-    tell noise; biased: share of the noise that cubics tell, below which that is theirs."""
+    tell noise; biased: share of the noise that cubics tell, below which that is theirs; least: of
+    the range, below which what a start of a law leaves is the error of its steps."""
 
     halves: tuple[int, ...] = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 64, 80)
     samples: int = 2_000
@@ -112,6 +113,7 @@ class _Options:
     orders: tuple[int, ...] = tuple(range(4, 11))
     fewest: int = 20
     biased: float = 0.5
+    least: float = 1e-6
 
 
 _OPTIONS = _Options()
@@ -171,7 +173,9 @@ def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np
     score = relative.max(axis=1)
     good = np.flatnonzero(score <= _OPTIONS.tolerance * score.min())
     sigma = np.min(sigmas, axis=0)
+    ranges = rounding / _OPTIONS.rounding
     by_differences = _by_differences([y for _, y in stretches], rounding)
+    by_differences = np.maximum(by_differences, _OPTIONS.least * ranges)
     told = by_differences < _OPTIONS.biased * sigma
     return halves[good[-1]], np.where(told, by_differences, sigma)
 

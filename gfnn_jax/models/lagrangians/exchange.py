@@ -169,11 +169,11 @@ def leaves_open(fit: LawFit, rival: Exchanged) -> bool:
     new = {row[1] for row in rival.fit.structure.friction if row not in fit.structure.friction}
     if new == {STRIBECK} and more == 1:
         evidence = fit.problem.options.evidence
-        return np.log(fit.independent) - rival.above > evidence.chance**2
+        return bool(np.log(fit.independent) - rival.above > evidence.chance**2)
     unlikely = rival.above + more * _for_fewer(fit, len(fit.p) - more)
     kinds, others = (_oddness(one.structure.friction) for one in (fit, rival.fit))
     plain = all(map(le, others, kinds)) and unlikely < fit.problem.options.evidence.deciding
-    return plain or rival.above < 0
+    return bool(plain or rival.above < 0)
 
 
 def _oddness(friction: Sequence[Loss]) -> tuple[int, ...]:
