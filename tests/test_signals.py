@@ -179,19 +179,6 @@ def test_rest_counts_friction_and_impacts_are_no_wrong_values(name):
     assert found_in(x, resolution(x) or 0.0) == ([], [])
 
 
-@pytest.mark.parametrize("digits", [3, 8])
-def test_a_logger_that_repeats_the_value_before_where_it_missed_one(digits):
-    rng = np.random.default_rng(1)
-    x = np.round(swing(T)[0] + 1e-3 * rng.standard_normal(len(T)), digits)
-    missed = 1 + np.flatnonzero(rng.uniform(size=len(x) - 1) < 0.06)
-    for k in missed:
-        x[k] = x[k - 1]
-    stuck, outliers = found_in(x, resolution(x) or 0.0)
-    fast = np.abs(np.gradient(swing(T)[0])[missed]) > 0.02  # far above the resolution
-    assert {*missed[fast].tolist()} <= {row for begin, end in stuck for row in range(begin, end)}
-    assert outliers == []
-
-
 # Derivatives
 
 

@@ -9,9 +9,6 @@ with few samples a period the sides themselves do not lie on it, and nothing is 
 begins and ends abruptly; a short swing of the motion rises and falls from sample to sample. Nor is
 it one that is off by a whole turn: an angle that was not lifted.
 
-*Repeats*: a logger that misses a sample may give the one before again. Where motion goes many steps
-of the sensor in a sample, noise makes two values equal as rarely as it makes them nearly so.
-
 *Stuck*: equal values, then a jump to where the motion is by then. A body that rests starts slowly
 from where it rested, and a coarse sensor shows its turning points by equal values beside which it
 moves by its smallest step. Only a sensor that was stuck while the motion went on catches up in one
@@ -52,8 +49,6 @@ class _Options:
     Stuck are at least ``fewest`` equal values (two or three are what a camera makes of a frame that
     it dropped) among ``around`` steps before and behind; jump: times the fastest of these, at
     least; resolutions: that the motion goes in a step (slower, equal values are a sensor's digits).
-    Fewer are repeats of a logger that missed a sample where motion goes so many ``steps`` of the
-    resolution, and there are ``chance`` times as many as of other small steps, and more than that.
 
     At jumps: smooth: degree of the polynomial of each side; beyond: part of the jump by which the
     sample is beyond both sides, for the overshoot of a real one is less.
@@ -78,8 +73,6 @@ class _Options:
     around: int = 8
     jump: float = 3.0
     resolutions: float = 2.0
-    steps: float = 10.0
-    chance: float = 5.0
     smooth: int = 3
     beyond: float = 0.5
 
@@ -111,10 +104,9 @@ def wrong_values(
     found = []
     for run, (t, x, rows) in enumerate(series):
         moving = np.ones(len(x), bool)
-        for begin, end in (*_stuck(t, x, step, rough), *_repeats(x, step)):
-            if moving[begin]:
-                moving[begin:end] = False
-                found.append(WrongValues(run, rows[begin:end], None))
+        for begin, end in _stuck(t, x, step, rough):
+            moving[begin:end] = False
+            found.append(WrongValues(run, rows[begin:end], None))
         t, x, rows = t[moving], x[moving], rows[moving]
         for begin, end, off in _outliers(t, x, step, rough):
             found.append(WrongValues(run, rows[begin:end], off))
@@ -275,21 +267,6 @@ def _apart(
     if abs(np.median(off[far]) - TURN) < _OPTIONS.of_turn * TURN:
         return None
     return int(rows[first]), int(rows[last]) + 1, float(off[far].max())
-
-
-def _repeats(x: np.ndarray, resolution: float) -> list[tuple[int, int]]:
-    """(begin, end) of single samples of a run (n,) that repeat the one before, where chance does
-    not; x: without missing values. resolution: the smallest step, 0 if it is unknown."""
-    ways, around = np.abs(np.diff(x)), _OPTIONS.around
-    if len(ways) < 2 * around or np.sum(ways == 0) <= _OPTIONS.chance:
-        return []
-    near = _OPTIONS.steps * max(resolution, 1e-9 * float(np.ptp(x)))
-    padded = np.pad(ways, around, mode="edge")
-    moves = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * around + 1), 1) > near
-    same, others = moves & (ways == 0), np.sum(moves & (ways > 0) & (ways < near))
-    if np.sum(same) <= _OPTIONS.chance * (1 + others / (2 * _OPTIONS.steps)):
-        return []
-    return [(int(k) + 1, int(k) + 2) for k in np.flatnonzero(same)]
 
 
 def _stuck(t: np.ndarray, x: np.ndarray, resolution: float, rough: float) -> list[tuple[int, int]]:
