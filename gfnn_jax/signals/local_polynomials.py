@@ -112,7 +112,7 @@ class _Options:
     rounding: float = 1e-13
     orders: tuple[int, ...] = tuple(range(4, 11))
     fewest: int = 20
-    biased: float = 0.5
+    biased: float = 0.1
     least: float = 1e-6
 
 
@@ -151,7 +151,7 @@ def smooth(
 def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np.ndarray]:
     """The window (samples to either side) for these stretches (t (n,), y (n, d)) of a recording,
     and the noise σ (d,) of the channels: the smallest leave-one-out error, less the cubic's own
-    part, or what is left of differences where that is much less."""
+    part, or what is left of differences where that is less than a tenth."""
     total = sum(len(t) for t, _ in stretches)
     rounding = _OPTIONS.rounding * np.max([np.ptp(y, axis=0) for _, y in stretches], axis=0)
     every = max(1, total // _OPTIONS.samples)
