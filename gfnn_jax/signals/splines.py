@@ -166,7 +166,9 @@ class _Problem:
             with contextlib.suppress(np.linalg.LinAlgError):  # readings of a run nearly coincide
                 unlikely, sigma, _ = self._solved(stiffness)
                 found.append((unlikely, stiffness, sigma))
-        return min(found)[1:]
+        if not found:
+            raise np.linalg.LinAlgError("no smoothing spline of these readings can be solved for")
+        return min(found, key=lambda one: one[0])[1:]
 
     def curve(self, stiffness: float) -> Any:
         """The curve of the first run."""

@@ -310,7 +310,8 @@ def unseen_friction(fit: LawFit) -> str:
         near, keys = fit.problem.linearised(larger, fit), larger.keys()
         at = keys.index(("loss", row))
         most = float((near.p + near.step())[at] + 2 * near.errors[at])
-        moved = most * near.covariance[at] / near.covariance[at, at]
+        with np.errstate(all="ignore"):  # of what is not determined at all
+            moved = most * near.covariance[at] / near.covariance[at, at]
         far = {
             key: abs(float(change) / own[key])
             for key, change in zip(keys, moved, strict=True)
