@@ -48,7 +48,7 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import PAPER_HIDDEN, Mlp, amplitude_of
 from gfnn_jax.families.products import Products
 from gfnn_jax.fitting import least_squares, row_blocks
-from gfnn_jax.fitting.adam import Recipe, Training
+from gfnn_jax.fitting.adam import Recipe, Training, gradient_loss
 from gfnn_jax.fitting.levenberg_marquardt import GradientFit, Limits
 from gfnn_jax.generating.charts import MIDPOINT
 from gfnn_jax.generating.generated import Generated
@@ -98,8 +98,8 @@ def training(problem: Problem, device) -> Iterator[Row]:
             def note(*_, seconds=seconds):
                 seconds.append(time.perf_counter())
 
-            Training(recipe, jax.random.key(2), on_epoch=note).of_gradients(
-                family, params, train, validation, np.ones(4)
+            Training(recipe, jax.random.key(2), on_epoch=note).of_loss(
+                gradient_loss(family, 1.0), params, train, validation, 4
             )
             found = {"seconds": min(np.diff(seconds)) / iterations}
             yield "training", f"{'–'.join(map(str, hidden))}, batch {recipe.batch_size:,}", found

@@ -16,7 +16,7 @@ import numpy as np
 
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import PAPER_HIDDEN, Mlp
-from gfnn_jax.fitting.adam import PAPER, Training
+from gfnn_jax.fitting.adam import PAPER, Training, gradient_loss
 from gfnn_jax.generating.charts import TYPE2
 from gfnn_jax.scenes import henon_heiles
 
@@ -32,12 +32,12 @@ def training(quick: bool) -> Numbers:
     recipe = dataclasses.replace(PAPER, epochs=runs + 1, epoch_length=length)
     ends = []
     key = jax.random.key(SEED)
-    Training(recipe, key, on_epoch=lambda *_: ends.append(time.perf_counter())).of_gradients(
-        family,
+    Training(recipe, key, on_epoch=lambda *_: ends.append(time.perf_counter())).of_loss(
+        gradient_loss(family, scene.dt),
         family.init(key, jnp.float32),
         (w, target),
         (w[:10], target[:10]),
-        scene.dt * np.ones(4),
+        4,
     )
     seconds = float(np.diff(ends).min()) / length
     weights = [jnp.ones(shape, jnp.float32) for shape in pairwise((4, *PAPER_HIDDEN, 1))]

@@ -33,7 +33,14 @@ from gfnn_jax.families.mlp import (
     initial,
     network,
 )
-from gfnn_jax.fitting.adam import PAPER, PAPER_STANDARD_MAP, AdamFit, Recipe, Training
+from gfnn_jax.fitting.adam import (
+    PAPER,
+    PAPER_STANDARD_MAP,
+    AdamFit,
+    Recipe,
+    Training,
+    gradient_loss,
+)
 from gfnn_jax.generating.charts import TYPE2
 from gfnn_jax.generating.generated import Generated
 from gfnn_jax.maps.domain import covering
@@ -261,26 +268,13 @@ def paper_gfnn(pairs: Sequences, budget: Budget) -> PaperGfnn:
     w, target = TYPE2.evaluation_point(z0, z1), TYPE2.target_gradient(z0, z1, pairs.dt)
     inputs = box_inputs(w, angles=q_angles(pairs))
     family = Mlp(inputs, hidden, "tanh", amplitude_of(w, target))
-    first = held(len(w))
-    part = 50  # iterations between two readings of the clock
+    part = 50  # iterations between two readings of the error
     iterations = recipe.epochs * (len(w) // recipe.batch_size)
     recipe = dataclasses.replace(recipe, epochs=max(1, iterations // part), epoch_length=part)
-    training = Training(
-        recipe,
-        budget.key,
-        cap=budget.cap,
-        on_epoch=lambda epoch, _, rms: budget.on_progress(
-            f"{epoch * part} iterations: error {rms:.1e}"
-        ),
-    ).of_gradients(
-        family,
-        family.init(budget.key, jnp.float32),
-        (w[first:], target[first:]),
-        (w[:first], target[:first]),
-        pairs.dt * np.ones(2 * pairs.dim),
-    )
+    loss, start = gradient_loss(family, pairs.dt), family.init(budget.key, jnp.float32)
+    params, training = train(loss, start, (w, target), 2 * pairs.dim, recipe, budget)
     scale = sizes(z0)
-    generated = Generated(family, in_float64(training.params), TYPE2, pairs.dt, scale)
+    generated = Generated(family, params, TYPE2, pairs.dt, scale)
     coordinates = Coordinates("cartesian", angles=pairs.angles)
     centre = np.full(len(pairs.angles), np.pi)  # z0 is in [0, 2π)
     domain = covering(z0[:20_000], ignore=pairs.angles)

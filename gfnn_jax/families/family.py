@@ -169,9 +169,22 @@ class AroundAnother(OfCoefficients):
         return self.family.num_parameters
 
     @property
+    def term_names(self) -> tuple[str, ...]:
+        return self.family.term_names
+
+    @property
+    def quadratic(self) -> bool:
+        """Return whether the field is affine."""
+        return self.family.quadratic
+
+    @property
     def operations(self) -> tuple[int, int]:
         """Floating-point operations of a gradient, and of a gradient with its Hessian."""
         return self.family.operations
+
+    def at_time(self, args, after):
+        """args a time ``after`` later."""
+        return at_time(self.family, args, after)
 
 
 class DifferentiatedByJax(CalledAsValue):

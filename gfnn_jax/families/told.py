@@ -139,11 +139,6 @@ class Constrained(AroundAnother):
         """Names of the terms whose coefficients are free."""
         return tuple(self.family.term_names[j] for j in self.free)
 
-    @property
-    def quadratic(self) -> bool:
-        """Return whether the gradient is affine."""
-        return self.family.quadratic
-
     def coefficients(self, params: np.ndarray) -> np.ndarray:
         """Coefficients (N,) of all terms."""
         return self.fixed + self.basis @ params

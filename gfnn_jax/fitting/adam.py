@@ -1,12 +1,6 @@
 """Minimise a loss by Adam, among them the paper's for S(params, w). The one home of optax.
 
-`Training.of_gradients` fits S to target gradients. Its loss is the paper's (3), a mean over pairs,
-with a weight for the size of each coordinate:
-
-    L(θ) = mean of ‖weight · (∇S(θ, w) − target_gradient)‖²
-
-``weight = h`` in all entries is the paper's; ``h / scale`` of the conjugate coordinate makes L
-independent of the units of q and p. `Training.of_loss` takes any loss of a batch.
+`Training.of_loss` takes any loss of a batch. The paper's (3) for S is `gradient_loss`.
 
 An epoch is one compiled scan. Its order of the pairs is a function of the key and the epoch's
 number alone: the same key gives the same bits.
@@ -24,12 +18,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from gfnn_jax.families import Family
 from gfnn_jax.phase_space import require_x64
-
-Rows = Float[Array | np.ndarray, "_ _"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,39 +109,13 @@ class Training:
     cap:        operations of the training, counted: the epochs are as many as it allows, one or
                 more, and the rate goes through its whole schedule in them.
 
-    What is
-    compiled serves the next training with the same loss, or family, and data of the same shapes.
+    What is compiled serves the next training with the same loss and data of the same shapes.
     """
 
     recipe: Recipe
     key: Any
     on_epoch: Callable[[int, float, float], Any] | None = None
     cap: float | None = None
-
-    def of_gradients(
-        self,
-        family: Family,
-        params: Any,
-        train: tuple[Rows, Rows],
-        validation: tuple[Rows, Rows],
-        weight: Any,
-    ) -> AdamFit:
-        """Minimise L over train = (w, target_gradient), each (N, 2d).
-
-        params: any pytree of floating-point arrays: the start. validation: (w, target_gradient) of
-        pairs kept apart. weight: (2d,).
-
-        Raises ValueError where shapes do not agree, data are not finite or the loss is not finite
-        at the start, RuntimeError where float64 is asked for and JAX's x64 mode is off. Where
-        numbers cease to be finite later, the fit stops and says so.
-        """
-        weight = np.asarray(weight, self.recipe.dtype)
-        train, validation = (
-            (np.asarray(w), np.asarray(target)) for w, target in (train, validation)
-        )
-        _check(train, validation, weight)
-        data = params, train, validation
-        return self._minimised(_gradient_loss, (family, weight), data, weight.size)
 
     def of_loss(
         self, loss: Callable, params: Any, train: tuple, validation: tuple, components: int
@@ -159,19 +124,17 @@ class Training:
         train.
 
         train, validation: tuples of arrays that agree in their first axis, the rows. components:
-        what a row's loss is a sum of: the errors reported are √(loss / components). Raises as
-        ``of_gradients``.
-        """
-        return self._minimised(_LossOfRows(loss), None, (params, train, validation), components)
+        what a row's loss is a sum of: the errors reported are √(loss / components).
 
-    def _minimised(self, loss: Callable, given: Any, data: tuple, components: int) -> AdamFit:
-        """Minimise ``loss(given, params, *batch)``; what is given, a pytree, may change without
-        another compilation. data: (params, train, validation)."""
+        Raises ValueError where the loss is not finite at the start, RuntimeError where float64 is
+        asked for and JAX's x64 mode is off. Where numbers cease to be finite later, the fit stops
+        and says so.
+        """
         recipe, cap = self.recipe, self.cap
         if recipe.dtype == "float64":
             require_x64("training in float64")
         params, train, validation = jax.tree.map(
-            lambda a: jnp.asarray(np.asarray(a, recipe.dtype)), data
+            lambda a: jnp.asarray(np.asarray(a, recipe.dtype)), (params, train, validation)
         )
         num_rows, batch_size = len(train[0]), min(recipe.batch_size, len(train[0]))
         length = recipe.epoch_length or num_rows // batch_size
@@ -195,18 +158,18 @@ class Training:
 
         started = time.perf_counter()
         carry, epochs = _first_carry(params), recipe.epochs
-        program = _run_epoch.trace(carry, given, order(0), rates(0), train, loss=loss)
+        program = _run_epoch.trace(carry, order(0), rates(0), train, loss=loss)
         operations = operations_of(program.jaxpr)
         if cap is not None:
             epochs = min(epochs, max(1, int(cap / operations)))
         program.lower().compile()
-        _validate.lower(params, given, validation, loss=loss).compile()
+        _validate.lower(params, validation, loss=loss).compile()
         compile_seconds = time.perf_counter() - started
 
         def rms(value):
             return math.sqrt(float(value) / components)
 
-        start = rms(_validate(params, given, validation, loss=loss))
+        start = rms(_validate(params, validation, loss=loss))
         if not math.isfinite(start):
             raise ValueError("the loss is not finite on the validation rows at the start")
         epoch, seconds = 0, 0.0
@@ -215,9 +178,9 @@ class Training:
         stopped_because = f"the cap of {cap:.3g} operations" if capped else "epochs"
         while epoch < epochs:
             started = time.perf_counter()
-            carry, value = _run_epoch(carry, given, order(epoch), rates(epoch), train, loss=loss)
+            carry, value = _run_epoch(carry, order(epoch), rates(epoch), train, loss=loss)
             epoch += 1
-            held = _validate(carry[0], given, validation, loss=loss)
+            held = _validate(carry[0], validation, loss=loss)
             now = {"train_rms": rms(value), "validation_rms": rms(held)}
             seconds += time.perf_counter() - started
             if not all(map(math.isfinite, now.values())):
@@ -237,26 +200,26 @@ class Training:
         )
 
 
-def _gradient_loss(given, params, w, target_gradient):
-    """The paper's (3), for weight = h."""
-    family, weight = given
-    error = weight[None, :] * (family.gradient(params, w) - target_gradient)
-    return jnp.mean(jnp.sum(error**2, axis=-1))
+def gradient_loss(family: Family, weight: Any) -> Callable:
+    """The paper's loss (3) of rows (w, target_gradient), each (N, 2d), with a weight (2d,) for the
+    size of each coordinate:
 
+        L(θ) = mean of ‖weight · (∇S(θ, w) − target_gradient)‖²
 
-@dataclasses.dataclass(frozen=True)
-class _LossOfRows:
-    """A loss that is given nothing but the parameters and the rows."""
+    ``weight = h`` in all entries is the paper's; ``h / scale`` of the conjugate coordinate makes L
+    independent of the units of q and p.
+    """
 
-    loss: Callable
+    def loss(params, w, target_gradient):
+        factors = jnp.broadcast_to(jnp.asarray(weight, w.dtype), w.shape)
+        error = factors * (family.gradient(params, w) - target_gradient)
+        return jnp.mean(jnp.sum(error**2, axis=-1))
 
-    def __call__(self, given, params, *rows):
-        del given
-        return self.loss(params, *rows)
+    return loss
 
 
 @partial(jax.jit, static_argnames="loss", donate_argnames="carry")
-def _run_epoch(carry, given, batches, rates, rows, *, loss):
+def _run_epoch(carry, batches, rates, rows, *, loss):
     """(carry, mean loss) after an iteration with each of the batches (length, batch_size)."""
     import optax
 
@@ -264,9 +227,7 @@ def _run_epoch(carry, given, batches, rates, rows, *, loss):
 
     def iterate(carry, chosen):
         (params, state), (batch, rate) = carry, chosen
-        value, slope = jax.value_and_grad(loss, argnums=1)(
-            given, params, *(array[batch] for array in rows)
-        )
+        value, slope = jax.value_and_grad(loss)(params, *(array[batch] for array in rows))
         with jax.numpy_dtype_promotion("standard"):  # optax counts in int32
             direction, state = optimizer.update(slope, state, params)
         updates = jax.tree.map(lambda a: -rate * a, direction)
@@ -277,8 +238,8 @@ def _run_epoch(carry, given, batches, rates, rows, *, loss):
 
 
 @partial(jax.jit, static_argnames="loss")
-def _validate(params, given, rows, *, loss):
-    return loss(given, params, *rows)
+def _validate(params, rows, *, loss):
+    return loss(params, *rows)
 
 
 @jax.jit
@@ -304,17 +265,6 @@ def _seed(key, epoch):
 def _copied(tree):
     """NumPy copies: the next epoch reuses the memory of its carry."""
     return jax.tree.map(np.array, tree)
-
-
-def _check(train, validation, weight):
-    for name, (w, target) in (("train", train), ("validation", validation)):
-        if w.shape != target.shape or w.ndim != 2 or w.shape[1:] != weight.shape or len(w) == 0:
-            raise ValueError(
-                f"{name}: expected w and target_gradient of shape (N, {weight.size}), N > 0, "
-                f"got {w.shape} and {target.shape}"
-            )
-        if not (np.isfinite(w).all() and np.isfinite(target).all()):
-            raise ValueError(f"{name}: w or target_gradient has entries that are NaN or infinite")
 
 
 # A number that is no sum of products takes as long as so many of these, memory and transcendental

@@ -15,7 +15,7 @@ import numpy as np
 from gfnn_jax.arrays import pytree
 from gfnn_jax.brackets import Bracket
 from gfnn_jax.families import as_family
-from gfnn_jax.families.family import AroundAnother, at_time
+from gfnn_jax.families.family import AroundAnother
 from gfnn_jax.flows.lifts import lift_of
 from gfnn_jax.generating.generated import two_sum
 from gfnn_jax.solve.linear import small_solve
@@ -54,10 +54,6 @@ class Collective(AroundAnother):
         """Floating-point operations of a gradient, and of a gradient with its Hessian."""
         gradient, hessian = self.family.operations
         return 2 * gradient, 4 * hessian
-
-    def at_time(self, args, after):
-        """args a time ``after`` later."""
-        return at_time(self.family, args, after)
 
     def value(self, params, w, args=None):
         """H (...) at w (..., N)."""

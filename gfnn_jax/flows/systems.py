@@ -34,15 +34,6 @@ class OfSystems(AroundAnother):
         return len(self.powers)
 
     @property
-    def term_names(self) -> tuple[str, ...]:
-        return self.family.term_names
-
-    @property
-    def quadratic(self) -> bool:
-        """Return whether the field is affine."""
-        return self.family.quadratic
-
-    @property
     def operations(self) -> tuple[int, int]:
         """Operations of the family, and of the powers."""
         gradient, with_hessian = self.family.operations

@@ -47,20 +47,11 @@ class Uniform(WithForces):
         """Names of the terms of H, and γ."""
         return (*self.family.term_names, FRICTION)
 
-    @property
-    def quadratic(self) -> bool:
-        """Return whether the field is affine."""
-        return self.family.quadratic
-
     def take(self, rows) -> Any:
         """The family of these terms alone; without γ the one without friction."""
         last = self.family.num_parameters
         own = self.family.take([j for j in rows if j != last])
         return Uniform(own) if last in list(rows) else own
-
-    def at_time(self, args, after):
-        """args a time ``after`` later."""
-        return at_time(self.family, args, after)
 
     def multiplier(self, params, dt):
         """e^(−γ dt); None beside other forces, which keep no multiple of the symplectic form."""

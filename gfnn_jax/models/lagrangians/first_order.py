@@ -11,13 +11,15 @@ dozen terms of f; a membrane is the other way round.
 from __future__ import annotations
 
 import dataclasses
-from itertools import combinations_with_replacement
+import re
 from typing import Any
 
 import numpy as np
 
 from gfnn_jax.dataset.stretches import Arcs
-from gfnn_jax.families.text import added, digits, power
+from gfnn_jax.families.expressions import coordinate_names
+from gfnn_jax.families.terms import Terms, exponents
+from gfnn_jax.families.text import added, digits, plain
 from gfnn_jax.fitting.evidence import EVIDENCE, criterion
 from gfnn_jax.fitting.linearised import Linearised
 from gfnn_jax.fitting.significance import significant
@@ -45,54 +47,15 @@ class FirstOrderOptions:
 OPTIONS = FirstOrderOptions()
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Products:
-    """Products φ_j of lengths, and of sines and cosines of ``angles``. factors: of each, numbers of
-    variables: first the lengths, in the order of coordinates, then sines, then cosines."""
-
-    dim: int
-    angles: tuple[int, ...]
-    factors: tuple[tuple[int, ...], ...]
-
-    @classmethod
-    def of(cls, dim: int, angles: tuple[int, ...], degree: int) -> Products:
-        """Every product up to a degree."""
-        count = dim + len(angles)
-        every = range(count)
-        factors = [f for n in range(degree + 1) for f in combinations_with_replacement(every, n)]
-        sines = range(dim - len(angles), dim)
-        twice = [f for f in factors if not any(f.count(k) > 1 for k in sines)]  # sin² is 1 − cos²
-        return cls(dim, angles, tuple(twice))
-
-    @property
-    def lengths(self) -> list[int]:
-        return [i for i in range(self.dim) if i not in self.angles]
-
-    def __call__(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """φ (N, J) and ∂φ/∂q (N, J, d) at positions q (N, d)."""
-        turned, lengths = q[:, list(self.angles)], self.lengths
-        s, c = np.sin(turned), np.cos(turned)
-        w = np.concatenate([q[:, lengths], s, c], axis=1)
-        slope = np.concatenate([np.ones((len(q), len(lengths))), c, -s], axis=1)
-        owner = [*lengths, *self.angles, *self.angles]
-        values = np.ones((len(q), len(self.factors)))
-        slopes = np.zeros((*values.shape, self.dim))
-        for j, own in enumerate(self.factors):
-            values[:, j] = np.prod(w[:, list(own)], axis=1)
-            for k in set(own):
-                rest = list(own)
-                rest.remove(k)
-                by = own.count(k) * np.prod(w[:, rest], axis=1) * slope[:, k]
-                slopes[:, j, owner[k]] += by
-        return values, slopes
-
-    def text(self, j: int, names: tuple[str, ...]) -> str:
-        """φ_j as code."""
-        turned = [names[i] for i in self.angles]
-        of = [names[i] for i in self.lengths]
-        of += [f"sin({n})" for n in turned] + [f"cos({n})" for n in turned]
-        own = self.factors[j]
-        return "*".join(power(of[k], own.count(k)) for k in dict.fromkeys(own)) or "1"
+def products(dim: int, angles: tuple[int, ...], degree: int) -> Terms:
+    """Products, up to a degree, of lengths, in the order of coordinates, then sines and cosines of
+    ``angles``; sin² is 1 − cos², and left out."""
+    q = coordinate_names(dim)[:dim]
+    of = [x for i, x in enumerate(q) if i not in angles]
+    of += [f"{function}({q[i]})" for function in ("sin", "cos") for i in angles]
+    sines = slice(dim - len(angles), dim)
+    rows = [(0,) * len(of), *exponents(len(of), degree)]
+    return Terms(dim, tuple(of), tuple(row for row in rows if max(row[sines], default=0) < 2))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -100,7 +63,7 @@ class FieldOnArcs:
     """q̇_i = Σ p_k φ_j of the pairs (i, j) = places (K, 2) along arcs of steps h (A, L − 1): the
     model of `Readings.fit`, by Runge–Kutta steps of order 4."""
 
-    products: Products
+    products: Terms
     places: np.ndarray
     h: np.ndarray
     substeps: int = 1
@@ -113,7 +76,7 @@ class FieldOnArcs:
 
     def matrix(self, p: np.ndarray) -> np.ndarray:
         """The coefficients as (d, J)."""
-        c = np.zeros((self.products.dim, len(self.products.factors)))
+        c = np.zeros((self.products.dim, self.products.num_parameters))
         c[tuple(self.places.T)] = p
         return c
 
@@ -123,8 +86,8 @@ class FieldOnArcs:
         own = np.arange(len(p))
 
         def rates(z: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            values, slopes = self.products(z)
-            moving = np.einsum("ij,njk->nik", c, slopes, optimize=True) @ slope
+            values = self.products.term_values(z)
+            moving = c @ self.products.term_gradients(z).swapaxes(1, 2) @ slope
             moving[:, i, d + own] += values[:, j]
             return values @ c.T, moving
 
@@ -142,10 +105,13 @@ class FirstOrder:
     def text(self, names: tuple[str, ...]) -> str:
         """The equations, in the names of coordinates."""
         errors, parts = Linearised.of_arcs(self.fitted).errors, [[] for _ in names]
+        terms = [
+            re.sub(r"q(\d+)", lambda q: names[int(q[1]) - 1], plain(term))
+            for term in self.model.products.term_names
+        ]
         for (i, j), c, e in zip(self.model.places, self.fitted.p, errors, strict=True):
-            term = self.model.products.text(int(j), names)
             number = digits(float(c), float(e))
-            parts[i].append(number if term == "1" else f"{number}*{term}")
+            parts[i].append(f"{number}*{terms[j]}" if terms[j] else number)
         return ", ".join(
             f"{name}_dot = {added(own) or '0'}" for name, own in zip(names, parts, strict=True)
         )
@@ -161,16 +127,16 @@ def first_order(
     q, v = x[seen], arcs.x[..., d:][seen]
     h = np.diff(arcs.t, axis=1)
     for degree in range(1, OPTIONS.degree + 1):
-        products = Products.of(d, angles, degree)
-        if len(products.factors) > OPTIONS.columns:
+        library = products(d, angles, degree)
+        if library.num_parameters > OPTIONS.columns:
             break
-        values, slopes = products(q)
+        values, slopes = library.term_values(q), library.term_gradients(q).swapaxes(1, 2)
         size = np.linalg.norm(values, axis=0)
         c = (np.linalg.lstsq(values / size, v, rcond=1e-9)[0] / size[:, None]).T
-        rate = np.abs(np.einsum("ij,njk->nik", c, slopes, optimize=True)).sum(axis=2).max(axis=1)
+        rate = np.abs(c @ slopes).sum(axis=2).max(axis=1)
         fast = float(np.quantile(rate, 0.99) * np.max(h)) / OPTIONS.rate
         places = np.argwhere(np.ones_like(c, bool))
-        model = FieldOnArcs(products, places, h, int(np.clip(np.ceil(fast), 1, OPTIONS.most)))
+        model = FieldOnArcs(library, places, h, int(np.clip(np.ceil(fast), 1, OPTIONS.most)))
         found = _fitted(model, c.ravel(), arcs, x, sigma)
         if found is not None and np.all(found.rms <= OPTIONS.as_well * most):
             return _pruned(found, arcs, sigma, OPTIONS.as_well * most)
