@@ -42,7 +42,7 @@ from harness import (
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import stretches
 from gfnn_jax.evaluate import figures, report
-from gfnn_jax.maps.estimates import Window, estimate_states, law_of, propagate
+from gfnn_jax.maps.estimates import Window, estimates_of, law_of, propagate
 
 SHORT = ("pendulum", "air_track", "two_carts", "double_pendulum")
 # name -> (times ahead in s, unit, {time or "rest": asked}, most seconds of the processor)
@@ -322,9 +322,10 @@ def forecasts(
     for s, k in ends:
         rows = slice(k - SAMPLES + 1, k + 1)
         windows.append(Window(s.t[rows], s.y[rows], s.t, s.u))
-    x, covariance = estimate_states(law, windows)
+    given = [law], np.zeros(len(windows), int), windows
+    x, covariance = estimates_of(*given)
     last = np.array([w.t[-1] for w in windows])
-    orbits = propagate([law], np.zeros(len(x), int), windows, x, covariance, last, ahead)
+    orbits = propagate(*given, x, covariance, last, ahead)
     error = np.abs(orbits.values - measured)
     seen = np.isfinite(error)
     median, share = [], []

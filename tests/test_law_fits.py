@@ -27,11 +27,11 @@ from gfnn_jax.jobs.output import Output
 from gfnn_jax.maps.estimates import (
     Orbits,
     Window,
-    estimate_states,
+    estimates_of,
     law_of,
     propagate,
 )
-from gfnn_jax.maps.laws import states_of
+from gfnn_jax.maps.laws import dynamics_of
 from gfnn_jax.models.lagrangians.exchange import with_exchanges
 from gfnn_jax.models.lagrangians.given_terms import given_terms
 from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_again
@@ -241,7 +241,7 @@ def test_lanes_that_follow_their_own_laws_are_followed_as_if_alone(swing):
     t, theta = pendulum()
     samples = [slice(0, 20), slice(40, 61), slice(100, 120)]
     windows = [Window(t[i], theta[i, None], t[i], np.zeros((len(t[i]), 0))) for i in samples]
-    x, covariance = estimate_states(law, windows)
+    x, covariance = estimates_of([law], np.zeros(3, int), windows)
     last = np.array([w.t[-1] for w in windows])
     times, which = last[:, None] + [0.3, 2.0, 7.0], np.array([1, 0, 1])
     together = propagate(laws, which, windows, x, covariance, last, times)
@@ -678,7 +678,8 @@ def test_a_cart_that_its_motor_moves_drives_a_pendulum_that_does_not_move_it(giv
     assert coefficients["z_dot*phi_dot*"] == pytest.approx(3, rel=5e-3)
     assert coefficients[""] == pytest.approx(30, rel=1e-3)
     assert [t.term for t in fit.law.equations[0].left.terms] == ["z_ddot"]
-    z = states_of(fit.map, x[:1, :2], x[:1, 2:])
+    p = dynamics_of(fit.map).momentum(x[:1, :2], x[:1, 2:])
+    z = np.concatenate([x[:1, :2], p], axis=1)
     ahead, _ = fit.map.rollout(z, 50, inputs=u[:50, None])
     np.testing.assert_allclose(np.asarray(ahead)[0, :, :2], x[:51, :2], atol=5e-3)
     with pytest.raises(InputError, match="do not act back"):

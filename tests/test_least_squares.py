@@ -66,6 +66,12 @@ def reduced(family, w, target, weight=ONE, num_train=600):
     return [least_squares.reduce(family, [part], weight) for part in parts(w, target, num_train)]
 
 
+def fitted(family, train, held, weight):
+    """``reduce`` and ``solve`` in one go."""
+    triangles = [least_squares.reduce(family, [rows], weight) for rows in (train, held)]
+    return least_squares.solve(*triangles, family.num_parameters)
+
+
 def numpys(family, w, target, weight=ONE):
     """Coefficients by numpy.linalg.lstsq on all rows at once."""
     rows = (family.term_gradients(w) * weight[:, None]).reshape(-1, family.num_parameters)
@@ -73,7 +79,7 @@ def numpys(family, w, target, weight=ONE):
 
 
 def test_exact_polynomial_is_reproduced_to_roundoff():
-    fit = least_squares.fit(FAMILY, *parts(W, TARGET), ONE)
+    fit = fitted(FAMILY, *parts(W, TARGET), ONE)
     np.testing.assert_allclose(fit.coefficients, EXACT, rtol=0, atol=1e-12)
     assert fit.rank == FAMILY.num_parameters
     assert 1 < fit.condition < 1e3
@@ -84,7 +90,7 @@ def test_exact_polynomial_is_reproduced_to_roundoff():
 def test_reported_errors_are_those_of_the_rows():
     weight = np.array([1.0, 0.5, 2.0, 3.0])
     train, held = parts(W, NOISY)
-    fit = least_squares.fit(FAMILY, train, held, weight)
+    fit = fitted(FAMILY, train, held, weight)
     for (w, target), reported in ((train, fit.train_rms), (held, fit.validation_rms)):
         error = (gradients(FAMILY, fit.coefficients, w) - target) * weight
         assert reported == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-9)
@@ -93,14 +99,14 @@ def test_reported_errors_are_those_of_the_rows():
 def test_plain_solution_is_numpys(monkeypatch):
     monkeypatch.setattr(least_squares, "_RIDGES", (0.0,))
     weight = np.array([1.0, 0.5, 2.0, 3.0])
-    fit = least_squares.fit(FAMILY, *parts(W, NOISY), weight)
+    fit = fitted(FAMILY, *parts(W, NOISY), weight)
     expected = numpys(FAMILY, W[:600], NOISY[:600], weight)
     np.testing.assert_allclose(fit.coefficients, expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("bytes_per_block", [1, 200_000])  # 256 and 355 rows; neither divides 2,400
 def test_blocks_and_parts_of_the_rows_do_not_matter(monkeypatch, bytes_per_block):
-    whole = least_squares.fit(FAMILY, *parts(W, NOISY), ONE)
+    whole = fitted(FAMILY, *parts(W, NOISY), ONE)
     options = dataclasses.replace(least_squares.OPTIONS, block_bytes=bytes_per_block)
     monkeypatch.setattr(least_squares, "OPTIONS", options)
     (w, target), held = parts(W, NOISY)
@@ -130,7 +136,7 @@ def test_a_reduction_can_be_stopped_between_blocks(monkeypatch):
 
 def test_leading_columns_answer_for_smaller_degrees():
     smaller = Monomials(4, 3)
-    direct = least_squares.fit(smaller, *parts(W, TARGET), ONE)
+    direct = fitted(smaller, *parts(W, TARGET), ONE)
     leading = least_squares.solve(*reduced(FAMILY, W, TARGET), smaller.num_parameters)
     np.testing.assert_allclose(leading.coefficients, direct.coefficients, rtol=0, atol=1e-11)
     assert leading.validation_rms == pytest.approx(direct.validation_rms, rel=1e-9)
@@ -174,7 +180,7 @@ def test_noise_leaves_an_error_of_its_own_order(num_train, noise):
     exact = gradients(FAMILY, smooth, W)
     noisy = exact + noise * np.random.default_rng(num_train).standard_normal(exact.shape)
     train, held = (W[:num_train], noisy[:num_train]), (W[600:700], noisy[600:700])
-    fit = least_squares.fit(FAMILY, train, held, ONE)
+    fit = fitted(FAMILY, train, held, ONE)
     error = gradients(FAMILY, fit.coefficients, W[700:]) - exact[700:]
     rms = np.sqrt(np.mean(error**2))
     assert rms < (10 if num_train < 600 else 0.5) * noise
@@ -183,7 +189,7 @@ def test_noise_leaves_an_error_of_its_own_order(num_train, noise):
 
 def test_fewer_rows_than_terms():
     """Ten pairs for 69 terms: no exception, a rank that says so, an error no larger than S."""
-    fit = least_squares.fit(FAMILY, (W[:10], TARGET[:10]), (W[600:], TARGET[600:]), ONE)
+    fit = fitted(FAMILY, (W[:10], TARGET[:10]), (W[600:], TARGET[600:]), ONE)
     assert fit.rank == 40
     assert np.isfinite(fit.coefficients).all()
     assert fit.validation_rms <= 1.01 * np.sqrt(np.mean(TARGET[600:] ** 2))
@@ -203,7 +209,7 @@ class Twice(Monomials):
 def test_rank_deficiency_is_reported_and_harmless():
     family = Twice(4, 3)
     target = gradients(Monomials(4, 3), EXACT[:34], W)
-    fit = least_squares.fit(family, *parts(W, target), ONE)
+    fit = fitted(family, *parts(W, target), ONE)
     assert fit.rank == 34
     assert fit.condition > 1e12
     assert fit.validation_rms < 1e-11
@@ -223,7 +229,7 @@ def test_units_do_not_matter():
         family = Monomials(2, 6, scale=(unit_q, unit_p))
         moved, h = w * units, 0.3 * unit_t
         asked = target * units[::-1] / unit_t
-        fit = least_squares.fit(family, *parts(moved, asked), h / moved.std(axis=0)[::-1])
+        fit = fitted(family, *parts(moved, asked), h / moved.std(axis=0)[::-1])
         return h * gradients(family, fit.coefficients, moved) / units[::-1], fit.validation_rms
 
     reference, rms = predicted(1.0, 1.0, 1.0)
@@ -237,7 +243,7 @@ def test_units_do_not_matter():
 def test_columns_of_very_different_size_are_told_apart():
     """Scaled columns: a term a million times smaller than the others keeps its digits."""
     exact = EXACT * np.where(np.arange(EXACT.size) % 2, 1.0, 1e-6)
-    fit = least_squares.fit(FAMILY, *parts(W, gradients(FAMILY, exact, W)), ONE)
+    fit = fitted(FAMILY, *parts(W, gradients(FAMILY, exact, W)), ONE)
     np.testing.assert_allclose(fit.coefficients, exact, rtol=1e-6, atol=1e-12)
 
 
@@ -246,7 +252,7 @@ def test_what_the_data_cannot_tell_from_zero_is_zero():
     w = np.random.default_rng(1).uniform(-1, 1, (800, 2))
     target = np.stack([w[:, 0] ** 2, w[:, 1]], axis=1)
     family = Monomials(2, 5)
-    fit = least_squares.fit(family, *parts(w, target), np.ones(2))
+    fit = fitted(family, *parts(w, target), np.ones(2))
     found = {
         tuple(e) for e, c in zip(family.exponents.tolist(), fit.coefficients, strict=True) if c
     }

@@ -36,17 +36,11 @@ def test_rows_in_any_parts_make_one_triangle():
     whole = Triangle.of(ROWS)
     blocks = (np.array(ROWS[i:j], order="F") for i, j in ((0, 3), (3, 3), (3, 60), (60, 90)))
     same(Triangle.of_blocks(blocks, 7), whole)
-    grown = {name: Triangle.empty(7) for name in ("append", "stacked")}
+    grown = Triangle.empty(7)
     for part in (ROWS[:4], ROWS[4:50], ROWS[50:]):
-        grown = {name: getattr(t, name)(part) for name, t in grown.items()}
+        grown = grown.stacked(part)
     parts = [Triangle.of(part) for part in (ROWS[:5], ROWS[5:])]  # of the first, rank 5
-    of_rows = parts[1].append(parts[0].factor, parts[0].rows)
-    for found in (
-        *grown.values(),
-        of_rows,
-        parts[0].merge(parts[1]),
-        whole.merge(Triangle.empty(7)),
-    ):
+    for found in (grown, parts[0].merge(parts[1]), whole.merge(Triangle.empty(7))):
         same(found, whole)
         assert np.array_equal(found.factor, np.triu(found.factor))
 
@@ -147,8 +141,6 @@ def test_lapack_is_never_given_arrays_of_another_shape():
     assert refused() == len(WRONG)
     with pytest.raises(ValueError, match="expected a factor"):
         folded(np.zeros((4, 4), order="F"), np.zeros((5, 4), order="F"), triangular=True)
-    with pytest.raises(ValueError, match="expected a factor"):
-        Triangle.empty(4).append(np.zeros((3, 4)))
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from test_law_fits import pendulum
 
 import gfnn_jax as gfnn
 from gfnn_jax.families.friction import DRY, LINEAR
-from gfnn_jax.maps.estimates import Window, estimate_states, law_in_use, propagate
+from gfnn_jax.maps.estimates import Window, estimates_of, law_in_use, propagate
 from gfnn_jax.maps.observation import Observation
 from gfnn_jax.maps.sensors import Sensors
 from gfnn_jax.solve.noise import SoftL1, Wander
@@ -79,7 +79,7 @@ def test_a_state_and_its_zero_are_those_of_the_normal_distribution(rng, size):
     y = 1.0 + 0.5 * t + wandering(t, rng, wander, sigma)
     law = free_body(sigma, wander)
     window = Window(t, y[:, None], t, np.zeros((20, 0)))
-    x, covariance = estimate_states(law, [window])
+    x, covariance = estimates_of([law], np.array([0]), [window])
     orbits = propagate([law], np.array([0]), [window], x, covariance, t[-1:], t[-1] + ahead[None])
 
     times = np.append(t, t[-1] + ahead)
@@ -123,7 +123,7 @@ def test_the_level_of_friction_is_that_of_the_window():
         Window(t[:end], (path[:end] + 1e-4 * rng.normal(size=end))[:, None], t, u) for _ in range(8)
     ]
     law, stiff = sliding_body(0.1, friction), sliding_body(0.0, friction)
-    x, covariance = estimate_states(law, windows)
+    x, covariance = estimates_of([law], np.zeros(8, int), windows)
     assert x.shape == (8, 3)
     std = np.sqrt(covariance[:, 2, 2])
     assert np.abs((x[:, 2] - 0.05) / std).max() < 3
@@ -131,9 +131,8 @@ def test_the_level_of_friction_is_that_of_the_window():
     last, ahead = np.full(8, t[end - 1]), np.broadcast_to(t[end:], (8, len(t) - end))
     errors = []
     for one in (law, stiff):
-        orbits = propagate(
-            [one], np.zeros(len(windows), int), windows, *estimate_states(one, windows), last, ahead
-        )
+        given = [one], np.zeros(8, int), windows
+        orbits = propagate(*given, *estimates_of(*given), last, ahead)
         errors.append(orbits.values[..., 0] - path[end:])
         found.append(orbits.std[..., 0])
     assert np.abs(errors[0]).max() < 0.1 * np.abs(errors[1]).max()

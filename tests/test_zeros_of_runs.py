@@ -5,7 +5,7 @@ import pytest
 from test_law_fits import pendulum
 
 import gfnn_jax as gfnn
-from gfnn_jax.maps.estimates import estimate_states, law_of, windows_of
+from gfnn_jax.maps.estimates import estimates_of, law_of, windows_of
 
 ZEROS = np.array([0.05, -0.03, 0.0, -0.06, 0.04])
 
@@ -42,7 +42,7 @@ def test_zeros_of_runs_are_found_with_the_law(fit):
 def test_an_estimate_tells_the_zero_of_its_run(fit):
     """The law's own zero is the mean of those of the runs it was learned from."""
     law, other = law_of(fit.map), swings([0.07])
-    (x,), (covariance,) = estimate_states(law, windows_of(law.sensors, other))
+    (x,), (covariance,) = estimates_of([law], np.zeros(1, int), windows_of(law.sensors, other))
     error = np.sqrt(covariance[2, 2])
     assert error < 0.02
     assert abs(x[2] - (0.07 - ZEROS.mean())) < 3 * error

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.arrays import pytree
-from gfnn_jax.families.family import DifferentiatedByJax
+from gfnn_jax.families.family import DifferentiatedByJax, OfCoefficients
 from gfnn_jax.families.inputs import Inputs
 
 # More accurate than the paper's shapes after a training of the same time, and three times smaller.
@@ -155,7 +155,7 @@ def amplitude_of(w, target_gradient) -> float:
 
 
 @pytree()
-class Ensemble(DifferentiatedByJax):
+class Ensemble(OfCoefficients, DifferentiatedByJax):
     """Ensemble of E networks of one shape; the params of the family are their weights (E,).
 
     network: the common shape. members: their params, every leaf with a leading axis E.
@@ -189,10 +189,6 @@ class Ensemble(DifferentiatedByJax):
         """Floating-point operations of ∇S, and of ∇S with its Hessian, for all members."""
         gradient, with_hessian = self.network.operations
         return self.size * gradient, self.size * with_hessian
-
-    def unflatten(self, coefficients):
-        """Return the weights (..., E) themselves."""
-        return coefficients
 
     def value(self, params, w, args=None):
         """S(params, w), shape (...): params (E,), w (..., 2d)."""

@@ -225,17 +225,6 @@ def solve(train: Triangle, held: Triangle, num_terms: int) -> LeastSquaresFit:
     )
 
 
-def fit(
-    family: Any,
-    train: tuple[np.ndarray, np.ndarray],
-    held: tuple[np.ndarray, np.ndarray],
-    weight: np.ndarray,
-) -> LeastSquaresFit:
-    """Fit one linear family to (w, target_gradient): ``reduce`` and ``solve`` in one go."""
-    triangles = [reduce(family, [rows], weight) for rows in (train, held)]
-    return solve(triangles[0], triangles[1], family.num_parameters)
-
-
 def accelerator_takes(family: Any) -> bool:
     """Return whether the gradients of its terms can be traced by JAX."""
     return isinstance(family, (Products, Sines))

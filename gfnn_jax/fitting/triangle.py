@@ -9,7 +9,7 @@ and (n + 1)² numbers hold all that the rows say: the solution c = T⁻¹t, the 
 ρ², and (TᵀT)⁻¹, the covariance of c for noise of variance one (Golub & Van Loan, Matrix
 Computations, ch. 5). The normal equations would square the condition number.
 
-- Rows are *appended* to R block by block; no more than one block is ever in memory.
+- Rows are *folded* into R block by block; no more than one block is ever in memory.
 - Two triangles are *merged* by the QR of one on top of the other (TSQR: Demmel, Grigori, Hoemmen &
   Langou, SIAM J. Sci. Comput. 34, 2012).
 - *Leading* columns of R are the triangle of the problem whose terms come first, for every number of
@@ -67,17 +67,8 @@ class Triangle:
 
     # Rows.
 
-    def append(self, rows: np.ndarray, count: int | None = None) -> Triangle:
-        """The triangle of these rows of [A b] (N, n + 1) too: 2 N n² operations.
-
-        count: of the rows for which these stand, if they are a triangle themselves; None: N.
-        """
-        factor = folded(np.array(self.factor, order="F"), np.array(rows, order="F"))
-        return Triangle(factor, self.rows + (len(rows) if count is None else count))
-
     def stacked(self, rows: np.ndarray) -> Triangle:
-        """Append rows by NumPy's QR of R on top of them: a third slower than `append`, other
-        rounding."""
+        """The triangle of these rows of [A b] (N, n + 1) too, by NumPy's QR of R on top of them."""
         stack = np.concatenate([self.factor[: self.rows], rows])
         return dataclasses.replace(Triangle.of(stack), rows=self.rows + len(rows))
 

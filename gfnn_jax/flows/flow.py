@@ -289,14 +289,9 @@ class Flow:
             first = h * velocity(family, self.params, z, args)
             weights = np.repeat(gauss(self.stages).weights, first.shape[-1])
             guess = jnp.tile(first, self.stages) * jnp.asarray(weights, first.dtype)[None]
-            if unrolled:
-                x, _, info = newton.iterate(
-                    equation, shared, lanes, guess, most=_MOST_NEWTON, gather=False
-                )
-            else:
-                guess = jax.lax.stop_gradient(guess)
-                x, _, info = newton.root(equation, shared, lanes, guess, _MOST_NEWTON)
-            return jnp.swapaxes(x.reshape(len(z), self.stages, -1), 0, 1), info
+            given = equation, shared, lanes, guess
+            x, _, info = newton.solved(*given, _MOST_NEWTON, bool(unrolled))
+            return _of_stages(x, self.stages), info
         solve = _fixed_point if unrolled else _stages
         return solve(self.stages, shared, z, args)
 

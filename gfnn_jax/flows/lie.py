@@ -157,14 +157,8 @@ class LieGenerated:
             args = jnp.broadcast_to(args, (z.shape[0], args.shape[-1]))
         shared = (self.family, self.params, self.bracket, self.scale)
         guess = jax.lax.stop_gradient(z)
-        if unrolled:
-            most = _MOST if unrolled is True else unrolled
-            solved = newton.iterate(
-                ArcEquation(), shared, (z, args, h), guess, most=most, gather=False
-            )
-        else:
-            solved = newton.root(ArcEquation(), shared, (z, args, h), guess, _MOST)
-        x, gradient, info = solved
+        given = ArcEquation(), shared, (z, args, h), guess
+        x, gradient, info = newton.solved(*given, _MOST, unrolled)
         return h * self.bracket.apply(x, gradient), info
 
 

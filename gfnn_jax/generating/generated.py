@@ -128,18 +128,14 @@ class Generated:
             guess = guess + self.predictor.forward(z, args)
         shared, lanes = self._shared_and_lanes(z, known, args)
         equation = ImplicitStep(self.chart)
-        given, free = (equation, shared, lanes), matrix_free(self.family)
-        if unrolled:
-            usual = fixed_point.MOST if free else MOST_UPDATES
-            most = usual if unrolled is True else unrolled
-            if free:
-                x, gradient, info = fixed_point.iterate(*given, guess, most=most)
-            else:
-                x, gradient, info = newton.iterate(*given, guess, most=most, gather=False)
-        elif free:
-            x, gradient, info = fixed_point.root(*given, jax.lax.stop_gradient(guess))
+        given = equation, shared, lanes
+        if not matrix_free(self.family):
+            x, gradient, info = newton.solved(*given, guess, MOST_UPDATES, unrolled)
+        elif unrolled:
+            most = fixed_point.MOST if unrolled is True else unrolled
+            x, gradient, info = fixed_point.iterate(*given, guess, most=most)
         else:
-            x, gradient, info = newton.root(*given, jax.lax.stop_gradient(guess), MOST_UPDATES)
+            x, gradient, info = fixed_point.root(*given, jax.lax.stop_gradient(guess))
         return self.chart.complete(known, x), gradient, info
 
     def step(self, z, args=None, *, unrolled: bool | int = False):

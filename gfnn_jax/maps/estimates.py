@@ -416,11 +416,6 @@ class _Windows:
         return dataclasses.replace(self, which=self.which[arcs], h=self.h[arcs], u=self.u[arcs])
 
 
-def estimate_states(law: Law, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
-    """`estimates_of` windows that follow one law."""
-    return estimates_of([law], np.zeros(len(windows), int), windows)
-
-
 def estimates_of(
     laws: Sequence[Law], which: np.ndarray, windows: Sequence[Window]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -591,7 +586,7 @@ def propagate(
     last: np.ndarray,
     times: np.ndarray,
 ) -> Orbits:
-    """Orbits from what `estimate_states` found, x (B, m) with its covariance, at times ``last``
+    """Orbits from what `estimates_of` found, x (B, m) with its covariance, at times ``last``
     (B,), to times (B, n); each lane follows its own law, ``laws[which]``, which (B,).
 
     The laws differ in coefficients, phases, covariance and the parameters of their channels only;

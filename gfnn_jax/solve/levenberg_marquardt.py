@@ -49,24 +49,6 @@ class Problem(Protocol):
         ...
 
 
-@runtime_checkable
-class Rule(Protocol):
-    """The damping, as it follows from step to step."""
-
-    @property
-    def start(self) -> float: ...
-    @property
-    def trials(self) -> int: ...
-
-    def grown(self, damping: Any, failures: int) -> Any:
-        """The damping after a step that failed, and so many before it."""
-        ...
-
-    def shrunk(self, step: Tried, failures: int) -> Any:
-        """The damping after a step that lowered the cost, and so many that did not."""
-        ...
-
-
 @dataclasses.dataclass(frozen=True)
 class Factors:
     """Damping that grows and shrinks by fixed factors, as Marquardt's.
@@ -85,9 +67,11 @@ class Factors:
     keeps: bool = False
 
     def grown(self, damping: float, failures: int) -> float:
+        """The damping after a step that failed, and so many before it."""
         return max(self.grown_by * damping, self.first)
 
     def shrunk(self, step: Tried, failures: int) -> float:
+        """The damping after a step that lowered the cost, and so many that did not."""
         if self.keeps and failures:
             return step.damping
         smaller = self.shrunk_by * step.damping
@@ -114,6 +98,9 @@ class Nielsen:
         with np.errstate(all="ignore"):  # of a step that failed nothing is taken
             ratio = step.decrease / step.promised
             return step.damping * np.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
+
+
+Rule = Factors | Nielsen
 
 
 class Descended(NamedTuple):

@@ -337,6 +337,17 @@ def _root_jvp(equation, most, primals, tangents):
     return (x, aux, info), (x_dot, aux_dot, info_dot)
 
 
+def solved(
+    equation: Equation, shared: Any, lanes: Any, guess: Any, most: int, unrolled: bool | int
+) -> tuple[Any, Any, Info]:
+    """``root``; where ``unrolled`` ``iterate``, with a number of updates of its own if it is one:
+    derivatives are then those of the iterations that ran."""
+    if not unrolled:
+        return root(equation, shared, lanes, jax.lax.stop_gradient(guess), most)
+    most = most if unrolled is True else unrolled
+    return iterate(equation, shared, lanes, guess, most=most, gather=False)
+
+
 def refine(equation: Equation, shared: Any, lanes: Any, guess: Any, updates: int = 6):
     """Solve by Newton updates in NumPy from a guess (B, n) known to be close: (x, aux, error (B,)).
 

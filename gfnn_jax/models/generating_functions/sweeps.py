@@ -138,8 +138,8 @@ class Factors(NamedTuple):
 
     @classmethod
     def of(cls, inner: Triangle, outer: Triangle, held: Triangle) -> Factors:
-        """The rows of the outermost twentieth are appended to the others by their own triangle."""
-        return cls(inner.append(outer.factor, outer.rows), held, inner, outer)
+        """The rows of the outermost twentieth are added to the others by their own triangle."""
+        return cls(inner.merge(outer), held, inner, outer)
 
 
 def part_of_noise(

@@ -97,11 +97,9 @@ class Windows:
         """Windows of parts of the nodes, whose integrals add up, for so many numbers a node."""
         count = -(-len(self.t) * width // OPTIONS.most)
         edges = np.linspace(0, len(self.t), count + 1).astype(int).tolist()
-        for a, b in pairwise(edges if count > 1 else []):
+        for a, b in pairwise(edges):
             t, x, u, args = (one[a:b] for one in (self.t, self.x, self.u, self.args))
             yield Windows(t, x, u, args, self.phi[:, a:b], self.slope[:, a:b])
-        if count <= 1:
-            yield self
 
     @property
     def systems(self) -> np.ndarray:
