@@ -1,7 +1,7 @@
 """The map of a law: the flow of a Lagrangian with friction and inputs, over the time of a sample.
 
-States are z = (q, p) with p = ∂L/∂v; `velocities_of` changes to velocities. Where only uniform
-friction acts, or none, the map is conformally symplectic.
+States are z = (q, p) with p = ∂L/∂v; `maps.laws.states_of` and `velocities_of` change to
+velocities and back. Where only uniform friction acts, or none, the map is conformally symplectic.
 """
 
 from __future__ import annotations
@@ -174,9 +174,15 @@ def bodies_of_map(map_: SymplecticMap) -> BodiesLaw | None:
     return family.family.law(own, family.friction, losses, gains)
 
 
+def states_of(map_: SymplecticMap, q, v, args=None):
+    """z = (q, p) (..., 2d) of positions and velocities (..., d); args (..., k): parameters of the
+    system, of a map that has such."""
+    law = dynamics_of(map_).at(args)
+    return np.concatenate([q, law.momentum(np.asarray(q), np.asarray(v))], axis=-1)
+
+
 def velocities_of(map_: SymplecticMap, z, args=None):
-    """v (..., d) of states z = (q, p) (..., 2d); args (..., k): parameters of the system, of a map
-    that has such."""
+    """v (..., d) of states z = (q, p) (..., 2d), as `states_of`."""
     law = dynamics_of(map_).at(args)
     if isinstance(law, BodiesLaw):
         return law.velocity(*split(np.asarray(z)))
