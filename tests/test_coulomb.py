@@ -162,6 +162,27 @@ def test_steps_do_not_matter():
     np.testing.assert_allclose(coarse[-1], fine[-1], atol=1e-7)
 
 
+@pytest.mark.parametrize("more", [[], [((-1, 1), DRY, 0.0)], [((0, 1), LOADED, 0.0)]])
+def test_forces_that_change_within_a_step_are_followed(more):
+    """Bodies that are let go, turn and stick again within one step, with friction of the relative
+    speed, or twice of one: by polynomials through noise at the nodes of a step, and by the same in
+    four parts of it."""
+    rows = [((1, 0), DRY, 0.0), ((0, 1), DRY, 0.0), *more]
+    form, p = blocks(rows, [1.0, 0.7, 0.4][: len(rows)], 1.0)
+    rng, shape = np.random.default_rng(0), (2_000, 10)
+    x, h = 0.5 * rng.normal(size=(shape[0], 4)), np.full(shape, 0.03)
+    nodes = 1.5 * rng.normal(size=(*shape, 1)) + 0.3 * rng.normal(size=(*shape, 6))
+    whole = form.follow(p, x, h, nodes[:, :, None, :, None], order=0)
+    assert not whole.status.any()
+    polynomials = np.linalg.solve(np.vander(NODES), nodes[..., None])[..., 0]
+    inside = (np.arange(4)[:, None] + NODES) / 4
+    parts = np.einsum("lsk,pnk->lspn", polynomials, np.vander(inside.ravel(), 6).reshape(4, 6, 6))
+    fine = form.follow(p, x, h, parts[..., None], order=0)
+    assert not fine.status.any()
+    off = np.abs(whole.states - fine.states)[:, -1]
+    assert np.quantile(off, 0.9) < 5e-3 and np.max(off) < 0.05  # speeds are about 0.5
+
+
 def test_derivatives_across_turns_and_stops():
     """Against finite differences: in the state, and in coefficients of all kinds, with an input
     that changes within the step."""

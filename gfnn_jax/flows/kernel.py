@@ -22,9 +22,9 @@ with s = c·v for each direction c, and ρ in proportion to the size of an input
 load (J. J. Moreau, in "Nonsmooth Mechanics and Applications" (1988) 1). As long as no direction
 changes from one to the other the motion is smooth. A step in which a sliding speed turns, or a λ
 that holds passes ρ, ends there: at the root of a cubic through the speeds and their slopes at the
-step's ends, or of a line through λ and ρ. Where a speed turns at the time τ the acceleration jumps
-from a₋ to a₊, and so do the derivatives, for τ depends on the state too (M. A. Aizerman & F. R.
-Gantmacher, Q. J. Mech. Appl. Math. 11 (1958) 225):
+step's ends, from which Newton's method goes on between bounds, or of a line through λ and ρ. Where
+a speed turns at the time τ the acceleration jumps from a₋ to a₊, and so do the derivatives, for τ
+depends on the state too (M. A. Aizerman & F. R. Gantmacher, Q. J. Mech. Appl. Math. 11 (1958) 225):
 
     D → D + (0, a₋ − a₊) dτ,      dτ = −c·D_v / c·a₋
 
@@ -93,15 +93,17 @@ U = RATES + _STAGES
 INSIDE = U + _STAGES
 STAGES = INSIDE + _STAGES
 NODES = STAGES + _STAGES
-WEIGHTS = NODES + 1
-BLOCKS = WEIGHTS + 1
+WEIGHTS, BLOCKS = NODES + 1, NODES + 2
 
 _EVENTS = 64  # of a lane in one substep, after which it has no solution
 _APART_FROM = 1e-6  # of a direction, left of others that it depends on
 _ALIKE = 1e-9  # of the largest entry, added for λ of directions that depend on each other
 _ROOT_STEPS = 60  # of Newton's method or bisection, to the root of a cubic: bisection needs 53
-_HALVINGS = 10  # of a step, before Newton's method: of a cubic with three roots they choose one
+# Of a step, at the most: before Newton's method, for of a cubic with three roots they choose one,
+# and where its steps leave the bounds.
+_HALVINGS = 10
 _ROOT = 1e-15  # of a step, that the root is told to
+_NEAR = 0.01  # of a step, by which Newton's method may be off before the last time
 
 
 class Task(NamedTuple):
@@ -728,13 +730,13 @@ def _root(before, after, slope_before, slope_after):
 @function
 def _carried(n, f):
     """The directions that slide by their modes and whose speeds are sums of those that stick, as a
-    relative speed where both bodies do: they are 0, and turn nowhere. λ is then ρ there, and the
-    others hold the rest."""
+    relative speed where both bodies do, or a load's beside dry friction: they are 0, and turn
+    nowhere. λ is then ρ there, and the others hold the rest."""
     count, d, c = n[SIZES, FRICTIONS], n[SIZES, DIM], n[SIZES, DIRECTIONS]
     alike, pairs = n[SIZES, ALIKE], n[SIZES, PAIRS]
     for k in range(count):
         f[CARRIED, k] = 0.0
-    if _stuck(n, f) > 1:
+    if _stuck(n, f) > 0:
         for k in range(count):
             for m in range(count):
                 f[alike + k, m] = 0.0
@@ -949,17 +951,27 @@ def follow(n, f, laws, task, order):
                             _smooth(n, f, 0.0, -1, last)
                             part, event = _first_event(n, f, left * h)
                     cut = part < 1.0
-                    for once in range(2 if cut else 0):  # the cubic's root; Newton's step from it
+                    low, high, tries = 0.0, 1.0, _HALVINGS if cut else 0
+                    while tries > 0:  # from the cubic's root: Newton's method, between bounds
+                        tries -= 1
                         _within(n, f, done, done + part * left)
-                        _smooth(n, f, part * left * h, order * once, INSIDE)
+                        _smooth(n, f, part * left * h, order if tries == 0 else 0, INSIDE)
                         for i in range(2 * d):
                             f[X, i] = f[X1, i]
                         _smooth(n, f, 0.0, -1, last)
-                        turning = _speed(n, f, event, A, 0)
+                        speed, turning = _speed(n, f, event, X1, d), _speed(n, f, event, A, 0)
                         if f[MODES, event] == 0.0 or turning == 0.0:
                             turning = np.inf  # let go, where nothing jumps
-                        part -= _speed(n, f, event, X1, d) / turning / (left * h)
-                        part = min(max(part, 0.0), 1.0) if part == part else 1.0
+                        if f[MODES, event] * speed > 0.0:
+                            low = part
+                        else:
+                            high = part
+                        nearer = part - speed / turning / (left * h)
+                        if low <= nearer <= high:
+                            tries = min(tries, 1) if abs(nearer - part) < _NEAR else tries
+                        elif tries > 0:
+                            nearer = 0.5 * (low + high)
+                        part = min(max(nearer, low), high) if nearer == nearer else 1.0
                     if cut:
                         _turn(n, f, event)
                         again = dry + 1
