@@ -937,6 +937,11 @@ def test_the_rule_between_samples_is_chosen_again_with_the_last_law():
     assert of["hold"].fit is found["hold"].fit  # chosen before: as it was
     assert set(of["hold"].others) == {"linear", "band"}
     assert min(of["hold"].others.values()) > 1.5
+    linear = found["linear"].fit
+    lost = dataclasses.replace(
+        linear, fitted=dataclasses.replace(linear.fitted, p=np.nan * linear.p)
+    )
+    assert choose_again(InputModel(lost), HOLDS, 30).fit is lost  # by no rule do orbits follow
     on = search_on(of["linear"])
     assert on.model.hold == "hold"
     p, error = on.fit.p, on.fit.linearised.errors

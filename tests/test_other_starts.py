@@ -12,11 +12,15 @@ from numpy.testing import assert_allclose
 
 import gfnn_jax as gfnn
 from gfnn_jax.errors import FitError
+from gfnn_jax.families.friction import LINEAR, QUADRATIC
 from gfnn_jax.maps.estimates import _with_zeros
+from gfnn_jax.models.lagrangians.friction_choice import table_of
+from gfnn_jax.models.lagrangians.libraries import losses, potentials
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.search import with_equal_masses
 from gfnn_jax.models.lagrangians.starts import best_start
 from gfnn_jax.models.lagrangians.structure import SINE, Structure
+from gfnn_jax.models.lagrangians.weak_form import weak_start
 from gfnn_jax.solve.latent_arcs import Fitted
 
 
@@ -32,6 +36,28 @@ def recorded(acceleration, start, names, end=40.0, samples=2_000, noise=1e-4, **
 
 def coefficients(expression):
     return {term.term: term.coefficient for term in expression.terms}
+
+
+@pytest.mark.parametrize("unit", [1e-7, 1e7])
+def test_the_unit_of_columns_does_not_matter(unit):
+    """To a start, to coefficients where others go, and to held-out costs of friction: of a spring
+    with powers up to 6."""
+    t, noise = np.linspace(0, 20, 400), 1e-3 * np.random.default_rng(0).normal(size=400)
+    x = motion(lambda q, v: -q - 0.4 * q**3 - 0.02 * v, [1.0, 0.0], t)[0] + noise
+    terms = (((2,), (0,), (0,), 0.0), *potentials(1, [0], 1, 2, 3, 4, 5, 6))
+    friction = tuple(losses(1, (LINEAR, QUADRATIC), 0.0))
+    found = []
+    for scale in (1.0, unit):
+        problem = samples_of(gfnn.Recording({"t": t, "x": scale * x}, positions=["x"])).problem
+        structure, known = weak_start(Structure(1, terms, friction[:1]), problem, prune=False)
+        fit = problem.fit(structure, known, problem.arcs(1.0), problem.scales.sigma)
+        fewer = fit.structure.without({("term", row) for row in terms if sum(row[1]) % 2})
+        less = fit.values_within(fewer)
+        powers = {("term", row): scale ** (sum(row[1]) - 2) for row in terms}
+        found.append([value * powers.get(key, 1.0) for key, value in less.items()])
+        table = table_of(fit, friction)
+        found[-1].append(table.judged([1]).cost / table.judged([]).cost)
+    assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -632,7 +632,9 @@ class LawFit:
         of, kept = self.linearised.covariance, set(structure.keys())
         gone = [k for k, key in enumerate(keys) if key not in kept and 0 < of[k, k] < np.inf]
         if gone:
-            p = p - of[:, gone] @ np.linalg.lstsq(of[np.ix_(gone, gone)], p[gone])[0]
+            size = np.sqrt(np.diag(of)[gone])
+            together = of[np.ix_(gone, gone)] / np.outer(size, size)
+            p = p - of[:, gone] / size @ np.linalg.lstsq(together, p[gone] / size)[0]
         own = {key: self.values[key] for key in freed}
         return own | dict(zip(keys, p.tolist(), strict=True))
 

@@ -371,8 +371,9 @@ class Table:
         on the arcs of the other thirds."""
         f, found = self.width, self.rows[..., self.width :].copy()
         for triangle, held in zip(self.triangles[:-1], self.folds, strict=True):
-            others = np.linalg.pinv(triangle[:f, :f], rcond=OPTIONS.rank) @ triangle[:f, f:]
-            found[held] -= self.rows[held][..., :f] @ others
+            size = np.maximum(np.linalg.norm(triangle[:, :f], axis=0), 1e-300)
+            others = np.linalg.pinv(triangle[:f, :f] / size, rcond=OPTIONS.rank) @ triangle[:f, f:]
+            found[held] -= self.rows[held][..., :f] / size @ others
         return found
 
     @functools.cached_property

@@ -90,11 +90,12 @@ def choose_rule(
     sigma: np.ndarray,
 ) -> InputModel:
     """The fit of these arcs by the rule between samples (of the problem's) and the delay that
-    held-out arcs choose."""
+    held-out arcs choose, of those whose orbits follow the arcs; where none does, by the first."""
     found = [
         with_delay(problem.by_rule(rule).fit(structure, known, arcs, sigma))
         for rule in problem.rules
     ]
+    found = [one for one in found if one.fit.follows] or found[:1]
     if len(found) == 1:
         return found[0]
     of_arcs = [one.held_out(sigma) for one in found]
@@ -116,15 +117,16 @@ def choose_rule(
 
 def choose_again(last: InputModel, rules: tuple[str, ...], length: int) -> InputModel:
     """The rule between samples (of ``rules``) that held-out arcs choose with the last law: ``last``
-    as it was, where that is its own. length: nodes of these arcs; many short ones tell it better
-    than a few long ones."""
+    as it was, where that is its own, or no orbit follows these arcs by any. length: nodes of these
+    arcs; many short ones tell it better than a few long ones."""
     if len(rules) < 2:
         return last
     fit = last.fit
     problem = dataclasses.replace(fit.problem, rules=rules)
     arcs = arcs_of(problem.nodes, length)
     best = choose_rule(problem, fit.structure, fit.values, arcs, fit.sigma)
-    return last._replace(others=best.others) if best.hold == last.hold else best
+    stays = best.hold == last.hold or not best.fit.follows
+    return last._replace(others=best.others) if stays else best
 
 
 def with_delay(fit: LawFit) -> InputModel:

@@ -159,9 +159,10 @@ def weak_start(
     weight = unit = np.where(speed > 0, speed, 1.0)
     while True:
         for _ in range(2):  # each coordinate's rows in units of their own residual
-            c, residual, inverse = _solve(X[..., keep] * weight[:, None], Y * weight)
+            rows = X[..., keep] * weight[:, None]
+            c, residual, inverse = _solve(rows, Y * weight)
             size = np.sqrt(np.mean(residual**2, axis=0))
-            if not np.min(size) > OPTIONS.rounding * np.linalg.norm(X[..., keep] * c):
+            if not np.min(size) > OPTIONS.rounding * np.linalg.norm(rows * c):
                 raise FitError(
                     "terms: a combination of them vanishes all along the recording, so that their "
                     "coefficients are not determined. Leave one out, or add a force"
