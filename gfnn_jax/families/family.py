@@ -150,8 +150,8 @@ class OfCoefficients(CalledAsValue):
 
 
 class AroundAnother(OfCoefficients):
-    """Base of a family that is made of another one, ``family``, and is that one where it has no
-    member of its own."""
+    """Base of a family that is made of another one, ``family``, and is that one, with params and
+    args of its own (`inside`), where it has no member of its own."""
 
     family: Any
 
@@ -185,6 +185,25 @@ class AroundAnother(OfCoefficients):
     def at_time(self, args, after):
         """args a time ``after`` later."""
         return at_time(self.family, args, after)
+
+    def inside(self, params, args) -> tuple[Any, Any]:
+        """Params and args of the other family."""
+        return params, args
+
+    def value(self, params, w, args=None):
+        """Value of f, shape (...): w (..., 2d)."""
+        own, args = self.inside(params, args)
+        return self.family.value(own, w, args)
+
+    def gradient(self, params, w, args=None):
+        """Gradient ∂f/∂w (..., 2d)."""
+        own, args = self.inside(params, args)
+        return self.family.gradient(own, w, args)
+
+    def gradient_and_hessian(self, params, w, args=None):
+        """Gradient ∂f/∂w (..., 2d) and Hessian ∂²f/∂w² (..., 2d, 2d)."""
+        own, args = self.inside(params, args)
+        return self.family.gradient_and_hessian(own, w, args)
 
 
 class DifferentiatedByJax(CalledAsValue):

@@ -57,17 +57,9 @@ class OfTimeStep(AroundAnother):
         """Make the matrix C, the parameters of S, of coefficients (..., num_parameters), NumPy."""
         return self.products.unflatten(coefficients)
 
-    def value(self, params: Any, w: Any, args: Any = None):
-        """Value of S, shape (...)."""
-        return self.products.value(params, w, args**2)
-
-    def gradient(self, params: Any, w: Any, args: Any = None):
-        """Gradient ∂S/∂w, shape (..., 2d)."""
-        return self.products.gradient(params, w, args**2)
-
-    def gradient_and_hessian(self, params: Any, w: Any, args: Any = None):
-        """Gradient ∂S/∂w (..., 2d) and Hessian ∂²S/∂w² (..., 2d, 2d)."""
-        return self.products.gradient_and_hessian(params, w, args**2)
+    def inside(self, params, args):
+        """The same params, and dt²."""
+        return params, args**2
 
     def term_gradients(self, w: Any, args: Any = None):
         """Gradients ∂/∂w of all terms, shape (..., 2d, num_parameters)."""

@@ -154,16 +154,9 @@ class Constrained(AroundAnother):
         free = tuple(kept.index(self.free[j]) for j in rows)
         return Constrained(self.family.take(kept), self.fixed[kept], basis[kept], free)
 
-    def value(self, params, w, args=None):
-        return self.family.value(self.coefficients(params), w, args)
-
-    def gradient(self, params, w, args=None):
-        """Gradient ∂f/∂w (..., 2d)."""
-        return self.family.gradient(self.coefficients(params), w, args)
-
-    def gradient_and_hessian(self, params, w, args=None):
-        """Gradient ∂f/∂w (..., 2d) and Hessian ∂²f/∂w² (..., 2d, 2d)."""
-        return self.family.gradient_and_hessian(self.coefficients(params), w, args)
+    def inside(self, params, args):
+        """All coefficients, and the same args."""
+        return self.coefficients(params), args
 
     def term_gradients(self, w, args=None):
         """∂/∂x of the gradient (..., 2d, m)."""

@@ -83,11 +83,11 @@ class Linearised:
     variance: float = 1.0
 
     @classmethod
-    def of_derivatives(cls, p: np.ndarray, triangle: Triangle, variance: float = 1.0) -> Linearised:
+    def of_derivatives(cls, p: np.ndarray, triangle: Triangle) -> Linearised:
         """Make it of the triangle of [∂r/∂p, r], as pairs have it."""
         factor = triangle.factor.copy()
         factor[:, -1] *= -1
-        return cls(p, Triangle(factor, triangle.rows), variance)
+        return cls(p, Triangle(factor, triangle.rows))
 
     @classmethod
     def of_arcs(cls, fitted: Fitted, correlation: float = 1.0) -> Linearised:
@@ -151,19 +151,19 @@ class Linearised:
         pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > least, 1)), strict=True)
         return [(int(i), int(j), float(correlation[i, j])) for i, j in pairs]
 
-    def null_space(self, options: LinearisedOptions = OPTIONS) -> np.ndarray:
+    def null_space(self) -> np.ndarray:
         """Independent changes (m, n) of the coefficients that move no residual, the least last, 0
         of those that are no part of one."""
         if not len(self.p):
             return np.zeros((0, 0))
         spectrum = self.spectrum
-        along = spectrum.vt[spectrum.s <= options.null * spectrum.s[0]]
-        part = np.abs(along) > options.part * np.abs(along).max(axis=1, keepdims=True, initial=0)
+        along = spectrum.vt[spectrum.s <= OPTIONS.null * spectrum.s[0]]
+        part = np.abs(along) > OPTIONS.part * np.abs(along).max(axis=1, keepdims=True, initial=0)
         return np.where(part, along / spectrum.column, 0.0)
 
-    def null_direction(self, options: LinearisedOptions = OPTIONS) -> np.ndarray:
+    def null_direction(self) -> np.ndarray:
         """The last of them (n,); 0 where there is none."""
-        found = self.null_space(options)
+        found = self.null_space()
         return found[-1] if len(found) else np.zeros(len(self.p))
 
     def shortest(self) -> np.ndarray:
@@ -181,10 +181,10 @@ class Linearised:
         size = np.maximum(np.linalg.norm(self.columns, axis=0), 1e-300)
         return np.linalg.lstsq(self.columns / size, self.residual, rcond=rank)[0] / size
 
-    def moved_by(self, other: Linearised, rank: float = OPTIONS.null) -> float:
+    def moved_by(self, other: Linearised) -> float:
         """The most that any combination of coefficients moves, in its standard errors, where the
         residuals are those of ``other``, as by shorter steps of the integrator."""
-        change = other.step(rank) - self.step(rank)
+        change = other.step(OPTIONS.null) - self.step(OPTIONS.null)
         return float(np.linalg.norm(self.columns @ change) / np.sqrt(self.variance))
 
     # Other columns.

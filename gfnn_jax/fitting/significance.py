@@ -17,7 +17,7 @@ ABOVE_NOISE, CERTAIN = EVIDENCE.significant, 5.0
 NULL = 1e-10  # of a term's size; one closer to the span of those before it is not known apart
 
 
-def null_terms(family, z, tolerance: float = NULL, *, args=None) -> tuple[list[int], list[int]]:
+def null_terms(family, z, args=None) -> tuple[list[int], list[int]]:
     """(kept, null): the terms that states z (N, 2d) with these args (N, k) tell apart, and those
     whose gradient is a combination of those before them."""
     gradients = family.term_gradients(z, args)
@@ -29,7 +29,7 @@ def null_terms(family, z, tolerance: float = NULL, *, args=None) -> tuple[list[i
     for j in range(scaled.shape[1]):
         rest = beside(basis, scaled[:, j])
         distance = np.linalg.norm(rest)
-        if np.isfinite(distance) and distance > tolerance and basis.shape[1] < len(scaled):
+        if np.isfinite(distance) and distance > NULL and basis.shape[1] < len(scaled):
             kept.append(j)
             basis = np.column_stack([basis, rest / distance])
     return kept, sorted(set(range(scaled.shape[1])) - set(kept))

@@ -36,10 +36,9 @@ class WithForces(AroundAnother):
         """Names of the args that are no inputs."""
         return getattr(self.family, "parameters", ())
 
-    def value(self, params, w, args=None):
-        """H, shape (...), the energy that friction loses and inputs supply."""
-        own = params[..., : self.family.num_parameters]
-        return self.family.value(own, w, self._inner(args))
+    def inside(self, params, args):
+        """Params and args of H, whose value is the energy that friction loses and inputs supply."""
+        return params[..., : self.family.num_parameters], self._inner(args)
 
     def _inner(self, args):
         """Args of H."""

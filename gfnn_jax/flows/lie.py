@@ -224,8 +224,29 @@ def law_flow(
     return piece
 
 
+class InARow:
+    """Base of a piece that is others in a row: ``_row(one, carry, args)`` is the carry after
+    ``one(piece, carry, args)`` of each, and the largest Info."""
+
+    _row: Any
+
+    def step(self, z, args=None, *, unrolled: bool | int = False):
+        """Step the states z (B, n): (Z, Info), by JAX."""
+        return self._row(lambda piece, z, at: piece.step(z, at, unrolled=unrolled), z, args)
+
+    def compensated_step(self, z, compensation, args=None):
+        """Step z + compensation (B, n): (Z, compensation, Info)."""
+
+        def one(piece, both, at):
+            *both, info = piece.compensated_step(*both, at)
+            return tuple(both), info
+
+        both, info = self._row(one, (z, compensation), args)
+        return *both, info
+
+
 @pytree("substeps")
-class LieFlow:
+class LieFlow(InARow):
     """The flow of H over dt in any Lie algebra, of order 8: 17 maps of `LieGenerated` with S = H a
     substep. A piece for the algebras that have no lift."""
 
@@ -272,26 +293,8 @@ class LieFlow:
         """1.0: the piece is Poisson."""
         return 1.0
 
-    def step(self, z, args=None, *, unrolled: bool | int = False):
-        """Step the states z (B, n): (Z, Info), by JAX."""
-
-        def one(short, z, args):
-            return short.step(z, args, unrolled=unrolled)
-
-        return self._composed(one, z, args)
-
-    def compensated_step(self, z, compensation, args=None):
-        """Step z + compensation (B, n), with the Casimirs kept: (Z, compensation, Info)."""
-
-        def one(short, both, args):
-            *both, info = short.compensated_step(*both, args)
-            return tuple(both), info
-
-        both, info = self._composed(one, (z, compensation), args)
-        return *both, info
-
-    def _composed(self, one, carry, args):
-        """All maps of the composition, in a row."""
+    def _row(self, one, carry, args):
+        """All maps of the composition, in a row; compensated steps keep the Casimirs."""
         weights = jnp.asarray(np.tile(COMPOSITION, self.substeps) / self.substeps)
         begun = jnp.cumsum(weights) - weights
 

@@ -45,7 +45,7 @@ class OfSystems(AroundAnother):
         rows = list(rows)
         return OfSystems(self.family.take(rows), tuple(self.powers[j] for j in rows))
 
-    def of_one(self, params, args) -> tuple[Any, Any]:
+    def inside(self, params, args) -> tuple[Any, Any]:
         """Params (..., m) and args of the family for the system, or those of each lane, that args
         tell. Raises ValueError without them."""
         if args is None:
@@ -68,21 +68,9 @@ class OfSystems(AroundAnother):
             return args
         return beside(args[..., :count], at_time(self.family, args[..., count:], after))
 
-    def value(self, params, w, args=None):
-        own, rest = self.of_one(params, args)
-        return self.family.value(own, w, rest)
-
-    def gradient(self, params, w, args=None):
-        own, rest = self.of_one(params, args)
-        return self.family.gradient(own, w, rest)
-
-    def gradient_and_hessian(self, params, w, args=None):
-        own, rest = self.of_one(params, args)
-        return self.family.gradient_and_hessian(own, w, rest)
-
     def parameter_gradients(self, params, w, args=None, along=None):
         """∂/∂params of the gradient (..., 2d, m). NumPy."""
-        own, rest = self.of_one(params, args)
+        own, rest = self.inside(params, args)
         columns = parameter_gradients(self.family, own, w, rest, along)
         if along is not None or args is None:
             return columns

@@ -133,7 +133,7 @@ def power(family, params, w, args=None) -> Power:
         even = params[-1] * xp.sum(split(w)[1] * v, axis=-1, keepdims=True)
         return Power(xp.concatenate([lost, even], axis=-1), supplied)
     if isinstance(family, OfSystems):
-        own, rest = family.of_one(params, args)
+        own, rest = family.inside(params, args)
         return power(family.family, own, w, rest)
     if isinstance(family, Forced):
         return Power(*family.power(params, w, args))

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gfnn_jax.arrays import pytree
+from gfnn_jax.flows.lie import InARow
 from gfnn_jax.maps.parameters import Parameters
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
@@ -21,7 +22,7 @@ _WHOLE = 1e-9  # relative tolerance on the whole number of steps in a period
 
 
 @pytree("steps", "backward")
-class OverPhases:
+class OverPhases(InARow):
     """Row of a driven piece at the times t0 + n dt, n from 0 to ``steps`` − 1, itself without args.
 
     parameters: those of the map; the time is the only one. backward: True for the inverse of the
@@ -35,29 +36,15 @@ class OverPhases:
     steps: int
     backward: bool = False
 
-    def step(self, z, args=None, *, unrolled: bool | int = False):
-        """Step the states z (B, 2d): (Z, Info), by JAX."""
-        return self._row(lambda z, at: self.piece.step(z, at, unrolled=unrolled), z)
-
-    def compensated_step(self, z, compensation, args=None):
-        """Step z + compensation (B, 2d): (Z, compensation, Info)."""
-
-        def step(both, at):
-            *both, info = self.piece.compensated_step(*both, at)
-            return tuple(both), info
-
-        (z, compensation), info = self._row(step, (z, compensation))
-        return z, compensation, info
-
     def action(self, z, image, origin, args=None):
         """Action (B,) of the row from z (B, 2d), the sum of the actions of its steps."""
 
-        def step(both, at):
+        def one(piece, both, at):
             z, total = both
-            image, info = self.piece.step(z, at)
-            return (image, total + self.piece.action(z, image, origin, at)), info
+            image, info = piece.step(z, at)
+            return (image, total + piece.action(z, image, origin, at)), info
 
-        return self._row(step, (z, jnp.zeros(z.shape[:1], z.dtype)))[0][1]
+        return self._row(one, (z, jnp.zeros(z.shape[:1], z.dtype)), args)[0][1]
 
     def inverse(self) -> OverPhases:
         """Make the inverse row: the inverse steps from the last to the first."""
@@ -68,11 +55,12 @@ class OverPhases:
         one = self.piece.multiplier(args)
         return None if one is None else one**self.steps
 
-    def _row(self, step, carry):
+    def _row(self, one, carry, args):
         def following(carry, number):
             # Backward, a piece begins where its step forward ends.
             n = self.steps - number if self.backward else number
-            return step(carry, self.parameters.after(jnp.reshape(self.t0, (1, 1)), n, self.dt))
+            at = self.parameters.after(jnp.reshape(self.t0, (1, 1)), n, self.dt)
+            return one(self.piece, carry, at)
 
         carry, infos = jax.lax.scan(following, carry, jnp.arange(self.steps))
         return carry, jax.tree.map(lambda a: jnp.max(a, axis=0), infos)

@@ -159,7 +159,6 @@ def latent_readings(
     piece: Generated,
     ends: tuple[list[Any], list[Any]],
     turns: list[np.ndarray],
-    on_progress: Callable[[str], Any] = lambda message: None,
 ) -> LatentReadings | None:
     """The S that the readings ``turns``, (n, 2d) of each stretch of turns without a gap, ask for by
     Akaike's criterion; None where they are too few, or every larger S leaves less: what is left is
@@ -175,7 +174,6 @@ def latent_readings(
     for family in _families(piece.family):
         if best and OPTIONS.passes * arcs.size * family.num_parameters**2 > OPTIONS.most_operations:
             break
-        on_progress(f"latent readings, S of {family.label}, {family.num_parameters} terms")
         found = _fitted(piece, family, ends, arcs)
         if found.converged and (best is None or found.criterion < best.criterion):
             best, worse = found, 0
