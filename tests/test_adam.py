@@ -208,8 +208,3 @@ def test_a_cap_ends_the_training_and_its_rate():
     assert result.validation_rms < fit(recipe, cap=2 * one.operations).validation_rms
     uncapped = fit(dataclasses.replace(recipe, epochs=2), cap=1e15)
     assert uncapped.stopped_because == "epochs"
-
-
-def test_a_batch_is_never_more_than_the_pairs():
-    result = fit(dataclasses.replace(SHORT, batch_size=10_000, epochs=2))
-    assert result.epochs == 2

@@ -316,10 +316,8 @@ def test_a_series_with_a_parameter_is_saved_and_put_in_a_row(series, tmp_path):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (None, "expected params l, which the map was learned with; got none"),
         ({"m": 1.0}, "expected params l; got m"),
         (np.ones((4, 2)), "of shape (1,) or (3, 1), got (4, 2)"),
-        ("long", "expected numbers as params, got 'long'"),
     ],
 )
 def test_params_that_are_not_the_maps(learned, given, message):
@@ -342,19 +340,9 @@ DT = np.linspace(0.1, 0.2, 40)
 @pytest.mark.parametrize(
     ("dt", "args", "options", "message"),
     [
-        (np.where(DT > 0.19, -DT, DT), None, {}, "time steps above 0, got 4 of 40 that are not"),
         (DT[:7], None, {}, "one number or one per pair (40,), got shape (7,)"),
-        (0.1, {"l": DT[:7]}, {}, "expected args['l'] of shape (40,), got (7,)"),
-        (0.1, DT[:7], {}, "as name -> (40,) or as an array (40, k)"),
         (0.1, {"q1": DT}, {}, "'q1' cannot name a parameter"),
-        (0.1, {"arm length": DT}, {}, "letters, digits and _ as a parameter's name"),
-        (0.1, {"l": np.where(DT > 0.19, np.nan, DT)}, {}, "finite values of l, got 4 of 40"),
         (DT, {"l": DT}, {"learn": "map"}, "dt and in parameters: expected learn='hamiltonian'"),
-        (DT, {"l": DT}, {"chart": "type2"}, "chart or base, got chart='type2'"),
-        (0.1, {"l": DT}, {"family": "sines"}, "or 'polynomial' and no base, got family='sines'"),
-        (0.1, {"l": DT}, {"base": "p**2/2"}, "no base, got a base"),
-        (DT, None, {"family": "sines"}, "chart 'auto' or 'midpoint' and no base, got family='si"),
-        (0.1, {"l": DT}, {"terms": ["m*p**2"]}, "has the name 'm'"),
     ],
 )
 def test_pairs_that_cannot_be_used(dt, args, options, message):
@@ -371,14 +359,6 @@ def test_a_parameter_that_never_varies_is_left_out():
     assert messages == [
         "the parameter l is 1 in all pairs: it is left out, for its effect is not known"
     ]
-
-
-def test_pairs_are_a_pytree_with_their_dt_and_args():
-    pairs = gfnn.Pairs(Z, Z, DT, {"l": DT})
-    half = jax.tree.map(lambda a: a[:20], pairs)
-    assert len(half) == 20
-    assert half.dt.shape == half.args["l"].shape == (20,)
-    assert jax.tree.map(lambda a: a[:20], gfnn.Pairs(Z, Z, 0.1)).dt == 0.1
 
 
 # Files and the command line.

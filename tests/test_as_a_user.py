@@ -30,31 +30,3 @@ def long_ones_slow(name):
 def test_what_is_said_is_true(name):
     measured = benchmark.measure(name)
     assert measured["wrong"] == [], measured["messages"]
-
-
-@pytest.mark.slow
-def test_the_quick_cases_write_their_result(tmp_path, monkeypatch):
-    monkeypatch.setattr(benchmark, "measure", lambda name: MEASURED | {"messages": [name]})
-    benchmark.main(["--quick", "--out", str(tmp_path)])
-    found = benchmark.read({"": tmp_path / "as-a-user.json"})[""]
-    assert list(found["measured"]) == [n for n in benchmark.CASES if n in benchmark.QUICK]
-    table = benchmark.table(found["measured"])
-    assert "| friction | 9 | 1 (10) |" in table
-    assert "| 1.00, 1.04 |" in table
-
-
-MEASURED = {
-    "seconds": 1.0,
-    "in_time": True,
-    "budget": 10.0,
-    "pairs": 9,
-    "model": "midpoint polynomial 2",
-    "claimed": 1e-7,
-    "true_error": 1e-7,
-    "met": True,
-    "messages": [],
-    "noise_ratio": [1.0, 1.04],
-    "ended": "the tolerance is met",
-    "truthful": False,
-    "wrong": ["met"],
-}

@@ -194,13 +194,6 @@ def test_a_law_of_uneven_times_knows_each_rows_own_step():
 
 
 @pytest.mark.slow
-def test_a_map_without_posterior_says_so(noisy):
-    bare = jax.tree.map(lambda leaf: leaf, noisy[1].map)
-    with pytest.raises(ValueError, match="no posterior to draw from"):
-        bare.sample(jax.random.key(0), 3)
-
-
-@pytest.mark.slow
 def test_the_posterior_of_s_covers_the_held_out_misfit():
     pairs, fresh = henon_heiles_pairs(400, 0), henon_heiles_pairs(200, 1)
     fit = gfnn.fit(pairs, learn="map", family="polynomial", chart="midpoint", tolerance=1e-3)

@@ -18,7 +18,6 @@ from gfnn_jax.errors import OutOfTime
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.collocation import Steps, images
 from gfnn_jax.learn import request as of_pairs
-from gfnn_jax.learn import searches
 
 QUIETLY = pytest.mark.filterwarnings("ignore::gfnn_jax.FitWarning")
 LARGE = 10**10  # operations whose time tells the rate of their kind: a second, by default
@@ -409,36 +408,3 @@ def test_seconds_that_are_gone_already_count():
         fit = gfnn.fit(kepler(), max_seconds=10.0, clock=hand, spent=9.9)
     assert fit.chosen.family == "linear"
     assert "there was no time for a first model" in fit.ended
-
-
-@pytest.mark.slow
-@QUIETLY
-def test_ended_names_the_clock_where_the_maps_ended_by_themselves(monkeypatch):
-    """Every size of S that so few pairs determine is judged before the clock ends the search for
-    H."""
-
-    def cut_off(request, *_):
-        with contextlib.suppress(OutOfTime), request.budget.unit("H of 60 terms", FLOW, 1e30):
-            pass
-
-    monkeypatch.setattr(searches, "_law", cut_off)
-    fit = gfnn.fit(kepler(60), tolerance=1e-12, max_seconds=1e6)
-    assert "there was no time" in fit.ended
-    assert "H of 60 terms" in fit.ended
-    assert fit.ended in " ".join(fit.messages)
-
-
-@pytest.mark.slow
-@QUIETLY
-def test_the_posterior_is_computed_when_it_is_asked_for():
-    fit = gfnn.fit(oscillators(), learn="map", tolerance=1e-4, max_seconds=None)
-    assert not fit.map.posterior.known
-    assert not fit.map.reversed().posterior.known
-    fit.sample(jax.random.key(0), 2)
-    assert fit.map.posterior.known
-
-
-def test_a_bound_that_is_no_number_of_operations_is_refused():
-    for wrong in (-1, 1.5, "1e9"):
-        with pytest.raises(gfnn.FitError, match="whole number of operations"):
-            gfnn.fit(kepler(30), max_operations=wrong)

@@ -112,13 +112,6 @@ def test_every_file_is_guarded(model):
     load_model(model)
 
 
-def test_flipped_bit_is_named(model):
-    path = model / "arrays.npz"
-    path.write_bytes(path.read_bytes()[:-1] + b"?")
-    with pytest.raises(InputError, match=r"arrays.npz has changed"):
-        load_model(model)
-
-
 def rewrite(folder, change):
     """Change model.json as another release would: with its digest."""
     record = json.loads((folder / "model.json").read_text())
@@ -138,25 +131,14 @@ def kernel(record):
     ("change", "message"),
     [
         (lambda r: r.update(format=4), "has format 4, this release reads formats 2 and 3"),
-        (lambda r: r.pop("format"), "model.json is damaged"),
-        (lambda r: kernel(r).update(shape=[8, 4]), r"float64 of shape \(8, 4\), found"),
         (lambda r: kernel(r).update(dtype="float32"), "should be float32 of shape"),
         (lambda r: kernel(r).update(sha256="0"), "mlp/layer 0/kernel has changed"),
-        (lambda r: kernel(r).update(key="other"), "cannot be restored"),
-        (lambda r: r["leaves"].clear(), "cannot be restored"),
     ],
 )
 def test_other_contents_are_refused(model, change, message):
     rewrite(model, change)
     with pytest.raises(InputError, match=message):
         load_model(model)
-
-
-def test_no_model(tmp_path):
-    (tmp_path / "empty").mkdir()
-    for name, message in [("none", "no such folder"), ("empty", "holds no model.json")]:
-        with pytest.raises(InputError, match=message):
-            load_model(tmp_path / name)
 
 
 def test_float64_needs_x64(model):

@@ -23,7 +23,6 @@ from command_line import (
     predict,
 )
 
-from gfnn_jax.jobs import fit as jobs_fit
 from gfnn_jax.jobs import output, progress
 from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.maps import saved as models
@@ -94,21 +93,6 @@ def test_nothing_is_left_where_nothing_was_kept(tmp_path, capsys, monkeypatch):
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "gfnn: stopped; nothing of the fit was kept"
     assert [p.name for p in tmp_path.iterdir()] == ["d.npz"]
-
-
-def test_what_an_earlier_fit_kept_is_told_however_soon_a_signal_comes(
-    tmp_path, capsys, monkeypatch
-):
-    def stop(*args, **kwargs):
-        raise KeyboardInterrupt
-
-    (tmp_path / "m.partial" / "best").mkdir(parents=True)
-    (tmp_path / "m.partial" / "job.json").write_text("{}")
-    monkeypatch.setattr(jobs_fit, "read_trajectories", stop)
-    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m", "--resume")
-    assert gfnn(*fit) == 130
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last == f"gfnn: stopped; {tmp_path}/m.partial keeps best: --resume goes on with it"
 
 
 def stopped_with(better):
@@ -270,38 +254,6 @@ def test_a_full_disk(model, fitted, tmp_path, capsys, monkeypatch):
     assert all("No space left on device" in e for e in errors)
     assert not (tmp_path / "m").exists()
     assert before.items() <= files(tmp_path).items()
-
-
-def test_a_changed_model_is_refused(model, tmp_path, capsys):
-    for file in model.rglob("*"):
-        if file.is_file():
-            copy = tmp_path / "m" / file.relative_to(model)
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            copy.write_bytes(file.read_bytes())
-    text = (tmp_path / "m" / "model.json").read_text()
-    (tmp_path / "m" / "model.json").write_text(text.replace('"dt": 0.1', '"dt": 0.2'))
-    np.save(tmp_path / "z0.npy", np.zeros((1, 2)))
-    assert predict(tmp_path / "m", tmp_path / "p.npz") == 2
-    assert "has changed since it was saved" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_killed_predictions_resume(model, tmp_path):
-    """Twenty SIGKILLs at random moments of a prediction: the same bits in the end."""
-    num_steps = 3_000_000
-    steps = f"--num-steps {num_steps} --save-every 1000 --resume --out"
-    initial = ("--initial", str(model.parent / "z0.npy"))
-    command = [sys.executable, "-m", "gfnn_jax", "predict", str(model), *initial, *steps.split()]
-    assert subprocess.run([*command, tmp_path / "whole.npz"], check=False).returncode == 0
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        process = subprocess.Popen([*command, tmp_path / "p.npz"])
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(timeout=rng.uniform(2, 6))
-        process.kill()
-        process.wait()
-    assert subprocess.run([*command, tmp_path / "p.npz"], check=False).returncode == 0
-    assert (tmp_path / "p.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
 
 
 # Every iteration of the training is saved and told.

@@ -112,33 +112,6 @@ def test_a_result_is_old_where_something_changed_that_its_piece_reaches(reposito
     assert [commits.behind(f"0.{minor}.1") for minor in (2, 3, 4)] == [True, False, False]
 
 
-def test_what_is_old_is_measured_again(repository, capsys):
-    root, commit = repository
-    results = root / "benchmarks/results"
-    for name in ("one", "broken", "other"):
-        is_old(root, None, name)
-    (results / "nobody.json").write_text("{}")
-    commit()
-    study = root / "benchmarks/a_try.py"
-    study.write_text(STUDY.replace('"broken": None', '"broken": True').replace("first", "third"))
-    forget()
-    before = (results / "a-try-broken.json").read_bytes()
-    assert commits.check(["a_try"], [], results, tell=True) == 1
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("nobody.json")
-    assert lines[1].startswith("1 of 3")
-    assert [line.split(",")[0] for line in lines[2:]] == ["a-try-broken.json", "a-try-one.json"]
-    assert commits.check(["a_try"], ["a_try"], results, tell=False) == 1
-    assert (results / "a-try-broken.json").read_bytes() == before
-    found = json.loads((results / "a-try-one.json").read_text())
-    assert found["measured"] == {"rms": 2.0}
-    (results / "nobody.json").unlink()
-    assert commits.check(["a_try"], ["a_try"], results, tell=False, read="renamed") == 0
-    commit()
-    forget()
-    assert commits.check(["a_try"], ["a_try"], results, tell=True) == 0
-
-
 def test_every_result_of_the_repository_has_a_study():
     here = commits.HERE
     made = [r for s in studies() for r in commits.results_of(here / f"{s}.py", here / "results")]

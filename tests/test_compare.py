@@ -7,12 +7,12 @@ import jax
 import numpy as np
 import pytest
 
-from gfnn_jax import cli, scenes
+from gfnn_jax import scenes
 from gfnn_jax.baselines import Budget
 from gfnn_jax.baselines.learned import paper_gfnn
 from gfnn_jax.errors import InputError
 from gfnn_jax.jobs import compare as comparison
-from gfnn_jax.jobs.compare import SharedData, separable
+from gfnn_jax.jobs.compare import SharedData
 from gfnn_jax.jobs.figures import divergences
 from gfnn_jax.jobs.measure import Rollouts, without_runaways
 from gfnn_jax.jobs.output import Output
@@ -77,31 +77,6 @@ def test_an_interrupted_comparison_keeps_what_is_finished_and_reports_all(small,
     assert compare(out, resume=True) is None  # done, this very job
     with pytest.raises(InputError, match="exists already"):
         compare(out)
-
-
-def test_bad_usage_is_one_line(tmp_path, capsys):
-    for arguments, message in (
-        (["compare", "two-bodies"], "did you mean 'two-body'"),
-        (["compare", "two-body", "--methods", "hnn,rnn"], "unknown method 'rnn'; methods: vfnn"),
-        (["compare", "two-body", "--cap", "0"], "expected a finite number > 0"),
-    ):
-        assert cli.main([*arguments, "--out", str(tmp_path / "new")]) == 2
-        error = capsys.readouterr().err
-        assert message in error
-        assert error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_which_scenes_are_separable():
-    assert separable(scenes.make("two-body"))
-    assert separable(scenes.make("standard-map-regular"))
-    assert not separable(scenes.make("pcr3bp"))
-
-
-def test_a_scene_with_parameters_is_not_compared(tmp_path):
-    with pytest.raises(InputError, match="parameters"):
-        comparison.compare("pendulum-length", Output(tmp_path / "c"))
 
 
 @pytest.mark.slow

@@ -75,15 +75,6 @@ def test_the_rotation_number_of_its_attractor_is_the_maps(learned):
 
 
 @pytest.mark.slow
-def test_it_is_saved_and_loaded(learned, tmp_path):
-    learned.map.save(tmp_path / "model")
-    loaded = gfnn.load(tmp_path / "model").map
-    z = states_of(300, 2)
-    assert np.array_equal(loaded.step(z)[0], learned.map.step(z)[0])
-    assert loaded.multiplier() == learned.map.multiplier()
-
-
-@pytest.mark.slow
 def test_oscillators_of_different_friction_keep_no_multiple_of_the_form():
     """Their determinant is the same everywhere, which would pass for one factor."""
     rates = np.array([0.1, 0.3])

@@ -73,33 +73,12 @@ def test_a_periodic_orbit_is_a_chain_too():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"run": np.zeros(3)}, r"expected run as numbers or text of shape \(23,\), got float64"),
-        ({"place": PLACES}, "expected run as well as place"),
-        ({"run": LABELS, "place": PLACES + 0.5}, "expected place as integers"),
-        ({"std": [1e-3]}, r"expected std of shape \(2,\), one of each coordinate, or .* \(1,\)"),
         ({"std": [1e-3, 0.0]}, "expected every std finite and above 0"),
     ],
 )
 def test_identities_and_noise_that_are_none(given, message):
     with pytest.raises(gfnn.FitError, match=message):
         in_rows(walks(*LENGTHS), **given)
-
-
-@pytest.mark.slow
-def test_a_permuted_fit_is_the_same_fit():
-    rng = np.random.default_rng(0)
-    states = np.zeros((20, 12, 2))
-    states[:, 0] = rng.uniform(-1, 1, (20, 2))
-    for k in range(11):  # a kicked rotor, and noise
-        p = states[:, k, 1] - 0.4 * np.sin(states[:, k, 0])
-        states[:, k + 1] = np.stack([states[:, k, 0] + 0.4 * p, p], axis=1)
-    states += 1e-4 * rng.normal(size=states.shape)
-    pairs = in_rows(states, run=np.repeat(np.arange(20), 11))
-    order = rng.permutation(len(pairs))
-    maps = [gfnn.fit(p, tolerance=1e-2, learn="map").map for p in (pairs, pairs.take(order))]
-    z = rng.uniform(-1, 1, (20, 2))
-    images = [np.asarray(m.step(z)[0]) for m in maps]
-    np.testing.assert_array_equal(*images)
 
 
 # Samples of large files

@@ -239,16 +239,6 @@ def test_files_that_differ_or_cannot_be_shared(tmp_path):
         next(iterate_pairs(tmp_path / "a.csv", 10, share=Share(0, 2)))
 
 
-def in_files(folder, pairs, parts):
-    """The files that these pairs are shared out among."""
-    names = [folder / f"{i}.npz" for i in range(parts)]
-    for name, rows in zip(names, np.array_split(np.arange(len(pairs)), parts), strict=True):
-        own = pairs.take(rows)
-        given = {} if own.args is None else {"params": np.stack([*own.args.values()], axis=1)}
-        np.savez(name, z0=own.z0, z1=own.z1, dt=own.dt, **given)
-    return names
-
-
 def turned(z, dt):
     """Images by the flow of p²/2 + q²/2, each over its own dt."""
     (q, p), cos, sin = z.T, np.cos(dt), np.sin(dt)
@@ -313,42 +303,6 @@ def test_pairs_of_another_dt_are_left_out(in_threads):
     other = refit(fit, [clean], clean.take(slice(99)))
     z = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 2))
     np.testing.assert_allclose(*(f.map.step(z)[0] for f in (again, other)), rtol=0, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_files_of_several_dt_are_all_taken(tmp_path):
-    pairs = noisy(flow)
-    for i, dt in enumerate((0.999 * DT, 1.001 * DT)):
-        own = pairs.take(slice(200 * i, 200 * (i + 1)))
-        np.savez(tmp_path / f"{i}.npz", z0=own.z0, z1=own.z1, dt=dt)
-    ran = fit_job.fit(
-        [tmp_path / "0.npz", tmp_path / "1.npz"],
-        output=Output(tmp_path / "m"),
-        learn="hamiltonian",
-        terms=("p1**2", "q1**4"),
-        tolerance=0.1,
-    )
-    assert ran.fit.num_pairs == 400
-    assert not any("is kept" in message for message in ran.fit.messages)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:no candidate:gfnn_jax.errors.FitWarning")
-def test_a_network_is_that_of_the_sample_and_says_so(tmp_path, monkeypatch):
-    from gfnn_jax.learn import searches
-    from gfnn_jax.models.generating_functions import networks
-
-    monkeypatch.setattr(networks, "_MLP_HIDDEN", (3,))
-    train = searches.NetworkSweep._trained
-    monkeypatch.setattr(
-        searches.NetworkSweep,
-        "_trained",
-        lambda self, **options: train(self, **{**options, "max_iterations": 1}),
-    )
-    names = in_files(tmp_path, noisy(image).take(slice(300)), 2)
-    with pytest.warns(gfnn.FitWarning, match="300 pairs"):
-        ran = fit_job.fit(names, output=Output(tmp_path / "m"), family="mlp", chart="midpoint")
-    assert any("needs a family that is linear" in message for message in ran.fit.messages)
 
 
 # Real processes, on this machine

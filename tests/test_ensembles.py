@@ -193,16 +193,3 @@ def test_an_interrupted_ensemble_goes_on_to_the_same_members(tmp_path, monkeypat
     ):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(whole.map.posterior.root, resumed.map.posterior.root)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"ensemble": 0}, "whole number from 1 to .* as ensemble, got 0"),
-        ({"ensemble": 3}, "expected family='mlp'"),
-        ({"ensemble": 3, "family": "mlp", "learn": "hamiltonian"}, "ensemble"),
-    ],
-)
-def test_what_makes_no_ensemble_is_refused(options, words):
-    with pytest.raises(gfnn.FitError, match=words):
-        gfnn.fit(pairs_of(60, 0), **options)

@@ -127,17 +127,6 @@ def test_times_of_one_period_tell_no_law():
         fitted(times)
 
 
-def test_the_noise_of_times_has_to_be_given():
-    with pytest.raises(gfnn.InputError, match="std="):
-        gfnn.fit(
-            gfnn.Recording(
-                {"gate": np.arange(60) - 0.1 * np.exp(-np.arange(60) / 20)},
-                observe={"gate": "crossing(theta)"},
-                angles=["theta"],
-            )
-        )
-
-
 def test_events_stand_between_samples():
     """Rows of both, each with what was read; a time of the file's clock."""
     t = np.arange(5.0)

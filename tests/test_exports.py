@@ -433,16 +433,6 @@ def test_the_file_tells_where_it_comes_from_and_keeps_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("relative", "told"), [(True, "relative to each"), (False, "in the data's units")]
-)
-def test_the_tolerance_is_told_as_it_was_asked_for(relative, told, tmp_path):
-    plain = dataclasses.replace(map_in(MIDPOINT, 1, 3)[0], coordinates=CARTESIAN)
-    fit = {"tolerance": 1e-3, "tolerance_is_relative": relative}
-    plain.save(tmp_path / "mine", record={"fit": fit})
-    assert f"tolerance asked for, {told}" in gfnn.export(tmp_path / "mine", "c").read_text()
-
-
-@pytest.mark.parametrize(
     "kind",
     ["type 2, angles", *(pytest.param(k, marks=pytest.mark.slow) for k in ("an angle", "law"))],
 )
@@ -533,21 +523,6 @@ def test_polynomials_are_arranged_anew():
 
 
 # Symbols
-
-
-def test_symbols_leave_no_arithmetic_with_zeros_and_do_nothing_twice():
-    tape = Tape()
-    z = tape.inputs("z", 3)
-    matrix = np.array([[0.0, 1.0, 2.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
-    text = tape.function("f", {"out": [*(z @ matrix)[0], 2.0 * z[0, 0] - z[0, 1]]})
-    assert text.splitlines()[2:] == [
-        "    const double t5 = 2.0*z[0] - z[1];",
-        "    out[0] = 0.0;",
-        "    out[1] = z[0];",
-        "    out[2] = t5;",
-        "    out[3] = t5;",
-        "}",
-    ]
 
 
 @needs_cc

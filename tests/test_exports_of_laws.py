@@ -28,7 +28,6 @@ import gfnn_jax as gfnn
 from gfnn_jax import cli
 from gfnn_jax.exports import SUFFIXES
 from gfnn_jax.families import friction
-from gfnn_jax.flows.legendre import Legendre
 from gfnn_jax.maps.inputs import Signals
 from gfnn_jax.maps.laws import law_of_map, map_of_law, velocities_of
 from gfnn_jax.maps.sensors import Sensors
@@ -376,18 +375,6 @@ def test_forces_of_a_motion_make_it():
     np.testing.assert_allclose(unforced.left, unforced.forces * [1.0, 0.0], atol=1e-12)
     with pytest.raises(ValueError, match="of one shape"):
         map_.inverse_dynamics(q, v, a[:3])
-
-
-def test_a_law_that_is_no_chain_has_no_links(tmp_path):
-    rods, _ = two_rods([((1, 0), friction.LINEAR, 0.0, 0.1)])
-    terms = rods.pieces[0].family.family.terms
-    springs = dataclasses.replace(terms, powers=np.array([[0, 0]] * 3 + [[2, 0], [0, 2]]))
-    family = dataclasses.replace(
-        rods.pieces[0].family, family=Legendre(dataclasses.replace(springs, modes=0 * terms.modes))
-    )
-    odd = dataclasses.replace(rods, pieces=(dataclasses.replace(rods.pieces[0], family=family),))
-    with pytest.raises(gfnn.InputError, match=r"chain .* to='fmu'"):
-        gfnn.export(odd, "mjcf", tmp_path / "own.xml")
 
 
 def test_formats_of_laws_are_refused_for_what_has_none(tmp_path):

@@ -70,12 +70,6 @@ def test_a_preamble_may_be_as_wide_as_the_table(tmp_path):
     assert (recording.columns, recording.units["Weg"]) == (("Weg",), "mm")
 
 
-def test_a_damaged_row_below_the_names_is_no_preamble(tmp_path):
-    (tmp_path / "bad.csv").write_text("t,x,y\n0,oops,2\n1,2,3\n2,3,4\n3,4,5\n")
-    with pytest.raises(InputError, match="line 2, x: 'oops'"):
-        gfnn.read(tmp_path / "bad.csv")
-
-
 @pytest.mark.parametrize(
     ("name", "told"),
     [
@@ -112,9 +106,7 @@ def test_names_with_commas_go_through_every_option():
 @pytest.mark.parametrize(
     ("head", "columns", "options"),
     [
-        (None, (T, SWING), ["--columns", "t,x"]),
         ("x", (SWING,), ["--dt", "0.02"]),
-        ("lap,x", (T, SWING), ["--time", "lap"]),
         ("t,#,x", (T, T, SWING), ["--columns", "t,x"]),
     ],
 )

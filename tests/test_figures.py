@@ -6,7 +6,6 @@ import sys
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
 from matplotlib.patches import StepPatch
 
 from gfnn_jax.evaluate import figures, metrics
@@ -85,11 +84,6 @@ def test_every_figure_is_labelled_saved_and_leaves_matplotlib_as_it_was(name, tm
     assert dict(matplotlib.rcParams) == before
 
 
-def test_the_suffix_chooses_the_format(tmp_path):
-    figures.save(every_figure()["phase_portrait"]().figure, tmp_path / "figure.pdf")
-    assert (tmp_path / "figure.pdf").read_bytes().startswith(b"%PDF")
-
-
 def test_pyplot_is_never_imported(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)  # an import of it raises
     for module in [name for name in sys.modules if name.startswith("gfnn_jax.evaluate.figures")]:
@@ -122,39 +116,10 @@ def test_a_lost_prediction_ends_its_curve_and_is_counted():
     assert line(ax, "HNN (1 of 3 lost)")[0].max() == 49
 
 
-def test_error_growth_shades_what_the_posterior_holds():
-    error = power_laws()
-    band = 3 * error[:2]
-    ax = figures.error_growth({"GFNN": (STEPS, error)}, band=(STEPS, band))
-    np.testing.assert_allclose(line(ax, "_band")[1], band.mean(axis=0)[1:])
-    labels = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert labels == ["GFNN", r"$\propto n$", r"two $\sigma$ of the posterior"]
-    assert ax.get_ylim()[1] > band.mean(axis=0)[-1]
-
-
-def test_element_errors_draws_each_element_on_its_own_axes():
-    a, e = power_laws(), power_laws()
-    ax_a, ax_e = figures.element_errors({"GFNN": (STEPS, a, e)})
-    np.testing.assert_allclose(line(ax_a, "GFNN")[1], a.mean(axis=0)[1:])
-    np.testing.assert_allclose(line(ax_e, "GFNN")[1], e.mean(axis=0)[1:])
-    assert "semi-major" in ax_a.get_ylabel()
-    assert "eccentricity" in ax_e.get_ylabel()
-
-
 def test_energy_error_is_a_root_mean_square():
     error = RNG.normal(size=(16, 101))
     ax = figures.energy_error({"GFNN": (STEPS, error)})
     np.testing.assert_allclose(line(ax, "GFNN")[1], np.sqrt(np.mean(error**2, axis=0))[1:])
-
-
-def test_coordinates_are_zoomed_to_the_window():
-    times, reference, predicted = 0.1 * STEPS, np.sin(STEPS), np.cos(STEPS)
-    ax = figures.coordinates_against_time(
-        times, reference, {"GFNN": predicted}, "$q_1$", window=(5, 7)
-    )
-    shown = (times >= 5) & (times <= 7)
-    np.testing.assert_array_equal(line(ax, "reference"), [times[shown], reference[shown]])
-    np.testing.assert_array_equal(line(ax, "GFNN"), [times[shown], predicted[shown]])
 
 
 def test_phase_portrait_modulo():
@@ -192,15 +157,3 @@ def test_speed_against_error_marks_the_choice_and_the_front():
     texts = [text.get_text() for text in ax.texts]
     assert texts[:4] == ["1", "2", "3", "4"]
     assert texts[4].splitlines() == ["1  b", "2  c  (chosen)", "3  d", "4  a"]
-
-
-def test_methods_differ_in_colour_and_marker():
-    curves = {f"method {i}": ([1, 2], [1, 2]) for i in range(9)}
-    lines = figures.work_precision(curves).get_lines()
-    assert len({(to_hex(line.get_color()), str(line.get_marker())) for line in lines}) == 9
-    assert len({str(line.get_marker()) for line in lines}) == 9
-
-
-def test_a_given_axes_is_drawn_on():
-    first = figures.work_precision({"one": ([1, 2], [1, 2])})
-    assert figures.work_precision({"GFNN": ([1, 2], [1, 2])}, ax=first) is first

@@ -1,6 +1,5 @@
 """Reading a user's data: every good file gives its numbers back, every bad one its line."""
 
-import builtins
 import dataclasses
 import tracemalloc
 import warnings
@@ -10,10 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from gfnn_jax.data import files
-from gfnn_jax.data.blocks import BLOCK_ROWS, LARGEST
+from gfnn_jax.data.blocks import BLOCK_ROWS
 from gfnn_jax.data.files import DataWarning, summary
 from gfnn_jax.errors import InputError
 
@@ -94,37 +92,6 @@ def test_sequences_of_any_length(tmp_path, lengths, dim, chunk, dtype, compresse
     assert max(map(len, chunks)) <= chunk
     assert np.array_equal(np.concatenate([c.z0 for c in chunks]), pairs.z0)
     assert np.array_equal(np.concatenate([c.z1 for c in chunks]), pairs.z1)
-
-
-FINITE = st.floats(-LARGEST, LARGEST)
-
-
-@pytest.mark.slow
-@QUICK
-@given(
-    hnp.arrays(np.float64, st.tuples(st.integers(6, 20), st.just(4)), elements=FINITE),
-    st.permutations(["t", "sequence", "q1", "q2", "p1", "p2"]),
-    st.integers(1, 7),
-)
-def test_csv_round_trip(tmp_path, z, order, chunk):
-    """Columns in any order, by name, every bit of every number; t goes on from sequence to
-    sequence or starts again."""
-    sequence = np.where(np.arange(len(z)) < 2, 7, 3)
-    columns = {"t": np.arange(len(z)) * 0.25, "sequence": sequence}
-    columns |= dict(zip(["q1", "q2", "p1", "p2"], z.T, strict=True))
-    path = csv(tmp_path / "d.csv", ",".join(order), np.column_stack([columns[n] for n in order]))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
-        try:
-            data = files.read_trajectories(path)
-        except InputError as error:
-            assert "pairs of consecutive" in str(error)  # noqa: PT017
-            return
-    assert data.dt == 0.25
-    assert list(data.lengths) == [2, len(z) - 2]
-    assert np.array_equal(data.states, z)
-    chunks = list(files.iterate_pairs(path, chunk))
-    assert np.array_equal(np.concatenate([c.z1 for c in chunks]), data.pairs().z1)
 
 
 def test_csv_headers(tmp_path):
@@ -335,86 +302,49 @@ STRINGS = np.array([["a", "b"]] * 9)
 # name -> (how the file is made, what the refusal must name beside the file: a line, an element)
 BAD_FILES = {
     "missing file": (lambda tmp: tmp / "none.npz", ""),
-    "directory": (folder, ""),
     "other suffix": (text("x", "d.txt"), ""),
-    "no suffix": (text("x", "d"), ""),
     "empty file npz": (text("", "d.npz"), ""),
-    "empty file npy": (text("", "d.npy"), ""),
-    "empty file csv": (text(""), ""),
     "text as npz": (text("hello\nworld", "d.npz"), ""),
-    "text as npy": (text("hello\nworld", "d.npy"), ""),
     "binary as csv": (text(bytes(range(128, 256))), "header"),
     "truncated npz": (changed(lambda b: b[: len(b) // 2]), ""),
     "truncated npy": (changed(lambda b: b[:-8], npy(Z)), "(30, 4)"),
-    "too long npy": (changed(lambda b: b + b"x", npy(Z)), "(30, 4)"),
     "flipped bit in npz": (changed(lambda b: flip(b, 700)), "z0"),
-    "flipped header in npy": (changed(lambda b: flip(b, 20), npy(Z)), ""),
     "flipped version in npy": (changed(lambda b: flip(b, 6), npy(Z)), "(17, 0)"),
-    "cut text of a header": (changed(lambda b: b.replace(b"), }", b"   }"), npy(Z)), ""),
-    "bytes for a header's key": (
-        changed(lambda b: b.replace(b" 'fortran_", b"b'fortran_"), npy(Z)),
-        "",
-    ),
     "flipped bit in lzma": (changed(lambda b: flip(b, 700), packed(zipfile.ZIP_LZMA)), ""),
     "flipped bit in bzip2": (changed(lambda b: flip(b, 700), packed(zipfile.ZIP_BZIP2)), ""),
     "flipped bit in deflate": (changed(lambda b: flip(b, 700), packed(zipfile.ZIP_DEFLATED)), ""),
-    "no .npy in an archive": (other_member, ""),
     "huge shape in npy": (
         changed(lambda b: b.replace(b"(30, 4), }        ", b"(3000000000, 4), }"), npy(Z)),
         "",
     ),
     "encrypted npz": (encrypted_flag, ""),
     "pickle": (npz(z0=np.array([None, {}]), z1=Z, dt=0.1), "z0"),
-    "ragged object array": (
-        npz(trajectories=np.array([Z[:3], Z[:5]], dtype=object), dt=0.1),
-        "trajectories",
-    ),
     "no arrays": (npz(dt=0.1), "dt"),
-    "wrong names": (npz(x=Z, y=Z, dt=0.1), "x, y, dt"),
-    "z0 alone": (npz(z0=Z, dt=0.1), "z0, dt"),
     "both kinds": (npz(z0=Z, z1=Z, trajectories=Z[None], dt=0.1), "trajectories"),
     "odd dimension": (npz(z0=Z[:, :3], z1=Z[:, :3], dt=0.1), "z0"),
-    "no columns": (npz(z0=Z[:, :0], z1=Z[:, :0], dt=0.1), "z0"),
     "shapes differ": (npz(z0=Z, z1=Z[:-1], dt=0.1), "(29, 4)"),
-    "one-dimensional": (npz(z0=Z[0], z1=Z[0], dt=0.1), "z0"),
-    "scalar array": (npy(np.float64(1)), "()"),
     "four-dimensional": (npz(trajectories=Z[None, None], dt=0.1), "trajectories"),
     "complex": (npz(z0=Z + 1j, z1=Z, dt=0.1), "complex128"),
-    "strings": (npz(z0=STRINGS, z1=STRINGS, dt=0.1), "z0"),
     "booleans": (npy(Z > 0), "bool"),
-    "structured": (npy(np.zeros(9, [("q", float), ("p", float)])), ""),
     "nan": (npz(z0=bad(np.nan), z1=Z, dt=0.1), "z0[3, 1] = nan"),
     "infinity": (npz(z0=Z, z1=bad(-np.inf), dt=0.1), "z1[3, 1] = -inf"),
     "nan in trajectories": (npz(trajectories=bad(np.nan, 7)[None], dt=0.1), "[0, 7, 1]"),
     "huge value": (npz(z0=bad(1e200), z1=Z, dt=0.1), "z0[3, 1]"),
     "no dt": (npz(z0=Z, z1=Z), "dt"),
-    "dt zero": (npz(z0=Z, z1=Z, dt=0.0), "dt"),
-    "dt negative": (npz(z0=Z, z1=Z, dt=-0.1), "dt"),
-    "dt nan": (npz(z0=Z, z1=Z, dt=np.nan), "dt"),
     "dt array": (npz(z0=Z, z1=Z, dt=[0.1, 0.2]), "(2,)"),
-    "dt of trajectories": (npz(trajectories=Z[None], dt=[0.1, 0.2]), "dt"),
     "dt of one pair": (npz(z0=Z, z1=Z, dt=-Z[:, 0]), "dt[0] = -"),
     "times fall": (npz(trajectories=Z[None], times=Z[None, :, 0] % 0.7), "times[0, "),
     "times and dt": (npz(trajectories=Z[None], times=Z[None, :, 0], dt=0.1), "dt or times"),
-    "times shape": (npz(trajectories=Z[None], times=Z[:, 0, None]), "times"),
     "params shape": (npz(z0=Z, z1=Z, dt=0.1, params=Z[:7, :2]), "(7, 2)"),
-    "params nan": (npz(z0=Z, z1=Z, dt=0.1, params=bad(np.nan)), "params[3, 1]"),
     "param names": (npz(z0=Z, z1=Z, dt=0.1, params=Z[:, :2], param_names=["l"]), "param_names"),
-    "dt text": (npz(z0=Z, z1=Z, dt="0.1"), "dt"),
     "lengths too long": (npz(trajectories=Z[None], lengths=[31], dt=0.1), "lengths[0] = 31"),
-    "length zero": (npz(trajectories=Z[None], lengths=[0], dt=0.1), "lengths[0] = 0"),
     "lengths shape": (npz(trajectories=Z[None], lengths=[3, 3], dt=0.1), "lengths"),
-    "lengths float": (npz(trajectories=Z[None], lengths=[3.0], dt=0.1), "lengths"),
     "csv without header": (rows("1.0,2.0,3.0", table(Z)), ""),
-    "csv header only": (rows(HEADER, []), ""),
     "csv without p2": (rows("t,q1,q2,p1", table(Z[:, :3])), "p2"),
-    "csv p without q": (rows("t,q1,p1,p2", table(Z[:, :3])), "p2"),
     "csv column twice": (rows("t,q1,q1,p1", table(Z[:, :3])), "q1"),
     "csv word": (text("t,q1,p1\n0,1,2\n1,x,2\n"), "line 3, q1: 'x'"),
-    "csv column of words": (text("t,q1,p1\n0,1,a\n1,1,b\n"), "p1"),
     "csv hole": (text("t,q1,p1\n0,1,2\n\n1,,2\n"), "line 4, q1"),
     "csv short row": (text("t,q1,p1\n0,1,2\n1,1\n"), "line 3: 3 columns"),
-    "csv long row": (text("t,q1,p1\n0,1,2,3\n1,1,2,3\n"), "line 2: 3 columns"),
     "csv nan": (rows(HEADER, table(bad(np.nan))), "line 5, q2 = nan"),
     "csv gap, dt given": (gap, "dt = 0.1"),
     "csv time falls": (
@@ -467,17 +397,6 @@ def test_bad_given_dt(tmp_path, dt):
         files.read_trajectories(save(tmp_path / "d.npz", z0=Z, z1=Z + 1, dt=0.1), dt=dt)
 
 
-def test_no_permission(tmp_path, monkeypatch):
-    path = save(tmp_path / "d.npz", z0=Z, z1=Z, dt=0.1)
-
-    def refuse(*args, **kwargs):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(builtins, "open", refuse)
-    with pytest.raises(InputError, match="Permission denied"):
-        files.read_trajectories(path)
-
-
 @settings(max_examples=75, deadline=None)
 @given(st.data())
 def test_damaged_bytes_never_escape(tmp_path_factory, data):
@@ -504,28 +423,6 @@ def test_damaged_bytes_never_escape(tmp_path_factory, data):
         else:
             if kind in ("npz", "zip"):  # the archive's checksums vouch for every bit
                 assert np.array_equal(read.pairs().z1, Z[1:10])
-
-
-@pytest.mark.parametrize("mistake", [TypeError, KeyError, AttributeError, IndexError])
-def test_a_mistake_is_not_called_damage(tmp_path, monkeypatch, mistake):
-    path = save(tmp_path / "d.npz", z0=Z, z1=Z, dt=0.1)
-
-    def wrong(*args, **kwargs):
-        raise mistake("ours")
-
-    monkeypatch.setattr(np, "frombuffer", wrong)
-    with pytest.raises(mistake, match="ours"):
-        files.read_trajectories(path)
-
-
-def test_zip_members_are_not_trusted(tmp_path):
-    """A member whose archive entry lies about its size is refused before it is read."""
-    path = tmp_path / "d.npz"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("z0.npy", b"\x93NUMPY\x01\x00")
-        archive.writestr("z1.npy", b"")
-    with pytest.raises(InputError, match="damaged"):
-        files.read_trajectories(path, dt=1.0)
 
 
 def test_a_summary_says_what_is_there(tmp_path):

@@ -267,9 +267,3 @@ def test_other_threads_work_while_rows_are_folded():
         counted += 1
     thread.join()
     assert counted > 10
-
-
-@pytest.mark.parametrize("devices", [2, 0, "two", 1.0, True])
-def test_devices_that_there_are_not(devices):
-    with pytest.raises(gfnn.FitError, match="expected"):
-        gfnn.fit(kicked(60), devices=devices)

@@ -52,12 +52,6 @@ def test_coefficients(stages):
     np.testing.assert_array_equal(coupling, coupling[::-1, ::-1].T)
 
 
-def test_known_coefficients():
-    root = np.sqrt(3) / 6
-    expected = np.array([[0.25, 0.25 - root], [0.25 + root, 0.25]])
-    np.testing.assert_allclose(gauss(2).matrix, expected, atol=1e-17)
-
-
 OPTIONS = [
     {},
     {"stages": 4, "substeps": 3},
@@ -137,11 +131,6 @@ def test_newton_solves_what_the_fixed_point_does_not():
     step = jax.jit(lambda piece, z: piece.step(z))
     assert (step(made[False], z)[1].status == NOT_CONVERGED).all()
     assert (step(made[True], z)[1].status == OK).all()
-
-
-def test_no_states_have_no_images():
-    found = images(FAMILY, C, np.empty((0, 4)), 0.5, Steps(6, 1))
-    assert found.states.shape == (0, 4)
 
 
 def test_a_plain_function_is_a_hamiltonian():

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax.errors import InputError
 from gfnn_jax.families.friction import DRY, ISOTROPIC, LINEAR, QUADRATIC
 from gfnn_jax.fitting.evidence import EVIDENCE
-from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, Table, WhichFriction, chosen
+from gfnn_jax.models.lagrangians.friction_choice import FrictionChoice, Table, chosen
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.search import frictions_tried, likeliest, without_drives
 from gfnn_jax.models.lagrangians.structure import Structure
@@ -121,15 +120,6 @@ def test_coefficients_of_friction_in_standard_errors():
     np.testing.assert_allclose(made.judged(subset).significance, expected, rtol=1e-8)
 
 
-def test_friction_kept_against_odds_is_said_to_be_that_of_fewest_kinds():
-    kept = WhichFriction(("linear",), {"none": 1e7, "linear+dry": 1 / 3.9}, {})
-    assert str(kept) == (
-        "linear; odds of 1 : 3.9 against linear+dry on held-out parts, "
-        "too few (below 20 : 1) for a further kind"
-    )
-    assert "kept" not in str(WhichFriction(("linear",), {"none": 1e7, "linear+dry": 30.0}, {}))
-
-
 @pytest.mark.parametrize(
     ("choose", "rest", "left"), [(True, 0.1, 2), (True, 5e-3, 1), (False, 5e-3, 2)]
 )
@@ -184,10 +174,3 @@ def test_of_choices_of_friction_that_do_not_stand_the_likeliest_is_taken():
     assert likeliest(tried)[0] is one
     assert likeliest([(two, None), (last, None)])[0] is two
     assert likeliest([(drives, None), (lost, None)])[0] is lost  # none can be: the last
-
-
-def test_stribecks_friction_is_asked_for_beside_the_dry_friction_that_it_lowers():
-    t = 0.1 * np.arange(200)
-    recording = gfnn.Recording({"t": t, "x": np.cos(t)}, positions=["x"])
-    with pytest.raises(InputError, match=r"dry\+stribeck"):
-        gfnn.fit(recording, model=gfnn.Lagrangian(friction="linear+stribeck"))

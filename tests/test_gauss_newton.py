@@ -8,12 +8,10 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.measured_error import Tolerance
 from gfnn_jax.dataset.runs import identified
 from gfnn_jax.families.terms import Terms, given_terms, polynomial_terms
-from gfnn_jax.families.text import Term
 from gfnn_jax.fitting.gauss_newton import Problem
 from gfnn_jax.fitting.linear_starts import log_start, midpoint_start
 from gfnn_jax.fitting.significance import null_terms
 from gfnn_jax.flows.collocation import Steps, images, truncation
-from gfnn_jax.models.hamiltonians.fitted_law import formula
 from gfnn_jax.models.hamiltonians.problem import LawProblem
 from gfnn_jax.models.hamiltonians.search import learn_hamiltonian
 from gfnn_jax.phase_space import Pairs
@@ -99,15 +97,6 @@ def test_henon_heiles_told_nothing(dt):
     assert not found.messages
 
 
-def test_an_exact_polynomial_ends_the_search_before_laws_of_physics():
-    said = []
-    data = Dataset.of(identified(henon_heiles(100, 1.0)).pairs, CARTESIAN).divided(0)
-    law = learn_hamiltonian(LawProblem(data, Tolerance(1e-12), on_progress=said.append))
-    assert law.candidate.num_parameters == 6
-    assert "H: 34 terms" in said
-    assert not any("atoms" in line for line in said)
-
-
 @pytest.mark.slow
 def test_long_steps_from_the_logarithm():
     pairs = henon_heiles(90, 3.0, size=0.2)
@@ -160,12 +149,6 @@ def test_starts_are_exact_for_what_they_are_made_for():
     np.testing.assert_allclose(start, c, atol=1e-12)
     short = images(quadratic, c, z0, 0.01, Steps(4, 1)).states
     np.testing.assert_allclose(midpoint_start(quadratic, z0, short, 0.01, np.ones(4)), c, atol=1e-4)
-
-
-def test_formulas():
-    terms = (Term("q1²", -0.5, 1e-15), Term("p1²", 1.0, 1e-15), Term("q2", 0.12345, 0.01))
-    assert formula(terms) == "-0.5 q1² + p1² + 0.123 q2"
-    assert formula(()) == "0"
 
 
 @pytest.mark.slow

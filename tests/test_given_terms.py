@@ -75,15 +75,8 @@ def test_masses_are_there_without_being_said():
     ("text", "message"),
     [
         ("exp(omega1)", "'exp\\(omega1\\)' is no term of a law"),
-        ("1/omega1", "is no term"),
-        ("omega1**2*omega2", "is no term"),
         ("theta3**2", "the name 'theta3'"),
-        ("omega2**2", "add a kinetic one, omega1\\*\\*2"),
-        ("V: omega1**2", "has a velocity"),
         ("R: omega1**5", "is no term"),
-        ("R: theta1**2", "is no term"),
-        ("T: omega1**2", "expected L:, V: or R:"),
-        ("omega1 +* 2", "no expression that can be read"),
     ],
 )
 def test_what_is_no_term_is_refused(text, message):
@@ -151,10 +144,7 @@ def test_what_is_told_of_a_coefficient(told, low, high):
     "told",
     [
         "3 <= cos(theta1) <= 2",
-        "cos(theta1) + theta2 = 3",
         "R: omega1**2 = 1",
-        "1 = 2",
-        "cos(theta1) = theta2",
     ],
 )
 def test_what_cannot_be_told(told):
@@ -188,9 +178,3 @@ def test_bounds_values_and_ties_of_coefficients():
         bound = fitted(single=None, double=gfnn.between(-1.5, 5))
     held = next(t for t in bound.lagrangian.terms if t.term.startswith("cos(2*theta"))
     assert (held.coefficient, held.std) == (-1.5, 0.0)
-
-
-def test_a_told_coefficient_that_sets_the_scale_is_refused():
-    swing = {"t": 0.05 * np.arange(100), "theta": np.cos(0.2 * np.arange(100))}
-    with pytest.raises(InputError, match="sets the scale of L"):
-        gfnn.fit(gfnn.Recording(swing), terms={"omega**2": 0.7, "cos(theta)": None})

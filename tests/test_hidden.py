@@ -55,7 +55,6 @@ def test_oscillations_are_the_parts_of_a_sum():
     ("options", "hidden", "message"),
     [
         ({"positions": ["x", "y"]}, 1, "one position"),
-        ({"positions": ["x"], "inputs": ["y"]}, 1, "without inputs"),
         ({"positions": ["x"], "angles": ["x"]}, 2, "of an angle one hidden coordinate"),
     ],
 )

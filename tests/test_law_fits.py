@@ -1,19 +1,16 @@
 """From simulated positions to the law: the engine, the start, the search, forecasts and files."""
 
 import dataclasses
-import json
 import re
 
-import jax
 import numpy as np
 import pytest
-from analytic import mechanics, motion
+from analytic import motion
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.stats import norm
 
 import gfnn_jax as gfnn
-from gfnn_jax.cli import main
 from gfnn_jax.errors import InputError
 from gfnn_jax.families.friction import DRY, LINEAR, QUADRATIC, STRIBECK, Friction
 from gfnn_jax.families.lagrangian import Terms
@@ -427,13 +424,6 @@ def test_friction_by_a_load_that_is_given(tmp_path):
             gfnn.export(fit.map, to, tmp_path / f"own.{to}")
 
 
-def test_a_load_that_no_column_shows_is_asked_for():
-    t = 0.1 * np.arange(200)
-    recording = gfnn.Recording({"t": t, "x": np.cos(t)}, positions=["x"])
-    with pytest.raises(InputError, match="the load: expected one, got none"):
-        gfnn.fit(recording, model=gfnn.Lagrangian(friction="load-dependent"))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("rest", [0.0, 0.1])
 def test_friction_by_a_load_is_found(rest):
@@ -838,20 +828,6 @@ def test_a_law_is_saved_with_its_sensors(swing, tmp_path):
         np.testing.assert_array_equal(values, again.forecast(past, times).values[name])
 
 
-def test_bad_recordings_and_options_are_refused(swing):
-    recording, fit = swing
-    with pytest.raises(InputError, match="not options of a recording"):
-        gfnn.fit(recording, learn="hamiltonian")
-    with pytest.raises(InputError, match="friction"):
-        gfnn.fit(recording, friction="sticky")
-    with pytest.raises(InputError, match="mass"):
-        gfnn.fit(recording, mass={"x": 1.0})
-    with pytest.raises(InputError, match="rising times"):
-        fit.map.forecast(recording, [1.0, 2.0])
-    with pytest.raises(InputError, match="at least 5 samples"):
-        fit.map.estimate(recording.slice(0.0, 0.15))
-
-
 @pytest.mark.slow
 def test_a_double_pendulum_has_its_five_terms():
     fit = gfnn.fit(chain())
@@ -873,52 +849,6 @@ def test_a_known_mass_scales_the_law(recwarn):
     assert not [w for w in recwarn if "requested" in str(w.message)]
     assert fit.lagrangian.terms[0].coefficient == pytest.approx(1.5)
     assert fit.lagrangian.terms[1].coefficient == pytest.approx(6.0, rel=0.01)
-
-
-def test_a_lagrangian_of_the_search_is_a_pytree():
-    law = mechanics([((2,), (0,), (0,), 0.0, 1.0)])
-    assert jax.tree.map(np.shape, law).coefficients == (1,)
-
-
-@pytest.mark.slow
-def test_the_command_line_learns_and_forecasts(tmp_path, capsys):
-    t, theta = pendulum(end=15.0)
-    clean = pendulum(end=20.0, noise=0.0)
-    for name, rows in (("past", (t, theta)), ("all", clean)):
-        lines = ["t,theta", *(f"{a:.4f},{b:.6f}" for a, b in zip(*rows, strict=True))]
-        (tmp_path / f"{name}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    past, model = str(tmp_path / "past.csv"), str(tmp_path / "model")
-    assert main(["fit", past, "--out", model, "--friction", "linear"]) == 0
-    report = json.loads((tmp_path / "model" / "report.json").read_text(encoding="utf-8"))
-    assert report["model"]["learns"] == "lagrangian"
-    assert report["lagrangian"]["terms"][0]["term"] == "omega**2"
-    assert set(report) >= {"hamiltonian", "friction", "inputs", "noise", "gauge", "energy"}
-    assert report["rollout"] is None
-    assert report["whiteness"]["theta"]["white"]
-    assert report["whiteness"]["theta"]["fit_percent"] > 99.5
-    assert (tmp_path / "model" / "law.png").stat().st_size > 10_000
-    everything = str(tmp_path / "all.csv")
-    out = tmp_path / "forecast.csv"
-    arguments = ["predict", model, "--initial", past, "--out", str(out)]
-    assert main([*arguments, "--compare", everything, "--estimate-from", "40"]) == 0
-    told = capsys.readouterr().out
-    assert "within two standard deviations" in told
-    assert "in L and R: theta in rad, times in s" in told
-    assert "theta: noise σ 0.00" in told
-    assert " rad, RMS residual 0.00" in told
-    rows = np.genfromtxt(out, delimiter=",", names=True)
-    wanted = np.interp(rows["t"], *clean)
-    assert np.abs(rows["theta"] - wanted).max() < 0.01
-    assert main([*arguments, "--num-steps", "20", "--overwrite"]) == 0
-    assert len(np.genfromtxt(out, delimiter=",", names=True)) == 20
-    assert main([*arguments, "--overwrite"]) == 2
-    assert "--num-steps" in capsys.readouterr().err
-    of_all = ["predict", model, "--initial", everything, "--out", str(out), "--overwrite"]
-    assert main([*of_all, "--compare", everything]) == 2
-    assert "end it by --to" in capsys.readouterr().err
-    assert main([*of_all, "--compare", everything, "--to", "15"]) == 0  # the rest of one file
-    assert " rad; " in capsys.readouterr().out
-    assert np.genfromtxt(out, delimiter=",", names=True)["t"][0] == pytest.approx(15.05)
 
 
 @pytest.mark.slow

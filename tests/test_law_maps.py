@@ -161,19 +161,6 @@ def test_uniform_friction_of_a_law_is_conformal():
     assert np.abs(found.closure).max() < 1e-9
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"inputs": np.zeros((STEPS - 1, 1))}, "expected inputs torque of shape (30, 1)"),
-        ({"inputs": np.zeros((STEPS, 2))}, "expected inputs torque of shape (30, 1)"),
-        ({"inputs": "all"}, "expected numbers as inputs"),
-    ],
-)
-def test_inputs_that_are_none(options, message):
-    with pytest.raises(ValueError, match=message.replace("(", r"\(").replace(")", r"\)")):
-        MAP.rollout(Z[:2], STEPS, **options)
-
-
 def test_signals_that_are_not_the_laws():
     with pytest.raises(ValueError, match="got 0"):
         map_of_law(LAW, Z, DT)

@@ -172,17 +172,3 @@ def test_non_finite_data_are_refused_by_name(bad, where):
     names = ("w", "target_gradient", "the validation's w", "the validation's target_gradient")
     with pytest.raises(ValueError, match=rf"^{names[where]} has entries that are NaN or infinite"):
         GradientFit(*data[:2], validation=tuple(data[2:])).train(NETWORK, network_params(0, 3))
-
-
-def test_other_bad_input_is_refused():
-    params = network_params(0, 3)
-    w, target = TRAINING
-    single = jax.tree.map(lambda a: a.astype(jnp.float32), params)
-    with pytest.raises(TypeError, match=r"params"):
-        GradientFit(w, target, validation=VALIDATION).train(NETWORK, single)
-    with pytest.raises(ValueError, match=r"must be \(N, 2d\)"):
-        GradientFit(w, target[:-1], validation=VALIDATION).train(NETWORK, params)
-
-    imaginary = from_function(lambda params, w: jnp.sqrt(-w @ w) * params["outer"][0])
-    with pytest.raises(ValueError, match=r"not finite"):
-        GradientFit(w, target, validation=VALIDATION).train(imaginary, params)

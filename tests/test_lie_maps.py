@@ -9,7 +9,7 @@ import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.families.terms import given_terms
 from gfnn_jax.flows.flow import Flow
-from gfnn_jax.flows.lie import LieFlow, law_flow, lie_generated, mean_of_arc
+from gfnn_jax.flows.lie import LieFlow, law_flow, mean_of_arc
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.models.brackets.lie_maps import fit_lie_map
 
@@ -112,12 +112,6 @@ def test_map_without_a_law():
     states, _ = map_.rollout(z[:5], 1_000)
     lengths = np.linalg.norm(states, axis=-1)
     np.testing.assert_allclose(lengths, lengths[:, :1] + 0 * lengths, rtol=1e-15)
-
-
-def test_only_for_brackets_with_that_chart():
-    bracket = gfnn.Bracket.magnetic([[0, 1], [-1, 0]])
-    with pytest.raises(gfnn.FitError, match="got one canonical by p"):
-        lie_generated(lambda p, z: z[0], None, bracket, 0.1, np.ones(4))
 
 
 @pytest.mark.slow

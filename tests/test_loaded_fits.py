@@ -69,12 +69,6 @@ def test_the_law_of_pairs(law_of_pairs, tmp_path):
     np.testing.assert_array_equal(*found)
 
 
-def test_a_generated_map_has_no_law(generated):
-    assert generated.law is None
-    assert generated.verdict == "map"
-    assert generated.met
-
-
 def test_the_law_of_a_recording(law_of_recording, tmp_path):
     law_of_recording.save(tmp_path / "m")
     again = gfnn.load(tmp_path / "m")

@@ -71,15 +71,6 @@ def test_the_command_to_type_mends_it(tmp_path, name):
     assert not [fault for fault in gfnn.read(path, **options).summary().faults if fault.wrong]
 
 
-@pytest.mark.parametrize("name", ["clipped", "drifting clock", "two systems", *MENDED])
-def test_the_next_command_is_none_that_is_refused(tmp_path, capsys, name):
-    wrong, has_runs = MISTAKES[name][1](MENDED.get(name, 0))
-    path = wrong.written(tmp_path / "r.csv", with_runs=has_runs)
-    assert main(["look", str(path), "--figure", str(tmp_path / "r.png")]) == 0
-    before = "next" if name in MENDED else "when that is mended"
-    assert f"\n{before}: gfnn fit" in capsys.readouterr().out
-
-
 def clean(t):
     return 0.8 * np.exp(-0.05 * t) * np.cos(4 * t)
 
@@ -111,13 +102,6 @@ def test_a_summary_says_what_the_record_is(tmp_path):
     assert "theta" in html
 
 
-def test_a_summary_is_text_in_a_notebook_too(tmp_path, monkeypatch):
-    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
-    summary = gfnn.read(a_swing(tmp_path / "r.csv")).summary()
-    assert "800 samples" in str(summary)
-    assert "800 samples" in summary._repr_html_()
-
-
 def test_columns_keep_the_unit_of_the_file(tmp_path):
     path = a_swing(tmp_path / "r.csv", alpha=lambda t, x: np.degrees(x))
     options = {"positions": "alpha", "degrees": "alpha"}
@@ -145,20 +129,6 @@ def test_columns_keep_the_unit_of_the_file(tmp_path):
 def test_columns_that_are_odd_are_named(tmp_path, change, kind):
     path = a_swing(tmp_path / "r.csv", **change)
     assert kind in [k for k, _ in found(path)]
-
-
-def test_names_with_blanks_are_quoted_for_the_shell():
-    t = np.arange(400) * 0.02
-    table = {
-        "t": t,
-        "the angle": np.cos(t),
-        "its rate": -2.5 * np.sin(t),
-        "other angle": np.mod(90 * t, 360),
-    }
-    roles = {"positions": ["the angle", "other angle"], "velocities": ["its rate"]}
-    said = " ".join(map(str, gfnn.Recording(table, **roles).summary().faults))
-    assert "--scale 'its rate'" in said
-    assert "--degrees 'other angle'" in said
 
 
 # The command line
@@ -263,18 +233,6 @@ def test_a_million_rows_in_ten_seconds_and_a_gigabyte(tmp_path):
     assert done.returncode == 0
     assert after.ru_utime - before.ru_utime < 10
     assert after.ru_maxrss < 1 << 20  # kB
-
-
-def test_one_missing_value_is_told_as_one_row():
-    t = 0.01 * np.arange(600)
-    for gone, told in (
-        (slice(200, 201), "1 row, which is"),
-        (slice(200, 202), "2 rows, which are"),
-    ):
-        x = np.cos(6 * t)
-        x[gone] = np.nan
-        notes = str(gfnn.Recording({"t": t, "x": x}, positions=["x"]).summary())
-        assert f"x has no value in {told} not used for it" in notes
 
 
 def two_carts(wrong=True):

@@ -139,19 +139,6 @@ def test_starts_from_its_key():
     assert not jax.tree.all(jax.tree.map(np.array_equal, first, other))
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"activation": "relu"}, "expected an activation among .*, got 'relu'"),
-        ({"hidden": ()}, "positive width"),
-        ({"hidden": (3, 0)}, "positive width"),
-    ],
-)
-def test_refuses_what_makes_no_network(change, words):
-    with pytest.raises(ValueError, match=words):
-        dataclasses.replace(PLAIN, **change)
-
-
 def test_amplitude_is_the_size_of_the_scalar():
     """S = 5 sin(w₀/100): of size 5 whatever the units of w."""
     w = np.random.default_rng(3).uniform(-300, 300, (400, 2))

@@ -1,7 +1,5 @@
 """Data in any form, and models as objects: each option belongs to one of them."""
 
-import inspect
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -56,12 +54,6 @@ def test_any_form_of_the_same_data(tmp_path):
         np.testing.assert_array_equal(found.values("x1", "0"), X)
 
 
-def test_several_positions():
-    both = np.stack([X, X[::-1]], axis=1)
-    recording, _ = as_pairs_or_recording(T, both)
-    assert recording.positions == ("x1", "x2")
-
-
 def test_a_file_of_states(tmp_path):
     np.savez(tmp_path / "pairs.npz", z0=PAIRS.z0, z1=PAIRS.z1, dt=PAIRS.dt)
     found = gfnn.fit(str(tmp_path / "pairs.npz"), tolerance=1e-6)
@@ -98,8 +90,3 @@ def test_a_wrong_name_tells_the_nearest(make, near):
 def test_an_option_belongs_to_one_model(data, options):
     with pytest.raises((gfnn.FitError, gfnn.InputError)):
         gfnn.fit(data, **options)
-
-
-@pytest.mark.slow
-def test_the_type_that_is_promised():
-    assert inspect.signature(gfnn.fit).return_annotation == "Fit"

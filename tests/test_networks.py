@@ -83,23 +83,6 @@ def test_it_is_saved_to_the_bit(untrained, tmp_path):
 
 
 @pytest.mark.slow
-def test_it_has_no_formula(fit):
-    assert fit.formula is None
-    with pytest.raises(gfnn.FitError, match="got a network"):
-        fit.accelerate()
-
-
-def test_what_it_cannot_be_learned_from_is_refused():
-    z = states(100, 4)
-    options = {"learn": "hamiltonian", "tolerance": TOLERANCE}
-    with pytest.raises(gfnn.FitError, match="'mlp'"):
-        gfnn.fit(gfnn.Pairs(z, moved(z), DT), family="sines", **options)
-    several = gfnn.Pairs(z, moved(z), np.linspace(0.1, 0.3, 100))
-    with pytest.raises(gfnn.FitError, match="family"):
-        gfnn.fit(several, family="mlp", **options)
-
-
-@pytest.mark.slow
 def test_the_flow_in_numpy_is_that_of_the_step(fit):
     """By it the pairs are looked at for gross errors, where a network misses the tolerance."""
     z = states(20, 4)

@@ -54,12 +54,6 @@ def test_the_current_folder_cannot_be_exchanged(tmp_path, monkeypatch):
             outputs.ensure_new(name, True, folder=True)
 
 
-def test_ensure_new_without_permission(tmp_path, monkeypatch):
-    monkeypatch.setattr(outputs.os, "access", lambda *args: False)
-    with pytest.raises(InputError, match="no permission"):
-        outputs.ensure_new(tmp_path / "new")
-
-
 def test_atomic_outputs_on_failure(tmp_path):
     """A failure leaves what was there before, and no rubbish beside it."""
     outputs.atomic_write(tmp_path / "a", "before")

@@ -185,12 +185,6 @@ def test_a_term_of_a_recording(tmp_path):
         gfnn.export(fit.map, "c", tmp_path / "m.c")
 
 
-@pytest.mark.parametrize("learn", ["map", "hamiltonian"])
-def test_a_noise_model_is_of_recordings(pairs, learn):
-    with pytest.raises(gfnn.FitError, match="loss: not options of"):
-        gfnn.fit(pairs, SCENE, learn=learn, loss=own_module.Normal())
-
-
 def test_few_pairs_are_cross_validated(pairs):
     fit = gfnn.fit(pairs.take(slice(40)), SCENE, model=own_module.Kicks(), tolerance=2e-2)
     assert "cross-validation" in fit.stated_by
@@ -199,10 +193,8 @@ def test_few_pairs_are_cross_validated(pairs):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"model": object()}, "a model with a name, sizes"),
         ({"model": own_module.Kicks(), "learn": "map"}, "nothing else is learned"),
         ({"family": lambda inputs: [inputs]}, "Inputs has no .*name"),
-        ({"family": 3}, "expected one of auto, .* as family"),
     ],
 )
 def test_what_is_none(options, message, pairs):

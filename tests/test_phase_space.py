@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gfnn_jax.errors import FitError
 from gfnn_jax.phase_space import (
     Pairs,
     apply_j,
@@ -80,17 +79,3 @@ def test_float64_is_required_by_name():
     require_x64("this")
     with jax.enable_x64(False), pytest.raises(RuntimeError, match="this needs float64"):
         require_x64("this")
-
-
-@pytest.mark.parametrize(
-    ("z0", "z1", "words"),
-    [
-        ([[0.0, 1.0]], [[0.0, 1.0]], "got a list"),
-        (np.zeros((3, 2)), np.zeros((2, 2)), r"got \(3, 2\) and \(2, 2\)"),
-        (np.zeros((3, 3)), np.zeros((3, 3)), "no positions and momenta"),
-        (np.zeros(4), np.zeros(4), r"\(N, 2d\)"),
-    ],
-)
-def test_pairs_check_themselves(z0, z1, words):
-    with pytest.raises(FitError, match=words):
-        Pairs(z0, z1, 0.1)

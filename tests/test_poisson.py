@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from analytic import states_in_motion
-from test_brackets_found import cross, heavy, lorenz, populations, runs_of, top
+from test_brackets_found import cross, heavy, populations, runs_of, top
 from test_exports import by_c, by_c_with, compiled, needs_cc
 
 import gfnn_jax as gfnn
@@ -328,25 +328,12 @@ def test_constant_brackets_are_told_apart():
     assert "in 1 of 4 pairs, rows [2], where se(3) has no step" in line
 
 
-def test_three_columns_say_what_to_type():
-    with pytest.raises(FitError, match='structure="poisson"'):
-        gfnn.Pairs(np.zeros((5, 3)), np.zeros((5, 3)), 0.1)
-
-
 @pytest.mark.slow
 def test_states_that_are_taken_for_canonical_are_told_their_bracket():
     starts = np.random.default_rng(0).uniform(0.5, 1.5, (30, 2))
     data = runs_of(lambda z: z * np.array([1 - z[1], z[0] - 1]), starts, 0.3, 20)
     with pytest.warns(gfnn.FitWarning, match="another bracket: {z1,z2} = -z1 z2: log-canonical"):
         gfnn.fit(gfnn.Pairs(data.z0, data.z1, 0.3, run=data.run), max_operations=10**9)
-
-
-def test_no_law_has_a_verdict():
-    starts = 8 * np.random.default_rng(0).normal(size=(30, 3)) + [0, 0, 20]
-    with pytest.raises(FitError) as raised:
-        gfnn.fit(pairs_of(runs_of(lorenz, starts, 0.1, 20)))
-    assert raised.value.verdict.startswith("no law: no bracket")
-    assert str(raised.value).endswith("bracket=gfnn.Bracket.so3()))")
 
 
 @pytest.mark.slow

@@ -428,17 +428,3 @@ def test_missing_readings_break_a_run():
     assert isinstance(triples, Triples)
     assert len(triples) == 5 + 2 + 5
     assert np.bincount(triples.run).tolist() == [5, 2, 5]
-
-
-@pytest.mark.slow
-def test_only_maps_of_positions_start_from_positions(lifted):
-    scene = gfnn.scenes.standard_map()
-    z = np.random.default_rng(0).uniform(0, 6, (200, 2))
-    image = np.asarray([np.asarray(scene.step(state)) for state in z])
-    pairs = gfnn.Pairs(z, image, 1.0)
-    with pytest.raises(ValueError, match="learned from positions"):
-        gfnn.fit(pairs, scene).map.from_positions(np.zeros(1), np.ones(1))
-    with pytest.raises(ValueError, match="two positions of shape"):
-        lifted.map.from_positions(np.zeros(2), np.ones(2))
-    with pytest.raises(ValueError, match="z0"):
-        lifted.map.rollout(num_steps=3)

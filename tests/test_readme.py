@@ -82,16 +82,6 @@ def test_ci_runs_the_test_command():
     assert f'"$bin/python"{arguments}' in (ROOT / ".ci/run").read_text()
 
 
-def test_it_is_short_and_its_first_screen_has_a_command_and_a_picture():
-    lines = README.splitlines()
-    assert len(lines) <= 150
-    for door in re.split(r"^## ", README, flags=re.M)[1:4]:  # three, of ten lines each
-        assert len([line for line in door.splitlines()[1:] if line and line[:3] != "```"]) <= 10
-    first = "\n".join(lines[:35])
-    assert "gfnn double_pendulum" in first
-    assert "![" in first
-
-
 @pytest.mark.slow
 def test_the_first_command_ends_in_the_law_that_is_printed_below_it(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

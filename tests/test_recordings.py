@@ -143,12 +143,6 @@ def test_rows_of_two_clocks_that_meet_are_one(tmp_path):
         gfnn.read(path, positions=["x", "y"])
 
 
-def test_a_second_column_of_times_is_named():
-    table = {"t": [0, 1, 2], "time": [0, 5, 9], "x": [1.0, 2, 3]}
-    assert gfnn.Recording(table).notes == ("time is not used, for the times are those of t",)
-    assert gfnn.Recording({n: table[n] for n in ("t", "x")}).notes == ()
-
-
 def test_several_files_are_runs_and_a_column_may_be_missing(tmp_path):
     one = write(tmp_path / "one.csv", "t,x,v\n0,1,2\n1,3,4\n")
     two = write(tmp_path / "two.csv", "t,x\n0,1\n1,\n")
@@ -310,23 +304,14 @@ def test_names_as_they_can_stand_in_a_formula():
 
 
 REFUSED = {
-    "a,x\n1,2\n2,3\n": "t or time",
-    "t,a,b\n1,2,3\n2,3,4\n": "a, b",
     "t,x\n0,1\n0,2\n": "line 3: t = 0",
     "run,t,x\n0,0,1\n# gap\n0,2,2\n0,1,2\n": "line 5: t = 1",
-    "t,x\n0,1\n1,two\n2,3\n": "line 3, x: 'two'",
-    "t,x,v\n0,1,2\n1,2\n2,3,4\n": "line 3: 3 columns expected",
     "t,x,v\n0,1,2\n1,2,3,4\n2,3,4\n": "line 3: 3 columns expected",
     "t,x,x\n0,1,2\n1,2,3\n": " x ",
-    "0,1\n1,2\n": r"columns=\['t', 'x'\]",
-    "t,x\n": "expected rows of numbers",
     "t,x\n,1\n1,2\n": "line 2: t",
     "t,x\n0,inf\n1,2\n": "line 2, x",
     "t,x\n0,00,1,5\n0,10,1,6\n": "decimal commas",
-    "t [fortnight],x\n0,1\n1,2\n": "time_unit=",
     "t,x,v1,v2\n0,1,2,3\n1,2,3,4\n": "v1, v2 .* x",
-    "": "expected rows of numbers",
-    "x\n1\n": "dt=",
 }
 
 
@@ -343,11 +328,7 @@ def test_a_file_that_cannot_be_used_has_its_line(tmp_path, text):
     [
         ({"positions": "y"}, "no column y"),
         ({"positions": "x", "velocities": "x"}, "x twice"),
-        ({"positions": "x", "angles": "v"}, "angles: no column v among x"),
         ({"std": {"x": -1.0}}, "0 or above"),
-        ({"std": {"w": 1.0}}, "std: no column w"),
-        ({"time_unit": "days"}, "time unit"),
-        ({"columns": "t,x"}, "no column t,x"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(options, message):
@@ -397,13 +378,6 @@ def test_options_of_the_command_line_are_keywords_of_read():
     assert not names_roles(column_options(parser.parse_args(["--angles", "0,2"])))
     assert column_options(parser.parse_args(["--angles", "0,2"]))["angles"] == (0, 2)
     assert dict(parser.parse_args(["--mass", "x=2,y=3"]).mass) == {"x": 2.0, "y": 3.0}
-
-
-def test_names_with_blanks_are_one_word_of_the_command_that_is_told():
-    t = np.arange(40) * 0.1
-    table = {"t": t, "frame": np.sin(7.3 * t), "pendulum angle": np.cos(t) + 0.1 * np.sin(9 * t)}
-    with pytest.raises(InputError, match=r"positions=\['frame', 'pendulum angle'\], or some"):
-        gfnn.Recording(table)
 
 
 def test_a_sensor_that_another_name_explains_names_no_velocity():

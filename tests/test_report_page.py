@@ -8,7 +8,6 @@ import shutil
 import subprocess
 from html.parser import HTMLParser
 
-import jax
 import numpy as np
 import pytest
 from command_line import gfnn as command
@@ -16,7 +15,7 @@ from command_line import gfnn as command
 import gfnn_jax as gfnn
 from gfnn_jax.evaluate.page import page
 from gfnn_jax.evaluate.physics import _count, _of_swings, _System, physics
-from gfnn_jax.exports.symbolic import Formula, as_latex, as_mathml, equations_of_motion
+from gfnn_jax.exports.symbolic import Formula, equations_of_motion
 from gfnn_jax.families.friction import QUADRATIC, Friction
 from gfnn_jax.families.text import Term
 
@@ -95,18 +94,6 @@ def test_the_equation_of_motion():
     assert str(first.left) == "x₁_ddot + 2.0(1) x₂_ddot cos(x₁−x₂)"
     assert str(first.right) == "-2.0(1) v₂² sin(x₁−x₂) - 0.40(4) (v₁−v₂) + 3.0(5) u"
     assert "- 0.30(3) v₂ |v₂|" in str(second.right)
-
-
-def test_formulas_in_a_browser_and_in_latex_have_errors_and_whole_names():
-    formula = Formula((Term("swing_angle**2", -62.213, 0.012),))
-    assert formula.latex() == r"-62.21(1) \mathrm{swing\_angle}^{2}"
-    assert "<mn>62.21(1)</mn>" in formula.mathml()
-    assert "<mi>swing_angle</mi>" in formula.mathml()
-    relative = Formula((Term("(v1 - v2)", -0.5, 0.0),))  # the coefficient is of the whole sum
-    assert relative.latex().startswith(r"-0.5 \left(")
-    assert relative.mathml().index("(</mo>") < relative.mathml().index("<mi>v</mi>")
-    assert as_latex("theta1_ddot") == r"\ddot{\theta_{1}}"
-    assert "¨" in as_mathml("x_ddot")
 
 
 class _Outline(HTMLParser):
@@ -204,28 +191,6 @@ def test_a_fit_forecasts_plots_and_shows_itself(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_page_of_pairs():
-    scene = gfnn.scenes.make("standard-map-regular")
-    pairs = gfnn.sample_pairs(scene, num_pairs=300, key=jax.random.key(0))
-    fit = gfnn.fit(pairs, scene, tolerance=1e-5, max_seconds=None)
-    text = page(fit)
-    assert "<h2>Candidates</h2>" in text
-    assert "standard-map" in text
-    assert fit.predict(pairs.z0[0], 3).shape == (4, 2)
-
-
-def test_a_wrong_keyword_is_named_with_the_nearest_right_one():
-    t, x = swing(2.0)
-    for call, hint in (
-        (lambda: gfnn.fit(t, x, tolerence=1e-3), "did you mean tolerance"),
-        (lambda: gfnn.fit(t, x, positions=["x"]), "gfnn.read"),
-        (lambda: gfnn.Recording({"t": t, "x": x}, postions=["x"]), "did you mean positions"),
-    ):
-        with pytest.raises(TypeError, match=hint):
-            call()
-
-
-@pytest.mark.slow
 def test_forecasts_are_in_the_degrees_of_the_file():
     t, x = swing(sigma=1e-3)
     table = {"t": t, "angle": 20 * x}
@@ -234,17 +199,6 @@ def test_forecasts_are_in_the_degrees_of_the_file():
     (name,) = ahead.values
     assert ahead.units[name] == "deg"
     assert 0.5 < np.abs(ahead.values[name]).max() < 30
-
-
-@pytest.mark.slow
-def test_options_of_columns_serve_the_one_command(tmp_path, monkeypatch, capsys):
-    """What `gfnn look` proposes, `gfnn FILE` takes."""
-    monkeypatch.chdir(tmp_path)
-    t, x = swing(12.0)
-    np.savetxt("swing.csv", np.stack([t, 20 * x], axis=1), "%.4f", ",", header="t,angle")
-    options = ("--degrees", "angle", "--friction", "linear", "--out", "out")
-    assert command("swing.csv", *options) == 0
-    assert "angle in rad" in capsys.readouterr().out
 
 
 CHROMIUM = next(

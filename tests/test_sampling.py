@@ -7,7 +7,6 @@ import pytest
 from analytic import states_in_motion
 
 import gfnn_jax as gfnn
-from gfnn_jax.cli import main
 from gfnn_jax.dataset.stretches import Nodes, measure, nodes_of, stretches
 from gfnn_jax.errors import InputError
 from gfnn_jax.models.lagrangians import weak_form
@@ -240,25 +239,6 @@ def test_what_an_accelerometer_does_not_tell_is_named():
     shown = {"y": "kappa*(l*omega**2 + g*cos(theta))"}
     recording = gfnn.Recording({"t": t, "y": np.cos(6 * t) + 9.8}, observe=shown)
     with pytest.raises(InputError, match=r"kappa\*l, kappa\*g, l/g are.*1\*\(l\*omega"):
-        gfnn.fit(recording)
-
-
-@pytest.mark.slow
-def test_a_gyroscope_from_the_command_line(gyroscope, tmp_path, capsys):
-    path, model = tmp_path / "phone.csv", tmp_path / "model"
-    rows = np.stack([*gyroscope.values()], axis=1)
-    np.savetxt(path, rows, delimiter=",", header="t,Gyroscope x (rad/s)", comments="")
-    assert (
-        main(["fit", str(path), "--observe", "Gyroscope x = omega + b", "--out", str(model)]) == 0
-    )
-    assert "no sensor shows theta" in capsys.readouterr().out
-    more = ["--num-steps", "50", "--out", str(tmp_path / "ahead.csv")]
-    assert main(["predict", str(model), "--initial", str(path), *more]) == 0
-
-
-def test_a_coordinate_that_nothing_shows_is_refused(gyroscope):
-    recording = gfnn.Recording(gyroscope, observe={"gyro": "theta + 0*x"}, coordinates="theta,phi")
-    with pytest.raises(InputError, match="phi"):
         gfnn.fit(recording)
 
 

@@ -1,7 +1,6 @@
 """Saved maps: the same bits after loading, for every family, chart, base map and kind of angle."""
 
 import dataclasses
-import json
 import sys
 
 import jax
@@ -98,18 +97,6 @@ def test_loads_the_same_bits(name, saved, tmp_path):
     assert models.record(tmp_path / "m") == {"note": "θ"}
 
 
-def test_the_description_is_for_humans(tmp_path):
-    models.save(a_map(*polynomial()), tmp_path / "m")
-    text = (tmp_path / "m" / "model.json").read_text()
-    description = json.loads(text)["description"]
-    piece = description["map"]["pieces"]["0"]
-    assert piece["family"]["type"] == "Products"
-    assert piece["family"]["degree"] == 2
-    assert piece["chart"]["name"] == "midpoint"
-    assert description["map"]["dt"] == 0.1
-    assert description["versions"]["jax"] == jax.__version__
-
-
 def test_an_existing_model_is_kept(tmp_path):
     models.save(a_map(*polynomial()), tmp_path / "m")
     before = models.digest(tmp_path / "m")
@@ -155,10 +142,7 @@ def test_a_function_of_ones_own_is_refused(tmp_path):
     ("change", "message"),
     [
         (lambda d: d["map"].update(type="Popen"), "holds a Popen, which is not known"),
-        (lambda d: d["map"].pop("dt"), "does not describe a map"),
         (lambda d: d["map"]["pieces"]["0"].update(surprise=1), "does not describe a map"),
-        (lambda d: d.pop("map"), "does not describe a map"),
-        (lambda d: d.update(scene="nowhere"), "Load it in Python"),
     ],
 )
 def test_a_foreign_description(change, message, tmp_path):

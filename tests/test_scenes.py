@@ -274,13 +274,6 @@ def test_chaotic_henon_heiles_stays_in_the_well():
         assert np.abs(orbit[..., :2]).max() < 1.01
 
 
-def test_a_scene_of_ones_own_has_a_name(monkeypatch):
-    mine = dataclasses.replace(scenes.two_body(), name="mine")
-    monkeypatch.setitem(scenes.SCENES, "mine", lambda: mine)
-    assert scenes.make("mine") is mine
-    assert scenes.make("mine", 0.2).dt == 0.2
-
-
 def test_the_same_scene_made_twice_has_the_same_functions():
     """Check that a program compiled for one serves the other."""
     for name in scenes.names():

@@ -1,7 +1,6 @@
 """Rollouts shared out among devices and processes: the same bits on any number of them."""
 
 import dataclasses
-import time
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from analytic import map_of
 from command_line import gfnn
 from other_python import ended, run_python, started
 
-from gfnn_jax import processes
 from gfnn_jax.coordinates import CARTESIAN
 from gfnn_jax.data import predictions
 from gfnn_jax.data.predictions import PredictionJob, PredictionWriter
@@ -24,7 +22,6 @@ from gfnn_jax.maps import saved
 from gfnn_jax.maps.domain import covering
 from gfnn_jax.maps.parameters import sampled
 from gfnn_jax.maps.posterior import Posterior
-from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.processes import Share
 
@@ -119,11 +116,6 @@ def test_parameters_go_with_their_lanes():
     assert (info.status == np.asarray(how.status)).all()
 
 
-def test_more_devices_than_there_are():
-    with pytest.raises(ValueError, match="got 2"):
-        local_devices(2)
-
-
 @pytest.mark.parametrize(("number", "count"), [(0, 2), (1, 3), (700, 2), (700, 5), (5_000, 8)])
 def test_shares_are_all_lanes_in_whole_blocks(number, count):
     shares = [Share(i, count).of(number, 256) for i in range(count)]
@@ -145,32 +137,6 @@ def alone(folder):
     of = ("predict", folder / "m", "--initial", folder / "z0.npy", "--num-steps", STEPS)
     assert gfnn(*of, "--out", folder / "alone.npz", "--devices", "all") == 0
     return (folder / "alone.npz").read_bytes()
-
-
-# JAX tells others that the first process is gone at once, and of another after ten seconds.
-@pytest.mark.slow
-@pytest.mark.parametrize("killed", [0, 1])
-def test_a_killed_process_ends_the_others(killed, folder):
-    steps, out = 200_000, folder / f"killed{killed}.npz"
-    # Programs that are compiled as for a user: they take their steps in a fraction of the time.
-    running = predicting(folder, out, "--save-every", "1000", num_steps=steps, XLA_FLAGS="")
-    journals = [folder / f"{out.stem}.part{i}of2.npz.partial/journal.jsonl" for i in (0, 1)]
-    limit = time.monotonic() + 60
-    while not all(j.exists() and j.read_bytes().count(b"\n") > 3 for j in journals):
-        assert time.monotonic() < limit, [p.poll() for p in running]
-        time.sleep(0.05)
-    running[killed].kill()
-    found = ended(running)
-    status, _, told = found[1 - killed]
-    assert status != 0
-    lines = [line for line in told.splitlines() if not line.startswith("[")]  # but progress
-    assert len(lines) == 1, told
-    assert lines[0].startswith("gfnn: this process or another one of the job was lost: their fin")
-    for journal in journals:
-        assert journal.read_bytes().count(b"\n") > 3
-    assert predictions.number_of_parts(out, Share(0, 3), resume=True) == 2
-    with pytest.raises(InputError, match=r"2 processes.*3"):
-        predictions.number_of_parts(out, Share(0, 3), resume=False)
 
 
 @pytest.mark.slow
@@ -222,20 +188,6 @@ def test_parts_of_everything_that_a_prediction_can_hold(tmp_path):
     predictions.put_together(own, tmp_path / "p.npz", PredictionJob({"m": 1}, (5, 2), **job).record)
     assert (tmp_path / "p.npz").read_bytes() == whole.read_bytes()
     assert not any(path.exists() for path in own)
-
-
-@pytest.mark.parametrize(
-    ("told", "line"),
-    [
-        ({}, "needs a launcher that JAX knows, such as srun or mpirun, or the variables JAX_COORD"),
-        ({"JAX_PROCESS_ID": "one"}, "expected a whole number as JAX_PROCESS_ID, got 'one'"),
-    ],
-)
-def test_nobody_says_where_the_others_are(told, line, monkeypatch):
-    for name, value in told.items():
-        monkeypatch.setenv(name, value)
-    with pytest.raises(InputError, match=line):
-        processes.join()
 
 
 @pytest.fixture(scope="module")

@@ -61,10 +61,7 @@ def test_a_sum_of_many_addends():
     ("text", "words"),
     [
         ("Sum(p(i)**2, (i, 1, 19))", r"expected p\(1\) to p\(4\), got p\(7\)"),
-        ("Sum(p(i)**2, i)", r"as Sum\(p\(i\)\*\*2, \(i, 1, 8\)\)"),
-        ("Sum(p(i/2)**2, (i, 1, 4))", "a whole number"),
         ("Sum(p(i)**2, (i, 4, 1))", "1 to 10,000 sites, got 0"),
-        ("Sum(i*p(i)**2, (i, 1, 4))", "the name 'i'"),
     ],
 )
 def test_a_sum_that_cannot_be_read(text, words):

@@ -115,21 +115,10 @@ def test_functions_are_traced(function):
     ("text", "says"),
     [
         ("__import__('os')", "a call of '__import__'"),
-        ("q1^2", "a power is written \\*\\*"),
         ("q3", "the name 'q3'"),
-        ("(lambda: 1)()", "a call of"),
-        ("q1.real", "'q1.real'"),
-        ("sin(q1, q2)", "with 2 arguments"),
-        ("q1 if p1 else 2", "expected numbers"),
-        ("q1**p1", "an exponent that is not a number"),
-        ("1 + 2", "the same at every state"),
-        ("q1 +", "is no expression"),
-        ("'a'", "expected numbers"),
         ("9.0**9**9*q1", "is no expression"),
         ("q1 + " * 4_000 + "q1", "at most"),
         ("-" * 200 + "q1", "levels"),
-        ("", "is no expression"),
-        ("1e999*q1", "a number that is beyond float64"),
     ],
 )
 def test_other_text_is_refused_in_one_line(text, says):

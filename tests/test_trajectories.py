@@ -329,12 +329,3 @@ def test_long_trajectories_go_on_from_call_to_call():
 def test_a_hundred_thousand_pairs_are_finite():
     pairs = draws.sample_pairs(scenes.pcr3bp(), 100_000, jax.random.key(8))
     assert np.isfinite(pairs.z1).all()
-
-
-def test_float32_is_refused():
-    jax.config.update("jax_enable_x64", False)
-    try:
-        with pytest.raises(RuntimeError, match=r"float64"):
-            draws.sample_pairs(scenes.two_body(), 2, KEY)
-    finally:
-        jax.config.update("jax_enable_x64", True)

@@ -1,13 +1,10 @@
 """Velocities of a file: used where they are honest, and not where they were made of positions."""
 
-import json
-
 import numpy as np
 import pytest
 from analytic import states_in_motion
 
 import gfnn_jax as gfnn
-from gfnn_jax.cli import main
 from gfnn_jax.signals.splines import with_rates
 
 
@@ -93,24 +90,3 @@ def test_velocities_make_up_for_positions_that_noise_hides(driven_round):
     found = {term.term: term for term in fit.lagrangian.terms}
     for name, true in (("cos(x)", 1.0), ("x", 1.5)):
         assert abs(found[name].coefficient - true) < 4 * found[name].std, fit.formula
-
-
-@pytest.mark.slow
-def test_a_file_without_the_velocity_is_forecast_all_the_same(record, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    columns = [record["t"], np.degrees(record["theta"]), np.degrees(record["omega"])]
-    header = "t,theta [deg],omega [deg/s]"
-    np.savetxt("both.csv", np.stack(columns, 1), "%.9g", ",", header=header, comments="")
-    np.savetxt("angle.csv", np.stack(columns[:2], 1), "%.9g", ",", header=header[:13], comments="")
-    terms = "V: cos(theta); R: omega**2"
-    assert main(["fit", "both.csv", "--out", "model", "--terms", terms]) == 0
-    report = json.loads((tmp_path / "model" / "report.json").read_text())
-    assert report["velocities"]["omega"]["used"]
-    assert report["velocities"]["omega"]["sigma"] == pytest.approx(np.degrees(2e-3), rel=0.2)
-    found = []
-    for name in ("both", "angle"):
-        arguments = ["--initial", f"{name}.csv", "--out", f"{name}_ahead.csv", "--num-steps", "20"]
-        assert main(["predict", "model", *arguments]) == 0
-        found.append(np.genfromtxt(f"{name}_ahead.csv", delimiter=",", names=True))
-    for column in ("theta", "omega"):
-        assert np.abs(found[0][column] - found[1][column]).max() < 0.3  # degrees

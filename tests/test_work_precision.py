@@ -101,21 +101,3 @@ def test_the_figure_joins_the_best_of_ours_in_both_precisions():
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert legend.count("a") == 1
     assert "1  HNN" in legend
-
-
-def test_a_name_looks_alike_in_all_panels():
-    """Check also a panel that lacks the name before it."""
-    points = ([1], [1e-3], ["3"])
-    both, second = {"a": points, "b": points}, {"b": points}
-    panels = {
-        "together": {"ours": both, "float32": {}, "known": {"heyoka": points}, "others": {}},
-        "alone": {"ours": second, "float32": {}, "known": {"heyoka": points}, "others": {}},
-    }
-    figure = work_precision.panels_figure(panels, "error")
-    looks = [
-        {str(ln.get_label()): (ln.get_color(), ln.get_marker()) for ln in ax.get_lines()}
-        for ax in figure.axes
-    ]
-    for name in ("b", "heyoka (given H)"):
-        assert looks[0][name] == looks[1][name]
-    assert looks[0]["a"] != looks[0]["b"]
