@@ -209,7 +209,6 @@ def csv_file(path, sequences, header):
     ("suffix", "num_pairs", "tolerance", "num_steps"),
     [
         pytest.param("npz", 400, 3e-2, 100, marks=pytest.mark.slow),
-        pytest.param("npz", 6_000, 1e-5, 1_000, marks=pytest.mark.slow),
         pytest.param("csv", 6_000, 1e-5, 1_000, marks=pytest.mark.slow),
     ],
 )

@@ -67,23 +67,6 @@ def test_a_training_that_was_stopped(fitted, tmp_path, capsys, monkeypatch):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d.npz", "m"]
 
 
-def test_resuming_another_job_discards_no_training(fitted, tmp_path, capsys, monkeypatch):
-    """A job that needs no checkpoints looks at whose they are all the same."""
-
-    def training(*args, checkpoints, **kwargs):
-        checkpoints.save(7, {"theta": np.arange(3.0)})
-        raise KeyboardInterrupt
-
-    fit = ("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m")
-    monkeypatch.setattr(output, "fit", training)
-    assert gfnn(*fit, "--family", "mlp") == 130
-    before = files(tmp_path)
-    monkeypatch.setattr(output, "fit", lambda *args, **kwargs: fitted)
-    assert gfnn(*fit, "--resume") == 2
-    assert "m.partial: belongs to another fit: family differ" in capsys.readouterr().err
-    assert files(tmp_path) == before
-
-
 def test_nothing_is_left_where_nothing_was_kept(tmp_path, capsys, monkeypatch):
     def stop(*args, **kwargs):
         raise KeyboardInterrupt

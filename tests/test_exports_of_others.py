@@ -27,11 +27,6 @@ def test_each_export_is_read(tmp_path, name):
     assert found["read"], found
 
 
-def swing(path, head, *columns):
-    path.write_text(head + "\n" + rows(*columns))
-    return path
-
-
 def test_a_missing_reader_of_workbooks_is_named(tmp_path, monkeypatch):
     (tmp_path / "b.xlsx").write_bytes(b"PK")
     monkeypatch.setitem(sys.modules, "python_calamine", None)
@@ -53,14 +48,6 @@ def test_a_refusal_shows_the_lines_that_it_could_not_read(tmp_path, text, lines)
         gfnn.read(tmp_path / "bad.csv")
     assert all(line in str(found.value) for line in lines)
     assert "\n" not in str(found.value)
-
-
-def test_words_beside_numbers_are_put_aside_and_said_so(tmp_path):
-    remarks = ["Start", *[""] * (len(T) - 2), "Stop"]
-    path = swing(tmp_path / "r.csv", "t,theta,remark", T, SWING, remarks)
-    recording = gfnn.read(path)
-    assert recording.ignored == ("remark",)
-    assert "remark holds words and is put aside" in recording.notes
 
 
 def test_a_preamble_may_be_as_wide_as_the_table(tmp_path):

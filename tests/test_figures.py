@@ -122,21 +122,6 @@ def test_energy_error_is_a_root_mean_square():
     np.testing.assert_allclose(line(ax, "GFNN")[1], np.sqrt(np.mean(error**2, axis=0))[1:])
 
 
-def test_phase_portrait_modulo():
-    x, y = 20 * RNG.normal(size=(2, 300))
-    ax = figures.phase_portrait({"reference": (x, y)}, modulo=True)
-    np.testing.assert_array_equal(line(ax, "reference"), [x % (2 * np.pi), y % (2 * np.pi)])
-    assert ax.get_xlim() == (0, 2 * np.pi)
-
-
-def test_sections_share_the_limits_of_the_first_and_count_what_lies_outside():
-    near, far = samples(), (np.array([0.0, 99.0]), np.zeros(2))
-    first, second = figures.sections({"reference": near, "HNN": far})
-    assert first.get_xlim() == second.get_xlim()
-    assert second.get_title() == "HNN (1 of 2 outside)"
-    np.testing.assert_array_equal(first.get_lines()[0].get_xdata(), near[0])
-
-
 def test_marginals_show_densities_and_the_divergence():
     reference, predicted = samples(5000)[0], 0.5 * samples(5000)[0]
     ax = figures.marginals(reference, {"GFNN": predicted}, 30, (-4, 4), "$q_2$")

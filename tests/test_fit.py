@@ -164,9 +164,6 @@ def test_too_many_degrees_of_freedom_for_so_few_pairs_are_answered_at_once():
     assert "\n" not in refused if refused else fit.seconds < 180
 
 
-# What is held out
-
-
 # The choice
 
 

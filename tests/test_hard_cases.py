@@ -77,26 +77,6 @@ def test_no_start_far_outside_is_ok(clean, factor):
 # Bad data
 
 
-@pytest.mark.slow
-def test_little_friction_is_learned():
-    z0, rate = disc(400, seed=5), 0.01
-    z1 = kick_and_drift(z0) * [1, math.exp(-rate * DT)]
-    fitted, said = fit(z0, z1, chart="midpoint", tolerance=1e-9)
-    assert len(fitted.messages) == 1
-    assert "uniform friction of rate γ = 0.01 ± " in said
-    assert float(fitted.damping.factor) == pytest.approx(math.exp(-rate * DT), abs=1e-9)
-
-
-@pytest.mark.slow
-def test_noise_of_a_tenth_is_fitted_not_refused():
-    z0 = disc(800, seed=6)
-    noise = 0.1 * np.random.default_rng(7).standard_normal((2, *z0.shape))
-    fitted, said = fit(z0 + noise[0], kick_and_drift(z0) + noise[1], tolerance=1e-3)
-    assert "noise" in said
-    z = disc(200, seed=8)
-    assert rms(fitted.map, z, kick_and_drift(z)) < 0.05
-
-
 # Long times
 
 
@@ -168,6 +148,3 @@ def test_chaotic_statistics_are_those_of_the_exact_map(exact, k):
     assert abs(mine.mean() - reference.mean()) < 4 * scatter
     if k == 5.0:  # ln(K/2) in the fully chaotic limit (Chirikov 1979)
         assert mine.mean() == pytest.approx(math.log(k / 2), rel=0.1)
-
-
-# Precision

@@ -82,24 +82,6 @@ def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
     assert error(ran.fit.map) < 0.6 * error(sample.map)
 
 
-@pytest.mark.slow
-def test_a_refit_that_does_not_fit_into_the_budget_is_left_out(file, tmp_path, monkeypatch):
-    monkeypatch.setattr(fit_job, "_LARGE_BYTES", 0)
-    monkeypatch.setattr(fit_job, "read_sample", functools.partial(read_sample, num_pairs=200))
-    monkeypatch.setattr(fit_job, "work_of_refit", lambda *given: 1e6)
-    with pytest.warns(gfnn.FitWarning, match="200 pairs"):
-        ran = fit_job.fit(
-            file,
-            output=Output(tmp_path / "m"),
-            scene_name="standard-map-regular",
-            tolerance=1e-3,
-            chart="type2",
-            max_seconds=600.0,
-        )
-    assert ran is not None
-    assert ran.report["data"]["num_pairs"] == 200
-
-
 def test_chunks_of_a_file_are_its_pairs(file):
     whole, chunks = read_trajectories(file).pairs(), list(iterate_pairs(file, 700))
     assert len(chunks) > 4

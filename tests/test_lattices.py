@@ -236,16 +236,6 @@ def test_bodies_in_space():
         np.testing.assert_allclose(values, values[:, :1] * np.ones(101), atol=1e-15, err_msg=name)
 
 
-@pytest.mark.slow
-def test_bodies_that_are_alike_share_their_coefficients():
-    family, corners = body_terms(3, 2, (-1,), alike=True), 2 * np.pi / 3 * np.arange(3)
-    around = np.stack([np.cos(corners), np.sin(corners)], axis=1).ravel()
-    z0 = np.concatenate([around, np.zeros(6)]) + 0.1 * RNG.normal(size=(320, 12))
-    z1 = images(family, np.array([0.5, -1.0]), z0, 0.2, Steps(8, 2)).states
-    fit = gfnn.fit(gfnn.Pairs(z0, z1, 0.2), structure="bodies:3", tolerance=1e-12)
-    assert str(fit.hamiltonian) == "0.5 Σ_i |p_i|² - Σ_{i<j} 1/|q_i - q_j|"
-
-
 def test_bodies_that_are_not_alike_are_told_by_the_midpoints_of_their_pairs():
     """Libraries of equal bodies are left out where their masses differ, and only there."""
     corners = 2 * np.pi / 3 * np.arange(3)

@@ -31,7 +31,7 @@ from gfnn_jax.maps.estimates import (
 from gfnn_jax.maps.laws import states_of
 from gfnn_jax.models.lagrangians.exchange import with_exchanges
 from gfnn_jax.models.lagrangians.given_terms import given_terms
-from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_again
+from gfnn_jax.models.lagrangians.input_rules import choose_again
 from gfnn_jax.models.lagrangians.libraries import central, textbook
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.rivals import (
@@ -909,19 +909,6 @@ def test_rules_that_chance_tells_apart_have_no_delay(hold):
     assert fit.map.sensors.hold in ({hold} if hold == "hold" else {hold, "band"})
     gain, std = fit.gains["u"]["x"]
     assert abs(gain - 1.24) < 3 * std < 3e-3
-
-
-@pytest.mark.slow
-def test_held_out_arcs_that_share_errors_do_not_make_up_a_delay(monkeypatch):
-    """Arcs of one third agree that inputs which are held act half a sample early: all of them alike
-    leave as much by either rule."""
-
-    def held_out(self, sigma):
-        late = 0.97 if self.delay else 1.5
-        return np.linspace(1, 2, 8) * (late if self.hold == "hold" else 1.0)
-
-    monkeypatch.setattr(InputModel, "held_out", held_out)
-    assert gfnn.fit(by_a_slow_input("linear")).delay[0] == 0
 
 
 def test_an_input_that_was_not_named_is_told():

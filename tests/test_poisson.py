@@ -283,31 +283,6 @@ def test_tops_whose_moment_differs_from_run_to_run(tmp_path, capsys):
         gfnn.fit(gfnn.Pairs(data.z0[:, :3], data.z1[:, :3], 0.2, {"m": two}, structure="poisson"))
 
 
-@pytest.mark.slow
-def test_a_gyroscope_on_the_command_line(tmp_path, capsys):
-    data = gyroscope(tmp_path / "gyro.csv", 6)
-    figure = str(tmp_path / "look.png")
-    assert cli.main(["look", str(tmp_path / "gyro.csv"), "--figure", figure]) == 0
-    command = capsys.readouterr().out.split("next: gfnn ")[1].splitlines()[0]
-    assert "--structure poisson --states 'Gyroscope x,Gyroscope y,Gyroscope z'" in command
-    assert cli.main(shlex.split(command.replace("--out model", f"--out {tmp_path}/m"))) == 0
-    shown = capsys.readouterr().out
-    assert "verdict: identified" in shown
-    assert "one of a family of 2" in shown
-    assert str(gfnn.load(tmp_path / "m").bracket).endswith("so(3), one of a family of 2")
-    command = shown.split("next: gfnn ")[1].replace("prediction.npz", f"{tmp_path}/p.npz")
-    assert cli.main(shlex.split(command.replace("1000", "20"))) == 0
-    with np.load(tmp_path / "p.npz") as file:
-        ends = [data.z0[data.run == run][-1] for run in range(6)]
-        assert file["trajectories"].shape == (6, 21, 3)
-        assert np.abs(file["trajectories"][:, 0] - ends).max() < 1e-6
-    wrong = tmp_path / "four.npy"
-    np.save(wrong, np.zeros((2, 4)))
-    predict = f"predict {tmp_path}/m --initial {wrong} --num-steps 5 --out {tmp_path}/q.npz"
-    assert cli.main(predict.split()) == 2
-    assert "expected states Gyroscope_x, Gyroscope_y, Gyroscope_z" in capsys.readouterr().err
-
-
 def test_constant_brackets_are_told_apart():
     """(q1, p1, q2, p2) get their order, (q, v) their masses; states of se(3) without a step their
     rows."""

@@ -343,18 +343,6 @@ def test_samples_start_from_the_same_two_positions(of_noisy):
 
 
 @pytest.mark.slow
-def test_it_forecasts_the_same_when_loaded(of_noisy, tmp_path):
-    of_noisy.map.save(tmp_path / "model")
-    recording = recorded(noisy(turns(5, 10, 1), 1e-3, 5), ["theta"], ["theta"])
-    ours, theirs = (
-        map_.forecast(recording, 10.0 + np.arange(1, 6))
-        for map_ in (of_noisy.map, gfnn.load(tmp_path / "model").map)
-    )
-    assert np.array_equal(ours.values["theta"], theirs.values["theta"])
-    assert np.array_equal(ours.std["theta"], theirs.std["theta"])
-
-
-@pytest.mark.slow
 def test_a_forecast_is_compared_with_what_was_read(of_noisy, tmp_path):
     read = noisy(turns(20, 15, 1), 1e-3, 5)[..., 0]
     run, turn = np.indices(read.shape)

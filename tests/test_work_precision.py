@@ -83,21 +83,3 @@ def test_a_lost_lane_counts_as_infinitely_far():
     assert lost["error_median"] == np.inf
     assert lost["num_lost"] == most.sum()
     assert lost["error_mean"] is None
-
-
-def test_the_figure_joins_the_best_of_ours_in_both_precisions():
-    groups = {
-        "ours": {"a": ([1, 3], [1e-2, 1e-6], ["3", "7"]), "b": ([2], [1e-1], ["2"])},
-        "float32": {"a": ([0.5], [1e-1], ["3"])},
-        "known": {"heyoka": ([0.1], [1e-15], ["1e-15"])},
-        "others": {"HNN": ([9], [1], ["200"])},
-    }
-    bare = {"ours": groups["ours"], "float32": {}, "known": {}, "others": {}}
-    figure = work_precision.panels_figure({"together": groups, "alone": bare}, "error")
-    first, _ = figure.axes
-    front = next(ln for ln in first.get_lines() if str(ln.get_label()).startswith("best"))
-    np.testing.assert_array_equal(front.get_data(orig=True), [[0.5, 1, 3], [1e-1, 1e-2, 1e-6]])
-    assert {text.get_text() for text in first.texts} >= {"3", "7", "2", "1"}
-    legend = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert legend.count("a") == 1
-    assert "1  HNN" in legend
