@@ -37,6 +37,17 @@ def pytest_addoption(parser):
     )
 
 
+def _takes_flags(cache):
+    """Whether this XLA knows the flags: it ends a process that asks for what it does not know."""
+    key = f"xla/{jax.__version__} {SOON_COMPILED}".replace(" ", "")
+    if cache.get(key, None) is None:
+        command = [sys.executable, "-c", "import jax; jax.devices()"]
+        env = {**os.environ, "XLA_FLAGS": SOON_COMPILED}
+        tried = subprocess.run(command, capture_output=True, check=False, env=env)
+        cache.set(key, tried.returncode == 0)
+    return cache.get(key, None)
+
+
 def pytest_configure(config):
     """Compiling is most of the suite: its workers, the processes that tests start and the next run
     share what was compiled once, in pytest's own cache."""
@@ -47,15 +58,13 @@ def pytest_configure(config):
         importlib.import_module("gfnn_jax.flows.kernel")
         importlib.import_module("gfnn_jax.flows.compiled_steps")
         install_import_hook("gfnn_jax", "typechecker.checked")
+    # Where bytecode may not be written beside its source, each process would compile all of it.
+    bytecode = str(config.cache.mkdir("bytecode"))
+    sys.pycache_prefix, sys.dont_write_bytecode = bytecode, False
+    os.environ["PYTHONPYCACHEPREFIX"] = bytecode
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     if "XLA_FLAGS" not in os.environ:  # which JAX reads when it is first used
-        # XLA ends a process that asks for what it does not know: that of another release might.
-        tried = subprocess.run(
-            [sys.executable, "-c", "import jax; jax.devices()"],
-            capture_output=True,
-            check=False,
-            env={**os.environ, "XLA_FLAGS": SOON_COMPILED},
-        )
-        os.environ["XLA_FLAGS"] = SOON_COMPILED if tried.returncode == 0 else ""
+        os.environ["XLA_FLAGS"] = SOON_COMPILED if _takes_flags(config.cache) else ""
     shared = {
         "jax_compilation_cache_dir": str(config.cache.mkdir("compiled")),
         "jax_persistent_cache_min_compile_time_secs": 0.02,

@@ -26,6 +26,7 @@ from gfnn_jax.storage.checkpoints import load_model, save_model
 
 RNG = np.random.default_rng(0)
 STATES = 1.0 + 0.1 * RNG.standard_normal((40, 4))
+POLAR = two_body().coordinates
 
 
 def inner(coordinates):
@@ -67,27 +68,28 @@ def network(dtype):
     return family, family.init(jax.random.key(0), dtype)
 
 
-def some_maps():
-    for name, chart in CHARTS.items():
-        yield name, a_map(*polynomial(), chart=chart)
-    sines = Sines(box_inputs(STATES), 20)
-    yield "sines", a_map(sines, 0.01 * RNG.standard_normal(20), chart=TYPE2)
-    yield "mlp", a_map(*network(jnp.float64))
-    yield "mlp float32", a_map(*network(jnp.float32))
-    yield "angles", a_map(*polynomial(angles=(0,)), coordinates=Coordinates("plain", (0, 2)))
-    yield "polar", a_map(*polynomial(two_body().coordinates), coordinates=two_body().coordinates)
-    yield "features", a_map(*polynomial(features=pcr3bp().features))
-    c, s = np.cos(0.4), np.sin(0.4)
-    turn = np.kron(np.array([[c, s], [-s, c]]), np.eye(2))
-    half = Affine(turn, np.ones(4), np.full(4, 0.01))
-    yield "base map", a_map(*polynomial(), half=half)
-    yield "predictor", a_map(*polynomial(), predictor=predictor())
+def turned(angle=0.4):
+    c, s = np.cos(angle), np.sin(angle)
+    matrix = np.kron(np.array([[c, s], [-s, c]]), np.eye(2))
+    return a_map(*polynomial(), half=Affine(matrix, np.ones(4), np.full(4, 0.01)))
 
 
-@pytest.mark.parametrize(
-    ("name", "saved"), list(some_maps()), ids=lambda x: x if type(x) is str else ""
-)
-def test_loads_the_same_bits(name, saved, tmp_path):
+MAPS = {
+    **{n: lambda chart=chart: a_map(*polynomial(), chart=chart) for n, chart in CHARTS.items()},
+    "sines": lambda: a_map(Sines(box_inputs(STATES), 20), RNG.standard_normal(20), chart=TYPE2),
+    "mlp": lambda: a_map(*network(jnp.float64)),
+    "mlp float32": lambda: a_map(*network(jnp.float32)),
+    "angles": lambda: a_map(*polynomial(angles=(0,)), coordinates=Coordinates("plain", (0, 2))),
+    "polar": lambda: a_map(*polynomial(POLAR), coordinates=POLAR),
+    "features": lambda: a_map(*polynomial(features=pcr3bp().features)),
+    "base map": turned,
+    "predictor": lambda: a_map(*polynomial(), predictor=predictor()),
+}
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_loads_the_same_bits(name, tmp_path):
+    saved = MAPS[name]()
     saved.save(tmp_path / "m", record={"note": "θ"})
     loaded = models.load(tmp_path / "m")
     assert jax.tree.structure(loaded) == jax.tree.structure(saved)
