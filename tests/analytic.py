@@ -90,6 +90,36 @@ def rotated(z, angle):
     return np.stack([q * c + p * s, p * c - q * s], axis=-1)
 
 
+def turning(z, dt):
+    """The exact flow over dt of oscillators whose frequency depends on their energy."""
+    q, p = np.split(z, 2, axis=1)
+    turn = np.reshape(dt, (-1, 1)) * (1 + 0.2 * (q**2 + p**2))
+    cos, sin = np.cos(turn), np.sin(turn)
+    return np.concatenate([cos * q + sin * p, cos * p - sin * q], axis=1)
+
+
+def standard_map(z, k):
+    """Images of states (N, 2) under the standard map of strength k, a number or one of each."""
+    p = z[:, 1] + k * np.sin(z[:, 0])
+    return np.stack([z[:, 0] + p, p], axis=1)
+
+
+def kepler(a, e, mean, turn=0.0):
+    """States (..., 4) of ellipses about the centre, by bisection of Kepler's equation for the mean
+    anomalies; their periapses turned by ``turn``."""
+    a, e, mean, turn = np.broadcast_arrays(a, e, mean, turn)
+    low, high = mean - 1.0, mean + 1.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        late = middle - e * np.sin(middle) > mean
+        low, high = np.where(late, low, middle), np.where(late, middle, high)
+    c, s, minor = np.cos(low), np.sin(low), np.sqrt(1 - e**2)
+    speed = a**-0.5 / (1 - e * c)
+    q = np.exp(1j * turn) * a * (c - e + 1j * minor * s)
+    p = np.exp(1j * turn) * speed * (-s + 1j * minor * c)
+    return np.stack([q.real, q.imag, p.real, p.imag], axis=-1)
+
+
 def henon_heiles_pairs(num, seed=0, radius=0.4, dt=0.5):
     """Pairs of states that are uniform in a box."""
 

@@ -159,14 +159,6 @@ def test_refuses_what_is_not_finite_at_the_start():
         fit(params={**start(), "outer": jnp.full(11, jnp.inf)})
 
 
-def test_refuses_unknown_schedules_and_sizes():
-    with pytest.raises(ValueError, match="staircase, cosine"):
-        dataclasses.replace(SHORT, schedule="linear")
-    for wrong in ({"batch_size": 0}, {"epochs": 0}, {"rate": 0.0}, {"epoch_length": 0}):
-        with pytest.raises(ValueError, match="positive"):
-            dataclasses.replace(SHORT, **wrong)
-
-
 def test_any_loss_of_a_batch():
     """The mean of rows (a batch of them all each time) by its squared distances."""
     rows = np.random.default_rng(3).standard_normal((40, 3))

@@ -10,14 +10,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 import as_a_user as benchmark
 
 # Cases of a second or two; the others take up to their budget of two minutes, or are much alike.
-SHORT = {
-    "single-orbit",
-    "twenty-pairs",
-    "friction",
-    "degrees",
-    "copies",
-    *benchmark.REFUSED,
-}
+SHORT = {"single-orbit", "twenty-pairs", "friction", "degrees", "copies", *benchmark.REFUSED}
 
 
 def long_ones_slow(name):

@@ -5,7 +5,7 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
-from analytic import generated, henon_heiles_pairs, map_of
+from analytic import generated, henon_heiles_pairs, map_of, standard_map
 
 import gfnn_jax as gfnn
 from gfnn_jax.coordinates import CARTESIAN
@@ -319,18 +319,12 @@ def test_what_is_no_noise_of_initial_states_is_refused(tmp_path):
         predict(tmp_path / "model", path, Output(tmp_path / "o.npz"), Steps(2, horizon=1.0))
 
 
-def strong_kicks(z, k):
-    """Images of states (N, 2) under standard maps of strengths k (N,)."""
-    p = z[:, 1] + k * np.sin(z[:, 0])
-    return np.stack([z[:, 0] + p, p], axis=1)
-
-
 @pytest.fixture(scope="module")
 def kicked():
     """600 pairs with noise of standard maps of several strengths, which are told."""
     rng = np.random.default_rng(0)
     z, k = rng.uniform(-1, 1, (600, 2)), rng.uniform(0.5, 1.0, 600)
-    noisy = (x + 1e-3 * rng.normal(size=x.shape) for x in (z, strong_kicks(z, k)))
+    noisy = (x + 1e-3 * rng.normal(size=x.shape) for x in (z, standard_map(z, k)))
     return gfnn.Pairs(*noisy, 1.0, args={"k": k})
 
 
@@ -339,7 +333,7 @@ def test_the_posterior_of_s_with_parameters_tells_noise_from_misfit(kicked):
     data = data.trained_on(np.arange(500)).validated_on(np.arange(500, 600))
     found = SumOfTerms(data, Tolerance(1e-8), chart="type2").learned()
     z, args = rng.uniform(-0.8, 0.8, (200, 2)), rng.uniform(0.6, 0.9, (200, 1))
-    image, piece = strong_kicks(z, args[:, 0]), found.piece
+    image, piece = standard_map(z, args[:, 0]), found.piece
     point, aim = TYPE2.evaluation_point(z, image), TYPE2.target_gradient(z, image, 1.0)
     error = piece.family.gradient(np.asarray(piece.params), point, args) - aim
     slopes = piece.family.term_gradients(point, args)
@@ -354,5 +348,5 @@ def test_bands_of_a_polynomial_with_parameters(kicked):
     rng = np.random.default_rng(1)
     z, k = rng.uniform(-0.8, 0.8, (40, 2)), rng.uniform(0.6, 0.9, 40)
     states, info = fit.map.rollout(z, 1, params=k[:, None], samples=30, key=jax.random.key(0))
-    error = np.asarray(states)[:, 1] - strong_kicks(z, k)
+    error = np.asarray(states)[:, 1] - standard_map(z, k)
     assert 0.7 < np.median(2 * info.bands.std[:, 1]) / np.sqrt(np.mean(error**2)) < 4

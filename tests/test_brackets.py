@@ -64,10 +64,7 @@ def test_text():
     [
         (lambda: gfnn.Bracket.constant([[0, 1], [1, 0]]), "antisymmetric"),
         (lambda: BRACKETS["log"].require_inside([[1, 1, 1], [1, 0, 1]]), "rows 1"),
-        (
-            lambda: gfnn.Bracket.magnetic([[[0, 1, 0], [-1, 0, 0], [0, 0, 0]]], [[0, 0, 1]]),
-            "curl",
-        ),
+        (lambda: gfnn.Bracket.magnetic([[[0, 1, 0], [-1, 0, 0], [0, 0, 0]]], [[0, 0, 1]]), "curl"),
     ],
 )
 def test_refusals(make, what):

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 import scipy.linalg
+from analytic import turning
 
 import gfnn_jax as gfnn
 from gfnn_jax.budget import COMPILE, FLOW, ROWS, Budget
@@ -208,19 +209,11 @@ class Jumping:
         return self._now
 
 
-def turned(z, dt):
-    """The exact flow of an oscillator whose frequency depends on its energy."""
-    q, p = np.split(z, 2, axis=1)
-    turn = np.reshape(dt, (-1, 1)) * (1 + 0.2 * (q**2 + p**2))
-    cos, sin = np.cos(turn), np.sin(turn)
-    return np.concatenate([cos * q + sin * p, cos * p - sin * q], axis=1)
-
-
 def oscillators(num_pairs=60, dt=0.5, noise=0.0):
     """Pairs of single steps, of one dt or of each its own."""
     rng = np.random.default_rng(0)
     z0 = rng.uniform(-1, 1, (num_pairs, 2))
-    z0, z1 = (z + noise * rng.normal(size=z.shape) for z in (z0, turned(z0, dt)))
+    z0, z1 = (z + noise * rng.normal(size=z.shape) for z in (z0, turning(z0, dt)))
     return gfnn.Pairs(z0, z1, dt)
 
 
@@ -230,7 +223,7 @@ def sequences(num=6, length=20, noise=1e-3):
     z = rng.uniform(-1, 1, (num, 2))
     for _ in range(length + 1):
         states.append(z + noise * rng.normal(size=z.shape))
-        z = turned(z, 0.5)
+        z = turning(z, 0.5)
     seen = np.stack(states, axis=1)
     run = np.repeat(np.arange(num), length)
     return gfnn.Pairs(seen[:, :-1].reshape(-1, 2), seen[:, 1:].reshape(-1, 2), 0.5, run=run)
@@ -255,7 +248,6 @@ def pendulums(num_pairs=80):
 
 SEVERAL = np.tile([0.3, 0.5, 0.7], 20)
 NETWORK = {"family": "mlp", "chart": "midpoint", "max_iterations": 3}
-KEPLER_TERMS = ["p1**2 + p2**2", "1/sqrt(q1**2 + q2**2)"]
 PENDULUM_TERMS = ["p1**2/l**2", "l*cos(q1)"]
 QUICK = {
     "S or H": (kepler, {"tolerance": 1e-4}),
@@ -286,20 +278,6 @@ def test_without_a_budget_no_decision_looks_at_a_clock(what, monkeypatch):
     same_bits(one, other)
     assert one.formula == other.formula
     assert (one.ended, one.operations) == (other.ended, other.operations)
-
-
-@pytest.mark.slow
-@QUIETLY
-def test_a_bound_on_operations_puts_none_on_the_clock_unless_told():
-    """Of a clock that jumps by hours, 120 s end a fit that is told nothing before any unit."""
-    pairs, options = kepler(100), {"learn": "map", "tolerance": 1e-4}
-    told_nothing = gfnn.fit(pairs, clock=Jumping(1), **options)
-    assert "there was no time for a first model" in told_nothing.ended
-    found = gfnn.fit(pairs, max_operations=10**8, clock=Jumping(1), **options)
-    same_bits(found, gfnn.fit(pairs, max_operations=10**8, max_seconds=None, **options))
-    assert found.operations > 0
-    both = gfnn.fit(pairs, max_operations=10**8, max_seconds=120.0, clock=Jumping(1), **options)
-    same_bits(both, told_nothing)
 
 
 @pytest.mark.slow

@@ -149,9 +149,7 @@ def test_float64_needs_x64(model):
         assert load_model(model)[0]["a"].dtype == np.float32
 
 
-# ---------------------------------------------------------------------------------------------
 # Training checkpoints
-# ---------------------------------------------------------------------------------------------
 
 
 def test_checkpoints_round_trip(tmp_path):

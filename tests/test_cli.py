@@ -2,42 +2,18 @@
 
 import json
 import shlex
-import time
-import warnings
 
 import jax
 import numpy as np
 import pytest
-from command_line import (
-    DT,
-    files,
-    fitted_oscillator,
-    gfnn,
-    oscillator,
-    oscillators_map,
-    pairs_file,
-)
+from analytic import kepler
+from command_line import DT, files, fitted_oscillator, gfnn, oscillator, oscillators_map, pairs_file
 
 from gfnn_jax import cli, cli_summary, scenes
-from gfnn_jax.budget import Budget
 from gfnn_jax.dataset.measured_error import Tolerance
-from gfnn_jax.errors import FitError, FitWarning
-from gfnn_jax.jobs import output, progress
+from gfnn_jax.errors import FitError
+from gfnn_jax.jobs import output
 from gfnn_jax.maps import saved as models
-
-
-def kepler(a, e, mean_anomaly, orientation):
-    """Plain NumPy: states (N, 4) of Kepler ellipses, q first."""
-    x = mean_anomaly.copy()
-    for _ in range(20):
-        x -= (x - e * np.sin(x) - mean_anomaly) / (1 - e * np.cos(x))
-    rate, b = a**-1.5 / (1 - e * np.cos(x)), a * np.sqrt(1 - e**2)
-    q = np.stack([a * (np.cos(x) - e), b * np.sin(x)])
-    p = np.stack([-a * np.sin(x) * rate, b * np.cos(x) * rate])
-    turn = np.array(
-        [[np.cos(orientation), -np.sin(orientation)], [np.sin(orientation), np.cos(orientation)]]
-    )
-    return np.vstack([np.einsum("ijn,jn->in", turn, v) for v in (q, p)]).T
 
 
 def kepler_orbits(num, times, seed=0):
@@ -286,30 +262,6 @@ def test_strict(fitted, tmp_path, capsys, monkeypatch):
     assert gfnn(*fit, "--overwrite") == 0
 
 
-def test_silence_is_never_long(capsys, monkeypatch):
-    """Where standard error is no terminal the last line is repeated."""
-    monkeypatch.setattr(progress, "LONGEST_SILENCE", 0.2)
-    with progress.on_stderr() as shown:
-        shown.status("factorising")
-        shown.status("not shown: too soon")
-        shown.line("a candidate, error 1e-3")
-        time.sleep(0.5)
-    lines = [line.split("] ")[1] for line in capsys.readouterr().err.splitlines()]
-    assert lines[:2] == ["factorising", "a candidate, error 1e-3"]
-    assert lines[2] == "not shown: too soon … 0 s so far"
-
-
-def test_parts_tell_the_time_left():
-    left = progress._Left()
-    assert left.of("bands (1 of 4)", 10.0) == ""
-    assert left.of("bands (2 of 4)", 16.0) == ", about 18 s left"
-    assert left.of("another step", 17.0) == ""
-    assert left.of("folds (1 of 2)", 20.0) == ""
-    assert progress._so_far("compiling (about 9 s)", 4.0).endswith("4 s so far, about 5 s left")
-    assert progress._so_far("compiling (about 9 s)", 9.0).endswith("9 s so far")
-    assert Budget(dim=1).compilation == " (about 3 s)"
-
-
 @pytest.mark.parametrize(
     ("error", "status", "line"),
     [
@@ -325,16 +277,6 @@ def test_a_recording_without_a_law_is_one_line(error, status, line, tmp_path, ca
     data = recording_file(tmp_path / "swing.csv")
     assert gfnn("fit", data, "--out", tmp_path / "m") == status
     assert capsys.readouterr().err.splitlines()[-1] == line
-
-
-def test_warnings_are_one_line(fitted, tmp_path, capsys, monkeypatch):
-    def warn(*args, **kwargs):
-        warnings.warn("nothing meets the tolerance", FitWarning, stacklevel=2)
-        return fitted
-
-    monkeypatch.setattr(output, "fit", warn)
-    assert gfnn("fit", pairs_file(tmp_path / "d.npz"), "--out", tmp_path / "m") == 0
-    assert "gfnn: warning: nothing meets the tolerance" in capsys.readouterr().err.splitlines()
 
 
 # Runs

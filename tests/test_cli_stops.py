@@ -23,7 +23,7 @@ from command_line import (
     predict,
 )
 
-from gfnn_jax.jobs import output, progress
+from gfnn_jax.jobs import output
 from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.maps import saved as models
 from gfnn_jax.storage import checkpoints
@@ -103,37 +103,6 @@ def test_an_interrupted_fit_publishes_the_best_of_all_its_runs(
     monkeypatch.setattr(output, "fit", lambda *args, **kwargs: fitted)
     assert gfnn(*fit) == 0
     assert "unfinished" not in models.record(tmp_path / "m")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("family", ["polynomial", "sines", "mlp"])
-def test_a_fit_survives_two_of_each_signal(family, tmp_path, monkeypatch):
-    """Send signals to a fit that is resumed each time: the map is that of an undisturbed fit."""
-    data = pairs_file(tmp_path / "d.npz", oscillator(300, [0, 1.0]), dt=1.0)
-    # Tolerances that take several sizes, and a training that ends in seconds.
-    tolerance = {"polynomial": 1e-14, "sines": 1e-14, "mlp": 1e-2}[family]
-    fit = ("fit", data, "--family", family, "--chart", "midpoint", "--tolerance", tolerance)
-    assert gfnn(*fit, "--out", tmp_path / "whole") == 0
-    say, count = progress._Lines.status, 0
-    signals = [(signal.SIGINT, 2), (signal.SIGTERM, 3), (signal.SIGINT, 4), (signal.SIGTERM, 5)]
-    for number, moment in signals:
-        count = 0
-
-        def counting(self, message, number=number, moment=moment):
-            nonlocal count
-            say(self, message)
-            count += 1
-            if count == moment:
-                signal.raise_signal(number)
-
-        monkeypatch.setattr(progress._Lines, "status", counting)
-        status = gfnn(*fit, "--out", tmp_path / "m", "--resume")
-        assert status == (130 if number == signal.SIGINT else 143)
-        if (tmp_path / "m").exists():
-            models.load(tmp_path / "m")
-    monkeypatch.setattr(progress._Lines, "status", say)
-    assert gfnn(*fit, "--out", tmp_path / "m", "--resume") == 0
-    same_model(tmp_path / "m", tmp_path / "whole")
 
 
 def test_an_interrupted_fit_leaves_an_older_model_as_it_is(fitted, tmp_path, capsys, monkeypatch):

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+import gfnn_jax as gfnn
 from gfnn_jax import scenes
 from gfnn_jax.baselines import Budget
 from gfnn_jax.baselines.learned import paper_gfnn
@@ -14,7 +15,7 @@ from gfnn_jax.errors import InputError
 from gfnn_jax.jobs import compare as comparison
 from gfnn_jax.jobs.compare import SharedData
 from gfnn_jax.jobs.figures import divergences
-from gfnn_jax.jobs.measure import Rollouts, without_runaways
+from gfnn_jax.jobs.measure import Rollouts, affine_errors, without_runaways
 from gfnn_jax.jobs.output import Output
 from gfnn_jax.jobs.progress import Progress
 
@@ -132,3 +133,11 @@ def test_the_papers_recipe_on_the_standard_map(small):
     image = np.asarray(learned.map.step(z)[0])
     np.testing.assert_allclose(image[1] - image[0], [2 * np.pi, -4 * np.pi], atol=1e-12)
     assert learned.family.hidden == (500, 500, 200, 20)
+
+
+def test_the_plain_map_beside_ours_is_exact_where_the_motion_is_linear():
+    t, r = 0.1 * np.arange(300), np.linspace(0.8, 1.2, 4)[:, None]
+    c, s = r * np.cos(t), r * np.sin(t)
+    states = np.stack([c, s, -s, c], axis=-1)
+    pairs = gfnn.Pairs(states[:, :-1].reshape(-1, 4), states[:, 1:].reshape(-1, 4), dt=0.1)
+    assert affine_errors(pairs, scenes.make("two-body"), states).max() < 1e-9

@@ -70,17 +70,6 @@ def test_a_periodic_orbit_is_a_chain_too():
     assert row.tolist() == [2, 3, 0, 1]
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"std": [1e-3, 0.0]}, "expected every std finite and above 0"),
-    ],
-)
-def test_identities_and_noise_that_are_none(given, message):
-    with pytest.raises(gfnn.FitError, match=message):
-        in_rows(walks(*LENGTHS), **given)
-
-
 # Samples of large files
 
 

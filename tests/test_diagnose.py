@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from analytic import rotated
 
 from gfnn_jax.diagnosis.local_jacobians import (
     chart_determinant,
@@ -14,18 +15,11 @@ from gfnn_jax.diagnosis.residuals import differs_between_sequences, hidden_frict
 from gfnn_jax.generating.charts import CHARTS
 
 
-def turned(z, angle=0.5):
-    q, p = z.T
-    return np.stack(
-        [q * np.cos(angle) + p * np.sin(angle), p * np.cos(angle) - q * np.sin(angle)]
-    ).T
-
-
 def test_more_noisy_pairs_are_judged_no_worse():
     rng = np.random.default_rng(0)
     z = rng.uniform(-1, 1, (60_000, 2))
     noise = 1e-2 * rng.standard_normal((2, *z.shape))
-    y0, y1, scale = z + noise[0], turned(z) + noise[1], z.std(axis=0)
+    y0, y1, scale = z + noise[0], rotated(z, 0.5) + noise[1], z.std(axis=0)
     jacobians, _ = local_jacobians(y0, y1, scale)
     assert data_defect(jacobians, scale) < 0.1
     found = chart_determinant(CHARTS["midpoint"], jacobians, scale)
@@ -47,7 +41,7 @@ def test_noise_as_large_as_a_tenth_of_the_data_folds_no_chart():
     z = rng.uniform(-1, 1, (1_000, 2))
     noise = 5e-2 * rng.standard_normal((2, *z.shape))
     scale = z.std(axis=0)
-    jacobians, _ = local_jacobians(z + noise[0], turned(z) + noise[1], scale)
+    jacobians, _ = local_jacobians(z + noise[0], rotated(z, 0.5) + noise[1], scale)
     assert (
         abs(chart_determinant(CHARTS["midpoint"], jacobians, scale).low - np.cos(0.25) ** 2) < 0.2
     )
@@ -77,13 +71,13 @@ def test_outliers_are_found_and_right_pairs_are_not(sigma):
 
 def test_few_or_coinciding_pairs_are_no_outliers():
     z = np.random.default_rng(3).uniform(-1, 1, (5, 2))
-    assert len(outliers(z, turned(z), z.std(axis=0))) == 0
+    assert len(outliers(z, rotated(z, 0.5), z.std(axis=0))) == 0
     q, p = np.random.default_rng(1642).uniform(-1, 1, (2, 20))  # the worst of 4,000 such draws
     ahead = q + 0.5 * p
     pairs = np.c_[q, p], np.c_[ahead, p - np.sin(ahead)]
     assert len(outliers(*pairs, pairs[0].std(axis=0))) == 0
     many = np.tile(z, (20, 1))
-    assert len(outliers(many, turned(many), many.std(axis=0))) == 0
+    assert len(outliers(many, rotated(many, 0.5), many.std(axis=0))) == 0
 
 
 def test_friction_is_told_from_noise_and_from_a_hamiltonian_residual():

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from analytic import moved
 from other_python import ended, started
 
 import gfnn_jax as gfnn
@@ -80,16 +81,8 @@ def image(z):
 
 
 def flow(z):
-    """Flow of H = p²/2 + q⁴/4, by small steps of fourth order."""
-    q, p = z.T
-    x = 1 / (2 - 2 ** (1 / 3))
-    for _ in range(200):
-        for part in (x, 1 - 2 * x, x):
-            h = part * DT / 200
-            q = q + h / 2 * p
-            p = p - h * q**3
-            q = q + h / 2 * p
-    return np.stack([q, p], axis=1)
+    """Flow of H = p²/2 + q⁴/4."""
+    return moved(lambda _, z: [z[1], -(z[0] ** 3)], z, DT)
 
 
 def noisy(function, sigma=5e-4):
@@ -286,23 +279,6 @@ def test_pairs_that_differ_in_dt_or_parameters_are_all_taken(of, options, in_thr
     np.testing.assert_allclose(steps[1], steps[2], rtol=0, atol=1e-12)
     errors = [np.sqrt(np.mean((states - exact.z1) ** 2)) for states in steps]
     assert errors[1] < 0.7 * errors[0]  # eight times the pairs: √8 at best
-
-
-@pytest.mark.slow
-def test_pairs_of_another_dt_are_left_out(in_threads):
-    """As those across a gap, where nearly all are of one dt."""
-    pairs = noisy(image)
-    fit = gfnn.fit(pairs.take(slice(100, 300)), learn="map", tolerance=3e-3, chart="midpoint")
-    dt = np.full(PAIRS, DT)
-    dt[[3, 500, 900]] = 2 * DT
-    gaps = gfnn.Pairs(pairs.z0, pairs.z1, dt)
-    with pytest.warns(gfnn.FitWarning, match="3 of 1200 pairs"):
-        again = refit(fit, [gaps], gaps.take(slice(100)))
-    assert again.num_pairs == PAIRS - 3
-    clean = pairs.take(np.delete(np.arange(PAIRS), [3, 500, 900]))
-    other = refit(fit, [clean], clean.take(slice(99)))
-    z = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 2))
-    np.testing.assert_allclose(*(f.map.step(z)[0] for f in (again, other)), rtol=0, atol=1e-12)
 
 
 # Real processes, on this machine

@@ -13,30 +13,12 @@ from gfnn_jax import cli
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
-# What these pages show is tested always elsewhere: in the README, or in these modules.
-SLOW = {
-    "args": ("test_args",),
-    "args-in-maps": ("test_args",),
-    "bands": ("test_bands", "test_ensembles"),
-    "brackets": ("test_poisson", "test_brackets_found", "test_lie_maps", "test_bracket_flows"),
-    "charts-and-families": ("test_charts", "test_damping"),
-    "cheat-sheet": ("test_report_page", "test_fit"),
-    "command-line": ("test_report_page", "test_cli"),
-    "export": ("test_exports",),
-    "extending": ("test_own_models",),
-    "friction-and-inputs": ("test_friction", "test_law_maps"),
-    "known-terms": ("test_told_terms", "test_laws"),
-    "laws": ("test_laws", "test_textbook", "test_noisy_textbook"),
-    "many": ("test_lattices",),
-    "mathematics": ("test_charts", "test_maps"),
-    "own-family": ("test_own_models",),
-    "own-parts": ("test_own_models",),
-    "positions-alone": ("test_positions", "test_monitors"),
-    "storage-ring": ("test_maps", "test_args"),
-    "runs-that-differ": ("test_systems", "test_recordings"),
-    "scaling": ("test_sharded", "test_fit_on_devices", "test_distributed_fit"),
-    "your-own-data": ("test_cli", "test_exports_of_others"),
-}
+# What these pages show other tests guard.
+SLOW = """
+    args args-in-maps bands brackets charts-and-families cheat-sheet command-line export
+    extending friction-and-inputs known-terms laws many mathematics own-family own-parts
+    positions-alone storage-ring runs-that-differ scaling your-own-data
+"""
 sys.path.insert(0, str(ROOT / "benchmarks"))
 INSTALL = ("python3 -m venv ", ".venv/bin/pip install ")
 
@@ -47,7 +29,10 @@ def blocks(page):
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=pytest.mark.slow) if page.stem in SLOW else page for page in PAGES],
+    [
+        pytest.param(page, marks=pytest.mark.slow) if page.stem in SLOW.split() else page
+        for page in PAGES
+    ],
     ids=lambda page: page.stem,
 )
 def test_code_runs(page, tmp_path, monkeypatch, as_a_user):
@@ -81,11 +66,6 @@ def test_pages_and_paragraphs_are_short(page):
     paragraphs = [block.strip("\n").split("\n") for block in prose.split("\n\n")]
     plain = [lines for lines in paragraphs if not any(map(other.match, lines))]
     assert not [lines[0] for lines in plain if len(lines) > 6]
-
-
-def test_what_slow_pages_show_is_tested_elsewhere():
-    assert set(SLOW) < {page.stem for page in PAGES}
-    assert all((ROOT / "tests" / f"{n}.py").exists() for names in SLOW.values() for n in names)
 
 
 def test_every_page_is_in_the_navigation():
@@ -154,3 +134,13 @@ def test_the_ten_lines_are_what_the_results_hold():
     text = (ROOT / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
     for claim, figure, _, _ in summary.LINES:
         assert f"| {claim} | {figure()} |" in text
+
+
+def test_every_result_of_the_repository_has_a_study():
+    import commits
+
+    from benchmarks.__main__ import studies
+
+    here = commits.HERE
+    made = [r for s in studies() for r in commits.results_of(here / f"{s}.py", here / "results")]
+    assert {path for _, path, _ in made} == set((here / "results").glob("*.json"))

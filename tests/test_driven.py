@@ -269,13 +269,8 @@ def test_pairs_that_cannot_be_used(options, fit, message):
 
 
 def test_times_that_are_not_the_maps(learned):
-    for given, message in (
-        ({}, "expected t0, the time of the drive that the map was learned with"),
-        ({"t0": np.ones(3)}, "expected params t of shape (1,) or (2, 1), got (3, 1)"),
-        ({"t0": 0.1, "args": [1.0, 2.0]}, "expected params none beside t0"),
-    ):
-        with pytest.raises(ValueError, match=re.escape(message)):
-            learned.map.step(np.zeros((2, 2)), **given)
+    with pytest.raises(ValueError, match="expected t0, the time of the drive"):
+        learned.map.step(np.zeros((2, 2)))
     with pytest.raises(ValueError, match="energy"):
         learned.map.modified_hamiltonian(np.zeros(2))
 
@@ -341,19 +336,10 @@ def test_files_of_pairs_and_of_trajectories(tmp_path):
     pairs = read_trajectories(tmp_path / "p.npz").pairs()
     np.testing.assert_allclose(pairs.t0, np.mod(t0, PERIOD), atol=1e-14)
     assert read_sample(tmp_path / "t.npz", num_pairs=20).pairs().period == PERIOD
-    for broken, message in (
-        ({"period": PERIOD}, "expected t0, the time of the drive, beside its period"),
-        ({"t0": t0}, "expected the drive's period beside t0"),
-        ({"t0": t0[:3], "period": PERIOD}, "t0 must be finite, of shape (60,), found (3,)"),
-        ({"t0": t0, "period": 0.0}, "period must be finite and above 0"),
-    ):
-        np.savez(tmp_path / "b.npz", trajectories=rows, dt=DT, **broken)
-        with pytest.raises(gfnn.InputError, match=re.escape(message)):
-            read_trajectories(tmp_path / "b.npz")
 
 
 @pytest.mark.slow
-def test_fit_and_predict_on_the_command_line(tmp_path, capsys):
+def test_fit_and_predict_on_the_command_line(tmp_path):
     rows, t0 = write_npz(tmp_path / "t.npz")
     terms = ["--angles", "0", "--terms", f"p**2; cos(q); cos(q)*cos({RATE!r}*t)"]
     model, out = str(tmp_path / "m"), tmp_path / "p.npz"
@@ -371,10 +357,3 @@ def test_fit_and_predict_on_the_command_line(tmp_path, capsys):
     assert "params" not in predicted
     again = read_trajectories(out)  # a prediction serves as data, and to go on from
     assert again.period == PERIOD
-    np.savez(tmp_path / "z.npz", z0=rows[:, 0])
-    predict[5] = str(tmp_path / "q.npz")
-    capsys.readouterr()
-    assert cli.main([*predict, str(tmp_path / "z.npz")]) == 2
-    told = capsys.readouterr().err.strip()
-    assert "expected t0, the time of the drive that the model was learned with" in told
-    assert "\n" not in told

@@ -5,15 +5,12 @@ import signal
 import jax
 import numpy as np
 import pytest
+from analytic import turning
 
 import gfnn_jax as gfnn
 from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.mlp import Mlp
-from gfnn_jax.fitting.levenberg_marquardt import (
-    GradientFit,
-    Limits,
-    LMState,
-)
+from gfnn_jax.fitting.levenberg_marquardt import GradientFit, Limits, LMState
 from gfnn_jax.jobs.output import Output, search
 from gfnn_jax.jobs.predict import Steps, predict
 from gfnn_jax.jobs.progress import Progress
@@ -23,21 +20,13 @@ from gfnn_jax.models.generating_functions import networks
 DT = 0.5
 
 
-def moved(z, dt=DT):
-    """A step of an oscillator whose frequency depends on its energy: its exact flow."""
-    turn = dt * (1 + 0.2 * np.sum(z**2, axis=1, keepdims=True))
-    q, p = z[:, :1], z[:, 1:]
-    cos, sin = np.cos(turn), np.sin(turn)
-    return np.concatenate([cos * q + sin * p, cos * p - sin * q], axis=1)
-
-
 def states(num, seed):
     return np.random.default_rng(seed).uniform(-1, 1, (num, 2))
 
 
 def pairs_of(num, seed, noise=0.0):
     z0, rng = states(num, seed), np.random.default_rng(seed + 1)
-    z1 = moved(z0)
+    z1 = turning(z0, DT)
     return gfnn.Pairs(*(z + noise * rng.normal(size=z.shape) for z in (z0, z1)), DT)
 
 
@@ -138,7 +127,7 @@ def test_bands_hold_the_true_error(fit, noise):
             fit = gfnn.fit(pairs_of(150, 0, noise), ensemble=4, **OPTIONS)
     z = states(200, 9) * 0.9
     found, info = fit.map.rollout(z, 1, samples=40, key=jax.random.key(0))
-    error = np.abs(np.asarray(found)[:, 1] - moved(z))
+    error = np.abs(np.asarray(found)[:, 1] - turning(z, DT))
     band = 2 * info.bands.std[:, 1]
     assert np.mean(error <= band) > 0.8
     assert np.median(band) < 4 * np.sqrt(np.mean(error**2))

@@ -32,10 +32,7 @@ def fitted(times):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("friction", "text"),
-    [
-        (lambda v: 0.03 * v, "omega**2"),
-        (lambda v: 0.01 * v * abs(v), "abs(omega)**3"),
-    ],
+    [(lambda v: 0.03 * v, "omega**2"), (lambda v: 0.01 * v * abs(v), "abs(omega)**3")],
 )
 def test_a_photogate_tells_a_pendulum_and_its_friction(friction, text):
     fit = fitted(gate(friction))

@@ -24,12 +24,7 @@ def words(formula):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("hardening", "end", "noise"),
-    [
-        (0.1, 50.0, 3e-2),
-        (0.3, 100.0, 3e-2),
-        (0.3, 100.0, 1e-4),
-    ],
+    ("hardening", "end", "noise"), [(0.1, 50.0, 3e-2), (0.3, 100.0, 3e-2), (0.3, 100.0, 1e-4)]
 )
 def test_a_law_beside_which_noise_leaves_others_is_one_of_several(hardening, end, noise, tmp_path):
     made = record(lambda q, v: -q - hardening * q**3 - 0.02 * v, [1.0], end, 0.6, noise)

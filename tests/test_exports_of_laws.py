@@ -20,9 +20,7 @@ from test_exports import (
     pushed,
     with_length,
 )
-from test_exports import (
-    two_rods as attracting,
-)
+from test_exports import two_rods as attracting
 
 import gfnn_jax as gfnn
 from gfnn_jax import cli

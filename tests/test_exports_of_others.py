@@ -92,10 +92,7 @@ def test_names_with_commas_go_through_every_option():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("head", "columns", "options"),
-    [
-        ("x", (SWING,), ["--dt", "0.02"]),
-        ("t,#,x", (T, T, SWING), ["--columns", "t,x"]),
-    ],
+    [("x", (SWING,), ["--dt", "0.02"]), ("t,#,x", (T, T, SWING), ["--columns", "t,x"])],
 )
 def test_predict_reads_a_file_as_fit_did(tmp_path, capsys, head, columns, options):
     """The command that ``fit`` prints runs as printed."""

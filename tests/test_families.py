@@ -101,10 +101,7 @@ def automatic(family, params, w):
     )
 
 
-@pytest.mark.parametrize(
-    ("kind", "inputs"),
-    [("products", "features"), ("from_function", "plain")],
-)
+@pytest.mark.parametrize(("kind", "inputs"), [("products", "features"), ("from_function", "plain")])
 def test_closed_derivatives_are_those_of_autodiff(kind, inputs):
     family, params = case(kind, inputs)
     found = family.gradient_and_hessian(params, W[0])

@@ -40,9 +40,7 @@ def csv(path, header, rows):
 HEADER = "t,q1,q2,p1,p2"
 
 
-# ---------------------------------------------------------------------------------------------
 # Good files
-# ---------------------------------------------------------------------------------------------
 
 
 def test_pairs_file(tmp_path):
@@ -210,9 +208,7 @@ def test_streaming_memory_is_bounded(tmp_path, suffix):
     assert peak < limit
 
 
-# ---------------------------------------------------------------------------------------------
 # Bad files: one line each
-# ---------------------------------------------------------------------------------------------
 
 
 def bad(value, row=3, column=1):
@@ -282,13 +278,6 @@ def packed(compression):
     return make
 
 
-def other_member(tmp):
-    with zipfile.ZipFile(tmp / "d.npz", "w") as archive:
-        archive.writestr("z0", "")
-        archive.writestr("z1", "")
-    return tmp / "d.npz"
-
-
 def encrypted_flag(tmp):
     path = npz(z0=Z, z1=Z, dt=0.1)(tmp)
     data = bytearray(path.read_bytes())
@@ -298,7 +287,6 @@ def encrypted_flag(tmp):
     return path
 
 
-STRINGS = np.array([["a", "b"]] * 9)
 # name -> (how the file is made, what the refusal must name beside the file: a line, an element)
 BAD_FILES = {
     "missing file": (lambda tmp: tmp / "none.npz", ""),

@@ -15,7 +15,6 @@ from gfnn_jax.families.inputs import box_inputs
 from gfnn_jax.families.products import Products
 from gfnn_jax.families.sines import Sines
 from gfnn_jax.fitting import gauss_newton, least_squares, row_blocks
-from gfnn_jax.fitting.triangle import folded
 from gfnn_jax.flows.collocation import Steps
 
 FITS = """
@@ -249,21 +248,3 @@ def test_rows_go_to_an_accelerator_where_there_is_one(monkeypatch):
     assert found.rows == plain.rows
     assert len(shapes) == 1
     same_factor(found.factor, plain.factor)
-
-
-def test_other_threads_work_while_rows_are_folded():
-    """With Python's lock held they would not count once."""
-    rows = np.asfortranarray(np.random.default_rng(0).normal(size=(4_000, 600)))
-    done, counted = threading.Event(), 0
-
-    def fold():
-        folded(np.zeros((600, 600), order="F"), rows)
-        done.set()
-
-    thread = threading.Thread(target=fold)
-    thread.start()
-    while not done.is_set():
-        time.sleep(0.001)
-        counted += 1
-    thread.join()
-    assert counted > 10

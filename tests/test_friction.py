@@ -3,8 +3,7 @@ quadratic or dry."""
 
 import numpy as np
 import pytest
-import scipy.integrate
-from analytic import block_on_a_spring, mechanics
+from analytic import block_on_a_spring, mechanics, moved
 
 import gfnn_jax as gfnn
 from gfnn_jax.families.friction import DRY, LINEAR, ONE_SIDED, POWER, QUADRATIC, Friction
@@ -12,9 +11,7 @@ from gfnn_jax.families.friction import DRY, LINEAR, ONE_SIDED, POWER, QUADRATIC,
 
 def pairs_of(field, z, dt):
     """Pairs by another integrator."""
-    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-15}
-    images = [scipy.integrate.solve_ivp(field, (0, dt), y, **options).y[:, -1] for y in z]
-    return gfnn.Pairs(z, np.stack(images), dt)
+    return gfnn.Pairs(z, moved(field, z, dt, atol=1e-15), dt)
 
 
 @pytest.mark.parametrize("direction", [(1, -1), (-1, 1), (1, 1), (-2, -1), (-1, 0)])
@@ -181,7 +178,7 @@ def double_pendulum(gamma, count=200, dt=0.2):
     law = mechanics(rows, uniform=gamma)
 
     def field(_, y):
-        return np.concatenate([y[2:], law.acceleration(y[None, :2], y[None, 2:])[0]])
+        return np.concatenate([y[2:], law.acceleration(y[:2].T, y[2:].T).T])
 
     z1 = pairs_of(field, z0, dt).z1
     both = (np.c_[z[:, :2], law.momentum(z[:, :2], z[:, 2:])] for z in (z0, z1))

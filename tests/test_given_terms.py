@@ -140,13 +140,7 @@ def test_what_is_told_of_a_coefficient(told, low, high):
     assert one.row in read(told).terms
 
 
-@pytest.mark.parametrize(
-    "told",
-    [
-        "3 <= cos(theta1) <= 2",
-        "R: omega1**2 = 1",
-    ],
-)
+@pytest.mark.parametrize("told", ["3 <= cos(theta1) <= 2", "R: omega1**2 = 1"])
 def test_what_cannot_be_told(told):
     with pytest.raises(InputError, match=r"terms: expected|a multiple of"):
         read(told)

@@ -41,36 +41,6 @@ def test_states_at_the_rim_are_told_from_gross_errors(at_rim, monkeypatch):
     assert gross_errors._at_the_rim(found, rows) is at_rim
 
 
-@pytest.mark.parametrize(
-    ("off", "unsolved", "follows"), [(1e-3, (), True), (1.0, (), False), (1e-3, (1,), False)]
-)
-def test_states_at_the_rim_are_kept_where_the_map_of_the_others_is_lost_there(
-    off, unsolved, follows, monkeypatch
-):
-    """All pairs err by 1e-3; two of 100 pairs without which the map errs there by ``off``."""
-    z = np.linspace(-1, 1, 200).reshape(100, 2)
-
-    class Data(types.SimpleNamespace):
-        def __len__(self):
-            return 100
-
-    candidate = types.SimpleNamespace(validation_bound=1e-3)
-    entry = types.SimpleNamespace(map=None, candidate=candidate)
-    data = Data(pairs=Pairs(z, z, 0.1), user_angles=(), spread=np.ones(2))
-    found = types.SimpleNamespace(
-        data=data,
-        tolerance=types.SimpleNamespace(relative=True),
-        found=types.SimpleNamespace(ranking=[entry]),
-    )
-
-    def stepped(map_, z0, dt, args, timed):
-        failed = np.isin(np.arange(len(z0)), unsolved)
-        return types.SimpleNamespace(images=z0 + off, failed=failed)
-
-    monkeypatch.setattr(gross_errors, "stepped", stepped)
-    assert gross_errors._follows(found, found, np.array([0, 99])) is follows
-
-
 def test_copies_are_found_whatever_the_sign_of_a_zero():
     rng = np.random.default_rng(0)
     z0, z1 = rng.normal(size=(2, 1_000, 4))
@@ -133,16 +103,6 @@ def looked_for(spoilt, monkeypatch):
 
 
 @pytest.mark.slow
-def test_without_a_budget_gross_errors_are_left_out(looked_for):
-    budget = Budget()
-    left, asked = looked_for(budget)
-    assert (left, asked >= 300, budget.left_out) == (297, True, [])
-    again = Budget(max_operations=budget.operations)
-    assert looked_for(again) == (left, asked)
-    assert again.operations == budget.operations
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("part", [0.9, 1.1])
 def test_where_the_budget_has_no_room_for_all_pairs_none_is_looked_at(part, spoilt, looked_for):
     """At a part of the operations, and of the seconds, that the residuals alone take; with a
@@ -157,12 +117,3 @@ def test_where_the_budget_has_no_room_for_all_pairs_none_is_looked_at(part, spoi
     again = Budget(max_operations=clock.operations)
     assert looked_for(again) == (300, 300 * (part > 1))
     assert again.operations == clock.operations
-
-
-@pytest.mark.slow
-def test_after_the_end_of_the_search_no_pair_is_looked_at(looked_for):
-    budget = Budget(max_operations=0)
-    with pytest.raises(gfnn.errors.OutOfTime), budget.unit("H", FLOW, 1):
-        pass
-    assert looked_for(budget) == (300, 0)
-    assert len(budget.left_out) == 1

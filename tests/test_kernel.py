@@ -3,19 +3,13 @@ what it does with hopeless lanes."""
 
 import concurrent.futures
 import dataclasses
-import os
 import pickle
-import shutil
-import subprocess
-import sys
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import own_module  # noqa: F401
 import pytest
 
-import gfnn_jax
 from gfnn_jax.families.friction import (
     DRY,
     ISOTROPIC,
@@ -108,10 +102,7 @@ def differences(form, p, x, h, u, e=1e-6):
         ]
         return np.stack([(up - down) / (2 * e) for up, down in ends], axis=-1)
 
-    return (
-        slope(lambda by: (p, x + by), x.shape[1]),
-        slope(lambda by: (p + by, x), form.count),
-    )
+    return (slope(lambda by: (p, x + by), x.shape[1]), slope(lambda by: (p + by, x), form.count))
 
 
 @pytest.mark.parametrize("own", [False, True])
@@ -252,46 +243,3 @@ def test_laws_are_pickled_and_followed_by_threads():
             for found, step in zip(pool.map(again, tasks), expected, strict=True):
                 for one, other in zip(found, step, strict=True):
                     np.testing.assert_array_equal(one, other)
-
-
-_ALONE = """
-import os, sys
-import numpy as np
-import test_kernel
-(form, p), (x, h, u) = test_kernel.law_of(3, True, True, 0, True), test_kernel.lanes_of(3, 30)
-step = form.step(p, x, h, u)
-assert np.isfinite(step.states).all()
-child = os.fork()  # after first use
-same = np.array_equal(form.step(p, x, h, u).states, step.states)
-if not child:
-    os._exit(not same)
-assert same and os.waitpid(child, 0)[1] == 0
-"""
-
-
-@pytest.mark.slow
-def test_an_installation_that_cannot_be_written(tmp_path):
-    """The cache goes to a temporary folder."""
-    package = tmp_path / "gfnn_jax"
-    ignored = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(Path(gfnn_jax.__file__).parent, package, ignore=ignored)
-    (temporary := tmp_path / "temporary").mkdir()
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(__file__).parent)]),
-        "HOME": "/dev/null",
-        "XDG_CACHE_HOME": "/dev/null/none",
-        "TMPDIR": str(temporary),
-        "JAX_PLATFORMS": "cpu",
-    }
-    done = subprocess.run(
-        [sys.executable, "-c", _ALONE],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.count("once on this machine, the motion of laws (about") == 1
-    assert list(temporary.glob("gfnn_jax-*/follow-*.o"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
-from gfnn_jax.data.files import iterate_pairs, read_trajectories
+from gfnn_jax.data.files import read_trajectories
 from gfnn_jax.data.sample import read_sample
 from gfnn_jax.jobs import fit as fit_job
 from gfnn_jax.jobs.output import Output
@@ -80,12 +80,3 @@ def test_all_pairs_fit_better_than_the_sample(file, tmp_path, monkeypatch):
 
     # 15 times the pairs: the error that the noise leaves falls by about √15.
     assert error(ran.fit.map) < 0.6 * error(sample.map)
-
-
-def test_chunks_of_a_file_are_its_pairs(file):
-    whole, chunks = read_trajectories(file).pairs(), list(iterate_pairs(file, 700))
-    assert len(chunks) > 4
-    assert max(map(len, chunks)) <= 700
-    for name in ("z0", "z1"):
-        joined = np.concatenate([getattr(chunk, name) for chunk in chunks])
-        np.testing.assert_array_equal(joined, getattr(whole, name))

@@ -21,13 +21,7 @@ from gfnn_jax.flows.motion import Form
 from gfnn_jax.flows.schedules import HOLDS, at_stages, interpolate
 from gfnn_jax.jobs.forecast import Ahead, forecast_recording
 from gfnn_jax.jobs.output import Output
-from gfnn_jax.maps.estimates import (
-    Orbits,
-    Window,
-    estimates_of,
-    law_of,
-    propagate,
-)
+from gfnn_jax.maps.estimates import Orbits, Window, estimates_of, law_of, propagate
 from gfnn_jax.maps.laws import states_of
 from gfnn_jax.models.lagrangians.exchange import with_exchanges
 from gfnn_jax.models.lagrangians.given_terms import given_terms
@@ -398,15 +392,17 @@ def with_a_load(seed, rest):
 
 
 @pytest.mark.slow
-def test_friction_by_a_load_that_is_given(tmp_path):
+@pytest.mark.parametrize(("given", "rest"), [(True, 0.0), (False, 0.0), (False, 0.1)])
+def test_friction_by_a_load_that_is_given_or_found(given, rest, tmp_path):
     """It is fitted, printed, read again, saved and forecast; formats that need its series refuse
     it."""
-    recording, truth = with_a_load(0, 0.0)
-    given = ["v**2", "x**2", *(f"R: {term}" for term in truth)]
-    fit = gfnn.fit(recording, model=gfnn.Lagrangian(terms=given))
-    for term, (name, expected) in zip(fit.friction.terms, truth.items(), strict=True):
-        assert term.term == name
-        assert abs(term.coefficient - expected) < 4 * term.std
+    recording, truth = with_a_load(1, rest)
+    terms = ["v**2", "x**2", *(f"R: {term}" for term in truth)]
+    fit = gfnn.fit(recording, model=gfnn.Lagrangian(terms=terms if given else ()))
+    assert fit.verdict == "identified"
+    found = {term.term: term for term in fit.friction.terms}
+    assert set(found) == set(truth)
+    assert all(abs(found[k].coefficient - c) < 4 * found[k].std for k, c in truth.items())
     again = given_terms([f"R: {fit.friction.formula}"], ["x"], ["v"], (), ["F", "N"]).friction
     assert again == tuple(law_of(fit.map).form.friction.rows())
     fit.save(tmp_path / "model")
@@ -422,17 +418,6 @@ def test_friction_by_a_load_that_is_given(tmp_path):
     for to in ("js", "c"):
         with pytest.raises(InputError, match="friction by the size of an input"):
             gfnn.export(fit.map, to, tmp_path / f"own.{to}")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rest", [0.0, 0.1])
-def test_friction_by_a_load_is_found(rest):
-    recording, truth = with_a_load(1, rest)
-    fit = gfnn.fit(recording)
-    assert fit.verdict == "identified"
-    found = {term.term: term for term in fit.friction.terms}
-    assert set(found) == set(truth)
-    assert all(abs(found[k].coefficient - c) < 4 * found[k].std for k, c in truth.items())
 
 
 @pytest.mark.slow

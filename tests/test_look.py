@@ -134,16 +134,6 @@ def test_columns_that_are_odd_are_named(tmp_path, change, kind):
 # The command line
 
 
-def test_look_prints_a_screen_and_draws_a_figure(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    a_swing(tmp_path / "r.csv")
-    assert main(["look", "r.csv"]) == 0
-    out = capsys.readouterr().out
-    assert "next: gfnn fit r.csv --out model" in out
-    assert (tmp_path / "runs" / "look-r.png").stat().st_size > 10_000
-    assert main(["look", "r.csv", "--figure", "runs/look-r.png"]) == 2
-
-
 def test_look_as_json(tmp_path, capsys):
     path = a_swing(tmp_path / "r.csv", omega=lambda t, x: -3.2 * np.sin(4 * t) * np.exp(-0.05 * t))
     assert main(["look", str(path), "--json", "--std", "theta=0.002", "--mass", "theta=2"]) == 0

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from analytic import kepler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
@@ -141,22 +142,10 @@ def test_drift_exponent_tells_a_random_walk_from_a_trend_under_an_oscillation():
     assert trend.value == pytest.approx(1.0, abs=1e-3)
 
 
-def kepler_state(a, e, anomaly, perihelion):
-    """The state of elements a, e at the eccentric anomaly, its ellipse turned by an angle."""
-    b = np.sqrt(1 - e**2)
-    c, s = np.cos(anomaly), np.sin(anomaly)
-    q = a * np.array([c - e, b * s])
-    p = np.array([-s, b * c]) / (np.sqrt(a) * (1 - e * c))
-    turn = np.array(
-        [[np.cos(perihelion), -np.sin(perihelion)], [np.sin(perihelion), np.cos(perihelion)]]
-    )
-    return np.concatenate([turn @ q, turn @ p])
-
-
 @settings(deadline=None)  # the first call compiles
 @given(st.floats(0.1, 10), st.floats(1e-6, 0.95), st.floats(0, 6.28), st.floats(0, 6.28))
 def test_orbital_elements_of_constructed_orbits(a, e, anomaly, perihelion):
-    z = kepler_state(a, e, anomaly, perihelion)
+    z = kepler(a, e, anomaly, perihelion)
     batch = np.stack([z, z])[None]
     np.testing.assert_allclose(metrics.semi_major_axis(batch), np.full((1, 2), a), rtol=1e-11)
     # To roundoff also near e = 0, where a formula through energy and angular momentum is not.
@@ -164,7 +153,7 @@ def test_orbital_elements_of_constructed_orbits(a, e, anomaly, perihelion):
 
 
 def test_orbital_elements_jit_and_differentiate():
-    z = np.array(kepler_state(1.1, 0.03, 1.0, 2.0))
+    z = kepler(1.1, 0.03, 1.0, 2.0)
     assert jax.jit(metrics.semi_major_axis)(z) == pytest.approx(1.1)
     assert np.isfinite(jax.jit(jax.grad(metrics.eccentricity))(z)).all()
 

@@ -37,40 +37,27 @@ def fit(*arrays, **options):
 MISTAKES = {
     # The pairs.
     "a list of lists": lambda: fit(Z0.tolist()),
-    "one state more": lambda: fit(Z0[:-1]),
-    "a single state": lambda: fit(Z0[0], Z1[0]),
     "q without p": lambda: fit(Z0[:, :1], Z1[:, :1]),
-    "q, p and a third": lambda: fit(np.ones((9, 3)), np.ones((9, 3))),
     "sequences as pairs": lambda: fit(Z0.reshape(10, 20, 2), Z1),
     "transposed": lambda: fit(Z0.T, Z1.T),
     "the same state all over": lambda: fit(0 * Z0, 0 * Z1),
-    "the same columns twice": lambda: fit(Z0, Z0),
     "complex numbers": lambda: fit(Z0 + 0j),
-    "numbers as text": lambda: fit(Z0, Z1.astype(str)),
-    "objects": lambda: fit(Z0.astype(object)),
     "the array instead of pairs": lambda: gfnn.fit(Z0),
-    "a tuple instead of pairs": lambda: gfnn.fit((Z0, Z1, DT)),
     "a file that is not there": lambda: gfnn.fit("nowhere.npz"),
     # The time step, parameters, the drive.
     "dt as text": lambda: fit(Z0, Z1, "0.1"),
-    "no dt": lambda: fit(Z0, Z1, None),
     "times instead of dt": lambda: fit(Z0, Z1, np.arange(3.0)),
     # What is asked for.
     "a budget of nothing": lambda: fit(max_seconds=0),
-    "a budget as text": lambda: fit(max_seconds="1 min"),
     "the scene's name": lambda: fit(scene="two-body"),
     "an angle that is no index": lambda: fit(angles=("q1",)),
-    "None as terms": lambda: fit(terms=None),
     "an unknown name in a term": lambda: fit(terms=["x1**2"]),
-    "a seed as text": lambda: fit(seed="a"),
     # Drawing from scenes, loading.
     "a name to draw from": lambda: gfnn.sample_pairs("two-body", 10, KEY),
     "a Hamiltonian of NumPy": lambda: gfnn.sample_pairs(OF_NUMPY, 10, KEY),
     "a flow of NumPy": lambda: gfnn.sample_pairs(FLOW_OF_NUMPY, 9, KEY),
-    "no pairs": lambda: gfnn.sample_pairs(SCENE, 0, KEY),
     "a number as key": lambda: gfnn.sample_pairs(SCENE, 10, 0),
     "a folder that is not there": lambda: gfnn.load("nowhere"),
-    "a file instead of the folder": lambda: gfnn.load(__file__),
 }
 
 
@@ -96,7 +83,6 @@ WITH_A_MAP = {
     "the inverse of no state": lambda m: m.inverse(),
     "nothing saved": lambda m: m.rollout(Z0[:3], 9, save_every=0),
     "dt < 0": lambda m: m.rollout(Z0[:3], 9, dt=-DT),
-    "another dt": lambda m: m.rollout(Z0[:3], 9, dt=0.2),
     "parameters that it has not": lambda m: m.rollout(Z0[:3], 9, params={"l": 1.0}),
     "the time of no drive": lambda m: m.rollout(Z0[:3], 9, t0=np.zeros(3)),
     "no samples": lambda m: m.sample(KEY, 0),

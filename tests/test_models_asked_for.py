@@ -64,8 +64,6 @@ def test_a_file_of_states(tmp_path):
     ("make", "near"),
     [
         (lambda: gfnn.Hamiltonian(term=["q1"]), "did you mean terms"),
-        (lambda: gfnn.Lagrangian(frictions="none"), "did you mean friction"),
-        (lambda: gfnn.GeneratingFunction(charts="type1"), "did you mean chart"),
         (lambda: gfnn.fit(PAIRS, tolerence=1e-3), "did you mean tolerance"),
     ],
 )
@@ -78,12 +76,8 @@ def test_a_wrong_name_tells_the_nearest(make, near):
     ("data", "options"),
     [
         (PAIRS, {"model": LAW}),
-        (PAIRS, {"friction": "linear"}),
         (PAIRS, {"terms": ["q1"], "chart": "type2"}),
-        (PAIRS, {"model": gfnn.Hamiltonian(), "chart": "type2"}),
-        (PAIRS, {"learn": "hamiltonian", "chart": "type2"}),
         ({"t": T, "x1": X}, {"model": gfnn.Hamiltonian()}),
-        ({"t": T, "x1": X}, {"structure": "ring"}),
         ({"t": T, "x1": X}, {"learn": "map", "loss": object()}),
     ],
 )

@@ -4,11 +4,6 @@ import dataclasses
 import inspect
 import json
 
-import jax
-import numpy as np
-import pytest
-from analytic import rotated
-
 import gfnn_jax as gfnn
 from gfnn_jax import cli_parser
 from gfnn_jax.learn.options import OPTIONS
@@ -45,20 +40,3 @@ def test_a_job_is_identified_by_what_decides_its_model():
     unasked = {"bracket", "hidden"}  # canonical pairs and plain recordings have none
     others = {"max_seconds", "max_operations", "devices", *unasked}
     assert set(FIELDS) - set(options.deciding) == others
-
-
-@pytest.mark.slow
-def test_given_whole_or_by_name():
-    z = np.random.default_rng(0).normal(size=(40, 2))
-    pairs = gfnn.Pairs(z, rotated(z, 0.3), 0.3)
-    asked = gfnn.FitOptions(learn="map", chart="midpoint", tolerance=1e-3)
-    whole = gfnn.fit(pairs, options=asked)
-    changed = gfnn.fit(pairs, options=dataclasses.replace(asked, tolerance=1.0), tolerance=1e-3)
-    assert whole.tolerance == changed.tolerance == 1e-3
-    jax.tree.map(np.testing.assert_array_equal, whole.map, changed.map)
-
-
-@pytest.mark.parametrize("name", ["tolerence", "scalar"])
-def test_a_name_that_is_none(name):
-    with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'"):
-        gfnn.FitOptions(**{name: 1})

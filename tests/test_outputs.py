@@ -121,25 +121,3 @@ def test_a_folder_of_others_is_never_removed(tmp_path):
         with pytest.raises(InputError, match="is no unfinished job"), job(tmp_path, **options):
             pass
     assert (tmp_path / "out.partial" / "thesis.tex").read_text() == "kept"
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_waits_for_the_end_of_a_write(number):
-    before, written = signal.getsignal(number), []
-
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    def write():
-        with outputs.uninterrupted():
-            signal.raise_signal(number)
-            written.append("all of it")
-
-    signal.signal(number, stop)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            write()
-        assert written == ["all of it"]
-        assert signal.getsignal(number) is stop
-    finally:
-        signal.signal(number, before)

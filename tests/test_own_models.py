@@ -185,11 +185,6 @@ def test_a_term_of_a_recording(tmp_path):
         gfnn.export(fit.map, "c", tmp_path / "m.c")
 
 
-def test_few_pairs_are_cross_validated(pairs):
-    fit = gfnn.fit(pairs.take(slice(40)), SCENE, model=own_module.Kicks(), tolerance=2e-2)
-    assert "cross-validation" in fit.stated_by
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

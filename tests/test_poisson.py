@@ -14,7 +14,6 @@ import gfnn_jax as gfnn
 from gfnn_jax import cli, cli_parser
 from gfnn_jax.data.text_files import to_text
 from gfnn_jax.errors import FitError, InputError
-from gfnn_jax.learn.poisson import _told_apart, _without_own_step
 
 
 def pairs_of(data, **more):
@@ -33,10 +32,7 @@ def test_a_heavy_top(heavy_top):
     assert fit.verdict == "identified"
     assert fit.bracket.blocks == ("se3",)
     assert fit.formula == "0.1*z4 + 0.2*z5 + 0.9*z6 + 0.25*z1**2 + 0.3*z2**2 + 0.5*z3**2"
-    assert [c.formula for c in fit.casimirs] == [
-        "z1*z4 + z2*z5 + z3*z6",
-        "z4**2 + z5**2 + z6**2",
-    ]
+    assert [c.formula for c in fit.casimirs] == ["z1*z4 + z2*z5 + z3*z6", "z4**2 + z5**2 + z6**2"]
     states = np.asarray(fit.map.rollout(starts[:4], 500)[0])
     for casimir in fit.casimirs:
         values = casimir(states)
@@ -281,26 +277,6 @@ def test_tops_whose_moment_differs_from_run_to_run(tmp_path, capsys):
     two = np.where(data.run % 2, 1.0, 2.0)
     with pytest.raises(FitError, match=r"has 2 values.*pairs.args\['m'\] == 1\)"):
         gfnn.fit(gfnn.Pairs(data.z0[:, :3], data.z1[:, :3], 0.2, {"m": two}, structure="poisson"))
-
-
-def test_constant_brackets_are_told_apart():
-    """(q1, p1, q2, p2) get their order, (q, v) their masses; states of se(3) without a step their
-    rows."""
-    order = np.array([0, 2, 1, 3])
-    form = gfnn.Bracket.constant(np.kron(np.eye(2), [[0.0, 1.0], [-1.0, 0.0]]))
-    what, command = _told_apart(form)
-    assert what == "(q, p) in another order"
-    pairs = SimpleNamespace(z0=np.arange(8.0).reshape(2, 4), z1=np.zeros((2, 4)), dt=0.1, run=None)
-    told = SimpleNamespace(Pairs=lambda z0, z1, dt, run: z0, fit=lambda z0: z0)
-    assert np.array_equal(eval(command, {"gfnn": told, "pairs": pairs}), pairs.z0[:, order])
-    masses = np.block(
-        [[np.zeros((2, 2)), np.diag([1, 0.5])], [np.diag([-1, -0.5]), np.zeros((2, 2))]]
-    )
-    assert _told_apart(gfnn.Bracket.constant(masses))[0].startswith("(q, v), velocities")
-    found = gfnn.Bracket.from_constants(gfnn.Bracket.se3().constants)
-    z = np.ones((4, 6)) * np.array([[1], [1], [0], [1]])
-    (line,) = _without_own_step(found, gfnn.Pairs(z, z, 0.1, structure="poisson"))
-    assert "in 1 of 4 pairs, rows [2], where se(3) has no step" in line
 
 
 @pytest.mark.slow

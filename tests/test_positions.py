@@ -19,8 +19,6 @@ from gfnn_jax.evaluate.gauge import beside_flow
 from gfnn_jax.families.displacements import OfDisplacement
 from gfnn_jax.families.inputs import box_inputs, variable_signs
 from gfnn_jax.families.products import Products
-from gfnn_jax.jobs.forecast import Ahead, forecast_recording
-from gfnn_jax.jobs.output import Output
 from gfnn_jax.models.positions.discrete_lagrangian import Triples, residuals, solve, triples_of
 from gfnn_jax.models.positions.latent_positions import arcs_of, fit_latent, starting_noise
 
@@ -342,23 +340,6 @@ def test_samples_start_from_the_same_two_positions(of_noisy):
     assert (off < 4 * std[:, 2:]).mean() > 0.9
 
 
-@pytest.mark.slow
-def test_a_forecast_is_compared_with_what_was_read(of_noisy, tmp_path):
-    read = noisy(turns(20, 15, 1), 1e-3, 5)[..., 0]
-    run, turn = np.indices(read.shape)
-    rows = np.stack([run, turn, read], axis=-1)
-    for name, part in (("begun.csv", rows[:, :11]), ("read.csv", rows)):
-        about = {"header": "run,t,theta", "comments": ""}
-        np.savetxt(tmp_path / name, part.reshape(-1, 3), "%.17g", ",", **about)
-    of_noisy.map.save(tmp_path / "model")
-    output, asked = Output(tmp_path / "on.csv"), Ahead(compare=tmp_path / "read.csv")
-    found, _, judged = forecast_recording(tmp_path / "model", tmp_path / "begun.csv", output, asked)
-    assert len(found) == 20
-    rms, _, within = judged.columns["theta"]
-    assert rms < 5e-3
-    assert within > 0.85
-
-
 # The command line
 
 
@@ -388,11 +369,6 @@ def test_positions_in_a_file_are_fitted_and_continued(tmp_path, monkeypatch, cap
     assert cli.main(go_on) == 0
     ahead = np.load("on.npz")["trajectories"][..., 0]
     assert np.abs(nearest_image(ahead - read[:20, 3:], tuple(range(5)))).max() < 1e-11
-    text = Path("begun.csv").read_text(encoding="utf-8").replace("theta", "theta [mrad]")
-    Path("begun.csv").write_text(text, encoding="utf-8")
-    assert cli.main([*go_on, "--overwrite"]) == 2
-    expected = "expected theta in rad, in which the model was learned, got mrad"
-    assert expected in capsys.readouterr().err
 
 
 # What is refused, in a line

@@ -1,14 +1,10 @@
 """`gfnn look` proposes what a table holds, on systems drawn at random, and nothing else."""
 
-import shlex
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import gfnn_jax as gfnn
-from gfnn_jax.cli import main
-from gfnn_jax.cli_parser import column_options, parser
 from gfnn_jax.data.columns import Undecided, first_order
 from gfnn_jax.data.recording_summary import refuse_mistakes
 from gfnn_jax.errors import InputError
@@ -194,29 +190,6 @@ def test_exact_velocities_are_no_differences_and_no_period_is_told_that_is_not_s
     assert found.period is None
     assert found.loss is None
     assert "its period is longer than the runs show" in str(found)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("axes", "options"),
-    [
-        (1, {"coordinates": ("theta",), "observe": {"Gyroscope x": "omega + b"}}),
-        (3, {"structure": "poisson", "states": ("Gyroscope x", "Gyroscope y", "Gyroscope z")}),
-    ],
-)
-def test_rates_of_turning_without_an_angle(tmp_path, capsys, axes, options):
-    rates = [np.cos((k + 1) * T + k) for k in range(axes)]
-    lines = ["t (s)," + ",".join(f"Gyroscope {n} (rad/s)" for n in "xyz"[:axes])]
-    lines += [",".join(f"{x:.6f}" for x in row) for row in zip(T, *rates, strict=True)]
-    (tmp_path / "g.csv").write_text("\n".join(lines) + "\n")
-    figure = str(tmp_path / "g.png")
-    assert main(["look", str(tmp_path / "g.csv"), "--figure", figure]) == 0
-    command = capsys.readouterr().out.split("next: gfnn ")[1].splitlines()[0]
-    if axes == 1:
-        typed = parser().parse_args(shlex.split(command))
-        assert column_options(typed) == options
-    else:
-        assert "--structure poisson --states 'Gyroscope x,Gyroscope y,Gyroscope z'" in command
 
 
 @pytest.mark.parametrize(

@@ -1,19 +1,12 @@
 """Files and tables of Python are read as ``gfnn FILE`` reads them, and hints are Python."""
 
-import ast
-import inspect
-import re
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import gfnn_jax as gfnn
 from gfnn_jax.data.proposed import as_proposed
-from gfnn_jax.data.recording import ReadOptions
 from gfnn_jax.errors import in_python
 from gfnn_jax.learn.fit import as_pairs_or_recording
-from gfnn_jax.learn.options import OPTIONS
 
 T = 0.02 * np.arange(200)
 RATE = np.sin(4.4 * T) + 0.05
@@ -51,32 +44,6 @@ def test_options_of_the_command_line_as_keywords(typed, called):
     assert in_python(typed) == called
 
 
-def options_named(path: Path):
-    """Options that the texts of a module name, but for its docstrings."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    with_body = (ast.Module, ast.ClassDef, ast.FunctionDef)
-    docstrings = {
-        ast.get_docstring(n, clean=False) for n in ast.walk(tree) if isinstance(n, with_body)
-    }
-    texts = (node.value for node in ast.walk(tree) if isinstance(node, ast.Constant))
-    for text in texts:
-        if isinstance(text, str) and text not in docstrings:
-            yield from re.findall(r"--([a-z][a-z-]+)", text)
-
-
-@pytest.mark.slow
-def test_every_option_that_a_message_names_is_a_keyword_of_python():
-    package = Path(gfnn.__file__).parent
-    known = {*ReadOptions.__annotations__, *OPTIONS, *inspect.signature(gfnn.read).parameters}
-    known |= {"overwrite", "scene", "states", "to", "despite", "out"}
-    for room in ("data", "dataset", "diagnosis", "exports", "families", "learn", "maps", "models"):
-        for path in (package / room).rglob("*.py"):
-            for option in options_named(path):
-                name = re.match(r"\w+", in_python(f"--{option}"))
-                assert name is not None
-                assert name[0] in known | {"resume"}, (path.name, option)
-
-
 @pytest.mark.parametrize("library", ["polars", pytest.param("xarray", marks=pytest.mark.slow)])
 def test_tables_of_other_libraries(library):
     module = pytest.importorskip(library)
@@ -87,10 +54,3 @@ def test_tables_of_other_libraries(library):
     recording, _ = as_pairs_or_recording(table)
     np.testing.assert_array_equal(recording.values("x", "0"), RATE)
     np.testing.assert_array_equal(gfnn.read(table).times("0"), T)
-
-
-@pytest.mark.slow
-def test_units_in_the_names_of_a_table():
-    recording = gfnn.Recording({"Time [ms]": 1e3 * T, "angle [deg]": 20 * RATE})
-    np.testing.assert_allclose(recording.times("0"), T)
-    np.testing.assert_allclose(recording.values("angle [deg]", "0"), np.deg2rad(20 * RATE))

@@ -1,18 +1,15 @@
 """Recordings: every way in gives the same numbers back, every mistake in a file has its line."""
 
-import argparse
-
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_array_equal
 
 import gfnn_jax as gfnn
-from gfnn_jax.cli_parser import add_column_options, column_options, names_roles
 from gfnn_jax.data.files import are_recordings
 from gfnn_jax.data.recording import parameters_of
 from gfnn_jax.data.roles import symbols
-from gfnn_jax.errors import InputError, as_typed
+from gfnn_jax.errors import InputError
 from gfnn_jax.models.lagrangians.in_words import about_parameters
 
 T = np.array([0.0, 0.1, 0.25, 0.3, 1.0])
@@ -248,14 +245,6 @@ def test_noise_and_units_follow_the_columns():
     assert recording.factors == {"theta": np.pi / 180, "omega": 1.0}
 
 
-def test_a_recording_is_frozen():
-    recording = gfnn.Recording({"t": T, "x": THETA})
-    with pytest.raises(AttributeError):
-        recording.runs = ()
-    with pytest.raises(ValueError, match="read-only"):
-        recording.values("x", 0)[0] = 1
-
-
 def test_units_stand_in_names_too(tmp_path):
     text = "time_ms,angle_deg\n" + rows(1e3 * T, np.degrees(THETA))
     recording = gfnn.read(write(tmp_path / "r.csv", text))
@@ -354,30 +343,6 @@ def test_rows_by_time_and_every_so_many(tmp_path):
     path = write(tmp_path / "r.csv", "t,x\n" + rows(np.arange(10), np.arange(10)))
     recording = gfnn.read(path, start=2, stop=8, every=2)
     np.testing.assert_array_equal(recording.values("x", 0), [2, 4, 6, 8])
-
-
-def test_options_of_the_command_line_are_keywords_of_read():
-    parser = argparse.ArgumentParser()
-    add_column_options(parser)
-    typed = (
-        "--positions theta1,theta2 --angles theta1 --degrees theta1 --time-unit ms --std "
-        "theta1=0.01 --from 2.0 --every 3"
-    )
-    options = column_options(parser.parse_args(typed.split()))
-    assert options == {
-        "positions": ("theta1", "theta2"),
-        "angles": ("theta1",),
-        "degrees": ("theta1",),
-        "time_unit": "ms",
-        "std": {"theta1": 0.01},
-        "start": 2.0,
-        "every": 3,
-    }
-    assert column_options(parser.parse_args(as_typed(options).split())) == options
-    assert names_roles(options)
-    assert not names_roles(column_options(parser.parse_args(["--angles", "0,2"])))
-    assert column_options(parser.parse_args(["--angles", "0,2"]))["angles"] == (0, 2)
-    assert dict(parser.parse_args(["--mass", "x=2,y=3"]).mass) == {"x": 2.0, "y": 3.0}
 
 
 def test_a_sensor_that_another_name_explains_names_no_velocity():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from analytic import standard_map
 
 import gfnn_jax as gfnn
 from gfnn_jax.learn.refit import refit
@@ -12,19 +13,13 @@ SIGMA = 1e-4
 pytestmark = pytest.mark.slow  # one fit of 3,000 pairs, and its programs
 
 
-def standard(z):
-    theta, p = z.T
-    p = p + 0.6 * np.sin(theta)
-    return np.stack([theta + p, p], axis=1)
-
-
 @pytest.fixture(scope="module")
 def sampled():
     """Noisy pairs of the standard map, those held out, and a fit of a sample of the others."""
     rng = np.random.default_rng(0)
     z = rng.uniform(-1, 1, (3_000, 2))
     noise = SIGMA * rng.standard_normal((2, *z.shape))
-    pairs = gfnn.Pairs(z + noise[0], standard(z) + noise[1], 1.0)
+    pairs = gfnn.Pairs(z + noise[0], standard_map(z, 0.6) + noise[1], 1.0)
     few = pairs.take(slice(200, 500))
     fit = gfnn.fit(few, angles=(0,), tolerance=3e-3, chart="type2")
     return pairs, pairs.take(slice(200)), fit

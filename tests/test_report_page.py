@@ -4,8 +4,6 @@ import dataclasses
 import functools
 import json
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
 
 import numpy as np
@@ -132,22 +130,6 @@ def test_the_simulation_begins_at_its_first_dot_and_names_the_columns():
     assert [slider["label"] for slider in shown["sliders"]] == ["x", "x²", "damping rate"]
 
 
-@pytest.mark.slow
-def test_a_refusal_has_its_page(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    t = np.arange(0.0, 20.0, 0.05)
-    x = np.ones(len(t))  # which moves nowhere
-    with pytest.raises((gfnn.FitError, gfnn.InputError)) as refused:
-        gfnn.discover({"t": t, "x": x}, tmp_path / "o", positions=["x"])
-    text = (tmp_path / "o" / "report.html").read_text(encoding="utf-8")
-    assert str(refused.value)[:40] in text
-    with pytest.raises((gfnn.FitError, gfnn.InputError)):
-        gfnn.discover({"t": t, "x": x}, positions=["x"])
-    assert [path.name for path in tmp_path.iterdir()] == ["o"]  # nothing without out
-    told = json.loads((tmp_path / "o" / "report.json").read_text(encoding="utf-8"))
-    assert (told["verdict"], told["error"]) == ("not fitted", str(refused.value))
-
-
 def test_one_command_writes_the_report(tmp_path, capsys, monkeypatch):
     """The law of two thirds of a file, and what it says of the third that it has not seen."""
     monkeypatch.chdir(tmp_path)
@@ -188,49 +170,3 @@ def test_a_fit_forecasts_plots_and_shows_itself(tmp_path):
     with pytest.raises(ValueError, match="after=gfnn"):
         gfnn.load(tmp_path / "model").forecast(times)
     assert gfnn.load(tmp_path / "model").forecast(times, after=fit.seen).values["x"].shape == (1, 2)
-
-
-@pytest.mark.slow
-def test_forecasts_are_in_the_degrees_of_the_file():
-    t, x = swing(sigma=1e-3)
-    table = {"t": t, "angle": 20 * x}
-    fit = gfnn.fit(gfnn.Recording(table, positions=["angle"], degrees=["angle"]))
-    ahead = fit.forecast(t[-1] + np.array([0.1, 0.2]))
-    (name,) = ahead.values
-    assert ahead.units[name] == "deg"
-    assert 0.5 < np.abs(ahead.values[name]).max() < 30
-
-
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here, in which the page is opened")
-def test_the_page_in_a_browser(tmp_path):
-    """No error in the console; a slider moves the curve and the button brings it back; A4."""
-    moved = """<script>
-        const curve = document.querySelector("#simulation path[fill=none]");
-        const before = curve.getAttribute("d");
-        const slider = document.querySelector("#sliders input");
-        slider.value = slider.max;
-        slider.dispatchEvent(new Event("input"));
-        const after = curve.getAttribute("d");
-        document.getElementById("reset").click();
-        const dots = document.querySelectorAll("#simulation circle").length;
-        document.title = `${before !== after} ${before === curve.getAttribute("d")} ${dots > 9}`;
-    </script></body>"""
-    path = tmp_path / "report.html"
-    path.write_text(page(discovered()).replace("</body>", moved), encoding="utf-8")
-
-    def chromium(*options):
-        fixed = ("--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr")
-        command = [CHROMIUM, *fixed, *options, path.as_uri()]
-        return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-
-    shown = chromium("--virtual-time-budget=3000", "--dump-dom")
-    assert not re.findall(r"CONSOLE.*", shown.stderr)
-    assert "<title>true true true</title>" in shown.stdout
-    chromium(f"--print-to-pdf={tmp_path / 'report.pdf'}")
-    assert (tmp_path / "report.pdf").stat().st_size > 20_000

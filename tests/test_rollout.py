@@ -47,10 +47,6 @@ def test_one_lane_and_saving_every_k():
     assert (info.iterations == 0).all()
 
 
-def test_no_steps_at_all():
-    np.testing.assert_array_equal(OSCILLATOR.rollout(Z, 0)[0][:, 0], Z)
-
-
 @pytest.mark.slow
 def test_blocks_are_the_whole_bit_for_bit():
     learned = map_of(generated(standard, KICK, TYPE2, 1.0), 3 * DISC, coordinates=TORUS)

@@ -7,12 +7,10 @@ import pytest
 from analytic import states_in_motion
 
 import gfnn_jax as gfnn
-from gfnn_jax.dataset.stretches import Nodes, measure, nodes_of, stretches
+from gfnn_jax.dataset.stretches import measure, nodes_of, stretches
 from gfnn_jax.errors import InputError
-from gfnn_jax.models.lagrangians import weak_form
 from gfnn_jax.models.lagrangians import windows as windows_module
 from gfnn_jax.models.lagrangians.recordings import samples_of
-from gfnn_jax.models.lagrangians.starts import best_start
 from gfnn_jax.signals.short_runs import noise_of_one_law
 from gfnn_jax.signals.splines import splines
 
@@ -100,19 +98,6 @@ def test_a_coordinate_that_does_not_show_is_not_taken_for_noise():
     assert noise_of_one_law([(t, x, x[:, :0]) for t, x in runs]) is not None
     apart = [(t + 0.1 * np.sin(7 * t), x, x[:, :0]) for t, x in runs]
     assert noise_of_one_law(apart) is None  # at uneven times
-
-
-def test_all_libraries_of_a_start_share_the_windows(monkeypatch):
-    runs, _ = short_runs_of_a_spring(np.random.default_rng(0), 40)
-    tables = [{"t": t, "x": x[:, 0]} for t, x in runs]
-    problem = samples_of(gfnn.Recording(tables, positions=["x"], angles=[])).problem
-    made, tried = [], []
-    own, rows = Nodes.evenly, weak_form.weak_rows
-    monkeypatch.setattr(Nodes, "evenly", lambda node, *a: made.append(node) or own(node, *a))
-    monkeypatch.setattr(weak_form, "weak_rows", lambda *a: tried.append(a) or rows(*a))
-    best_start(problem)
-    assert len(tried) > 1
-    assert len(made) == len(problem.nodes)
 
 
 def test_windows_of_parts_of_the_nodes_add_up(monkeypatch):

@@ -99,17 +99,6 @@ def test_loads_the_same_bits(name, tmp_path):
     assert models.record(tmp_path / "m") == {"note": "θ"}
 
 
-def test_an_existing_model_is_kept(tmp_path):
-    models.save(a_map(*polynomial()), tmp_path / "m")
-    before = models.digest(tmp_path / "m")
-    other = a_map(*polynomial(degree=3))
-    with pytest.raises(InputError, match="exists already"):
-        models.save(other, tmp_path / "m")
-    assert models.digest(tmp_path / "m") == before
-    models.save(other, tmp_path / "m", overwrite=True)
-    assert models.digest(tmp_path / "m") != before
-
-
 def test_a_scene_of_ones_own(tmp_path):
     """Save and load a map with features of one's own scene, given both times."""
 

@@ -1,15 +1,14 @@
 """The scenes: exact solutions, laws of data, symmetries, orbits that are what they claim."""
 
-import dataclasses
 import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from analytic import kepler
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import brentq
 
 from gfnn_jax import scenes
 from gfnn_jax.coordinates import to_inner, to_user
@@ -21,31 +20,13 @@ from gfnn_jax.scenes.systems import angular_momentum, kepler_energy, kepler_flow
 FLOW = jax.jit(jax.vmap(kepler_flow))
 
 
-def kepler_state(a, e, mean_anomaly):
-    """Textbook oracle: E − e sin E = M by bracketing, periapsis on the positive x axis."""
-    turns = round(mean_anomaly / (2 * math.pi))
-    m = mean_anomaly - 2 * math.pi * turns
-    ecc = brentq(lambda x: x - e * math.sin(x) - m, m - 1, m + 1, xtol=1e-16, rtol=1e-15)
-    b, rate = math.sqrt(1 - e**2), a**-1.5 / (1 - e * math.cos(ecc))
-    return np.array(
-        [
-            a * (math.cos(ecc) - e),
-            a * b * math.sin(ecc),
-            -a * rate * math.sin(ecc),
-            a * b * rate * math.cos(ecc),
-        ]
-    )
-
-
 @given(st.floats(0.1, 10), st.floats(0, 0.95), st.floats(-math.pi, math.pi), st.floats(-20, 20))
 @settings(max_examples=100, deadline=None)
 def test_kepler_flow_is_the_textbook_solution(a, e, mean_anomaly, phase):
-    z0 = kepler_state(a, e, mean_anomaly)
+    z0 = kepler(a, e, mean_anomaly)
     z = np.asarray(FLOW(jnp.array([z0]), jnp.array([phase * a**1.5]))[0])
     scale = np.array([a, a, a**-0.5, a**-0.5]) / (1 - e) ** 2
-    np.testing.assert_array_less(
-        np.abs(z - kepler_state(a, e, mean_anomaly + phase)), 1e-13 * scale
-    )
+    np.testing.assert_array_less(np.abs(z - kepler(a, e, mean_anomaly + phase)), 1e-13 * scale)
 
 
 def test_kepler_flow_on_circles_whole_periods_and_long_times():
@@ -54,7 +35,7 @@ def test_kepler_flow_on_circles_whole_periods_and_long_times():
         exact = [math.cos(t), math.sin(t), -math.sin(t), math.cos(t)]
         atol = 1e-15 * max(1.0, 2 * abs(t))
         np.testing.assert_allclose(FLOW(circle, jnp.array([t]))[0], exact, atol=atol, rtol=0)
-    z0 = jnp.array([kepler_state(1.0, 0.9, 0.3)])
+    z0 = jnp.array([kepler(1.0, 0.9, 0.3)])
     z = FLOW(z0, jnp.array([2 * math.pi * 1000]))
     np.testing.assert_allclose(z, z0, atol=1e-9, rtol=0)
     for invariant in (kepler_energy, angular_momentum):
@@ -286,28 +267,15 @@ def test_the_same_scene_made_twice_has_the_same_functions():
 def test_names_and_mistakes():
     for name in scenes.names():
         assert scenes.make(name).name == name
-        assert "\n" not in scenes.make(name).purpose
     assert scenes.make("two-body", dt=0.25).dt == 0.25
-    assert scenes.make("standard-map-regular", dt=1.0).dt == 1.0
-    with pytest.raises(ValueError, match=r"'two-body'"):
-        scenes.make("twobody")
-    with pytest.raises(ValueError, match=r"'xyz'.*driven-pendulum"):
-        scenes.make("xyz")
-    with pytest.raises(ValueError, match=r"its dt is 1, got 0\.5"):
-        scenes.make("standard-map-chaotic", dt=0.5)
-    with pytest.raises(ValueError, match=r"its dt is 1, got 2"):
-        scenes.make("henon-heiles-section", dt=2.0)
     assert scenes.make("driven-pendulum", dt=4 * math.pi).dt == scenes.driven_pendulum(2).dt
-    for dt in (3.0, 0.1, 6.2832):
-        with pytest.raises(ValueError, match=r"6\.2831853"):
-            scenes.make("driven-pendulum", dt=dt)
-    for dt in (0.0, -1.0, math.nan, math.inf):
-        with pytest.raises(ValueError, match="finite and > 0"):
-            scenes.make("pcr3bp", dt=dt)
-    with pytest.raises(ValueError, match="tolerance"):
-        dataclasses.replace(scenes.two_body(), tolerance=0.0)
-    for energy in (0.0, 0.2, math.nan):
-        with pytest.raises(ValueError, match="energy must be"):
-            scenes.henon_heiles(energy=energy)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        scenes.two_body().dt = 0.2
+    for name, dt, told in (
+        ("twobody", None, "'two-body'"),
+        ("standard-map-chaotic", 0.5, r"its dt is 1, got 0\.5"),
+        ("driven-pendulum", 3.0, r"6\.2831853"),
+        ("pcr3bp", math.nan, "finite and > 0"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            scenes.make(name, dt=dt)
+    with pytest.raises(ValueError, match="energy must be"):
+        scenes.henon_heiles(energy=0.2)

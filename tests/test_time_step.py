@@ -134,9 +134,3 @@ def test_bands_of_samples(learned):
     wrong = stepped(fit.map) - new.z1
     spread = np.sqrt(np.mean(np.var([stepped(m) for m in drawn], axis=0)))
     assert 1 / 3 < np.sqrt(np.mean(wrong**2)) / spread < 3
-
-
-@pytest.mark.parametrize("options", [{"chart": "type2"}, {"family": "sines"}, {"base": "p**2/2"}])
-def test_what_an_s_of_dt_is_not(options):
-    with pytest.raises(gfnn.FitError, match="differ in their dt: expected family 'auto'"):
-        gfnn.fit(sampled(40), learn="map", **options)

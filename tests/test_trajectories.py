@@ -151,15 +151,6 @@ def test_measured_error_of_the_reference():
     assert 0 < tr.reference_error(scenes.standard_map(), start, 100) < 1e-11
 
 
-@pytest.mark.slow
-def test_saving_less_changes_no_state():
-    scene = scenes.henon_heiles()
-    every = tr.reference_trajectories(scene, neighbours(scene), 10)
-    fourth = tr.reference_trajectories(scene, neighbours(scene), 40, save_every=4)
-    assert every.shape == fourth.shape == (3, 11, 4)
-    np.testing.assert_array_equal(every[:, ::4], fourth[:, :3])
-
-
 def test_a_collision_is_nan_and_leaves_the_others_alone():
     """A body released at rest falls into the centre at t = π/√8 ≈ 1.11; NaN stays NaN."""
     scene = integrated("two-body", dt=0.3)
@@ -323,9 +314,3 @@ def test_long_trajectories_go_on_from_call_to_call():
     for _ in range(num_steps):
         path.append(np.asarray(step(path[-1])))
     np.testing.assert_allclose(found, np.stack(path[::2], axis=1), rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_hundred_thousand_pairs_are_finite():
-    pairs = draws.sample_pairs(scenes.pcr3bp(), 100_000, jax.random.key(8))
-    assert np.isfinite(pairs.z1).all()

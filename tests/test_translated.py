@@ -101,17 +101,12 @@ def other(rows, k):
     """Statements that no code stands for, one after another."""
     (
         rows[0] // 3,
-        rows.shape[0] // 3,
         rows.shape[0] // -2,
-        rows.shape[0] // rows.shape[0],
-        rows.shape[0] % 2,
         k**2,
         k or 1,
         rows[-1],
-        rows[0:2],
         rows[0.5],
         max(1, 2, key=abs),
-        sum(rows),
         [k],
         rows + 1,
     )
@@ -124,10 +119,6 @@ def other(rows, k):
         rows[i] = 0.0
     else:
         rows[0] = 1.0
-    while k < 0:
-        k += 1
-    else:
-        k = 0
     k = rows
     LIMIT(k)
     if k > 2:
