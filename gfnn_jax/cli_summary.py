@@ -63,7 +63,7 @@ def print_summary(ran: Any, out: Path) -> None:
     print(f"the search ended: {fit['ended']}")
     rollout = report["rollout"]
     if rollout is not None:
-        errors = ", ".join(f"{e:.1e} at step {n}" for n, e in rollout["error"].items())
+        errors = ", ".join(f"{_number(e)} at step {n}" for n, e in rollout["error"].items())
         print(f"mean position error {errors}")
         if rollout["growth_exponent"] is not None:
             print(f"growth of the error: as steps to the power {rollout['growth_exponent']:.2f}")
@@ -71,6 +71,11 @@ def print_summary(ran: Any, out: Path) -> None:
         print("rollouts: " + ", ".join(f"{n} {name}" for name, n in counts if n))
     print(_holds(ran.fit))
     print(f"written to {out}")
+
+
+def _number(value: float | None, form: str = ".1e") -> str:
+    """A number of a report; a dash where it has none, as after a rollout that does not end."""
+    return "–" if value is None else format(value, form)
 
 
 def _holds(fit: Any) -> str:
@@ -195,9 +200,6 @@ def comparison_table(compared: dict[str, Any]):
     """Make a rich table of a comparison's report, a row per method."""
     from rich.table import Table  # loaded when first used
 
-    def number(value, form=".1e"):
-        return "–" if value is None else format(value, form)
-
     chaotic = any(m["kl"] for m in compared["methods"].values())
     shown = Table(box=None, pad_edge=False)
     heads = ["method", "parameters", "training, s", "µs/step", "one step", "step 100", "step 1000"]
@@ -210,11 +212,11 @@ def comparison_table(compared: dict[str, Any]):
             f"{m['model']['num_parameters']:,}",
             f"{fit['seconds']:.1f}" + (" (cap)" if fit["capped"] else ""),
             f"{rolled['microseconds_per_step']:.2g}",
-            number(fit["validation_rms"]),
-            number(rolled["error"]["100"]),
-            number(rolled["error"]["1000"]),
-            number(rolled["growth_exponent"], ".2f"),
-            number(m["map"]["symplecticity_defect"]),
-            *([", ".join(number(v, ".2g") for v in m["kl"].values())] if chaotic else []),
+            _number(fit["validation_rms"]),
+            _number(rolled["error"]["100"]),
+            _number(rolled["error"]["1000"]),
+            _number(rolled["growth_exponent"], ".2f"),
+            _number(m["map"]["symplecticity_defect"]),
+            *([", ".join(_number(v, ".2g") for v in m["kl"].values())] if chaotic else []),
         )
     return shown

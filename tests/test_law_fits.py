@@ -25,7 +25,7 @@ from gfnn_jax.maps.estimates import Orbits, Window, estimates_of, law_of, propag
 from gfnn_jax.maps.laws import states_of
 from gfnn_jax.models.lagrangians.exchange import with_exchanges
 from gfnn_jax.models.lagrangians.given_terms import given_terms
-from gfnn_jax.models.lagrangians.input_rules import choose_again
+from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_again
 from gfnn_jax.models.lagrangians.libraries import central, textbook
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.rivals import (
