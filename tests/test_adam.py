@@ -12,7 +12,6 @@ import pytest
 from analytic import Network, gradient_data, network_params, steep_pendulum
 
 from gfnn_jax.fitting.adam import (
-    DEFAULT,
     PAPER,
     PAPER_STANDARD_MAP,
     Recipe,
@@ -116,11 +115,11 @@ def test_the_papers_schedule(recipe):
 
 
 def test_the_cosine_rises_and_falls():
-    rates = np.asarray(jax.vmap(lambda k: DEFAULT.rate_at(k, 1000))(np.arange(1000.0)))
-    assert rates.max() == pytest.approx(DEFAULT.rate)
+    rates = np.asarray(jax.vmap(lambda k: SHORT.rate_at(k, 1000))(np.arange(1000.0)))
+    assert rates.max() == pytest.approx(SHORT.rate)
     assert (np.diff(rates[:10]) > 0).all()
     assert (np.diff(rates[10:]) < 0).all()
-    assert rates[-1] < 1e-3 * DEFAULT.rate
+    assert rates[-1] < 1e-3 * SHORT.rate
 
 
 @pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])

@@ -167,10 +167,6 @@ class Ensemble(OfCoefficients, DifferentiatedByJax):
     name = "mlp"
 
     @property
-    def inputs(self):
-        return self.network.inputs
-
-    @property
     def size(self) -> int:
         """Number E of members."""
         return jax.tree.leaves(self.members)[0].shape[0]

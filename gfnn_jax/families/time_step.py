@@ -13,7 +13,6 @@ import numpy as np
 
 from gfnn_jax.arrays import pytree
 from gfnn_jax.families.family import AroundAnother
-from gfnn_jax.families.inputs import Inputs
 from gfnn_jax.families.products import Products
 
 
@@ -39,15 +38,6 @@ class OfTimeStep(AroundAnother):
     def degree(self) -> int:
         """Total degree in w and dt²."""
         return self.products.degree
-
-    @property
-    def signs(self) -> tuple[int, ...] | None:
-        return self.products.signs
-
-    @property
-    def inputs(self) -> Inputs:
-        """Inputs of w and dt²."""
-        return self.products.inputs
 
     def terms_of(self, degree: int) -> int:
         """Number of parameters of the same family of another degree."""

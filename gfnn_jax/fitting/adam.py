@@ -77,8 +77,6 @@ SCHEDULES: dict[str, Callable] = {"staircase": _staircase, "cosine": _cosine}
 # Paper, Experimental Details; for 100,000 pairs, and for the standard map's 1,000,000.
 PAPER = Recipe(batch_size=200, epochs=20, rate=0.01, schedule="staircase")
 PAPER_STANDARD_MAP = dataclasses.replace(PAPER, batch_size=1000, rate=0.001)
-# As many iterations whatever the number of pairs.
-DEFAULT = Recipe(batch_size=200, epochs=160, rate=0.02, schedule="cosine", epoch_length=500)
 
 
 class AdamFit(NamedTuple):

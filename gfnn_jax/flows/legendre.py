@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from gfnn_jax.arrays import namespace, pytree
+from gfnn_jax.families.family import OfCoefficients
 from gfnn_jax.families.friction import Friction
 from gfnn_jax.families.lagrangian import Derivatives, Lagrangian, Terms
 from gfnn_jax.families.text import shown
@@ -26,7 +27,7 @@ from gfnn_jax.solve.linear import small_solve
 
 
 @pytree()
-class Legendre:
+class Legendre(OfCoefficients):
     """H of L = Σ θ_j ℓ_j; params are θ (P,), ``terms`` the ℓ_j. H is not linear in θ. Where terms
     have inputs these are the args (..., inputs), as `flows.forces.Forced` gives them."""
 
@@ -64,21 +65,10 @@ class Legendre:
         gradient = count * (20 + 6 * d + 2 * d * d) + d**3
         return gradient, 2 * gradient + 6 * d**3
 
-    def unflatten(self, coefficients):
-        """The parameters are the coefficients (P,) themselves."""
-        return coefficients
-
-    def __call__(self, params, w, args=None):
-        return self.value(params, w, args)
-
     def velocity(self, params, w):
         """v (..., d) at states w = (q, p)."""
         law, (q, p) = self._law(params), split(w)
         return small_solve(law.masses(q), p - law.momentum(q, namespace(q).zeros_like(q)))
-
-    def state(self, params, q, v):
-        """z = (q, p) (..., 2d) of positions and velocities (..., d)."""
-        return namespace(q, v).concatenate([q, self._law(params).momentum(q, v)], axis=-1)
 
     def value(self, params, w, args=None):
         """H, shape (...): the energy v·∂L/∂v − L."""
