@@ -81,10 +81,6 @@ class NetworkSweep(Generates):
         """Infinite: a network is not trained anew."""
         return np.inf
 
-    def predicted(self, size: Size, others: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Raise NotImplementedError: a network is not trained anew."""
-        raise NotImplementedError
-
     def posterior(self, size: Size) -> Callable[[], np.ndarray] | None:
         """Return None: one network does not tell how well it is determined."""
         return None
