@@ -20,7 +20,6 @@ from gfnn_jax.errors import FitError
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.fitting.triangle import Spectrum
 from gfnn_jax.models.brackets.arcs import arcs_of, equal_arcs, fit_arcs, lagged
-from gfnn_jax.models.brackets.atoms import with_shapes
 from gfnn_jax.models.brackets.beside import NOTHING, Beside
 from gfnn_jax.models.brackets.fields import (
     Field,
@@ -41,7 +40,7 @@ from gfnn_jax.models.brackets.null_space import (
     null_spaces,
     shrinking,
 )
-from gfnn_jax.models.brackets.poisson_field import PoissonField, hamiltonian_of
+from gfnn_jax.models.brackets.poisson_field import PoissonField, hamiltonian_of, with_shapes
 from gfnn_jax.phase_space import sizes
 from gfnn_jax.signals.noise import noise
 
