@@ -14,7 +14,10 @@ from scipy.integrate import solve_ivp
 import gfnn_jax as gfnn
 from gfnn_jax.dataset.stretches import measure, stretches
 from gfnn_jax.exports.symbolic import Formula
+from gfnn_jax.models.lagrangians.in_words import _trend
 from gfnn_jax.models.lagrangians.nature import _jumps, nature
+from gfnn_jax.models.lagrangians.recordings import samples_of
+from gfnn_jax.models.lagrangians.structure import Structure
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
 from certificates import NOISES
@@ -54,6 +57,32 @@ def test_friction_that_is_not_seen_leaves_the_stiffness_open():
     fit = gfnn.fit(t, x + 0.01 * x.std() * np.random.default_rng(0).normal(size=200))
     assert not fit.which_friction.kinds
     assert fit.verdict.startswith("one of several")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_creeps_back_is_not_identified_as_drag(seed):
+    """An overdamped spring: of its slow part x = e^−λt drag alone, ẍ = −λ ẋ, leaves as little as
+    any spring with the friction that suits it."""
+    rng = np.random.default_rng([5, seed])
+    omega, zeta = 10 ** rng.uniform(-0.5, 1), rng.uniform(4, 8)
+    stiffness, drag = omega**2, 2 * zeta * omega
+    t = np.linspace(0, rng.uniform(2, 5) * drag / stiffness, 250)
+    x = motion(lambda q, v: -stiffness * q - drag * v, [1.0, 0.0], t)[0]
+    fit = gfnn.fit(t, x + 1e-3 * x.std() * rng.normal(size=250))
+    found = {term.term: term.coefficient for term in fit.lagrangian.terms}
+    right = found.get("x1**2", 0.0) == pytest.approx(-stiffness / 2, rel=0.1)
+    assert right or not fit.verdict.startswith("identified")
+
+
+def test_a_law_without_a_constant_mass_is_asked_for_no_trend_of_its_constant_terms():
+    """ẍ of ½ x² ẋ² − x⁴: it ended in an error."""
+    t = np.linspace(0, 5, 200)
+    x = 2 + np.cos(t) + 1e-3 * np.random.default_rng(0).normal(size=200)
+    problem = samples_of(gfnn.Recording({"t": t, "x": x}, positions=["x"])).problem
+    none = (0,)
+    structure = Structure(1, (((2,), (2,), none, 0.0), (none, (4,), none, 0.0)))
+    fit = problem.fit(structure, {}, problem.arcs(0.5), problem.scales.sigma)
+    assert isinstance(_trend(fit, True), dict)
 
 
 @pytest.mark.slow

@@ -295,8 +295,8 @@ def _trend(fit: LawFit, flawed: bool) -> dict[str, str]:
     textbook = libraries.textbook(structure.dim, problem.angles)
     for rubs, rows in product((False, True)[: 1 + flawed], map(tuple, (textbook, constant))):
         fewer, own = len(rows) + 1 < len(structure.terms), {*rows} == {*structure.terms}
-        if not (fewer or own or flawed) or problem.parameters:
-            continue
+        if not (fewer or own or flawed) or problem.parameters or max(rows[0][0]) < 2:
+            continue  # of masses that all depend on position nothing constant is left
         plain = Structure(structure.dim, rows, structure.friction, (), structure.num_inputs)
         with contextlib.suppress(FitError):
             found = trend(plain, problem, rubs)

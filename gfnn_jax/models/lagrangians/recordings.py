@@ -78,7 +78,7 @@ from gfnn_jax.models.lagrangians.rivals import (
     constants,
     of_a_sensor,
     other_powers,
-    unseen_friction,
+    unseen,
 )
 from gfnn_jax.models.lagrangians.search import (
     SearchResult,
@@ -301,7 +301,9 @@ def fit_recording(
             coloured = [one for one in law.whiteness.values() if law.flaws and not one.white]
             over = [one.smoothed_over(data.problem.scales.period) for one in coloured]
             sensor, explained = of_a_sensor(best.fit, any(over) and all(over))
-            rival = law.rival or sensor or _other_shapes(best.fit) or unseen_friction(best.fit)
+            rival = law.rival or sensor
+            if not rival:
+                rival = "; ".join(filter(None, (unseen(best.fit), _other_shapes(best.fit))))
             law = dataclasses.replace(law, rival=rival, nature=sensor, messages=messages)
             law = law if law.flaws else _with_rivals(law, recording, data, best.fit)
     except (FitError, np.linalg.LinAlgError):

@@ -39,6 +39,7 @@ from gfnn_jax.models.lagrangians.libraries import (
     SHAPES,
     central,
     losses,
+    potentials,
     shaped,
     springs,
     textbook,
@@ -59,7 +60,8 @@ class RivalOptions:
     fades: of a speed's rms, between which Stribeck's friction does; speeds: tried between these;
     as_fast: relative, within which it is found. clearly: of Schwarz's
     criterion, that a sensor gains where a law leaves more; explains: of what that law leaves, the
-    share that the one beside the sensor may leave, where it is no noise.
+    share that the one beside the sensor may leave, where it is no noise. much: of a coefficient,
+    that a spring which is not seen would have to move; told: times it, up to which that is told.
     """
 
     most: int = 4
@@ -75,6 +77,8 @@ class RivalOptions:
     fades: tuple[float, ...] = (0.01, 0.025, 0.06, 0.15, 0.37, 0.9)
     clearly: float = 10.0
     explains: float = 0.5
+    much: float = 0.5
+    told: float = 10.0
 
 
 OPTIONS = RivalOptions()
@@ -297,34 +301,51 @@ def other_powers(fit: LawFit, coordinates: Sequence[str]) -> str:
     )
 
 
-def unseen_friction(fit: LawFit) -> str:
-    """A line where linear friction, of which a record shows none, would move a coefficient by what
-    is significant if it were as large as two standard errors allow, "" elsewhere: what grows from
-    near rest in one second tells a stiffness by itself as little as friction."""
-    if fit.structure.friction or fit.problem.parameters:
+def unseen(fit: LawFit) -> str:
+    """A line where what a record does not show would move a coefficient by what is significant if
+    it were as large as two standard errors allow, "" elsewhere: linear friction, for what grows
+    from near rest in one second tells a stiffness by itself as little as friction; and beside
+    friction a spring about any place, for what creeps back to it follows laws of a whole family,
+    and drag is one of them."""
+    structure, d = fit.structure, fit.problem.dim
+    if fit.problem.parameters or not fit.follows:
         return ""
-    own, least, lines = fit.values, fit.problem.options.evidence.significant, []
+    if not structure.friction:
+        rubs = [[("loss", row)] for row in losses(d, (LINEAR,), 0.0)[:d]]
+        return _moving("no friction is seen, but", rubs, fit, 0.0)
+    held = [any(row[1][i] > 1 or shape_of(row) for row in structure.terms) for i in range(d)]
+    free = [i for i in fit.problem.lengths if not held[i]]
+    pulls = [[("term", row) for row in potentials(d, [i], 2, 1)] for i in free]
+    return _moving("no spring is seen, but", pulls, fit, OPTIONS.much)
+
+
+def _moving(what: str, each: Sequence[list[Key]], fit: LawFit, least: float) -> str:
+    """A line on what those of ``each`` that is not seen, the first of it as large as the record
+    allows, would move by more than its error, and this share of itself, at ``least``."""
+    own, significant, lines = fit.values, fit.problem.options.evidence.significant, []
     errors = dict(zip(fit.structure.keys(), fit.linearised.errors.tolist(), strict=True))
-    for row in losses(fit.problem.dim, (LINEAR,), 0.0)[: fit.problem.dim]:
-        larger = fit.structure.plus([("loss", row)])
+    for new in each:
+        larger = fit.structure.plus(new)
         near, keys = fit.problem.linearised(larger, fit), larger.keys()
-        at = keys.index(("loss", row))
-        most = float((near.p + near.step())[at] + 2 * near.errors[at])
+        at, rubs = keys.index(new[0]), new[0][0] == "loss"
+        size, error = (float(part[at]) for part in (near.p + near.step(), near.errors))
+        most = size + 2 * error if rubs else abs(size) + 2 * error
         with np.errstate(all="ignore"):  # of what is not determined at all
             moved = most * near.covariance[at] / near.covariance[at, at]
+        null = near.null_space()
+        moved[np.any(null[null[:, at] != 0] != 0, axis=0)] = np.inf
         far = {
             key: abs(float(change) / own[key])
             for key, change in zip(keys, moved, strict=True)
-            if key[0] == "term" and abs(change) > least * errors[key] and most > 0
+            if key in errors and key[0] in ("term", "loss") and most > 0
+            if abs(change) > max(significant * errors[key], least * abs(own[key]))
         }
         if far:
-            word, rubs = (
-                fit.problem.word(key) for key in (max(far, key=far.__getitem__), keys[at])
-            )
-            lines.append(
-                f"{rubs} as large as the record allows moves {word} by {max(far.values()):.2g}"
-            )
-    return f"no friction is seen, but {'; '.join(lines)} of itself" if lines else ""
+            word, other = (fit.problem.word(k) for k in (max(far, key=far.__getitem__), new[0]))
+            by, most = max(far.values()), OPTIONS.told
+            share = f"{by:.2g} of itself" if by < most else f"more than {most:g} times itself"
+            lines.append(f"{other} as large as the record allows moves {word} by {share}")
+    return f"{what} {'; '.join(lines)}" if lines else ""
 
 
 def of_a_sensor(fit: LawFit, smoothed: bool = False) -> tuple[str, bool]:
