@@ -120,6 +120,16 @@ def test_a_law_beyond_the_textbook(name):
         assert fit.map.coordinates.angles == ()
 
 
+@pytest.mark.parametrize("hold", [{"x1": -4.0}, {"x1": 6.0, "x1**2": -3.0}])
+def test_a_body_in_a_plane_by_its_distance_and_its_direction(hold):
+    def acceleration(q, v):
+        pull = hold["x1"] + 2 * hold.get("x1**2", 0.0) * q[0]
+        return np.array([q[0] * v[1] ** 2 + pull, -2 * v[0] * v[1] / q[0]])
+
+    fit = gfnn.fit(recorded(acceleration, [1.0, 0.0, 0.1, 1.2], 25, 600, ["x2"]))
+    within_errors(fit.lagrangian, {"v1**2": 0.5, "v2**2*x1**2": 0.5, **hold})
+
+
 @pytest.mark.slow
 def test_a_body_in_a_bowl_has_the_inertia_of_its_surface():
     bend = np.array([0.4, 1.1])

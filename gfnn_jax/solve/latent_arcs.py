@@ -19,9 +19,10 @@ units of the noise through a robust loss (`solve.noise`). The noise may be estim
 Where it is not white, a *whitening* (`solve.noise`) mixes residuals along an arc into white ones.
 
 Where the least residuals lie in a canyon that bends, as of coefficients that act on what nothing
-shows, a straight step soon leaves it. A step of a *curved* fit bends as it does: δ + ½ a, a the
-acceleration that keeps the linearised residuals (geodesic acceleration: Transtrum & Sethna,
-arXiv:1207.4999). It needs one further evaluation, without derivatives.
+shows, or of masses that phases alone tell apart, a straight step soon leaves it, and brings less
+than it promised. From then on steps bend as the canyon does: δ + ½ a, a the acceleration that keeps
+the linearised residuals (geodesic acceleration: Transtrum & Sethna, arXiv:1207.4999). Each needs
+one further evaluation, without derivatives.
 """
 
 from __future__ import annotations
@@ -136,7 +137,7 @@ class Following(Protocol):
 
 @runtime_checkable
 class Stepping(Model, Protocol):
-    """A model whose defects can be told without their derivatives, as a curved fit asks."""
+    """A model whose defects can be told without their derivatives, as steps that bend ask."""
 
     def closing(self, p: np.ndarray, x: np.ndarray) -> np.ndarray:
         """c_n (A, L − 1, m) of states x (A, L, m)."""
@@ -162,6 +163,8 @@ class Options:
     # times the defects of an arc that stays, at the most, by a step of the coefficients
     grown: float = 2.0
     block_bytes: int = 64 * 2**20  # of the sensitivities of a block of arcs
+    determined: float = 1e-6  # least singular value, of columns of norm 1, of a direction that is
+    short: float = 0.5  # of the decrease that was promised: below, steps are bent
     probed: float = 0.1  # of a step, over which its curvature is told
     bent: float = 1.5  # times a step, that its acceleration may be: Transtrum and Sethna's 2 · ¾
 
@@ -224,7 +227,6 @@ class Readings:
 
     y: NaN where nothing was measured. sigma: (k,) or (A, L, k), their noise. loss: of residuals in
     units of it. whitening: (A, k, L, L) of these residuals, by channel; None: they are white.
-    curved: steps of coefficients bend, of a `Stepping` model.
     """
 
     model: Model | Known
@@ -232,7 +234,6 @@ class Readings:
     sigma: np.ndarray
     loss: Loss = SOFT_L1
     whitening: np.ndarray | None = None
-    curved: bool = False
 
     def fit(
         self,
@@ -248,7 +249,7 @@ class Readings:
 
         ``state_scale`` (m,) is the defect that counts as one standard deviation. While defects
         matter, an iteration has to close them; then it has to lower the cost. Ends where it lowers
-        it by less than ``tolerance`` of itself. The cost is infinite where the defects could not be
+        it by less than ``tolerance`` of itself, and a whole step promises no more. The cost is infinite where the defects could not be
         closed.
 
         least: (k,) what of the residuals is no noise; sigma is then where the noise starts from,
@@ -256,8 +257,8 @@ class Readings:
         is known.
         """
         measured = np.isfinite(self.y)
-        known, curved = np.where(measured, self.y, 0.0), self.curved and len(p) > 0
-        data = _Data(self.model, measured, known, least, tolerance, curved)
+        known = np.where(measured, self.y, 0.0)
+        data = _Data(self.model, measured, known, least, tolerance)
         here = data.at(p, x, _Units(self.sigma, state_scale, self.loss, self.whitening))
         start = _AtStates(data, here, here, np.arange(len(x)))
         if not np.isfinite(here.cost):
@@ -302,8 +303,7 @@ class _Data(NamedTuple):
     """Data that arcs are fitted to.
 
     measured, known: which of y (A, L, k) was measured, and y, 0 where it was not. least: what of
-    the residuals is no noise; None: the noise is known. tolerance: of the cost. curved: whether
-    steps bend.
+    the residuals is no noise; None: the noise is known. tolerance: of the cost.
     """
 
     model: Model | Known
@@ -311,7 +311,6 @@ class _Data(NamedTuple):
     known: np.ndarray
     least: np.ndarray | None
     tolerance: float
-    curved: bool
 
     def at(self, p: np.ndarray, x: np.ndarray, units: _Units) -> _Iterate:
         """The residuals and defects of coefficients p and states x."""
@@ -368,13 +367,16 @@ class _AtStates:
     """The problem of all arcs where a descent stands, the best iterate that it came by, and which
     arcs are ``moving`` (indices): of those that share nothing, the ones that have not settled.
 
-    While defects matter a step has to close them; then it has to lower the cost.
+    While defects matter a step has to close them; then it has to lower the cost. Once a step has
+    brought much less than the linear problem promised, steps are bent along the valley
+    (``bends``), where the model is a `Stepping` one.
     """
 
     data: _Data
     here: _Iterate
     best: _Iterate
     moving: np.ndarray
+    bends: bool = False
 
     @property
     def _apart(self) -> bool:
@@ -398,7 +400,7 @@ class _AtStates:
         if not np.isfinite(self._rows.factor).all():  # derivatives along an arc have overflowed
             return Tried(here, -np.inf, damping, hopeless=True)
         dp, dx = _solve(self._rows, here.defects, damping)
-        if self.data.curved and self.closed(here):
+        if self.bends and self.closed(here):
             return self._curved(dp, dx, damping)
         there = self.data.at(here.p + share * dp, here.x + share * dx, here.units)
         decrease = self._decrease(there, share, np.zeros(len(here.x), bool))
@@ -504,8 +506,21 @@ class _AtStates:
             settled &= bool(np.allclose(here.units.sigma, sigma, rtol=OPTIONS.settled, atol=0))
         elif self.closed(here) and (not self.closed(best) or here.merit < best.merit):
             best = here
-        settled |= not np.isfinite(here.cost)
-        return dataclasses.replace(self, here=here, best=best), settled
+        short = before.merit - there.merit < OPTIONS.short * self.promised
+        bends = short and self.closed(before) and isinstance(self.data.model, Stepping)
+        after = dataclasses.replace(self, here=here, best=best, bends=self.bends or bends)
+        settled = settled and after.promised <= self.data.tolerance * here.cost
+        return after, settled or not np.isfinite(here.cost)
+
+    @property
+    def promised(self) -> float:
+        """Decrease of the cost by a whole step of what is determined, if residuals and defects were
+        linear: a short step in a narrow valley lowers it by little."""
+        R, n = self._rows.factor, len(self.here.p)
+        if not n or not np.isfinite(R).all():
+            return 0.0
+        U, sizes, _ = np.linalg.svd(R[:, :n] / _sizes(R[:, :n]))
+        return 0.5 * float(np.sum((U[:, :n].T @ R[:, n])[sizes > OPTIONS.determined] ** 2))
 
     def fitted(self, iterations: int, converged: bool) -> Fitted:
         """The fit that ends here."""
@@ -720,14 +735,19 @@ def _linearised(at: _Iterate, block: slice | np.ndarray) -> tuple[np.ndarray, np
     return J.reshape(num_arcs, length * k, -1), S[:, -1]
 
 
+def _sizes(columns: np.ndarray) -> np.ndarray:
+    """Norms of columns, 1 of a column of zeros."""
+    sizes = np.linalg.norm(columns, axis=0)
+    return np.where(sizes > 0, sizes, 1.0)
+
+
 def _solve(rows: _Rows, defects: Defects, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """δp (n,) and δx (A, L, m), with Levenberg and Marquardt's damping of δp."""
     m, R = rows.arcs.shape[1], rows.factor
     n = R.shape[1] - 1
     dp = np.zeros(n)
     if n:
-        scale = np.linalg.norm(R[:, :n], axis=0)
-        scale = np.where(scale > 0, scale, 1.0)
+        scale = _sizes(R[:, :n])
         matrix = np.concatenate([R[:, :n] / scale, np.sqrt(damping) * np.eye(n)])
         target = np.concatenate([R[:, n], np.zeros(n)])
         dp = np.linalg.lstsq(matrix, target, rcond=1e-13)[0] / scale

@@ -386,8 +386,7 @@ class ArcProblem:
     def readings(self, law: LawOnArcs, arcs: Arcs, sigma: np.ndarray) -> Readings:
         """The readings of arcs, beside a law on them."""
         noise, loss = sigma * arcs.noise, self.observation.loss
-        curved = self.observation.hidden is not None
-        return Readings(law, arcs.y, noise, loss, self.whitening(arcs), curved)
+        return Readings(law, arcs.y, noise, loss, self.whitening(arcs))
 
     def state_scale(self, sigma: np.ndarray) -> np.ndarray:
         """The defect (2d,) that counts as one standard deviation of the channels."""

@@ -187,6 +187,18 @@ def spun(dim: int, angles: tuple[int, ...]) -> list[Row]:
     return [*textbook(dim, angles), *(row for row in spins if row[0] != row[2])]
 
 
+def polar(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """The textbook's terms, and v_j² q_i² of lengths and angles, 1/q_i, q_i cos q_j: a body in a
+    plane, by its distance and its direction, where springs, a weight or gravity pull at it."""
+    none, lengths = (0,) * dim, _lengths(dim, angles)
+    rows = textbook(dim, angles)
+    for i in lengths if angles else []:
+        rows += [(unit(dim, j, j), unit(dim, i, i), none, 0.0) for j in angles]
+        rows += [(none, unit(dim, i), unit(dim, j), 0.0) for j in angles]
+        rows.append((none, none, none, 0.0, f"1/q{i + 1}"))
+    return rows
+
+
 def on_a_surface(dim: int, angles: tuple[int, ...]) -> list[Row]:
     """The textbook's terms, and v_i v_j q_i q_j of lengths: a body on a surface whose height is of
     degree 2 in them moves up and down too."""

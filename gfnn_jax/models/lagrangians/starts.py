@@ -130,6 +130,8 @@ def best_start(problem: ArcProblem) -> LawFit:
         some.add(_Library(libraries.uncoupled(d, angles), apart=True))
     some.add_richer([*textbook.rows, *pulls], 1)
     some.add_richer(libraries.spun(d, angles), 1)
+    if 0 < len(angles) < d and not some.are_noise:
+        some.add(_Library(libraries.polar(d, angles), 1, apart=True, equal=True))
     if not (many and some.are_noise):
         some.add(_Library(first, 2))
     some.add_central(textbook.rows, 3, across=False)

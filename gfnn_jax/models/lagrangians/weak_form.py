@@ -77,6 +77,15 @@ def protected(structure: Structure, others: bool = False) -> set[Key]:
     return {("term", row) for row in alone if is_constant(row)}
 
 
+def _of_bodies(structure: Structure) -> set[Key]:
+    """The masses that are equal where each coordinate is that of a body: the constant ones, and
+    those of angles v_j² q_i², at distances q_i."""
+    far = {row for row in structure.terms if max(row[0]) == sum(row[1]) == max(row[1]) == 2}
+    turned = {row[0] for row in far}
+    constant = {key for key in protected(structure) if key[1][0] not in turned}
+    return constant | {("term", row) for row in far if row[0] != row[1] and not any(row[2])}
+
+
 class _Equations(NamedTuple):
     """X (windows, d, n) c = Y (windows, d) of coefficients ``keys``, of which ``keep`` (indices)
     act and ``masses`` are ½; t (windows,) where their windows are."""
@@ -101,7 +110,7 @@ class _Equations(NamedTuple):
             X[held], Y[held] = 0.0, 0.0  # held by any force up to that of sliding
         keys = structure.keys()[: form.count]
         keep = [k for k in range(form.count) if np.any(X[..., k])]
-        masses = [k for k in keep if equal and keys[k] in protected(structure)]
+        masses = [k for k in keep if equal and keys[k] in _of_bodies(structure)]
         keep = [k for k in keep if k not in masses]
         Y = Y - 0.5 * X[..., masses].sum(axis=-1)
         return cls(keys, X, Y, keep, masses, windows.mean(windows.t))
