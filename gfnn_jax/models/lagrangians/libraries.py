@@ -292,6 +292,12 @@ def every(dim: int, angles: tuple[int, ...]) -> list[Row]:
     return list(dict.fromkeys(rows))
 
 
+def forces(dim: int, angles: tuple[int, ...]) -> list[Row]:
+    """All potentials and fields that a search may come to, with the masses of the first library."""
+    plain = first(dim, angles)
+    return [row for row in every(dim, angles) if sum(row[0]) < 2 or row in plain]
+
+
 def without_forces(rows: Sequence[Row], axes: Sequence[int]) -> tuple[Row, ...]:
     """The rows without constant forces along these axes, whose zero is where the force is none."""
     forces = potentials(len(rows[0][0]), axes, 1)

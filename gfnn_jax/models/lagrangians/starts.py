@@ -156,7 +156,7 @@ def best_start(problem: ArcProblem) -> LawFit:
         some.add(_Library(libraries.uncoupled(d, angles), apart=True))
         some.add(_Library(libraries.bodies(d, angles), 2, apart=True))
     some.add_central(textbook.rows, 4, across=True)
-    some.add_richer([row for row in every if sum(row[0]) < 2 or row in first], 5)
+    some.add_richer(libraries.forces(d, angles), 5)
     some.add_richer(every, 6)
     # Coordinates that drive others and are not moved by them: a cart whose motor holds its course.
     led = _Library([*first, *libraries.couplings(d, angles)], 7, apart=True)
@@ -399,8 +399,10 @@ class _Starts:
         self.add(_Library(min(found, key=share), 4, apart=True, equal=True), zero)
 
     def plainest(self) -> LawFit:
-        """The plainest of those that leave little more than the best."""
+        """The plainest of those that leave little more than the best; noise, where that does."""
         most = OPTIONS.plain * self.least
+        if self.are_noise:
+            most = min(most, OPTIONS.noise)
         ranked = zip(self.ranks, self.fits, strict=True)
         near = [(rank, misfit(fit), fit) for rank, fit in ranked if misfit(fit) <= most]
         return min(near, key=lambda one: one[:2])[2]
@@ -425,6 +427,9 @@ class _Starts:
             for degree in (3, 4):
                 self.add_bodies(degree, always=True)
             self.add_two_powers()
+            d, angles = self.problem.dim, self.problem.angles
+            if d <= libraries.FEW and not self.one_valued:
+                self.add(_Library(libraries.forces(d, angles), 5, apart=True, equal=not angles))
             if len(self.fits) > count:
                 return self.best_along(taken)
         above = _criteria(longer)
