@@ -244,6 +244,16 @@ def test_a_foucault_pendulum_has_its_field_and_its_hamiltonian():
     assert float(fit.hamiltonian.sympy().subs(at)) == pytest.approx(float(H.subs(at)), rel=2e-3)
 
 
+def test_one_energy_does_not_tell_a_mass_from_a_potential_of_many_terms():
+    def acceleration(q, v):  # M = 1 + (ax² − 1)², as of a bead on a wire; V = −b (ax³/3 − x + cx²)
+        a, b, c = 1.11, 9.81, 0.7
+        mass, slope = 1 + (a * q**2 - 1) ** 2, 4 * a * q * (a * q**2 - 1)
+        return (-b * (a * q**2 - 1 + 2 * c * q) - 0.5 * slope * v**2) / mass
+
+    fit = gfnn.fit(recorded(acceleration, [0.308, 0.0], 30, 900))
+    assert fit.verdict != "identified"
+
+
 @pytest.mark.slow
 def test_a_bead_on_a_wire_has_a_mass_that_depends_on_its_place():
     """y = ½ x²: L = ½ (1 + x²) v² − ½ x²."""

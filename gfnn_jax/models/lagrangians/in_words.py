@@ -54,7 +54,8 @@ class WarningOptions:
     have beside the noise, above which they are such motion too. complete: %, above which what is
     left is no energy that is gained. alike: correlation of two coefficients that the record cannot
     tell apart. energies: range of the energy, as a share of the largest kinetic one,
-    below which a motion of one coordinate shows M and V together only. hides: noise of an angle, in
+    below which a motion of one coordinate shows M and V together only; series: potentials, from
+    which on a constant mass is hardly plainer than one that depends on position. hides: noise of an angle, in
     radians, above which other laws follow the record as well. lost: of the spread, by which half of
     the forecasts of held-out parts err, however short, of a law that fits its own record alone; of
     half of it is noise that hides other laws. left, left_rubbing: of the squares of what a law
@@ -67,6 +68,7 @@ class WarningOptions:
     beyond: float = 1.5
     missed: float = 0.02
     energies: float = 0.1
+    series: int = 4
     nearly: float = 99.99
     complete: float = 99.999
     alike: float = 0.99
@@ -394,10 +396,12 @@ def _alike(fit: LawFit, lagrangian: Formula, friction: Formula) -> tuple[str, ..
 
 
 def _is_of_one_energy(fit: LawFit) -> bool:
-    """Return whether the states of a law of one coordinate with masses M(q) have one energy, so
-    that any M with some V gives the same speed at each position."""
+    """Return whether the states of a law of one coordinate have one energy, so that any M with some
+    V gives the same speed at each position, and a constant mass is no plain choice."""
     masses = [row for row in fit.structure.terms if row[0] == (2,)]
-    if fit.form.dim > 1 or all(is_constant(row) for row in masses):
+    potentials = [row for row in fit.structure.terms if not any(row[0])]
+    plain = all(map(is_constant, masses)) and len(potentials) < OPTIONS.series
+    if fit.form.dim > 1 or plain:
         return False
     law = fit.form.lagrangian(fit.p[: fit.form.count]).at(fit.problem.args)
     q, v = np.split(fit.problem.states, 2, axis=1)
