@@ -249,8 +249,8 @@ class Readings:
 
         ``state_scale`` (m,) is the defect that counts as one standard deviation. While defects
         matter, an iteration has to close them; then it has to lower the cost. Ends where it lowers
-        it by less than ``tolerance`` of itself, and a whole step promises no more. The cost is infinite where the defects could not be
-        closed.
+        it by less than ``tolerance`` of itself, and a whole step promises no more. The cost is
+        infinite where the defects could not be closed.
 
         least: (k,) what of the residuals is no noise; sigma is then where the noise starts from,
         and is estimated by every iteration, of (A, L, k) one factor for each of the k. None: sigma
