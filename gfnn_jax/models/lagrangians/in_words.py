@@ -53,9 +53,9 @@ class WarningOptions:
     there they may be a series that a library ends. missed: of the spread, what correlated residuals
     have beside the noise, above which they are such motion too. complete: %, above which what is
     left is no energy that is gained. alike: correlation of two coefficients that the record cannot
-    tell apart. energies: range of the energy, as a share of the largest kinetic one,
-    below which a motion of one coordinate shows M and V together only; series: potentials, from
-    which on a constant mass is hardly plainer than one that depends on position. hides: noise of an angle, in
+    tell apart. energies: range of the energy, as a share of the largest kinetic one, below which a
+    motion of one coordinate shows M and V together only; series: potentials, from which on a
+    constant mass is hardly plainer than one that depends on position. hides: noise of an angle, in
     radians, above which other laws follow the record as well. lost: of the spread, by which half of
     the forecasts of held-out parts err, however short, of a law that fits its own record alone; of
     half of it is noise that hides other laws. left, left_rubbing: of the squares of what a law
