@@ -29,7 +29,7 @@ from gfnn_jax.families.friction import (
     kind_of,
 )
 from gfnn_jax.families.lagrangian import has_inputs, shape_of
-from gfnn_jax.fitting.evidence import Comparison, criterion, improved
+from gfnn_jax.fitting.evidence import EVIDENCE, Comparison, criterion, improved
 from gfnn_jax.models.lagrangians import libraries
 from gfnn_jax.models.lagrangians.exchange import may_be_chosen, with_exchanges
 from gfnn_jax.models.lagrangians.fine_steps import with_fine_steps
@@ -452,11 +452,33 @@ class TermSearch:
         if options.choose_friction:
             fit = with_viscous_as_it_fades(fit)
             frictions = self._may_rub(fit)
+            fit = _with_more_beside_a_load(fit, frictions)
         rows = fit.structure.friction
         if set(choice.rows) != set(rows):
             choice = chosen(table_of(fit, frictions), options.choose_friction, rows=rows)
         fit = without_drives(begun.again(fit.structure, fit.values))
         return fit, choice._replace(rows=fit.structure.friction)
+
+
+def _with_more_beside_a_load(fit: LawFit, frictions: Sequence[Loss]) -> LawFit:
+    """The fit with the usual friction that stands beside that by a load, by odds that decide. The
+    choice sees what changes close to its fit: without linear friction that by the load and dry
+    friction make up for it, and what they miss, in which bodies stick at other times, no small
+    coefficient mends."""
+    along = {row[0] for row in fit.structure.friction if row[1] >= LOADED}
+    usual = [row for row in frictions if row[0] in along and not kind_of(row[1]).rare]
+
+    def likelier(here: LawFit, row: Loss) -> LawFit | None:
+        other = here.again(here.structure.plus([("loss", row)]), rescale=False)
+        gain = here.criterion() - other.criterion(here.independent)
+        return other if other.follows and gain > 2 * np.log(EVIDENCE.decided) else None
+
+    def missing(here: LawFit) -> list[Loss]:
+        kinds = {row[1] for row in here.structure.friction}
+        rows = [row for row in usual if row not in here.structure.friction]
+        return [row for row in rows if libraries.together((*kinds, row[1]))]
+
+    return improved(fit, missing, likelier)
 
 
 def with_a_spring(fit: LawFit, angle: int) -> LawFit:
