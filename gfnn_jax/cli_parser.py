@@ -359,11 +359,7 @@ def _split(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(","))
 
 
-_STEPS = Kind(
-    f"{COUNT.words}, or its negative",
-    lambda value: COUNT.holds(abs(value)),
-    int,
-)
+_STEPS = Kind(f"{COUNT.words}, or its negative", lambda value: COUNT.holds(abs(value)), int)
 _positive, _count, _seed, _devices, _steps = (
     _reader(kind) for kind in (POSITIVE, COUNT, SEED, DEVICES, _STEPS)
 )

@@ -181,9 +181,7 @@ class RecordingSummary:
 
 
 def summarise(
-    recording: Recording,
-    options: Mapping[str, Any] | None = None,
-    proposals: Sequence[Fault] = (),
+    recording: Recording, options: Mapping[str, Any] | None = None, proposals: Sequence[Fault] = ()
 ) -> RecordingSummary:
     """The summary of a recording, in seconds for a million samples.
 

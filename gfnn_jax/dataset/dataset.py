@@ -245,9 +245,7 @@ class Dataset:
             )
         if after is not None:
             found = dataclasses.replace(
-                found,
-                y1=after.inverse().image(found.y1, found.args),
-                after=(after, *found.after),
+                found, y1=after.inverse().image(found.y1, found.args), after=(after, *found.after)
             )
         return found
 

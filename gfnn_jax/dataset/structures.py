@@ -16,14 +16,7 @@ import numpy as np
 from gfnn_jax.coordinates import CARTESIAN, Coordinates
 from gfnn_jax.dataset.structure_names import EXPECTED
 from gfnn_jax.errors import FitError
-from gfnn_jax.families.sums import (
-    Part,
-    Sums,
-    Windows,
-    body_terms,
-    periodic_site_terms,
-    site_terms,
-)
+from gfnn_jax.families.sums import Part, Sums, Windows, body_terms, periodic_site_terms, site_terms
 from gfnn_jax.families.terms import Terms
 from gfnn_jax.maps.domain import Ranges, ranges_of
 from gfnn_jax.phase_space import sizes

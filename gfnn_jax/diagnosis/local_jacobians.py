@@ -260,11 +260,7 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
         if valid:
             raise FitError(_about(request, determinant, "is singular over the data", valid))
     half = fit_half_map(
-        data.y0,
-        data.y1,
-        data.scale,
-        angles=data.coordinates.angles,
-        reversor=reversor,
+        data.y0, data.y1, data.scale, angles=data.coordinates.angles, reversor=reversor
     )
     closest = max((determinants[n].low for n in valid), default=0.0)
     if half is not None and closest < _FAR:

@@ -26,15 +26,7 @@ from gfnn_jax.evaluate.figures_of_recordings import law_figure as law_figure
 from gfnn_jax.evaluate.figures_of_recordings import recording_figure as recording_figure
 from gfnn_jax.evaluate.figures_of_recordings import residuals_figure as residuals_figure
 from gfnn_jax.evaluate.figures_of_recordings import swings_figure as swings_figure
-from gfnn_jax.evaluate.figures_style import (
-    COLOURS,
-    HEIGHT,
-    LINES,
-    MARKERS,
-    REFERENCE,
-    WIDTH,
-    style,
-)
+from gfnn_jax.evaluate.figures_style import COLOURS, HEIGHT, LINES, MARKERS, REFERENCE, WIDTH, style
 from gfnn_jax.evaluate.figures_style import save as save
 from gfnn_jax.evaluate.metrics import error_statistics, kl_divergence
 from gfnn_jax.phase_space import split

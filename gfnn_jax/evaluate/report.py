@@ -58,10 +58,7 @@ def _made(fit: Fit, scene: str | None, seed: int | None) -> dict[str, Any]:
 
 
 def assemble(
-    fit: Fit,
-    *,
-    data: dict[str, Any] | None = None,
-    rollout: dict[str, Any] | None = None,
+    fit: Fit, *, data: dict[str, Any] | None = None, rollout: dict[str, Any] | None = None
 ) -> dict[str, Any]:
     """Assemble the report of a fit, and of rollouts with it (see `rollout_part`) where there are.
 
@@ -78,10 +75,7 @@ def assemble(
             "symmetries": fit.symmetries,
             **(data or {}),
         },
-        "model": {
-            **_of(chosen, *_LABELS),
-            "base_map": fit.base_map,
-        },
+        "model": {**_of(chosen, *_LABELS), "base_map": fit.base_map},
         "fit": {
             "seconds": chosen.fit_seconds,
             "total_seconds": fit.seconds,

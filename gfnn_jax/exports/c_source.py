@@ -240,10 +240,7 @@ def args_after(map_: SymplecticMap) -> list[str]:
         time = f"y[{width + len(names) - 1}]"
         return [f"{time} = fmod({time} + {literal(later)}, {literal(period)});"]
     if map_.signals is not None and moves_args(map_.pieces[0], more):
-        return [
-            f"const double after = {literal(dt)};",
-            f"piece0_later(args, &after, y + {width});",
-        ]
+        return [f"const double after = {literal(dt)};", f"piece0_later(args, &after, y + {width});"]
     return []
 
 

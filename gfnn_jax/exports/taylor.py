@@ -669,10 +669,7 @@ def _given(rows: _Rows) -> str:
                 f"        T[{begin} + m] += t*T[{begin} + m + 1];",
             ]
         if symbol.number in rows.varies:
-            lines += [
-                f"for (int k = {degree + 1}; k < SIZE; k++)",
-                f"    T[{begin} + k] = 0.0;",
-            ]
+            lines += [f"for (int k = {degree + 1}; k < SIZE; k++)", f"    T[{begin} + k] = 0.0;"]
     for rate in rows.rates:
         if not (rows.unrolled or rows.varying(rate)):  # no operation writes its later terms
             lines += ["for (int k = 1; k < SIZE; k++)", f"    T[{rows.begin(rate)} + k] = 0.0;"]

@@ -34,13 +34,7 @@ from gfnn_jax.jobs.output import (
 )
 from gfnn_jax.jobs.progress import Progress
 from gfnn_jax.learn.options import FitOptions
-from gfnn_jax.learn.refit import (
-    help_refit,
-    not_refitted,
-    refit,
-    why_not,
-    work_of_refit,
-)
+from gfnn_jax.learn.refit import help_refit, not_refitted, refit, why_not, work_of_refit
 from gfnn_jax.learn.request import FEWEST
 from gfnn_jax.maps.sharded import local_devices
 from gfnn_jax.phase_space import POISSON, Pairs
@@ -151,7 +145,7 @@ def fit(
                     "units": trajectories.units,
                     "dt": _range(trajectories.dt),
                     "params": {n: _range(v) for n, v in (trajectories.args or {}).items()},
-                },
+                }
             )
         except KeyboardInterrupt as stop:
             if note := publish(kept_in / BEST, output.out):

@@ -68,12 +68,7 @@ QUICK = Sizes(4_000, 1e-6, 25, 3_000, 1e-5, 60, 0, 0)
 
 
 def run(
-    name: str,
-    output: Output,
-    *,
-    quick: bool = False,
-    dt: float | None = None,
-    **options: Any,
+    name: str, output: Output, *, quick: bool = False, dt: float | None = None, **options: Any
 ) -> Ran | None:
     """Run a scene: reference data, fit, rollouts, metrics, figures, report, into a folder.
 

@@ -44,13 +44,7 @@ from gfnn_jax.threads import one_thread
 
 
 @with_options
-def fit(
-    data: Any,
-    scene: Any = None,
-    *,
-    options: FitOptions | None = None,
-    **changes: Any,
-) -> Fit:
+def fit(data: Any, scene: Any = None, *, options: FitOptions | None = None, **changes: Any) -> Fit:
     """Learn the law of a recording, a Lagrangian with friction and inputs; or the map of pairs of
     states, the cheapest candidate within the tolerance, else the best.
 

@@ -307,8 +307,7 @@ OPTIONS: dict[str, About] = {
         commands=(),
     ),
     "chart": About(
-        _one_of("auto", "type1", "type2", "type3", "midpoint"),
-        "chart that S is evaluated in",
+        _one_of("auto", "type1", "type2", "type3", "midpoint"), "chart that S is evaluated in"
     ),
     "ensemble": About(
         COUNT,
@@ -316,16 +315,8 @@ OPTIONS: dict[str, About] = {
         "spread its bands",
         "N",
     ),
-    "angles": About(
-        _INDICES,
-        "without a scene: indices in z of what has period 2π",
-        commands=(),
-    ),
-    "seed": About(
-        SEED,
-        "seed of what is drawn at random",
-        "N",
-    ),
+    "angles": About(_INDICES, "without a scene: indices in z of what has period 2π", commands=()),
+    "seed": About(SEED, "seed of what is drawn at random", "N"),
     "max_seconds": About(
         _SECONDS,
         "time for the fit in seconds, after which the best map so far is kept (default 120, or no "
@@ -341,11 +332,7 @@ OPTIONS: dict[str, About] = {
         "N",
         decides=False,
     ),
-    "max_iterations": About(
-        COUNT,
-        "iterations of a network's training",
-        commands=(),
-    ),
+    "max_iterations": About(COUNT, "iterations of a network's training", commands=()),
     "friction": About(
         _TEXT,
         "for a recording, friction by its force: auto, none, linear (viscous, ∝ v), quadratic "
@@ -359,11 +346,7 @@ OPTIONS: dict[str, About] = {
         "for a recording, inputs between samples: hold (zero order), linear, band (band-limited), "
         "or auto, by held-out data",
     ),
-    "mass": About(
-        _MASSES,
-        "for a recording: the known mass of one position",
-        commands=(),
-    ),
+    "mass": About(_MASSES, "for a recording: the known mass of one position", commands=()),
     "loss": About(
         _LOSS,
         "for a recording whose law is learned: the loss of residuals in units of their noise, of "

@@ -112,15 +112,7 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
         np.array([triples.dt]),
         np.zeros((1, triples.dim)),
     )
-    sweep = _Sweep(
-        triples,
-        sites,
-        _split(triples, options.seed),
-        tolerance,
-        budget,
-        watch,
-        sensors,
-    )
+    sweep = _Sweep(triples, sites, _split(triples, options.seed), tolerance, budget, watch, sensors)
     best = sweep.best(symmetric=True)
     if best is None or not tolerance.met_by(best.candidate):
         other = sweep.best(symmetric=False)
