@@ -38,7 +38,6 @@ RATES = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Shares of a budget, and what compiling takes."""
 
@@ -48,8 +47,6 @@ class _Options:
     compiling_more: float = 9.0  # seconds, of more dimensions than the table below has
     most_reserved: float = 1 / 5  # of a budget
 
-
-_OPTIONS = _Options()
 
 # Seconds that compiling a step takes, by 2d: small eliminations are unrolled, and larger ones call
 # the library (`solve.linear`). Processor time of polynomials, jax 0.10.2; other work on the machine
@@ -111,7 +108,7 @@ class Budget:
         self._done, self._last, self._closed = 0, "", False
         self._measured: dict[str, tuple[float, float]] = {}  # kind -> operations, seconds
         self._reserved: dict[str, float] = {}  # kind -> operations that follow the search
-        self.compiling = 0.0 if dim is None else _COMPILING.get(2 * dim, _OPTIONS.compiling_more)
+        self.compiling = 0.0 if dim is None else _COMPILING.get(2 * dim, _Options.compiling_more)
 
     @property
     def compilation(self) -> str:
@@ -252,7 +249,7 @@ class Budget:
     def _set_apart(self) -> float:
         """Seconds for what follows the search."""
         assert self.max_seconds is not None
-        compiling = min(self.compiling, _OPTIONS.most_reserved * self.max_seconds)
+        compiling = min(self.compiling, _Options.most_reserved * self.max_seconds)
         return compiling + sum(self._foretold(*each) for each in self._reserved.items())
 
     def _foretold(self, kind: str, operations: float) -> float:
@@ -267,7 +264,7 @@ class Budget:
         started, before = self._clock(), 0.0 if made is None else made()
         yield
         operations = operations if made is None else made() - before
-        if operations >= _OPTIONS.telling * RATES[kind]:
+        if operations >= _Options.telling * RATES[kind]:
             done, seconds = self._measured.get(kind, (0.0, 0.0))
             self._measured[kind] = done + operations, seconds + self._clock() - started
 

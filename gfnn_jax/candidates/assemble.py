@@ -27,8 +27,7 @@ from gfnn_jax.solve.status import LEFT_DOMAIN
 _TIMING = "the time of a step, and the error of compiled ones"
 
 
-@dataclasses.dataclass(frozen=True)
-class AssemblyOptions:
+class Options:
     """Pairs and states of the last looks at a chosen map."""
 
     predictor_pairs: int = 2_000
@@ -37,9 +36,6 @@ class AssemblyOptions:
     block: int = 512
     block_numbers: int = 2**16
     repeats: int = 5  # of a timed block; the best counts
-
-
-OPTIONS = AssemblyOptions()
 
 
 class Assembled(NamedTuple):
@@ -77,7 +73,7 @@ def measured(
 def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:
     """The piece with predictors fitted to its own images of the data's states: where S is coarse,
     the data are no closer to its roots than S is to the data."""
-    rows = rows[: OPTIONS.predictor_pairs]
+    rows = rows[: Options.predictor_pairs]
     images, solved = refined_images(data, generated.chart, generated.family, generated.params, rows)
     if solved.sum() < 2:  # nothing to learn from: the data's own images
         images, solved = data.y1[rows], np.ones(len(rows), bool)
@@ -119,7 +115,7 @@ def composed(piece: Piece, data: Dataset) -> SymplecticMap:
 
 def block_of(width: int) -> int:
     """The number of states (2d,) of this width that are stepped together."""
-    return max(1, min(OPTIONS.block, OPTIONS.block_numbers // width))
+    return max(1, min(Options.block, Options.block_numbers // width))
 
 
 class Stepped(NamedTuple):
@@ -161,7 +157,7 @@ def stepped(
     else:
         found, seconds = [run(rows[0])], 0.0
         if timed:
-            seconds = min(run(rows[0])[1] for _ in range(OPTIONS.repeats))
+            seconds = min(run(rows[0])[1] for _ in range(Options.repeats))
         compiling = found[0][1] - seconds if timed else 0.0
         found += [run(block) for block in rows[1:]]
     blocks = [out for out, _ in found]

@@ -34,7 +34,6 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.
 SECONDS |= {"d": 1.0, "year": 1.0}
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Columns that are told apart by their values.
 
@@ -65,8 +64,6 @@ class _Options:
     runs: int = 3
     most: int = 20_000
 
-
-_OPTIONS = _Options()
 
 _STD = "_std"  # end of the name of a column that holds the σ of another
 _OF_MOTION = ("positions", "velocities", "momenta", "sensors")  # roles of what shows the motion
@@ -132,7 +129,7 @@ def roles_of(
     counts = [
         name
         for name, columns in every.items()
-        if all(len(x) > _OPTIONS.rows and np.all(np.diff(x) == 1) for x in columns)
+        if all(len(x) > _Options.rows and np.all(np.diff(x) == 1) for x in columns)
     ]
     names = [name for name in names if name not in counts] or names
     roles, notes = by_name(names), [f"{name} counts the rows, and is put aside" for name in counts]
@@ -198,7 +195,7 @@ def _by_data(
     Raises Undecided where a column is left over that may be a position or an input.
     """
     times = [t for t, _ in runs.values()]
-    some = names[: _OPTIONS.most_columns]
+    some = names[: _Options.most_columns]
     columns = {n: np.concatenate([values[n] for _, values in runs.values()]) for n in some}
     moving = [name for name, x in columns.items() if np.isfinite(x).any() and np.nanstd(x) > 0]
     if not moving:
@@ -209,7 +206,7 @@ def _by_data(
         for name, size in zip(moving, sizes, strict=True)
         if size.white
         and size.sigma is not None
-        and float(np.nanstd(columns[name])) < _OPTIONS.alone * size.sigma
+        and float(np.nanstd(columns[name])) < _Options.alone * size.sigma
     ]
     moving = [name for name in moving if name not in still] or moving
     notes = [f"{name} holds noise alone, and is put aside" for name in still]
@@ -228,7 +225,7 @@ def _by_data(
     shaken = [n for n in rest if _OF_ACCELERATIONS.fullmatch(units.get(n, ""))]
     if shaken and len(shaken) == len(rest) and not pairs:
         raise _of_accelerations(source, {name: columns[name] for name in shaken})
-    switches = [n for n in rest if len(np.unique(columns[n])) <= _OPTIONS.levels]
+    switches = [n for n in rest if len(np.unique(columns[n])) <= _Options.levels]
     switches = switches if len(switches) < len(rest) else []
     rest = [n for n in rest if n not in switches]
     notes += [f"{name} only switches, and is taken as an input" for name in switches]
@@ -257,8 +254,8 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int)
     known = columns[:, np.isfinite(columns).all(axis=0)]
     strengths = np.linalg.svd(known, compute_uv=False) if known.size else np.ones(len(names))
     shown = f"{', '.join(names)} {'is a rate' if len(names) == 1 else 'are rates'} of turning"
-    if len(names) == 3 and strengths[1] > _OPTIONS.one_axis * strengths[0]:
-        least = _OPTIONS.runs_of_a_body
+    if len(names) == 3 and strengths[1] > _Options.one_axis * strengths[0]:
+        least = _Options.runs_of_a_body
         wanted = f", from {least} or more runs of different speeds" * (runs < least)
         return Undecided(
             f"{source}: {shown} of a body about three axes. To learn its bracket{wanted}:",
@@ -317,7 +314,7 @@ def _unclear(
     """Options for columns that nothing tells apart. explained: share of their rates that functions
     of them explain."""
     positions = {"positions": tuple(moving)}
-    if explained > _OPTIONS.first_order:
+    if explained > _Options.first_order:
         states = {"structure": "poisson", "states": tuple(moving)}
         return Undecided(
             f"{source}: the names {', '.join(columns)} do not show what was measured; their rates "
@@ -346,7 +343,7 @@ def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tupl
     like = {pair: r.likeness for pair, r in related.items() if r is not None}
     found, used = [], set()
     for (a, b), likeness in sorted(like.items(), key=lambda item: -item[1]):
-        if likeness > _OPTIONS.like and not {a, b} & used:
+        if likeness > _Options.like and not {a, b} & used:
             found.append((a, b))
             used |= {a, b}
     return [(names[a], names[b]) for a, b in sorted(found)]
@@ -550,8 +547,8 @@ def first_order(times: Sequence[np.ndarray], runs: Sequence[np.ndarray]) -> Firs
     kept = [np.isfinite(x).all(axis=1) for x in runs]
     times = [t[own] for t, own in zip(times, kept, strict=True)]
     runs = [x[own] for x, own in zip(runs, kept, strict=True)]
-    runs = [x for x in runs if len(x) > 2 * _OPTIONS.parts]
-    times = [t for t in times if len(t) > 2 * _OPTIONS.parts]
+    runs = [x for x in runs if len(x) > 2 * _Options.parts]
+    times = [t for t in times if len(t) > 2 * _Options.parts]
     if not runs:
         return FirstOrder(0.0, 0)
     every = np.concatenate(runs)
@@ -564,7 +561,7 @@ def first_order(times: Sequence[np.ndarray], runs: Sequence[np.ndarray]) -> Firs
         _explained(
             [x[lag:] - x[:-lag] for x in runs], [s[lag:] - s[:-lag] for s in sums], lag, every
         )
-        for lag in _OPTIONS.lags
+        for lag in _Options.lags
     ]
     return FirstOrder(max(shares), _constants(runs, tables))
 
@@ -584,14 +581,14 @@ def _explained(moved: list[np.ndarray], sums: list[np.ndarray], lag: int, every)
     if not len(target):
         return 0.0
     variance = np.var(target, axis=0)
-    if np.any(variance > _OPTIONS.quarter * np.var(every, axis=0)):
+    if np.any(variance > _Options.quarter * np.var(every, axis=0)):
         return 0.0
-    thin, left, judged = 1 + len(target) // _OPTIONS.most, np.zeros(target.shape[1]), 0
+    thin, left, judged = 1 + len(target) // _Options.most, np.zeros(target.shape[1]), 0
     for own, others in _parts([len(x) for x in moved], lag):
         own, others = own[::thin], others[::thin]
-        if len(others) < _OPTIONS.samples * rows.shape[1]:
+        if len(others) < _Options.samples * rows.shape[1]:
             return 0.0
-        c = np.linalg.lstsq(rows[others], target[others], rcond=_OPTIONS.told_apart)[0]
+        c = np.linalg.lstsq(rows[others], target[others], rcond=_Options.told_apart)[0]
         left += np.sum((target[own] - rows[own] @ c) ** 2, axis=0)
         judged += len(own)
     return float(np.min(1 - left / np.maximum(judged * variance, 1e-300)))
@@ -602,12 +599,12 @@ def _parts(lengths: list[int], lag: int) -> Iterator[tuple[np.ndarray, np.ndarra
     every eighth run, of few an eighth of each run."""
     run = np.repeat(np.arange(len(lengths)), lengths)
     place = np.concatenate([np.arange(n) for n in lengths])
-    for k in range(_OPTIONS.parts):
-        if len(lengths) >= _OPTIONS.runs:
-            own = run % _OPTIONS.parts == k
+    for k in range(_Options.parts):
+        if len(lengths) >= _Options.runs:
+            own = run % _Options.parts == k
             others = ~own
         else:
-            edges = np.array([(n * k, n * (k + 1)) for n in lengths])[run] // _OPTIONS.parts
+            edges = np.array([(n * k, n * (k + 1)) for n in lengths])[run] // _Options.parts
             own = (edges[:, 0] <= place) & (place < edges[:, 1])
             others = (place <= edges[:, 0] - lag) | (place >= edges[:, 1] - 1 + lag)
         if own.any():
@@ -616,7 +613,7 @@ def _parts(lengths: list[int], lag: int) -> Iterator[tuple[np.ndarray, np.ndarra
 
 def _constants(runs: list[np.ndarray], tables: list[np.ndarray]) -> int:
     """Number of functions that are constant in each run and differ between runs."""
-    if len(runs) < _OPTIONS.runs:
+    if len(runs) < _Options.runs:
         return 0
     found = [_constant_within([table[:, 1:] for table in tables])]
     if all((x > 0).all() for x in runs):
@@ -633,4 +630,4 @@ def _constant_within(tables: list[np.ndarray]) -> int:
     total = every.T @ every
     total += 1e-6 * len(every) * np.eye(len(total))
     parts = eigh(within.T @ within, total, eigvals_only=True)
-    return int(np.sum(parts < _OPTIONS.invariant))
+    return int(np.sum(parts < _Options.invariant))

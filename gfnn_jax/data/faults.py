@@ -38,7 +38,6 @@ WRONG = (
 PROPOSED = ("kind", "let go", "caught", "rounded times", "roles")
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Thresholds of the checks, chosen on recordings of test systems with and without mistakes
     (`benchmarks/random_recordings.py`, tests of mistakes).
@@ -72,9 +71,6 @@ class _Options:
     worse: float = 6.0
     missed: float = 0.04
     drives: float = 0.9
-
-
-_OPTIONS = _Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,7 +158,7 @@ def _flats(x: np.ndarray, extreme: float, step: float) -> int:
     count = 0
     for begin, end in zip(begins, ends, strict=True):
         sides = [abs(x[k] - extreme) for k in (begin - 1, end) if 0 <= k < len(x)]
-        count += int(end - begin >= _OPTIONS.flat and max(sides, default=0.0) > step)
+        count += int(end - begin >= _Options.flat and max(sides, default=0.0) > step)
     return count
 
 
@@ -239,9 +235,9 @@ def _other_order(traits: Traits, declared: list[tuple[str, str]]) -> list[tuple[
     pairings = (list(zip(order[::2], order[1::2], strict=True)) for order in orders)
     best = max(pairings, key=lambda pairs: sum(scores[pair] for pair in pairs))
     gain = sum(scores[pair] for pair in best) - sum(scores[pair] for pair in declared)
-    good = gain > _OPTIONS.better and all(scores[pair] > 0.9 for pair in best)
+    good = gain > _Options.better and all(scores[pair] > 0.9 for pair in best)
     turned = (r for pair in declared if (r := related[pair]) is not None)
-    if all(abs(r.factor + 1) < _OPTIONS.near and r.explained > 0.9 for r in turned):
+    if all(abs(r.factor + 1) < _Options.near and r.explained > 0.9 for r in turned):
         return None  # velocities of the wrong sign: of an oscillator x is that of v, too
     if not good or set(best) == set(declared):
         return None
@@ -251,7 +247,7 @@ def _other_order(traits: Traits, declared: list[tuple[str, str]]) -> list[tuple[
 def _time_unit(unit: str, factors: list[float]) -> str | None:
     """The unit of time that makes all velocities derivatives, if factors are a power of 1000."""
     power = np.round(np.log10(np.abs(factors)) / 3) * 3
-    near = np.abs(np.array(factors) / 10.0**power - 1) < _OPTIONS.near
+    near = np.abs(np.array(factors) / 10.0**power - 1) < _Options.near
     if not near.all() or len(set(power)) > 1 or power[0] == 0:
         return None
     second = SECONDS[unit] / 10.0 ** power[0]
@@ -259,11 +255,11 @@ def _time_unit(unit: str, factors: list[float]) -> str | None:
 
 
 def _of_pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
-    factor, degree, near = relation.factor, 180 / np.pi, _OPTIONS.near
+    factor, degree, near = relation.factor, 180 / np.pi, _Options.near
     alone = {"positions": traits.recording.positions}
     without = f"or ignore {v}:{as_typed(alone)}"
     finding = f"{v} is {factor:.4g} × d{x}/dt"
-    if relation.explained < _OPTIONS.derivative:
+    if relation.explained < _Options.derivative:
         part = f"{100 * relation.explained:.0f} % of its variance"
         finding = f"{v} is not the derivative of {x}: d{x}/dt explains {part}"
         remedy = f"Name {v} as an input ({as_typed({'inputs': (v,)}).strip()}), {without}"
@@ -277,7 +273,7 @@ def _of_pair(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fau
         yield Fault("degrees", finding, remedy, {"degrees": (v,)})
     elif abs(factor + 1) < near:
         yield Fault("sign", finding, f"Change the sign of {v} in the file, {without}", alone)
-    elif factor < 0 or abs(np.log(factor)) > _OPTIONS.off:
+    elif factor < 0 or abs(np.log(factor)) > _Options.off:
         scale = as_typed({"scale": (v,)}).strip()
         remedy = f"Check its unit, fit its scale ({scale}), {without}"
         yield Fault("factor", finding, remedy, alone)
@@ -294,7 +290,7 @@ def _drives(traits: Traits, name: str) -> bool:
         return False
     without = dataclasses.replace(beside, u=beside.u[:-1])
     ratio = beside.held_out(angles) / np.maximum(without.held_out(angles), 1e-300)
-    return bool(np.any(ratio < _OPTIONS.drives))
+    return bool(np.any(ratio < _Options.drives))
 
 
 def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fault]:
@@ -305,8 +301,8 @@ def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fau
         found = f"{v} is the {kind} difference of {x} and adds no information"
         yield Fault("difference", found, without, alone)
         return
-    error = max(5 * relation.factor_error, _OPTIONS.filtered)
-    late = max(5 * relation.lag_error, _OPTIONS.late * traits.step)
+    error = max(5 * relation.factor_error, _Options.filtered)
+    late = max(5 * relation.lag_error, _Options.late * traits.step)
     if abs(relation.factor - 1) > error or abs(relation.lag) > late:
         found = (
             f"{v} looks filtered: it is {relation.factor:.3g} × d{x}/dt with a lag of "
@@ -350,7 +346,7 @@ def _units_of_angles(traits: Traits) -> Iterator[Fault]:
             continue
         option, raw = {"degrees": (name,)}, traits.raw(name)
         jump, swing = _jumps(traits, name), _swing(raw)
-        wide = swing > _OPTIONS.swing and np.ptp(np.concatenate(raw)) < 720
+        wide = swing > _Options.swing and np.ptp(np.concatenate(raw)) < 720
         if jump is not None and jump[0] == 360:
             found = f"{name} jumps by 360 ({jump[1]} times)"
             yield Fault("degrees", found, "Its unit is degrees:", option)
@@ -425,7 +421,7 @@ def _coarse(traits: Traits) -> Iterator[Fault]:
     for name in _angles(traits):
         raw = traits.raw(name)
         steps = _steps(raw)
-        wide = int(np.sum(np.abs(np.angle(np.exp(1j * steps))) > _OPTIONS.wide))
+        wide = int(np.sum(np.abs(np.angle(np.exp(1j * steps))) > _Options.wide))
         is_lift = np.ptp(np.concatenate(raw)) > 1.02 * TURN
         if wide > max(3, 0.01 * len(steps)) and not is_lift:
             found = f"{name} moves by more than 135° in {wide} steps, in an ambiguous direction"
@@ -449,7 +445,7 @@ def _drifting(traits: Traits) -> Iterator[Fault]:
     drifts = {run: drift(t) for run, t in zip(traits.recording.runs, traits.times, strict=True)}
     run = max(drifts, key=lambda name: abs(drifts[name]))
     events = traits.recording.events  # whose times are what is measured
-    if abs(drifts[run]) > _OPTIONS.drift and not events:
+    if abs(drifts[run]) > _Options.drift and not events:
         found = f"the time step drifts by {100 * drifts[run]:.2g} % along run {run}"
         remedy = "If the samples are even and the clock drifts, give even steps: --dt"
         yield Fault("drifting clock", found, f"{remedy} {traits.step:g}")
@@ -481,19 +477,19 @@ def _of_other_systems(traits: Traits) -> list[str]:
     angles = [n in recording.angles for n in recording.positions]
     table = scaled(functions(known.q, known.v, angles, known.u))
     target, run = known.a.T, known.run
-    fewest, most = _OPTIONS.fewest_windows, _OPTIONS.most_runs
+    fewest, most = _Options.fewest_windows, _Options.most_runs
     runs = [r for r in range(len(recording.runs)) if np.sum(run == r) >= fewest][:most]
     if len(runs) < 2:
         return []
     rows = [np.flatnonzero(run == r) for r in runs]
-    least = _OPTIONS.missed * target.std(axis=0)
+    least = _Options.missed * target.std(axis=0)
     own = np.array([held_out(table[k], target[k]) for k in rows])
     if np.any(own > least):
         return []
     together = np.concatenate(rows)
     common = fitted(table[together], target[together])
     shared = np.array([missed(table[k], target[k], common) for k in rows])
-    apart = np.any((shared > _OPTIONS.worse * own) & (shared > least), axis=1)
+    apart = np.any((shared > _Options.worse * own) & (shared > least), axis=1)
     return [recording.runs[r] for r, is_apart in zip(runs, apart, strict=True) if is_apart]
 
 

@@ -18,7 +18,6 @@ from gfnn_jax.data.roles import is_rate_of_turning
 from gfnn_jax.data.traits import Accelerations, Traits, accelerations, turning_points
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Thresholds, chosen on pendulums, springs and orbits drawn at random (tests of proposals).
 
@@ -53,9 +52,6 @@ class _Options:
     most_states: int = 12
 
 
-_OPTIONS = _Options()
-
-
 def mistakes(traits: Traits) -> list[Fault]:
     """Faults, points on a circle, which are no free coordinates, and states that are no positions;
     of these nothing else is said, for it would be judged by accelerations."""
@@ -78,7 +74,7 @@ def _states(traits: Traits) -> Iterator[Fault]:
     """Positions whose rates are functions of themselves, with an energy that each run keeps."""
     recording, names = traits.recording, traits.recording.positions
     others = (*recording.velocities, *recording.momenta, *recording.inputs, *recording.sensors)
-    if not 2 <= len(names) <= _OPTIONS.most_states or others or recording.explained:
+    if not 2 <= len(names) <= _Options.most_states or others or recording.explained:
         return
     runs = [np.stack(x, axis=1) for x in zip(*map(traits.by_run, names), strict=True)]
     found, shown = first_order(traits.times, runs), ", ".join(names)
@@ -109,7 +105,7 @@ def _circle(
     x, y = x[known], y[known]
     if len(x) < 10:
         return None
-    points = np.stack([x, y])[:, :: max(len(x) // _OPTIONS.most, 1)]
+    points = np.stack([x, y])[:, :: max(len(x) // _Options.most, 1)]
     apart = points - points.mean(axis=1)[:, None]
     line = float(np.linalg.svd(apart, compute_uv=False)[1]) / np.sqrt(points.shape[1])
 
@@ -123,10 +119,10 @@ def _circle(
         scale = np.maximum(np.abs(first), 1e-12)
         centre = optimize.least_squares(lambda c: away(c) - away(c).mean(), first, x_scale=scale).x
     radius, rms = float(away(centre).mean()), float(away(centre).std())
-    if rms > _OPTIONS.round * sigma or line < _OPTIONS.bent * max(rms, sigma):
+    if rms > _Options.round * sigma or line < _Options.bent * max(rms, sigma):
         return None
     ways = np.diff(np.unwrap(np.arctan2(x - centre[0], centre[1] - y)))
-    if abs(ways.mean()) > 0 and ways.std() < _OPTIONS.even * abs(ways.mean()):
+    if abs(ways.mean()) > 0 and ways.std() < _Options.even * abs(ways.mean()):
         return None
     return centre, radius
 
@@ -184,7 +180,7 @@ def _kinds(traits: Traits) -> Iterator[Fault]:
     if begin is not None:
         known = known.taken(known.time > begin)
     now = [n in recording.angles for n in recording.positions]
-    least = _OPTIONS.follows * known.a.std(axis=1)
+    least = _Options.follows * known.a.std(axis=1)
     for k, name in enumerate(recording.positions):
         unit = recording.units.get(name, "")
         if recording.factors[name] != 1 or (unit and not unit.startswith("rad")):
@@ -197,10 +193,10 @@ def _kinds(traits: Traits) -> Iterator[Fault]:
             kind
             for kind, turn in (("rad", 1.0), ("degrees", np.pi / 180))
             if kind in kinds
-            and wide * turn > _OPTIONS.wide
-            and kinds[kind] < _OPTIONS.turns * kinds["length"]
+            and wide * turn > _Options.wide
+            and kinds[kind] < _Options.turns * kinds["length"]
         }
-        good |= {"length"} if kinds["length"] < _OPTIONS.straight * kinds["rad"] else set()
+        good |= {"length"} if kinds["length"] < _Options.straight * kinds["rad"] else set()
         best = min(good or {mine}, key=lambda kind: kinds[kind])
         if best == mine or kinds[best] > float(least[k]):
             continue
@@ -243,20 +239,20 @@ def _let_go(traits: Traits) -> float | None:
     """The time at which a motion that began at rest is free: that of its largest deflection; None
     where it did not begin so."""
     for x, sigma in _undriven(traits):
-        off = x - np.median(x[: _OPTIONS.still])
+        off = x - np.median(x[: _Options.still])
         largest = int(np.argmax(np.abs(off)))
-        away = np.abs(off[: largest + 1]) > _OPTIONS.at_rest * sigma
+        away = np.abs(off[: largest + 1]) > _Options.at_rest * sigma
         rest = int(np.argmax(away)) if away.any() else largest
         wide = off[rest : largest + 1]
-        wide = np.sign(wide[np.abs(wide) > _OPTIONS.large * np.abs(off[largest])])
+        wide = np.sign(wide[np.abs(wide) > _Options.large * np.abs(off[largest])])
         free = x[largest:]
         centre, reach = (free.max() + free.min()) / 2, (free.max() - free.min()) / 2
         good = (
-            rest >= _OPTIONS.still
+            rest >= _Options.still
             and abs(x[0] - centre) < 0.5 * reach  # no release from a turning point
-            and np.abs(off[largest]) > _OPTIONS.moved * sigma
-            and largest < _OPTIONS.early * len(x)
-            and np.sum(np.diff(wide) != 0) < _OPTIONS.most_ways
+            and np.abs(off[largest]) > _Options.moved * sigma
+            and largest < _Options.early * len(x)
+            and np.sum(np.diff(wide) != 0) < _Options.most_ways
         )
         if good:
             return float(traits.times[0][largest])
@@ -267,14 +263,14 @@ def _caught(traits: Traits) -> float | None:
     """The time of the last free swing of a motion that ends at rest at once; None where it does not
     end so."""
     for x, sigma in _undriven(traits):
-        off = x - np.median(x[-_OPTIONS.still :])
-        away = np.flatnonzero(np.abs(off) > _OPTIONS.at_rest * sigma)
-        if not len(away) or len(x) - away[-1] <= _OPTIONS.still:
+        off = x - np.median(x[-_Options.still :])
+        away = np.flatnonzero(np.abs(off) > _Options.at_rest * sigma)
+        if not len(away) or len(x) - away[-1] <= _Options.still:
             continue
         swing = off[: away[-1] + 1]
         size = float(np.ptp(swing))
-        wide = turning_points(swing, _OPTIONS.large * size)
-        if len(wide) < _OPTIONS.swings or size < _OPTIONS.moved * sigma:
+        wide = turning_points(swing, _Options.large * size)
+        if len(wide) < _Options.swings or size < _Options.moved * sigma:
             continue
         half = float(np.median(np.diff(wide)))  # of a period, in samples
         if len(x) - away[-1] > half and away[-1] - wide[-1] < 2 * half:
@@ -310,7 +306,7 @@ def _rounded_times(traits: Traits) -> Iterator[Fault]:
             return
         step, begin = np.polyfit(np.arange(len(t)), t, 1)
         line = t - begin - step * np.arange(len(t))
-        if np.ptp(line) > 1.2 * unit or np.ptp(np.diff(t)) < _OPTIONS.uneven * step:
+        if np.ptp(line) > 1.2 * unit or np.ptp(np.diff(t)) < _Options.uneven * step:
             return
         steps.append((float(step), unit / len(t)))
     step, error = min(steps, key=lambda one: one[1])

@@ -29,7 +29,6 @@ _OF_FITS = ("structure", "states", "mass")
 _NOTEBOOK = '<pre style="line-height:normal;white-space:pre">{code}</pre>'
 
 
-@dataclasses.dataclass(frozen=True)
 class _Shown:
     """width: of the screen, in characters. most: columns (twice as many), faults or runs shown.
     unknown_loss: standard error of a loss per period, above which its absence is not reported.
@@ -41,9 +40,6 @@ class _Shown:
     unknown_loss: float = 0.02
     related: float = 0.8
     window: int = 12
-
-
-_SHOWN = _Shown()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,14 +151,14 @@ class RecordingSummary:
 
     def __rich__(self) -> Group:
         told = filter(None, (_samples(self), _times(self), _moving(self)))
-        found = [_fault(fault) for fault in self.faults[: _SHOWN.most]]
-        more = len(self.faults) - _SHOWN.most
+        found = [_fault(fault) for fault in self.faults[: _Shown.most]]
+        more = len(self.faults) - _Shown.most
         found += [Text(f"and {more} more")] if more > 0 else []
         return Group(*(Text(said(line)) for line in told), _columns(self), *found)
 
     def _printed(self) -> Console:
         # A notebook would take it for its own display.
-        console = Console(file=io.StringIO(), width=_SHOWN.width, record=True, force_jupyter=False)
+        console = Console(file=io.StringIO(), width=_Shown.width, record=True, force_jupyter=False)
         console.print(self)
         return console
 
@@ -205,7 +201,7 @@ def summarise(
     typed = _options(found, options or {})
     files = " ".join(shlex.quote(path) for path in recording.source.split(", "))
     windows = [known.noise[name].size for name in recording.positions]
-    coarsest = known.step * max(min(windows) // _SHOWN.window, 1) if windows else None
+    coarsest = known.step * max(min(windows) // _Shown.window, 1) if windows else None
     return RecordingSummary(
         recording.source,
         counts,
@@ -306,7 +302,7 @@ def _derivative_of(known: Traits, name: str):
     if name in recording.positions:
         return None, None
     related = [(of, known.relation(of, name)) for of in recording.positions]
-    good = [(of, r) for of, r in related if r is not None and r.explained > _SHOWN.related]
+    good = [(of, r) for of, r in related if r is not None and r.explained > _Shown.related]
     return max(good, key=lambda pair: pair[1].explained, default=(None, None))
 
 
@@ -333,7 +329,7 @@ def _as_code(value: Any) -> str:
 def _samples(summary: RecordingSummary) -> str:
     counts = [count for count, _, _ in summary.runs.values()]
     spans = [end - begin for _, begin, end in summary.runs.values()]
-    names = ", ".join([*summary.runs][: _SHOWN.most]) + ", …" * (len(counts) > _SHOWN.most)
+    names = ", ".join([*summary.runs][: _Shown.most]) + ", …" * (len(counts) > _Shown.most)
     runs = f"{len(counts)} run{'s' * (len(counts) > 1)}"
     of = f"{sum(counts)} samples in {sum(spans):.4g} {summary.clock}"
     each = f" ({min(counts)} to {max(counts)} samples each: {names})" if len(counts) > 1 else ""
@@ -372,7 +368,7 @@ def _loss(summary: RecordingSummary) -> str:
         return "friction: not estimated, for the samples allow no balance of energy"
     beside = " beside what the inputs supply" if summary.driven else ""
     size = f"{100 * abs(loss.per_period):.2g} ± {100 * loss.error:.1g} % of the energy per period"
-    if not loss.significant and loss.error > _SHOWN.unknown_loss:
+    if not loss.significant and loss.error > _Shown.unknown_loss:
         return f"friction{beside} not determined ({size})"
     if not loss.significant:
         return f"no friction found{beside} ({size})"
@@ -388,7 +384,7 @@ def _columns(summary: RecordingSummary) -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
     for head in ("column", "role", "from", "to", "unit", "resolution", "noise σ", "Hz", "remarks"):
         table.add_column(head, justify="right" if head in ("from", "to", "noise σ") else "left")
-    for column in summary.columns[: 2 * _SHOWN.most]:
+    for column in summary.columns[: 2 * _Shown.most]:
         table.add_row(
             column.name,
             column.role,

@@ -6,7 +6,6 @@ All text goes through here: recordings, and states q, p (`csv_files`).
 from __future__ import annotations
 
 import csv
-import dataclasses
 import itertools
 import re
 import shlex
@@ -35,7 +34,6 @@ _OF_RUN = re.compile(
 )
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """block_rows: rows of a recording that are parsed at a time. sniffed: characters of the file's
     begin that tell its dialect. last_lines: that tell the separator. shown: lines of a refusal.
@@ -48,7 +46,6 @@ class _Options:
     daily: float = 43_200.0
 
 
-_OPTIONS = _Options()
 # What begins as dates and times of day do: 2024-05-01, 5/7/2021, 7.5.2021, 09:33:31.
 _DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}(\D|$)|\d{1,2}:\d{2}(:\d|$)")
 # Names of the time between rows, and of its inverse, in what instruments write above a table.
@@ -76,9 +73,9 @@ class TextFile:
         text = text_of(path)
         self._open, self.notes = text.open, text.notes
         with damage(path, "the header"), self._open() as stream:
-            head = stream.read(_OPTIONS.sniffed)
+            head = stream.read(_Options.sniffed)
         lines = head.split("\n")
-        if len(head) == _OPTIONS.sniffed and len(lines) > 2:
+        if len(head) == _Options.sniffed and len(lines) > 2:
             lines.pop()  # cut
         numbered = [(i, line.rstrip("\r")) for i, line in enumerate(lines, 1) if line.strip()]
         begins = [line.lstrip()[0] for _, line in numbered]
@@ -94,7 +91,7 @@ class TextFile:
         if first is None:
             raise InputError(
                 f"{path}: expected rows of numbers below a line of names, found "
-                f"{_shown(of_file[: _OPTIONS.shown])}"
+                f"{_shown(of_file[: _Options.shown])}"
             )
         self._first = of_file[first][0] - 1  # lines before the first row of numbers
         rows, above = cells[first:], cells[:first]
@@ -142,7 +139,7 @@ class TextFile:
         Instruments write numbers into their preambles too: a row that does not fit the last ones is
         of the preamble where a line without numbers, the names, stands between.
         """
-        tail = cells[-_OPTIONS.last_lines :]
+        tail = cells[-_Options.last_lines :]
         widths = [len(one) for one in tail]
         width = max(set(widths), key=lambda w: (widths.count(w), w))
         columns = list(zip(*(one for one in tail if len(one) == width), strict=True))
@@ -341,7 +338,7 @@ class TextFile:
                 f"({reason})"
             )
         _, step, way = min(found, key=lambda one: one[0])
-        second = 24 * 3600.0 if step >= _OPTIONS.daily else 1.0
+        second = 24 * 3600.0 if step >= _Options.daily else 1.0
         unit = "s" if second == 1 else "d"
         self.units[self.times[0]] = unit
         self.notes += (
@@ -391,7 +388,7 @@ class TextFile:
         """Raises InputError at the first rows of another width than the header's."""
         count = len(self.names)
         wrong = ((n, cells) for n, cells in self._rows() if len(cells) != count)
-        found = list(itertools.islice(wrong, _OPTIONS.shown))
+        found = list(itertools.islice(wrong, _Options.shown))
         if found:
             number, cells = found[0]
             raise InputError(
@@ -408,7 +405,7 @@ class TextFile:
             for name, cell in zip(self.names, cells, strict=False)
             if name in columns and not _is_number(cell, self._decimal)
         )
-        found = list(itertools.islice(wrong, _OPTIONS.shown))
+        found = list(itertools.islice(wrong, _Options.shown))
         if found:
             number, name, cell = found[0]
             others = ",".join(n for n in self.names if n != name and n not in self.text)
@@ -448,7 +445,7 @@ def from_text(
     kept: list[dict[str, np.ndarray]] = []
     numbers: list[np.ndarray] = []  # of the rows that are kept, in the file
     passed = 0
-    for block in text.blocks([*wanted, *read], _OPTIONS.block_rows, [*runs, *read]):
+    for block in text.blocks([*wanted, *read], _Options.block_rows, [*runs, *read]):
         keep = rows.kept(block, text.times, passed)
         kept.append({name: values[keep] for name, values in block.items()})
         numbers.append(np.flatnonzero(keep) + passed)
@@ -481,7 +478,7 @@ def _stacked(text: TextFile, columns: Sequence[str]) -> Table:
 
     wanted = [name for name in text.names if name not in text.text]
     aside = [name for name in text.text if name not in text.times]
-    blocks = list(text.blocks(wanted, _OPTIONS.block_rows))
+    blocks = list(text.blocks(wanted, _Options.block_rows))
     raw = {name: np.concatenate([block[name] for block in blocks]) for name in wanted}
     runs = [run for run in dict.fromkeys(run for _, run in text.runs.values()) if run]
     parts = []
@@ -543,7 +540,7 @@ def _more(lines: Sequence[tuple[int, str]]) -> str:
 
 def _dialect(path: Path, lines: list[str]) -> tuple[str, str]:
     """(separator, decimal sign) that make the last lines rows of numbers of equal width."""
-    sample = lines[-1:] if len(lines) == 1 else lines[max(1, len(lines) - _OPTIONS.last_lines) :]
+    sample = lines[-1:] if len(lines) == 1 else lines[max(1, len(lines) - _Options.last_lines) :]
     good = []
     for separator, decimal in _DIALECTS:
         rows = [_cells(line, separator) for line in sample]
@@ -557,7 +554,7 @@ def _dialect(path: Path, lines: list[str]) -> tuple[str, str]:
             return widest, "."  # a row of another width will be named
         one = next((d for d in ".," if all(_is_number(x.strip(), d) for x in sample)), None)
         if one is None:
-            numbered = list(enumerate(lines[: _OPTIONS.shown], 1))
+            numbered = list(enumerate(lines[: _Options.shown], 1))
             raise InputError(f"{path}: expected columns of numbers, found {_shown(numbered)}")
         return (",", ".") if one == "." else (";", ",")  # a single column
     share, separator, decimal = max(good, key=lambda found: found[0])

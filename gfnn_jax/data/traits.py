@@ -16,7 +16,6 @@ from gfnn_jax.signals.steps import median_step
 from gfnn_jax.signals.wrong_values import WrongValues, wrong_at_jumps, wrong_values
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """narrowest: samples of a window. degree: of its polynomial. block: windows fitted or judged
     together. ridge: of the fits, relative to columns of unit size. ignored: most columns without a
@@ -29,9 +28,6 @@ class _Options:
     ridge: float = 1e-8
     ignored: int = 8
     gone: float = 0.5
-
-
-_OPTIONS = _Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +78,7 @@ class Traits:
 
 def traits(recording: Recording) -> Traits:
     """The traits of a recording, in seconds for a million rows."""
-    ignored = [name for name in recording.ignored if name in recording.factors][: _OPTIONS.ignored]
+    ignored = [name for name in recording.ignored if name in recording.factors][: _Options.ignored]
     names = [*recording.columns, *ignored]
     times = [recording.times(run) for run in recording.runs]
     columns = {n: np.concatenate(recording.each(recording.unwrapped, n)) for n in names}
@@ -122,7 +118,7 @@ def of_rows(times: list[np.ndarray], rows: np.ndarray) -> list[np.ndarray]:
 
 def _rows(gone: np.ndarray) -> np.ndarray:
     """The rows that are not gone, or all where most are."""
-    return np.flatnonzero(~gone) if gone.mean() <= _OPTIONS.gone else np.arange(len(gone))
+    return np.flatnonzero(~gone) if gone.mean() <= _Options.gone else np.arange(len(gone))
 
 
 def wrong_values_of(recording: Recording) -> dict[str, tuple[WrongValues, ...]]:
@@ -216,9 +212,9 @@ def accelerations(traits: Traits, inputs: Sequence[str]) -> Accelerations | None
     if not names:
         return None
     # Second derivatives want narrower windows than values do.
-    size = max(2 * min(traits.noise[n].size for n in names) // 3, _OPTIONS.narrowest)
+    size = max(2 * min(traits.noise[n].size for n in names) // 3, _Options.narrowest)
     columns = np.stack([traits.columns[n] for n in (*names, *inputs)])
-    fits = local_fits(traits.times, columns, size, _OPTIONS.degree)
+    fits = local_fits(traits.times, columns, size, _Options.degree)
     if fits is None:
         return None
     dim = len(names)
@@ -232,7 +228,7 @@ def accelerations(traits: Traits, inputs: Sequence[str]) -> Accelerations | None
     )
     every = np.concatenate([found.q, found.v, found.a, found.u])
     known = np.asarray(np.isfinite(every).all(axis=0))
-    return found.taken(known) if known.sum() >= 2 * _OPTIONS.block else None
+    return found.taken(known) if known.sum() >= 2 * _Options.block else None
 
 
 def scaled(table: np.ndarray) -> np.ndarray:
@@ -242,7 +238,7 @@ def scaled(table: np.ndarray) -> np.ndarray:
 
 def fitted(table: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Coefficients of a least-squares fit with a small ridge."""
-    normal = table.T @ table / len(table) + _OPTIONS.ridge * np.eye(table.shape[1])
+    normal = table.T @ table / len(table) + _Options.ridge * np.eye(table.shape[1])
     return np.linalg.solve(normal, table.T @ target / len(table))
 
 
@@ -253,7 +249,7 @@ def missed(table: np.ndarray, target: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 def held_out(table: np.ndarray, target: np.ndarray) -> np.ndarray:
     """RMS (d,) that fits to every other block of windows leave in the blocks between."""
-    half = np.arange(len(table)) // _OPTIONS.block % 2
+    half = np.arange(len(table)) // _Options.block % 2
     left = [
         missed(table[half == b], target[half == b], fitted(table[half != b], target[half != b]))
         for b in (0, 1)

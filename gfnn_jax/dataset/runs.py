@@ -14,16 +14,12 @@ import numpy as np
 from gfnn_jax.phase_space import Pairs
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Sequences that runs are made of."""
 
     bridged: int = 10  # pairs of a run, left out one after another, beyond which it does not go on
     together: int = 50  # pairs of a run that are looked at or left out as one
     stretches: int = 20  # of a sample of the runs, at least
-
-
-_OPTIONS = _Options()
 
 
 class Identified(NamedTuple):
@@ -57,7 +53,7 @@ def identified(pairs: Pairs) -> Identified:
     chain, along = _chains(run, z0, z1)
     row = np.lexsort((along, chain))
     # Chains of one run are farther apart than what is bridged.
-    place = along[row] + chain[row] * (len(pairs) + _OPTIONS.bridged)
+    place = along[row] + chain[row] * (len(pairs) + _Options.bridged)
     return Identified(_numbered(pairs.take(row), run[row], place), row)
 
 
@@ -103,7 +99,7 @@ def steps_between(pairs: Pairs) -> np.ndarray:
     if pairs.run is None:
         return np.zeros(max(0, len(pairs) - 1), int)
     steps = np.diff(pairs.place)
-    same = (np.diff(pairs.run) == 0) & (steps > 0) & (steps <= 1 + _OPTIONS.bridged)
+    same = (np.diff(pairs.run) == 0) & (steps > 0) & (steps <= 1 + _Options.bridged)
     return np.where(same, steps, 0)
 
 
@@ -124,7 +120,7 @@ def looked_at(pairs: Pairs, rows: np.ndarray, most: int) -> tuple[np.ndarray, np
     """
     places = np.argsort(rows)
     if len(rows) > most:
-        together = _OPTIONS.together if next_of(pairs, rows[places]).any() else 1
+        together = _Options.together if next_of(pairs, rows[places]).any() else 1
         block = np.arange(len(rows)) // together
         drawn = np.random.default_rng(0).permutation(block[-1] + 1)[: -(-most // together)]
         places = places[np.isin(block, drawn)]
@@ -138,7 +134,7 @@ def sampled(pairs: Pairs, most: int, seed: int) -> np.ndarray:
     first = np.concatenate([[True], ~goes_on])
     run = np.cumsum(first) - 1
     along = np.arange(len(pairs)) - np.flatnonzero(first)[run]
-    longest = max(1, most // _OPTIONS.stretches)
+    longest = max(1, most // _Options.stretches)
     block = np.cumsum(first | (along % longest == 0)) - 1
     order = np.random.default_rng(seed).permutation(block[-1] + 1)
     drawn = order[: np.searchsorted(np.cumsum(np.bincount(block)[order]), most) + 1]

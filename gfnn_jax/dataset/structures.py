@@ -24,7 +24,6 @@ from gfnn_jax.phase_space import sizes
 _ENDS = {"ring": ("ring",), "chain": ("free", "fixed")}
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Libraries of structures, by rising size (benchmarks/many.py)."""
 
@@ -59,8 +58,6 @@ class Options:
     fewest_sites: int = 5  # a window of the longest reach meets itself in a smaller ring
 
 
-OPTIONS = Options()
-
 _FUNCTIONS = (
     "cos(q1)",
     "sin(q1)",
@@ -84,22 +81,22 @@ class Sites:
 
     def fewest(self, width: int) -> int:
         """Pairs of states (2d,) that a library is fitted to, at least."""
-        return max(1, min(OPTIONS.fewest_pairs, OPTIONS.fewest_numbers // width))
+        return max(1, min(Options.fewest_pairs, Options.fewest_numbers // width))
 
     def libraries(self, dim: int, given: Sequence[str] = ()) -> Iterator[Sums]:
         """Sums by rising size. given: a user's own terms, as text in a site's q1, p1 and the next
         sites' q2, p2, …"""
         ends = _ENDS[self.kind]
         if self.angles:
-            for degree, products in OPTIONS.fourier:
+            for degree, products in Options.fourier:
                 yield from (
                     periodic_site_terms(dim, end, degree, products=products) for end in ends
                 )
             return
         if given:
             yield from (site_terms(dim, end, 0, 0, given, self.fields) for end in ends)
-        for reach, degree, with_functions in OPTIONS.libraries:
-            if comb((2 + reach) * self.fields + degree, degree) > OPTIONS.most_products:
+        for reach, degree, with_functions in Options.libraries:
+            if comb((2 + reach) * self.fields + degree, degree) > Options.most_products:
                 continue
             functions = (*given, *(self._functions() if with_functions else ()))
             yield from (site_terms(dim, end, reach, degree, functions, self.fields) for end in ends)
@@ -154,12 +151,12 @@ class Bodies:
 
     def fewest(self, width: int) -> int:
         """Pairs that a library is fitted to, at least."""
-        return OPTIONS.fewest_states
+        return Options.fewest_states
 
     def libraries(self, dim: int, given: Sequence[str] = ()) -> Iterator[Sums]:
         """Sums by rising size: of bodies that are all alike, then of bodies that are not; where
         species are known, of these."""
-        for powers in OPTIONS.powers:
+        for powers in Options.powers:
             if self.species:
                 yield body_terms(self.count, self.space, powers, species=self.species)
                 continue
@@ -204,9 +201,9 @@ def structure_of(
         raise FitError(f"expected {EXPECTED}, got {text!r}")
     if dim % fields:
         raise FitError(f"expected {fields} q of every site; got {dim} degrees of freedom")
-    if dim // fields < OPTIONS.fewest_sites:
+    if dim // fields < Options.fewest_sites:
         raise FitError(
-            f"expected a {kind} of at least {OPTIONS.fewest_sites} sites, got {dim // fields}"
+            f"expected a {kind} of at least {Options.fewest_sites} sites, got {dim // fields}"
         )
     sides = {(): "", tuple(range(dim)): "q", tuple(range(2 * dim)): "qp"}
     if coordinates.angles not in sides:

@@ -18,7 +18,6 @@ from gfnn_jax.families.expressions import check_names
 from gfnn_jax.phase_space import TIME, Pairs, sizes
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Times and parameters that count as one."""
 
@@ -26,8 +25,6 @@ class _Options:
     printed: float = 1e-5  # of dt: what printed times may differ by
     nearly_all: float = 0.9  # of the pairs
 
-
-_OPTIONS = _Options()
 
 _OF_DT = ("auto", "polynomial")  # families of an S of dt
 
@@ -80,8 +77,8 @@ def as_varied(
     pairs, messages = without_constants(pairs)
     if np.ndim(pairs.dt) and learn != "hamiltonian":
         usual = np.median(pairs.dt)
-        rows = np.flatnonzero(np.abs(pairs.dt - usual) <= _OPTIONS.printed * usual)
-        if len(rows) >= _OPTIONS.nearly_all * len(pairs):
+        rows = np.flatnonzero(np.abs(pairs.dt - usual) <= _Options.printed * usual)
+        if len(rows) >= _Options.nearly_all * len(pairs):
             messages.append(
                 f"{len(pairs) - len(rows)} of {len(pairs)} pairs are not dt = {usual:g} apart: "
                 "they are left out (--learn hamiltonian uses them)"
@@ -118,15 +115,15 @@ def without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
     """The pairs without a dt, parameters or a phase of a drive that are the same in all, and
     messages."""
     dt = np.asarray(pairs.dt)
-    one = float(np.mean(dt)) if dt.ndim and np.ptp(dt) <= _OPTIONS.same * np.mean(dt) else pairs.dt
+    one = float(np.mean(dt)) if dt.ndim and np.ptp(dt) <= _Options.same * np.mean(dt) else pairs.dt
     args = {name: np.asarray(v, np.float64) for name, v in (pairs.args or {}).items()}
-    still = [name for name, v in args.items() if np.ptp(v) <= _OPTIONS.same * np.abs(v).max()]
+    still = [name for name, v in args.items() if np.ptp(v) <= _Options.same * np.abs(v).max()]
     period, own_time = pairs.period, []
     if period is not None:
         args[TIME] = np.mod(args[TIME], period)
         still = [name for name in still if name != TIME]
         apart = np.mod(args[TIME] - args[TIME][0] + 0.5 * period, period) - 0.5 * period
-        if not np.ndim(one) and np.ptp(apart) <= _OPTIONS.same * period:
+        if not np.ndim(one) and np.ptp(apart) <= _Options.same * period:
             own_time = [_one_phase(args.pop(TIME)[0], one, period)]
             period = None
     kept = {name: v for name, v in args.items() if name not in still}
@@ -142,7 +139,7 @@ def without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
 def _one_phase(t0: float, dt: float, period: float) -> str:
     message = f"all pairs begin at the phase t = {t0:g} of the drive: the map from there is learned"
     turns = dt / period
-    if abs(turns - round(turns)) <= _OPTIONS.same * max(turns, 1.0) and round(turns) > 0:
+    if abs(turns - round(turns)) <= _Options.same * max(turns, 1.0) and round(turns) > 0:
         return (
             f"{message}, that of {round(turns)} whole period{'s' * (round(turns) > 1)} of the drive"
         )

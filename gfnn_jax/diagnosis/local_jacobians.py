@@ -6,7 +6,6 @@ Neighbours also tell which pairs are outliers, and the residuals of a fit whethe
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +19,6 @@ from gfnn_jax.maps.piece import Affine
 from gfnn_jax.phase_space import Pairs, symplecticity_defect
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the local fits (benchmarks/as_a_user.py)."""
 
@@ -51,7 +49,6 @@ class Options:
     thin: float = 0.05
 
 
-OPTIONS = Options()
 # Neighbours per unknown of a local fit: enough to average noise, few enough to stay local.
 NEIGHBOURS_PER_TERM = 3
 # With more terms than these a local fit goes by its Gram matrix, which tells no directions apart
@@ -105,9 +102,9 @@ def local_jacobians(y0, y1, scale, given=None, *, seed: int = 0) -> tuple[np.nda
     quadratic = n >= 20 * (1 + width + len(i))
     terms = 1 + width + (len(i) if quadratic else 0)
     fewest = NEIGHBOURS_PER_TERM * terms
-    count = min(n, max(fewest, min(OPTIONS.most_neighbours, fewest * n // OPTIONS.local_enough)))
-    affordable = max(OPTIONS.fewest_centres, int(OPTIONS.operations / (6 * count * terms**2)))
-    chosen = _centres(n, min(OPTIONS.centres, affordable), seed)
+    count = min(n, max(fewest, min(Options.most_neighbours, fewest * n // Options.local_enough)))
+    affordable = max(Options.fewest_centres, int(Options.operations / (6 * count * terms**2)))
+    chosen = _centres(n, min(Options.centres, affordable), seed)
     among = _among(n, seed)
     tree = cKDTree(x[among])
     while True:
@@ -124,19 +121,19 @@ def local_jacobians(y0, y1, scale, given=None, *, seed: int = 0) -> tuple[np.nda
         noise = np.sqrt(np.sum(rest**2, axis=1) / max(1, count - terms))
         spread = np.sqrt(np.sum(inverse[:, 1 : 1 + width] ** 2, axis=-1))
         error = np.median(noise.max(axis=1) * spread.max(axis=1))
-        if error <= OPTIONS.slope_error or count >= min(n, OPTIONS.most_neighbours):
+        if error <= Options.slope_error or count >= min(n, Options.most_neighbours):
             break
-        count = min(n, OPTIONS.most_neighbours, 2 * count)
+        count = min(n, Options.most_neighbours, 2 * count)
     slope = np.eye(of_state) + np.swapaxes(solution[:, 1 : 1 + of_state], 1, 2)
     # How far neighbours reach in the direction where they differ least, apart from what the other
     # columns tell of it: along a curve or a torus the rest of the map is anybody's guess.
     reach = 1 / (np.sqrt(count) * spread.max(axis=1) * np.sqrt(np.mean(offset**2, axis=(1, 2))))
     if terms <= MANY_TERMS:
-        apart = np.linalg.matrix_rank(design, rtol=OPTIONS.spanned) == terms
+        apart = np.linalg.matrix_rank(design, rtol=Options.spanned) == terms
     else:
         squares = np.linalg.eigvalsh(np.swapaxes(design, 1, 2) @ design)
         apart = squares[:, 0] > _SPANNED_OF_GRAM**2 * squares[:, -1]
-    filled = apart & (reach > OPTIONS.filled)
+    filled = apart & (reach > Options.filled)
     known = float(error + 0.5 * count * error**2) if np.mean(filled) > 0.5 else np.inf
     return slope * scale[:, None] / scale[None, :], known
 
@@ -152,16 +149,16 @@ def _centres(count: int, most: int, seed: int) -> np.ndarray:
 
 def _among(count: int, seed: int) -> np.ndarray:
     """The rows of so many among which neighbours are sought."""
-    if count <= OPTIONS.most_among:
+    if count <= Options.most_among:
         return np.arange(count)
-    return np.sort(_centres(count, OPTIONS.most_among, seed))
+    return np.sort(_centres(count, Options.most_among, seed))
 
 
 def pseudo_inverse(design):
     """Pseudo-inverses of local designs (n, neighbours, terms). They take the map for the identity
     in what the neighbours do not span: a thin tube of data, the torus of a single orbit."""
     if design.shape[-1] <= MANY_TERMS:
-        return np.linalg.pinv(design, rcond=OPTIONS.spanned)
+        return np.linalg.pinv(design, rcond=Options.spanned)
     across = np.swapaxes(design, 1, 2)
     gram = across @ design
     ridge = _SPANNED_OF_GRAM**2 * np.trace(gram, axis1=1, axis2=2)
@@ -200,8 +197,8 @@ def look_symplectic(jacobians, error: float, scale) -> bool:
     move = np.abs(jacobians * scale[None, None, :] / scale[None, :, None] - np.eye(len(scale)))
     size = float(np.median(move.max(axis=(1, 2))))
     defect = data_defect(jacobians, scale)
-    return error > OPTIONS.known * size or defect <= max(
-        OPTIONS.errors * error, OPTIONS.missed * size
+    return error > Options.known * size or defect <= max(
+        Options.errors * error, Options.missed * size
     )
 
 
@@ -214,12 +211,12 @@ def sampled_dimension(y, scale) -> int:
     """
     x, width = np.asarray(y) / scale, np.shape(y)[1]
     count = min(len(x), NEIGHBOURS_PER_TERM * (1 + width))
-    centres = np.linspace(0, len(x) - 1, min(OPTIONS.centres, len(x))).astype(int)
+    centres = np.linspace(0, len(x) - 1, min(Options.centres, len(x))).astype(int)
     among = x[_among(len(x), 0)]
     _, near = cKDTree(among).query(x[centres], k=count)
     offset = among[near] - among[near].mean(axis=1, keepdims=True)
     spread = np.linalg.svd(offset, compute_uv=False)
-    return int(np.median(np.sum(spread > OPTIONS.thin * spread[:, :1], axis=1)))
+    return int(np.median(np.sum(spread > Options.thin * spread[:, :1], axis=1)))
 
 
 # Where the best chart's determinant falls below this, the map is far from the identity.

@@ -12,7 +12,6 @@ coefficient like others, with a standard error.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -34,7 +33,6 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 from gfnn_jax.phase_space import Pairs, apply_j, sizes, split
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the tests of residuals (benchmarks/as_a_user.py, benchmarks/friction_kinds.py)."""
 
@@ -74,9 +72,6 @@ class Options:
     quiet: float = 0.75  # of the sample, that moves least
 
 
-OPTIONS = Options()
-
-
 def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
     """Standard deviation (2d,) of each coordinate's noise, from the residuals of these pairs.
 
@@ -87,7 +82,7 @@ def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
     width, size = z0.shape[1], sizes(z0)
     residual = nearest_image(z1 - _images(map_, pairs, z0), map_.angles_of_z)
     jacobian = np.empty((len(z0), width, width))
-    for j, apart in enumerate(OPTIONS.apart * size):
+    for j, apart in enumerate(Options.apart * size):
         offset = apart * (np.arange(width) == j)
         jacobian[:, :, j] = _change(map_, pairs, offset) / apart
     known = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
@@ -107,10 +102,10 @@ def noise_of_sites(map_: SymplecticMap, pairs: Pairs) -> np.ndarray:
     halves = np.arange(2 * dim) // dim
     grown = np.zeros((2, len(z0), 2 * dim))
     for half in (0, 1):
-        apart = OPTIONS.apart * float(size[halves == half].min())
-        for _ in range(OPTIONS.probes):
+        apart = Options.apart * float(size[halves == half].min())
+        for _ in range(Options.probes):
             signs = rng.choice([-1.0, 1.0], z0.shape) * (halves == half)
-            grown[half] += (_change(map_, pairs, apart * signs) / apart) ** 2 / OPTIONS.probes
+            grown[half] += (_change(map_, pairs, apart * signs) / apart) ** 2 / Options.probes
     known = np.isfinite(residual).all(axis=1) & np.isfinite(grown).all(axis=(0, 2))
     return of_halves(residual[known], grown[:, known])
 
@@ -135,13 +130,13 @@ def is_noise(z, residual, run, place) -> bool | None:
     follow each other share a state, and its noise, and are no neighbours.
     """
     one, other = _close_neighbours(np.asarray(z), np.asarray(run), np.asarray(place))
-    if len(one) < OPTIONS.fewest:
+    if len(one) < Options.fewest:
         return None
-    if _difference_of_neighbours(residual, one, other) < OPTIONS.noise:
+    if _difference_of_neighbours(residual, one, other) < Options.noise:
         return False
     # Products of coordinates are as smooth as what may be missing is at best.
     smooth = np.asarray(z) * np.roll(z, 1, axis=1)
-    return True if _difference_of_neighbours(smooth, one, other) < OPTIONS.smooth else None
+    return True if _difference_of_neighbours(smooth, one, other) < Options.smooth else None
 
 
 def _difference_of_neighbours(values, one, other) -> float:
@@ -153,13 +148,13 @@ def _difference_of_neighbours(values, one, other) -> float:
 def _close_neighbours(z, run, place) -> tuple[np.ndarray, np.ndarray]:
     """Rows and the nearest neighbour of each, the quarter of them that is closest."""
     rows = np.arange(len(z))
-    distance, near = cKDTree(z).query(z, k=min(OPTIONS.nearest + 1, len(z)))
+    distance, near = cKDTree(z).query(z, k=min(Options.nearest + 1, len(z)))
     distance, near = distance[:, 1:], near[:, 1:]
     follows = (run[near] == run[:, None]) & (np.abs(place[near] - place[:, None]) <= 1)
     distance = np.where(follows, np.inf, distance)
     first = np.argmin(distance, axis=1)
     distance, near = distance[rows, first], near[rows, first]
-    closest = np.argsort(distance)[: max(OPTIONS.fewest, int(OPTIONS.closest * len(z)))]
+    closest = np.argsort(distance)[: max(Options.fewest, int(Options.closest * len(z)))]
     closest = closest[np.isfinite(distance[closest])]
     return rows[closest], near[closest]
 
@@ -170,15 +165,15 @@ def hidden_friction(images, residual, angles: tuple[int, ...] = ()) -> tuple[flo
     are too few."""
     images, residual = np.asarray(images), np.asarray(residual)
     whole, square = _by_friction(images, residual, angles), np.mean((residual / sizes(images)) ** 2)
-    if whole is None or not abs(whole[0]) > max(CERTAIN * whole[1], square, OPTIONS.roundoff):
+    if whole is None or not abs(whole[0]) > max(CERTAIN * whole[1], square, Options.roundoff):
         return None
     distance = np.linalg.norm((images - images.mean(axis=0)) / sizes(images), axis=1)
     inside = distance <= np.median(distance)
     for half in (inside, ~inside):
         part = _by_friction(images[half], residual[half], angles)
-        if part is None or not abs(part[0]) > OPTIONS.of_halves * part[1]:
+        if part is None or not abs(part[0]) > Options.of_halves * part[1]:
             return None
-        if not 1 / OPTIONS.alike_of_halves < part[0] / whole[0] < OPTIONS.alike_of_halves:
+        if not 1 / Options.alike_of_halves < part[0] / whole[0] < Options.alike_of_halves:
             return None
     return whole
 
@@ -187,9 +182,9 @@ def _by_friction(images, residual, angles) -> tuple[float, float] | None:
     """The sum of −ρ_i and its standard error, which knows that pairs differ in what is left."""
     count, width = residual.shape
     inputs = box_inputs(images, angles=angles)
-    most = min(OPTIONS.most_terms, count * width // OPTIONS.rows_per_term)
+    most = min(Options.most_terms, count * width // Options.rows_per_term)
     family = next(
-        (f for f in (Products(inputs, n) for n in OPTIONS.degrees) if f.num_parameters <= most),
+        (f for f in (Products(inputs, n) for n in Options.degrees) if f.num_parameters <= most),
         None,
     )
     if family is None:
@@ -217,7 +212,7 @@ def is_smooth(z, residual) -> bool:
     """Return whether a cubic function of the state, a linear one where the pairs are few, explains
     half of the residual. z, residual: (N, 2d)."""
     z, residual = np.asarray(z), np.asarray(residual)
-    few = len(z) < OPTIONS.pairs_per_term * math.comb(z.shape[1] + 3, 3)
+    few = len(z) < Options.pairs_per_term * math.comb(z.shape[1] + 3, 3)
     design = products((z - z.mean(axis=0)) / sizes(z), 1 if few else 3)
     rest = residual - design @ np.linalg.lstsq(design, residual, rcond=None)[0]
     return bool(np.mean(rest**2) <= 0.5 * np.mean(residual**2))
@@ -235,7 +230,7 @@ def differs_between_sequences(z, residual, sequence) -> bool:
     their size nearby: a step magnifies the noise of the states, in close passages a hundred times,
     and a few of these would stand for all.
     """
-    z, residual, count = np.asarray(z), np.asarray(residual), min(len(z), OPTIONS.nearby)
+    z, residual, count = np.asarray(z), np.asarray(residual), min(len(z), Options.nearby)
     near = cKDTree(z).query(z, k=count)[1].reshape(len(z), count)
     size = np.sqrt(np.mean(residual[near] ** 2, axis=1))
     residual = residual / np.where(size > 0, size, 1.0)
@@ -249,10 +244,10 @@ def differs_between_sequences(z, residual, sequence) -> bool:
         total += np.sum(residual[own[1::2]] ** 2)
         within += np.sum((residual[own[1::2]] - design[1::2] @ fitted) ** 2)
         rows.append(own)
-    if len(rows) < 2 or not within < OPTIONS.explained * total:
+    if len(rows) < 2 or not within < Options.explained * total:
         return False
     rows = np.concatenate(rows)
-    count = min(len(rows), OPTIONS.sequence_neighbours)
+    count = min(len(rows), Options.sequence_neighbours)
     _, near = cKDTree(z[rows]).query(z[rows], k=count)
     other = sequence[rows][near] != sequence[rows][:, None]
     first = np.argmax(other, axis=1)  # the nearest of another sequence
@@ -263,16 +258,16 @@ def differs_between_sequences(z, residual, sequence) -> bool:
         np.sum((residual[places] - residual[near[np.arange(len(near)), k[known]]]) ** 2)
         for k in (first, np.argmax(as_far, axis=1))
     )
-    return bool(across > 0.5 * np.sum(residual[places] ** 2) and across > OPTIONS.across * along)
+    return bool(across > 0.5 * np.sum(residual[places] ** 2) and across > Options.across * along)
 
 
 def misfit(family, data: Dataset, chart: AnyChart) -> float:
     """Part of the held-out target gradients that a family, linear in its parameters, leaves over:
     the median over pairs, of the forces or of the velocities, whichever is larger; infinite where
     its functions overflow. data: without args."""
-    rows = data.training[: 2 * OPTIONS.pairs_of_misfit]
+    rows = data.training[: 2 * Options.pairs_of_misfit]
     moved = np.abs((data.y1[rows] - data.y0[rows]) / data.scale).max(axis=1)
-    rows = rows[moved <= np.quantile(moved, OPTIONS.quiet)]  # close passages move most
+    rows = rows[moved <= np.quantile(moved, Options.quiet)]  # close passages move most
     y0, y1 = data.y0[rows], data.y1[rows]
     half = len(rows) // 2
     w, target = chart.evaluation_point(y0, y1), chart.target_gradient(y0, y1, data.dt)

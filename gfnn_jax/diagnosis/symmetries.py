@@ -8,7 +8,6 @@ hold them, are compared with the images of others.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from itertools import combinations
 from typing import NamedTuple
@@ -23,7 +22,6 @@ from gfnn_jax.fitting.linear_starts import fitted_gradients
 from gfnn_jax.phase_space import apply_j
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the search for symmetries (benchmarks/as_a_user.py)."""
 
@@ -42,9 +40,6 @@ class Options:
     covered: float = 0.5  # part of the images that must lie among the pairs
 
 
-OPTIONS = Options()
-
-
 class SymmetryOfPairs(NamedTuple):
     """text: as it is told. left: of a conserved quantity what it changes by, in parts of what it
     would; else what gradients and their images differ by, in parts of the gradients."""
@@ -59,7 +54,7 @@ class SymmetryOfPairs(NamedTuple):
 def symmetries_of_pairs(data: Dataset) -> tuple[SymmetryOfPairs, ...]:
     """The symmetries that the pairs show, or a sample of them; none of pairs with args, of many
     degrees of freedom, or where too few lie where their images do. data: without a base map."""
-    if data.varied or data.structure is not None or data.dim > OPTIONS.most_dim:
+    if data.varied or data.structure is not None or data.dim > Options.most_dim:
         return ()
     angles = tuple(a for a in data.coordinates.angles if a < data.dim)
     if len(angles) < len(data.coordinates.angles):  # a momentum is one: pairs of a kicked map
@@ -68,7 +63,7 @@ def symmetries_of_pairs(data: Dataset) -> tuple[SymmetryOfPairs, ...]:
 
 
 def _conserved(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPairs]:
-    rows = np.arange(min(len(data.y0), OPTIONS.rows))
+    rows = np.arange(min(len(data.y0), Options.rows))
     goes_on, before, after = next_of(data.pairs, rows), data.y0[rows], data.y1[rows]
     first = before[np.concatenate([[True], ~goes_on])]
     last = after[np.concatenate([~goes_on, [True]])]
@@ -79,7 +74,7 @@ def _conserved(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPai
         if not spread > 0 or not moved > 0:
             continue
         left = np.sqrt(np.mean((values[2] - values[1]) ** 2)) / spread / moved
-        if left <= OPTIONS.conserved:
+        if left <= Options.conserved:
             yield SymmetryOfPairs(text, float(left))
 
 
@@ -90,15 +85,15 @@ def _generated(generator: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 def _reflected(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPairs]:
     rows = np.concatenate(
-        [_some(data.training, OPTIONS.trained), _some(data.validation, OPTIONS.held)]
+        [_some(data.training, Options.trained), _some(data.validation, Options.held)]
     )
-    train, held = np.split(np.arange(len(rows)), [min(len(data.training), OPTIONS.trained)])
+    train, held = np.split(np.arange(len(rows)), [min(len(data.training), Options.trained)])
     before, after = data.y0[rows], data.y1[rows]
     middle, weight = 0.5 * (before + after), 1.0 / np.roll(data.scale, data.dim)
     gradient = -apply_j(after - before) / data.dt
     inputs = box_inputs(middle[train], angles=angles, cyclic=data.coordinates.cyclic)
-    most = min(OPTIONS.most_terms, len(train) * 2 * data.dim // OPTIONS.rows_per_term)
-    known = [f for f in (Products(inputs, n) for n in OPTIONS.degrees) if f.num_parameters <= most]
+    most = min(Options.most_terms, len(train) * 2 * data.dim // Options.rows_per_term)
+    known = [f for f in (Products(inputs, n) for n in Options.degrees) if f.num_parameters <= most]
     if not known or not len(held):
         return
     c = fitted_gradients(known[-1], middle[train], gradient[train], data.scale)
@@ -112,11 +107,11 @@ def _reflected(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPai
     for text, matrix in reflections(data.dim, angles):
         there = middle[held] @ matrix.T
         inside = ((there[:, plain] >= low) & (there[:, plain] <= high)).all(axis=1)
-        if np.mean(inside) < OPTIONS.covered:
+        if np.mean(inside) < Options.covered:
             continue
         own = missed(middle[held][inside], gradient[held][inside])
         left = missed(there[inside], gradient[held][inside] @ matrix.T)
-        if own <= OPTIONS.fitted and left <= OPTIONS.as_well * own:
+        if own <= Options.fitted and left <= Options.as_well * own:
             yield SymmetryOfPairs(text, left)
 
 

@@ -3,7 +3,6 @@ file's own names and units."""
 
 from __future__ import annotations
 
-import dataclasses
 import textwrap
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from gfnn_jax.models.lagrangians.residuals import Trace
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Sizes of figures, and when a line is broken."""
 
@@ -35,8 +33,6 @@ class _Options:
     page: float = 9.2  # inches: the width of figures for a page
     points: int = 1_500  # of a series in a figure, whose panels are some 500 pixels wide
 
-
-_OPTIONS = _Options()
 
 _BLUE, _RED, _GREEN, *_ = COLOURS
 # Labels that are set as formulas take half of the time of a figure, and powers of ten are rare.
@@ -70,7 +66,7 @@ class _Sheet:
 
 
 def _thinned(values: np.ndarray) -> np.ndarray:
-    return values[:: max(len(values) // _OPTIONS.points, 1)]
+    return values[:: max(len(values) // _Options.points, 1)]
 
 
 def _broken(t: np.ndarray, *series: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -78,7 +74,7 @@ def _broken(t: np.ndarray, *series: np.ndarray) -> tuple[np.ndarray, ...]:
     t, *series = map(_thinned, (t, *series))  # pyright: ignore[reportAssignmentType]
     if len(t) < 3:
         return (t, *series)
-    pauses = np.flatnonzero(np.diff(t) > _OPTIONS.gap * np.median(np.diff(t))) + 1
+    pauses = np.flatnonzero(np.diff(t) > _Options.gap * np.median(np.diff(t))) + 1
     return tuple(np.insert(np.asarray(x, float), pauses, np.nan) for x in (t, *series))
 
 
@@ -87,7 +83,7 @@ def recording_figure(recording: Recording, summary: RecordingSummary) -> Figure:
     """Draw time series with gaps shaded, phase portraits and spectra, a row for each position and
     input."""
     names = (*recording.positions, *recording.inputs) or recording.columns
-    names = names[: _OPTIONS.most_rows]
+    names = names[: _Options.most_rows]
     sheet = _Sheet(recording, len(names), 3)
     sheet.units = {column.name: column.unit for column in summary.columns}
     longest = max(recording.runs, key=lambda run: len(recording.times(run)))
@@ -137,7 +133,7 @@ def _phases(sheet: _Sheet, name: str, measured) -> Iterator[tuple[np.ndarray, ..
 def law_figure(fit: LearnedLaw, recording: Recording) -> Figure:
     """Draw a law and the recording that it was learned from: what was measured against a forecast
     with its band, residuals, whether they are white, and the energy."""
-    channels = list(fit.whiteness)[: _OPTIONS.most_rows]
+    channels = list(fit.whiteness)[: _Options.most_rows]
     sheet = _Sheet(recording, len(channels) + 1, 3)
     run = max(recording.runs, key=lambda name: np.ptp(recording.times(name)))
     own, t = recording.slice(run=run), recording.times(run)
@@ -181,8 +177,8 @@ def _noise_lines(ax, sigma: float) -> None:
 @_style
 def residuals_figure(fit: LearnedLaw, recording: Recording) -> Figure:
     """Draw the residuals of a law against time, the channel itself and its rate of change."""
-    channels = list(fit.whiteness)[: _OPTIONS.most_rows]
-    sheet = _Sheet(recording, len(channels), 3, _OPTIONS.page / 3, sharey="row")
+    channels = list(fit.whiteness)[: _Options.most_rows]
+    sheet = _Sheet(recording, len(channels), 3, _Options.page / 3, sharey="row")
     for place, (name, row) in enumerate(zip(channels, sheet.axes, strict=True)):
         t, x, rate, missed = (
             _thinned(np.concatenate(column))
@@ -208,7 +204,7 @@ def _residual(trace: Trace, place: int) -> tuple[np.ndarray, ...]:
 @_style
 def swings_figure(swings: Swings, label: str) -> Figure:
     """Draw frequency and Q of free swings against their amplitude, with two standard errors."""
-    figure = Figure(figsize=(_OPTIONS.page, 2.6))
+    figure = Figure(figsize=(_Options.page, 2.6))
     shown = (
         (swings.frequency, swings.frequency_std, "frequency [Hz]"),
         (swings.quality, swings.quality_std, "quality factor Q"),
@@ -281,12 +277,12 @@ def _energy(ax, fit: LearnedLaw) -> None:
 def coming_figure(fit: LearnedLaw, recording: Recording, begin: float | None = None) -> Figure:
     """Draw the longest run, and the forecast of what comes after ``begin`` (s) from the one state
     there; None: after two thirds."""
-    channels = list(fit.whiteness)[: _OPTIONS.most_rows]
+    channels = list(fit.whiteness)[: _Options.most_rows]
     run = max(recording.runs, key=lambda name: np.ptp(recording.times(name)))
     own = recording.slice(run=run)
     begin = begin_of(own, begin)
-    sheet = _Sheet(recording, len(channels), 1, _OPTIONS.page, sharex=True)
-    sheet.figure.set_size_inches(_OPTIONS.page, 2.6 * len(channels))
+    sheet = _Sheet(recording, len(channels), 1, _Options.page, sharex=True)
+    sheet.figure.set_size_inches(_Options.page, 2.6 * len(channels))
     for name, (ax,) in zip(channels, sheet.axes, strict=True):
         draw_forecast(ax, sheet, fit, own.slice(stop=begin), own, name)
         ax.axvline(begin, color="0.4", lw=0.8, ls="--")
@@ -299,9 +295,9 @@ def coming_figure(fit: LearnedLaw, recording: Recording, begin: float | None = N
 def forecasts_figure(found: Forecasts, recording: Recording) -> Figure:
     """Draw three forecasts of what no fit has seen: measured and forecast above,
     what the forecast missed and its band below."""
-    names = list(found.median)[: _OPTIONS.most_rows]
+    names = list(found.median)[: _Options.most_rows]
     shown = [found.each[k] for k in sorted({0, len(found.each) // 2, len(found.each) - 1})]
-    sheet = _Sheet(recording, 2 * len(names), len(shown), _OPTIONS.page / len(shown), sharey="row")
+    sheet = _Sheet(recording, 2 * len(names), len(shown), _Options.page / len(shown), sharey="row")
     for column, one in zip(sheet.axes.T, shown, strict=True):
         for above, below, name in zip(column[::2], column[1::2], names, strict=True):
             above.plot(one.t, one.measured[name], ".", ms=3, color="0.5", label="measured")

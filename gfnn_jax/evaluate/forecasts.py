@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,7 +15,6 @@ from gfnn_jax.maps.sensors import TUBE
 from gfnn_jax.maps.symplectic_map import SymplecticMap
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Forecasts of a part that no fit has seen."""
 
@@ -26,8 +24,6 @@ class _Options:
     # of the fastest motion, that are forecast ahead, if there are as many
     periods: tuple[float, ...] = (0.25, 1.0, 2.0)
 
-
-_OPTIONS = _Options()
 
 PART = 2 / 3  # of a recording, in time, that is learned from where the rest is held out
 
@@ -81,7 +77,7 @@ def forecasts_of(fit: Fit, held_out: Recording) -> Forecasts:
     if map_.sensors is None:
         noise = fit.noise if isinstance(fit.found, Choice) else None
         return _forecasts(partial(_of_state, map_, noise), held_out, [half / 4, half / 2, half])
-    ahead = [periods * 2 * np.pi / map_.sensors.omega for periods in _OPTIONS.periods]
+    ahead = [periods * 2 * np.pi / map_.sensors.omega for periods in _Options.periods]
     ahead = [seconds for seconds in ahead if seconds < half] or [half]
     return forecasts_along(map_, held_out, ahead)
 
@@ -103,15 +99,15 @@ def _forecasts(
     starts = [
         (run, k)
         for run, t in times.items()
-        for k in range(_OPTIONS.samples - 1, len(t) - 1)
+        for k in range(_Options.samples - 1, len(t) - 1)
         if t[k] + ahead[-1] <= t[-1]
     ]
     if not starts:
         raise InputError(
-            f"{recording.source}: no run has {_OPTIONS.samples} samples and {ahead[-1]:.3g} s "
+            f"{recording.source}: no run has {_Options.samples} samples and {ahead[-1]:.3g} s "
             "behind them that no fit has seen"
         )
-    chosen = np.linspace(0, len(starts) - 1, min(_OPTIONS.starts, len(starts))).astype(int)
+    chosen = np.linspace(0, len(starts) - 1, min(_Options.starts, len(starts))).astype(int)
     begins = (starts[i] for i in chosen)
     each = tuple(forecast(recording, run, k, ahead[-1]) for run, k in begins)
     names = list(each[0].values)
@@ -131,7 +127,7 @@ def _ahead(map_: SymplecticMap, recording: Recording, run: str, k: int, longest:
     t = recording.times(run)
     begin = float(t[k])
     later = recording.slice(np.nextafter(begin, np.inf), begin + longest, run=run)
-    start = recording.slice(float(t[k - _OPTIONS.samples + 1]), begin, run=run)
+    start = recording.slice(float(t[k - _Options.samples + 1]), begin, run=run)
     own = recording.slice(run=run) if recording.inputs else None
     found = map_.forecast(start, later.times(run), own, coverage=TUBE)
     measured, values, std = {}, {}, {}
@@ -160,7 +156,7 @@ def _of_state(
     t, z, dt = recording.times(run), recording.array("positions", run), float(map_.dt)
     steps = int(longest / dt * (1 + 1e-9))
     sigma = np.zeros(z.shape[1]) if noise is None else noise
-    starts = z[k] + sigma * np.random.default_rng(k).normal(size=(_OPTIONS.drawn, z.shape[1]))
+    starts = z[k] + sigma * np.random.default_rng(k).normal(size=(_Options.drawn, z.shape[1]))
     own = None if map_.parameters is None else args_of(recording, run, parameters_of(recording))
     states = np.concatenate([z[k : k + 1], starts])
     found = np.asarray(map_.rollout(states, steps, params=own)[0])[:, 1:]

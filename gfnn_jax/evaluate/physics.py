@@ -22,8 +22,7 @@ from gfnn_jax.maps.laws import is_of_law, law_of_map
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 
 
-@dataclasses.dataclass(frozen=True)
-class PhysicsOptions:
+class Options:
     """Numerical options.
 
     nodes: of the quadrature over a swing, whose integrand is smooth. amplitudes: that the curve of
@@ -41,9 +40,6 @@ class PhysicsOptions:
     step: float = 1e-5
     small: float = 1e-2
     gravity: float = 9.80665
-
-
-OPTIONS = PhysicsOptions()
 
 
 class Quantity(NamedTuple):
@@ -178,7 +174,7 @@ class _System(NamedTuple):
     def rest_from(self, q: np.ndarray) -> np.ndarray | None:
         """The position of rest that Newton's method finds from q (d,), where it finds one."""
         q, v = np.array(q, float), np.zeros(self.law.dim)
-        for _ in range(OPTIONS.iterations):
+        for _ in range(Options.iterations):
             found = self.law.derivatives(q, v)
             step = np.linalg.lstsq(found.by_qq, found.by_q, rcond=None)[0]
             if np.any(np.abs(found.by_qq @ step - found.by_q) > 1e-6 * np.abs(found.by_q).max()):
@@ -192,7 +188,7 @@ class _System(NamedTuple):
     def rests(self) -> list[tuple[np.ndarray, bool]]:
         """(position, whether it is stable) of each rest position near the data, stable ones
         first."""
-        count = max(1, min(OPTIONS.starts, int(OPTIONS.most ** (1 / self.law.dim))))
+        count = max(1, min(Options.starts, int(Options.most ** (1 / self.law.dim))))
         along = np.linspace(-2.0, 2.0, count) if count > 1 else np.zeros(1)
         grid = np.stack(np.meshgrid(*[along] * self.law.dim), axis=-1).reshape(-1, self.law.dim)
         found: list[tuple[np.ndarray, bool]] = []
@@ -260,7 +256,7 @@ class _System(NamedTuple):
         """The matrix (2d, 2d) of small motion (q, v) about rest."""
         law, d = self._viscous(), self.law.dim
         speed = self.size * max(np.sqrt(np.max(np.abs(self._curvature(q)))), 1e-12)
-        steps = OPTIONS.step * np.concatenate([self.size, speed])
+        steps = Options.step * np.concatenate([self.size, speed])
         moved = np.concatenate([np.diag(steps), -np.diag(steps)])
         a = law.acceleration(q + moved[:, :d], moved[:, d:])
         matrix = np.zeros((2 * d, 2 * d))
@@ -290,7 +286,7 @@ class _System(NamedTuple):
         def compute(other: _System) -> np.ndarray:
             at = other._near(q)
             squared = (-other._curvature(at) / other.law.masses(at)).item()
-            return np.array([squared, OPTIONS.gravity / squared])
+            return np.array([squared, Options.gravity / squared])
 
         (squared, length), (error, of_length) = self.with_errors(compute)
         return [
@@ -300,7 +296,7 @@ class _System(NamedTuple):
                 length,
                 of_length,
                 "m",
-                f"g/ω₀² with g = {OPTIONS.gravity:g} m/s²",
+                f"g/ω₀² with g = {Options.gravity:g} m/s²",
             ),
         ]
 
@@ -323,7 +319,7 @@ class _System(NamedTuple):
     def swings(self, q: np.ndarray) -> Swings | None:
         """Frequency and Q of swings about rest, up to those of the data."""
         largest = float(self.size[0])
-        fractions = np.linspace(OPTIONS.small, 1.0, OPTIONS.amplitudes)
+        fractions = np.linspace(Options.small, 1.0, Options.amplitudes)
         amplitude = largest * fractions
 
         def compute(other: _System) -> np.ndarray:
@@ -358,7 +354,7 @@ class _System(NamedTuple):
             return np.nan, np.nan
         left = float(brentq(above, left, rest))  # pyright: ignore[reportArgumentType]
         half, middle = 0.5 * (right - left), 0.5 * (right + left)
-        nodes, weights = np.polynomial.legendre.leggauss(OPTIONS.nodes)
+        nodes, weights = np.polynomial.legendre.leggauss(Options.nodes)
         angle = 0.5 * np.pi * nodes
         q = (middle + half * np.sin(angle))[:, None]
         free = energy - np.array([self._potential(x) for x in q[:, 0]])

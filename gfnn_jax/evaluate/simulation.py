@@ -3,7 +3,6 @@ coefficients."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 from importlib.resources import files
@@ -19,8 +18,7 @@ from gfnn_jax.maps.laws import law_of_map, velocities_of
 from gfnn_jax.models.lagrangians.learned_law import LearnedLaw
 
 
-@dataclasses.dataclass(frozen=True)
-class SimulationOptions:
+class Options:
     """Sizes of the simulation. points: of the data, which a browser steps through in some ms.
     errors, share: a slider reaches this many standard errors, and this share of its coefficient, to
     either side, whichever is more."""
@@ -28,9 +26,6 @@ class SimulationOptions:
     points: int = 500
     errors: float = 10.0
     share: float = 0.5
-
-
-OPTIONS = SimulationOptions()
 
 
 class Slider(NamedTuple):
@@ -59,7 +54,7 @@ def simulation(law: LearnedLaw, recording: Recording, begin: float) -> str | Non
     (run,) = recording.runs
     t = recording.times(run)
     rows = np.arange(len(before.times(run)) - 1, len(t))  # the state is that of the last row before
-    rows = rows[:: max(1, len(rows) // OPTIONS.points)]
+    rows = rows[:: max(1, len(rows) // Options.points)]
     if len(rows) < 2:
         return None
     names = () if law.map.parameters is None else law.map.parameters.names
@@ -129,7 +124,7 @@ def _sliders(law: LearnedLaw) -> list[Slider]:
     losses = first + own.friction.count
     for place, (value, error) in enumerate(zip(values.tolist(), std.tolist(), strict=True)):
         if error > 0 and value != 0:
-            reach = max(OPTIONS.errors * error, OPTIONS.share * abs(value))
+            reach = max(Options.errors * error, Options.share * abs(value))
             friction = first <= place < losses or place >= losses + gains
             low = max(value - reach, 0.0) if friction else value - reach
             label = _label(law, piece.family.term_names[place])

@@ -36,7 +36,6 @@ from gfnn_jax.maps.symplectic_map import SymplecticMap
 GRAVITY = 9.81  # m/s², by which lengths are in metres where times are in seconds
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the links of a law.
 
@@ -48,9 +47,6 @@ class Options:
     states: int = 200
     most: float = 0.05
     still: float = 1e-9
-
-
-OPTIONS = Options()
 
 
 class Link(NamedTuple):
@@ -109,12 +105,12 @@ def robot_of(map_: SymplecticMap) -> Robot:
             "inputs, which no chain of links does: use --to fmu"
         )
     rng = np.random.default_rng(0)
-    q, none = rng.uniform(-np.pi, np.pi, (OPTIONS.states, dim)), np.zeros((OPTIONS.states, dim))
+    q, none = rng.uniform(-np.pi, np.pi, (Options.states, dim)), np.zeros((Options.states, dim))
     at_rest = law.derivatives(q, none)
     found = [_Chain.of(at_rest.by_vv, at_rest.by_q, q, turn) for turn in _conventions(dim)]
     best = min(found, key=lambda chain: chain.off)
     gyroscopic = np.abs(law.momentum(q, none)).max()
-    if best.off > OPTIONS.most or gyroscopic > 1e-9:
+    if best.off > Options.most or gyroscopic > 1e-9:
         raise InputError(
             f"this law is not a planar chain of links: it differs from one by {best.off:.0%}: use "
             "--to fmu or --to c"
@@ -158,7 +154,7 @@ class _Chain:
             s, c = np.linalg.lstsq(waves, -forces[:, i])[0]
             weight[i], zeros[i] = np.hypot(s, c), np.arctan2(-c, s)
             shown[:, i] = -waves @ [s, c]
-        strong = weight > OPTIONS.still * np.abs(masses).max()
+        strong = weight > Options.still * np.abs(masses).max()
         weight, zeros = np.where(strong, weight, 0.0), np.where(strong, zeros, 0.0)
         a, b = masses[:, range(dim), range(dim)].mean(axis=0), np.zeros((dim, dim))
         model, rotors, size = np.zeros_like(masses), np.zeros(dim), np.linalg.norm(masses)
@@ -167,14 +163,14 @@ class _Chain:
             wave = np.cos(theta[:, i] - theta[:, j] - zeros[i] + zeros[j])
             rows = np.stack([wave, -np.ones_like(wave)], axis=1)
             b[i, j], rotor = np.linalg.lstsq(rows, masses[:, i, j])[0]
-            if j == i + 1 and rotor > OPTIONS.still * size:
+            if j == i + 1 and rotor > Options.still * size:
                 rotors[j] = rotor
             else:
                 b[i, j] = wave @ masses[:, i, j] / (wave @ wave)
             model[:, i, j] = model[:, j, i] = b[i, j] * wave - rotors[j] * (j == i + 1)
         a = a - rotors - np.append(rotors[1:], 0.0)
         off = np.linalg.norm(model - masses) / size
-        if np.linalg.norm(forces) > OPTIONS.still * size:
+        if np.linalg.norm(forces) > Options.still * size:
             off = max(off, np.linalg.norm(shown - forces) / np.linalg.norm(forces))
         return _Chain(a, b, rotors, weight, zeros, turn, float(off))
 

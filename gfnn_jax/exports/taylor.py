@@ -15,7 +15,6 @@ has the series of this force as one unknown more of each order, from d^k(c·v)/d
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -357,7 +356,6 @@ static int flow(double *z, double h, const double *u, const double *p)
 """
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the series (`benchmarks/machines.py`).
 
@@ -376,9 +374,6 @@ class Options:
     rest: float = 1e-12
     unrolled: int = 6
     first: int = 4  # terms of a series before it is asked whether it ends
-
-
-OPTIONS = Options()
 
 
 def _refused(_: Any) -> Any:
@@ -450,7 +445,7 @@ class _Rows:
         )
         self.rates = [rate if _has_row(rate) else tape.made("+", rate, 0.0) for rate in rates]
         self.speeds, self.limits = speeds.tolist(), limits.tolist()
-        self.tape, self.size = tape, OPTIONS.order + 1
+        self.tape, self.size = tape, Options.order + 1
         self.made = self._used()
         self.varies: set[int] = set()
         self.rows: dict[int, int] = {s.number: i for i, s in enumerate(z)}
@@ -470,7 +465,7 @@ class _Rows:
             linear = s.operation in ("+", "-", "negative", "input")
             one = s.operation == "*" and sum(map(self.varying, s.operands)) == 1
             sums += s.number in self.varies and not (linear or one)
-        few = sums <= OPTIONS.unrolled and not self.count
+        few = sums <= Options.unrolled and not self.count
         self.unrolled = few if unrolled is None else unrolled
 
     @property
@@ -598,18 +593,18 @@ def c_of_flow(graph: LawGraph, coefficients: bool = False, unrolled: bool | None
     sizes = {
         "DIM": graph.dim,
         "WIDTH": rows.width,
-        "ORDER": OPTIONS.order,
+        "ORDER": Options.order,
         "SIZE": rows.size,
         "ROWS": rows.num,
-        "MOST_SERIES": OPTIONS.most,
+        "MOST_SERIES": Options.most,
     }
     tables = {"double scale[WIDTH]": map(literal, graph.scale)}
-    numbers = {"ROUNDING": OPTIONS.rounding}
+    numbers = {"ROUNDING": Options.rounding}
     if not rows.unrolled:
         tables["int rates[WIDTH]"] = map(rows.begin, rows.rates)
     if rows.count:
-        sizes |= {"FRICTIONS": rows.count, "STICKS": int(graph.sticks), "SCAN": OPTIONS.scan}
-        numbers["REST"] = OPTIONS.rest
+        sizes |= {"FRICTIONS": rows.count, "STICKS": int(graph.sticks), "SCAN": Options.scan}
+        numbers["REST"] = Options.rest
         tables["int speeds[FRICTIONS]"] = map(rows.begin, rows.speeds)
         tables["double directions[FRICTIONS*DIM]"] = map(literal, np.ravel(graph.directions))
     parts = [
@@ -685,7 +680,7 @@ def _written_out(rows: _Rows) -> str:
     inputs = [s for s in rows.made if s.operation == "input" and s.number in rows.rows]
     z = inputs[: rows.width]
     for s in inputs:
-        last = OPTIONS.order - 1 if s.number in rows.varies and s not in z else 0
+        last = Options.order - 1 if s.number in rows.varies and s not in z else 0
         lines += [
             f"const double {rows.at(s, k)} = T[{rows.rows[s.number] * rows.size + k}];"
             for k in range(last + 1)
@@ -694,8 +689,8 @@ def _written_out(rows: _Rows) -> str:
         f"const double size{i} = ROUNDING*(fabs({rows.at(s, 0)}) + {literal(graph.scale[i])});"
         for i, s in enumerate(z)
     ]
-    lines.append(f"const double square = h*h;\ndouble power = {'*'.join('h' * OPTIONS.first)};")
-    for k in range(OPTIONS.order):
+    lines.append(f"const double square = h*h;\ndouble power = {'*'.join('h' * Options.first)};")
+    for k in range(Options.order):
         lines += rows.written(k)
         for i, (s, rate) in enumerate(zip(z, rows.rates, strict=True)):
             still = k > 0 and not rows.varying(rate)
@@ -703,7 +698,7 @@ def _written_out(rows: _Rows) -> str:
             place = i * rows.size + k + 1
             lines.append(f"const double {rows.at(s, k + 1)} = {later};")
             lines.append(f"T[{place}] = {rows.at(s, k + 1)};")
-        if k > OPTIONS.first and (k - OPTIONS.first) % 2 == 0:
+        if k > Options.first and (k - Options.first) % 2 == 0:
             lines.append("power *= square;")
             small = [
                 f"fabs({rows.at(s, n)}*{power}) <= size{i}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -14,16 +13,12 @@ import numpy as np
 from gfnn_jax.arrays import as_row, matmul, namespace, pytree
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Boxes of inputs, and tests of parity."""
 
     margin: float = 1.0 + 1e-9  # the data's extremes lie just inside the box
     parity_states: int = 64  # number of states on which the parity of a feature is judged
     chunk: int = 4_096  # states for which features are compiled, whatever the number of data
-
-
-_OPTIONS = _Options()
 
 
 @pytree("keep", "angles", "width", "features")
@@ -157,7 +152,7 @@ def feature_tables(features: Callable, w, *, order: int) -> tuple:
     if namespace(w) is jnp:
         return _feature_tables(features, order, w)
     flat = w.reshape(-1, w.shape[-1])
-    size = min(_OPTIONS.chunk, 2 ** max(6, (len(flat) - 1).bit_length()))
+    size = min(_Options.chunk, 2 ** max(6, (len(flat) - 1).bit_length()))
     count = max(1, -(-len(flat) // size))
     padded = np.resize(flat, (count * size, w.shape[-1]))  # repeated, or zeros for none
     blocks = [
@@ -203,14 +198,14 @@ def box_inputs(
         signs = np.asarray(variable_signs(plain, reversor, w))
         reach = np.maximum(np.abs(low), np.abs(high))
         low, high = np.where(signs < 0, -reach, low), np.where(signs < 0, reach, high)
-    centre, scale = 0.5 * (low + high), 0.5 * (high - low) * _OPTIONS.margin
+    centre, scale = 0.5 * (low + high), 0.5 * (high - low) * _Options.margin
     scale = np.where(scale > 0, scale, np.where(centre != 0, np.abs(centre), 1.0))
     positions = tuple(keep.index(i) for i in angles if i in keep) if features is None else ()
     centre[list(positions)], scale[list(positions)] = 0.0, 1.0
     if args is None:
         return Inputs(keep, positions, w.shape[-1], centre, scale, features)
     low, high = np.min(args, axis=0), np.max(args, axis=0)
-    of_args = 0.5 * (low + high), 0.5 * (high - low) * _OPTIONS.margin
+    of_args = 0.5 * (low + high), 0.5 * (high - low) * _Options.margin
     return Inputs(keep, positions, w.shape[-1], centre, scale, features, *of_args)
 
 
@@ -219,7 +214,7 @@ def variable_signs(inputs: Inputs, reversor: tuple[int, ...], w) -> tuple[int, .
 
     Raises ValueError for a feature that is neither even nor odd.
     """
-    w = np.asarray(w)[: _OPTIONS.parity_states]
+    w = np.asarray(w)[: _Options.parity_states]
     x, flipped = inputs.raw(w), inputs.raw(w * np.asarray(reversor, w.dtype))
     size = np.abs(x).max(axis=0) + 1e-300
     even = np.abs(flipped - x).max(axis=0) / size

@@ -8,7 +8,6 @@ single Newton update. Next to a fold of S the guess decides which branch is foun
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -26,7 +25,6 @@ from gfnn_jax.phase_space import sizes
 CLOSE = 5e-8
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of predictors (benchmarks/speed.py)."""
 
@@ -44,9 +42,6 @@ class Options:
     rows: int = 4_000
     # relative to a column's size: data on a surface leave some products undetermined
     ridge: float = 1e-13
-
-
-OPTIONS = Options()
 
 
 @pytree()
@@ -83,7 +78,7 @@ class PolynomialModel:
     @property
     def reach(self) -> np.ndarray:
         """Largest magnitude of each variable at which the polynomials are evaluated."""
-        reach = min(OPTIONS.reach, math.cosh(math.acosh(OPTIONS.largest) / self.family.degree))
+        reach = min(Options.reach, math.cosh(math.acosh(Options.largest) / self.family.degree))
         return np.where(self.family.inputs.is_angle, np.inf, reach)
 
     def of_variables(self, x):
@@ -135,7 +130,7 @@ def fit_predictors(
     the variables of states, as ``box_inputs``. The degree rises until the model is close enough or
     no longer improves, because of noise or of the number of pairs.
     """
-    rows = np.linspace(0, len(y0) - 1, min(OPTIONS.rows, len(y0))).astype(int)
+    rows = np.linspace(0, len(y0) - 1, min(Options.rows, len(y0))).astype(int)
     y0, y1, args = y0[rows], y1[rows], None if args is None else args[rows]
     args, back = (dt[rows, None], -dt[rows, None]) if np.ndim(dt) else (args, args)
 
@@ -182,14 +177,14 @@ def _by_degree(inputs: Inputs, x, target, unit) -> list[tuple[PolynomialModel, f
     One factorisation serves all degrees. Returns the models with their held-out errors.
     """
     held = np.arange(len(x)) % 5 == 0
-    most = min(OPTIONS.most_terms, len(x) // 3)
+    most = min(Options.most_terms, len(x) // 3)
     top = 1
-    while top < OPTIONS.most_degree and Products(inputs, top + 1).num_parameters <= most:
+    while top < Options.most_degree and Products(inputs, top + 1).num_parameters <= most:
         top += 1
     largest = _basis(Products(inputs, top))
     design = _design(largest, x)
     width = design.shape[1]
-    ridge = OPTIONS.ridge * np.linalg.norm(design[~held], axis=0)
+    ridge = Options.ridge * np.linalg.norm(design[~held], axis=0)
     ridge = np.where(ridge > 0, ridge, 1.0)  # a product that vanishes on all states gets 0
     rows = np.vstack([design[~held], np.diag(ridge)])
     q, r = np.linalg.qr(rows)
@@ -208,7 +203,7 @@ def _by_degree(inputs: Inputs, x, target, unit) -> list[tuple[PolynomialModel, f
         matrices = _basis(family).placed(solution[1:].T)
         matrices[:, 0, 0] = solution[0]
         found.append((PolynomialModel(family, matrices), float(error)))
-        if error < OPTIONS.steady:
+        if error < Options.steady:
             break
     return found
 

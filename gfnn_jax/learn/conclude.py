@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -36,8 +35,7 @@ _LOOK = "the test whether the residuals are noise"
 _WHITE = "the residuals of H are white, as noise is"
 
 
-@dataclasses.dataclass(frozen=True)
-class ConclusionOptions:
+class Options:
     """Limits by which what a map leaves over is told apart, and how many pairs are looked at."""
 
     share: float = 0.1  # of the residual, that a change of volume must explain
@@ -50,9 +48,6 @@ class ConclusionOptions:
     friction_pairs: int = 1_000  # where the tolerance is met
     noise_pairs: int = 1_024  # from which the noise of the states is measured
     noise_numbers: int = 8_192  # the same of many sites: numbers of so many pairs
-
-
-OPTIONS = ConclusionOptions()
 
 
 class Conclusion(NamedTuple):
@@ -100,7 +95,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     if jumps:
         messages = []  # of a law that misses them
         ended = reason = "no map follows the jumps of an angle that is wrapped and was not named"
-    elif candidate.validation_relative > OPTIONS.roundoff and searched.linear is None:
+    elif candidate.validation_relative > Options.roundoff and searched.linear is None:
         stalled = _stalled(candidate, chosen.entry, searched)
         left = _left_of_sites if structured else _what_is_left
         work = _work(chosen.entry or next(iter(found.ranking), None))
@@ -132,11 +127,11 @@ def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
     candidate, data = chosen.candidate, searched.data
     lossy = chosen.law is not None and bool(chosen.law.friction)
     compiled = candidate.microseconds_per_step is not None
-    if lossy or not compiled or data.varied or not candidate.validation_relative > OPTIONS.roundoff:
+    if lossy or not compiled or data.varied or not candidate.validation_relative > Options.roundoff:
         return []
     if not data.coordinates.plain:
         return []
-    sample = _residuals_of_sample(candidate, None, searched, OPTIONS.friction_pairs)
+    sample = _residuals_of_sample(candidate, None, searched, Options.friction_pairs)
     found = hidden_friction(sample.image, sample.residual, sample.angles)
     if found is None:
         return []
@@ -170,7 +165,7 @@ def _work(entry: Entry | None) -> float:
         return 0.0
     width, count = 2 * entry.sweep.data.dim, entry.candidate.num_parameters
     rows = len(entry.sweep.data.training) * width
-    steps = OF_STEPS * (OPTIONS.residual_pairs + OPTIONS.noise_pairs * width / 10)
+    steps = OF_STEPS * (Options.residual_pairs + Options.noise_pairs * width / 10)
     return 2 * OF_SOLVE * count**3 + 2 * rows * count**2 + steps * entry.size.operations
 
 
@@ -217,7 +212,7 @@ def _residuals_of_sample(
     candidate: Candidate,
     entry: Entry | None,
     searched: Searched,
-    most: int = OPTIONS.residual_pairs,
+    most: int = Options.residual_pairs,
 ) -> _Sample:
     """The residuals of the steps that were solved: of the entry's map in inner coordinates, or of
     the candidate's, where there is none, in the user's."""
@@ -254,11 +249,14 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
         )
     if not stalled:
         return _LeftOver(None, [])
-    some, size = slice(OPTIONS.friction_pairs), float(np.sqrt(np.mean((residual / scale) ** 2)))
+    some, size = (
+        slice(Options.friction_pairs),
+        float(np.sqrt(np.mean((residual / scale) ** 2))),
+    )
     smooth = is_smooth(y0, residual)
     found = hidden_friction(image[some], residual[some], sample.angles) if smooth else None
     # Friction shrinks every coordinate by a part of what is left over of it.
-    if found is not None and abs(found[0]) > OPTIONS.share * residual.shape[1] * size:
+    if found is not None and abs(found[0]) > Options.share * residual.shape[1] * size:
         change, error = found
         message = (
             f"the residuals are no noise: phase-space volumes change by {change:.2g} ± {error:.1g} "
@@ -312,7 +310,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         )
     rows, sequence = sample.rows, sample.sequence
     taken = candidate.num_parameters / (data.training.size * 2 * data.dim)
-    noise = state_noise(candidate.map, data.pairs.take(rows[: OPTIONS.noise_pairs]), taken)
+    noise = state_noise(candidate.map, data.pairs.take(rows[: Options.noise_pairs]), taken)
     if law is not None and law.noise is not None:
         # Along an arc what the law misses adds up, and looks like noise.
         noise = np.minimum(law.noise, noise)
@@ -323,7 +321,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     sizes_of_noise = ", ".join(f"{s:.1e} ({n})" for n, s in zip(names, noise, strict=True))
     if law is None and entry is not None and entry.sweep.linear:
         part = entry.sweep.error_by_noise(entry.size) / np.sqrt(np.mean((noise / data.spread) ** 2))
-        if part > OPTIONS.own_error:
+        if part > Options.own_error:
             message = (
                 "the residuals look like noise, but fits to halves of the pairs differ by "
                 f"{part:.1g} times as much, more than noise makes them. The terms tried cannot "
@@ -352,7 +350,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
 def _beside_known(found: np.ndarray, known: np.ndarray) -> _LeftOver:
     """Noise (2d,) that was given, beside what the residuals suggest (2d,)."""
     ratio = float(np.max(found / known))
-    if ratio <= OPTIONS.known:
+    if ratio <= Options.known:
         reason = "the residuals are the noise that was given"
         return _LeftOver(known, [f"larger models are no more accurate: {reason}"], reason)
     name = coordinate_names(len(found) // 2)[int(np.argmax(found / known))]
@@ -369,7 +367,7 @@ def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOv
     if not stalled:
         return _LeftOver(None, [])
     data = chosen.data
-    few = max(1, OPTIONS.noise_numbers // (2 * data.dim))
+    few = max(1, Options.noise_numbers // (2 * data.dim))
     rows = np.sort(data.training)[:few]
     noise = noise_of_sites(chosen.candidate.map, data.pairs.take(rows))
     message = (

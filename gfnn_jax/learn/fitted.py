@@ -40,7 +40,6 @@ from gfnn_jax.scenes.scene import Scene
 STATES_MEASURED = 200  # states at which the chosen map's defect and determinant are taken
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Options of what is measured of a chosen map and of its law."""
 
@@ -49,9 +48,6 @@ class _Options:
     hides: float = 0.2
     states: int = 4_096  # about: at which H is compared
     explains: float = 0.5  # of the squares of steps, under which it is no law
-
-
-_OPTIONS = _Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,7 +167,7 @@ class Choice:
         if law is None:
             return "map" if self.met else f"map: {missed}"
         if not (self.met or self.white):
-            if (share := max(0.0, self._explained)) < _OPTIONS.explains:
+            if (share := max(0.0, self._explained)) < _Options.explains:
                 return f"no law: the best explains {share:.0%} of the squares of steps: {missed}"
             return f"partly: {missed}"
         # Sums over sites have terms that vanish or add up to nothing, whatever the data.
@@ -180,7 +176,7 @@ class Choice:
         if self.several:
             return f"one of several: {self.several}"
         relative = self.chosen.validation_relative
-        if relative > _OPTIONS.hides:
+        if relative > _Options.hides:
             return (
                 f"one of several: noise of {relative:.0%} of the spread in a step hides what "
                 "another law would leave"
@@ -211,7 +207,7 @@ class Choice:
             return False
         if law.friction or self.base_map or isinstance(law.flow.family, Sums):
             return False
-        z, flow = pairs.z0[:: 1 + len(pairs) // _OPTIONS.states], law.flow
+        z, flow = pairs.z0[:: 1 + len(pairs) // _Options.states], law.flow
         h = flow.family.value(flow.params, z, None)
         slopes, bends = flow.family.gradient_and_hessian(flow.params, z, None)
         by_noise = of_noise(slopes, bends, np.broadcast_to(noise, z.shape))
@@ -545,7 +541,7 @@ class Fit:
             last = self.budget.last("the posterior, and with it bands", ROWS, work)
             if within(last, lambda: posterior.root) is None:
                 map_ = dataclasses.replace(map_, posterior=None)
-        seconds = _OPTIONS.of_derivative * self.budget.compiling
+        seconds = _Options.of_derivative * self.budget.compiling
         last = self.budget.last("the symplecticity defect of a step", COMPILE, seconds)
         defect = within(last, lambda: self.symplecticity_defect)
         messages = self.budget.left_out[known:]

@@ -34,16 +34,12 @@ from gfnn_jax.models.generating_functions.map_arcs import Linear, latent_reading
 from gfnn_jax.phase_space import Pairs, sizes, symplectic_form
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Stretches between monitors, and the grid of their times."""
 
     symplectic: float = 1e-9  # ‖MᵀJM − J‖ of a stretch that is known
     singular: float = 1e-8  # smallest singular value of B, ÷ its largest, that tells momenta
     even: float = 0.01  # of a turn, by which times may miss an even grid
-
-
-_OPTIONS = _Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +117,7 @@ def fit_monitors(
     states = [_states(q, known) for q in runs]
     steps = np.concatenate([np.diff(recording.times(run)) for run in recording.runs])
     turn = float(np.median(steps)) if len(steps) else 1.0
-    if len(steps) and np.abs(steps - turn).max() > _OPTIONS.even * turn:
+    if len(steps) and np.abs(steps - turn).max() > _Options.even * turn:
         raise InputError(f"{recording.source}: expected a row for every turn, {turn:g} s apart")
     dt = turn / len(places)
     pairs = [_pairs(states, k, dt) for k in range(len(places))]
@@ -192,13 +188,13 @@ def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
         )
     form = symplectic_form(dim)
     defect = np.abs(matrix.T @ form @ matrix - form).max()
-    if not defect < _OPTIONS.symplectic * max(1.0, np.abs(matrix).max() ** 2):
+    if not defect < _Options.symplectic * max(1.0, np.abs(matrix).max() ** 2):
         raise InputError(
             f"between: expected symplectic matrices in q1…qd, p1…pd, got one with |MᵀJM − J| of "
             f"{defect:.2g}"
         )
     values = np.linalg.svd(matrix[:dim, dim:], compute_uv=False)
-    if not values[-1] > _OPTIONS.singular * max(values[0], 1e-300):
+    if not values[-1] > _Options.singular * max(values[0], 1e-300):
         raise InputError(
             "between: the block ∂Q/∂p of a matrix is singular (a phase advance near a multiple of "
             "π), so that two readings determine no momenta. Give another stretch as the known one"

@@ -50,8 +50,7 @@ from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.search.search import MET
 
 
-@dataclasses.dataclass(frozen=True)
-class PositionOptions:
+class Options:
     """Sizes of S(q, Q) that are tried, and when a larger one is of no use (study: positions)."""
 
     degrees: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 20)
@@ -68,9 +67,6 @@ class PositionOptions:
     # of the residual, that a larger S leaves at least where readings have noise
     stalled: float = 0.5
     window: int = 40  # steps, from whose readings a state is estimated
-
-
-OPTIONS = PositionOptions()
 
 
 def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> Fit:
@@ -96,9 +92,9 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
     sites = structure_of(structure, triples.dim, Coordinates("positions", triples.angles))
     if sites is not None and not isinstance(sites, Sites):
         raise FitError(f"expected a ring or a chain of positions, got {structure!r}")
-    if len(triples) < OPTIONS.fewest:
+    if len(triples) < Options.fewest:
         raise FitError(
-            f"expected at least {OPTIONS.fewest} triples of positions, got {len(triples)}"
+            f"expected at least {Options.fewest} triples of positions, got {len(triples)}"
         )
     sensors = Sensors(
         recording.positions,
@@ -106,7 +102,7 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
         recording.angles,
         np.zeros(triples.dim),
         0.0,
-        OPTIONS.window * triples.dt,
+        Options.window * triples.dt,
         "hold",
         0.0,
         np.array([triples.dt]),
@@ -116,7 +112,7 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
     best = sweep.best(symmetric=True)
     if best is None or not tolerance.met_by(best.candidate):
         other = sweep.best(symmetric=False)
-        least = np.inf if best is None else OPTIONS.gain * best.candidate.validation_bound
+        least = np.inf if best is None else Options.gain * best.candidate.validation_bound
         if other is not None and (best is None or other.candidate.validation_bound < least):
             best = other
     if best is None:
@@ -169,13 +165,13 @@ class _Sweep:
             if new is None:
                 break
             if found is None or not new.candidate.validation_bound >= (
-                OPTIONS.better * found.candidate.validation_bound
+                Options.better * found.candidate.validation_bound
             ):
                 found, worse = new, 0
             else:
                 worse += 1
-            met = found.candidate.validation_bound <= max(self.tolerance.bound, OPTIONS.roundoff)
-            if met or worse == OPTIONS.worse:
+            met = found.candidate.validation_bound <= max(self.tolerance.bound, Options.roundoff)
+            if met or worse == Options.worse:
                 break
         if found is None or not np.isfinite(found.candidate.validation_bound):
             return None
@@ -190,8 +186,8 @@ class _Sweep:
             both = symmetric and getattr(inner, "signs", None) is None
             family = OfDisplacement(inner, part, both, moves)
             terms = family.num_parameters
-            if OPTIONS.rows_per_term * terms > rows or (
-                k and rows * terms**2 > OPTIONS.most_operations
+            if Options.rows_per_term * terms > rows or (
+                k and rows * terms**2 > Options.most_operations
             ):
                 return
             yield family
@@ -208,12 +204,12 @@ class _Sweep:
             turned = (1,) * dim + (-1,) * dim
             inputs = box_inputs(x, reversor=turned)
             signs = variable_signs(inputs, turned, x) if symmetric else None
-            yield from (Products(inputs, degree, signs) for degree in OPTIONS.degrees)
+            yield from (Products(inputs, degree, signs) for degree in Options.degrees)
             return
         if symmetric:
             x = np.concatenate([x, np.concatenate([other, q - other], axis=1)])
         inputs = box_inputs(x, angles=self.triples.angles)
-        yield from (Products(inputs, degree) for degree in OPTIONS.degrees)
+        yield from (Products(inputs, degree) for degree in Options.degrees)
 
     def without_noise(self, best: _Found) -> _Found:
         """S with latent positions where the readings have noise, by which least squares is biased;
@@ -248,7 +244,7 @@ class _Sweep:
         error, terms = best.candidate.validation_relative, best.candidate.num_parameters
         families = self._families(best.about.symmetric)
         larger = next((f for f in families if f.num_parameters > terms), None)
-        if error <= OPTIONS.exact or larger is None:
+        if error <= Options.exact or larger is None:
             return False
         known = next((c for c in self.tried if c.num_parameters == larger.num_parameters), None)
         if known is None:
@@ -256,7 +252,7 @@ class _Sweep:
             if new is None:
                 return False
             known = new.candidate
-        return known.validation_relative > OPTIONS.stalled * error
+        return known.validation_relative > Options.stalled * error
 
     def _within_budget(self, family: OfDisplacement, symmetric: bool) -> _Found | None:
         """S of this family; None where the budget has no room for it."""

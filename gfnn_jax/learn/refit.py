@@ -44,8 +44,7 @@ from gfnn_jax.processes import Group
 from gfnn_jax.scenes import Scene
 
 
-@dataclasses.dataclass(frozen=True)
-class RefitOptions:
+class Options:
     """Limits of a refit to all pairs (study: scaling)."""
 
     # A pair is an outlier that is missed by so many deviations, which are no smaller than
@@ -61,7 +60,6 @@ class RefitOptions:
     printed: float = 1e-5
 
 
-OPTIONS = RefitOptions()
 _OF_TASK = "task "  # before the names of a task, in what processes are told
 
 
@@ -95,7 +93,7 @@ def work_of_refit(fitted: Fit, num_pairs: int, reading: float) -> float:
     if chosen.learns == "map":
         return reading + 2.0 * num_pairs * width * (chosen.num_parameters + 1) ** 2 / RATES[ROWS]
     of_flow = num_pairs * width * chosen.operations / RATES[FLOW]
-    return OPTIONS.passes_of_law * (reading + of_flow)
+    return Options.passes_of_law * (reading + of_flow)
 
 
 def refit(
@@ -131,7 +129,7 @@ def refit(
         warnings.warn(message, FitWarning, stacklevel=3)
 
     old, law, map_ = fitted.chosen, fitted.hamiltonian, fitted.map
-    most = OPTIONS.outlying * np.maximum(old.deviations, OPTIONS.roundoff * np.asarray(map_.scale))
+    most = Options.outlying * np.maximum(old.deviations, Options.roundoff * np.asarray(map_.scale))
     apart = [held] if test is None else [held, test]
     worker = RowsOfRefit(map_, {"most": most, "held": _states_of(apart)})
     apart = [pairs.take(np.flatnonzero(worker.close(pairs))) for pairs in apart]
@@ -150,7 +148,7 @@ def refit(
         if found.outliers:
             warn(
                 f"{found.outliers} of {found.count + found.outliers} pairs are outliers, with "
-                f"residuals above {OPTIONS.outlying:g} standard deviations: they are left out"
+                f"residuals above {Options.outlying:g} standard deviations: they are left out"
             )
         if found.other_dt:
             warn(
@@ -172,7 +170,7 @@ def refit(
             num_pairs = found.count
     else:
         group.broadcast({})
-    if chosen is None or not after <= OPTIONS.no_worse * before:
+    if chosen is None or not after <= Options.no_worse * before:
         found_map = "no map" if chosen is None else f"a worse map (RMS error {after:.2e})"
         warn(
             f"the fit to all pairs gives {found_map}: that of the sample (RMS error {before:.2e} "
@@ -300,13 +298,13 @@ class RowsOfRefit:
     def _served(self, pairs: Pairs) -> np.ndarray:
         """Mark the pairs (N,) that are apart by a dt that the map has steps of."""
         off = np.abs(np.broadcast_to(np.asarray(pairs.dt), len(pairs)) - self.dt)
-        return np.full(len(pairs), True) if self.any_dt else off <= OPTIONS.printed * self.dt
+        return np.full(len(pairs), True) if self.any_dt else off <= Options.printed * self.dt
 
     def _own_dt(self, pairs: Pairs) -> np.ndarray | None:
         """Time steps (N,) of the pairs, where a map of any dt must be told."""
         dt = np.broadcast_to(np.asarray(pairs.dt, float), len(pairs))
         same = not isinstance(self.piece.family, OfTimeStep) and np.ndim(pairs.dt) == 0
-        if not self.any_dt or (same and np.all(np.abs(dt - self.dt) <= OPTIONS.same * self.dt)):
+        if not self.any_dt or (same and np.all(np.abs(dt - self.dt) <= Options.same * self.dt)):
             return None
         return np.array(dt)
 
@@ -375,7 +373,7 @@ class RowsOfRefit:
                 coefficients, train_rms = solved.coefficients, solved.train_rms
         else:
             c, found, made = descended(
-                lambda c: _triangle(asked(c)), self.piece.params, gauss_newton.OPTIONS.most
+                lambda c: _triangle(asked(c)), self.piece.params, gauss_newton.Options.most
             )
             rows = found.rows
             if rows:
@@ -432,8 +430,8 @@ class RowsOfRefit:
         """Pairs but outliers and those held out, as the fitted piece sees them."""
         held = _keys(self.task["held"])
         for chunk in chunks:
-            for first in range(0, len(chunk), OPTIONS.block):
-                part = chunk.take(slice(first, first + OPTIONS.block))
+            for first in range(0, len(chunk), Options.block):
+                part = chunk.take(slice(first, first + Options.block))
                 served = self._served(part)
                 counts["other_dt"] += int((~served).sum())
                 if not served.all():

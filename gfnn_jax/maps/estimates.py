@@ -35,7 +35,6 @@ from gfnn_jax.solve.linear import covariance_root
 FEWEST = 5  # samples from which a state is estimated
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Windows, and the steps in which their states are followed."""
 
@@ -46,9 +45,6 @@ class _Options:
     at_once: int = 4_096  # steps whose derivatives are taken together
     settled: float = 1e-3  # of the cost, at 2 % of a standard deviation of the state
     draws: int = 400  # of errors of a trajectory, whose largest multiple of a band is looked for
-
-
-_OPTIONS = _Options()
 
 
 class Window(NamedTuple):
@@ -322,7 +318,7 @@ def windows_of(
 def thinned(window: Window) -> Window:
     """The window with every so many of its samples, counted from the last one, of each set of
     channels that are read together: more tell no more."""
-    every = -(-len(window.t) // _OPTIONS.most)
+    every = -(-len(window.t) // _Options.most)
     if every == 1:
         return window
     which = np.unique(np.isfinite(window.y), axis=0, return_inverse=True)[1].ravel()
@@ -361,7 +357,7 @@ def _check_inputs(t: np.ndarray, begin: float, end: float, run: str) -> None:
     usual = np.median(np.diff(inside if len(inside) > 1 else t))
     ahead = np.concatenate([[begin], inside, [end]])
     steps = np.diff(ahead) / usual
-    lacks = steps > np.append(np.full(len(steps) - 1, _OPTIONS.few), 1) + 0.5
+    lacks = steps > np.append(np.full(len(steps) - 1, _Options.few), 1) + 0.5
     if lacks.any():
         gap = int(np.argmax(lacks))
         raise InputError(
@@ -464,7 +460,7 @@ def estimates_of(
             unit = np.broadcast_to(np.eye(t.shape[1]), (len(t), 1, t.shape[1], t.shape[1]))
             white = np.concatenate([white, unit], axis=1)
     readings = Readings(arcs, y, sigma, loss, white)
-    found = readings.fit(np.zeros(0), x, scale, tolerance=_OPTIONS.settled)
+    found = readings.fit(np.zeros(0), x, scale, tolerance=_Options.settled)
     if wander is None or white is None:
         return found.x[:, -1], found.last_covariance()
     near = np.zeros(y.shape)
@@ -518,7 +514,7 @@ def _started(sensors: Sensors, window: Window) -> tuple[Window, np.ndarray]:
         start = splines([(t, own)]).smooth(t, own, t)
     x = np.concatenate([start.q, start.v], axis=1)
     steps = np.diff(t)
-    parts = np.ceil(steps / max(np.median(steps), _OPTIONS.fine / sensors.omega) - 1e-3).astype(int)
+    parts = np.ceil(steps / max(np.median(steps), _Options.fine / sensors.omega) - 1e-3).astype(int)
     measured = np.concatenate([[0], np.cumsum(parts)])
     if measured[-1] == len(parts):
         return window, x
@@ -567,9 +563,9 @@ class Orbits(NamedTuple):
         lanes, times, count, rank = self.modes.shape
         rng, found = np.random.default_rng(0), np.empty((lanes, times))
         for lane, (modes, std, t) in enumerate(zip(self.modes, self.std, at, strict=True)):
-            drawn = modes @ rng.normal(size=(rank, _OPTIONS.draws))
+            drawn = modes @ rng.normal(size=(rank, _Options.draws))
             readings, which = np.unique(t, return_inverse=True)
-            noise = rng.normal(size=(len(readings), count, _OPTIONS.draws))
+            noise = rng.normal(size=(len(readings), count, _Options.draws))
             drawn += self.noise[:, None] * noise[which]
             largest = np.max(np.abs(drawn) / std[..., None], axis=1)
             running = np.maximum.accumulate(largest, axis=0)
@@ -636,7 +632,7 @@ def _followed(
     size, count, modes = root.shape[-1], roots.shape[-1], None
     root, of_level = root[:, :d], root[:, d:]
     spread = np.concatenate([root, np.zeros((*x.shape, roots.shape[1]))], axis=2)
-    orbit, spreads, most = [x[:, None]], [], max(1, _OPTIONS.at_once // len(x))
+    orbit, spreads, most = [x[:, None]], [], max(1, _Options.at_once // len(x))
     for first in range(0, h.shape[1], most):
         some = slice(first, first + most)
         step = form.follow(p, x, h[:, some], u[:, some], modes=modes)
@@ -693,7 +689,7 @@ def _channels(laws: Sequence[Law], which: np.ndarray, x: np.ndarray, u: np.ndarr
     found: list[Any] = [None] * len(x)
     for k in np.unique(which).tolist():
         own, law = np.flatnonzero(which == k), laws[k]
-        values, h = law.sensors.observation_model.values, _OPTIONS.small / law.sensors.omega
+        values, h = law.sensors.observation_model.values, _Options.small / law.sensors.omega
         shown, _ = seen.along(law.form, law.p, x[own], u[own], h, values)
         for n, *parts in zip(own.tolist(), *shown, strict=True):
             found[n] = parts
@@ -702,7 +698,7 @@ def _channels(laws: Sequence[Law], which: np.ndarray, x: np.ndarray, u: np.ndarr
 
 def substeps_of(sensors: Sensors, h: Any) -> Any:
     """Runge–Kutta steps that a step h (...) is made of."""
-    return np.maximum(1, np.ceil(h * sensors.omega / _OPTIONS.fine).astype(int))
+    return np.maximum(1, np.ceil(h * sensors.omega / _Options.fine).astype(int))
 
 
 def _inputs(

@@ -109,7 +109,6 @@ class Hidden:
         )
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of what sensors tell of a state (benchmarks/random_recordings.py)."""
 
@@ -123,9 +122,6 @@ class Options:
     factors: tuple[float, ...] = tuple(np.outer((1, -1), 1.1 ** np.arange(-25.0, 26.0)).ravel())
     between: int = 16  # places between two events, at which a state stands
     iterations: int = 30
-
-
-OPTIONS = Options()
 
 
 @runtime_checkable
@@ -365,10 +361,10 @@ class Observation:
             return self._integrated(t, y, angles)
         d = self.dim
         still = [k for k, name in enumerate(self.channels) if name in self.needed]
-        if np.mean(np.isfinite(y[:, still]).any(axis=1)) < OPTIONS.few:  # others, as at rest
+        if np.mean(np.isfinite(y[:, still]).any(axis=1)) < Options.few:  # others, as at rest
             still = [k for k, used in enumerate(self._used) if min(used, default=d) < d]
         scale = np.nanstd(y[:, still], axis=0) + 1e-300
-        turns = np.arange(OPTIONS.tried) * 2 * np.pi / OPTIONS.tried
+        turns = np.arange(Options.tried) * 2 * np.pi / Options.tried
         own = [self.channels.index(n) if n in self.channels else None for n in self.coordinates]
         choices = [turns if i in angles and own[i] is None else np.zeros(1) for i in range(d)]
         starts = np.array(list(product(*choices)))
@@ -430,7 +426,7 @@ class Observation:
     @property
     def between(self) -> int:
         """Places between two events at which states stand; 0 where sensors show positions too."""
-        return OPTIONS.between if self.crossed else 0
+        return Options.between if self.crossed else 0
 
     def _between_gates(self, i: int, t: np.ndarray, y: np.ndarray, turns: bool) -> np.ndarray:
         """An unseen coordinate (n,) by the events that it alone makes: its swing, of the sign and
@@ -442,11 +438,11 @@ class Observation:
         z = swung(t, y[:, gates], turns and not aside)
         if not aside:
             return z
-        x = np.zeros((len(OPTIONS.factors), len(t), 2 * self.dim))
-        x[..., i], x[..., self.dim + i] = np.outer(OPTIONS.factors, z), 1.0
+        x = np.zeros((len(Options.factors), len(t), 2 * self.dim))
+        x[..., i], x[..., self.dim + i] = np.outer(Options.factors, z), 1.0
         left = np.where(np.isfinite(y[:, aside]), self(x).values[..., aside], np.nan)
         best = int(np.argmin(np.nansum(left**2, axis=(1, 2))))
-        return OPTIONS.factors[best] * z
+        return Options.factors[best] * z
 
     def _velocity(self, i: int, y: np.ndarray) -> np.ndarray:
         """The velocity (n,) of a coordinate by the channel that shows it alone, at ``values``."""
@@ -506,7 +502,7 @@ class Observation:
         values, scale, cost = self.values, np.ones(len(self.channels)), np.inf
         sampled = ~np.isin(range(len(scale)), self.events)
         scale[sampled] = _roughness(y[:, sampled])
-        for _ in range(OPTIONS.iterations):
+        for _ in range(Options.iterations):
             shown = self(x, values, a)
             by_time = np.linalg.norm(shown.by_state[..., : self.dim], axis=-1)  # of an event: 1/ḣ
             each = np.where(sampled, scale, by_time)
@@ -532,7 +528,7 @@ class Observation:
                 one = Swing(k, 2 * np.pi * line, even, turned, bool(angles))
                 z = one.along(t, y)
                 unit = 1.0 if angles else np.nanstd(y[:, k]) / one.own_omega**2
-                for size in np.outer(OPTIONS.sizes, (1, -1)).ravel() * unit / np.max(np.abs(z)):
+                for size in np.outer(Options.sizes, (1, -1)).ravel() * unit / np.max(np.abs(z)):
                     swing = dataclasses.replace(one, size=float(size))
                     suited, cost = self._suited(*swing.states(z), y)
                     found.append((cost, dataclasses.replace(suited, swing=swing)))
@@ -556,7 +552,7 @@ class Observation:
         infinite where a coordinate moves no channel."""
         d, x, sizes = self.dim, x.copy(), np.full(len(x), np.inf)
         J, moving = np.zeros((len(x), len(still), d)), np.arange(len(x))
-        for _ in range(OPTIONS.iterations):
+        for _ in range(Options.iterations):
             shown = self(x[moving])
             r = (y[moving][:, still] - shown.values[:, still]) / scale
             known, r = np.isfinite(r), np.nan_to_num(r)
@@ -630,13 +626,13 @@ class Observation:
         by_state, by_values = self._anywhere(scaled=True)
         stretch = by_state[:, list(lengths)]
         u, v = (np.linalg.svd(a, full_matrices=False) for a in (by_values, stretch))
-        both = u[0][:, u[1] > OPTIONS.same].T @ v[0][:, v[1] > OPTIONS.same]
+        both = u[0][:, u[1] > Options.same].T @ v[0][:, v[1] > Options.same]
         left, overlap, _ = np.linalg.svd(both)
-        if not len(overlap) or overlap[0] < 1 - OPTIONS.same:
+        if not len(overlap) or overlap[0] < 1 - Options.same:
             return ()
-        along = u[2][u[1] > OPTIONS.same].T @ (left[:, 0] / u[1][u[1] > OPTIONS.same])
+        along = u[2][u[1] > Options.same].T @ (left[:, 0] / u[1][u[1] > Options.same])
         return tuple(
-            n for n, a in zip(self.parameters, along, strict=True) if abs(a) > OPTIONS.same
+            n for n, a in zip(self.parameters, along, strict=True) if abs(a) > Options.same
         )
 
     def hidden_places(self) -> list[int]:
@@ -654,13 +650,13 @@ class Observation:
         by = self._shown(rng.normal(size=(40, 2 * d)), c, rng.normal(size=(40, d)))[1]
         rows = by[..., 3 * d :] * c
         _, sizes, turns = np.linalg.svd(np.tensordot(rows, rows, ((0, 1), (0, 1))))
-        open_ = turns[np.sqrt(sizes) <= OPTIONS.same * np.sqrt(sizes.max(initial=0.0))]
-        own = [i for i in range(len(c)) if np.abs(open_[:, i]).max(initial=0.0) > OPTIONS.same]
+        open_ = turns[np.sqrt(sizes) <= Options.same * np.sqrt(sizes.max(initial=0.0))]
+        own = [i for i in range(len(c)) if np.abs(open_[:, i]).max(initial=0.0) > Options.same]
         told = [
             f"{names[i]}{sign}{names[j]}"
             for i, j in combinations(own, 2)
             for sign, both in (("*", open_[:, i] + open_[:, j]), ("/", open_[:, i] - open_[:, j]))
-            if np.abs(both).max() < OPTIONS.same
+            if np.abs(both).max() < Options.same
         ]
         return [names[i] for i in own], told
 
@@ -781,7 +777,7 @@ def _started(g: Observation) -> np.ndarray:
     x = np.random.default_rng(0).normal(size=(40, 2 * g.dim))
     values[open_] = 1.0
     determined = np.zeros(len(values), bool)
-    for _ in range(OPTIONS.iterations if len(open_) else 0):
+    for _ in range(Options.iterations if len(open_) else 0):
         shown = g(x, values)
         rows = [shown.by_coefficients[:, k][:, open_] for k, _ in own]
         left = [x[:, i] - shown.values[:, k] for k, i in own]
@@ -801,7 +797,7 @@ def _started(g: Observation) -> np.ndarray:
 def _roughness(y: np.ndarray) -> np.ndarray:
     """About the noise (k,) of channels y (n, k), by their second differences."""
     rough = np.nanstd(np.diff(y, 2, axis=0), axis=0) / np.sqrt(6)
-    return np.fmax(rough, OPTIONS.clean * np.nanstd(y, axis=0))
+    return np.fmax(rough, Options.clean * np.nanstd(y, axis=0))
 
 
 def _spans(table: np.ndarray, column: np.ndarray) -> bool:
@@ -810,4 +806,4 @@ def _spans(table: np.ndarray, column: np.ndarray) -> bool:
     if size == 0 or not table.shape[1]:
         return bool(size == 0)
     left = column - table @ np.linalg.lstsq(table, column, rcond=None)[0]
-    return bool(np.linalg.norm(left) < OPTIONS.same * size)
+    return bool(np.linalg.norm(left) < Options.same * size)

@@ -7,7 +7,6 @@ rollout of any length keeps the drive's phase.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,7 +16,6 @@ from gfnn_jax.arrays import as_numbers, as_row, namespace, pytree
 from gfnn_jax.phase_space import TIME
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Ranges of parameters, and gaps in a period."""
 
@@ -27,7 +25,6 @@ class _Options:
     largest_gap: float = 1 / 8
 
 
-_OPTIONS = _Options()
 _HALF_DIGITS = 2.0**27 + 1  # splits a float64 in two halves, whose products are exact (Veltkamp)
 
 
@@ -48,7 +45,7 @@ class Parameters:
     @property
     def bounds(self) -> tuple[Any, Any]:
         """Lower and upper bounds (k,), with a tolerance for numbers that were printed."""
-        edge = _OPTIONS.edge * (self.high - self.low)
+        edge = _Options.edge * (self.high - self.low)
         return self.low - edge, self.high + edge
 
     def contains(self, args):
@@ -106,7 +103,7 @@ def _covered(t0: np.ndarray, dt: np.ndarray, period: float) -> tuple[float, floa
     # An interval that reaches into the next period covers the first part of this one.
     gaps = np.append(begin[1:], begin[0] + period) - np.maximum(end, end[-1] - period)
     longest = int(np.argmax(gaps))
-    if gaps[longest] <= _OPTIONS.largest_gap * period:
+    if gaps[longest] <= _Options.largest_gap * period:
         return 0.0, period
     first = begin[(longest + 1) % len(begin)]
     return float(first), float(first + period - gaps[longest])

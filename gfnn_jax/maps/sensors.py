@@ -16,8 +16,7 @@ from gfnn_jax.solve.noise import Wander
 TUBE = 0.95  # of trajectories lie in the tube that scores are multiples of
 
 
-@dataclasses.dataclass(frozen=True)
-class TubeOptions:
+class Options:
     """Scores of forecasts whose tubes hold whole trajectories (`benchmarks/certificates.py`).
 
     least: a score, of errors that are roundoff. beyond: times the largest score seen: a further one
@@ -31,9 +30,6 @@ class TubeOptions:
     phases: float = 3.0
     usual: float = 0.3
     known: float = 4.0
-
-
-OPTIONS = TubeOptions()
 
 
 class OtherLaw(NamedTuple):
@@ -169,10 +165,10 @@ class Sensors:
             return 1.0
         lead = min(int(np.searchsorted(self.leads, ahead)), self.held_out - 1)
         scores = self.scores[np.isfinite(self.scores[:, lead]), lead]
-        logs = np.log(np.maximum(scores, OPTIONS.least))
-        count = np.clip(OPTIONS.phases * self.observed / self.leads[lead], 2, len(logs))
-        free = count - 1 + OPTIONS.known
-        variance = (count * logs.var() + OPTIONS.known * OPTIONS.usual**2) / free
+        logs = np.log(np.maximum(scores, Options.least))
+        count = np.clip(Options.phases * self.observed / self.leads[lead], 2, len(logs))
+        free = count - 1 + Options.known
+        variance = (count * logs.var() + Options.known * Options.usual**2) / free
         reach = stdtrit(free, coverage) * np.sqrt(variance * (1 + 1 / count))
-        far = min(logs.mean() + reach, logs.max() + np.log(OPTIONS.beyond))
+        far = min(logs.mean() + reach, logs.max() + np.log(Options.beyond))
         return float(np.exp(far))

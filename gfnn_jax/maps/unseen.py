@@ -14,7 +14,6 @@ from gfnn_jax.signals.oscillations import Oscillations
 from gfnn_jax.signals.splines import FEWEST, splines
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Limits of these starts (benchmarks/any_record.py, gyroscopes, accelerometers and gates).
 
@@ -26,9 +25,6 @@ class Options:
     extreme: float = 0.25
     same_period: float = 0.8
     missed: float = 0.95
-
-
-OPTIONS = Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +86,7 @@ def between_extremes(t: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, float]:
     curve = splines([(t, v[:, None])]).curve(t, v)
     q = curve.antiderivative()(t)
     speed, rate = np.abs(curve(t)), curve(t, nu=1)
-    at = np.flatnonzero((rate[1:] * rate[:-1] < 0) & (speed[1:] > OPTIONS.extreme * speed.max()))
+    at = np.flatnonzero((rate[1:] * rate[:-1] < 0) & (speed[1:] > Options.extreme * speed.max()))
     if len(at) < 3:
         return np.where(known, q - np.mean(q), np.nan), 0.0
     line = np.polyfit(t[at], q[at], 1)
@@ -117,7 +113,7 @@ def swung(t: np.ndarray, seen: np.ndarray, turns: bool) -> np.ndarray:
         left = np.sum((rows @ [least, more] - period) ** 2)
         if left < best and 0 < more < least / 2:
             best, size, square, life = left, np.sqrt(16 * more / least), of, tried
-    if turns and not best < OPTIONS.same_period * np.sum((period - np.mean(period)) ** 2):
+    if turns and not best < Options.same_period * np.sum((period - np.mean(period)) ** 2):
         raise FitError(
             "the times between events show no change of the period, so that they do not tell how "
             "large the swings are, nor the law: record swings that die down, or the angle too",
@@ -137,8 +133,8 @@ def _turns(gates: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     if not len(periods):
         return np.zeros(0), np.zeros(0)
     period = float(np.median(periods))
-    near = [g[:-1][np.diff(g) < OPTIONS.missed * period] for g in gates]
-    far = [g[1:][np.diff(g) < OPTIONS.missed * period] for g in gates]
+    near = [g[:-1][np.diff(g) < Options.missed * period] for g in gates]
+    far = [g[1:][np.diff(g) < Options.missed * period] for g in gates]
     middles = np.sort((np.concatenate(near) + np.concatenate(far)) / 2)
     count = np.cumsum(np.round(2 * np.diff(middles, prepend=middles[:1]) / period))
     numbers, which = np.unique(count, return_inverse=True)

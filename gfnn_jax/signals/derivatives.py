@@ -20,16 +20,12 @@ from gfnn_jax.signals.local_polynomials import LocalFits, local_fits
 from gfnn_jax.signals.noise import Noise
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """degree: of the polynomials of values. fewest: windows. narrowest: samples of a window."""
 
     degree: int = 3
     fewest: int = 12
     narrowest: int = 7
-
-
-_OPTIONS = _Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +64,7 @@ class Derivatives:
         v = self.values.values[column]
         rate, bend = self.slopes.slopes[of], self.slopes.curvatures[of]
         known = np.isfinite(v) & np.isfinite(rate)
-        if known.sum() < _OPTIONS.fewest or np.ptp(v[known]) == 0 or np.ptp(rate[known]) == 0:
+        if known.sum() < _Options.fewest or np.ptp(v[known]) == 0 or np.ptp(rate[known]) == 0:
             return None
         v, rate, bend = (x[known] - np.mean(x[known]) for x in (v, rate, bend))
         noise = (self.sigmas[of] or 0.0) * self.slopes.slope_gain[known]
@@ -97,7 +93,7 @@ class Derivatives:
 
 def window(noises: Sequence[Noise]) -> int:
     """Samples of a window for derivatives of columns with this noise."""
-    return max(min((n.size for n in noises), default=0) // 2, _OPTIONS.narrowest)
+    return max(min((n.size for n in noises), default=0) // 2, _Options.narrowest)
 
 
 def derivatives(
@@ -107,8 +103,8 @@ def derivatives(
 
     sigmas: of the columns' noise.
     """
-    values = local_fits(times, columns, size, _OPTIONS.degree)
-    slopes = local_fits(times, columns, size, _OPTIONS.degree + 1)
+    values = local_fits(times, columns, size, _Options.degree)
+    slopes = local_fits(times, columns, size, _Options.degree + 1)
     if values is None or slopes is None:
         return None
     return Derivatives(values, slopes, sigmas)

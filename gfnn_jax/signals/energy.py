@@ -23,7 +23,6 @@ from gfnn_jax.signals.local_polynomials import LocalFits
 POWERS = {"dry": 1, "linear": 2, "quadratic": 3}
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """stretches: lengths in periods. blocks: of stretches, whose scatter tells errors. clearly:
     standard errors, by which one kind of friction leaves less than the others. balanced: part of
@@ -36,9 +35,6 @@ class _Options:
     balanced: float = 0.9
     ridge: float = 1e-9
     significant: tuple[float, float] = (3.0, 1e-4)
-
-
-_OPTIONS = _Options()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +51,7 @@ class Loss:
     def significant(self) -> bool:
         """Return whether there is a loss, or a gain: more than three standard errors, and than
         1e-4."""
-        errors, least = _OPTIONS.significant
+        errors, least = _Options.significant
         return abs(self.per_period) > max(errors * self.error, least)
 
 
@@ -89,7 +85,7 @@ def loss(fits: LocalFits, angles: Sequence[bool], inputs: np.ndarray, period: fl
         table = np.concatenate([changes[:, 1:], taken[:, of_kind], taken[:, 3 * dim :]], axis=1)
         found[kind] = _Balance(table, -changes[:, 0])
     linear = found["linear"]
-    if linear.explained < _OPTIONS.balanced:
+    if linear.explained < _Options.balanced:
         return None
     power = np.nanmean(speeds**2, axis=1)
     both = sum(angles[i] and angles[j] for i, j in itertools.combinations(range(dim), 2))
@@ -110,7 +106,7 @@ class _Balance:
     def __init__(self, table: np.ndarray, target: np.ndarray):
         scale = np.linalg.norm(table, axis=0)
         self.scale = np.where(scale > 0, scale, 1.0)
-        blocks = np.array_split(np.arange(len(target)), _OPTIONS.blocks)
+        blocks = np.array_split(np.arange(len(target)), _Options.blocks)
         parts = [(table[rows] / self.scale, target[rows]) for rows in blocks]
         self.normals = np.stack([a.T @ a for a, _ in parts])
         self.sides = np.stack([a.T @ b for a, b in parts])
@@ -119,7 +115,7 @@ class _Balance:
         self.explained = 1 - self.squares.sum() / np.sum(target**2)
 
     def _solved(self, normal: np.ndarray, side: np.ndarray) -> np.ndarray:
-        ridge = _OPTIONS.ridge * np.eye(len(normal))
+        ridge = _Options.ridge * np.eye(len(normal))
         return np.linalg.lstsq(normal + ridge, side, rcond=None)[0] / self.scale
 
     def with_error(self, quantity) -> tuple[float, float]:
@@ -133,7 +129,7 @@ class _Balance:
         )
         spread = np.sum((without - without.mean()) ** 2)
         return quantity(self._solved(normal, side)), float(
-            np.sqrt((_OPTIONS.blocks - 1) / _OPTIONS.blocks * spread)
+            np.sqrt((_Options.blocks - 1) / _Options.blocks * spread)
         )
 
 
@@ -142,7 +138,7 @@ def _kind(found: dict[str, _Balance]) -> str | None:
     best = min(found, key=lambda kind: found[kind].squares.sum())
     for kind, balance in found.items():
         more = np.log(np.maximum(balance.squares, 1e-300) / np.maximum(found[best].squares, 1e-300))
-        if kind != best and more.mean() < _OPTIONS.clearly * more.std() / np.sqrt(len(more)):
+        if kind != best and more.mean() < _Options.clearly * more.std() / np.sqrt(len(more)):
             return None
     return best
 
@@ -183,7 +179,7 @@ def _over_stretches(
         t = fits.centres[rows]
         middle = 0.5 * (rates[:, rows[1:]] + rates[:, rows[:-1]]) * np.diff(t)
         total = np.concatenate([np.zeros((len(rates), 1)), np.cumsum(middle, axis=1)], axis=1)
-        for part in _OPTIONS.stretches:
+        for part in _Options.stretches:
             end = np.searchsorted(t, t + part * period)
             begin = np.flatnonzero(end < len(t))
             end = end[begin]

@@ -98,7 +98,6 @@ def _windows(times: Sequence[np.ndarray], size: int) -> tuple[np.ndarray, np.nda
     return rows, 0.5 * (t[:, 0] + t[:, -1]), run
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """halves: windows, samples on either side. samples: where the errors of a window are measured.
     tolerance: of the leave-one-out error, against the best window's. rounding: of a channel's
@@ -114,9 +113,6 @@ class _Options:
     fewest: int = 20
     biased: float = 0.1
     least: float = 1e-6
-
-
-_OPTIONS = _Options()
 
 
 class Smooth(NamedTuple):
@@ -153,9 +149,9 @@ def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np
     and the noise σ (d,) of the channels: the smallest leave-one-out error, less the cubic's own
     part, or what is left of differences where that is less than a tenth."""
     total = sum(len(t) for t, _ in stretches)
-    rounding = _OPTIONS.rounding * np.max([np.ptp(y, axis=0) for _, y in stretches], axis=0)
-    every = max(1, total // _OPTIONS.samples)
-    halves = [h for h in _OPTIONS.halves if any(len(t) >= 2 * h + 1 for t, _ in stretches)]
+    rounding = _Options.rounding * np.max([np.ptp(y, axis=0) for _, y in stretches], axis=0)
+    every = max(1, total // _Options.samples)
+    halves = [h for h in _Options.halves if any(len(t) >= 2 * h + 1 for t, _ in stretches)]
     errors, sigmas = [], []
     for half in halves:
         left_out = [
@@ -171,12 +167,12 @@ def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np
         sigmas.append(np.sqrt(variance / (1 + 9 / (4 * (2 * half + 1)))))
     relative = np.array(errors) / np.maximum(np.min(errors, axis=0), 1e-300)
     score = relative.max(axis=1)
-    good = np.flatnonzero(score <= _OPTIONS.tolerance * score.min())
+    good = np.flatnonzero(score <= _Options.tolerance * score.min())
     sigma = np.min(sigmas, axis=0)
-    ranges = rounding / _OPTIONS.rounding
+    ranges = rounding / _Options.rounding
     by_differences = _by_differences([y for _, y in stretches], rounding)
-    by_differences = np.maximum(by_differences, _OPTIONS.least * ranges)
-    told = by_differences < _OPTIONS.biased * sigma
+    by_differences = np.maximum(by_differences, _Options.least * ranges)
+    told = by_differences < _Options.biased * sigma
     return halves[good[-1]], np.where(told, by_differences, sigma)
 
 
@@ -185,11 +181,11 @@ def _by_differences(each: Sequence[np.ndarray], rounding: np.ndarray) -> np.ndar
     order; infinite of few. Of a smooth motion they vanish with their order, faster than what a
     cubic leaves."""
     sigma = np.full(len(rounding), np.inf)
-    for order in _OPTIONS.orders:
+    for order in _Options.orders:
         left = np.concatenate([np.diff(y, order, axis=0) for y in each])
         gain = np.sqrt(comb(2 * order, order))
         left[np.abs(left) < rounding * gain] = np.nan
-        enough = np.isfinite(left).sum(axis=0) >= _OPTIONS.fewest
+        enough = np.isfinite(left).sum(axis=0) >= _Options.fewest
         size = np.nanmedian(np.abs(left[:, enough]), axis=0) / (0.6745 * gain)
         sigma[enough] = np.minimum(sigma[enough], size)
     return sigma

@@ -25,7 +25,6 @@ from gfnn_jax.signals.wrong_values import wrong_values
 _SIZES = (9, 11, 13, 15, 19, 23, 29, 37, 45, 57, 71, 89, 111, 139, 173, 217, 271, 339)
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Thresholds, chosen on noise of known size on motions of test systems (tests of signals).
 
@@ -47,9 +46,6 @@ class _Options:
     white: float = 0.15
 
 
-_OPTIONS = _Options()
-
-
 @dataclasses.dataclass(frozen=True)
 class Noise:
     """Noise of one column.
@@ -65,7 +61,7 @@ class Noise:
 
     @property
     def white(self) -> bool:
-        return self.correlation is None or abs(self.correlation) < _OPTIONS.white
+        return self.correlation is None or abs(self.correlation) < _Options.white
 
 
 def noise(
@@ -76,7 +72,7 @@ def noise(
     sizes = [size for size in _SIZES if size <= shortest]
     if sizes and len(columns):
         columns = np.stack([_without_outliers(times, column) for column in columns])
-    fits = [local_fits(times, columns, size, _OPTIONS.degree) for size in sizes]
+    fits = [local_fits(times, columns, size, _Options.degree) for size in sizes]
     found = []
     for c, column in enumerate(columns):
         variances = np.array([np.nan if f is None else _trimmed(f.variances[c]) for f in fits])
@@ -88,7 +84,7 @@ def noise(
         fit = fits[k]
         assert fit is not None
         sigma, correlation = float(np.sqrt(variances[k])), _correlation(fit, c)
-        if widest == 0 or sigma > _OPTIONS.unresolved * np.nanstd(column):
+        if widest == 0 or sigma > _Options.unresolved * np.nanstd(column):
             predicted = _unpredicted(times, [column, *(() if inputs is None else inputs)])
             if predicted is not None and predicted < sigma:
                 sigma, correlation = predicted, None
@@ -102,7 +98,7 @@ def _without_outliers(times: Sequence[np.ndarray], column: np.ndarray) -> np.nda
     runs = np.split(column, np.cumsum([len(t) for t in times])[:-1])
     wrong = wrong_values(times, runs, resolution(column))
     off = [stretch.rows for stretch in wrong if stretch.off is not None]
-    if not off or sum(map(len, off)) > _OPTIONS.rare * column.size:
+    if not off or sum(map(len, off)) > _Options.rare * column.size:
         return column
     column = column.copy()
     column[np.concatenate(off)] = np.nan
@@ -112,9 +108,9 @@ def _without_outliers(times: Sequence[np.ndarray], column: np.ndarray) -> np.nda
 def _trimmed(variances: np.ndarray) -> float:
     """The mean variance of windows, the largest left out; NaN where there are few."""
     known = np.sort(variances[np.isfinite(variances)])
-    if len(known) < _OPTIONS.fewest:
+    if len(known) < _Options.fewest:
         return np.nan
-    return float(np.mean(known[: int(np.ceil(len(known) * (1 - _OPTIONS.trimmed)))]))
+    return float(np.mean(known[: int(np.ceil(len(known) * (1 - _Options.trimmed)))]))
 
 
 def _widest(variances: np.ndarray) -> int | None:
@@ -125,7 +121,7 @@ def _widest(variances: np.ndarray) -> int | None:
     last = known[0]
     for k in known[1:]:
         growth = np.log(max(variances[k], 1e-300) / max(variances[last], 1e-300))
-        if growth > _OPTIONS.growth * np.log(_SIZES[k] / _SIZES[last]):
+        if growth > _Options.growth * np.log(_SIZES[k] / _SIZES[last]):
             break
         last = k
     return int(last)
@@ -153,7 +149,7 @@ def _correlation(fit: LocalFits, column: int) -> float:
 def _unpredicted(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> float | None:
     """RMS of what the samples before, and the inputs, do not tell linearly of the first column;
     None where the samples are not even or are few."""
-    ends, lags = np.cumsum([len(t) for t in times]), _OPTIONS.lags
+    ends, lags = np.cumsum([len(t) for t in times]), _Options.lags
     rows, targets = [], []
     for i in even_runs(times):
         series = [np.split(x, ends[:-1])[i] for x in columns]
@@ -165,7 +161,7 @@ def _unpredicted(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> 
         rows.append(np.concatenate([past[1:], np.ones((1, past.shape[1]))]).T)
     if not rows or sum(map(len, targets)) < 4 * rows[0].shape[1]:
         return None
-    some = slice(_OPTIONS.most_rows)
+    some = slice(_Options.most_rows)
     table, target = np.concatenate(rows)[some], np.concatenate(targets)[some]
     left = target - table @ np.linalg.lstsq(table, target, rcond=None)[0]
     return float(np.sqrt(np.sum(left**2) / (len(left) - table.shape[1])))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from itertools import combinations_with_replacement
 from typing import NamedTuple
 
@@ -13,7 +12,6 @@ from gfnn_jax.signals.splines import FEWEST, splines
 from gfnn_jax.signals.steps import dominant_frequencies
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """periods: of the slowest oscillation, in a window. fewest: samples of a window, for each
     oscillation. places: where states are told. dense, cells: values a period of
@@ -35,9 +33,6 @@ class _Options:
     sets: int = 3
 
 
-_OPTIONS = _Options()
-
-
 class Oscillations(NamedTuple):
     """A series as the sum of oscillations of these angular frequencies (count,), whose sizes and
     phases change slowly."""
@@ -47,7 +42,7 @@ class Oscillations(NamedTuple):
     @property
     def seconds(self) -> float:
         """Length of a window."""
-        return _OPTIONS.periods * 2 * np.pi / float(np.min(self.omega[self.omega > 0]))
+        return _Options.periods * 2 * np.pi / float(np.min(self.omega[self.omega > 0]))
 
     def parts(self, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The parts (n, count) of y (n,) at times t (n,), and their rates of change; y may have
@@ -63,9 +58,9 @@ class Oscillations(NamedTuple):
         """Times (n,) that windows of y are about, and sizes (n, 2 count) of the oscillations in
         them."""
         step = np.ptp(t) / max(len(t) - 1, 1)
-        size = max(round(self.seconds / step), _OPTIONS.fewest * len(self.omega))
+        size = max(round(self.seconds / step), _Options.fewest * len(self.omega))
         size = min(size, len(t))
-        begun = np.arange(0, len(t) - size + 1, max(1, size // _OPTIONS.places))
+        begun = np.arange(0, len(t) - size + 1, max(1, size // _Options.places))
         index = begun[:, None] + np.arange(size)
         at = t[index].mean(axis=1)
         turned = np.exp(1j * self.omega * (t[index] - at[:, None])[..., None])
@@ -84,18 +79,18 @@ def oscillations(t: np.ndarray, y: np.ndarray, count: int) -> list[Oscillations]
     at ±a ± b ± c come of powers of degree 4), then each with a weaker one for its last.
     """
     known = np.isfinite(y)
-    if known.sum() < _OPTIONS.fewest * max(count, FEWEST):
+    if known.sum() < _Options.fewest * max(count, FEWEST):
         return []
     lines, width = _lines(t[known], y[known] - np.mean(y[known]))
     own, others = [], []
     for size, omega in lines:
-        strong = [w for other, w in own if size < _OPTIONS.imitated * other]
+        strong = [w for other, w in own if size < _Options.imitated * other]
         tones = combinations_with_replacement([*strong, *(-w for w in strong)], 3)
         side = any(abs(w - omega) < 2 * width for w in strong)
         made = side or any(abs(sum(three) - omega) < width for three in tones)
         (others if made else own).append((size, omega))
     ranked = [omega for _, omega in (*own, *others)]
-    ends = ranked[count - 1 :][: _OPTIONS.sets]
+    ends = ranked[count - 1 :][: _Options.sets]
     return [Oscillations(np.sort([*ranked[: count - 1], end])) for end in ends]
 
 
@@ -110,16 +105,16 @@ def _lines(t: np.ndarray, y: np.ndarray) -> tuple[list[tuple[float, float]], flo
     peaks = dominant_frequencies([t], y, 4)
     if not peaks:
         return [], 0.0
-    step = 1 / (_OPTIONS.dense * max(peaks))
-    n = min(int(np.ptp(t) / step), _OPTIONS.cells)
-    if n < _OPTIONS.fewest:
+    step = 1 / (_Options.dense * max(peaks))
+    n = min(int(np.ptp(t) / step), _Options.cells)
+    if n < _Options.fewest:
         return [], 0.0
     even = t[0] + step * np.arange(n)
     seen = t < even[-1] + step
     t, y = t[seen], y[seen]
     z = splines([(t, y[:, None])]).curve(t, y)(even)
     vectors, *_ = np.linalg.svd(hankel(z[: n // 3], z[n // 3 - 1 :]))
-    vectors = vectors[:, : min(2 * _OPTIONS.lines, n // 6)]
+    vectors = vectors[:, : min(2 * _Options.lines, n // 6)]
     turns = np.linalg.eigvals(np.linalg.lstsq(vectors[:-1], vectors[1:])[0])
     rates = np.log(turns[turns.imag > 0]) / step
     rates.real = rates.real.clip(-8 / np.ptp(t), 4 / np.ptp(t))
@@ -130,9 +125,9 @@ def _lines(t: np.ndarray, y: np.ndarray) -> tuple[list[tuple[float, float]], flo
     c = inverse @ (A.T @ y)
     errors = np.sqrt(np.mean((y - A @ c) ** 2) * np.diag(inverse).reshape(2, -1).sum(axis=0))
     size = np.hypot(*c.reshape(2, -1))
-    width = _OPTIONS.width * 2 * np.pi / np.ptp(t)
+    width = _Options.width * 2 * np.pi / np.ptp(t)
     found: list[tuple[float, float]] = []
-    left = np.flatnonzero((size > _OPTIONS.clear * errors) & (size > _OPTIONS.weak * size.max()))
+    left = np.flatnonzero((size > _Options.clear * errors) & (size > _Options.weak * size.max()))
     while len(left):
         top = left[np.argmax(size[left])]
         near = np.abs(rates.imag[left] - rates.imag[top]) < width

@@ -13,7 +13,6 @@ readings that they share. The first degree is taken at which it is.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from math import comb
 
@@ -23,7 +22,6 @@ from scipy.optimize import nnls
 from gfnn_jax.arrays import products
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """even: part of a step that times may be off. degrees: of polynomials, at most. share:
     equations for each coefficient. small: of a spread, over which is differenced. alike: difference
@@ -34,9 +32,6 @@ class _Options:
     share: int = 4
     small: float = 1e-5
     alike: float = 0.1
-
-
-_OPTIONS = _Options()
 
 
 def noise_of_one_law(
@@ -50,7 +45,7 @@ def noise_of_one_law(
     step = np.quantile(np.concatenate([np.diff(t) for t, *_ in runs]), 0.5, method="lower")
     rows, told, follows = [], [], []
     for t, y, others in runs:
-        even = np.abs(np.diff(t) / step - 1) < _OPTIONS.even
+        even = np.abs(np.diff(t) / step - 1) < _Options.even
         known = np.all(np.isfinite(np.concatenate([y, others], axis=1)), axis=1)
         first = np.flatnonzero(even[:-1] & even[1:] & known[:-2] & known[1:-1] & known[2:])
         rows.append(y[first[:, None] + np.arange(3)])
@@ -59,8 +54,8 @@ def noise_of_one_law(
     y, variables = np.concatenate(rows), np.concatenate(told)
     variables = variables[:, np.std(variables, axis=0) > 0] if len(y) else variables
     many, pairs = 2 * y.shape[2] + variables.shape[1], np.flatnonzero(np.concatenate(follows))
-    for degree in range(1, _OPTIONS.degrees + 1):
-        if _OPTIONS.share * comb(many + degree, degree) > len(y):
+    for degree in range(1, _Options.degrees + 1):
+        if _Options.share * comb(many + degree, degree) > len(y):
             return None
         sigma = _noise(y, variables, degree, pairs)
         if sigma is not None:
@@ -83,8 +78,8 @@ def _noise(
     r, d = bent - X @ c, y.shape[2]
     by = np.empty((2 * d, *r.shape))  # of F, in readings and in differences
     for j, axis in enumerate(np.eye(own.shape[1])[: 2 * d]):
-        further = products(own + _OPTIONS.small * axis, degree)
-        by[j] = (further - X) @ c / (_OPTIONS.small * size[j])
+        further = products(own + _Options.small * axis, degree)
+        by[j] = (further - X) @ c / (_Options.small * size[j])
     self, slope = np.eye(d)[:, None], by[d:]
     J = np.stack([self / 2 + slope, -self - by[:d], self / 2 - slope])  # of r (place, j, n, i)
     scale = np.maximum(np.sum(r**2, axis=0) / (len(r) - rank), 1e-300)
@@ -92,5 +87,5 @@ def _noise(
     squares = nnls(gains * scale / scale[:, None], np.ones(d))[0] * scale
     shared = squares @ np.mean(np.sum(J[1:, :, pairs] * J[:-1, :, pairs + 1], axis=0), axis=1)
     correlated = np.mean(r[pairs] * r[pairs + 1], axis=0) if len(pairs) else np.inf
-    is_noise = np.abs(correlated - shared) < _OPTIONS.alike * scale
+    is_noise = np.abs(correlated - shared) < _Options.alike * scale
     return np.sqrt(squares) if np.all(is_noise) and np.all(squares > 0) else None

@@ -27,7 +27,6 @@ import numpy as np
 from gfnn_jax.signals.local_polynomials import Smooth
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """degree: of the splines. order: of the differences. stiffness: log10 of λ, least and most, and
     the step of the search (`tests/test_sampling.py`). fewest: readings of a run."""
@@ -38,8 +37,7 @@ class _Options:
     fewest: int = 5
 
 
-_OPTIONS = _Options()
-FEWEST = _OPTIONS.fewest
+FEWEST = _Options.fewest
 
 
 class Splines(NamedTuple):
@@ -124,8 +122,8 @@ class _Problem:
         from scipy import sparse  # loaded when first used
         from scipy.interpolate import BSpline
 
-        k = _OPTIONS.degree
-        signs = np.diff(np.eye(_OPTIONS.order + 1), _OPTIONS.order, axis=0)[0]
+        k = _Options.degree
+        signs = np.diff(np.eye(_Options.order + 1), _Options.order, axis=0)[0]
         designs, roughs, begins, counts, targets = [], [], [], [], []
         for t, y, *rated in runs:
             length = float(np.ptp(t))
@@ -144,9 +142,9 @@ class _Problem:
                 own, y = sparse.diags_array(1 / noise) @ own, y / noise
             designs.append(own)
             targets.append(y)
-            size = spans + k - _OPTIONS.order
+            size = spans + k - _Options.order
             of_order = [np.full(size, sign) for sign in signs]
-            offsets: Any = range(_OPTIONS.order + 1)
+            offsets: Any = range(_Options.order + 1)
             roughs.append(sparse.diags_array(of_order, offsets=offsets, shape=(size, spans + k)))
             begins.append(float(begin))
             counts.append(spans + k)
@@ -159,7 +157,7 @@ class _Problem:
 
     def likeliest(self) -> tuple[float, float]:
         """λ of the largest restricted likelihood, and σ there."""
-        low, high, by = _OPTIONS.stiffness
+        low, high, by = _Options.stiffness
         tried = 10.0 ** np.arange(low, high + by / 2, by)
         found = []
         for stiffness in tried.tolist():
@@ -174,7 +172,7 @@ class _Problem:
         """The curve of the first run."""
         from scipy.interpolate import BSpline
 
-        k, count = _OPTIONS.degree, self.counts[0]
+        k, count = _Options.degree, self.counts[0]
         knots = self.begins[0] + self.step * np.arange(-k, count + 1)
         return BSpline(knots, self._solved(stiffness)[2][:count], k)
 
@@ -186,7 +184,7 @@ class _Problem:
         alpha = cho_solve_banded((root, True), self.target)
         rough = alpha @ _times(self.rough, alpha)
         left = np.sum((self.y - self.design @ alpha) ** 2) + stiffness * max(rough, 0.0)
-        flat = _OPTIONS.order * len(self.counts)
+        flat = _Options.order * len(self.counts)
         free = max(len(self.y) - flat, 1)
         unlikely = free * np.log(max(left, 1e-300)) + 2 * np.sum(np.log(root[0]))
         unlikely -= (sum(self.counts) - flat) * np.log(stiffness)
@@ -195,7 +193,7 @@ class _Problem:
 
 def _band(matrix: Any) -> np.ndarray:
     """The diagonals (6, M) of a symmetric band, the main one first."""
-    band = np.zeros((_OPTIONS.degree + 1, matrix.shape[0]))
+    band = np.zeros((_Options.degree + 1, matrix.shape[0]))
     for k in range(min(len(band), matrix.shape[0])):
         band[k, : matrix.shape[0] - k] = matrix.diagonal(-k)
     return band

@@ -3,7 +3,6 @@ of series."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +10,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial import legendre
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """gap: times the 95th percentile of the steps, above which a step is a gap. even: part of a
     step that times may be off. drifting: samples, at least, of a run whose drift is told. nearby:
@@ -30,9 +28,6 @@ class _Options:
     kept: float = 2.0
 
 
-_OPTIONS = _Options()
-
-
 def median_step(times: Sequence[np.ndarray]) -> float:
     """The median time between samples, in s; NaN where no run has two."""
     steps = np.concatenate([np.diff(t) for t in times])
@@ -41,7 +36,7 @@ def median_step(times: Sequence[np.ndarray]) -> float:
 
 def longest_step(steps: np.ndarray) -> float:
     """The longest step that is no gap among these steps (n,)."""
-    return float(_OPTIONS.gap * np.quantile(steps, 0.95)) if len(steps) else np.inf
+    return float(_Options.gap * np.quantile(steps, 0.95)) if len(steps) else np.inf
 
 
 def gaps(times: Sequence[np.ndarray]) -> list[tuple[int, float, float]]:
@@ -58,7 +53,7 @@ def even_runs(times: Sequence[np.ndarray]) -> list[int]:
     """Numbers of the runs whose steps are all the median step, but for a twentieth."""
     step = median_step(times)
     return [
-        r for r, t in enumerate(times) if np.all(np.abs(np.diff(t) - step) <= _OPTIONS.even * step)
+        r for r, t in enumerate(times) if np.all(np.abs(np.diff(t) - step) <= _Options.even * step)
     ]
 
 
@@ -69,18 +64,18 @@ def drift(times: np.ndarray) -> float:
     Times are a parabola in the number of steps then. Gaps count as so many steps; jitter does not
     make a parabola.
     """
-    if len(times) < _OPTIONS.drifting:
+    if len(times) < _Options.drifting:
         return 0.0
     from scipy import ndimage  # loaded when first used
 
     steps = np.diff(times)
-    usual = ndimage.median_filter(steps, _OPTIONS.nearby, mode="nearest")
+    usual = ndimage.median_filter(steps, _Options.nearby, mode="nearest")
     number = np.concatenate([[0], np.cumsum(np.maximum(np.round(steps / usual), 1))])
     place = 2 * number / number[-1] - 1
     _, slope, bend = coefficients = legendre.legfit(place, times, 2)
     off = times - legendre.legval(place, coefficients[:2])
     parabola = legendre.legval(place, [0, 0, bend])
-    if np.sum(parabola**2) < _OPTIONS.parabola * np.sum(off**2):
+    if np.sum(parabola**2) < _Options.parabola * np.sum(off**2):
         return 0.0
     return float(6 * bend / slope)
 
@@ -93,15 +88,15 @@ def spectrum(times: Sequence[np.ndarray], values: np.ndarray) -> tuple[np.ndarra
     between gaps that a swing does not bridge count as runs.
     """
     step = median_step(times)
-    length = min(max(len(t) for t in times), _OPTIONS.longest)
+    length = min(max(len(t) for t in times), _Options.longest)
     ends = np.cumsum([len(t) for t in times])[:-1]
     runs = list(zip(times, np.split(values, ends), strict=True))
     frequencies, power = _welch(runs, step, length)
     strongest = frequencies[np.argmax(power)] if len(power) else 0.0
     if not strongest > 0:
         return frequencies, power
-    parts = [part for t, x in runs for part in _between_gaps(t, x, _OPTIONS.across / strongest)]
-    whole = [(t, x) for t, x in parts if np.ptp(t) * strongest >= _OPTIONS.kept]
+    parts = [part for t, x in runs for part in _between_gaps(t, x, _Options.across / strongest)]
+    whole = [(t, x) for t, x in parts if np.ptp(t) * strongest >= _Options.kept]
     return _welch(whole, step, length) if len(parts) > len(runs) and whole else (frequencies, power)
 
 

@@ -30,7 +30,6 @@ from numpy.polynomial.legendre import legvander
 TURN = 2 * np.pi
 
 
-@dataclasses.dataclass(frozen=True)
 class _Options:
     """Thresholds, chosen on recordings of test systems with and without wrong values
     (`benchmarks/random_recordings.py`).
@@ -77,9 +76,6 @@ class _Options:
     beyond: float = 0.5
 
 
-_OPTIONS = _Options()
-
-
 @dataclasses.dataclass(frozen=True)
 class WrongValues:
     """A stretch of wrong values of one column.
@@ -117,11 +113,11 @@ def wrong_at_jumps(
     times: Sequence[np.ndarray], runs: Sequence[np.ndarray], resolution: float | None
 ) -> tuple[WrongValues, ...]:
     """The samples of an input (n_r,) of each run that are beyond both sides of a jump."""
-    begins, found, side = np.cumsum([0, *map(len, times)]), [], _OPTIONS.side
+    begins, found, side = np.cumsum([0, *map(len, times)]), [], _Options.side
     for run, (t, x, begin) in enumerate(zip(times, runs, begins, strict=False)):
         ways = np.diff(x)
         usual = np.abs(ways[np.isfinite(ways)])
-        high = _OPTIONS.suspected * float(np.median(usual)) if len(usual) else 0.0
+        high = _Options.suspected * float(np.median(usual)) if len(usual) else 0.0
         turns = -ways[:-1] * ways[1:] > high**2  # not where a value is missing
         for k in 1 + np.flatnonzero(turns):
             if not side <= k < len(x) - side:
@@ -129,18 +125,18 @@ def wrong_at_jumps(
             sides = np.arange(k - side, k), np.arange(k + 1, k + 1 + side)
             led = [_led(t[rows] - t[k], x[rows], resolution or 0.0) for rows in sides]
             off, jump = x[k] - np.array([at for at, _ in led]), abs(led[0][0] - led[1][0])
-            least = _OPTIONS.far * max(sigma for _, sigma in led)
+            least = _Options.far * max(sigma for _, sigma in led)
             beyond = float(np.abs(off).min()) if off[0] * off[1] > 0 else 0.0
-            if jump > least and beyond > max(least, _OPTIONS.beyond * jump):
+            if jump > least and beyond > max(least, _Options.beyond * jump):
                 found.append(WrongValues(run, np.array([begin + k]), beyond))
     return tuple(found)
 
 
 def _led(t: np.ndarray, x: np.ndarray, resolution: float) -> tuple[float, float]:
     """Value that samples (n,) of a side lead to at time 0, and its standard deviation."""
-    q, r = np.linalg.qr(np.vander(t / np.abs(t).max(), _OPTIONS.smooth + 1))
+    q, r = np.linalg.qr(np.vander(t / np.abs(t).max(), _Options.smooth + 1))
     left = x - q @ (q.T @ x)
-    sigma = max(resolution, float(np.sqrt(left @ left / (len(x) - _OPTIONS.smooth - 1))))
+    sigma = max(resolution, float(np.sqrt(left @ left / (len(x) - _Options.smooth - 1))))
     reach = np.linalg.solve(r.T, np.eye(len(r))[-1])
     return float(q.T @ x @ reach), sigma * float(np.sqrt(1 + reach @ reach))
 
@@ -166,11 +162,11 @@ def _roughness(runs: Sequence[np.ndarray]) -> float:
     """The largest miss that is ordinary in a column, of the `_misses` (n_r,) of its runs: 3.4
     standard deviations of white noise. Infinite where no run has a block of samples."""
     whole = [
-        miss[: len(miss) // _OPTIONS.block * _OPTIONS.block].reshape(-1, _OPTIONS.block)
+        miss[: len(miss) // _Options.block * _Options.block].reshape(-1, _Options.block)
         for miss in runs
     ]
     largest = np.concatenate([blocks.max(axis=1) for blocks in whole] or [np.empty(0)])
-    return float(np.quantile(largest, _OPTIONS.ordinary)) if len(largest) else np.inf
+    return float(np.quantile(largest, _Options.ordinary)) if len(largest) else np.inf
 
 
 def _outliers(
@@ -182,20 +178,20 @@ def _outliers(
     rough: of the column (`_roughness`).
     """
     miss = _misses(t, x)
-    if len(x) < 2 * _OPTIONS.side + 1 or not miss.max() > _OPTIONS.rough * rough:
+    if len(x) < 2 * _Options.side + 1 or not miss.max() > _Options.rough * rough:
         return []
     usual = np.maximum(_nearby(miss), max(resolution, 1e-12 * np.ptp(x)))
-    suspected = miss > _OPTIONS.suspected * usual
+    suspected = miss > _Options.suspected * usual
     at = np.flatnonzero(suspected)
     if len(at) == 0:
         return []
     clean = ~suspected
-    for k in range(1, _OPTIONS.beside + 1):
+    for k in range(1, _Options.beside + 1):
         clean[k:] &= ~suspected[:-k]
         clean[:-k] &= ~suspected[k:]
     right = np.flatnonzero(clean)
-    parts, found = np.split(at, np.flatnonzero(np.diff(at) > _OPTIONS.joined) + 1), []
-    series = _Series(t, x, right, float(np.median(np.diff(t))), usual, _OPTIONS.rough * rough)
+    parts, found = np.split(at, np.flatnonzero(np.diff(at) > _Options.joined) + 1), []
+    series = _Series(t, x, right, float(np.median(np.diff(t))), usual, _Options.rough * rough)
     while parts:
         first, *parts = parts
         outlier = series.outlier(first[0], first[-1])
@@ -223,24 +219,24 @@ class _Series(NamedTuple):
     ) -> tuple[int, int, float] | None:
         """(begin, end, how far off) of the stretch with the suspected samples from ``first`` to
         ``last``; None where it is none, or too few samples around it tell."""
-        begin, end = first - _OPTIONS.beside, last + _OPTIONS.beside + 1
-        count = max(_OPTIONS.side, end - begin)
+        begin, end = first - _Options.beside, last + _Options.beside + 1
+        count = max(_Options.side, end - begin)
         before = self.right[self.right < begin][-count:]
         behind = self.right[self.right >= end][:count]
-        if end - begin > _OPTIONS.longest or min(len(before), len(behind)) < count:
+        if end - begin > _Options.longest or min(len(before), len(behind)) < count:
             return None
-        widest = _OPTIONS.widest * self.step * (2 * count + end - begin)
+        widest = _Options.widest * self.step * (2 * count + end - begin)
         if self.t[behind[-1]] - self.t[before[0]] > widest:
             return None
         sides = np.concatenate([before, behind])
-        noise = float(self.usual[first]) / _OPTIONS.of_median
+        noise = float(self.usual[first]) / _Options.of_median
         outlier = _apart(self.t, self.x, np.arange(begin, end), sides, noise)
         return outlier if outlier is not None and outlier[2] > self.least else None
 
 
 def _nearby(miss: np.ndarray) -> np.ndarray:
     """The median of the block that a sample is in, or of the one before or behind if it is more."""
-    blocks = np.array_split(miss, max(len(miss) // _OPTIONS.nearby, 1))
+    blocks = np.array_split(miss, max(len(miss) // _Options.nearby, 1))
     medians = np.pad([np.median(block) for block in blocks], 1, mode="edge")
     most = np.maximum(np.maximum(medians[:-2], medians[2:]), medians[1:-1])
     return np.repeat(most, [len(block) for block in blocks])
@@ -252,19 +248,19 @@ def _apart(
     """(begin, end, how far off) of the samples among ``rows`` that the polynomial of the ``sides``
     misses by far; None where it does not tell."""
     middle, half = t[rows].mean(), np.ptp(t[sides]) / 2
-    q, r = np.linalg.qr(legvander((t[sides] - middle) / half, _OPTIONS.degree))
+    q, r = np.linalg.qr(legvander((t[sides] - middle) / half, _Options.degree))
     coefficients = q.T @ x[sides]
     left = x[sides] - q @ coefficients
-    sigma = max(sigma, float(np.sqrt(left @ left / (len(sides) - _OPTIONS.degree - 1))))
-    reach = np.linalg.solve(r.T, legvander((t[rows] - middle) / half, _OPTIONS.degree).T)
+    sigma = max(sigma, float(np.sqrt(left @ left / (len(sides) - _Options.degree - 1))))
+    reach = np.linalg.solve(r.T, legvander((t[rows] - middle) / half, _Options.degree).T)
     off = np.abs(x[rows] - coefficients @ reach)
-    far = np.flatnonzero(off > _OPTIONS.far * sigma * np.sqrt(1 + np.sum(reach**2, axis=0)))
+    far = np.flatnonzero(off > _Options.far * sigma * np.sqrt(1 + np.sum(reach**2, axis=0)))
     if len(far) == 0 or far[0] == 0 or far[-1] == len(rows) - 1:
         return None
     first, last = far[0], far[-1]
-    if off[first] < _OPTIONS.abrupt * off[first - 1] or off[last] < _OPTIONS.abrupt * off[last + 1]:
+    if off[first] < _Options.abrupt * off[first - 1] or off[last] < _Options.abrupt * off[last + 1]:
         return None
-    if abs(np.median(off[far]) - TURN) < _OPTIONS.of_turn * TURN:
+    if abs(np.median(off[far]) - TURN) < _Options.of_turn * TURN:
         return None
     return int(rows[first]), int(rows[last]) + 1, float(off[far].max())
 
@@ -275,26 +271,26 @@ def _stuck(t: np.ndarray, x: np.ndarray, resolution: float, rough: float) -> lis
     t, x: without missing values. resolution: the smallest step between values, 0 if it is unknown.
     rough: of the column (`_roughness`), which the motion goes in a step at least.
     """
-    if len(x) < _OPTIONS.fewest:
+    if len(x) < _Options.fewest:
         return []
     times = np.diff(t)
     ways = np.abs(np.diff(x)) * np.minimum(np.median(times) / times, 1.0)  # a gap makes a long way
     same = np.concatenate([[False], ways == 0, [False]])
     begins = np.flatnonzero(same[1:] & ~same[:-1])
     ends = np.flatnonzero(~same[1:] & same[:-1])
-    slow = max(_OPTIONS.resolutions * resolution, rough)
-    many = (ends - begins + 1 >= _OPTIONS.fewest) & (ends < len(ways))
+    slow = max(_Options.resolutions * resolution, rough)
+    many = (ends - begins + 1 >= _Options.fewest) & (ends < len(ways))
     found = []
     for begin, end in zip(begins[many], ends[many], strict=True):
         before, behind = (
-            ways[max(begin - _OPTIONS.around, 0) : begin],
-            ways[end + 1 : end + 1 + _OPTIONS.around],
+            ways[max(begin - _Options.around, 0) : begin],
+            ways[end + 1 : end + 1 + _Options.around],
         )
-        around = [part for part in (before, behind) if len(part) == _OPTIONS.around]
+        around = [part for part in (before, behind) if len(part) == _Options.around]
         moves = any(np.median(part) > slow for part in around)
         way = max(
-            _OPTIONS.fewest * slow,
-            _OPTIONS.jump * max((part.max() for part in around), default=0.0),
+            _Options.fewest * slow,
+            _Options.jump * max((part.max() for part in around), default=0.0),
         )
         if moves and ways[end] > way:
             found.append((int(begin) + 1, int(end) + 1))

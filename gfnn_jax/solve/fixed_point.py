@@ -9,7 +9,6 @@ data. A lane that has converged is frozen.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -26,7 +25,6 @@ from gfnn_jax.solve.status import NON_FINITE, NOT_CONVERGED, OK, Info
 MOST = 100  # updates, and those of a derivative: a contraction of 0.7 reaches roundoff
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of the fixed-point iteration (benchmarks/many.py)."""
 
@@ -43,9 +41,6 @@ class Options:
     close: float = 1e-15  # residual relative to its terms, in NumPy: roundoff
     solved: float = 1e-14  # relative residual above which a lane has Newton updates in NumPy
     stale: int = 4  # updates in NumPy without a better lane, after which the iteration ends
-
-
-OPTIONS = Options()
 
 
 @runtime_checkable
@@ -107,11 +102,11 @@ def iterate(
         x = state.x - unit * state.residual
         evaluation = equation.evaluate(shared, lanes, x)
         error, iterations = floors(evaluation), state.iterations + 1
-        further = (error > settled) | ((error > 1.0) & (error < OPTIONS.shrinks * state.earlier))
+        further = (error > settled) | ((error > 1.0) & (error < Options.shrinks * state.earlier))
         fast = (
-            (iterations < OPTIONS.first)
+            (iterations < Options.first)
             | (error <= settled)
-            | (error < OPTIONS.slow ** iterations.astype(error.dtype) * start)
+            | (error < Options.slow ** iterations.astype(error.dtype) * start)
         )
         new = _Iterate(
             x,
@@ -140,7 +135,7 @@ def newton_krylov(
     """
     unit, settled = equation.unit(shared, lanes), settled_floors(guess.dtype)
     _, aux, info = done
-    most, infinite = info.iterations + OPTIONS.most_newton, jnp.full_like(guess, jnp.inf)
+    most, infinite = info.iterations + Options.most_newton, jnp.full_like(guess, jnp.inf)
     begun = _Damped(  # the first step is zero and leads to the guess
         guess,
         infinite,
@@ -160,7 +155,7 @@ def newton_krylov(
         further = (error > settled) | ((error > 1.0) & (error < 0.5 * state.error))
         further = better & further & (iterations < most)
         rhs = jnp.where(further[:, None], evaluation.residual, 0.0)
-        step = krylov.differentiable(equation.product(shared, lanes, x), rhs, OPTIONS.linear)
+        step = krylov.differentiable(equation.product(shared, lanes, x), rhs, Options.linear)
         new = _Damped(
             x,
             evaluation.residual,
@@ -172,7 +167,7 @@ def newton_krylov(
             further,
         )
         # Close to the floor only the full step makes sense: what is left is roundoff.
-        shortest = jnp.where(state.error <= settled, 1.0, OPTIONS.shortest)
+        shortest = jnp.where(state.error <= settled, 1.0, Options.shortest)
         halved = state._replace(part=0.5 * state.part, open=state.part[:, 0] > shortest)
         return where(better, new, where(state.open, halved, state))
 
@@ -228,19 +223,19 @@ def refine(equation: Contraction, shared: Any, lanes: Any, guess: Any):
         unit, stale = equation.unit(shared, lanes), 0
         new = best = evaluated(guess)
         for _ in range(MOST):
-            if stale == OPTIONS.stale or (best[2] <= OPTIONS.close).all():
+            if stale == Options.stale or (best[2] <= Options.close).all():
                 break
             new = evaluated(new[0] - unit * new[1].residual)
             better = new[2] < best[2]
             best, stale = where(better, new, best), 0 if better.any() else stale + 1
-        best = where(best[2] <= OPTIONS.solved, best, evaluated(guess))
-        while (left := ~(best[2] <= OPTIONS.solved)).any():
+        best = where(best[2] <= Options.solved, best, evaluated(guess))
+        while (left := ~(best[2] <= Options.solved)).any():
             product = equation.product(shared, lanes, best[0])
             step = krylov.solve(
-                product, np.where(left[:, None], best[1].residual, 0.0), OPTIONS.linear
+                product, np.where(left[:, None], best[1].residual, 0.0), Options.linear
             )
             new = evaluated(best[0] - unit * step)
-            better = left & (new[2] < OPTIONS.shrinks * best[2])
+            better = left & (new[2] < Options.shrinks * best[2])
             best = where(better, new, best)
             if not better.any():
                 break

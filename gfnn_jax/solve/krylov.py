@@ -10,7 +10,6 @@ Memory: 2 `SPACE` vectors for each lane.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -22,7 +21,6 @@ from gfnn_jax.arrays import namespace
 SPACE = 20  # directions before a restart
 
 
-@dataclasses.dataclass(frozen=True)
 class Options:
     """Options of GMRES and Newton–Krylov (benchmarks/many.py)."""
 
@@ -32,9 +30,6 @@ class Options:
     most: int = 12  # restarts of a system that is solved to roundoff
     # a restart that leaves more than this part of the residual has met roundoff
     stalled: float = 0.5
-
-
-OPTIONS = Options()
 
 
 class _Search(NamedTuple):
@@ -67,13 +62,13 @@ def solve(product: Callable, rhs: Any, tolerance: float):
             along = xp.sum(s.pairs[:, 1] * pair[None, 1], axis=-1)
             pair = pair - xp.sum(along[:, None, :, None] * s.pairs, axis=0)
         size = norm_of(pair[1])
-        pair = _unit(pair, xp.where(size > OPTIONS.nothing * norm_of(image), size, 0.0)[None])
+        pair = _unit(pair, xp.where(size > Options.nothing * norm_of(image), size, 0.0)[None])
         along = xp.sum(s.residual * pair[1], axis=-1)
         moved = xp.where(s.norm > goal, along, 0.0)[None, :, None] * pair
         residual = s.residual - moved[1]
         norm = norm_of(residual)
         here = (xp.arange(SPACE) == s.count).reshape(-1, 1, 1, 1)
-        shrunk = (norm < OPTIONS.shrunk * s.norm)[:, None]
+        shrunk = (norm < Options.shrunk * s.norm)[:, None]
         return _Search(
             s.x + moved[0],
             residual,
@@ -104,14 +99,14 @@ def solve_to_roundoff(product: Callable, rhs: Any):
     def solved(product, rhs):
         def goes_on(state):
             _, _, norm, earlier, count = state
-            return (count < OPTIONS.most) & jax.numpy.any(norm < OPTIONS.stalled * earlier)
+            return (count < Options.most) & jax.numpy.any(norm < Options.stalled * earlier)
 
         def again(state):
             x, residual, norm, earlier, count = state
-            tried = x + solve(product, residual, OPTIONS.restart)
+            tried = x + solve(product, residual, Options.restart)
             left = rhs - product(tried)
             new = norm_of(left)
-            better = (norm < OPTIONS.stalled * earlier) & (new < norm)
+            better = (norm < Options.stalled * earlier) & (new < norm)
             return (
                 jax.numpy.where(better[:, None], tried, x),
                 jax.numpy.where(better[:, None], left, residual),
