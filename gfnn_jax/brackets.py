@@ -123,10 +123,8 @@ class Bracket:
         d = field.shape[-1]
         powers = np.zeros((1, d), int) if powers is None else np.asarray(powers, int)
         if field.shape != (len(powers), d, d) or powers.shape[1] != d:
-            raise FitError(
-                f"expected a field (m, d, d) and its exponents (m, d), got {field.shape} and "
-                f"{powers.shape}"
-            )
+            shapes = f"{field.shape} and {powers.shape}"
+            raise FitError(f"expected a field (m, d, d) and its exponents (m, d), got {shapes}")
         for coefficients in field:
             _antisymmetric(coefficients)
         mass = np.eye(d) if mass is None else np.asarray(mass, float)
@@ -323,11 +321,8 @@ class LieAlgebra(Bracket):
         forms = forms + forms.swapaxes(1, 2)
         fields = np.einsum("ijm,ajl->aiml", c, forms)
         fields = (fields + fields.swapaxes(2, 3)).reshape(len(forms), -1)
-        squares = [
-            (np.outer(row, other) + np.triu(np.outer(other, row), 1))[upper]
-            for k, row in enumerate(linear)
-            for other in linear[k:]
-        ]
+        pairs = [(row, other) for k, row in enumerate(linear) for other in linear[k:]]
+        squares = [(np.outer(a, b) + np.triu(np.outer(b, a), 1))[upper] for a, b in pairs]
         found = [
             Casimir(np.tensordot(row, forms, 1), np.zeros(n), False, self.labels)
             for row in null_space(fields.T, without=squares)
@@ -401,12 +396,8 @@ class Magnetic(Bracket):
         if j < d:
             return ""
         values = (inverse @ c @ inverse for c in self.field)
-        return added(
-            [
-                (c[i - d, j - d], _product(self.labels[:d], p))
-                for c, p in zip(values, self.powers, strict=True)
-            ]
-        )
+        own = zip(values, self.powers, strict=True)
+        return added([(c[i - d, j - d], _product(self.labels[:d], p)) for c, p in own])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -27,15 +27,7 @@ MAX_SECONDS = 120.0  # of a fit that is told of no budget
 # matched to gradients, iterations of a network. Compiling and reading are counted in seconds.
 ROWS, SOLVE, FLOW, NETWORK, COMPILE = "rows", "solve", "flow", "network", "compile"
 MATCHING, READING = "matching", "reading"
-RATES = {
-    ROWS: 1e10,
-    SOLVE: 2e10,
-    FLOW: 5e8,
-    MATCHING: 1e8,
-    NETWORK: 5e9,
-    COMPILE: 1.0,
-    READING: 1.0,
-}
+RATES = {ROWS: 1e10, SOLVE: 2e10, FLOW: 5e8, MATCHING: 1e8, NETWORK: 5e9, COMPILE: 1, READING: 1}
 
 
 class _Options:

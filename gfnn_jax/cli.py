@@ -74,14 +74,11 @@ def _status_of(argv: Sequence[str]) -> int:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, lasts until exit
         return 1
     except KeyboardInterrupt as stop:
-        terminated = isinstance(stop, Terminated)
         # The job's notes name what it has kept; before its work, an earlier job may have kept some.
         before = unfinished_note(arguments.out) if getattr(arguments, "out", None) else None
         kept = getattr(stop, "__notes__", [before or "nothing was kept"])
-        return _fail(
-            143 if terminated else 130,
-            "; ".join(["terminated" if terminated else "stopped", *kept]),
-        )
+        status, how = (143, "terminated") if isinstance(stop, Terminated) else (130, "stopped")
+        return _fail(status, "; ".join([how, *kept]))
 
 
 def _is_data(first: str) -> bool:
@@ -124,10 +121,8 @@ def _records(arguments: argparse.Namespace) -> None:
     from gfnn_jax.records import RECORDS, path
 
     for name, record in RECORDS.items():
-        print(
-            f"{name:16} {record.what}; positions {', '.join(record.positions)}\n"
-            f"{'':16} {path(name)}"
-        )
+        about = f"{record.what}; positions {', '.join(record.positions)}"
+        print(f"{name:16} {about}\n{'':16} {path(name)}")
     print("gfnn run NAME learns the law of two thirds of a record and forecasts the last third")
 
 
@@ -369,9 +364,7 @@ _OF_FORECAST = ("stop", "estimate_from", "inputs", "compare")
 def _refuse_given(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
     """Raise InputError where one of these options was given."""
     values = {name: getattr(arguments, name, None) for name in names}
-    given = [
-        f"--{n.replace('_', '-')}" for n, value in values.items() if value not in (None, False, ())
-    ]
+    given = [f"--{n.replace('_', '-')}" for n, v in values.items() if v not in (None, False, ())]
     if given:
         raise InputError(f"{', '.join(given)}: {why}")
 

@@ -154,12 +154,9 @@ class _Command:
 def parser() -> argparse.ArgumentParser:
     """Make the parser; what it parses has the command's name as ``command``."""
     plain: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
-    found = _Parser(
-        prog="gfnn",
-        description="Find the law of motion in data, predict with exactly symplectic maps.",
-        epilog=f"{WORKFLOW}\n\n{EXIT_STATUS}\n{DISTRIBUTED_STATUS}",
-        **plain,
-    )
+    about = "Find the law of motion in data, predict with exactly symplectic maps."
+    epilog = f"{WORKFLOW}\n\n{EXIT_STATUS}\n{DISTRIBUTED_STATUS}"
+    found = _Parser(prog="gfnn", description=about, epilog=epilog, **plain)
     found.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = found.add_subparsers(required=True, metavar="COMMAND")
 
@@ -255,18 +252,14 @@ def _fit(command: _Command) -> None:
         "of a recording: write the law into MODEL although it misses most of the motion; the exit "
         "status is 1 all the same",
     )
+    of_each = "each reads its own rows of DATA, or its own files"
     command.flag(
-        "--distributed",
-        "this is one of several processes that srun or another launcher has started: each reads "
-        "its own rows of DATA, or its own files",
+        "--distributed", f"this is one of several processes, started by srun, say: {of_each}"
     )
 
 
 def _add_despite(command: _Command) -> None:
-    about = (
-        "of a recording: fit although gfnn look finds these mistakes, by kind (in brackets after "
-        "the word wrong), joined by commas"
-    )
+    about = "of a recording: fit although gfnn look finds these mistakes, by kind, joined by commas"
     command.add("--despite", about, "KIND", type=_split, default=())
 
 
@@ -289,10 +282,7 @@ def _predict(command: _Command) -> None:
     command.add("--compare", about, "FILE", type=Path)
     saved = "save the state of every K-th step (default %(default)s)"
     command.add("--save-every", saved, "K", type=_count, default=1)
-    about = (
-        "time step, for a model that serves others than that of its data: H, or S of pairs with "
-        "several time steps"
-    )
+    about = "time step, where the model serves others than its data's: H, or S of several steps"
     command.add("--dt", about, "H", type=_positive)
     about = "file to write: .npz, or for the forecast of a recording .npz or .csv"
     command.add("--out", about, "FILE", type=Path, required=True)
@@ -307,10 +297,7 @@ def _predict(command: _Command) -> None:
     command.add("--outside", about, choices=("continue", "stop"))
     about = "number of devices that share the trajectories; on a CPU these are its cores"
     command.add("--devices", about, "all|N", type=_devices)
-    command.flag(
-        "--distributed",
-        "this is one of several processes that srun or another launcher has started",
-    )
+    command.flag("--distributed", "this is one of several processes, started by srun, say")
     command.add_output()
 
 
@@ -360,9 +347,8 @@ def _split(text: str) -> tuple[str, ...]:
 
 
 _STEPS = Kind(f"{COUNT.words}, or its negative", lambda value: COUNT.holds(abs(value)), int)
-_positive, _count, _seed, _devices, _steps = (
-    _reader(kind) for kind in (POSITIVE, COUNT, SEED, DEVICES, _STEPS)
-)
+_KINDS = (POSITIVE, COUNT, SEED, DEVICES, _STEPS)
+_positive, _count, _seed, _devices, _steps = map(_reader, _KINDS)
 
 
 # Options about columns.
@@ -373,12 +359,8 @@ def add_column_options(command: argparse.ArgumentParser) -> None:
 
     ``--angles`` are names of columns, or whole numbers, the indices in z of canonical states.
     """
-    group = _Command(
-        command.add_argument_group(
-            "columns of a recording",
-            "names separated by commas; without these options the file's names and data decide",
-        )
-    )
+    about = "names separated by commas; without these options the file's names and data decide"
+    group = _Command(command.add_argument_group("columns of a recording", about))
 
     def names(name: str, about: str) -> None:
         group.add(name, about, "A,B", type=_names)
@@ -430,9 +412,7 @@ def names_roles(options: dict[str, Any]) -> bool:
 def _names(text: str) -> tuple[str, ...]:
     names = tuple(part.strip() for part in text.split(",") if part.strip())
     if not names or len(set(names)) < len(names):
-        raise argparse.ArgumentTypeError(
-            f"expected different names separated by commas, got '{text}'"
-        )
+        raise argparse.ArgumentTypeError(f"expected different names joined by commas, got '{text}'")
     return names
 
 
@@ -441,9 +421,7 @@ def _names_or_indices(text: str) -> tuple[str, ...] | tuple[int, ...]:
         return ()
     names = _names(text)
     if len(names) < len(text.split(",")):
-        raise argparse.ArgumentTypeError(
-            f"expected different names or indices separated by commas, got '{text}'"
-        )
+        raise argparse.ArgumentTypeError(f"expected different names or indices, got '{text}'")
     return tuple(map(int, names)) if all(name.isdecimal() for name in names) else names
 
 

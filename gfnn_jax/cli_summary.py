@@ -10,11 +10,8 @@ from pathlib import Path
 from typing import Any
 
 _FEW_TERMS = 15  # of a law with noise that is shown as H
-_MEANS = {
-    "left the domain": " (extrapolated from there)",
-    "not converged": " (NaN from there)",
-    "non-finite": " (NaN from there)",
-}
+_MEANS = {"left the domain": " (extrapolated from there)"}
+_MEANS |= dict.fromkeys(("not converged", "non-finite"), " (NaN from there)")
 
 
 def law_line(report: dict[str, Any]) -> str:
@@ -83,10 +80,7 @@ def _holds(fit: Any) -> str:
     parts = ["valid where the data are: gfnn predict names the trajectories that leave them"]
     outside = fit.chosen.outside
     if outside is not None and math.isfinite(outside):
-        parts.append(
-            f"a fit without the outermost 5 % of the states errs there by {outside:.1e} of the "
-            "spread"
-        )
+        parts.append(f"a fit without the outermost 5 % of the states errs there by {outside:.1e}")
     if fit.chosen.learns == "hamiltonian":
         parts.append("other time steps: gfnn predict --dt")
     return "; ".join(parts)
@@ -120,14 +114,9 @@ def _print_ahead(found: Any, held_out: Any) -> None:
     for name, errors in found.median.items():
         sizes = ", ".join(f"{error:.3g}" for error in errors)
         unit = f" {held_out.unit(name)}".rstrip()
-        print(
-            f"forecasts of the last third, which no fit has seen: median error of {name} "
-            f"{sizes}{unit} after {ahead} s"
-        )
-    print(
-        f"{100 * found.within:.0f} % of what was measured lies within two standard deviations "
-        "(95 % expected)"
-    )
+        median = f"median error of {name} {sizes}{unit} after {ahead} s"
+        print(f"forecasts of the last third, which no fit has seen: {median}")
+    print(f"{100 * found.within:.0f} % of it lies within two standard deviations (95 % expected)")
 
 
 def print_law(fit: Any, ahead: Callable[[], None] | None = None) -> None:
@@ -159,28 +148,22 @@ def print_forecasts(found: Any, out: Path) -> None:
         return
     for name, (rms, median, within) in compared.columns.items():
         unit = f" {compared.units[name]}".rstrip()
-        print(
-            f"{name}: RMS error {rms:.4g}{unit}, median of its size {median:.4g}{unit}; "
-            f"{within:.0%} of {compared.num_samples} samples within two standard deviations "
-            "(95 % expected)"
-        )
+        sizes = f"RMS error {rms:.4g}{unit}, median of its size {median:.4g}{unit}"
+        share = f"{within:.0%} of {compared.num_samples} samples within two standard deviations"
+        print(f"{name}: {sizes}; {share} (95 % expected)")
 
 
 def print_predicted(predicted: Any, asked: Any, out: Path) -> None:
     """Print the number of trajectories by status, and where their bands are wide."""
     num_lanes, back = len(predicted.status), " backwards" if asked.num_steps < 0 else ""
-    print(
-        f"{out}: {num_lanes} trajectories of {abs(asked.num_steps)} steps{back}, "
-        f"{predicted.seconds:.1f} s"
-    )
+    steps = f"{abs(asked.num_steps)} steps{back}, {predicted.seconds:.1f} s"
+    print(f"{out}: {num_lanes} trajectories of {steps}")
     _print_status(predicted.status, predicted.left_at)
     if predicted.horizon is not None:
         passed = predicted.horizon[predicted.horizon >= 0]
         first = f", the first at step {passed.min()}" if passed.size else ""
-        print(
-            f"the band of the position (2 σ) exceeds {asked.horizon:g} in {passed.size} of "
-            f"{num_lanes} trajectories{first}"
-        )
+        where = f"{passed.size} of {num_lanes} trajectories{first}"
+        print(f"the band of the position (2 σ) exceeds {asked.horizon:g} in {where}")
 
 
 def _print_status(status, left_at) -> None:

@@ -61,12 +61,9 @@ def measured(
         return Assembled(dataclasses.replace(candidate, map=map_), 0.0, compiled=False)
     images = np.where(steps.failed[:, None], np.nan, steps.images)
     error = measured_error(data, tolerance, images)
-    candidate = dataclasses.replace(
-        with_error(candidate, error),
-        map=map_,
-        newton_iterations_max=int(steps.iterations.max()),
-        microseconds_per_step=steps.microseconds_per_step,
-    )
+    seconds, most = steps.microseconds_per_step, int(steps.iterations.max())
+    timed = {"newton_iterations_max": most, "microseconds_per_step": seconds}
+    candidate = dataclasses.replace(with_error(candidate, error), map=map_, **timed)
     return Assembled(candidate, steps.compile_seconds, failed=int(steps.failed.sum()))
 
 
@@ -79,14 +76,12 @@ def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:
         images, solved = data.y1[rows], np.ones(len(rows), bool)
     args = data.given(rows[solved])[1]
     features = getattr(getattr(generated.family, "inputs", None), "features", None)
-    fitted = fit_predictors(
-        generated.chart,
-        data.y0[rows][solved],
-        images[solved],
-        of_lanes(data.given(rows)[0], solved),
+    dt = of_lanes(data.given(rows)[0], solved)
+    ends, features = (
+        (data.y0[rows][solved], images[solved]),
         partial(inputs_of, data, features=features),
-        args,
     )
+    fitted = fit_predictors(generated.chart, *ends, dt, features, args)
     chosen = affordable(fitted, generated.family)
     return dataclasses.replace(generated, predictor=chosen.predictor)
 
@@ -99,16 +94,10 @@ def composed(piece: Piece, data: Dataset) -> SymplecticMap:
         parameters = sampled(data.parameters, data.args, data.each_dt, data.period)
     if data.own_dt is not None and isinstance(piece, Generated):
         dt_range = np.array([data.own_dt.min(), data.own_dt.max()])
-    map_ = SymplecticMap(
-        pieces=(*data.before, piece, *data.after),
-        coordinates=data.coordinates,
-        domain=data.domain,
-        scale=data.spread,
-        angle_centre=data.angle_centre,
-        dt=data.dt,
-        parameters=parameters,
-        dt_range=dt_range,
-    )
+    names = ("coordinates", "domain", "angle_centre", "dt")
+    own: dict[str, Any] = {name: getattr(data, name) for name in names}
+    own |= {"scale": data.spread, "parameters": parameters, "dt_range": dt_range}
+    map_ = SymplecticMap(pieces=(*data.before, piece, *data.after), **own)
     # Not jnp.asarray, which compiles a copy for every new shape.
     return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)), map_)
 
@@ -216,12 +205,8 @@ class Candidate:
 
 
 def _fields_of(error: OneStepError) -> dict[str, Any]:
-    return {
-        "validation_rms": error.rms,
-        "validation_relative": error.relative,
-        "validation_bound": error.bound,
-        "deviations": error.deviations,
-    }
+    found = {f"validation_{name}": getattr(error, name) for name in ("rms", "relative", "bound")}
+    return {**found, "deviations": error.deviations}
 
 
 def refined_images(

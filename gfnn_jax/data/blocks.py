@@ -28,16 +28,8 @@ ARC = 50
 # What flipped bits and cuts in files made zipfile, its decompressors, NumPy and the decoding of
 # text raise; a flipped bit in a header may ask for an unknown compression or for a password.
 _OF_DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    OSError,
-    EOFError,
-    ValueError,
-    tokenize.TokenError,
-    SyntaxError,
-    RuntimeError,
-    MemoryError,
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, ValueError),
+    *(tokenize.TokenError, SyntaxError, RuntimeError, MemoryError),
 )
 
 
@@ -59,13 +51,11 @@ class Block:
 
     def rows(self, index: np.ndarray) -> Block:
         locate = self.locate  # `self` would keep all rows in memory
-        return Block(
-            self.states[index],
-            self.sequence[index],
-            self.place[index],
-            lambda r, c: locate(int(index[r]), c),
+        own, at = (
             None if self.own is None else self.own[index],
+            (self.sequence[index], self.place[index]),
         )
+        return Block(self.states[index], *at, lambda r, c: locate(int(index[r]), c), own)
 
     @property
     def going(self) -> np.ndarray:
@@ -92,12 +82,9 @@ def joined(blocks: Iterable[Block], dim: int) -> Block:
     """Checked blocks of states (n, 2 · dim) one behind another; none may be there."""
     parts = [Block(np.empty((0, 2 * dim)), np.empty(0), np.empty(0, int)), *blocks]
     own = [block.own for block in parts if block.own is not None]
-    return Block(
-        np.concatenate([block.states for block in parts]),
-        np.concatenate([block.sequence for block in parts]),
-        np.concatenate([block.place for block in parts]),
-        own=np.concatenate(own) if own else None,
-    )
+    each = zip(*((block.states, block.sequence, block.place) for block in parts), strict=True)
+    states, sequence, place = map(np.concatenate, each)
+    return Block(states, sequence, place, own=np.concatenate(own) if own else None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,9 +116,7 @@ class Request:
             return given if found is None else found  # pyright: ignore[reportReturnType]
         if not abs(given - found) <= TIME_TOLERANCE * found:
             own = "times that are uneven" if np.isnan(found) else f"the file's dt = {found}"
-            raise InputError(
-                f"{self.path}: the given dt = {given} disagrees with {own}. Leave out --dt"
-            )
+            raise InputError(f"{self.path}: the given dt = {given} disagrees with {own}. Omit --dt")
         return given
 
 

@@ -117,20 +117,18 @@ def roles_of(
             check_known(source, role, of_role, names)
         twice = [name for name in dict.fromkeys(wanted) if wanted.count(name) > 1]
         if twice:
-            raise InputError(
-                f"{source}: expected one role of each column, got {', '.join(twice)} twice"
-            )
+            raise InputError(f"{source}: expected one role a column, got {', '.join(twice)} twice")
         rest = [name for name in names if name not in wanted]
         if any(given[role] for role in _OF_MOTION) or not rest:
             return given, []
         roles, notes = roles_of(source, rest, dict.fromkeys(ROLES, ()), runs, units)
         return {role: given[role] or roles[role] for role in ROLES}, notes
     every = {name: [values[name] for _, values in runs.values()] for name in names}
-    counts = [
-        name
-        for name, columns in every.items()
-        if all(len(x) > _Options.rows and np.all(np.diff(x) == 1) for x in columns)
-    ]
+    least = _Options.rows
+    rows = {
+        n: all(len(x) > least and np.all(np.diff(x) == 1) for x in own) for n, own in every.items()
+    }
+    counts = [name for name, counted in rows.items() if counted]
     names = [name for name in names if name not in counts] or names
     roles, notes = by_name(names), [f"{name} counts the rows, and is put aside" for name in counts]
     rest = [name for name in names if not any(name in roles[role] for role in ROLES)]
@@ -158,11 +156,9 @@ def roles_of(
         notes += told
     for role in ("velocities", "momenta"):
         if len(roles[role]) > len(roles["positions"]) > 0:
-            raise InputError(
-                f"{source}: by their names {', '.join(roles[role])} are {role} and only "
-                f"{', '.join(roles['positions'])} positions. Name each pair: --positions and "
-                f"--{role}, in one order"
-            )
+            are = f"{', '.join(roles[role])} are {role} and only {', '.join(roles['positions'])}"
+            name = f"Name each pair: --positions and --{role}, in one order"
+            raise InputError(f"{source}: by their names {are} positions. {name}")
     return roles, notes
 
 
@@ -242,11 +238,9 @@ def _by_data(
         own = [np.stack([values[n] for n in moving], axis=1) for _, values in runs.values()]
         explained = first_order(times, own).explained if len(moving) > 1 else 0.0
         raise _unclear(source, columns, moving, unclear or inputs, explained)
-    return {
-        "positions": (*(x for x, _ in pairs), *lengths),
-        "velocities": tuple(v for _, v in pairs),
-        "inputs": (*inputs, *switches),
-    }, notes
+    positions, velocities = (*(x for x, _ in pairs), *lengths), tuple(v for _, v in pairs)
+    found = {"positions": positions, "velocities": velocities, "inputs": (*inputs, *switches)}
+    return found, notes
 
 
 def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int) -> Undecided:
@@ -262,11 +256,9 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int)
             {"structure": "poisson", "states": tuple(names)},
         )
     main = names[int(np.argmax(known.std(axis=1)))] if known.size else names[0]
-    return Undecided(
-        f"{source}: {shown}, and no column shows the angle. To learn its law, with an offset b of "
-        "the sensor:",
-        {"coordinates": ("theta",), "observe": {main: "omega + b"}},
-    )
+    learn = "To learn its law, with an offset b of the sensor:"
+    options = {"coordinates": ("theta",), "observe": {main: "omega + b"}}
+    return Undecided(f"{source}: {shown}, and no column shows the angle. {learn}", options)
 
 
 def _of_speeds(source: str, names: Sequence[str], units: Mapping[str, str]) -> Undecided:
@@ -297,11 +289,9 @@ def _of_accelerations(source: str, columns: Mapping[str, np.ndarray]) -> Undecid
         name = max(columns, key=lambda n: np.nanstd(columns[n]))
         what = "of a cart, say, with an offset of the sensor"
         options = {"coordinates": ("x",), "observe": {name: "x_ddot + b"}}
-    return Undecided(
-        f"{source}: {', '.join(columns)}: accelerations by their units, and no column shows a "
-        f"position. To learn a law from one of them, {what}:",
-        options,
-    )
+    told = f"{', '.join(columns)}: accelerations by their units, and no column shows a position"
+    learn = f"To learn a law from one of them, {what}:"
+    return Undecided(f"{source}: {told}. {learn}", options)
 
 
 def _unclear(
@@ -322,12 +312,10 @@ def _unclear(
             f"populations say:{as_typed(states)}. If they are positions:{as_typed(positions)}",
             states,
         )
-    return Undecided(
-        f"{source}: the names {', '.join(moving)} do not show what was measured, and "
-        f"{', '.join(shown)} may be motion or what drives it. Name them:{as_typed(positions)}, or "
-        "some of them and --inputs",
-        positions,
-    )
+    names = f"the names {', '.join(moving)} do not show what was measured"
+    may = f"{', '.join(shown)} may be motion or what drives it"
+    name = f"Name them:{as_typed(positions)}, or some of them and --inputs"
+    return Undecided(f"{source}: {names}, and {may}. {name}", positions)
 
 
 def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tuple[str, str]]:
@@ -337,10 +325,8 @@ def _pairs(times: list[np.ndarray], columns: dict[str, np.ndarray]) -> list[tupl
     local = derivatives(times, table, window(noises), [n.sigma for n in noises])
     if local is None:
         return []
-    related = {
-        (a, b): local.relation(a, b) for a, b in itertools.permutations(range(len(names)), 2)
-    }
-    like = {pair: r.likeness for pair, r in related.items() if r is not None}
+    pairs = itertools.permutations(range(len(names)), 2)
+    like = {pair: r.likeness for pair in pairs if (r := local.relation(*pair)) is not None}
     found, used = [], set()
     for (a, b), likeness in sorted(like.items(), key=lambda item: -item[1]):
         if likeness > _Options.like and not {a, b} & used:
@@ -371,11 +357,9 @@ def angles_of(
     angles = set(given) | {n for n in roles["positions"] if n in factors}
     if by_names:
         units_of_angles = ("deg", "°", "rad")
-        angles |= {
-            n
-            for n in roles["positions"]
-            if (is_angle(n) and not _unit(units, n)) or _unit(units, n).startswith(units_of_angles)
-        }
+        told = {n: _unit(units, n) for n in roles["positions"]}
+        by_unit = {n for n, unit in told.items() if unit.startswith(units_of_angles)}
+        angles |= by_unit | {n for n, unit in told.items() if is_angle(n) and not unit}
     return tuple(n for n in roles["positions"] if n in angles), factors
 
 
@@ -387,10 +371,8 @@ def check_known(source: str, what: str, wanted: Any, known: Sequence[str]) -> No
     """Raises InputError where a wanted name is not a known one."""
     missing = [name for name in wanted if name not in known]
     if missing:
-        raise InputError(
-            f"{source}: {what}: no column {', '.join(map(str, missing))} among "
-            f"{', '.join(known) or 'none'}"
-        )
+        absent, there = ", ".join(map(str, missing)), ", ".join(known) or "none"
+        raise InputError(f"{source}: {what}: no column {absent} among {there}")
 
 
 def time_unit_of(
@@ -404,15 +386,11 @@ def time_unit_of(
     for name in times:
         told = _time_unit(name, units)
         if told is None and given is None and _unit(units, name):
-            raise InputError(
-                f"{source}: {name}: unit {units[name]!r} is not known; give it, one of "
-                f"{', '.join(SECONDS)}: --time-unit"
-            )
+            given = f"give it, one of {', '.join(SECONDS)}: --time-unit"
+            raise InputError(f"{source}: {name}: unit {units[name]!r} is not known; {given}")
         if told is not None and given is not None and clock_of(told) != clock_of(given):
-            raise InputError(
-                f"{source}: {name} is in {told} by its header, got the time unit {given} "
-                "(--time-unit)"
-            )
+            got = f"got the time unit {given} (--time-unit)"
+            raise InputError(f"{source}: {name} is in {told} by its header, {got}")
         if told is not None:
             return told
     return given
@@ -554,23 +532,18 @@ def first_order(times: Sequence[np.ndarray], runs: Sequence[np.ndarray]) -> Firs
     every = np.concatenate(runs)
     size = np.sqrt(np.mean(every**2, axis=0)) + 1e-300
     tables = [_quadratic(x / size) for x in runs]
-    sums = [
-        cumulative_simpson(p, x=t, axis=0, initial=0) for t, p in zip(times, tables, strict=True)
+    pairs = zip(times, tables, strict=True)
+    sums = [cumulative_simpson(p, x=t, axis=0, initial=0) for t, p in pairs]
+    moves = [
+        ([x[k:] - x[:-k] for x in runs], [s[k:] - s[:-k] for s in sums], k) for k in _Options.lags
     ]
-    shares = [
-        _explained(
-            [x[lag:] - x[:-lag] for x in runs], [s[lag:] - s[:-lag] for s in sums], lag, every
-        )
-        for lag in _Options.lags
-    ]
+    shares = [_explained(*moved, every) for moved in moves]
     return FirstOrder(max(shares), _constants(runs, tables))
 
 
 def _quadratic(x: np.ndarray) -> np.ndarray:
     """1, x and products of two (n, m)."""
-    products = [
-        x[:, i] * x[:, j] for i, j in itertools.combinations_with_replacement(range(x.shape[1]), 2)
-    ]
+    products = [a * b for a, b in itertools.combinations_with_replacement(x.T, 2)]
     return np.stack([np.ones(len(x)), *x.T, *products], axis=1)
 
 

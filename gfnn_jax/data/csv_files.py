@@ -6,6 +6,7 @@ import contextlib
 import re
 import warnings
 from collections.abc import Generator, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -57,33 +58,23 @@ class _StatesInText:
         moving = self._moving(first)
         if "period" in self.names and not request.initial:
             if "t" not in self.names:
-                raise InputError(
-                    f"{self.path}: expected a column t, the time of the drive of that period"
-                )
+                raise InputError(f"{self.path}: expected a column t, the time of its drive")
             self._check_period(first, first["period"][0])
             self.period = check_dt(first["period"][0], f"{self.path}: the column period")
         further = (*self.states, "t", "sequence", "period")
         self.parameters = [n for n in self.names if n not in (*further, *moving)]
-        self.source = Source(
-            dim,
-            dt,
-            self.blocks,
-            units={n.lower(): unit for n, unit in self.file.units.items()},
-            parameters=tuple(re.sub(r"\W+", "_", name) for name in self.parameters),
-            period=self.period,
-            timed=self.with_time,
-        )
+        units = {n.lower(): unit for n, unit in self.file.units.items()}
+        names = tuple(re.sub(r"\W+", "_", name) for name in self.parameters)
+        more = {"period": self.period, "timed": self.with_time}
+        self.source = Source(dim, dt, self.blocks, units=units, parameters=names, **more)
 
     def _check_header(self) -> None:
         """Raises InputError where columns are missing, or are without a partner."""
         others = [n for n in self.names if _STATE.fullmatch(n) and n not in self.states]
         missing = [n for n in self.states if n not in self.names]
         words = [n.lower() for n in self.file.text if n.lower() in (*self.states, "t", "sequence")]
-        for columns, what in (
-            (missing, "missing"),
-            (others, "without a partner"),
-            (words, "without numbers"),
-        ):
+        found = {"missing": missing, "without a partner": others, "without numbers": words}
+        for what, columns in found.items():
             if columns or not self.states:
                 raise InputError(
                     f"{self.path}: the header must name q1..qd and p1..pd once each: "
@@ -105,18 +96,15 @@ class _StatesInText:
         moving = [n for n, step in steps.items() if np.any(step[same] != 0)]
         ignored = [*moving, *(n.lower() for n in self.file.text)]
         if ignored:
-            warnings.warn(
-                f"{self.path}: columns ignored: {', '.join(ignored)} (not constant in a sequence)",
-                DataWarning,
-                stacklevel=6,
+            told = (
+                f"{self.path}: columns ignored: {', '.join(ignored)} (not constant in a sequence)"
             )
+            warnings.warn(told, DataWarning, stacklevel=6)
         return ignored
 
     def _check_period(self, table: dict[str, np.ndarray], period: float) -> None:
         if np.any(table["period"] != period):
-            raise InputError(
-                f"{self.path}: the column period must hold the same number in all rows"
-            )
+            raise InputError(f"{self.path}: the column period must hold one number in all rows")
 
     def blocks(self, rows: int) -> Iterator[Block]:
         """The rows in blocks of at most so many. Raises InputError, with the line, where the rows
@@ -153,13 +141,12 @@ class _StatesInText:
             place = row - np.maximum.accumulate(np.where(begins, row, -count))
             last, count = told[-1:], int(place[-1]) + 1
             passed += length
-            yield Block(
-                np.stack([table[name] for name in self.states], axis=1),
-                sequence,
-                place,
-                lambda r, c, n=begin: f"{self.file.locate(n + r)}, {self.states[c]}",
-                told[:, 1:],
-            )
+            states = np.stack([table[name] for name in self.states], axis=1)
+            locate = partial(self._locate, begin)
+            yield Block(states, sequence, place, locate, told[:, 1:])
+
+    def _locate(self, begin: int, row: int, column: int) -> str:
+        return f"{self.file.locate(begin + row)}, {self.states[column]}"
 
     def _check_constant(self, values: np.ndarray, begins: np.ndarray, begin: int) -> None:
         """Raises InputError where a parameter (1 + n, k) changes within a sequence. ``values``
@@ -169,11 +156,9 @@ class _StatesInText:
         if bad.any():
             row = int(np.argmax(bad))
             before, now = (", ".join(f"{v:g}" for v in values[r]) for r in (row, row + 1))
-            raise InputError(
-                f"{self.path}: {self.file.locate(begin + row)}: expected "
-                f"{', '.join(self.parameters)} finite and constant in each sequence, as parameters "
-                f"are, found {now} after {before}"
-            )
+            wanted = f"expected {', '.join(self.parameters)} finite and constant in each sequence"
+            found = f"as parameters are, found {now} after {before}"
+            raise InputError(f"{self.path}: {self.file.locate(begin + row)}: {wanted}, {found}")
 
     def _check_times_rise(self, time: np.ndarray, sequence: np.ndarray, begin: int) -> None:
         """Raises InputError where times do not rise in a sequence. ``time`` and ``sequence`` start

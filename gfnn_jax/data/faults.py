@@ -124,9 +124,8 @@ def _constant(traits: Traits) -> Iterator[Fault]:
 def _repeated(traits: Traits) -> Iterator[Fault]:
     for one, other in itertools.combinations(traits.recording.columns, 2):
         low, high = traits.range(one)
-        if low < high and np.array_equal(
-            traits.columns[one], traits.columns[other], equal_nan=True
-        ):
+        same = np.array_equal(traits.columns[one], traits.columns[other], equal_nan=True)
+        if low < high and same:
             found = f"{one} and {other} are equal in all rows"
             yield Fault("repeated", found, f"Leave {other} out")
 
@@ -138,17 +137,15 @@ def _clipped(traits: Traits) -> Iterator[Fault]:
         low, high = traits.range(name)
         if name in recording.angles and high - low > 0.95 * TURN:
             continue
-        least = max(
-            4 * (traits.resolution[name] or 0.0), 1e-9 * float(np.nanstd(traits.columns[name]))
-        )
+        spread = float(np.nanstd(traits.columns[name]))
+        least = max(4 * (traits.resolution[name] or 0.0), 1e-9 * spread)
         for extreme in (low, high):
             count = sum(_flats(x, extreme, least) for x in traits.by_run(name))
             if count > 1:
                 shown = f"{extreme / recording.factors[name]:.6g} {recording.unit(name)}".rstrip()
                 found = f"{name} saturates: {count} times it stays at its extreme, {shown}"
-                yield Fault(
-                    "clipped", found, "Leave these samples out: --from, --to, or NaN in them"
-                )
+                remedy = "Leave these samples out: --from, --to, or NaN in them"
+                yield Fault("clipped", found, remedy)
 
 
 def _flats(x: np.ndarray, extreme: float, step: float) -> int:
@@ -180,8 +177,7 @@ def _wrong_values(traits: Traits) -> Iterator[Fault]:
     around them lead."""
     told = [in_words(traits.recording, name, of) for name, of in traits.wrong.items()]
     for kind in ("stuck", "outliers"):
-        for of_column in (one for one in told if kind in one):
-            yield Fault(kind, of_column[kind], "Left out of a fit")
+        yield from (Fault(kind, one[kind], "Left out of a fit") for one in told if kind in one)
 
 
 # Velocities that are not the derivatives of their positions.
@@ -201,12 +197,9 @@ def _related(traits: Traits) -> Iterator[Fault]:
     if other is not None:
         positions, velocities = zip(*other, strict=True)
         finding = ", ".join(f"{v} is the derivative of {x}" for x, v in other)
-        yield Fault(
-            "order",
-            f"the columns are in another order than their names say: {finding}",
-            "Name them in that order:",
-            {"positions": positions, "velocities": velocities},
-        )
+        finding = f"the columns are in another order than their names say: {finding}"
+        order = {"positions": positions, "velocities": velocities}
+        yield Fault("order", finding, "Name them in that order:", order)
         return
     unit = _time_unit(recording.time_unit, [relation.factor for relation in known.values()])
     if unit is not None:
@@ -304,11 +297,8 @@ def _derived(traits: Traits, x: str, v: str, relation: Relation) -> Iterator[Fau
     error = max(5 * relation.factor_error, _Options.filtered)
     late = max(5 * relation.lag_error, _Options.late * traits.step)
     if abs(relation.factor - 1) > error or abs(relation.lag) > late:
-        found = (
-            f"{v} looks filtered: it is {relation.factor:.3g} × d{x}/dt with a lag of "
-            f"{1e3 * relation.lag:.2g} ms"
-        )
-        yield Fault("filtered", found, without, alone)
+        shown = f"{relation.factor:.3g} × d{x}/dt with a lag of {1e3 * relation.lag:.2g} ms"
+        yield Fault("filtered", f"{v} looks filtered: it is {shown}", without, alone)
 
 
 # Angles in other units, wrapped angles, and jumps that interpolation has cut.
@@ -392,8 +382,7 @@ def _interpolated_jumps(traits: Traits) -> Iterator[Fault]:
         if count:
             jump = "1 jump by a turn takes" if count == 1 else f"{count} jumps by a turn take"
             found = f"{name} was resampled across its wraps: {jump} several samples"
-            remedy = "Unwrap the angle before resampling, or resample its sine and cosine"
-            yield Fault("interpolated jump", found, remedy)
+            yield Fault("interpolated jump", found, "Unwrap it first, or resample sine and cosine")
 
 
 def _cuts(x: np.ndarray) -> int:
@@ -494,18 +483,7 @@ def _of_other_systems(traits: Traits) -> list[str]:
 
 
 _CHECKS = (
-    _constant,
-    _repeated,
-    _related,
-    _units_of_angles,
-    _wraps,
-    _interpolated_jumps,
-    _clipped,
-    _time_units,
-    _drifting,
-    _systems,
-    _missing,
-    _wrong_values,
-    _coarse,
+    *(_constant, _repeated, _related, _units_of_angles, _wraps, _interpolated_jumps, _clipped),
+    *(_time_units, _drifting, _systems, _missing, _wrong_values, _coarse),
     lambda traits: (Fault("reading", note) for note in traits.recording.notes),
 )

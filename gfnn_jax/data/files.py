@@ -103,15 +103,8 @@ class TrajectoryData:
         from gfnn_jax.phase_space import Pairs  # brings JAX
 
         rows = np.delete(np.arange(len(self.states)), np.cumsum(self.lengths) - 1)
-        return Pairs(
-            self.states[rows],
-            self.states[rows + 1],
-            self.dt,
-            self.args,
-            period=self.period,
-            run=self.run,
-            place=self.place,
-        )
+        z0, z1, run, place = self.states[rows], self.states[rows + 1], self.run, self.place
+        return Pairs(z0, z1, self.dt, self.args, period=self.period, run=run, place=place)
 
 
 def read_trajectories(
@@ -140,18 +133,8 @@ def read_trajectories(
         warnings.warn(f"{path}: {odd}", DataWarning, stacklevel=2)
     known = (labels(sequence[going]), whole.place[going])
     identities = (None, None) if source.of_pairs_alone else known
-    return TrajectoryData(
-        states,
-        lengths,
-        dt,
-        str(path),
-        digest_of(path),
-        source.precision,
-        source.units,
-        args,
-        source.period,
-        *identities,
-    )
+    about = str(path), digest_of(path), source.precision, source.units, args, source.period
+    return TrajectoryData(states, lengths, dt, *about, *identities)
 
 
 def labels(sequence: np.ndarray) -> np.ndarray:
@@ -214,14 +197,8 @@ def iterate_pairs(
                     if source.of_pairs_alone:
                         pair, run = run, _arcs_of_pairs(run, z0, z1, *last_arc)
                         along, last_arc = pair - run, (int(run[-1]), z1[-1])
-                    yield Pairs(
-                        z0,
-                        z1,
-                        *source.of_pairs(block.own, rows),
-                        period=source.period,
-                        run=run + number * FILE_STEP,
-                        place=along,
-                    )
+                    run, own = run + number * FILE_STEP, source.of_pairs(block.own, rows)
+                    yield Pairs(z0, z1, *own, period=source.period, run=run, place=along)
 
 
 def _arcs_of_pairs(pair: np.ndarray, z0, z1, last_arc: int, last_image) -> np.ndarray:
@@ -256,10 +233,8 @@ def read_initial(
         elif driven and source.timed:
             columns[TIME] = 0
         if driven and TIME not in columns:
-            raise InputError(
-                f"{path}: expected t0, the time of the drive that the model was learned with, "
-                "beside the states; found none"
-            )
+            needed = "expected t0, the time of the drive that the model was learned with"
+            raise InputError(f"{path}: {needed}, beside the states; found none")
         missing = [name for name in parameters if name not in columns]
         if missing:
             raise InputError(
@@ -341,9 +316,7 @@ def are_recordings(paths: str | Path | Sequence[str | Path], *, with_roles: bool
     if len(set(kinds.values())) > 1:
         one = next(path for path, is_one in kinds.items() if is_one)
         other = next(path for path, is_one in kinds.items() if not is_one)
-        raise InputError(
-            f"expected files of one kind, got a recording ({one}) and states q, p ({other})"
-        )
+        raise InputError(f"expected files of one kind, got a recording, {one}, and states, {other}")
     return any(kinds.values())
 
 
@@ -399,9 +372,7 @@ def summary(data: TrajectoryData) -> list[str]:
     pairs, lengths = data.pairs(), data.lengths
     both = np.concatenate([pairs.z0, pairs.z1], axis=1)
     copies = len(both) - len(np.unique(both, axis=0))
-    of = (
-        f"{lengths.min()}" if lengths.min() == lengths.max() else f"{lengths.min()}–{lengths.max()}"
-    )
+    of = "–".join(map(str, sorted({int(lengths.min()), int(lengths.max())})))
     dt = np.asarray(data.dt)
     every = f"{dt:g}" if dt.ndim == 0 else f"{dt.min():g} to {dt.max():g}"
     sampled = "" if data.sampled is None else f" (a sample of {data.sampled})"

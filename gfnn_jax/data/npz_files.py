@@ -51,9 +51,7 @@ class _StoredArray:
             self.shape, self.fortran_order, self.dtype = _HEADERS[version](stream)
         if self.dtype.kind not in "fiu":
             hint = " (save padded sequences with 'lengths')" if self.dtype.hasobject else ""
-            raise InputError(
-                f"{path}: {name} must hold real numbers, found dtype {self.dtype}{hint}"
-            )
+            raise InputError(f"{path}: {name} must hold real numbers, found {self.dtype}{hint}")
         expected = math.prod(self.shape) * self.dtype.itemsize
         if size - stream.tell() != expected:
             raise InputError(
@@ -128,21 +126,14 @@ class _Archive:
             raise InputError(f"{self.path}: params must have shape (n, k), found {values.shape}")
         if not np.isfinite(values).all():
             row, column = np.argwhere(~np.isfinite(values))[0]
-            raise InputError(
-                f"{self.path}: params not finite (NaN or infinity), first params[{row}, {column}]"
-            )
+            raise InputError(f"{self.path}: params not finite, first params[{row}, {column}]")
         names = tuple(f"a{i + 1}" for i in range(values.shape[1]))
         if "param_names" in self:
-            with (
-                damage(self.path, "param_names", *_OF_HEADERS),
-                np.load(self.path, allow_pickle=False) as file,
-            ):
+            with damage(self.path, "param_names", *_OF_HEADERS), np.load(self.path) as file:
                 names = tuple(np.atleast_1d(file["param_names"]).astype(str).tolist())
             if len(names) != values.shape[1] or len(set(names)) < len(names):
-                raise InputError(
-                    f"{self.path}: param_names must be {values.shape[1]} different names, found "
-                    f"{', '.join(names)}"
-                )
+                wanted = f"{values.shape[1]} different names, found {', '.join(names)}"
+                raise InputError(f"{self.path}: param_names must be {wanted}")
         return names, values
 
 
@@ -169,10 +160,8 @@ class _Sequences(NamedTuple):
         array, shape, of_pairs = self.arrays[0], self.arrays[0].shape, len(self.arrays) == 2
         if of_pairs:
             if len(shape) != 2 or shape != self.arrays[1].shape:
-                raise InputError(
-                    f"{self.path}: z0 and z1 must both have shape (N, 2d), found {shape} and "
-                    f"{self.arrays[1].shape}"
-                )
+                found = f"found {shape} and {self.arrays[1].shape}"
+                raise InputError(f"{self.path}: z0 and z1 must both have shape (N, 2d), {found}")
         elif len(shape) not in (2, 3) or (self.each_row and len(shape) != 2):
             wanted = "(B, 2d)" if self.each_row else "(L, 2d) or (M, L, 2d)"
             raise InputError(f"{self.path}: {array.name} must have shape {wanted}, found {shape}")
@@ -184,10 +173,8 @@ class _Sequences(NamedTuple):
         names, values = self.parameters
         if values is not None and len(values) != count:
             what = "pairs" if of_pairs else "states" if self.each_row else "sequences"
-            raise InputError(
-                f"{self.path}: params must have a row for each of the {count} {what}, found "
-                f"{values.shape}"
-            )
+            wanted = f"a row for each of the {count} {what}"
+            raise InputError(f"{self.path}: params must have {wanted}, found {values.shape}")
         if self.lengths is not None:
             _check_lengths(self.path, self.lengths, count, length)
         own = None
@@ -214,13 +201,9 @@ class _Sequences(NamedTuple):
                 if of_pairs:
                     states = np.stack(several, axis=1).reshape(-1, 2 * dim)
                 number = row + np.arange(len(states))
-                block = Block(
-                    states,
-                    number // length,
-                    number % length,
-                    lambda r, c, n=row: locate(n + r, c),
-                    None if own is None else own[number],
-                )
+                given = None if own is None else own[number]
+                places = number // length, number % length
+                block = Block(states, *places, lambda r, c, n=row: locate(n + r, c), given)
                 if self.lengths is not None:
                     kept = block.place < self.lengths[block.sequence]
                     block = block.rows(np.flatnonzero(kept))
@@ -267,18 +250,14 @@ def open_npz(request: Request, stream) -> Source:
         )
     further = [name for name in archive.names if name not in _READ]
     if further and "job" not in further:  # other arrays of a prediction are about it
-        warnings.warn(
-            f"{path}: arrays ignored: {', '.join(further)} (parameters are in params)",
-            DataWarning,
-            stacklevel=4,
-        )
+        ignored = f"{path}: arrays ignored: {', '.join(further)} (parameters are in params)"
+        warnings.warn(ignored, DataWarning, stacklevel=4)
     with_t0, period = "t0" in archive and request.with_times, None
     if "period" in archive and not request.initial:
         period = check_dt(archive.array("period").whole(), f"{path}: period")
         if not (with_t0 or "times" in archive):
-            raise InputError(
-                f"{path}: expected t0, the time of the drive, beside its period; got none"
-            )
+            wanted = "expected t0, the time of the drive, beside its period; got none"
+            raise InputError(f"{path}: {wanted}")
     elif with_t0 and not request.initial:
         raise InputError(f"{path}: expected the drive's period beside t0, found none")
     dt = archive.array("dt").whole() if "dt" in archive and request.with_times else None
@@ -300,9 +279,7 @@ def _pairs(
     if each:
         assert dt is not None
         if dt.shape != z0.shape[:1]:
-            raise InputError(
-                f"{path}: dt must be one number or have shape ({z0.shape[0]},), found {dt.shape}"
-            )
+            raise InputError(f"{path}: dt must be one number or {z0.shape[:1]}, found {dt.shape}")
         bad = ~(np.isfinite(dt) & (dt > 0))
         if bad.any():
             row = int(np.argmax(bad))
@@ -360,10 +337,8 @@ def _times_dt(path, times, shape, lengths) -> float:
     bad = ~(np.isfinite(steps) & (steps > 0)) & used
     if bad.any():
         m, i = (int(k) for k in np.argwhere(bad)[0])
-        raise InputError(
-            f"{path}: times must rise, found times[{m}, {i + 1}] = {times[m, i + 1]:g} after "
-            f"{times[m, i]:g}"
-        )
+        row, found = f"times[{m}, {i + 1}]", f"{times[m, i + 1]:g} after {times[m, i]:g}"
+        raise InputError(f"{path}: times must rise, found {row} = {found}")
     usual = float(np.median(steps[used])) if used.any() else np.nan
     slack = TIME_TOLERANCE * usual + 4 * np.finfo(np.float64).eps * np.abs(times[:, 1:])
     even = bool((np.abs(steps - usual) <= slack)[used].all())
@@ -382,13 +357,9 @@ def _stride(path, shape: tuple[int, ...], steps: np.ndarray) -> float:
 
 def _check_lengths(path, lengths: np.ndarray, count: int, longest: int) -> None:
     if lengths.shape != (count,) or lengths.dtype.kind not in "iu":
-        raise InputError(
-            f"{path}: lengths must be integers of shape ({count},), found {lengths.dtype} of shape "
-            f"{lengths.shape}"
-        )
+        found = f"found {lengths.dtype} of shape {lengths.shape}"
+        raise InputError(f"{path}: lengths must be integers of shape ({count},), {found}")
     bad = np.flatnonzero((lengths < 1) | (lengths > longest))
     if len(bad):
-        raise InputError(
-            f"{path}: {len(bad)} of the lengths outside 1..{longest}, first lengths[{bad[0]}] = "
-            f"{lengths[bad[0]]}"
-        )
+        first = f"first lengths[{bad[0]}] = {lengths[bad[0]]}"
+        raise InputError(f"{path}: {len(bad)} of the lengths outside 1..{longest}, {first}")

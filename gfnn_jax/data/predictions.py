@@ -214,13 +214,9 @@ class PredictionWriter:
             raise ValueError(f"{self.saved} of {self.total} states are there")
         status = np.asarray(status).astype(np.int64).reshape(self.lanes)
         left_at = np.asarray(left_at).astype(np.int64).reshape(self.lanes)
-        arrays = {
-            "status": status,
-            "left_at": left_at,
-            "dt": np.asarray(float(self.asked.dt)),
-            "job": np.asarray(digest_of(self._job)),
-            **{name: np.asarray(value) for name, value in more.items()},
-        }
+        arrays = {name: np.asarray(value) for name, value in more.items()}
+        arrays |= {"status": status, "left_at": left_at, "dt": np.asarray(float(self.asked.dt))}
+        arrays["job"] = np.asarray(digest_of(self._job))
         if self.asked.params is not None:
             names, values = self.asked.params
             arrays |= {"params": values, "param_names": np.array(names)}
@@ -261,10 +257,8 @@ class PredictionWriter:
         together = max(1, OPTIONS.assembly // (2 * max(lane, 1)))
         for first in range(0, self.lanes, together):
             lanes = min(together, self.lanes - first)
-            pieces = (
-                np.ascontiguousarray(self._read_chunk(entry, first, lanes)[..., columns])
-                for entry in self._chunks
-            )
+            chunks = (self._read_chunk(entry, first, lanes) for entry in self._chunks)
+            pieces = (np.ascontiguousarray(chunk[..., columns]) for chunk in chunks)
             if lanes == 1:  # a lane may be larger than memory: piece after piece
                 for piece in pieces:
                     member.write(piece.data)
@@ -306,11 +300,10 @@ class PredictionWriter:
         for line in lines[1:]:
             carry = self._verified_carry(line)
             if carry is None:
-                warnings.warn(
-                    f"{self.partial}: a chunk is damaged or half written: going on from saved "
-                    f"state {self.saved} instead",
-                    stacklevel=3,
+                told = (
+                    f"{self.partial}: a chunk is damaged or half written: going on from saved state"
                 )
+                warnings.warn(f"{told} {self.saved} instead", stacklevel=3)
                 break
             entry = json.loads(line)
             self._chunks.append(entry)
@@ -343,11 +336,8 @@ class PredictionWriter:
 def member_of(archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: Any):
     """An open ``.npy`` member, its header written; ZipInfo's fixed date makes it repeatable."""
     member = archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)
-    header = {
-        "descr": np.lib.format.dtype_to_descr(np.dtype(dtype)),
-        "fortran_order": False,
-        "shape": shape,
-    }
+    descr = np.lib.format.dtype_to_descr(np.dtype(dtype))
+    header = {"descr": descr, "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(member, header)
     return member
 

@@ -83,13 +83,9 @@ def _states(traits: Traits) -> Iterator[Fault]:
     populations = all((x > 0).all() for x in runs)
     what = "of populations" if populations else "of the rates of a body that turns"
     keeps = f", and each run keeps {found.constants} of these" * (found.constants > 0)
-    yield Fault(
-        "first order",
-        f"the rates of {shown} are functions of {shown} themselves{keeps}, as {what}: these are "
-        "not positions",
-        "Learn their bracket:",
-        {"structure": "poisson", "states": names},
-    )
+    found = f"the rates of {shown} are functions of {shown} themselves{keeps}, as {what}"
+    options = {"structure": "poisson", "states": names}
+    yield Fault("first order", f"{found}: these are not positions", "Learn their bracket:", options)
 
 
 # Points that a rod or a string holds.
@@ -146,10 +142,8 @@ def _circles(traits: Traits) -> Iterator[Fault]:
             found, base = _circle(x, y, sigma, fixed=False), ("x0", "y0")
         else:
             a, b = (traits.columns[n] for n in before)
-            found, base = (
-                _circle(x - a, y - b, 2 * sigma, fixed=True),
-                tuple(shows[n] for n in before),
-            )
+            found = _circle(x - a, y - b, 2 * sigma, fixed=True)
+            base = tuple(shows[n] for n in before)
         if found is None:
             return
         centre, guess[f"l{mark}"] = found
@@ -189,13 +183,10 @@ def _kinds(traits: Traits) -> Iterator[Fault]:
         mine, wide = ("rad" if now[k] else "length"), float(np.ptp(known.q[k]))
         if not unit and not now[k]:
             kinds["degrees"] = _left(known, now, k, True, np.pi / 180)
-        good = {
-            kind
-            for kind, turn in (("rad", 1.0), ("degrees", np.pi / 180))
-            if kind in kinds
-            and wide * turn > _Options.wide
-            and kinds[kind] < _Options.turns * kinds["length"]
-        }
+        turns = {"rad": 1.0, "degrees": np.pi / 180}
+        most = _Options.turns * kinds["length"]
+        wides = [kind for kind, turn in turns.items() if wide * turn > _Options.wide]
+        good = {kind for kind in wides if kinds.get(kind, np.inf) < most}
         good |= {"length"} if kinds["length"] < _Options.straight * kinds["rad"] else set()
         best = min(good or {mine}, key=lambda kind: kinds[kind])
         if best == mine or kinds[best] > float(least[k]):
@@ -205,10 +196,8 @@ def _kinds(traits: Traits) -> Iterator[Fault]:
         angles = tuple(n for n in recording.positions if n in (*others, *[name] * (best == "rad")))
         options = {"degrees": (name,)} if best == "degrees" else {"angles": angles}
         what = {"length": "a length, and are not periodic", "rad": "an angle in radians"}
-        found = (
-            f"the accelerations of {name} are those of {what.get(best, 'an angle in degrees')}: "
-            f"{times:.2g} times closer"
-        )
+        whose = what.get(best, "an angle in degrees")
+        found = f"the accelerations of {name} are those of {whose}: {times:.2g} times closer"
         yield Fault("kind", found, "To say so:", options)
 
 

@@ -46,9 +46,7 @@ def as_proposed(source: Any, given: Mapping[str, Any]) -> Proposed:
     reading = {name: value for name, value in proposed.items() if name in known}
     asked = {name: value for name, value in proposed.items() if name not in known}
     new = {name: value for name, value in proposed.items() if given.get(name) != value}
-    why = (
-        tuple(f.message for f in summary.faults if set(f.options) & {*new, "states"}) if new else ()
-    )
+    why = tuple(f.message for f in summary.faults if new and set(f.options) & {*new, "states"})
     recording = read(source, **reading) if new else found
     return Proposed(recording, reading, asked, summary, new, why)
 

@@ -217,9 +217,7 @@ class Recording:
             decided = [*decided, f"{', '.join(beside)}: not used, for observe speaks of {unseen}"]
         # A column that another name explains is a sensor: it gives the velocity no name of its own.
         shown = [n for n in roles["velocities"] if n not in given["velocities"]]
-        shown = [
-            n for n in shown if (of := words_in(observe.get(n))) and symbols((n,))[0] not in of
-        ]
+        shown = [n for n in shown if (w := words_in(observe.get(n))) and symbols((n,))[0] not in w]
         roles["velocities"] = tuple(n for n in roles["velocities"] if n not in shown)
         others = [name for of_role in roles.values() for name in of_role]
         more = (name for name in observe if name not in others)
@@ -229,26 +227,17 @@ class Recording:
         empty = [n for n in with_role if not any(np.isfinite(v[n]).any() for _, v in runs.values())]
         if empty:
             raise InputError(f"{source}: no value in column {', '.join(empty)}")
-        angular, radians = angles_of(
-            source,
-            {**roles, "positions": coordinate_names},
-            angles or (),
-            names_of["degrees"],
-            angles is None,
-            units,
-        )
+        given_angles = angles or (), names_of["degrees"], angles is None
+        known = {**roles, "positions": coordinate_names}
+        angular, radians = angles_of(source, known, *given_angles, units)
         factors = {name: radians.get(name, 1.0) for name in numbers}
         factors |= {of: factors[name] for name, of in sigmas.items()}
         values = {
             run: {name: column * factors[name] for name, column in of_run.items()}
             for run, (_, of_run) in runs.items()
         }
-        for what, wanted in (
-            ("std", std),
-            ("offset", names_of["offset"]),
-            ("scale", names_of["scale"]),
-        ):
-            check_known(source, what, wanted, with_role)
+        for what in ("std", "offset", "scale"):
+            check_known(source, what, std if what == "std" else names_of[what], with_role)
         sigmas = {name: of for name, of in sigmas.items() if name in with_role}
         check_sigmas(source, sigmas, values)
         about_times = (*(second_times(tables) if dt is None else ()), *restarts(tables, runs))

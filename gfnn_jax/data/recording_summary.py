@@ -185,18 +185,15 @@ def summarise(
     """
     known = traits(recording)
     found = (*proposals, *findings(known))
-    counts = {
-        run: (len(t), float(t[0]), float(t[-1]))
-        for run, t in zip(recording.runs, known.times, strict=True)
-    }
+    of_runs = zip(recording.runs, known.times, strict=True)
+    counts = {run: (len(t), float(t[0]), float(t[-1])) for run, t in of_runs}
     times = of_rows(known.times, known.seen)
     holes = gaps(times)
     steps = np.concatenate([np.diff(t) for t in times])
     longest = min((b - a for _, a, b in holes), default=np.inf)
     between = steps[steps < longest] if len(steps) else np.array([np.nan])
-    doubted = frozenset(
-        name for f in found if f.wrong and f.kind == "degrees" for name in f.options["degrees"]
-    )
+    doubts = (f.options["degrees"] for f in found if f.wrong and f.kind == "degrees")
+    doubted = frozenset(name for names in doubts for name in names)
     period, loss = _motion(known, doubted)
     typed = _options(found, options or {})
     files = " ".join(shlex.quote(path) for path in recording.source.split(", "))
@@ -230,10 +227,7 @@ def refuse_mistakes(recording: Recording, despite: Sequence[str] = ()) -> None:
     if wrong:
         more = f" gfnn look shows {len(wrong) - 1} more." if len(wrong) > 1 else ""
         kind = shlex.quote(wrong[0].kind)
-        raise InputError(
-            f"{recording.source}: {wrong[0]}. If the data are right, fit with --despite {kind}."
-            f"{more}"
-        )
+        raise InputError(f"{recording.source}: {wrong[0]}. To fit anyway: --despite {kind}.{more}")
 
 
 def _motion(known: Traits, doubted: frozenset[str]) -> tuple[float | None, energy.Loss | None]:
@@ -242,12 +236,8 @@ def _motion(known: Traits, doubted: frozenset[str]) -> tuple[float | None, energ
     if local is None or not recording.positions:
         return None, None
     places = [known.moving.index(name) for name in recording.positions]
-    fits = dataclasses.replace(
-        local.slopes,
-        values=local.slopes.values[places],
-        slopes=local.slopes.slopes[places],
-        curvatures=local.slopes.curvatures[places],
-    )
+    of, names = local.slopes, ("values", "slopes", "curvatures")
+    fits = dataclasses.replace(of, **{name: getattr(of, name)[places] for name in names})
     if not np.isfinite(fits.slopes).all(axis=0).any() or not np.any(np.nanstd(fits.slopes, axis=1)):
         return None, None
     middle = known.sound[fits.rows[:, fits.rows.shape[1] // 2]]
@@ -423,8 +413,6 @@ def _remarks(column: Column) -> str:
 
 
 def _fault(fault: Fault) -> Text:
-    text = Text(
-        f"wrong ({fault.kind}): " if fault.wrong else "note: ",
-        style="bold red" if fault.wrong else "yellow",
-    )
+    head, style = (f"wrong ({fault.kind}): ", "bold red") if fault.wrong else ("note: ", "yellow")
+    text = Text(head, style=style)
     return text.append(said(str(fault)), style="not bold default")

@@ -86,20 +86,9 @@ def read_sample(
     states = found["pairs"].reshape(-1, found["pairs"].shape[-1])
     args = {n.removeprefix(_ARG): v for n, v in found.items() if n.startswith(_ARG)}
     each = float(found["dt"][0]) if same and len(states) else found["dt"]
-    return TrajectoryData(
-        states,
-        np.full(len(found["pairs"]), 2),
-        each,
-        named(paths),
-        digest,
-        precision,
-        units,
-        args or None,
-        period,
-        found["run"],
-        found["place"],
-        int(total),
-    )
+    pairs = np.full(len(found["pairs"]), 2), each, named(paths), digest, precision, units
+    of_rows = found["run"], found["place"], int(total)
+    return TrajectoryData(states, *pairs, args or None, period, *of_rows)
 
 
 def _table(pairs: Any, seed: int) -> dict[str, np.ndarray]:

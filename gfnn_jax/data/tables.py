@@ -74,9 +74,8 @@ def _kept(table: Table, keep: np.ndarray) -> Table:
     columns = {n: v[keep] for n, v in table.columns.items()}
     text = {n: v[keep] if len(v) else v for n, v in table.text.items()}
     places = np.flatnonzero(keep)
-    return dataclasses.replace(
-        table, columns=columns, text=text, locate=lambda row: table.locate(int(places[row]))
-    )
+    kept = dataclasses.replace(table, columns=columns, text=text)
+    return dataclasses.replace(kept, locate=lambda row: table.locate(int(places[row])))
 
 
 def with_events(table: Table, names: Collection[str]) -> Table:
@@ -127,9 +126,7 @@ def from_memory(table: Any) -> Table:
     elif isinstance(frame, nw.DataFrame):
         named = {str(name): frame[name].to_numpy() for name in frame.columns}
     else:
-        raise InputError(
-            f"expected a DataFrame, a dict of arrays or a list of these, got {type(table).__name__}"
-        )
+        raise InputError(f"expected a DataFrame, or arrays by name, got {type(table).__name__}")
     found: dict[str, np.ndarray] = {}
     text: dict[str, np.ndarray] = {}
     for name, values in named.items():
@@ -151,10 +148,8 @@ def from_memory(table: Any) -> Table:
         found.update(each)
     lengths = {name: len(values) for name, values in found.items()}
     if len(set(lengths.values())) > 1:
-        raise InputError(
-            "expected columns of one length, got "
-            + ", ".join(f"{name} {length}" for name, length in lengths.items())
-        )
+        shown = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise InputError(f"expected columns of one length, got {shown}")
     return Table(found, text=text)
 
 
@@ -190,9 +185,8 @@ def _of_matlab(path: Path) -> Table:
         try:
             loaded = loadmat(path, simplify_cells=True)
         except NotImplementedError:
-            raise InputError(
-                f"{path}: is of MATLAB 7.3: write it by save('{path.name}', …, '-v7')"
-            ) from None
+            mended = f"write it by save('{path.name}', …, '-v7')"
+            raise InputError(f"{path}: is of MATLAB 7.3: {mended}") from None
     arrays = dict(_numeric(loaded))
     lengths = [max(x.shape) for x in arrays.values() if x.size > 1]
     if not lengths:
@@ -284,10 +278,8 @@ def _parts(
             f"{named}the time between rows: --dt{step}"
         )
     if column is not None:
-        labels, first, inverse = np.unique(
-            table.columns[column], return_index=True, return_inverse=True
-        )
-        groups = {str(labels[i]): np.flatnonzero(inverse == i) for i in np.argsort(first)}
+        own = table.columns[column]
+        groups = {str(run): np.flatnonzero(own == run) for run in dict.fromkeys(own.tolist())}
     elif dt is None:
         assert time is not None
         falls = _falls(table.columns[time])
@@ -333,11 +325,9 @@ def _check_places(table: Table, name: str, falls: np.ndarray) -> None:
         before, behind = times[begin:row], times[row : row + _MOST_MOVED + 1]
         goes_on = before[-_MOST_MOVED - 1 :].min() < times[row] or behind.max() > before[-1]
         if before[0] < times[row] and goes_on:
-            raise InputError(
-                f"{table.source}: {table.locate(int(row))}: {name} = {times[row]:.9g} runs back "
-                f"from {times[row - 1]:.9g} and goes on from there: sort the rows, or number the "
-                "runs in a column run"
-            )
+            back = f"{name} = {times[row]:.9g} runs back from {times[row - 1]:.9g} and goes on from"
+            mended = "there: sort the rows, or number the runs in a column run"
+            raise InputError(f"{table.source}: {table.locate(int(row))}: {back} {mended}")
         begin = int(row)
 
 

@@ -80,9 +80,7 @@ class TextFile:
         numbered = [(i, line.rstrip("\r")) for i, line in enumerate(lines, 1) if line.strip()]
         begins = [line.lstrip()[0] for _, line in numbered]
         self._comment = next((sign for sign in begins if sign in _COMMENTS), None)
-        of_file = [
-            pair for pair, sign in zip(numbered, begins, strict=True) if sign != self._comment
-        ]
+        of_file = [p for p, sign in zip(numbered, begins, strict=True) if sign != self._comment]
         if not of_file:
             raise InputError(f"{path}: expected rows of numbers below a line of names, found none")
         self._separator, self._decimal = _dialect(path, [line for _, line in of_file])
@@ -101,11 +99,9 @@ class TextFile:
             above = above[gaps[-1] :]
         commented = not above and self._comment  # np.savetxt writes the header as a comment
         if commented:
-            above = [
-                self._cells(line.lstrip().lstrip(commented).strip())
-                for i, line in numbered
-                if i <= self._first and line.lstrip().startswith(commented)
-            ][-1:]
+            own = [line.lstrip() for i, line in numbered if i <= self._first]
+            own = [line for line in own if line.startswith(commented)][-1:]
+            above = [self._cells(line.lstrip(commented).strip()) for line in own]
         width = len(rows[0])
         if not any(row[-1] for row in rows) and not any(any(c[width - 1 :]) for c in above):
             width -= 1  # a separator ends every line
@@ -120,10 +116,14 @@ class TextFile:
         self.names, self.units = self._header(above, width, columns)
         known = [[row[i] for row in rows if i < len(row)] for i in range(width)]
         held = [[c for c in of if c.lower() not in _MISSING] for of in known]
+        numeric = {
+            n: sum(_is_number(c, self._decimal) for c in of)
+            for n, of in zip(self.names, held, strict=True)
+        }
         self.text = tuple(
-            name
-            for name, of in zip(self.names, held, strict=True)
-            if not is_run(name) and 2 * sum(_is_number(c, self._decimal) for c in of) < len(of)
+            n
+            for n, of in zip(self.names, held, strict=True)
+            if not is_run(n) and 2 * numeric[n] < len(of)
         )
         self.times = self._times(dict(zip(self.names, held, strict=True)), time)
         # Words of a file in which the time is told by dates: (how they are read, s in their unit).
@@ -148,10 +148,12 @@ class TextFile:
         dates = [sum(map(bool, map(_DATE.match, of))) * 2 > len(of) for of in held]
 
         def fits(one: list[str]) -> bool:
-            return len(one) == width and all(
-                (not is_number or _is_number(cell, self._decimal))
-                and (not is_date or is_number or bool(_DATE.match(cell)))
-                for cell, is_number, is_date in zip(one, numbers, dates, strict=True)
+            if len(one) != width:
+                return False
+            each = [(c, n, d and not n) for c, n, d in zip(one, numbers, dates, strict=True)]
+            return all(
+                (not n or _is_number(c, self._decimal)) and (not d or _DATE.match(c))
+                for c, n, d in each
             )
 
         rows = [k for k, one in enumerate(cells) if self._is_data(one)]
@@ -329,21 +331,16 @@ class TextFile:
             except ValueError as error:
                 reason = reason or str(error).split(" You might")[0][:120]
                 continue
-            found.append(
-                (float(np.std(steps)) if len(steps) else 0.0, float(np.median(steps)), way)
-            )
+            spread = float(np.std(steps)) if len(steps) else 0.0
+            found.append((spread, float(np.median(steps)), way))
         if not found:
-            raise InputError(
-                f"{self.path}: {self.times[0]}: expected times like 2024-05-01 23:59:59.5 "
-                f"({reason})"
-            )
+            expected = f"{self.path}: {self.times[0]}: expected times like 2024-05-01 23:59:59.5"
+            raise InputError(f"{expected} ({reason})")
         _, step, way = min(found, key=lambda one: one[0])
         second = 24 * 3600.0 if step >= _Options.daily else 1.0
         unit = "s" if second == 1 else "d"
         self.units[self.times[0]] = unit
-        self.notes += (
-            f"the times are {unit} since the first of {' '.join(self.times)}: {cells[0]}",
-        )
+        self.notes += (f"times are {unit} since the first of {' '.join(self.times)}: {cells[0]}",)
         return way, second
 
     def _moments(self, columns: Any) -> Any:
@@ -354,9 +351,8 @@ class TextFile:
             return self._dates[0](_cleaned(joined))
         except ValueError as error:
             reason = str(error).split(" You might")[0][:120]
-            raise InputError(
-                f"{self.path}: {self.times[0]}: expected times like the first of them ({reason})"
-            ) from None
+            what = f"{self.path}: {self.times[0]}: expected times like the first of them"
+            raise InputError(f"{what} ({reason})") from None
 
     def _is_data(self, cells: list[str]) -> bool:
         """Return whether at least half of a line's cells are numbers."""
@@ -391,29 +387,24 @@ class TextFile:
         found = list(itertools.islice(wrong, _Options.shown))
         if found:
             number, cells = found[0]
-            raise InputError(
-                f"{self.path}: line {number}: {count} columns expected "
-                f"({', '.join(self.names)[:60]}), {len(cells)} found"
-                f"{_more([(n, ', '.join(c)) for n, c in found])}"
+            expected = (
+                f"{count} columns expected ({', '.join(self.names)[:60]}), {len(cells)} found"
             )
+            more = _more([(n, ", ".join(c)) for n, c in found])
+            raise InputError(f"{self.path}: line {number}: {expected}{more}")
 
     def _check_numbers(self, columns: Sequence[str]) -> None:
         """Raises InputError at the first cells of these columns that are no numbers."""
-        wrong = (
-            (number, name, cell)
-            for number, cells in self._rows()
-            for name, cell in zip(self.names, cells, strict=False)
-            if name in columns and not _is_number(cell, self._decimal)
-        )
+        cells = ((n, *one) for n, of in self._rows() for one in zip(self.names, of, strict=False))
+        cells = (one for one in cells if one[1] in columns)
+        wrong = (one for one in cells if not _is_number(one[2], self._decimal))
         found = list(itertools.islice(wrong, _Options.shown))
         if found:
             number, name, cell = found[0]
             others = ",".join(n for n in self.names if n != name and n not in self.text)
-            raise InputError(
-                f"{self.path}: line {number}, {name}: {cell[:40]!r} is not a number"
-                f"{_more([(n, f'{name} {cell}') for n, name, cell in found])}. "
-                f"Without that column: --columns {shlex.quote(others)}"
-            )
+            what = f"{self.path}: line {number}, {name}: {cell[:40]!r} is not a number"
+            more = _more([(n, f"{name} {cell}") for n, name, cell in found])
+            raise InputError(f"{what}{more}. Without that column: --columns {shlex.quote(others)}")
 
 
 def from_text(
@@ -454,16 +445,9 @@ def from_text(
     of_words = {name: found.pop(name, np.array([], str)) for name in words_of}
     aside = [name for name, cells in of_words.items() if not {*words} & {*cells}]
     row_numbers = np.concatenate(numbers)
-    return Table(
-        found,
-        text.units,
-        str(path),
-        of_words,
-        (*text.notes, *_put_aside(aside)),
-        lambda row: text.locate(int(row_numbers[row])),
-        next(iter(text.times), None),
-        text.step,
-    )
+    time, notes = next(iter(text.times), None), (*text.notes, *_put_aside(aside))
+    told = str(path), of_words, notes, lambda row: text.locate(int(row_numbers[row]))
+    return Table(found, text.units, *told, time, text.step)
 
 
 def _put_aside(names: Sequence[str]) -> tuple[str, ...]:
@@ -488,14 +472,11 @@ def _stacked(text: TextFile, columns: Sequence[str]) -> Table:
     found = pd.concat(parts)
     time = text.runs[text.times[0]][0] if text.times else None
     kept = [str(n) for n in found if not columns or n in (*columns, time, "run")]
-    return Table(
-        {name: found[name].to_numpy() for name in kept},
-        {text.runs[name][0]: unit for name, unit in text.units.items()},
-        str(text.path),
-        {},
-        (*text.notes, *_put_aside(aside), f"the runs {', '.join(runs)} stand side by side"),
-        time=time,
-    )
+    named, units = {n: found[n].to_numpy() for n in kept}, text.units.items()
+    units = {text.runs[name][0]: unit for name, unit in units}
+    beside = f"the runs {', '.join(runs)} stand side by side"
+    notes = (*text.notes, *_put_aside(aside), beside)
+    return Table(named, units, str(text.path), {}, notes, time=time)
 
 
 def to_text(columns: Mapping[str, np.ndarray]) -> str:
@@ -572,13 +553,10 @@ def _titled(titles: list[str], names: list[str]) -> tuple[list[str], tuple[str, 
     if len(set(names)) == len(names) or len(titles) != len(names):
         return names, ()
     spread = list(itertools.accumulate(titles, lambda before, title: title or before))
-    bodies = list(
-        dict.fromkeys(t for t, n in zip(spread, names, strict=True) if names.count(n) > 1)
-    )
-    found = [
-        f"{n}{bodies.index(t) + 1}" if names.count(n) > 1 else n
-        for t, n in zip(spread, names, strict=True)
-    ]
+    told = zip(spread, names, strict=True)
+    bodies = list(dict.fromkeys(t for t, n in told if names.count(n) > 1))
+    told = zip(spread, names, strict=True)
+    found = [f"{n}{bodies.index(t) + 1}" if names.count(n) > 1 else n for t, n in told]
     return found, (f"the columns 1, 2 … are of {', '.join(bodies)}",)
 
 

@@ -79,10 +79,7 @@ def _opener(path: Path, suffix: str) -> tuple[Callable[[], BinaryIO], tuple[str,
     found = [name for name in tables if "/" not in name] or tables  # phyphox: meta/device.csv
     if len(found) != 1:
         shown = ", ".join(found[:8]) or "no text"
-        raise InputError(
-            f"{path}: expected one table in the archive, found {shown}. Unpack the one that is "
-            "wanted"
-        )
+        raise InputError(f"{path}: expected one table in the archive, found {shown}. Unpack one")
     notes = (f"the table is {found[0]} of the archive",)
     return (lambda: zipfile.ZipFile(path).open(found[0])), notes  # type: ignore[return-value]
 
@@ -100,9 +97,7 @@ def _encoding(path: Path, head: bytes) -> str:
         best = charset_normalizer.from_bytes(part, cp_isolation=_ENCODINGS).best()
         best = best or charset_normalizer.from_bytes(part).best()
         if best is None:
-            raise InputError(
-                f"{path}: the header cannot be read: damaged? ({error})"[:300]
-            ) from None
+            raise InputError(f"{path}: header cannot be read: damaged? ({error})"[:300]) from None
         return best.encoding
     return "utf-8-sig" if b"\0" not in head[:1000] else "utf-16-le"
 
@@ -114,9 +109,7 @@ def _of_sheets(path: Path) -> Text:
     try:
         sheets = pd.read_excel(path, sheet_name=None, header=None, engine="calamine")
     except ImportError:
-        raise InputError(
-            f"{path}: workbooks need python-calamine: pip install 'gfnn_jax[files]'"
-        ) from None
+        raise InputError(f"{path}: needs python-calamine: pip install 'gfnn_jax[files]'") from None
     name = max(sheets, key=lambda name: int(sheets[name].notna().to_numpy().sum()))
     text = sheets[name].to_csv(index=False, header=False, sep="\t")
     notes = (f"the table is the sheet {name}, of {', '.join(sheets)}",) if len(sheets) > 1 else ()

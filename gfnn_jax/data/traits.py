@@ -218,14 +218,8 @@ def accelerations(traits: Traits, inputs: Sequence[str]) -> Accelerations | None
     if fits is None:
         return None
     dim = len(names)
-    found = Accelerations(
-        fits.values[:dim],
-        fits.slopes[:dim],
-        fits.curvatures[:dim],
-        fits.values[dim:],
-        fits.run,
-        fits.centres,
-    )
+    known = fits.values[:dim], fits.slopes[:dim], fits.curvatures[:dim], fits.values[dim:]
+    found = Accelerations(*known, fits.run, fits.centres)
     every = np.concatenate([found.q, found.v, found.a, found.u])
     known = np.asarray(np.isfinite(every).all(axis=0))
     return found.taken(known) if known.sum() >= 2 * _Options.block else None
@@ -250,10 +244,8 @@ def missed(table: np.ndarray, target: np.ndarray, c: np.ndarray) -> np.ndarray:
 def held_out(table: np.ndarray, target: np.ndarray) -> np.ndarray:
     """RMS (d,) that fits to every other block of windows leave in the blocks between."""
     half = np.arange(len(table)) // _Options.block % 2
-    left = [
-        missed(table[half == b], target[half == b], fitted(table[half != b], target[half != b]))
-        for b in (0, 1)
-    ]
+    parts = [(half == b, half != b) for b in (0, 1)]
+    left = [missed(table[a], target[a], fitted(table[b], target[b])) for a, b in parts]
     return np.sqrt(np.mean(np.square(left), axis=0))
 
 

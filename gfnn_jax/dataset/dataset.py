@@ -71,11 +71,11 @@ class Dataset:
         before, after = (to_inner(coordinates, z) for z in (pairs.z0, pairs.z1))
         known = np.isfinite(before + after).all(axis=1)
         if not known.all():
-            raise FitError(
-                f"{int((~known).sum())} pairs have no {coordinates.name} coordinates of the scene, "
-                f"the first is number {int(np.argmin(known))}, from 0. Leave them out, or fit "
-                "without --scene"
+            count, first = int((~known).sum()), int(np.argmin(known))
+            told = (
+                f"{count} pairs have no {coordinates.name} coordinates of the scene, the first is"
             )
+            raise FitError(f"{told} number {first}, from 0. Leave them out, or fit without --scene")
         lifted = lift if structure is None or not structure.angles else lift_sites
         y0, y1, centres, covered = lifted(before, after, coordinates)
         whole = tuple(i for i, c in zip(coordinates.angles, covered, strict=True) if c)
@@ -210,10 +210,8 @@ class Dataset:
         Raises FitError where states of the others have no inner coordinates.
         """
         held, count = self.pairs.take(self.validation), len(others)
-        z0, z1 = (
-            np.concatenate([one, other])
-            for one, other in ((others.z0, held.z0), (others.z1, held.z1))
-        )
+        both = (others.z0, held.z0), (others.z1, held.z1)
+        z0, z1 = map(np.concatenate, both)
         rows = np.arange(len(z0))
         split = Split(rows[:count], rows[count:], rows[:0], rows)
         both = Dataset.of(Pairs(z0, z1, self.dt), self.coordinates, self.structure)
@@ -221,14 +219,9 @@ class Dataset:
 
     def take(self, rows: np.ndarray) -> Dataset:
         """Take these rows alone, each in its part; sizes and domain are theirs."""
-        return dataclasses.replace(
-            self,
-            pairs=self.pairs.take(rows),
-            row=self.row[rows],
-            y0=self.y0[rows],
-            y1=self.y1[rows],
-            split=self.split.take(rows),
-        )._measured()
+        own = {"row": self.row[rows], "y0": self.y0[rows], "y1": self.y1[rows]}
+        parts = {"pairs": self.pairs.take(rows), "split": self.split.take(rows)}
+        return dataclasses.replace(self, **own, **parts)._measured()
 
     def lifted_anew(self, rows: np.ndarray) -> Dataset:
         """Take these rows alone, their angles lifted among themselves, nothing factored out and all
@@ -240,9 +233,8 @@ class Dataset:
         states."""
         found = self
         if before is not None:
-            found = dataclasses.replace(
-                found, y0=before.image(found.y0, found.args), before=(*found.before, before)
-            )
+            y0 = before.image(found.y0, found.args)
+            found = dataclasses.replace(found, y0=y0, before=(*found.before, before))
         if after is not None:
             found = dataclasses.replace(
                 found, y1=after.inverse().image(found.y1, found.args), after=(after, *found.after)

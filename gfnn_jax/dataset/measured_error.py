@@ -162,13 +162,9 @@ def one_step_error(
     deviations = np.sqrt(squares.mean(axis=0))
     measured = np.mean(squares / spread**2 if tolerance.relative else squares, axis=1)
     bound = bound_of_mean(measured, np.arange(len(measured)) if block is None else block, worst)
-    return OneStepError(
-        float(np.sqrt(squares.mean())),
-        float(np.sqrt(np.mean(squares / spread**2))),
-        float(np.sqrt(bound)),
-        deviations,
-        float(np.sqrt(np.median(measured))),
-    )
+    relative, typical = np.mean(squares / spread**2), np.median(measured)
+    rms, relative, bound, typical = np.sqrt([squares.mean(), relative, bound, typical]).tolist()
+    return OneStepError(rms, relative, bound, deviations, typical)
 
 
 def estimated_error(data: Dataset, tolerance: Tolerance, relative: float) -> OneStepError:

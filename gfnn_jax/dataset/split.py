@@ -55,10 +55,8 @@ class Split(NamedTuple):
         """The split of these rows alone, (n,) of the N rows, each in its part."""
         place = np.full(len(self.stretch), -1)
         place[rows] = np.arange(len(rows))
-        training, validation, test = (
-            kept[kept >= 0] for kept in (place[part] for part in self[:3])
-        )
-        return Split(training, validation, test, self.stretch[rows])
+        train, validation, test = (p[p >= 0] for p in (place[part] for part in self[:3]))
+        return Split(train, validation, test, self.stretch[rows])
 
 
 def split_rows(pairs: Pairs, seed: int) -> Split:
@@ -99,12 +97,8 @@ def _apart(goes_on: np.ndarray, part: np.ndarray, gap: int) -> np.ndarray:
     # The border belongs to the part that judges less: training rows give way to both.
     for border in np.flatnonzero(goes_on & (part[1:] != part[:-1])):
         low, high = part[border], part[border + 1]
-        side = (
-            slice(border - gap + 1, border + 1)
-            if low < high
-            else slice(border + 1, border + 1 + gap)
-        )
-        rows = np.arange(max(side.start, 0), min(side.stop, len(part)))
+        first = border - gap + 1 if low < high else border + 1
+        rows = np.arange(max(first, 0), min(first + gap, len(part)))
         own = run[border] if low < high else run[border + 1]
         apart[rows[(run[rows] == own) & (part[rows] == min(low, high))]] = False
     return apart

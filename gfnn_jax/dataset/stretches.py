@@ -331,9 +331,7 @@ def measure(found: Sequence[Stretch]) -> Scales:
     if all(s.even for s in found):
         steps, half, sigma = _windows([(s.t, s.q) for s in found])
         scales = Scales(sigma, sigma, 0.0, steps, half, 0.0, 0.0)
-        smooths = [
-            smooth(s.t, s.q, scales.of(s)[1], np.arange(0, len(s.t), every))[0] for s in found
-        ]
+        smooths = [smooth(s.t, s.q, scales.of(s)[1], np.r_[: len(s.t) : every])[0] for s in found]
     else:
         half = splines([(s.t, s.q) for s in found])
         sigma = half.sigma
@@ -362,10 +360,8 @@ def measure(found: Sequence[Stretch]) -> Scales:
         systems.setdefault(tuple(stretch.args.tolist()), []).append(own)
     omega = 0.0  # the largest ratio of rms acceleration to rms speed; of slow ones noise moves
     for own in systems.values():
-        v, a = (
-            np.sqrt(np.mean(np.concatenate([getattr(s, name) for s in own]) ** 2, axis=0))
-            for name in "va"
-        )
+        parts = (np.concatenate([getattr(s, name) for s in own]) for name in "va")
+        v, a = (np.sqrt(np.mean(part**2, axis=0)) for part in parts)
         omega = max(omega, float(np.max(a / np.maximum(v, OPTIONS.slow * speed))))
     spread = np.nanstd(np.concatenate([s.y for s in found]), axis=0)
     stride = np.divide(size, spread, out=np.full(len(size), omega * steps[0]), where=spread > 0)
@@ -399,9 +395,7 @@ def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:
     """σ (k,) of channels, each where it was seen."""
     sigma = []
     for k in range(found[0].y.shape[1]):
-        known = [
-            (s.t[have], s.y[have, k : k + 1]) for s in found for have in [~np.isnan(s.y[:, k])]
-        ]
+        known = [(s.t[own], s.y[own, k : k + 1]) for s in found for own in [~np.isnan(s.y[:, k])]]
         if not any(y.any() for _, y in known):  # of events
             sigma.append(0.0)
         elif all(s.even for s in found):

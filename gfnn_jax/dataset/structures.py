@@ -7,6 +7,7 @@ A structure tells which libraries of terms are tried, and by what the domain of 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Iterator, Sequence
 from math import comb
@@ -29,24 +30,12 @@ class Options:
 
     # (reach, degree, whether functions are tried too) of the libraries, by rising size.
     libraries: tuple[tuple[int, int, bool], ...] = (
-        (1, 2, False),
-        (1, 4, False),
-        (1, 2, True),
-        (2, 2, False),
-        (2, 4, False),
-        (1, 6, False),
-        (1, 8, False),
+        *((1, 2, False), (1, 4, False), (1, 2, True)),
+        *((2, 2, False), (2, 4, False), (1, 6, False), (1, 8, False)),
     )
     # (degree, whether products of p, of modes of q and of modes of the difference are tried) of
     # the libraries where q is an angle, by rising size.
-    fourier: tuple[tuple[int, bool], ...] = (
-        (2, False),
-        (4, False),
-        (2, True),
-        (6, False),
-        (3, True),
-        (4, True),
-    )
+    fourier = ((2, False), (4, False), (2, True), (6, False), (3, True), (4, True))
     # Powers of the distances of bodies, by rising size.
     powers: tuple[tuple[int, ...], ...] = ((-3, -2, -1, 1, 2), (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4))
     # A library of sites is fitted to so many pairs, or to those that hold so many numbers; one of
@@ -59,14 +48,8 @@ class Options:
 
 
 _FUNCTIONS = (
-    "cos(q1)",
-    "sin(q1)",
-    "exp(q1)",
-    "exp(-q1)",
-    "cos(q2 - q1)",
-    "sin(q2 - q1)",
-    "exp(q2 - q1)",
-    "exp(q1 - q2)",
+    *("cos(q1)", "sin(q1)", "exp(q1)", "exp(-q1)"),
+    *("cos(q2 - q1)", "sin(q2 - q1)", "exp(q2 - q1)", "exp(q1 - q2)"),
 )
 
 
@@ -88,10 +71,8 @@ class Sites:
         sites' q2, p2, …"""
         ends = _ENDS[self.kind]
         if self.angles:
-            for degree, products in Options.fourier:
-                yield from (
-                    periodic_site_terms(dim, end, degree, products=products) for end in ends
-                )
+            for (degree, products), end in itertools.product(Options.fourier, ends):
+                yield periodic_site_terms(dim, end, degree, products=products)
             return
         if given:
             yield from (site_terms(dim, end, 0, 0, given, self.fields) for end in ends)
@@ -123,19 +104,12 @@ class Sites:
         fields = range(1, self.fields + 1)
         alone = tuple(f"{x}{k}" for x in own for k in fields)
         bonds = () if self.angles else tuple(f"q{k + self.fields} - q{k}" for k in fields)
-        parts = tuple(
-            Part(
-                Terms(
-                    (k + 1) * self.fields,
-                    names,
-                    tuple(map(tuple, np.eye(len(names), dtype=int).tolist())),
-                ),
-                Windows(ends, k, self.fields),
-            )
-            for k, names in enumerate((alone, bonds))
-            if names
-        )
-        return ranges_of(Sums(dim, parts), z)
+        parts = []
+        for k, names in enumerate((alone, bonds)):
+            each = tuple(map(tuple, np.eye(len(names), dtype=int).tolist()))
+            terms = Terms((k + 1) * self.fields, names, each)
+            parts += [Part(terms, Windows(ends, k, self.fields))] if names else []
+        return ranges_of(Sums(dim, tuple(parts)), z)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,9 +176,7 @@ def structure_of(
     if dim % fields:
         raise FitError(f"expected {fields} q of every site; got {dim} degrees of freedom")
     if dim // fields < Options.fewest_sites:
-        raise FitError(
-            f"expected a {kind} of at least {Options.fewest_sites} sites, got {dim // fields}"
-        )
+        raise FitError(f"expected {Options.fewest_sites} sites or more, got {dim // fields}")
     sides = {(): "", tuple(range(dim)): "q", tuple(range(2 * dim)): "qp"}
     if coordinates.angles not in sides:
         raise FitError(
@@ -212,9 +184,7 @@ def structure_of(
             f"{2 * dim - 1}), got {coordinates.angles}"
         )
     if coordinates.angles and fields > 1:
-        raise FitError(
-            f"expected no angles where a site has {fields} q: only a single q may be an angle"
-        )
+        raise FitError(f"expected no angles where a site has {fields} q: a single q may be one")
     return Sites(kind, sides[coordinates.angles], fields)
 
 

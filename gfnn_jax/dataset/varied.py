@@ -35,15 +35,10 @@ def check_varied(pairs: Pairs) -> None:
     if (TIME in args) != (pairs.period is not None):
         came = "t0 without a period" if TIME in args else "a period without t0"
         raise FitError(f"expected t0, the time of a drive, together with its period; got {came}")
-    if pairs.period is not None and not (
-        np.ndim(pairs.period) == 0
-        and np.asarray(pairs.period).dtype.kind in "fiu"
-        and 0 < float(pairs.period) < np.inf
-    ):
-        raise FitError(
-            f"expected a number that is finite and above 0 as the drive's period, got "
-            f"{pairs.period!r}"
-        )
+    given = np.asarray(0.0 if pairs.period is None else pairs.period)
+    known = given.ndim == 0 and given.dtype.kind in "fiu" and 0 < float(given) < np.inf
+    if pairs.period is not None and not known:
+        raise FitError(f"expected a period that is finite and above 0, got {pairs.period!r}")
     try:
         check_names(pairs.dim, tuple(name for name in args if name != TIME))
     except InputError as error:
@@ -127,11 +122,8 @@ def without_constants(pairs: Pairs) -> tuple[Pairs, list[str]]:
             own_time = [_one_phase(args.pop(TIME)[0], one, period)]
             period = None
     kept = {name: v for name, v in args.items() if name not in still}
-    messages = [
-        f"the parameter {name} is {args[name][0]:g} in all pairs: it is left out, for its effect "
-        "is not known"
-        for name in still
-    ]
+    out = "in all pairs: it is left out, for its effect is not known"
+    messages = [f"the parameter {name} is {args[name][0]:g} {out}" for name in still]
     varied = dataclasses.replace(pairs, dt=one, args=kept or None, t0=None, period=period)
     return varied, own_time + messages
 

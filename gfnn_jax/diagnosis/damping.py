@@ -126,16 +126,12 @@ class LearnedDamping:
         by = f", depending on {', '.join(self.names)}" if self.names else ""
         if self.differs:
             means = ", ".join(f"{b:.4g}" for b in self.factor.ravel())
-            return (
-                f"steps multiply areas by {means} in the mean, not alike everywhere.{self.differs}"
-            )
+            return f"steps multiply areas by {means} in the mean, not everywhere.{self.differs}"
         if self.uniform:
             return f"every step multiplies areas by {factors[0]}{by}, one factor for all states"
         planes = [f"{factor} in (q{i}, p{i})" for i, factor in enumerate(factors, 1)]
-        return (
-            f"every step multiplies areas by {', '.join(planes)}{by}: no multiple of the "
-            "symplectic form is kept"
-        )
+        whole = f"every step multiplies areas by {', '.join(planes)}{by}"
+        return f"{whole}: no multiple of the symplectic form is kept"
 
     def line(self, dt: float) -> str:
         """Line about what was learned, with the rate γ of p' = −γ p where one factor b = e^(−γ dt)
@@ -176,9 +172,8 @@ def learn_damping(
     if not b > 0 or not abs(b - 1) > max(3 * error, CERTAIN * deviation):
         return None
     if len(data.training) > OPTIONS.plenty * OPTIONS.sample:
-        some = data.take(
-            np.concatenate([data.training[: OPTIONS.sample], data.validation[: OPTIONS.sample]])
-        )
+        parts = (data.training, data.validation)
+        some = data.take(np.concatenate([part[: OPTIONS.sample] for part in parts]))
         if learn_damping(some, jacobians, error, chart, reversor, OPTIONS.of_sample) is None:
             return None
     start = LearnedDamping(np.asarray(b), np.asarray(np.inf), np.zeros(dim))
@@ -223,9 +218,8 @@ def where_areas_differ(centres, scale, parameters: tuple[str, ...], jacobians) -
         if share > explained:
             explained, ends = share, (np.argmin(fitted), np.argmax(fitted))
             low, high = (f"{fitted[i]:.3g} at {name} = {x[i]:.3g}" for i in ends)
-            sentence = (
-                f" Areas change by a factor that differs over phase space, from {low} to {high}"
-            )
+            span = f"from {low} to {high}"
+            sentence = f" Areas change by a factor that differs over phase space, {span}"
     return sentence
 
 
@@ -301,29 +295,19 @@ class _Problem:
         if factor.shape[1] == 1:
             factor, std, b = factor[:, 0], std[:, 0], b[:, 0]
         if len(factor) == 1:
-            return LearnedDamping(
-                np.asarray(factor[0]), np.asarray(std[0]), np.asarray(found.shift[0])
-            )
-        return LearnedDamping(
-            factor,
-            std,
-            found.shift,
-            found.functions,
-            self.data.parameters,
-            (np.asarray(b.min(axis=0)), np.asarray(b.max(axis=0))),
-        )
+            first, error, shift = (np.asarray(x[0]) for x in (factor, std, found.shift))
+            return LearnedDamping(first, error, shift)
+        extremes = np.asarray(b.min(axis=0)), np.asarray(b.max(axis=0))
+        by = found.functions, self.data.parameters, extremes
+        return LearnedDamping(factor, std, found.shift, *by)
 
     def _families(self, spread, factor) -> Iterator[Products]:
         """Families by rising degree, those that the training rows determine in reasonable time."""
         undamped = self._undamped(_momenta(spread, factor), np.zeros(self.data.dim))
         rows = self.data.training
         w = rows_of(undamped, self.chart, rows)[0][0]
-        inputs = box_inputs(
-            w,
-            angles=tuple(self._angles),
-            cyclic=undamped.coordinates.cyclic,
-            args=undamped.given(rows)[1],
-        )
+        angles, args = tuple(self._angles), undamped.given(rows)[1]
+        inputs = box_inputs(w, angles=angles, cyclic=undamped.coordinates.cyclic, args=args)
         for degree in OPTIONS.degrees:
             family = Products(inputs, degree)
             terms = family.num_parameters
@@ -473,9 +457,8 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
     if may_lose:
         damping = learn_damping(plain, jacobians, error, chart, reversor)
     at = plain.y0 if plain.args is None else np.concatenate([plain.y0, plain.args], axis=1)
-    differing = partial(
-        where_areas_differ, centres(at, jacobians, seed), plain.scale, plain.parameters
-    )
+    places = centres(at, jacobians, seed)
+    differing = partial(where_areas_differ, places, plain.scale, plain.parameters)
     if damping is not None:
         undone = damping.undone(jacobians)
         if data_defect(undone, plain.scale) > OPTIONS.errors * error:

@@ -173,9 +173,8 @@ def chart_determinant(chart: AnyChart, jacobians, scale) -> ChartDeterminant:
     if chart.name == "type1":
         determinant = determinant * np.prod(scale[dim:] / scale[:dim])
     sign = 1 if np.median(determinant) >= 0 else -1
-    return ChartDeterminant(
-        float(np.quantile(sign * determinant, 0.01)), sign, float(np.mean(determinant < 0))
-    )
+    low = float(np.quantile(sign * determinant, 0.01))
+    return ChartDeterminant(low, sign, float(np.mean(determinant < 0)))
 
 
 def data_defect(jacobians, scale) -> float:
@@ -197,9 +196,8 @@ def look_symplectic(jacobians, error: float, scale) -> bool:
     move = np.abs(jacobians * scale[None, None, :] / scale[None, :, None] - np.eye(len(scale)))
     size = float(np.median(move.max(axis=(1, 2))))
     defect = data_defect(jacobians, scale)
-    return error > Options.known * size or defect <= max(
-        Options.errors * error, Options.missed * size
-    )
+    most = max(Options.errors * error, Options.missed * size)
+    return error > Options.known * size or defect <= most
 
 
 def sampled_dimension(y, scale) -> int:
@@ -241,13 +239,11 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
     where no chart covers the data, or the one asked for is singular over them.
     """
     determinants = {name: chart_determinant(c, jacobians, data.scale) for name, c in CHARTS.items()}
-    angular = bool(data.coordinates.angles)
+    angles = data.coordinates.angles
     near_identity = {n: c for n, c in CHARTS.items() if n != "type1"}
     valid = [n for n in near_identity if determinants[n].valid and determinants[n].sign > 0]
-    if request == "type1" and angular:
-        raise FitError(
-            "chart type1 has no meaning for angles: w = (q, Q) is not periodic; use type2"
-        )
+    if request == "type1" and angles:
+        raise FitError("chart type1 has no meaning for angles: (q, Q) is not periodic; use type2")
     if request != "auto":
         determinant = determinants[request]
         if determinant.valid:
@@ -256,9 +252,7 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
             return Charts([CHARTS[request]], None, determinants, [message] if close else [])
         if valid:
             raise FitError(_about(request, determinant, "is singular over the data", valid))
-    half = fit_half_map(
-        data.y0, data.y1, data.scale, angles=data.coordinates.angles, reversor=reversor
-    )
+    half = fit_half_map(data.y0, data.y1, data.scale, angles=angles, reversor=reversor)
     closest = max((determinants[n].low for n in valid), default=0.0)
     if half is not None and closest < _FAR:
         back = np.asarray(half.inverse().matrix)
@@ -273,13 +267,12 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
         one_sided = [n for n in ("type2", "type3") if n in valid][:1]
         names = [n for n in ("midpoint", *one_sided) if n in valid]
         return Charts([CHARTS[n] for n in names], None, determinants, [])
-    if request in ("auto", "type1") and determinants["type1"].valid and not angular:
+    if request in ("auto", "type1") and determinants["type1"].valid and not angles:
         return Charts([TYPE1], None, determinants, [])
     beyond = [n for n in near_identity if determinants[n].valid]
     if request == "auto" and beyond:
-        message = _about(
-            beyond[0], determinants[beyond[0]], "is used beyond a fold, where w turns back", ()
-        )
+        name, folded = beyond[0], "is used beyond a fold, where w turns back"
+        message = _about(name, determinants[name], folded, ())
         return Charts([CHARTS[beyond[0]]], None, determinants, [message])
     lows = ", ".join(f"{n} {j.sign * j.low:.2g}" for n, j in determinants.items())
     raise FitError(

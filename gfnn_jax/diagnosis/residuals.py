@@ -183,10 +183,8 @@ def _by_friction(images, residual, angles) -> tuple[float, float] | None:
     count, width = residual.shape
     inputs = box_inputs(images, angles=angles)
     most = min(Options.most_terms, count * width // Options.rows_per_term)
-    family = next(
-        (f for f in (Products(inputs, n) for n in Options.degrees) if f.num_parameters <= most),
-        None,
-    )
+    families = (Products(inputs, n) for n in Options.degrees)
+    family = next((f for f in families if f.num_parameters <= most), None)
     if family is None:
         return None
     size, (_, p) = sizes(images), split(images)

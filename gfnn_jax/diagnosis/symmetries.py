@@ -84,9 +84,8 @@ def _generated(generator: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 def _reflected(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPairs]:
-    rows = np.concatenate(
-        [_some(data.training, Options.trained), _some(data.validation, Options.held)]
-    )
+    parts = _some(data.training, Options.trained), _some(data.validation, Options.held)
+    rows = np.concatenate(parts)
     train, held = np.split(np.arange(len(rows)), [min(len(data.training), Options.trained)])
     before, after = data.y0[rows], data.y1[rows]
     middle, weight = 0.5 * (before + after), 1.0 / np.roll(data.scale, data.dim)
@@ -131,27 +130,21 @@ def generators(
     names = names or tuple(f"{letter}{i + 1}" for letter in "qp" for i in range(dim))
     plain = [i for i in range(dim) if i not in angles]
     for i in range(dim):
-        yield (
-            f"translation of {names[i]}: {names[i + dim]} conserved",
-            _generator(dim, linear={i + dim: 1.0}),
-        )
+        text = f"translation of {names[i]}: {names[i + dim]} conserved"
+        yield text, _generator(dim, linear={i + dim: 1.0})
     if not one:
         yield (
             "translation of all positions: the sum of all momenta conserved",
             _generator(dim, linear={i + dim: 1.0 for i in range(dim)}),
         )
     for i, j in combinations(plain, 2):
-        yield (
-            f"rotation in ({names[i]}, {names[j]}): angular momentum "
-            f"{names[i]} {names[j + dim]} − {names[j]} {names[i + dim]} conserved",
-            _generator(dim, {(i, j + dim): 1.0, (j, i + dim): -1.0}),
-        )
+        conserved = f"{names[i]} {names[j + dim]} − {names[j]} {names[i + dim]} conserved"
+        text = f"rotation in ({names[i]}, {names[j]}): angular momentum {conserved}"
+        yield text, _generator(dim, {(i, j + dim): 1.0, (j, i + dim): -1.0})
     if len(plain) == dim:
         squares = "q1² + p1²" if one else "the sum of all q² + p²"
-        yield (
-            f"rotation of every (q, p): {squares} conserved",
-            _generator(dim, {(i, i): 1.0 for i in range(2 * dim)}),
-        )
+        each = {(i, i): 1.0 for i in range(2 * dim)}
+        yield f"rotation of every (q, p): {squares} conserved", _generator(dim, each)
 
 
 def _generator(dim: int, quadratic=None, linear=None) -> np.ndarray:

@@ -41,11 +41,8 @@ def _axes_or_new(ax, width=WIDTH, height=HEIGHT) -> Axes:
 
 
 def _look_of(place: int) -> dict[str, Any]:
-    return {
-        "color": COLOURS[place % len(COLOURS)],
-        "marker": MARKERS[place % len(MARKERS)],
-        "linestyle": LINES[place % len(LINES)],
-    }
+    looks = {"color": COLOURS, "marker": MARKERS, "linestyle": LINES}
+    return {name: every[place % len(every)] for name, every in looks.items()}
 
 
 def _without_minor_ticks(*axes: Axes) -> None:
@@ -240,9 +237,8 @@ def coordinates_against_time(
     every = max(1, int(shown.sum()) // 12)
     ax.plot(times[shown], np.asarray(reference)[shown], color=REFERENCE, lw=2.2, label="reference")
     for place, (name, values) in enumerate(predictions.items()):
-        look: dict[str, Any] = _look_of(place) | {
-            "markevery": (place * every // max(1, len(predictions)), every)
-        }
+        marks = (place * every // max(1, len(predictions)), every)
+        look: dict[str, Any] = _look_of(place) | {"markevery": marks}
         ax.plot(times[shown], np.asarray(values)[shown], label=name, **look)
     ax.set(xlabel="time $t$", ylabel=ylabel)
     _legend_above(ax)

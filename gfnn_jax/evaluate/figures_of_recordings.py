@@ -152,11 +152,8 @@ def law_figure(fit: LearnedLaw, recording: Recording) -> Figure:
         for u, one in of.inputs.items():
             whiteness.plot(one.lag, one.correlation, "o", mfc="none", label=f"with {u}")
         whiteness.set(xlabel="lag [s]")
-    titles = (
-        f"forecast from one state, run {run}",
-        "residuals of the fitted arcs",
-        "correlation of residuals",
-    )
+    first = f"forecast from one state, run {run}"
+    titles = (first, "residuals of the fitted arcs", "correlation of residuals")
     for ax, title in zip(sheet.axes[0], titles, strict=True):
         ax.set_title(title)
         ax.legend()
@@ -205,10 +202,8 @@ def _residual(trace: Trace, place: int) -> tuple[np.ndarray, ...]:
 def swings_figure(swings: Swings, label: str) -> Figure:
     """Draw frequency and Q of free swings against their amplitude, with two standard errors."""
     figure = Figure(figsize=(_Options.page, 2.6))
-    shown = (
-        (swings.frequency, swings.frequency_std, "frequency [Hz]"),
-        (swings.quality, swings.quality_std, "quality factor Q"),
-    )
+    quality = swings.quality, swings.quality_std, "quality factor Q"
+    shown = ((swings.frequency, swings.frequency_std, "frequency [Hz]"), quality)
     finite = [one for one in shown if np.isfinite(one[0]).any()]
     axes = figure.subplots(1, len(finite), squeeze=False)[0]
     for ax, (value, std, name) in zip(axes, finite, strict=True):

@@ -55,12 +55,8 @@ class Forecasts(NamedTuple):
     @property
     def report(self) -> dict[str, Any]:
         """Entry of ``report.json``."""
-        return {
-            "num": len(self.each),
-            "ahead": self.ahead,
-            "median": self.median,
-            "within_two_deviations": self.within,
-        }
+        own = {"num": len(self.each), "ahead": self.ahead, "median": self.median}
+        return {**own, "within_two_deviations": self.within}
 
 
 def end_of_part(recording: Recording) -> float:
@@ -96,12 +92,10 @@ def _forecasts(
 ) -> Forecasts:
     """Forecasts along a recording. forecast: one, of (recording, run, its sample, seconds)."""
     times = {run: recording.times(run) for run in recording.runs}
-    starts = [
-        (run, k)
-        for run, t in times.items()
-        for k in range(_Options.samples - 1, len(t) - 1)
-        if t[k] + ahead[-1] <= t[-1]
-    ]
+    places = (
+        (run, t, k) for run, t in times.items() for k in range(_Options.samples - 1, len(t) - 1)
+    )
+    starts = [(run, k) for run, t, k in places if t[k] + ahead[-1] <= t[-1]]
     if not starts:
         raise InputError(
             f"{recording.source}: no run has {_Options.samples} samples and {ahead[-1]:.3g} s "

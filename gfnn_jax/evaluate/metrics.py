@@ -180,9 +180,8 @@ def _power_law(steps, lanes, first, last, floor, power=1.0):
         num = 2 + int(POINTS_PER_DECADE * (grid[-1] - grid[0]) / np.log(10))
         targets = np.linspace(grid[0], grid[-1], num) - 1e-9  # the first target is the first step
         chosen = chosen[np.unique(np.searchsorted(grid, targets))]
-    return _slope(
-        np.log(steps[chosen]), lanes[:, chosen], steps[chosen], lambda mean: power * np.log(mean)
-    )
+    lanes, steps = lanes[:, chosen], steps[chosen]
+    return _slope(np.log(steps), lanes, steps, lambda mean: power * np.log(mean))
 
 
 def _slope(x, lanes, steps, transform):
@@ -206,9 +205,8 @@ def _slope(x, lanes, steps, transform):
     error = float(np.sqrt(variance))
     half = float(stdtrit(degrees, 0.975)) * error
     value = float(value)
-    return Estimate(
-        value, error, (value - half, value + half), float(steps[0]), float(steps[-1]), num_lanes
-    )
+    interval, ends = (value - half, value + half), (float(steps[0]), float(steps[-1]))
+    return Estimate(value, error, interval, *ends, num_lanes)
 
 
 def semi_major_axis(z):
@@ -225,9 +223,8 @@ def eccentricity(z):
     xp, (q, p) = namespace(z), split(z)
     speed = xp.sum(p * p, axis=-1, keepdims=True)
     radial = xp.sum(q * p, axis=-1, keepdims=True)
-    return xp.linalg.norm(
-        (speed - 1 / xp.linalg.norm(q, axis=-1, keepdims=True)) * q - radial * p, axis=-1
-    )
+    vector = (speed - 1 / xp.linalg.norm(q, axis=-1, keepdims=True)) * q - radial * p
+    return xp.linalg.norm(vector, axis=-1)
 
 
 ELEMENTS: dict[str, Callable] = {"axis": semi_major_axis, "eccentricity": eccentricity}
@@ -276,9 +273,8 @@ def section_crossings(trajectory, index: int, direction: int = 1):
     windows = trajectory[before[:, None] + nodes.astype(int)]
     heights = direction * windows[..., index]
     # Barycentric weights of equispaced nodes: binomial coefficients of alternating sign.
-    weights = np.cumprod(
-        np.append(1.0, -(STENCIL - 1 - np.arange(STENCIL - 1)) / np.arange(1, STENCIL))
-    )
+    k = np.arange(STENCIL - 1)
+    weights = np.cumprod(np.append(1.0, -(STENCIL - 1 - k) / (k + 1)))
 
     def lagrange(t):
         """Values (K, STENCIL) of the Lagrange polynomials at times t (K,), none of them a node."""

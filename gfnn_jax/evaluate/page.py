@@ -83,13 +83,9 @@ def _rendered(title: str, verdict: str, sections: Sequence[Section]) -> str:
     kind, _, reason = verdict.partition(": ")
     template = files("gfnn_jax.evaluate").joinpath("page.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string(template).render(
-        title=title,
-        verdict=kind,
-        reason=reason,
-        meaning=_MEANING.get(kind, ""),
-        sections=[section for section in sections if not section.empty],
-    )
+    shown = [section for section in sections if not section.empty]
+    words = {"title": title, "verdict": kind, "reason": reason, "meaning": _MEANING.get(kind, "")}
+    return environment.from_string(template).render(sections=shown, **words)
 
 
 def figure(fit: Fit) -> Figure | None:
@@ -211,14 +207,11 @@ def _of_law(
             ],
         )
     yield Section("Not identified", lines=list(_not_identified(law)))
-    yield Section(
-        "Rivals", heads=("alternative", "odds of this law against it", ""), rows=list(_rivals(law))
-    )
-    yield Section(
-        "What to record next",
-        heads=("release from rest at", "what it tells"),
-        rows=[(motion.start_text, motion.tells) for motion in law.next_motions],
-    )
+    heads = ("alternative", "odds of this law against it", "")
+    yield Section("Rivals", heads=heads, rows=list(_rivals(law)))
+    rows = [(motion.start_text, motion.tells) for motion in law.next_motions]
+    heads = ("release from rest at", "what it tells")
+    yield Section("What to record next", heads=heads, rows=rows)
     yield Section("The data", lines=[*notes, *_faults(fit, law)])
 
 
@@ -229,31 +222,20 @@ def _physics(law: LearnedLaw, known: Physics) -> Section:
         name = law.map.sensors.positions[0]
         unit = "rad" if name in law.map.sensors.angles else law.units.get(name, "")
         label = f"{name} [{unit}]" if unit else name
-        drawn = [
-            _svg(
-                figures.swings_figure(known.swings, label),
-                "Free swings about rest, by the law: two standard errors are shaded.",
-            )
-        ]
-    return Section(
-        "Physical quantities",
-        heads=("quantity", "value", "unit", ""),
-        rows=[(one.name, one.shown, one.unit, one.about) for one in known.quantities],
-        figures=drawn,
-    )
+        caption = "Free swings about rest, by the law: two standard errors are shaded."
+        drawn = [_svg(figures.swings_figure(known.swings, label), caption)]
+    rows = [(one.name, one.shown, one.unit, one.about) for one in known.quantities]
+    heads = ("quantity", "value", "unit", "")
+    return Section("Physical quantities", heads=heads, rows=rows, figures=drawn)
 
 
 def _coming(fit: Fit, law: LearnedLaw) -> list[tuple[str, str]]:
     """Figure of the forecast from the end of what was learned from."""
     if fit.data is None:
         return []
-    return [
-        _svg(
-            figures.coming_figure(law, fit.data, fit.learned_to),
-            "Forecast from one state at the "
-            "dashed line on, and what was measured. Two standard deviations are shaded.",
-        )
-    ]
+    told = "Forecast from one state at the dashed line on, and what was measured."
+    drawn = figures.coming_figure(law, fit.data, fit.learned_to)
+    return [_svg(drawn, f"{told} Two standard deviations are shaded.")]
 
 
 def _forecasts(
@@ -282,10 +264,8 @@ def _forecasts(
 def _not_identified(law: LearnedLaw) -> Iterator[str]:
     yield from (f"The record does not distinguish: {in_letters(pair)}." for pair in law.alike)
     for term, limit in law.which_friction.limits.items():
-        yield (
-            f"No friction of the form {in_letters(term)} is seen: its coefficient in R is below "
-            f"{limit:.2g} (2 σ)."
-        )
+        seen = f"No friction of the form {in_letters(term)} is seen: its coefficient"
+        yield f"{seen} in R is below {limit:.2g} (2 σ)."
     if law.delay is not None and not np.isfinite(law.delay[1]):
         yield "The delay of the inputs is not determined."
 
@@ -304,11 +284,8 @@ def _faults(fit: Fit, law: LearnedLaw) -> Iterator[str]:
     yield f"{law.num_samples:,} samples."
     for name, sigma in law.noise.items():
         unit = law.units.get(name, "")
-        yield (
-            f"{name}: noise σ = {sigma:.3g} {unit}".rstrip()
-            + f", RMS residual {law.residual[name]:.3g} {unit}".rstrip()
-            + "."
-        )
+        shown = f"{name}: noise σ = {sigma:.3g} {unit}".rstrip()
+        yield f"{shown}, RMS residual {law.residual[name]:.3g} {unit}".rstrip() + "."
     if fit.data is not None:
         yield from fit.data.notes
         yield from map(str, fit.data.summary().faults)
@@ -325,13 +302,10 @@ def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
     if law is not None and law.formula:
         with_formula = "Lagrangian" not in law.formula
         shown = as_mathml(law.formula) if with_formula else f"<mtext>{escape(law.formula)}</mtext>"
-        yield Section(
-            "Law",
-            formulas=[("Hamiltonian", f"{defines('H')} <math><mrow>{shown}</mrow></math>")],
-            lines=[*fit.bracket_lines, *law.notes],
-            heads=("term", "coefficient"),
-            rows=[(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms],
-        )
+        formulas = [("Hamiltonian", f"{defines('H')} <math><mrow>{shown}</mrow></math>")]
+        rows = [(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms]
+        table = {"heads": ("term", "coefficient"), "rows": rows}
+        yield Section("Law", formulas=formulas, lines=[*fit.bracket_lines, *law.notes], **table)
     yield Section(
         "The map",
         lines=[
@@ -346,35 +320,23 @@ def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
     heads, rows = candidate_cells(found)
     yield Section("Candidates", heads=heads, rows=rows)
     null = law.null_terms if law is not None else ()
-    yield Section(
-        "Not identified", lines=[f"The pairs do not distinguish {', '.join(null)}."] if null else []
-    )
-    yield Section(
-        "Rivals",
-        heads=("alternative", "odds of this law against it"),
-        rows=[(r.formula, odds_text(r.odds)) for r in law.rivals] if law is not None else [],
-    )
-    yield Section(
-        "The data",
-        lines=[
-            f"{found.num_pairs:,} pairs.",
-            *(f"Symmetry of the pairs: {one}." for one in found.symmetries),
-            *found.messages,
-        ],
-    )
+    lines = [f"The pairs do not distinguish {', '.join(null)}."] if null else []
+    yield Section("Not identified", lines=lines)
+    rows = [(r.formula, odds_text(r.odds)) for r in law.rivals] if law is not None else []
+    yield Section("Rivals", heads=("alternative", "odds of this law against it"), rows=rows)
+    lines = [
+        f"{found.num_pairs:,} pairs.",
+        *(f"Symmetry of the pairs: {s}." for s in found.symmetries),
+    ]
+    yield Section("The data", lines=[*lines, *found.messages])
 
 
 def _made(seconds: float, command: str) -> Section:
     fitted = f", {seconds:.1f} s of fitting" if np.isfinite(seconds) else ""
     packages = ", ".join(f"{n} {v}" for n, v in versions().items() if v)
-    return Section(
-        "How this was made",
-        lines=[
-            *([f"Command: {command}"] if command else []),
-            f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {device()}{fitted}.",
-            packages + ".",
-        ],
-    )
+    made = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC, {device()}{fitted}."
+    typed = [f"Command: {command}"] if command else []
+    return Section("How this was made", lines=[*typed, made, packages + "."])
 
 
 def _svg(figure: Figure, caption: str) -> tuple[str, str]:

@@ -148,12 +148,10 @@ class _System(NamedTuple):
         """The system with its coefficients moved by these (k,)."""
         ends = np.cumsum([self.law.terms.count, self.law.friction.count, self.law.gains.size])
         of_terms, of_losses, _, of_rate = np.split(by, ends)
-        law = dataclasses.replace(
-            self.law,
-            coefficients=self.law.coefficients + of_terms,
-            losses=np.asarray(self.law.losses) + of_losses,
-            uniform=self.law.uniform + (of_rate[0] if len(of_rate) else 0.0),
-        )
+        coefficients = self.law.coefficients + of_terms
+        losses, more = np.asarray(self.law.losses) + of_losses, of_rate[0] if len(of_rate) else 0.0
+        own = {"losses": losses, "uniform": self.law.uniform + more}
+        law = dataclasses.replace(self.law, coefficients=coefficients, **own)
         return self._replace(law=law)
 
     def with_errors(
@@ -289,16 +287,12 @@ class _System(NamedTuple):
             return np.array([squared, Options.gravity / squared])
 
         (squared, length), (error, of_length) = self.with_errors(compute)
-        return [
-            Quantity("ω₀², of a pendulum g/l", squared, error, "1/s²"),
-            Quantity(
-                "length of a simple pendulum of this frequency",
-                length,
-                of_length,
-                "m",
-                f"g/ω₀² with g = {Options.gravity:g} m/s²",
-            ),
-        ]
+        named, about = (
+            "length of a simple pendulum of this frequency",
+            f"g/ω₀² with g = {Options.gravity:g} m/s²",
+        )
+        rate = Quantity("ω₀², of a pendulum g/l", squared, error, "1/s²")
+        return [rate, Quantity(named, length, of_length, "m", about)]
 
     def _dead_band(self, q: np.ndarray) -> list[Quantity]:
         """Distance from rest within which dry friction holds a body of one degree of freedom."""
@@ -347,9 +341,8 @@ class _System(NamedTuple):
         def above(q: float) -> float:
             return self._potential(q) - energy
 
-        left = next(
-            (end for k in np.linspace(1, 4, 16) if above(end := rest - k * amplitude) >= 0), None
-        )
+        ends = (rest - k * amplitude for k in np.linspace(1, 4, 16))
+        left = next((end for end in ends if above(end) >= 0), None)
         if left is None:
             return np.nan, np.nan
         left = float(brentq(above, left, rest))  # pyright: ignore[reportArgumentType]
@@ -386,9 +379,8 @@ def _mode(
     if imag[0] <= 1e-9 * size:
         return [Quantity(f"{name}: rate of decay", -real[0], real[1], "1/s", "overdamped")]
     of_shape = f"amplitudes {shape}" if shape else ""
-    found = [
-        Quantity(f"{name}: frequency", imag[0] / (2 * np.pi), imag[1] / (2 * np.pi), "Hz", of_shape)
-    ]
+    hertz = imag[0] / (2 * np.pi), imag[1] / (2 * np.pi)
+    found = [Quantity(f"{name}: frequency", *hertz, "Hz", of_shape)]
     if abs(real[0]) <= 1e-9 * size:
         return found
     ratio, of_ratio = -real[0] / size, real[1] / size
@@ -412,15 +404,8 @@ def _of_swings(swings: Swings, system: _System) -> list[Quantity]:
     at = f"swings of ± {a:.3g} {unit}".rstrip()
     drift = swings.frequency[-1] / swings.frequency[0] - 1
     against = f"{100 * drift:+.2g} % against small swings" if abs(drift) > 1e-6 else "as small ones"
-    found = [
-        Quantity(
-            f"{at}, without friction: frequency",
-            float(swings.frequency[-1]),
-            float(swings.frequency_std[-1]),
-            "Hz",
-            against,
-        )
-    ]
+    largest = float(swings.frequency[-1]), float(swings.frequency_std[-1])
+    found = [Quantity(f"{at}, without friction: frequency", *largest, "Hz", against)]
     if np.isfinite(swings.quality[-1]):
         about = "2π × energy ÷ energy lost in a period, by all friction"
         if system.law.friction.count > system._viscous().friction.count:
@@ -440,15 +425,10 @@ def _energies(law: LearnedLaw) -> list[Quantity]:
     if not law.energy:
         return []
     of_losses = {t.term: relative(t.coefficient, t.std) for t in law.friction.terms}
-    found = [
-        Quantity(
-            f"energy lost per second by {in_letters(name)}",
-            e,
-            abs(e) * of_losses.get(name, 0.0),
-            unit,
-        )
-        for name, e in law.energy["lost"].items()
-    ]
+    found = []
+    for name, e in law.energy["lost"].items():
+        std = abs(e) * of_losses.get(name, 0.0)
+        found.append(Quantity(f"energy lost per second by {in_letters(name)}", e, std, unit))
     for name, e in law.energy["supplied"].items():
         strongest = max(law.gains[name].values(), key=lambda pair: abs(pair[0]))
         std = abs(e) * relative(*strongest)

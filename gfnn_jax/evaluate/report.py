@@ -46,15 +46,9 @@ def _of(result: Any, *names: str) -> dict[str, Any]:
 
 
 def _made(fit: Fit, scene: str | None, seed: int | None) -> dict[str, Any]:
-    return {
-        "verdict": fit.verdict,
-        "scene": scene,
-        "dt": float(np.asarray(fit.map.dt)),
-        "seed": seed,
-        "dtype": str(fit.map.scale.dtype),
-        "device": device(),
-        "versions": versions(),
-    }
+    found = {"verdict": fit.verdict, "scene": scene, "dt": float(np.asarray(fit.map.dt))}
+    found |= {"seed": seed, "dtype": str(fit.map.scale.dtype)}
+    return found | {"device": device(), "versions": versions()}
 
 
 def assemble(

@@ -344,9 +344,8 @@ class Formulas(Inputs):
         width = w.shape[-1]
         assert self.features is not None
         found = jets(traced(self.features, width // 2), w, order)
-        tables: list[np.ndarray] = [
-            np.zeros((1, len(found), *[width] * n), dtype=object) for n in range(order + 1)
-        ]
+        shapes = ((1, len(found), *[width] * n) for n in range(order + 1))
+        tables: list[np.ndarray] = [np.zeros(shape, dtype=object) for shape in shapes]
         for k, jet in enumerate(found):
             tables[0][:, k] = jet.value
             for i, slope in jet.slope.items():

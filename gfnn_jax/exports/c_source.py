@@ -69,12 +69,9 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
             "and formulas: use --to stablehlo"
         )
     inner = dataclasses.replace(map_, coordinates=CARTESIAN)  # what pieces move
-    graphs = [
-        graph_of(dataclasses.replace(inner, pieces=(piece,)))
-        if isinstance(piece, (Flow, LieFlow, DampedFlow))
-        else None
-        for piece in map_.pieces
-    ]
+    laws = [isinstance(piece, (Flow, LieFlow, DampedFlow)) for piece in map_.pieces]
+    alone = [dataclasses.replace(inner, pieces=(piece,)) for piece in map_.pieces]
+    graphs = [graph_of(own) if law else None for own, law in zip(alone, laws, strict=True)]
     sticks = any(graph is not None and graph.sticks for graph in graphs)
     map_ = jax.tree.map(np.asarray, map_)
     pieces, width, domain = map_.pieces, map_.width, map_.domain
@@ -105,9 +102,8 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     order = range(len(map_.pieces))
     ahead = args_after(map_)
     parts.append(_whole(map_, f"{name}_step", [f"piece{i}_step" for i in order], []))
-    parts.append(
-        _whole(map_, f"{name}_inverse", [f"piece{i}_back" for i in reversed(order)], ahead)
-    )
+    back = [f"piece{i}_back" for i in reversed(order)]
+    parts.append(_whole(map_, f"{name}_inverse", back, ahead))
     if of_samples(map_):
         parts.append(inputs_of_samples(map_, name))
     return "\n".join(parts)
@@ -124,11 +120,11 @@ def _flow(name: str, piece: Any, graph: LawGraph, width: int, inputs: int) -> li
     flow = re.sub(rf"\b({'|'.join(own)})\b", rf"{name}_\1", flow)
     later = args_later(f"{name}_later", on_symbols(piece.family), inputs)
     ways = (("step", dt), ("back", -dt))
-    return [flow, *([later] if later else [])] + [
-        f"static int {name}_{way}(double *z)\n{{\n"
-        f"    return {name}_flow(z, {literal(h)}, z + {width}, NULL);\n}}\n"
-        for way, h in ways
-    ]
+    found = [flow, later] if later else [flow]
+    for way, h in ways:
+        answer = f"{name}_flow(z, {literal(h)}, z + {width}, NULL)"
+        found.append(f"static int {name}_{way}(double *z)\n{{\n    return {answer};\n}}\n")
+    return found
 
 
 def _signature(map_: SymplecticMap, name: str) -> str:
@@ -158,11 +154,9 @@ def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str], ahead: Sequenc
     ]
     assert isinstance(domain, Domain)
     if domain.keep:
-        lines += [
-            "double kappa[1];",
-            "christoffel(y, kappa);",
-            f"inside = inside && kappa[0] <= {literal(float(np.asarray(domain.limit)))};",
-        ]
+        limit = literal(float(np.asarray(domain.limit)))
+        lines += ["double kappa[1];", "christoffel(y, kappa);"]
+        lines.append(f"inside = inside && kappa[0] <= {limit};")
     lines += inside_ranges(map_)
     lines += [
         "int status = OK;",

@@ -43,54 +43,35 @@ def casadi_function(map_: SymplecticMap, name: str, about: Mapping[str, Any]) ->
         sum(u[place] * t**n for n, place in enumerate(places)) + (t if graph.time == i else 0)
         for i, places in enumerate(graph.series)
     ]
-    inputs = {
-        "z": casadi.vertsplit(z),
-        "u": now,
-        "p": [dp[k] + value for k, value in enumerate(graph.values.tolist())],
-    }
-    rates = casadi.Function(
-        "rates", [z, u, dp, t], [casadi.vertcat(*rates_of(graph, inputs, functions))]
-    )
+    values = [dp[k] + value for k, value in enumerate(graph.values.tolist())]
+    inputs = {"z": casadi.vertsplit(z), "u": now, "p": values}
+    found = casadi.vertcat(*rates_of(graph, inputs, functions))
+    rates = casadi.Function("rates", [z, u, dp, t], [found])
     scale = casadi.DM(np.asarray(graph.scale))
     stages, h = casadi.SX.sym("stages", width, rule.nodes.size), casadi.SX.sym("h")
     inside = casadi.repmat(z, 1, rule.nodes.size) + stages @ casadi.DM(rule.coupling.T)
-    slopes = casadi.horzcat(
-        *(
-            h * weight * rates(inside[:, i], u, dp, t + node * h)
-            for i, (weight, node) in enumerate(zip(rule.weights, rule.nodes, strict=True))
-        )
-    )
+    each = enumerate(zip(rule.weights, rule.nodes, strict=True))
+    slopes = (h * w * rates(inside[:, i], u, dp, t + node * h) for i, (w, node) in each)
+    slopes = casadi.horzcat(*slopes)
     off = casadi.vec((stages - slopes) / casadi.repmat(scale, 1, rule.nodes.size))
     given = casadi.vertcat(z, u, dp, t, h)
-    solver = casadi.rootfinder(
-        "stages",
-        "newton",
-        {"x": casadi.vec(stages), "p": given, "g": off},
-        {"abstol": _FLOOR, "max_iter": 40},
-    )
+    equation = {"x": casadi.vec(stages), "p": given, "g": off}
+    rules = {"abstol": _FLOOR, "max_iter": 40}
+    solver = casadi.rootfinder("stages", "newton", equation, rules)
     again = casadi.Function("again", [casadi.vec(stages), given], [casadi.vec(slopes)])
-    Z, U, D, H = (
-        casadi.MX.sym(n, s)
-        for n, s in (("z", width), ("u", u.numel()), ("dp", dp.numel()), ("h", 1))
-    )
+    shapes = {"z": width, "u": u.numel(), "dp": dp.numel(), "h": 1}
+    Z, U, D, H = (casadi.MX.sym(name, size) for name, size in shapes.items())
     state, part = Z, H / piece.substeps
     for n in range(piece.substeps):
         args = casadi.vertcat(state, U, D, n * part, part)
-        begun = casadi.repmat(
-            part * rates(state, U, D, n * part) / rule.nodes.size, rule.nodes.size, 1
-        )
+        begun = part * rates(state, U, D, n * part) / rule.nodes.size
+        begun = casadi.repmat(begun, rule.nodes.size, 1)
         found = solver(begun, args)
         if not piece.newton:  # iterations contract
             found = again(again(found, args), args)
         state = state + casadi.sum2(casadi.reshape(found, width, rule.nodes.size))
-    step = casadi.Function(
-        name,
-        [Z, U, D, H],
-        [state],
-        ["z", "u", "dp", "h"],
-        ["Z"],
-        {"default_in": [0.0, 0.0, 0.0, graph.dt]},
-    )
+    names, default = ["z", "u", "dp", "h"], {"default_in": [0.0, 0.0, 0.0, graph.dt]}
+    step = casadi.Function(name, [Z, U, D, H], [state], names, ["Z"], default)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "step.casadi"
         step.save(str(path))

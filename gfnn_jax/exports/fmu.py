@@ -80,11 +80,8 @@ def _compiled(text: str, name: str) -> tuple[str, bytes]:
 def _source(graph: LawGraph, smooth: LawGraph, starts: list[float]) -> str:
     """Write the C of the FMU: ours, and the interface about it."""
     tape, found = rates_on_tape(smooth)
-    rates, count, coefficients = (
-        tape.function("rates_of", {"r": found}),
-        len(graph.arguments),
-        len(graph.values),
-    )
+    rates = tape.function("rates_of", {"r": found})
+    count, coefficients = len(graph.arguments), len(graph.values)
     time = "" if graph.time is None else f"    one->u[{graph.time}] = one->time;\n"
     stubs = [f"STUB(fmi3{own})" for own in _UNSERVED.split()]
     stubs += [f"STUB(fmi3{way}{kind})" for kind in _TYPES.split() for way in ("Get", "Set")]
@@ -293,9 +290,8 @@ def _description(
         rows.append(_variable(own, first + i, causality=kind, variability=how, start=start))
     for k, (term, value) in enumerate(zip(graph.terms, graph.values.tolist(), strict=True)):
         kind = {"causality": "parameter", "variability": "tunable", "start": repr(value)}
-        rows.append(
-            _variable(f"c{k + 1}", first + len(graph.arguments) + k, description=term, **kind)
-        )
+        place = first + len(graph.arguments) + k
+        rows.append(_variable(f"c{k + 1}", place, description=term, **kind))
     outputs = [*range(1, 1 + width), *range(1 + width, 1 + width + dim)]
     structure = [f'    <Output valueReference="{n}"/>' for n in outputs]
     for key in ("ContinuousStateDerivative", "InitialUnknown"):

@@ -106,13 +106,9 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
     """
     piece, bracket = map_.pieces[0], map_.bracket
     if len(map_.pieces) != 1 or not isinstance(piece, Flow | LieFlow | DampedFlow):
-        raise InputError(
-            "this map has no law, whose rates would be exported: use --to c or --to stablehlo"
-        )
+        raise InputError("this map has no law with rates to export: use --to c or --to stablehlo")
     if map_.coordinates.forward not in (CARTESIAN.forward, LOG.forward):
-        raise InputError(
-            f"this law is one in {map_.coordinates.name} coordinates: use --to c or --to stablehlo"
-        )
+        raise InputError(f"a law in {map_.coordinates.name} coordinates: --to c or --to stablehlo")
     sensors = map_.sensors
     map_ = jax.tree.map(np.asarray, map_)  # drops the sensors
     piece: Any = map_.pieces[0]
@@ -140,9 +136,7 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
         rates = [*gradient[dim:], *(-gradient[:dim])]
     count = len(inputs)
     series = [(i,) for i in range(len(base))]
-    series += [
-        tuple(len(base) + order * count + j for order in range(degree + 1)) for j in range(count)
-    ]
+    series += [tuple(len(base) + n * count + j for n in range(degree + 1)) for j in range(count)]
     none = np.zeros(len(base) + count)
     # Whether the family depends on time, the last of its args but for the inputs.
     advances = none.size and np.any(at_time(_held(piece.family), none, 1.0) != none)

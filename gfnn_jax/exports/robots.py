@@ -95,10 +95,7 @@ def robot_of(map_: SymplecticMap) -> Robot:
         raise InputError("expected a law of a recording: only a Lagrangian has links; use --to c")
     law, dim = law_of_map(map_), map_.dim
     if law.powers is not None:
-        raise InputError(
-            "this law is one of systems that differ in parameters, and MJCF and URDF hold one: use "
-            "--to fmu"
-        )
+        raise InputError("MJCF and URDF hold no law of systems that differ in parameters: --to fmu")
     if law.terms.leaders or law.terms.driven:
         raise InputError(
             "in this law some coordinates move others that do not act back on them, or terms have "
@@ -112,8 +109,7 @@ def robot_of(map_: SymplecticMap) -> Robot:
     gyroscopic = np.abs(law.momentum(q, none)).max()
     if best.off > Options.most or gyroscopic > 1e-9:
         raise InputError(
-            f"this law is not a planar chain of links: it differs from one by {best.off:.0%}: use "
-            "--to fmu or --to c"
+            f"no planar chain of links: the law differs by {best.off:.0%}: use --to fmu or c"
         )
     return _of_chain(map_, law, best)
 
@@ -180,10 +176,8 @@ def _lengths(chain: _Chain) -> tuple[np.ndarray, np.ndarray, float, list[str]]:
     dim = len(chain.a)
     if np.all(chain.weight > 0):
         beta = chain.weight / GRAVITY
-        lengths = [
-            chain.b[i, i + 1 :] @ beta[i + 1 :] / (beta[i + 1 :] @ beta[i + 1 :])
-            for i in range(dim - 1)
-        ]
+        behind = [beta[i + 1 :] for i in range(dim - 1)]
+        lengths = [chain.b[i, i + 1 :] @ own / (own @ own) for i, own in enumerate(behind)]
         return np.array([*lengths, 0.0]), beta, GRAVITY, []
     if np.any(chain.weight > 0):
         raise InputError("gravity acts on some links only: no chain of links; use --to fmu")
@@ -210,9 +204,7 @@ def _masses(chain: _Chain, lengths: np.ndarray, beta: np.ndarray) -> tuple[np.nd
             inertias[j] = left - moment * centres[j]
         else:
             return masses, centres, inertias
-    raise InputError(
-        f"link {j + 1} would have a negative inertia: the law as fitted is no chain that can exist"
-    )
+    raise InputError(f"link {j + 1} would have a negative inertia: no such chain can exist")
 
 
 def _of_rows(
@@ -221,9 +213,8 @@ def _of_rows(
     """Rows of damping and of dry friction, directions times ``turn``, and a note on others."""
     rows: dict[int, list[tuple[np.ndarray, float]]] = {LINEAR: [], DRY: []}
     notes: list[str] = []
-    for row, kind, size in zip(
-        friction.directions, friction.kinds.tolist(), np.asarray(losses), strict=True
-    ):
+    entries = zip(friction.directions, friction.kinds.tolist(), np.asarray(losses), strict=True)
+    for row, kind, size in entries:
         if kind in rows:
             rows[kind].append((row @ turn, float(size)))
         else:
@@ -290,20 +281,10 @@ def _of_arm(map_: SymplecticMap, law: BodiesLaw) -> Robot:
         m, centre = J[3, 3], J[:3, 3] / J[3, 3]
         second = J[:3, :3] - m * np.outer(centre, centre)
         about = np.trace(second) * np.eye(3) - second
-        links.append(
-            Link(
-                name,
-                bodies.parents[i],
-                bodies.sliding[i],
-                float(m),
-                centre,
-                about,
-                Rotation.from_matrix(np.asarray(bodies.rotations[i])),
-                np.asarray(bodies.origins[i]),
-                np.asarray(bodies.axes[i]),
-                float(law.rotors[i]),
-            )
-        )
+        joint = name, bodies.parents[i], bodies.sliding[i]
+        turned = Rotation.from_matrix(np.asarray(bodies.rotations[i]))
+        frame = turned, np.asarray(bodies.origins[i]), np.asarray(bodies.axes[i])
+        links.append(Link(*joint, float(m), centre, about, *frame, float(law.rotors[i])))
     damping, dry, left_out = _of_rows(law.friction, law.losses, np.eye(len(links)))
     offsets = ", ".join(f"{n} {c:.6g}" for n, c in zip(bodies.names, law.offsets, strict=True))
     notes = [f"constant forces that the joints hold against, left out: {offsets}", *left_out]
@@ -378,10 +359,8 @@ def mjcf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
         for row, size in rows:
             if _of_joint(row) is None:
                 along(row, f' {key}="{_text(size)}"')
-    motors = [
-        f'  <motor name={quoteattr(own)} tendon="{along(row)}"/>'
-        for own, row in robot.inputs.items()
-    ]
+    rows = robot.inputs.items()
+    motors = [f'  <motor name={quoteattr(own)} tendon="{along(row)}"/>' for own, row in rows]
     step = min(robot.dt, _STEP)
     # Friction that holds within two steps: MuJoCo's own lets a body creep that friction holds. The
     # arm of benchmarks/machines.py is 5 mrad off after 0.5 s by that, and 1 mrad by this. Of its
@@ -410,23 +389,18 @@ def urdf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     and rotors, is told in its comment. Raises InputError where the law is no chain.
     """
     robot = robot_of(map_)
-    told = [
-        f"friction along {row.tolist()} of the joints' velocities is left out: URDF has none"
-        for row, _ in (*robot.damping, *robot.dry)
-        if _of_joint(row) is None
-    ]
-    told += [
-        f"forces of the joints for a unit of {own}: {row.tolist()}"
-        for own, row in robot.inputs.items()
-    ]
+    others = [row.tolist() for row, _ in (*robot.damping, *robot.dry) if _of_joint(row) is None]
+    left_out = "of the joints' velocities is left out: URDF has none"
+    told = [f"friction along {row} {left_out}" for row in others]
+    forces = robot.inputs.items()
+    told += [f"forces of the joints for a unit of {own}: {row.tolist()}" for own, row in forces]
     rotors = ", ".join(f"{link.name} {link.rotor:.6g}" for link in robot.links if link.rotor)
     told += [f"inertias of rotors, left out: {rotors}"] if rotors else []
     parts = ['<?xml version="1.0"?>', f"<robot name={quoteattr(name)}>"]
     parts += [_comment(robot, about, told), '<link name="base"/>']
     for i, link in enumerate(robot.links):
-        entries = zip(
-            ("xx", "xy", "xz", "yy", "yz", "zz"), link.inertia[np.triu_indices(3)], strict=True
-        )
+        upper = link.inertia[np.triu_indices(3)]
+        entries = zip(("xx", "xy", "xz", "yy", "yz", "zz"), upper, strict=True)
         inertia = " ".join(f'i{at}="{_text(value)}"' for at, value in entries)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of one of many ways to name a rotation

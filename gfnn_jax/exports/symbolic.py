@@ -207,9 +207,7 @@ def equations_of_motion(
                 _collect(right, summand, term, -1.0)
         for term in friction.terms:
             _collect(right, _slope(as_sympy(term.term), sympy.Symbol(speeds[i])), term, -1.0)
-        sides = [
-            Formula(tuple(t for each in side.values() for t in each)) for side in (left, right)
-        ]
+        sides = [Formula(tuple(t for of in side.values() for t in of)) for side in (left, right)]
         found.append(_by_known_mass(Equation(sides[0], Formula((*sides[1].terms, *own)))))
     return tuple(found)
 

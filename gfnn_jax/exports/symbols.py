@@ -156,20 +156,14 @@ class Tape:
 
     def function(self, name: str, outputs: Mapping[str, Any]) -> str:
         """Write ``static void name(inputs, outputs)`` in C; outputs: name -> values, any shape."""
-        results = {
-            f"{output}[{i}]": value
-            for output, values in outputs.items()
-            for i, value in enumerate(np.ravel(np.asarray(values, dtype=object)).tolist())
-        }
+        flat = {n: np.ravel(np.asarray(of, dtype=object)).tolist() for n, of in outputs.items()}
+        results = {f"{n}[{i}]": value for n, of in flat.items() for i, value in enumerate(of)}
         sizes = {output: np.size(values) for output, values in outputs.items()}
         given = [f"const double {n}[{size}]" for n, size in self._inputs.items()]
         taken = [f"double {n}[{size}]" for n, size in sizes.items()]
         uses = self._uses(results.values())
-        used = {
-            s.operands[0].partition("[")[0]
-            for s in self._made
-            if s.operation == "input" and s.number in uses
-        }
+        read = [s for s in self._made if s.operation == "input" and s.number in uses]
+        used = {s.operands[0].partition("[")[0] for s in read}
         lines = [f"(void)({n});" for n in self._inputs if n not in used] + self.lines(results)
         body = [f"    {line}" for line in lines]
         return "\n".join([f"static void {name}({', '.join([*given, *taken])})", "{", *body, "}\n"])

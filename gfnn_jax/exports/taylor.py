@@ -590,14 +590,8 @@ def c_of_flow(graph: LawGraph, coefficients: bool = False, unrolled: bool | None
     unrolled: whether the sums are written out, by default those of small laws.
     """
     rows = _Rows(graph, None if coefficients else graph.values.tolist(), unrolled)
-    sizes = {
-        "DIM": graph.dim,
-        "WIDTH": rows.width,
-        "ORDER": Options.order,
-        "SIZE": rows.size,
-        "ROWS": rows.num,
-        "MOST_SERIES": Options.most,
-    }
+    sizes = {"DIM": graph.dim, "WIDTH": rows.width, "ORDER": Options.order, "SIZE": rows.size}
+    sizes |= {"ROWS": rows.num, "MOST_SERIES": Options.most}
     tables = {"double scale[WIDTH]": map(literal, graph.scale)}
     numbers = {"ROUNDING": Options.rounding}
     if not rows.unrolled:
@@ -681,10 +675,8 @@ def _written_out(rows: _Rows) -> str:
     z = inputs[: rows.width]
     for s in inputs:
         last = Options.order - 1 if s.number in rows.varies and s not in z else 0
-        lines += [
-            f"const double {rows.at(s, k)} = T[{rows.rows[s.number] * rows.size + k}];"
-            for k in range(last + 1)
-        ]
+        at = [(k, rows.rows[s.number] * rows.size + k) for k in range(last + 1)]
+        lines += [f"const double {rows.at(s, k)} = T[{place}];" for k, place in at]
     lines += [
         f"const double size{i} = ROUNDING*(fabs({rows.at(s, 0)}) + {literal(graph.scale[i])});"
         for i, s in enumerate(z)
@@ -700,10 +692,9 @@ def _written_out(rows: _Rows) -> str:
             lines.append(f"T[{place}] = {rows.at(s, k + 1)};")
         if k > Options.first and (k - Options.first) % 2 == 0:
             lines.append("power *= square;")
+            last = [(n, w) for n, w in ((k, "power"), (k + 1, "power*h"))]
             small = [
-                f"fabs({rows.at(s, n)}*{power}) <= size{i}"
-                for i, s in enumerate(z)
-                for n, power in ((k, "power"), (k + 1, "power*h"))
+                f"fabs({rows.at(s, n)}*{w}) <= size{i}" for i, s in enumerate(z) for n, w in last
             ]
             lines += [f"if ({' && '.join(small)})", f"    return {k + 1};"]
     lines.append("return ORDER;")

@@ -54,10 +54,8 @@ from gfnn_jax.storage.outputs import (
 )
 
 PAPER_GFNN, OURS = "gfnn-paper", "gfnn"
-TITLES = {name: method.title for name, method in METHODS.items()} | {
-    PAPER_GFNN: "GFNN (paper)",
-    OURS: "GFNN (ours)",
-}
+TITLES = {name: method.title for name, method in METHODS.items()}
+TITLES |= {PAPER_GFNN: "GFNN (paper)", OURS: "GFNN (ours)"}
 _NUM_DEFECTS = 200
 _MODEL = ("learns", "family", "label", "chart", "num_parameters")
 _NO_MAP = {"chart_determinant_min": None, "newton_iterations_max": None}
@@ -132,12 +130,8 @@ def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollout
     z = data.sequences(2).z[:num_pairs]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)  # kept in fit.messages
-        fit = search(
-            Pairs(z[:, 0], z[:, 1], scene.dt),
-            scene,
-            FitOptions(tolerance=tolerance, learn="map", seed=data.seed),
-            progress=progress,
-        )
+        asked = FitOptions(tolerance=tolerance, learn="map", seed=data.seed)
+        fit = search(Pairs(z[:, 0], z[:, 1], scene.dt), scene, asked, progress=progress)
     told = fit.replaced(defect_known=False).report()  # the defect is that of all methods' states
     error = _rms(data, fit.map.step(data.fresh.z0)[0])
     part = {
@@ -270,19 +264,12 @@ def compare(
         raise InputError(f"the scene {name} is driven, and the other methods do not take the time")
     cap = (QUICK_CAP if quick else CAP) if cap is None else cap
     chosen = chosen_methods(methods, scene)
-    job = {
-        "command": "compare",
-        "scene": name,
-        "seed": seed,
-        "quick": quick,
-        "cap": cap,
-        "version": versions()["gfnn_jax"],
-    }
+    job = {"command": "compare", "scene": name, "seed": seed, "quick": quick, "cap": cap}
+    job["version"] = versions()["gfnn_jax"]
     if output.resume and _already_done(output.out, job, chosen):
         return None
-    with unfinished(
-        output.out, job, what="comparison", overwrite=output.overwrite, resume=output.resume
-    ) as kept_in:
+    given = {"overwrite": output.overwrite, "resume": output.resume}
+    with unfinished(output.out, job, what="comparison", **given) as kept_in:
         data = SharedData(scene, seed, quick)
         for method in chosen:
             if (kept_in / f"{method}.json").exists():
@@ -291,15 +278,11 @@ def compare(
             try:
                 part, rollouts = learn_and_roll(method, data, cap * RATE, progress)
             except ValueError as error:  # the results of the other methods are kept
-                raise WorkError(
-                    f"{TITLES[method]}: {error} (leave it out with --methods; --resume keeps the "
-                    "others)"
-                ) from error
+                ways = "leave it out with --methods; --resume keeps the others"
+                raise WorkError(f"{TITLES[method]}: {error} ({ways})") from error
             _keep(kept_in, method, part, rollouts)
-            progress.line(
-                f"{TITLES[method]}: one-step error {part['fit']['validation_rms']:.2e}, "
-                f"{part['fit']['seconds']:.1f} s"
-            )
+            seconds, error = part["fit"]["seconds"], part["fit"]["validation_rms"]
+            progress.line(f"{TITLES[method]}: one-step error {error:.2e}, {seconds:.1f} s")
         progress.status("reference, measures and figures")
         reported, measured = {}, {}
         for method in chosen:
@@ -359,13 +342,9 @@ def _curve(error) -> dict[str, Any]:
     """Statistics of an error (B, L) at about 13 steps a decade."""
     steps = np.unique(np.round(np.geomspace(1, error.shape[1] - 1, 40)).astype(int))
     statistics = metrics.error_statistics(error)
-    return {
-        "steps": steps.tolist(),
-        **{
-            name: [float(f"{v:.4e}") for v in getattr(statistics, name)[steps]]
-            for name in ("mean", "std", "median")
-        },
-    }
+    names = ("mean", "std", "median")
+    found = {n: [float(f"{v:.4e}") for v in getattr(statistics, n)[steps]] for n in names}
+    return {"steps": steps.tolist(), **found}
 
 
 # Finished methods: a .json and a .npz for each, written whole or not at all.

@@ -135,14 +135,10 @@ def _coordinates(scene: Scene, predicted: dict[str, Any], reference):
 def _marginals(scene: Scene, predicted: dict[str, Any], reference):
     """Draw the histograms that the KL divergences compare, a panel for each coordinate."""
     ours = {n: marginal_samples(scene, z) for n, z in predicted.items()}
-    panels = {
-        label: (
-            samples,
-            {n: s[label][0] for n, s in ours.items()},
-            histogram_range(samples, natural),
-        )
-        for label, (samples, natural) in marginal_samples(scene, reference).items()
-    }
+    panels = {}
+    for label, (samples, natural) in marginal_samples(scene, reference).items():
+        own = {n: s[label][0] for n, s in ours.items()}
+        panels[label] = samples, own, histogram_range(samples, natural)
     return figures.marginal_panels(panels, BINS)
 
 
@@ -177,9 +173,8 @@ def divergences(scene: Scene, predicted, reference) -> dict[str, float] | None:
     if scene.regular:
         return None
     ours, theirs = (marginal_samples(scene, states) for states in (predicted, reference))
-    return {
-        label.strip("$"): metrics.kl_divergence(
-            samples, theirs[label][0], BINS, histogram_range(*theirs[label])
-        )
-        for label, (samples, _) in ours.items()
-    }
+    found = {}
+    for label, (samples, _) in ours.items():
+        range_ = histogram_range(*theirs[label])
+        found[label.strip("$")] = metrics.kl_divergence(samples, theirs[label][0], BINS, range_)
+    return found

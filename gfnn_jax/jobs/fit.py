@@ -82,11 +82,10 @@ def fit(
     size = sum(path.stat().st_size for path in data if path.is_file())
     large = processes is not None or len(data) > 1 or size > _LARGE_BYTES
     started = time.perf_counter()
-    trajectories = (
-        read_sample(data, dt=dt, group=processes)
-        if large
-        else read_trajectories(data[0], dt=dt, fewest=fewest)
-    )
+    if large:
+        trajectories = read_sample(data, dt=dt, group=processes)
+    else:
+        trajectories = read_trajectories(data[0], dt=dt, fewest=fewest)
     reading = time.perf_counter() - started
     if not group.first:
         progress.status("waiting for the map of a sample")
@@ -97,26 +96,16 @@ def fit(
         return None
     for text in summary(trajectories):
         progress.line(text)
-    job = {
-        "command": "fit",
-        "data": trajectories.digest,
-        "dt": None if np.ndim(trajectories.dt) else trajectories.dt,
-        "scene": scene_name,
-        **asked.deciding,
-    }
+    own_dt = None if np.ndim(trajectories.dt) else trajectories.dt
+    job = {"command": "fit", "data": trajectories.digest, "dt": own_dt, "scene": scene_name}
+    job |= asked.deciding
     if output.holds(job):
         group.broadcast({})
         return None
     with output.unfinished(job) as kept_in:
         try:
-            fitted = search(
-                trajectories.pairs(),
-                scene,
-                asked,
-                progress=progress,
-                spent=reading,
-                kept=(kept_in, job),
-            )
+            watched = {"progress": progress, "spent": reading, "kept": (kept_in, job)}
+            fitted = search(trajectories.pairs(), scene, asked, **watched)
             why, again = why_not(fitted.map), None
             if fitted.chosen.learns == "hamiltonian" and anything_told(asked.terms):
                 why = "a refit keeps nothing that is told of coefficients"

@@ -116,9 +116,7 @@ class _Model:
     def __init__(self, folder: Path, columns: Mapping[str, Any]):
         self.map: SymplecticMap = load(folder)
         if self.map.sensors is None:
-            raise InputError(
-                f"{folder}: was not learned from a recording: --initial needs states q, p"
-            )
+            raise InputError(f"{folder}: not learned from a recording: --initial needs states q, p")
         self.sensors = self.map.sensors
         self.job = record(folder).get("job", {})
         varied = () if self.map.parameters is None else self.map.parameters.names

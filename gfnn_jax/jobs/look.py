@@ -41,10 +41,8 @@ def look(
 def _of_states(paths: Sequence[Path], options: Mapping[str, Any]) -> Recording:
     """The recording of one array file of trajectories, a run each."""
     if len(paths) > 1 or set(options) - {"dt"}:
-        raise InputError(
-            f"{paths[0]}: holds states q, p in an array: look at one such file, without options "
-            "about columns"
-        )
+        which = "holds states q, p in an array: look at one such file, without column options"
+        raise InputError(f"{paths[0]}: {which}")
     data = read_trajectories(paths[0], dt=options.get("dt"), fewest=1)
     if max(data.lengths) < 3 or np.ndim(data.dt):
         raise InputError(f"{paths[0]}: expected runs of states at one time step, got pairs")

@@ -52,9 +52,8 @@ class Output:
 
     def unfinished(self, job: dict[str, Any]) -> AbstractContextManager[Path]:
         """Open the folder in which this job keeps its work (`storage.outputs.unfinished`)."""
-        return unfinished(
-            self.out, job, what=job["command"], overwrite=self.overwrite, resume=self.resume
-        )
+        asked = {"overwrite": self.overwrite, "resume": self.resume}
+        return unfinished(self.out, job, what=job["command"], **asked)
 
     def holds(self, job: dict[str, Any], model: str = ".") -> bool:
         """Return whether a resumed job had already finished, by the record of its model."""
@@ -113,11 +112,9 @@ def digest_of(*arrays: Any) -> str:
 
 def units_of(recording: Recording) -> dict[str, Any]:
     """Entries of a model's job by which `read_in_units` reads another recording in its units."""
-    return {
-        "degrees": [name for name, factor in recording.factors.items() if factor != 1],
-        "time_unit": recording.time_unit,
-        "units": {name: recording.unit(name) for name in recording.columns},
-    }
+    degrees = [name for name, factor in recording.factors.items() if factor != 1]
+    units = {name: recording.unit(name) for name in recording.columns}
+    return {"degrees": degrees, "time_unit": recording.time_unit, "units": units}
 
 
 def read_in_units(path: Any, job: dict[str, Any], roles: dict[str, Any]) -> Recording:
@@ -152,10 +149,8 @@ def refuse_other_units(recording: Recording, job: dict[str, Any]) -> None:
         angles = all(unit.strip().lower().startswith(_ANGLES) for unit in (own, known))
         same = angles and own.partition("/")[2] == known.partition("/")[2]
         if own and known and own != known and not same:
-            raise InputError(
-                f"{recording.source}: expected {name} in {known}, in which the model was learned, "
-                f"got {own}"
-            )
+            learned = f"expected {name} in {known}, in which the model was learned"
+            raise InputError(f"{recording.source}: {learned}, got {own}")
 
 
 BEST = "best"
@@ -215,11 +210,10 @@ def line(candidate: Candidate) -> str:
     The error is estimated from the gradient's residual until steps have validated it.
     """
     first = "" if candidate.validated else "first estimated at "
-    return (
-        f"{candidate.chart} {candidate.label}: one-step error {first}"
-        f"{candidate.validation_relative:.2e} of the spread, "
-        f"{candidate.num_parameters} parameters"
+    about = (
+        f"{candidate.validation_relative:.2e} of the spread, {candidate.num_parameters} parameters"
     )
+    return f"{candidate.chart} {candidate.label}: one-step error {first}{about}"
 
 
 @contextlib.contextmanager

@@ -69,10 +69,8 @@ class Steps:
     def check(self) -> None:
         """Raises InputError where the options contradict each other."""
         if self.save_every > abs(self.num_steps):
-            raise InputError(
-                f"expected --save-every of at most {abs(self.num_steps)} (--num-steps), got "
-                f"{self.save_every}"
-            )
+            most = f"expected --save-every of at most {abs(self.num_steps)} (--num-steps)"
+            raise InputError(f"{most}, got {self.save_every}")
         if self.horizon is not None and self.samples is None:
             raise InputError("--horizon needs --samples: the band is the spread of samples")
 
@@ -99,9 +97,8 @@ class _Begin(NamedTuple):
 
     def of(self, lanes: slice) -> _Begin:
         of_samples = None if self.of_samples is None else self.of_samples[:, lanes]
-        return _Begin(
-            self.z0[lanes], None if self.params is None else self.params[lanes], of_samples
-        )
+        params = None if self.params is None else self.params[lanes]
+        return _Begin(self.z0[lanes], params, of_samples)
 
 
 def predict(
@@ -227,10 +224,8 @@ def _states_of(map_: SymplecticMap, model: Path, initial: Path) -> tuple[np.ndar
             "with their columns, or an .npz with z0 and an array of each name"
         )
     if z0.ndim != 2 or z0.shape[1] != bracket.size or not np.isfinite(z0).all():
-        raise InputError(
-            f"{initial}: expected states {', '.join(bracket.labels)} that are finite, got an array "
-            f"{z0.shape}"
-        )
+        wanted = f"states {', '.join(bracket.labels)} that are finite"
+        raise InputError(f"{initial}: expected {wanted}, got an array {z0.shape}")
     try:
         bracket.require_inside(z0)
     except FitError as error:
@@ -247,9 +242,7 @@ def _last_states(map_: SymplecticMap, model: Path, initial: Path) -> np.ndarray:
     refuse_other_units(recording, job)
     ends = np.array([recording.array("positions", run)[-2:] for run in recording.runs])
     if ends.shape[1:] != (2, map_.dim) or not np.isfinite(ends).all():
-        raise InputError(
-            f"{initial}: expected two positions of {map_.dim} coordinates at the end of every run"
-        )
+        raise InputError(f"{initial}: expected two positions ({map_.dim},) at the end of every run")
     return np.asarray(map_.step(map_.from_positions(ends[:, 0], ends[:, 1]))[0])
 
 
@@ -280,16 +273,10 @@ class _Prediction:
             if TIME in names:
                 drive = params[:, -1], float(np.asarray(parameters.period))
                 own = (names[:-1], params[:, :-1]) if len(names) > 1 else None
-        return PredictionJob(
-            identity,
-            begin.z0.shape,
-            self.asked.num_steps,
-            abs(float(self.map.dt)),
-            self.asked.save_every,
-            self.drawn is not None,
-            own,
-            drive,
-        )
+        asked, dt = self.asked, abs(float(self.map.dt))
+        bands = self.drawn is not None
+        known = asked.num_steps, dt, asked.save_every, bands, own, drive
+        return PredictionJob(identity, begin.z0.shape, *known)
 
     def written(self, out: Path, begin: _Begin, identity: dict[str, Any]) -> Predicted:
         """Predict these lanes into one file."""
@@ -313,10 +300,8 @@ class _Prediction:
         except KeyboardInterrupt as stop:
             if not writer.finished:
                 done = max(0, writer.saved - 1) * asked.save_every
-                stop.add_note(
-                    f"{writer.partial} keeps {done} of {abs(asked.num_steps)} steps: --resume goes "
-                    "on with it"
-                )
+                kept = f"{writer.partial} keeps {done} of {abs(asked.num_steps)} steps"
+                stop.add_note(f"{kept}: --resume goes on with it")
             raise
         return Predicted(status, left_at, time.perf_counter() - started, passed)
 

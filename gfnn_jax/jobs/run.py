@@ -86,19 +86,10 @@ def run(
     with refusals():
         asked = FitOptions(**{**usual, **options})
     if asked.family == "features" and scene.features is None:
-        raise InputError(
-            f"family 'features' needs features, and the scene {name} declares none: choose another "
-            "family"
-        )
+        raise InputError(f"family 'features': the scene {name} declares none, take another family")
     num_trajectories = sizes.trajectories
-    job = {
-        "command": "run",
-        "scene": name,
-        "dt": scene.dt,
-        "num_pairs": num_pairs,
-        "quick": quick,
-        **asked.deciding,
-    }
+    job = {"command": "run", "scene": name, "dt": scene.dt, "num_pairs": num_pairs}
+    job |= {"quick": quick, **asked.deciding}
     if output.holds(job, MODEL):
         return None
     with output.unfinished(job) as kept_in:
@@ -116,10 +107,8 @@ def run(
         progress.status(f"rollouts of {NUM_STEPS} steps")
         rollouts = map_rollouts(fitted.map, z0, **given)
         measured = measure(rollouts, scene, reference, given["params"])
-        result = fitted.report(
-            rollout=measured.report,
-            data={"source": "reference data of the scene", "digest": pairs_digest(pairs)},
-        )
+        origin = {"source": "reference data of the scene", "digest": pairs_digest(pairs)}
+        result = fitted.report(rollout=measured.report, data=origin)
         progress.status("figures")
         with atomic_folder(output.out) as folder:
             write(folder, folder / MODEL, fitted, result, job)
@@ -150,9 +139,7 @@ def _band(map_: SymplecticMap, z0, predicted, given: dict[str, Any]) -> np.ndarr
     if map_.posterior is None:
         return None
     few = slice(WHOLE.band_trajectories)
-    own: dict[str, Any] = {
-        name: None if values is None else values[few] for name, values in given.items()
-    }
+    own: dict[str, Any] = {n: None if x is None else x[few] for n, x in given.items()}
     samples = map_.sample(jax.random.key(0), WHOLE.band_samples)
     drawn, _ = samples.rollout(z0[few], predicted.shape[1] - 1, **own)
     std = bands(drawn, predicted[few], map_.angles_of_z).std

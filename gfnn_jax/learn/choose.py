@@ -106,9 +106,8 @@ def choose(searched: Searched, request: Request) -> Chosen:
     best = ranking[0].candidate if ranking else None
     if law is None or not (best is None or preferred(law.candidate, best, request.tolerance)):
         return _of_ranking(ranking, request)
-    request.watch.on_progress(
-        f"compiling the flow of {law.candidate.label}{request.budget.compilation}"
-    )
+    named = f"{law.candidate.label}{request.budget.compilation}"
+    request.watch.on_progress(f"compiling the flow of {named}")
     candidate, seconds, *_ = flow_assembled(law, *given)
     expected = max(bound, OPTIONS.confirmed * law.candidate.validation_bound)
     if best is not None and not candidate.validation_bound <= expected:
@@ -159,9 +158,8 @@ def _smaller(
         return
     sweep = min(tried, key=lambda t: t[1])[2].sweep
     least = min(sweep.sizes.index(e.size) for _, _, e in tried if e.sweep is sweep)
-    for entry in _validated(
-        sweep, sweep.sizes[:least][: -OPTIONS.smaller - 1 : -1], budget, on_progress
-    ):
+    sizes = sweep.sizes[:least][: -OPTIONS.smaller - 1 : -1]
+    for entry in _validated(sweep, sizes, budget, on_progress):
         yield entry
         if not tried[-1][1]:
             return
@@ -232,12 +230,9 @@ def _stated(chosen: Chosen, found: Searched, by: str, rows, images) -> Chosen:
     """The error of these rows' images (n, 2d) in the user's coordinates."""
     error = measured_error(found.data, found.tolerance, images, rows)
     error = error._replace(bound=float(np.hypot(error.bound, _of_steps(chosen, found))))
-    return chosen._replace(
-        candidate=with_error(chosen.candidate, error),
-        by=by,
-        stated_by=_stated_by(by, found, rows),
-        few=of_few(error_of_each(found.data, found.tolerance, images, rows), found.tolerance),
-    )
+    candidate, told = with_error(chosen.candidate, error), _stated_by(by, found, rows)
+    few = of_few(error_of_each(found.data, found.tolerance, images, rows), found.tolerance)
+    return chosen._replace(candidate=candidate, by=by, stated_by=told, few=few)
 
 
 def _stated_by(by: str, found: Searched, rows: np.ndarray) -> str:
@@ -268,9 +263,8 @@ def _of_steps(chosen: Chosen, found: Searched) -> float:
     rows = np.arange(0, len(data), -(-len(data) * data.y0.shape[1] // OPTIONS.numbers))
     (dt, args), flow = data.given(rows), law.flow
     steps = Steps(flow.stages, flow.over(np.max(data.each_dt)).substeps)
-    off = truncation(
-        flow.family, np.asarray(flow.params), data.y0[rows], dt, steps, args=args, scale=data.scale
-    )
+    states, params = data.y0[rows], np.asarray(flow.params)
+    off = truncation(flow.family, params, states, dt, steps, args=args, scale=data.scale)
     square = np.mean((off / data.scale) ** 2, axis=1)
     square = square[np.isfinite(square)]
     bound = bound_of_mean(square, np.arange(len(square)), OPTIONS.worst) if len(square) > 1 else 0.0
@@ -285,11 +279,11 @@ def of_few(errors: np.ndarray, tolerance: Tolerance) -> str:
     if not FEW * np.median(errors) < rms < np.inf or rms < OPTIONS.matters * tolerance.bound:
         return ""
     unit = " of the spread" if tolerance.relative else ""
-    return (
-        f"few states make most of the error: nine of ten err by less than "
-        f"{np.quantile(errors, OPTIONS.nine_of_ten):.1e}{unit}. "
+    most = f"nine of ten err by less than {np.quantile(errors, OPTIONS.nine_of_ten):.1e}{unit}"
+    bound = (
         "The 95 % bound of the RMS does not hold for other states: quote the error of nine of ten"
     )
+    return f"few states make most of the error: {most}. {bound}"
 
 
 def _by_folds(
@@ -375,10 +369,8 @@ def _of_law(law: LearnedHamiltonian, data: Dataset) -> _Refits:
 
     def predicts(parts: list[np.ndarray]) -> list[np.ndarray]:
         without = without_each(problem, family, coefficients, steps, parts)
-        images = (
-            problem.images(family, c, part, steps).states
-            for c, part in zip(without, parts, strict=True)
-        )
+        fits = zip(without, parts, strict=True)
+        images = (problem.images(family, c, part, steps).states for c, part in fits)
         return [to_user(data.coordinates, states) for states in images]
 
     return _Refits(predicts, FLOW, work_of_refit(flow.family, len(data), data.dim, steps))
@@ -403,12 +395,10 @@ def with_test_rows(chosen: Chosen, found: Searched, budget: Budget) -> Chosen:
     if not again.validation_rms <= before.validation_rms:
         return chosen
     params = jax.tree.map(np.asarray, size.family.unflatten(again.coefficients))
-    pieces = tuple(
-        dataclasses.replace(piece, params=jax.device_put(params))
-        if isinstance(piece, Generated)
-        else piece
-        for piece in candidate.map.pieces
-    )
+    fitted = [isinstance(piece, Generated) for piece in candidate.map.pieces]
+    own = {"params": jax.device_put(params)}
+    each = zip(candidate.map.pieces, fitted, strict=True)
+    pieces = tuple(dataclasses.replace(p, **own) if is_s else p for p, is_s in each)
     map_ = dataclasses.replace(candidate.map, pieces=pieces)
     return chosen._replace(
         candidate=dataclasses.replace(candidate, map=map_),

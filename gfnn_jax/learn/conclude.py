@@ -87,9 +87,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     if met:
         messages += [] if structured else _hidden(chosen, searched)
         ended = _with_clock(ended, request.budget)
-        return Conclusion(
-            ended, searched.data.noise_of_channels, [*messages, *request.budget.left_out]
-        )
+        messages += request.budget.left_out
+        return Conclusion(ended, searched.data.noise_of_channels, messages)
     diagnosis: list[str] = []
     jumps = wrapped(request.pairs, request.coordinates)
     if jumps:
@@ -178,11 +177,8 @@ def _stalled(candidate: Candidate, entry: Entry | None, searched: Searched) -> b
     if entry is None and not found.ranking:
         return searched.law is not None and searched.law.stalled
     limit = candidate.validation_relative / GAINED
-    return any(
-        (e.candidate.chart, e.candidate.family) in found.stalled
-        and e.candidate.validation_relative <= limit
-        for e in found.entries
-    )
+    near = [e.candidate for e in found.entries if e.candidate.validation_relative <= limit]
+    return any((candidate.chart, candidate.family) in found.stalled for candidate in near)
 
 
 class _LeftOver(NamedTuple):
@@ -244,9 +240,8 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
             "that the states do not hold (a mass, a length, a field) differs. Give it as a "
             "parameter (a column of its own, args=), or fit the sequences of one value alone"
         )
-        return _LeftOver(
-            None, [message], "a quantity that the states do not hold differs between the sequences"
-        )
+        ended = "a quantity that the states do not hold differs between the sequences"
+        return _LeftOver(None, [message], ended)
     if not stalled:
         return _LeftOver(None, [])
     some, size = (
@@ -303,11 +298,8 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     if known is not None:
         return known
     if data.noise_of_channels is None and _noise_by_neighbours(sample) is None:
-        return _LeftOver(
-            None,
-            [],
-            "the pairs lie too far apart to distinguish noise from what these functions lack",
-        )
+        apart = "the pairs lie too far apart to distinguish noise from what these functions lack"
+        return _LeftOver(None, [], apart)
     rows, sequence = sample.rows, sample.sequence
     taken = candidate.num_parameters / (data.training.size * 2 * data.dim)
     noise = state_noise(candidate.map, data.pairs.take(rows[: Options.noise_pairs]), taken)
@@ -332,16 +324,13 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     hidden, reason = "", "the residuals are noise"
     if len(np.unique(sequence)) == len(sequence):
         hidden = (
-            ". Single pairs cannot distinguish noise from something that the states do not hold (a "
-            "parameter, a drive)"
+            ". Single pairs cannot distinguish noise from what states do not hold (a drive, say)"
         )
         reason += ", or something that the states do not hold"
     alone = law is not None and not (hidden or law.misfit)
     if law is not None and alone and leaves_white(law.flow, searched.data):
-        message = (
-            "the residuals of H are white: these pairs do not contradict H. They are noise of "
-            f"about {sizes_of_noise}"
-        )
+        white = "the residuals of H are white: these pairs do not contradict H"
+        message = f"{white}. They are noise of about {sizes_of_noise}"
         return _LeftOver(noise, [message], _WHITE)
     message = f"the residuals are noise of about {sizes_of_noise}{own}{hidden}"
     return _LeftOver(noise, [message], reason)
@@ -370,9 +359,7 @@ def _left_of_sites(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOv
     few = max(1, Options.noise_numbers // (2 * data.dim))
     rows = np.sort(data.training)[:few]
     noise = noise_of_sites(chosen.candidate.map, data.pairs.take(rows))
-    message = (
-        "other terms of the structure are no more accurate: the residuals are noise of about "
-        f"{noise[0]:.1e} on positions and {noise[-1]:.1e} on momenta, or terms that were not tried "
-        "(give known ones: --terms)"
-    )
+    noises = f"noise of about {noise[0]:.1e} on positions and {noise[-1]:.1e} on momenta"
+    others = "other terms of the structure are no more accurate: the residuals are"
+    message = f"{others} {noises}, or terms that were not tried (give known ones: --terms)"
     return _LeftOver(noise, [message])

@@ -105,16 +105,10 @@ def fit(data: Any, scene: Any = None, *, options: FitOptions | None = None, **ch
             if of_map:
                 return _told(learn_positions(pairs, options, watch))
             try:
-                law = fit_recording(
-                    pairs,
-                    friction=options.friction,
-                    input_hold=options.input_hold,
-                    mass=options.mass,
-                    terms=tuple(options.terms),
-                    loss=options.loss,
-                    hidden=options.hidden,
-                    on_progress=watch.on_progress,
-                )
+                names = ("friction", "input_hold", "mass", "loss", "hidden")
+                asked = {name: getattr(options, name) for name in names}
+                terms, report = tuple(options.terms), watch.on_progress
+                law = fit_recording(pairs, terms=terms, on_progress=report, **asked)
             except FitError as error:
                 if error.fit is not None:
                     error.fit = Fit(error.fit.map, error.fit, {"verdict": error.verdict}, pairs)
@@ -135,12 +129,8 @@ def fit(data: Any, scene: Any = None, *, options: FitOptions | None = None, **ch
         taken = paid_for(identified(request.pairs), budget, options.seed)
         request = dataclasses.replace(request, pairs=taken.pairs)
         watch.on_progress(f"estimating local Jacobians from {len(taken.pairs):,} pairs")
-        data, about_pairs = clean(
-            taken,
-            request.coordinates,
-            request.structure,
-            jumps=bool(wrapped(request.pairs, request.coordinates)),
-        )
+        jumps = bool(wrapped(request.pairs, request.coordinates))
+        data, about_pairs = clean(taken, request.coordinates, request.structure, jumps=jumps)
         warn(about_pairs)
         count = len(request.pairs)
         if not_looked_at := count - len(looked_for_errors(count)):
@@ -277,10 +267,8 @@ def _of_arrays(t: Any, x: Any) -> Recording:
         kinds = f"{times.dtype} and {positions.dtype}"
         raise InputError(f"expected t and x of real numbers, got {kinds}")
     if not np.isfinite(times).all():
-        raise InputError(
-            f"expected finite times, got {times[~np.isfinite(times)][0]} in row "
-            f"{int(np.argmin(np.isfinite(times)))}"
-        )
+        row = int(np.argmin(np.isfinite(times)))
+        raise InputError(f"expected finite times, got {times[row]} in row {row}")
     columns = positions.reshape(len(positions), -1).T
     named = {f"x{i}": column for i, column in enumerate(columns, start=1)}
     return Recording({"t": times, **named}, positions=list(named))
@@ -296,11 +284,8 @@ def _devices(devices: int | str | None) -> tuple[Any, ...]:
 
 def _all_candidates(chosen: Chosen, found: Searched) -> tuple[Candidate, ...]:
     """Every candidate by rising operations, the chosen one as its own steps showed it."""
-    others = [
-        e.candidate
-        for e in found.found.entries
-        if chosen.entry is None or e.size is not chosen.entry.size
-    ]
+    own = None if chosen.entry is None else chosen.entry.size
+    others = [e.candidate for e in found.found.entries if own is None or e.size is not own]
     if found.law is not None and chosen.candidate.learns == "map":
         others.append(found.law.candidate)
     candidates = [*others, dataclasses.replace(chosen.candidate, chosen=True, map=None)]

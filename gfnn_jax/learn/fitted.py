@@ -149,9 +149,8 @@ class Choice:
     def law(self) -> LearnedHamiltonian | None:
         """H, where one was found that meets the tolerance or was chosen."""
         law = self.hamiltonian
-        known = law is not None and (
-            self.chosen.learns == "hamiltonian" or self.asked.met_by(law.candidate)
-        )
+        chosen = self.chosen.learns == "hamiltonian"
+        known = law is not None and (chosen or self.asked.met_by(law.candidate))
         return law if known else None
 
     @property
@@ -177,10 +176,8 @@ class Choice:
             return f"one of several: {self.several}"
         relative = self.chosen.validation_relative
         if relative > _Options.hides:
-            return (
-                f"one of several: noise of {relative:.0%} of the spread in a step hides what "
-                "another law would leave"
-            )
+            hides = f"noise of {relative:.0%} of the spread in a step hides what another law"
+            return f"one of several: {hides} would leave"
         rivals = [rival.formula for rival in law.rivals if rival.odds < EVIDENCE.decided]
         if rivals:
             return f"one of several: {'; '.join(rivals)} is as likely"
@@ -380,12 +377,8 @@ class Fit:
                 found = getattr(own["found"], name)
                 return said(found) if isinstance(found, str) else found
             if hasattr(own["map"], name):
-                warnings.warn(
-                    f"fit.{name} is fit.map.{name}: a fit is no map, and will not stand for it in "
-                    "the next version",
-                    DeprecationWarning,
-                    stacklevel=2,
-                )
+                told = f"fit.{name} is fit.map.{name}: a fit is no map, and will not stand for it"
+                warnings.warn(f"{told} in the next version", DeprecationWarning, stacklevel=2)
                 return getattr(own["map"], name)
         known = [n for n in {*dir(type(self)), *dir(own.get("found"))} if not n.startswith("_")]
         near = difflib.get_close_matches(name, known, n=1)
@@ -547,12 +540,9 @@ class Fit:
         messages = self.budget.left_out[known:]
         for message in messages:
             warnings.warn(message, FitWarning, stacklevel=2)
-        found = self.replaced(
-            map=map_,
-            messages=(*self.messages, *messages),
-            defect_known=defect is not None,
-            seconds=self.budget.seconds,
-        )
+        told, seconds = (*self.messages, *messages), self.budget.seconds
+        known = defect is not None
+        found = self.replaced(map=map_, messages=told, defect_known=known, seconds=seconds)
         if defect is not None:
             found.__dict__["symplecticity_defect"] = defect
         return found

@@ -100,10 +100,7 @@ def fit_monitors(
     if set(recording.angles) & {n for names in places for n in names}:
         raise InputError("expected displacements at monitors, got angles")
     if len(between) != len(places):
-        raise InputError(
-            f"expected {len(places)} stretches between {len(places)} places of a ring, got "
-            f"{len(between)}"
-        )
+        raise InputError(f"expected {len(places)} stretches, as many as places, got {len(between)}")
     known = tuple(_matrix(stretch, len(places[0])) for stretch in between)
     if all(m is None for m in known) or all(m is not None for m in known):
         raise InputError("between: expected some stretches that are known, and some None")
@@ -122,11 +119,8 @@ def fit_monitors(
     dt = turn / len(places)
     pairs = [_pairs(states, k, dt) for k in range(len(places))]
     stretches = list(zip(pairs, known, strict=True))
-    learned = {
-        k: fit(own, learn="map", **options)
-        for k, (own, matrix) in enumerate(stretches)
-        if matrix is None
-    }
+    unknown = {k: own for k, (own, matrix) in enumerate(stretches) if matrix is None}
+    learned = {k: fit(own, learn="map", **options) for k, own in unknown.items()}
     first, one = next(iter(learned.items()))
     whole = [
         learned[k].map if matrix is None else _linear(matrix, own, one.map)
@@ -154,10 +148,8 @@ def _of_latent_readings(
     dim = len(matrix) // 2
     read = np.eye(2 * dim)
     read[dim:] = matrix[:dim]
-    ends = (
-        [Linear(matrix @ np.linalg.inv(read)), *pieces[:own]],
-        [*pieces[own + 1 :], Linear(read)],
-    )
+    inner, outer = Linear(matrix @ np.linalg.inv(read)), Linear(read)
+    ends = [inner, *pieces[:own]], [*pieces[own + 1 :], outer]
     turns = []  # without a missing value
     for y in (np.concatenate(_ends(q, 1 - k), axis=1) for q in runs):
         parts = np.split(y, np.flatnonzero(np.diff(np.isfinite(y).all(axis=1))) + 1)
@@ -182,17 +174,13 @@ def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
     else:
         matrix = np.asarray(stretch, float)
     if matrix.shape != (2 * dim, 2 * dim) or not np.isfinite(matrix).all():
-        raise InputError(
-            f"expected the length of a drift or a matrix of shape {(2 * dim, 2 * dim)}, got "
-            f"{np.shape(stretch)}"
-        )
+        known = f"a drift or a matrix of shape {(2 * dim, 2 * dim)}"
+        raise InputError(f"expected the length of {known}, got {np.shape(stretch)}")
     form = symplectic_form(dim)
     defect = np.abs(matrix.T @ form @ matrix - form).max()
     if not defect < _Options.symplectic * max(1.0, np.abs(matrix).max() ** 2):
-        raise InputError(
-            f"between: expected symplectic matrices in q1…qd, p1…pd, got one with |MᵀJM − J| of "
-            f"{defect:.2g}"
-        )
+        got = f"got one with |MᵀJM − J| of {defect:.2g}"
+        raise InputError(f"between: expected symplectic matrices in q1…qd, p1…pd, {got}")
     values = np.linalg.svd(matrix[:dim, dim:], compute_uv=False)
     if not values[-1] > _Options.singular * max(values[0], 1e-300):
         raise InputError(
@@ -233,10 +221,8 @@ def _pairs(states: list[list[np.ndarray]], k: int, dt: float) -> Pairs:
     """The states of all runs at the ends of stretch k."""
     ends = [_ends(of_run, k) for of_run in states]
     known = [np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1) for a, b in ends]
-    z0, z1 = (
-        np.concatenate([e[side][rows] for e, rows in zip(ends, known, strict=True)])
-        for side in (0, 1)
-    )
+    each = [(a[rows], b[rows]) for (a, b), rows in zip(ends, known, strict=True)]
+    z0, z1 = map(np.concatenate, zip(*each, strict=True))
     if not len(z0):
         raise FitError("expected turns with readings of all monitors, found none")
     run = np.repeat(np.arange(len(ends)), [rows.sum() for rows in known])
@@ -247,11 +233,6 @@ def _pairs(states: list[list[np.ndarray]], k: int, dt: float) -> Pairs:
 def _linear(matrix: np.ndarray, pairs: Pairs, like: SymplecticMap) -> SymplecticMap:
     """The map of a known stretch, in the coordinates of a learned one."""
     none = np.zeros(len(matrix))
-    return SymplecticMap(
-        pieces=(Affine(matrix, none, none),),
-        coordinates=like.coordinates,
-        domain=covering(pairs.z0),
-        scale=sizes(pairs.z0),
-        angle_centre=np.zeros(0),
-        dt=pairs.dt,
-    )
+    known = {"coordinates": like.coordinates, "angle_centre": np.zeros(0), "dt": pairs.dt}
+    pieces, domain = (Affine(matrix, none, none),), covering(pairs.z0)
+    return SymplecticMap(pieces=pieces, domain=domain, scale=sizes(pairs.z0), **known)

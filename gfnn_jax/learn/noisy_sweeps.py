@@ -99,14 +99,9 @@ def _as_far(found: Searched) -> list[Entry]:
         known = best.get(id(entry.sweep))
         if error <= limit and (known is None or error < known[0]):
             best[id(entry.sweep)] = error, entry
-    able = [
-        (error, e)
-        for error, e in best.values()
-        if e.sweep.linear
-        and isinstance(e.size.family, Products)
-        and not e.sweep.data.varied
-        and e.sweep.moved_by_states
-    ]
+    able = [(error, e) for error, e in best.values() if e.sweep.linear and e.sweep.moved_by_states]
+    able = [one for one in able if isinstance(one[1].size.family, Products)]
+    able = [one for one in able if not one[1].sweep.data.varied]
     return [e for _, e in sorted(able, key=lambda known: known[0])[:_MOST_SWEEPS]]
 
 
@@ -217,9 +212,8 @@ class NoisySweep(LinearSweep):
                 assert along is not None
                 sigma = np.where(np.isfinite(along.states), along.states, sigma)
             ends = data.before, data.after
-            model = GeneratedOnArcs(
-                size.family, self.chart, data.dt, arcs.moves, ends, coordinates=data.coordinates
-            )
+            given = size.family, self.chart, data.dt, arcs.moves, ends
+            model = GeneratedOnArcs(*given, coordinates=data.coordinates)
             return NearestArcs.of(model, coefficients, arcs, sigma)
 
         self._along = nearest
@@ -292,13 +286,8 @@ class NoisySweep(LinearSweep):
 
         noise = None if larger is None else part_of_noise(size, larger, left(size), left(larger))
         slopes = rows[:, :count]
-        return uncertainty.root(
-            train,
-            count,
-            (slopes, slopes @ solved.coefficients - rows[:, -1]),
-            noise=noise,
-            ridge=solved.ridge,
-        )
+        parts = (slopes, slopes @ solved.coefficients - rows[:, -1])
+        return uncertainty.root(train, count, parts, noise=noise, ridge=solved.ridge)
 
 
 def _chained(data: Dataset, rows) -> tuple[np.ndarray, np.ndarray, int, Any]:

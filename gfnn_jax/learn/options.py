@@ -231,10 +231,7 @@ class GeneratingFunction:
 
 
 MODELS = {"hamiltonian": Hamiltonian, "lagrangian": Lagrangian, "map": GeneratingFunction}
-_OF_MODEL = {
-    learn: tuple(field.name for field in dataclasses.fields(model))
-    for learn, model in MODELS.items()
-}
+_OF_MODEL = {n: tuple(f.name for f in dataclasses.fields(model)) for n, model in MODELS.items()}
 _MODEL = Kind(
     "gfnn.Hamiltonian(), Lagrangian(), GeneratingFunction(), Arm(), or a model with a name, "
     "sizes(data) and fit(data, size)",

@@ -42,10 +42,7 @@ from gfnn_jax.search.search import MET
 
 EVEN = 1e-3  # of a sampling interval: what printed times may be off by
 FEW = 0.1  # of the pairs: those that may be wrong readings of positive states
-_NO_MORE = (
-    "no larger library was more accurate: the pairs have noise, or the library lacks a part of H "
-    "(--terms)"
-)
+_NO_MORE = "no larger library was more accurate: noise, or the library lacks a part of H (--terms)"
 NOISE = 1.15  # times the noise, that the errors of a law may be which misses nothing else
 
 
@@ -158,10 +155,8 @@ def _next(data: Pairs | Recording, pairs: Pairs, verdict: str) -> str:
         call = "gfnn.fit(pairs.take((pairs.z0 > 0).all(axis=1) & (pairs.z1 > 0).all(axis=1)))"
         if isinstance(data, Recording):
             call = "the same command, once these cells are empty"
-        return (
-            f". Logarithms were not tried, for in {_rows(below)} a coordinate is not above 0. "
-            f"Without them: {call}"
-        )
+        why = f"Logarithms were not tried, for in {_rows(below)} a coordinate is not above 0"
+        return f". {why}. Without them: {call}"
     if isinstance(data, Recording):
         if not all(map(is_rate_of_turning, data.positions)):
             return ". If these are positions: gfnn.fit(recording)"
@@ -177,10 +172,8 @@ def _next(data: Pairs | Recording, pairs: Pairs, verdict: str) -> str:
         known = f"so3({spins if spins > 1 else ''})"
         if n % 3:
             known = f"lie({('so3',) * spins + ('centre',) * (n % 3)})"
-        return (
-            ". H of a bracket that you know, for example: "
-            f"gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=gfnn.Bracket.{known}))"
-        )
+        call = f"gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=gfnn.Bracket.{known}))"
+        return f". H of a bracket that you know, for example: {call}"
     call = "gfnn.fit(gfnn.Pairs(pairs.z0, pairs.z1, pairs.dt, run=pairs.run))"
     return f". As positions and momenta, with friction of any kind: {call}"
 
@@ -201,9 +194,7 @@ def pairs_of_states(recording: Recording) -> Pairs:
     than two columns, or inputs."""
     names, parts, own = recording.positions, [], parameters_of(recording)
     if len(names) < 2:
-        raise InputError(
-            f"expected two or more columns of states, got {len(names)}: --positions A,B"
-        )
+        raise InputError(f"expected 2 or more columns of states, got {len(names)}: --positions A,B")
     if recording.inputs:
         raise InputError(
             f"a law with a bracket has no inputs, got {', '.join(recording.inputs)}. It may depend "
@@ -246,17 +237,13 @@ def _checked(pairs: Any, bracket: Bracket | None) -> int:
         states.append(z)
     if bracket is not None:
         if bracket.size != states[0].shape[1]:
-            raise FitError(
-                f"the bracket is one of {bracket.size} coordinates, the states have "
-                f"{states[0].shape[1]}"
-            )
+            own = states[0].shape[1]
+            raise FitError(f"the bracket has {bracket.size} coordinates, the states have {own}")
         outside = bracket.outside(states[0]) | bracket.outside(states[1])
         if outside.any():
-            raise FitError(
-                f"{bracket.undefined} in {_rows(outside)}. Without them: "
-                "gfnn.fit(pairs.take(~(bracket.outside(pairs.z0) | "
-                "bracket.outside(pairs.z1))), bracket=bracket)"
-            )
+            kept = "pairs.take(~(bracket.outside(pairs.z0) | bracket.outside(pairs.z1)))"
+            call = f"gfnn.fit({kept}, bracket=bracket)"
+            raise FitError(f"{bracket.undefined} in {_rows(outside)}. Without them: {call}")
     return states[0].shape[1]
 
 
@@ -329,10 +316,8 @@ def _generated(data: Data, bracket: Bracket | None) -> _Learned:
             "may depend on them: gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=bracket))"
         )
     if bracket is None:
-        raise FitError(
-            "a map without a law needs its bracket, such as "
-            "model=gfnn.GeneratingFunction(bracket=gfnn.Bracket.so3())"
-        )
+        known = "model=gfnn.GeneratingFunction(bracket=gfnn.Bracket.so3())"
+        raise FitError(f"a map without a law needs its bracket, such as {known}")
     if np.ndim(data.dt):
         raise FitError("a map without a law is one of pairs with one dt")
     y0, y1 = (_inner(z, bracket) for z in (data.z0, data.z1))
@@ -365,16 +350,10 @@ def _learned(law, map_, candidate, messages) -> LearnedHamiltonian:
     named = zip(names, law.fit.c, std, strict=True)
     every = [Term(name, float(c), float(s)) for name, c, s in named]
     terms = tuple(every[: law.field.library.num_parameters])
-    return LearnedHamiltonian(
-        candidate,
-        map_.pieces[0],
-        terms,
-        formula(terms),
-        float("nan"),
-        messages=tuple(messages),
-        covariance=lambda: law.fit.root,
-        friction=tuple(every[len(terms) :]),
-    )
+    told = {"messages": tuple(messages), "friction": tuple(every[len(terms) :])}
+    flow, text, none = map_.pieces[0], formula(terms), float("nan")
+    root = law.fit.root
+    return LearnedHamiltonian(candidate, flow, terms, text, none, covariance=lambda: root, **told)
 
 
 def _resistances(law: PoissonLaw) -> list[str]:

@@ -93,21 +93,10 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
     if sites is not None and not isinstance(sites, Sites):
         raise FitError(f"expected a ring or a chain of positions, got {structure!r}")
     if len(triples) < Options.fewest:
-        raise FitError(
-            f"expected at least {Options.fewest} triples of positions, got {len(triples)}"
-        )
-    sensors = Sensors(
-        recording.positions,
-        (),
-        recording.angles,
-        np.zeros(triples.dim),
-        0.0,
-        Options.window * triples.dt,
-        "hold",
-        0.0,
-        np.array([triples.dt]),
-        np.zeros((1, triples.dim)),
-    )
+        raise FitError(f"expected at least {Options.fewest} triples, got {len(triples)}")
+    none, window = np.zeros(triples.dim), Options.window * triples.dt
+    columns, moves = (recording.positions, (), recording.angles), np.zeros((1, triples.dim))
+    sensors = Sensors(*columns, none, 0.0, window, "hold", 0.0, np.array([triples.dt]), moves)
     sweep = _Sweep(triples, sites, _split(triples, options.seed), tolerance, budget, watch, sensors)
     best = sweep.best(symmetric=True)
     if best is None or not tolerance.met_by(best.candidate):
@@ -164,9 +153,8 @@ class _Sweep:
             new = self._within_budget(family, symmetric)
             if new is None:
                 break
-            if found is None or not new.candidate.validation_bound >= (
-                Options.better * found.candidate.validation_bound
-            ):
+            least = np.inf if found is None else Options.better * found.candidate.validation_bound
+            if found is None or not new.candidate.validation_bound >= least:
                 found, worse = new, 0
             else:
                 worse += 1
@@ -186,9 +174,8 @@ class _Sweep:
             both = symmetric and getattr(inner, "signs", None) is None
             family = OfDisplacement(inner, part, both, moves)
             terms = family.num_parameters
-            if Options.rows_per_term * terms > rows or (
-                k and rows * terms**2 > Options.most_operations
-            ):
+            many = k and rows * terms**2 > Options.most_operations
+            if many or Options.rows_per_term * terms > rows:
                 return
             yield family
 
@@ -216,26 +203,19 @@ class _Sweep:
         else the best as it is."""
         if not self._stalls(best):
             return best
-        self.watch.on_progress(
-            "larger S are no more accurate: fitting the noise of the readings too"
-        )
+        self.watch.on_progress("larger S are no more accurate: fitting the readings' noise too")
         symmetric, split = best.about.symmetric, self.split
-        training, held_out = (
-            self.triples.take(np.sort(rows)) for rows in (split.training, split.validation)
-        )
+        both = np.sort(split.training), np.sort(split.validation)
+        training, held_out = map(self.triples.take, both)
         families = self._families(symmetric)
         found = without_noise(families, training, held_out, self.budget, self.watch.on_progress)
         if found is None:
             return best
         started = time.perf_counter()
         noise = tuple(map(float, found.fit.sigma))
-        about = dataclasses.replace(
-            best.about,
-            num_parameters=found.family.num_parameters,
-            rank=found.solved.rank,
-            condition=found.solved.condition,
-            noise=noise,
-        )
+        of_fit = {"rank": found.solved.rank, "condition": found.solved.condition, "noise": noise}
+        terms = found.family.num_parameters
+        about = dataclasses.replace(best.about, num_parameters=terms, **of_fit)
         own = found.fit.coefficients, found.fit.root, found.fit.sigma
         return self._found(found.family, about, *own, started)
 
@@ -265,9 +245,8 @@ class _Sweep:
         self.watch.on_progress(f"S of {family.label}, {family.num_parameters} terms")
         started, training = time.perf_counter(), self.triples.take(self.split.training)
         solved = solve(family, training)
-        about = OfPositions(
-            symmetric, family.num_parameters, solved.rank, solved.condition, len(self.triples)
-        )
+        told, count = (solved.rank, solved.condition), len(self.triples)
+        about = OfPositions(symmetric, family.num_parameters, *told, count)
         left = residuals(family, family.unflatten(solved.coefficients), training)
         deviation = np.sqrt(np.mean((left / displacement(training)) ** 2))
         noise = starting_noise(family, solved.coefficients, training)
@@ -323,12 +302,10 @@ class _Sweep:
         test = self.split.test if len(self.split.test) else self.split.validation
         steps = stepped(map_, states.z1[test])
         images = np.where(steps.failed[:, None], np.nan, steps.images)[:, : self.triples.dim]
-        chosen = dataclasses.replace(
-            with_error(best.candidate, self.error_of(images, test)),
-            chosen=True,
-            newton_iterations_max=int(steps.iterations.max()),
-            microseconds_per_step=steps.microseconds_per_step,
-        )
+        seconds, most = steps.microseconds_per_step, int(steps.iterations.max())
+        timed = {"newton_iterations_max": most, "microseconds_per_step": seconds}
+        chosen = with_error(best.candidate, self.error_of(images, test))
+        chosen = dataclasses.replace(chosen, chosen=True, **timed)
         others = [c for c in self.tried if c is not best.candidate]
         met, messages = self.tolerance.met_by(chosen), list(left_out)
         ended = MET if met else self.budget.ended or "larger S are no more accurate"

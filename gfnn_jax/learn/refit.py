@@ -76,10 +76,8 @@ def why_not(map_: SymplecticMap) -> str:
 
 def not_refitted(fitted: Fit, why: str) -> Fit:
     """The fit of a sample as it is, with a warning (FitWarning) that says so, and why."""
-    message = (
-        f"{fitted.chosen.label} is fitted to a sample of {fitted.num_pairs} pairs, not to all of "
-        f"them: {why}"
-    )
+    fitted_to = f"a sample of {fitted.num_pairs} pairs, not to all of them"
+    message = f"{fitted.chosen.label} is fitted to {fitted_to}: {why}"
     warnings.warn(message, FitWarning, stacklevel=2)
     return fitted.replaced(messages=(*fitted.messages, message))
 
@@ -141,25 +139,18 @@ def refit(
         worker.task["held"] = _states_of(apart)
         worker.task |= worker.resolving(held)
         bare = dataclasses.replace(map_, posterior=None)
-        group.broadcast(
-            {**packed(bare, scene), **{_OF_TASK + n: v for n, v in worker.task.items()}}
-        )
+        task = {_OF_TASK + n: v for n, v in worker.task.items()}
+        group.broadcast(packed(bare, scene) | task)
         found = worker.solved(chunks, held, group)
-        if found.outliers:
-            warn(
-                f"{found.outliers} of {found.count + found.outliers} pairs are outliers, with "
-                f"residuals above {Options.outlying:g} standard deviations: they are left out"
-            )
-        if found.other_dt:
-            warn(
-                f"{found.other_dt} of {found.count + found.outliers + found.other_dt} pairs are "
-                f"not dt = {float(map_.dt):g} apart: they are left out"
-            )
-        if found.unresolved:
-            warn(
-                f"{found.unresolved} of {found.count} pairs, as of close passages, are not "
-                "resolved by the steps of the law: they are left out"
-            )
+        apart, above = f"not dt = {float(map_.dt):g} apart", f"above {Options.outlying:g}"
+        served, close = found.count + found.outliers, "as of close passages"
+        for number, among, why in (
+            (found.outliers, served, f"outliers, with residuals {above} standard deviations"),
+            (found.other_dt, served + found.other_dt, apart),
+            (found.unresolved, found.count, f"not resolved by the steps of the law, {close}"),
+        ):
+            if number:
+                warn(f"{number} of {among} pairs are {why}: they are left out")
         if found.map is not None:
             after = worker.error(found.map, held, tolerance).rms
             # Test pairs of few runs did not state the sample's error either, which then stands.
@@ -172,23 +163,18 @@ def refit(
         group.broadcast({})
     if chosen is None or not after <= Options.no_worse * before:
         found_map = "no map" if chosen is None else f"a worse map (RMS error {after:.2e})"
-        warn(
-            f"the fit to all pairs gives {found_map}: that of the sample (RMS error {before:.2e} "
-            "in the data's units) is kept"
-        )
+        kept = f"that of the sample (RMS error {before:.2e} in the data's units) is kept"
+        warn(f"the fit to all pairs gives {found_map}: {kept}")
         chosen, num_pairs = old, fitted.num_pairs
     elif law is not None and found.law is not None and old.learns == "hamiltonian":
         law = _with_coefficients(law, found.law, chosen)
     if not tolerance.met_by(chosen):
         warn(tolerance.missed_by(chosen, fitted.ended))
-    return fitted.replaced(
-        map=map_ if chosen is old else better,
-        candidates=tuple(chosen if c.chosen else c for c in fitted.candidates),
-        num_pairs=num_pairs,
-        seconds=fitted.seconds + time.perf_counter() - started,
-        hamiltonian=law,
-        messages=tuple(messages),
-    )
+    seconds = fitted.seconds + time.perf_counter() - started
+    candidates = tuple(chosen if c.chosen else c for c in fitted.candidates)
+    told = {"num_pairs": num_pairs, "hamiltonian": law, "messages": tuple(messages)}
+    new = map_ if chosen is old else better
+    return fitted.replaced(map=new, candidates=candidates, seconds=seconds, **told)
 
 
 def _states_of(parts: Sequence[Pairs]) -> np.ndarray:
@@ -224,9 +210,7 @@ def _with_coefficients(
     """The law with the coefficients of this fit."""
     names = [term.term for term in law.terms]
     errors = fit.standard_errors.tolist()
-    terms = tuple(
-        Term(*entry) for entry in zip(names, fit.coefficients.tolist(), errors, strict=True)
-    )
+    terms = tuple(map(Term, names, fit.coefficients.tolist(), errors))
     flow = dataclasses.replace(law.flow, params=fit.coefficients)
     text = getattr(flow.family, "prefix", "") + formula(terms)
     return dataclasses.replace(law, flow=flow, terms=terms, shown=text, candidate=candidate)
@@ -372,9 +356,8 @@ class RowsOfRefit:
                 solved = least_squares.solve(train, validation, size)
                 coefficients, train_rms = solved.coefficients, solved.train_rms
         else:
-            c, found, made = descended(
-                lambda c: _triangle(asked(c)), self.piece.params, gauss_newton.Options.most
-            )
+            first, most = self.piece.params, gauss_newton.OPTIONS.most
+            c, found, made = descended(lambda c: _triangle(asked(c)), first, most)
             rows = found.rows
             if rows:
                 law = gauss_newton.summarised(c, found, None, made, self._steps)
@@ -422,9 +405,8 @@ class RowsOfRefit:
 
     def _problem(self, rows: _Rows) -> gauss_newton.Problem:
         dt = self.dt if rows.dt is None else rows.dt
-        return gauss_newton.Problem(
-            rows.y0, rows.y1, dt, np.asarray(self.piece.scale), args=rows.args
-        )
+        scale = np.asarray(self.piece.scale)
+        return gauss_newton.Problem(rows.y0, rows.y1, dt, scale, args=rows.args)
 
     def _kept(self, chunks: Iterable[Pairs], counts: dict[str, int]) -> Iterator[_Rows]:
         """Pairs but outliers and those held out, as the fitted piece sees them."""

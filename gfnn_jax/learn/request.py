@@ -83,9 +83,8 @@ def check_request(
         raise FitError("angles come with the scene: give a scene or angles, not both")
     bad = [a for a in angles if not 0 <= a < 2 * pairs.dim]
     if bad or len(set(angles)) < len(angles):
-        raise FitError(
-            f"expected different angles among 0..{2 * pairs.dim - 1}, got {tuple(angles)}"
-        )
+        most, got = 2 * pairs.dim - 1, tuple(angles)
+        raise FitError(f"expected different angles among 0..{most}, got {got}")
     if own_dt or pairs.args or pairs.period is not None:
         check_varied(pairs)
     if pairs.period is not None and options.chart == "type1":
@@ -123,11 +122,12 @@ def check_request(
 
 def _check_told(structure: str | None, options: FitOptions, pairs: Pairs) -> None:
     """Raises FitError and InputError for what cannot be told of coefficients."""
+    depends = bool(pairs.args) or pairs.period is not None
     refused = {
         f"structure {structure}": structure is not None,
         "a network": options.family == "mlp",
-        "args or a drive": bool(pairs.args) or pairs.period is not None,
     }
+    refused["args or a drive"] = depends
     for what, given in refused.items():
         if given:
             raise FitError(
@@ -201,11 +201,9 @@ def coarse_tolerance(pairs: Pairs, tolerance: Tolerance) -> list[str]:
         return []
     unit = "of the coordinates' spread" if tolerance.relative else "in the data's units"
     option = "tolerance" if tolerance.relative else "absolute_tolerance"
-    return [
-        f"a step moves the states by {size:.1e} {unit}: maps close to the identity meet the "
-        f"tolerance {tolerance.bound:g}. Set --{option.replace('_', '-')} to "
-        f"{OPTIONS.coarse * size:.0e} or less"
-    ]
+    moves = f"a step moves the states by {size:.1e} {unit}: maps close to the identity meet the"
+    less = f"Set --{option.replace('_', '-')} to {OPTIONS.coarse * size:.0e} or less"
+    return [f"{moves} tolerance {tolerance.bound:g}. {less}"]
 
 
 def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
@@ -251,10 +249,8 @@ def unnamed_angles(pairs: Pairs, coordinates: Coordinates) -> list[str]:
     move = np.abs(np.asarray(pairs.z1) - np.asarray(pairs.z0))
     count, indices = int((move[:, found] > np.pi).any(axis=1).sum()), ",".join(map(str, found))
     named = "coordinate " + indices if len(found) == 1 else f"coordinates {indices}"
-    return [
-        f"{named} of z: jumps of 2π in {count} of {len(pairs)} pairs, as of an angle that is "
-        f"wrapped; name it: --angles {indices}"
-    ]
+    told = f"jumps of 2π in {count} of {len(pairs)} pairs, as of an angle that is wrapped"
+    return [f"{named} of z: {told}; name it: --angles {indices}"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -318,26 +314,18 @@ def checked(
     line, where the pairs cannot give what is asked for."""
     structure = lent(scene, options)
     check_request(pairs, scene, options, structure)
-    coordinates = (
-        scene.coordinates if scene else Coordinates("cartesian", angles=tuple(options.angles))
-    )
+    plain = Coordinates("cartesian", angles=tuple(options.angles))
+    coordinates = scene.coordinates if scene else plain
     found = structure_of(structure, pairs.dim, coordinates)
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
     pairs = dataclasses.replace(pairs, z0=z0, z1=z1)
-    pairs, learn, messages = as_varied(
-        pairs,
-        learn=options.learn,
-        family=options.family,
-        chart=options.chart,
-        base=options.base,
-        structure=structure,
-    )
+    names = ("learn", "family", "chart", "base")
+    asked = {name: getattr(options, name) for name in names}
+    pairs, learn, messages = as_varied(pairs, structure=structure, **asked)
     z0, z1 = (np.asarray(z, np.float64) for z in (pairs.z0, pairs.z1))
     if np.ptp(z0, axis=0).any() and np.max(np.abs(z1 - z0) / sizes(z0)) <= OPTIONS.still:
-        raise FitError(
-            "expected states that move, got z1 = z0 in every pair: is H = 0, or are these the same "
-            "columns twice?"
-        )
+        why = "is H = 0, or are these the same columns twice?"
+        raise FitError(f"expected states that move, got z1 = z0 in every pair: {why}")
     if scene is not None and scene.features is not None and options.family in ("auto", "features"):
         messages += unlike_the_scene(pairs, scene)
     bound = Tolerance.of(options)
@@ -359,10 +347,8 @@ def paid_for(found: Identified, budget: Budget, seed: int) -> Identified:
     enough = f"--max-seconds {work / RATES[ROWS]:.0f}"
     if budget.max_operations is not None:
         enough = f"--max-operations {work:,}"
-    budget.leave_out(
-        f"{count - len(rows):,} of {count:,} pairs",
-        f"the budget pays for a sample; {enough} pays for all",
-    )
+    whole = f"the budget pays for a sample; {enough} pays for all"
+    budget.leave_out(f"{count - len(rows):,} of {count:,} pairs", whole)
     return Identified(pairs.take(rows), row[rows])
 
 
@@ -408,11 +394,9 @@ def proposed(data: Dataset) -> list[str]:
     best, left = _best(data)
     if not left < PROPOSALS.explained:
         return []
-    return [
-        f"the structure {best} explains these pairs: a sample of them leaves relative residuals of "
-        f"{left:.1g} in forces and velocities, to second order in dt. Fit again with "
-        f"--structure {best}"
-    ]
+    left_over = f"a sample of them leaves relative residuals of {left:.1g} in forces and velocities"
+    told = f"the structure {best} explains these pairs: {left_over}, to second order in dt"
+    return [f"{told}. Fit again with --structure {best}"]
 
 
 def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request, Dataset]]:
@@ -428,10 +412,8 @@ def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request
                 "velocities: it is tried first"
             )
             same = Dataset.of(data.pairs, data.coordinates, structure, data.row)
-            yield (
-                dataclasses.replace(request, structure=structure),
-                dataclasses.replace(same, split=data.split),
-            )
+            same = dataclasses.replace(same, split=data.split)
+            yield dataclasses.replace(request, structure=structure), same
     yield request, data
 
 

@@ -118,13 +118,9 @@ def sample_sequences(
     scene: Scene, num: int, length: int, key
 ) -> Float[np.ndarray, "num length phase"]:
     """Draw ``num`` reference sequences of ``length`` states, which start with the training law."""
-    return reference_trajectories(
-        scene,
-        sample_states(scene, num, key),
-        length - 1,
-        params=sample_params(scene, num, key),
-        t0=sample_t0(scene, num, key),
-    )
+    params, t0 = sample_params(scene, num, key), sample_t0(scene, num, key)
+    z0 = sample_states(scene, num, key)
+    return reference_trajectories(scene, z0, length - 1, params=params, t0=t0)
 
 
 def sample_pairs(

@@ -159,9 +159,7 @@ class Scene:
         if self.period is not None and not self.any_phase:
             periods = self.dt / self.period
             if round(periods) < 1 or abs(periods - round(periods)) > 1e-9 * periods:
-                raise ValueError(
-                    f"dt must be a whole number of periods of {self.period}, got {self.dt}"
-                )
+                raise ValueError(f"dt must be whole periods of {self.period}, got {self.dt}")
 
     @property
     def timeless(self) -> bool:

@@ -281,9 +281,7 @@ def henon_heiles(energy: float = 1 / 12, dt: float = 0.5, *, printed: bool = Fal
     """
     highest = 1 / 12 if printed else ESCAPE_ENERGY
     if not 0 < energy <= highest:
-        raise ValueError(
-            f"energy must be > 0 and at most {highest:.6g}, where orbits are bound, got {energy}"
-        )
+        raise ValueError(f"energy must be > 0 and at most {highest:.6g}, got {energy}")
     kind = "printed" if printed else "regular" if energy < 0.1 else "chaotic"
     chaotic = kind == "chaotic"
 
@@ -494,9 +492,7 @@ def standard_map(k: float = 0.6) -> Scene:
     """
     regular = k < 0.971635
     orbit = AroundOrbit((0.3, math.pi) if regular else (0.1, 0.1), num_steps=10_000, sigma=0.5)
-    seen = (
-        "two islands that the orbit jumps between" if regular else "the chaotic sea and its islands"
-    )
+    seen = "two islands that the orbit jumps between" if regular else "the chaotic sea and islands"
     return Scene(
         name=f"standard-map-{'regular' if regular else 'chaotic'}",
         purpose=f"a map with no equation of motion: {seen}",

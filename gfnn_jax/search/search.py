@@ -209,9 +209,8 @@ class Search:
         self._on_progress, self._on_candidate = on_progress, on_candidate
         self._on_validated = on_validated
         self._climbs = [_Climb(sweep) for sweep in sweeps]
-        self._queue = sorted(
-            (size.operations, i, n) for i, s in enumerate(sweeps) for n, size in enumerate(s.sizes)
-        )
+        every = ((i, n, size) for i, s in enumerate(sweeps) for n, size in enumerate(s.sizes))
+        self._queue = sorted((size.operations, i, n) for i, n, size in every)
         self._entries: list[Entry] = []
         self._cheapest, self._kept, self._unfinished = np.inf, np.inf, False
 
@@ -375,11 +374,8 @@ def _ranking(entries: list[Entry], bound: float) -> list[Entry]:
         key=lambda e: (e.candidate.validation_relative, e.candidate.train_rms),
     )
     as_good = [e for e in others if _as_good(e, others[0])]
-    return [
-        *sorted(meeting, key=lambda e: e.candidate.operations),
-        *sorted(as_good, key=lambda e: e.candidate.operations),
-        *(e for e in others if not _as_good(e, others[0])),
-    ]
+    ordered = [sorted(those, key=lambda e: e.candidate.operations) for those in (meeting, as_good)]
+    return [*ordered[0], *ordered[1], *(e for e in others if not _as_good(e, others[0]))]
 
 
 def _as_good(entry: Entry, best: Entry) -> bool:
@@ -405,9 +401,8 @@ def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
     """(chart, family) of the sweeps whose last two sizes gained nothing worth while."""
     found, of_sweep = set(), {}
     for e in entries:
-        of_sweep.setdefault((e.candidate.chart, e.candidate.family), []).append(
-            e.candidate.validation_relative
-        )
+        own = (e.candidate.chart, e.candidate.family)
+        of_sweep.setdefault(own, []).append(e.candidate.validation_relative)
     for sweep, errors in of_sweep.items():
         if len(errors) > 2 and min(errors[-2:]) > GAINED * min(errors[:-2]):
             found.add(sweep)

@@ -82,13 +82,8 @@ class Derivatives:
         errors = _errors(table * left[:, None], normal)
         if factor == 0:
             return None
-        return Relation(
-            float(factor),
-            float(errors[0]),
-            float(-minus_lag / factor),
-            float(errors[1] / abs(factor)),
-            explained,
-        )
+        of_factor, of_lag = float(errors[0]), float(errors[1] / abs(factor))
+        return Relation(float(factor), of_factor, float(-minus_lag / factor), of_lag, explained)
 
 
 def window(noises: Sequence[Noise]) -> int:
@@ -131,11 +126,9 @@ def difference(times: Sequence[np.ndarray], x: np.ndarray, v: np.ndarray) -> str
         kinds["backward"].append(b[1:-1] - steps[:-1])
         kinds["central"].append(b[1:-1] - (a[2:] - a[:-2]) / (t[2:] - t[:-2]))
         step = np.diff(t).mean()
-        kinds["fourth"].append(
-            b[2:-2] - (8 * (a[3:-1] - a[1:-3]) - a[4:] + a[:-4]) / (12 * step)
-            if np.allclose(np.diff(t), step, rtol=1e-6)
-            else np.full(len(t), np.nan)
-        )
+        even = np.allclose(np.diff(t), step, rtol=1e-6)
+        fourth = b[2:-2] - (8 * (a[3:-1] - a[1:-3]) - a[4:] + a[:-4]) / (12 * step)
+        kinds["fourth"].append(fourth if even else np.full(len(t), np.nan))
     sizes = {}
     for kind, parts in kinds.items():
         off = np.abs(np.concatenate(parts)) if parts else np.empty(0)

@@ -121,16 +121,11 @@ class _Balance:
     def with_error(self, quantity) -> tuple[float, float]:
         """A function of the coefficients, and its standard error by leaving blocks out."""
         normal, side = self.normals.sum(0), self.sides.sum(0)
-        without = np.array(
-            [
-                quantity(self._solved(normal - n, side - s))
-                for n, s in zip(self.normals, self.sides, strict=True)
-            ]
-        )
+        left = [(normal - n, side - s) for n, s in zip(self.normals, self.sides, strict=True)]
+        without = np.array([quantity(self._solved(*one)) for one in left])
         spread = np.sum((without - without.mean()) ** 2)
-        return quantity(self._solved(normal, side)), float(
-            np.sqrt((_Options.blocks - 1) / _Options.blocks * spread)
-        )
+        error = float(np.sqrt((_Options.blocks - 1) / _Options.blocks * spread))
+        return quantity(self._solved(normal, side)), error
 
 
 def _kind(found: dict[str, _Balance]) -> str | None:

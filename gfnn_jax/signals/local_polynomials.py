@@ -64,18 +64,9 @@ def local_fits(
     inverse = np.linalg.inv(r)
     powers = (inverse @ coefficients[..., None])[..., 0]
     gains = np.sqrt(np.sum(inverse**2, axis=2))  # (W, k), of the coefficient of each power
-    return LocalFits(
-        rows,
-        centres,
-        run,
-        powers[..., 0],
-        powers[..., 1] / half,
-        2 * powers[..., 2] / half**2,
-        residuals,
-        gains[:, 1] / half,
-        2 * gains[:, 2] / half**2,
-        q,
-    )
+    bend, of_curvature = 2 * powers[..., 2] / half**2, 2 * gains[:, 2] / half**2
+    found = powers[..., 0], powers[..., 1] / half, bend, residuals, gains[:, 1] / half, of_curvature
+    return LocalFits(rows, centres, run, *found, q)
 
 
 def _windows(times: Sequence[np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -154,11 +145,8 @@ def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np
     halves = [h for h in _Options.halves if any(len(t) >= 2 * h + 1 for t, _ in stretches)]
     errors, sigmas = [], []
     for half in halves:
-        left_out = [
-            smooth(t, y, half, np.arange(0, len(t), every))[1]
-            for t, y in stretches
-            if len(t) >= 2 * half + 1
-        ]
+        longer = [(t, y) for t, y in stretches if len(t) >= 2 * half + 1]
+        left_out = [smooth(t, y, half, np.arange(0, len(t), every))[1] for t, y in longer]
         squares = np.concatenate(left_out) ** 2
         squares[squares < rounding**2] = np.nan  # a sensor's step hides the noise of what rests
         squares[:, np.isnan(squares).all(axis=0)] = 0.0

@@ -141,9 +141,8 @@ def _correlation(fit: LocalFits, column: int) -> float:
     total = float(np.sum(residuals**2))
     if total == 0:
         return 0.0
-    return float(
-        np.sum(residuals[:, 1:] * residuals[:, :-1]) / total - neighbours / (size - q.shape[2])
-    )
+    shared = np.sum(residuals[:, 1:] * residuals[:, :-1]) / total
+    return float(shared - neighbours / (size - q.shape[2]))
 
 
 def _unpredicted(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> float | None:

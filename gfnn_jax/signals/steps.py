@@ -42,19 +42,15 @@ def longest_step(steps: np.ndarray) -> float:
 def gaps(times: Sequence[np.ndarray]) -> list[tuple[int, float, float]]:
     """(number of the run, begin, end in s) of each gap."""
     longest = longest_step(np.concatenate([np.diff(t) for t in times]))
-    return [
-        (run, float(t[k]), float(t[k + 1]))
-        for run, t in enumerate(times)
-        for k in np.flatnonzero(np.diff(t) > longest)
-    ]
+    found = [(r, t, k) for r, t in enumerate(times) for k in np.flatnonzero(np.diff(t) > longest)]
+    return [(run, float(t[k]), float(t[k + 1])) for run, t, k in found]
 
 
 def even_runs(times: Sequence[np.ndarray]) -> list[int]:
     """Numbers of the runs whose steps are all the median step, but for a twentieth."""
     step = median_step(times)
-    return [
-        r for r, t in enumerate(times) if np.all(np.abs(np.diff(t) - step) <= _Options.even * step)
-    ]
+    most = _Options.even * step
+    return [r for r, t in enumerate(times) if np.all(np.abs(np.diff(t) - step) <= most)]
 
 
 def drift(times: np.ndarray) -> float:

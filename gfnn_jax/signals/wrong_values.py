@@ -161,10 +161,8 @@ def _misses(t: np.ndarray, x: np.ndarray) -> np.ndarray:
 def _roughness(runs: Sequence[np.ndarray]) -> float:
     """The largest miss that is ordinary in a column, of the `_misses` (n_r,) of its runs: 3.4
     standard deviations of white noise. Infinite where no run has a block of samples."""
-    whole = [
-        miss[: len(miss) // _Options.block * _Options.block].reshape(-1, _Options.block)
-        for miss in runs
-    ]
+    size = _Options.block
+    whole = [miss[: len(miss) // size * size].reshape(-1, size) for miss in runs]
     largest = np.concatenate([blocks.max(axis=1) for blocks in whole] or [np.empty(0)])
     return float(np.quantile(largest, _Options.ordinary)) if len(largest) else np.inf
 
@@ -282,16 +280,12 @@ def _stuck(t: np.ndarray, x: np.ndarray, resolution: float, rough: float) -> lis
     many = (ends - begins + 1 >= _Options.fewest) & (ends < len(ways))
     found = []
     for begin, end in zip(begins[many], ends[many], strict=True):
-        before, behind = (
-            ways[max(begin - _Options.around, 0) : begin],
-            ways[end + 1 : end + 1 + _Options.around],
-        )
+        before = ways[max(begin - _Options.around, 0) : begin]
+        behind = ways[end + 1 :][: _Options.around]
         around = [part for part in (before, behind) if len(part) == _Options.around]
         moves = any(np.median(part) > slow for part in around)
-        way = max(
-            _Options.fewest * slow,
-            _Options.jump * max((part.max() for part in around), default=0.0),
-        )
+        fastest = max((part.max() for part in around), default=0.0)
+        way = max(_Options.fewest * slow, _Options.jump * fastest)
         if moves and ways[end] > way:
             found.append((int(begin) + 1, int(end) + 1))
     return found

@@ -84,9 +84,7 @@ class TrainingCheckpoints:
         _write(self._path(step), tree, {"step": int(step), "identity": self.identity})
         before = [old for old in self._steps() if old < step]
         # Later steps are damaged ones that were passed over; a kill leaves hidden folders.
-        unused = [
-            self._path(old) for old in self._steps() if old != step and old not in before[-1:]
-        ]
+        unused = [self._path(s) for s in self._steps() if s != step and s not in before[-1:]]
         for path in [*unused, *self.folder.glob(".step_*")]:
             shutil.rmtree(path, ignore_errors=True)
 
@@ -140,11 +138,12 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
         if stored:
             np.savez(new / _ARRAYS[_FORMAT], allow_pickle=False, **stored)
         (new / _JSON).write_text(text, encoding="utf-8")
-        sums = [
-            f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(new).as_posix()}\n"
-            for file in sorted(new.rglob("*"))
-            if file.is_file()
-        ]
+        whole = (
+            (f, hashlib.sha256(f.read_bytes()).hexdigest())
+            for f in sorted(new.rglob("*"))
+            if f.is_file()
+        )
+        sums = [f"{digest}  {file.relative_to(new).as_posix()}\n" for file, digest in whole]
         (new / _SUMS).write_text("".join(sums), encoding="utf-8")
 
 
@@ -232,13 +231,9 @@ def _describe(name: str, leaf: Any) -> tuple[dict[str, Any], np.ndarray | None]:
     array = np.ascontiguousarray(leaf).reshape(np.shape(leaf))  # raises TypeError for a random key
     if array.dtype.kind not in "fiubc":
         raise TypeError(f"{name}: a leaf must hold numbers, got dtype {array.dtype}")
-    return {
-        "name": name,
-        "kind": "numpy",
-        "shape": list(array.shape),
-        "dtype": str(array.dtype),
-        "sha256": hashlib.sha256(array.tobytes()).hexdigest(),
-    }, array
+    about = {"shape": list(array.shape), "dtype": str(array.dtype)}
+    digest = hashlib.sha256(array.tobytes()).hexdigest()
+    return {"name": name, "kind": "numpy", **about, "sha256": digest}, array
 
 
 def _restored(folder: Path, entry: dict[str, Any], stored: dict[str, Any]) -> Any:
@@ -248,10 +243,8 @@ def _restored(folder: Path, entry: dict[str, Any], stored: dict[str, Any]) -> An
     shape, dtype = tuple(entry["shape"]), np.dtype(entry["dtype"])
     array = np.asarray(stored[entry["key"]]) if "key" in entry else np.empty(shape, dtype)
     if array.shape != shape or array.dtype != dtype:
-        raise Damaged(
-            f"{folder}: {name} should be {dtype} of shape {shape}, found {array.dtype} of shape "
-            f"{array.shape}"
-        )
+        wanted, own = f"{dtype} of shape {shape}", f"{array.dtype} of shape {array.shape}"
+        raise Damaged(f"{folder}: {name} should be {wanted}, found {own}")
     if hashlib.sha256(array.tobytes()).hexdigest() != entry["sha256"]:
         raise Damaged(f"{folder}: {name} has changed since it was saved (digest differs)")
     return array

@@ -42,9 +42,7 @@ def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
         if path.exists() and folder and not path.is_dir():
             raise InputError(f"{path}: is a file, expected a folder to write")
         if folder and path.resolve() in (here := Path.cwd(), *here.parents):
-            raise InputError(
-                f"{path}: is the current folder or one above it; name another folder to write"
-            )
+            raise InputError(f"{path}: is the current folder or one above it; name another")
         if path.exists() and not (folder and not any(path.iterdir())):
             if not overwrite:
                 raise InputError(f"{path}: exists already (--overwrite replaces it)")
@@ -55,10 +53,8 @@ def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
             inside = [*path.iterdir(), *path.glob("model/*")] if folder else []
             others = [file for file in inside if not any(map(file.match, _OURS))]
             if others:
-                raise InputError(
-                    f"{path}: holds {others[0].name}, which is no part of a model or a run; not "
-                    "overwritten"
-                )
+                told = f"holds {others[0].name}, which is no part of a model or a run"
+                raise InputError(f"{path}: {told}; not overwritten")
         parent = path.absolute().parent
         while not parent.exists():
             parent = parent.parent
@@ -284,10 +280,8 @@ def _make_way(folder: Path, job, what: str, *, overwrite: bool, resume: bool) ->
         return
     if not resume:
         if not overwrite:
-            raise InputError(
-                f"{folder}: holds an unfinished {what} (--resume continues it, --overwrite "
-                "discards it)"
-            )
+            ways = "--resume continues it, --overwrite discards it"
+            raise InputError(f"{folder}: holds an unfinished {what} ({ways})")
         return _discard(folder)
     try:
         found = json.loads((folder / JOB).read_text(encoding="utf-8"))
@@ -295,10 +289,8 @@ def _make_way(folder: Path, job, what: str, *, overwrite: bool, resume: bool) ->
         raise InputError(f"{folder}: {JOB} cannot be read ({error})") from error
     other = [key for key in {**found, **job} if found.get(key) != job.get(key)]
     if other:
-        raise InputError(
-            f"{folder}: belongs to another {what}: {', '.join(other)} differ (--overwrite discards "
-            "it)"
-        )
+        told = f"belongs to another {what}: {', '.join(other)} differ"
+        raise InputError(f"{folder}: {told} (--overwrite discards it)")
 
 
 def _discard(folder: Path) -> None:
