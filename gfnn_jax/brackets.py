@@ -103,10 +103,8 @@ class Bracket:
             raise FitError("expected constants with c_ijk = −c_jik")
         failure = jacobi_failure(constants)
         if failure > _ROUNDOFF * size**2:
-            raise FitError(
-                f"Jacobi's identity fails by {failure / size**2:.1e} of the constants' size: "
-                "these constants are not those of a Lie algebra"
-            )
+            told = f"Jacobi's identity fails by {failure / size**2:.1e} of the constants' size"
+            raise FitError(f"{told}: these constants are not those of a Lie algebra")
         return LieAlgebra(constants, None, (), tuple(names))
 
     @staticmethod
@@ -323,10 +321,8 @@ class LieAlgebra(Bracket):
         fields = (fields + fields.swapaxes(2, 3)).reshape(len(forms), -1)
         pairs = [(row, other) for k, row in enumerate(linear) for other in linear[k:]]
         squares = [(np.outer(a, b) + np.triu(np.outer(b, a), 1))[upper] for a, b in pairs]
-        found = [
-            Casimir(np.tensordot(row, forms, 1), np.zeros(n), False, self.labels)
-            for row in null_space(fields.T, without=squares)
-        ]
+        rows = null_space(fields.T, without=squares)
+        found = [Casimir(np.tensordot(r, forms, 1), np.zeros(n), False, self.labels) for r in rows]
         of_degree_1 = (Casimir(None, row, False, self.labels) for row in linear)
         return (*of_degree_1, *found)
 

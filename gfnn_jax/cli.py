@@ -270,10 +270,8 @@ def _fit(arguments: argparse.Namespace) -> None:
     if of_states or are_recordings(arguments.data, with_roles=names_roles(columns)):
         return _fit_recording(arguments, columns, options)
     if options.get("learn") == "lagrangian":
-        raise InputError(
-            f"--learn lagrangian: {arguments.data[0]} is read as states q, p. If these columns are "
-            "measured positions, name them: --positions A,B"
-        )
+        told = f"{arguments.data[0]} is read as states q, p. If its columns are measured positions"
+        raise InputError(f"--learn lagrangian: {told}, name them: --positions A,B")
     options["angles"] = _as_indices(columns)
     with _processes(arguments) as join:
         with _output(arguments, options.get("devices")) as output:

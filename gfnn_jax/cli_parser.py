@@ -253,9 +253,7 @@ def _fit(command: _Command) -> None:
         "status is 1 all the same",
     )
     of_each = "each reads its own rows of DATA, or its own files"
-    command.flag(
-        "--distributed", f"this is one of several processes, started by srun, say: {of_each}"
-    )
+    command.flag("--distributed", f"this is one of several processes, by srun, say: {of_each}")
 
 
 def _add_despite(command: _Command) -> None:
@@ -288,10 +286,8 @@ def _predict(command: _Command) -> None:
     command.add("--out", about, "FILE", type=Path, required=True)
     about = "maps drawn from the model's posterior: adds std and quantiles to FILE"
     command.add("--samples", about, "N", type=_count)
-    about = (
-        "with --samples: adds the first step at which the band of the position (two standard "
-        "deviations of its distance) exceeds SIZE, in the data's unit"
-    )
+    about = "adds the first step at which the band of the position (two standard deviations of"
+    about = f"with --samples: {about} its distance) exceeds SIZE, in the data's unit"
     command.add("--horizon", about, "SIZE", type=_positive)
     about = "what to do where a trajectory leaves the data's domain (default continue)"
     command.add("--outside", about, choices=("continue", "stop"))

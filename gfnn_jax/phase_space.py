@@ -166,10 +166,8 @@ class Pairs:
         if isinstance(self.dt, (list, tuple, np.ndarray, jax.Array)):
             self._set("dt", np.asarray(self.dt) if np.ndim(self.dt) else self.dt)
             if np.ndim(self.dt) and np.shape(self.dt) != (len(self),):
-                raise FitError(
-                    f"expected dt as one number or one per pair ({len(self)},), got shape "
-                    f"{np.shape(self.dt)}"
-                )
+                wanted = f"expected dt as one number or one per pair ({len(self)},)"
+                raise FitError(f"{wanted}, got shape {np.shape(self.dt)}")
         if self.args is not None:
             self._set("args", _named(self.args, len(self)))
         if self.t0 is not None or TIME in (self.args or {}):
@@ -179,10 +177,9 @@ class Pairs:
             self._set("std", np.asarray(self.std, np.float64))
             width = self.z0.shape[1]
             if self.std.shape not in ((width,), (len(self), width)):
-                raise FitError(
-                    f"expected std of shape ({width},), one of each coordinate, or "
-                    f"({len(self)}, {width}), one of each value, got {self.std.shape}"
-                )
+                wanted = f"({width},), one of each coordinate, or ({len(self)}, {width})"
+                got = f"got {self.std.shape}"
+                raise FitError(f"expected std of shape {wanted}, one of each value, {got}")
             if not (np.isfinite(self.std) & (self.std > 0)).all():
                 raise FitError("expected every std finite and above 0; leave std out if unknown")
 
@@ -191,9 +188,8 @@ class Pairs:
         width, any_width = self.z0.shape[-1], self.structure == POISSON
         if self.z0.shape != self.z1.shape or self.z0.ndim != 2 or width < 2:
             shape = "(N, n), n ≥ 2" if any_width else "(N, 2d)"
-            raise FitError(
-                f"expected z0 and z1 of one shape {shape}, got {self.z0.shape} and {self.z1.shape}"
-            )
+            got = f"{self.z0.shape} and {self.z1.shape}"
+            raise FitError(f"expected z0 and z1 of one shape {shape}, got {got}")
         if width % 2 and not any_width:
             raise FitError(
                 f"{width} columns are no positions and momenta (q, p). Of states with another "
@@ -215,10 +211,8 @@ class Pairs:
                 continue
             values = np.asarray(given)
             if values.shape != (len(self),) or values.dtype.kind not in kinds:
-                raise FitError(
-                    f"expected {name} as {what} of shape ({len(self)},), got {values.dtype} of "
-                    f"shape {values.shape}"
-                )
+                wanted = f"{name} as {what} of shape ({len(self)},)"
+                raise FitError(f"expected {wanted}, got {values.dtype} of shape {values.shape}")
             self._set(name, values.astype(str) if values.dtype.kind in "SO" else values)
 
     def _set_time(self) -> None:
@@ -280,9 +274,9 @@ def _named(args: Any, count: int) -> dict[str, Any]:
     """Return the parameters by name, each (N,). Raises FitError on other shapes."""
     if not isinstance(args, Mapping):
         if np.ndim(args) not in (1, 2) or len(args) != count:
+            got = f"got {type(args).__name__} of shape {np.shape(args)}"
             raise FitError(
-                f"expected args as name -> ({count},) or as an array ({count}, k), got "
-                f"{type(args).__name__} of shape {np.shape(args)}"
+                f"expected args as name -> ({count},) or as an array ({count}, k), {got}"
             )
         columns = np.asarray(args).reshape(count, -1).T
         return {f"a{i + 1}": column for i, column in enumerate(columns)}

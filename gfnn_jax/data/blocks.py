@@ -51,10 +51,8 @@ class Block:
 
     def rows(self, index: np.ndarray) -> Block:
         locate = self.locate  # `self` would keep all rows in memory
-        own, at = (
-            None if self.own is None else self.own[index],
-            (self.sequence[index], self.place[index]),
-        )
+        own = None if self.own is None else self.own[index]
+        at = self.sequence[index], self.place[index]
         return Block(self.states[index], *at, lambda r, c: locate(int(index[r]), c), own)
 
     @property
@@ -71,10 +69,8 @@ class Block:
             if bad.any():
                 row, column = (int(i) for i in np.argwhere(bad)[0])
                 count = int(bad.sum())
-                raise InputError(
-                    f"{path}: {count} value{'s' * (count != 1)} {what}, first "
-                    f"{self.locate(row, column)} = {self.states[row, column]}"
-                )
+                told = f"{count} value{'s' * (count != 1)} {what}, first {self.locate(row, column)}"
+                raise InputError(f"{path}: {told} = {self.states[row, column]}")
         return self
 
 

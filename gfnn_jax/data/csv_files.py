@@ -76,10 +76,8 @@ class _StatesInText:
         found = {"missing": missing, "without a partner": others, "without numbers": words}
         for what, columns in found.items():
             if columns or not self.states:
-                raise InputError(
-                    f"{self.path}: the header must name q1..qd and p1..pd once each: "
-                    f"{', '.join(columns)} {what} in {','.join(self.file.names)}"
-                )
+                must = f"must name q1..qd and p1..pd once each: {', '.join(columns)} {what}"
+                raise InputError(f"{self.path}: the header {must} in {','.join(self.file.names)}")
 
     def _tables(self, rows: int) -> Generator[dict[str, np.ndarray], None, None]:
         """All columns of numbers by name, a block of rows at a time; sequences as numbers."""
@@ -96,9 +94,7 @@ class _StatesInText:
         moving = [n for n, step in steps.items() if np.any(step[same] != 0)]
         ignored = [*moving, *(n.lower() for n in self.file.text)]
         if ignored:
-            told = (
-                f"{self.path}: columns ignored: {', '.join(ignored)} (not constant in a sequence)"
-            )
+            told = f"columns ignored: {', '.join(ignored)} (not constant in a sequence)"
             warnings.warn(told, DataWarning, stacklevel=6)
         return ignored
 
@@ -124,10 +120,8 @@ class _StatesInText:
             begins = both[1:, 0] != both[:-1, 0]
             for row in np.flatnonzero(begins):
                 if sequence[row] in earlier or not np.isfinite(sequence[row]):
-                    raise InputError(
-                        f"{self.path}: {self.file.locate(begin + int(row))}: the rows of sequence "
-                        f"{sequence[row]:g} must stand together"
-                    )
+                    rows = f"the rows of sequence {sequence[row]:g} must stand together"
+                    raise InputError(f"{self.path}: {self.file.locate(begin + int(row))}: {rows}")
                 if "sequence" in table:
                     earlier.add(float(sequence[row]))
             if self.with_time:
@@ -167,10 +161,8 @@ class _StatesInText:
         bad = ((sequence[1:] == sequence[:-1]) & ~(np.diff(time) > 0)) | ~np.isfinite(time[1:])
         if bad.any():
             row = int(np.argmax(bad))
-            raise InputError(
-                f"{self.path}: the column t must rise in a sequence, found {time[row + 1]:.9g} in "
-                f"{self.file.locate(begin + row)} after {time[row]:.9g}"
-            )
+            found = f"{time[row + 1]:.9g} in {self.file.locate(begin + row)} after {time[row]:.9g}"
+            raise InputError(f"{self.path}: the column t must rise in a sequence, found {found}")
 
 
 def _first_dt(states: _StatesInText, table: dict[str, np.ndarray]) -> float | None:

@@ -125,10 +125,8 @@ def read_trajectories(
     lengths, pairs = np.diff(begins, append=len(sequence)), len(going)
     needed = 2 * source.dim + 1 if fewest is None else fewest
     if pairs < needed:
-        raise InputError(
-            f"{path}: {pairs} pair{'s' * (pairs != 1)} of consecutive states found, at least "
-            f"{needed} are needed for d = {source.dim}"
-        )
+        found = f"{pairs} pair{'s' * (pairs != 1)} of consecutive states found"
+        raise InputError(f"{path}: {found}, at least {needed} are needed for d = {source.dim}")
     for odd in _odd_columns(states, going):
         warnings.warn(f"{path}: {odd}", DataWarning, stacklevel=2)
     known = (labels(sequence[going]), whole.place[going])
@@ -181,10 +179,8 @@ def iterate_pairs(
     own, of_rows = own_files(paths, share)
     for number, path in own:
         if of_rows.count > 1 and path.suffix.lower() == ".csv":
-            raise InputError(
-                f"{path}: expected .npz or .npy, whose rows {share.count} processes can share, or "
-                "as many files as processes"
-            )
+            wanted = f"expected .npz or .npy, whose rows {share.count} processes can share"
+            raise InputError(f"{path}: {wanted}, or as many files as processes")
         with opened(path, dt) as source:
             last: list[Block] = []  # the row before the next block
             last_arc = (0, np.empty(2 * source.dim))
@@ -223,10 +219,8 @@ def read_initial(
     driven = TIME in parameters
     with opened(path, None, initial=True, driven=driven) as source:
         if source.dim != dim:
-            raise InputError(
-                f"{path}: expected states of {2 * dim} columns (d = {dim}), found "
-                f"{2 * source.dim} columns (d = {source.dim})"
-            )
+            wanted = f"expected states of {2 * dim} columns (d = {dim})"
+            raise InputError(f"{path}: {wanted}, found {2 * source.dim} columns (d = {source.dim})")
         columns = {name: 1 + i for i, name in enumerate(source.parameters)}
         if driven and "t0" in columns:
             columns[TIME] = columns["t0"]

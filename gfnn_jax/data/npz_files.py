@@ -54,10 +54,8 @@ class _StoredArray:
             raise InputError(f"{path}: {name} must hold real numbers, found {self.dtype}{hint}")
         expected = math.prod(self.shape) * self.dtype.itemsize
         if size - stream.tell() != expected:
-            raise InputError(
-                f"{path}: {name} is damaged: {expected} bytes expected for shape {self.shape}, "
-                f"{size - stream.tell()} found"
-            )
+            told = f"{expected} bytes expected for shape {self.shape}, {size - stream.tell()} found"
+            raise InputError(f"{path}: {name} is damaged: {told}")
 
     def whole(self) -> np.ndarray:
         with damage(self.path, self.name):
@@ -110,10 +108,9 @@ class _Archive:
         """The times (count,) of a drive."""
         t0 = np.atleast_1d(self.array("t0").whole().astype(np.float64))
         if t0.shape != (count,) or not np.isfinite(t0).all():
-            raise InputError(
-                f"{self.path}: t0 must be finite, of shape ({count},), found {t0.shape}"
-                + ("" if np.isfinite(t0).all() else " with NaN or infinity")
-            )
+            rest = "" if np.isfinite(t0).all() else " with NaN or infinity"
+            wanted = f"t0 must be finite, of shape ({count},), found {t0.shape}"
+            raise InputError(f"{self.path}: {wanted}{rest}")
         return t0
 
     def parameters(self) -> tuple[tuple[str, ...], np.ndarray | None]:
@@ -244,10 +241,9 @@ def open_npz(request: Request, stream) -> Source:
     is_pairs = "z0" in archive and "z1" in archive
     if is_pairs == ("trajectories" in archive):
         names = archive.names
-        raise InputError(
-            f"{path}: expected either the arrays z0 and z1, or trajectories; found "
-            f"{', '.join(names[:8]) or 'none'}{', ...' * (len(names) > 8)}"
-        )
+        found = f"{', '.join(names[:8]) or 'none'}{', ...' * (len(names) > 8)}"
+        wanted = "expected either the arrays z0 and z1, or trajectories"
+        raise InputError(f"{path}: {wanted}; found {found}")
     further = [name for name in archive.names if name not in _READ]
     if further and "job" not in further:  # other arrays of a prediction are about it
         ignored = f"{path}: arrays ignored: {', '.join(further)} (parameters are in params)"
@@ -283,10 +279,8 @@ def _pairs(
         bad = ~(np.isfinite(dt) & (dt > 0))
         if bad.any():
             row = int(np.argmax(bad))
-            raise InputError(
-                f"{path}: dt must be finite and above 0, found {int(bad.sum())} that are not, "
-                f"first dt[{row}] = {dt[row]:g}"
-            )
+            told = f"found {int(bad.sum())} that are not, first dt[{row}] = {dt[row]:g}"
+            raise InputError(f"{path}: dt must be finite and above 0, {told}")
         times = np.stack([np.zeros(len(dt)), dt], axis=1)
     if period is not None:
         t0 = np.mod(archive.t0(z0.shape[0] if z0.shape else 0), period)
@@ -326,10 +320,8 @@ def _times_dt(path, times, shape, lengths) -> float:
     """The time step of ``times`` (M, L), NaN where they are uneven."""
     times = times[None] if times.ndim == 1 else times
     if times.shape != ((1, *shape[:1]) if len(shape) == 2 else shape[:2]):
-        raise InputError(
-            f"{path}: times must have the shape of the trajectories without the last axis, found "
-            f"{times.shape} beside {shape}"
-        )
+        must = "times must have the shape of the trajectories without the last axis"
+        raise InputError(f"{path}: {must}, found {times.shape} beside {shape}")
     steps = np.diff(times, axis=1)
     used = np.ones(steps.shape, bool)
     if lengths is not None and lengths.shape == times.shape[:1]:

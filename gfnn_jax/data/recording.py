@@ -528,10 +528,9 @@ def parameters_of(recording: Recording) -> tuple[str, ...]:
         columns = recording.each(recording.values, name)
         for run, column in zip(recording.runs, columns, strict=True):
             if not (np.isfinite(column).all() and np.ptp(column) == 0):
-                raise InputError(
-                    f"{recording.source}: parameter {name} is not one number in run {run}. Name "
-                    "what changes within a run an input: --inputs"
-                )
+                told = f"parameter {name} is not one number in run {run}"
+                advice = "Name what changes within a run an input: --inputs"
+                raise InputError(f"{recording.source}: {told}. {advice}")
         if len({float(column[0]) for column in columns}) > 1:
             found.append(name)
     return tuple(found)

@@ -121,10 +121,8 @@ def _both(one: dict[str, np.ndarray] | None, other: dict[str, np.ndarray]) -> di
         return one or other
     shapes = [{name: column.shape[1:] for name, column in table.items()} for table in (one, other)]
     if shapes[0] != shapes[1]:
-        raise InputError(
-            "expected files with the same coordinates and parameters, and all with sequences or "
-            "none, got files that differ"
-        )
+        same = "expected files with the same coordinates and parameters"
+        raise InputError(f"{same}, and all with sequences or none, got files that differ")
     return {name: np.concatenate([column, other[name]]) for name, column in one.items()}
 
 

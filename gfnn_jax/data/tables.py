@@ -169,10 +169,9 @@ def from_arrays(path: Path, columns: Sequence[str]) -> Table:
                 loaded = dict(archive.items())
     if isinstance(loaded, np.ndarray) and not loaded.dtype.names:
         if loaded.ndim != 2 or loaded.shape[1] != len(columns):
-            raise InputError(
-                f"{path}: expected --columns with the names of the columns of an array (T, k), got "
-                f"{len(columns)} names for shape {loaded.shape}"
-            )
+            got = f"got {len(columns)} names for shape {loaded.shape}"
+            wanted = "expected --columns with the names of the columns of an array (T, k)"
+            raise InputError(f"{path}: {wanted}, {got}")
         loaded = dict(zip(columns, loaded.T, strict=True))
     return dataclasses.replace(from_memory(loaded), source=str(path))
 
@@ -273,10 +272,8 @@ def _parts(
         rising = [n for n, way in ways.items() if np.all(way > 0) and not np.all(way == 1)]
         named = f"--time {shlex.quote(rising[0])} if that is it, or " if rising else ""
         step = f" {table.step[1]:g}, its {table.step[0]}" if table.step else ""
-        raise InputError(
-            f"{table.source}: expected a column t or time, found {', '.join(table.columns)}; give "
-            f"{named}the time between rows: --dt{step}"
-        )
+        found = f"expected a column t or time, found {', '.join(table.columns)}"
+        raise InputError(f"{table.source}: {found}; give {named}the time between rows: --dt{step}")
     if column is not None:
         own = table.columns[column]
         groups = {str(run): np.flatnonzero(own == run) for run in dict.fromkeys(own.tolist())}
@@ -343,7 +340,6 @@ def _check_times(table: Table, name: str, rows: np.ndarray) -> None:
         same = times[at + 1] == times[at]
         what = "is the same as" if same else "runs back from"
         remedy = "keep one row of each time" if same else "number the runs in a column run"
-        raise InputError(
-            f"{table.source}: {table.locate(row)}: {name} = {times[at + 1]:.9g} {what} "
-            f"{times[at]:.9g} before it ({len(falls)} such rows): {remedy}"
-        )
+        found = f"{name} = {times[at + 1]:.9g} {what} {times[at]:.9g} before it"
+        found = f"{table.locate(row)}: {found} ({len(falls)} such rows): {remedy}"
+        raise InputError(f"{table.source}: {found}")

@@ -87,10 +87,8 @@ class TextFile:
         cells = [self._cells(line) for _, line in of_file]
         first = self._first_row(cells)
         if first is None:
-            raise InputError(
-                f"{path}: expected rows of numbers below a line of names, found "
-                f"{_shown(of_file[: _Options.shown])}"
-            )
+            told = f"{path}: expected rows of numbers below a line of names"
+            raise InputError(f"{told}, found {_shown(of_file[: _Options.shown])}")
         self._first = of_file[first][0] - 1  # lines before the first row of numbers
         rows, above = cells[first:], cells[:first]
         # A blank line ends what instruments write above the names.
@@ -107,19 +105,15 @@ class TextFile:
             width -= 1  # a separator ends every line
         above = [one if any(one[width:]) else one[:width] for one in above]
         if above[-1:] and len(above[-1]) > 1 and not any(len(one) == width for one in above):
-            raise InputError(
-                f"{path}: line {of_file[first][0]}: {len(above[-1])} columns expected "
-                f"({', '.join(above[-1])[:60]}), {width} found"
-            )
+            wanted = f"{len(above[-1])} columns expected ({', '.join(above[-1])[:60]})"
+            raise InputError(f"{path}: line {of_file[first][0]}: {wanted}, {width} found")
         self.step = self._step(cells[:first])
         self.runs: dict[str, tuple[str, str]] = {}
         self.names, self.units = self._header(above, width, columns)
         known = [[row[i] for row in rows if i < len(row)] for i in range(width)]
         held = [[c for c in of if c.lower() not in _MISSING] for of in known]
-        numeric = {
-            n: sum(_is_number(c, self._decimal) for c in of)
-            for n, of in zip(self.names, held, strict=True)
-        }
+        of_each = zip(self.names, held, strict=True)
+        numeric = {n: sum(_is_number(c, self._decimal) for c in of) for n, of in of_each}
         self.text = tuple(
             n
             for n, of in zip(self.names, held, strict=True)
@@ -200,10 +194,9 @@ class TextFile:
         elif len(columns) == width:
             names, units = list(columns), {}
         else:
-            raise InputError(
-                f"{self.path}: expected a line of names above {width} columns of numbers, found "
-                f"none; name them: --columns {','.join(['t', 'x', 'v', 'u', 'a', 'b'][:width])}"
-            )
+            names = f"--columns {','.join(['t', 'x', 'v', 'u', 'a', 'b'][:width])}"
+            wanted = f"expected a line of names above {width} columns of numbers"
+            raise InputError(f"{self.path}: {wanted}, found none; name them: {names}")
         repeated = [name for name in dict.fromkeys(names) if names.count(name) > 1]
         if repeated:
             raise InputError(f"{self.path}: the header names {', '.join(repeated)} twice")
@@ -282,10 +275,8 @@ class TextFile:
                         begin = times.iloc[0] if begin is None else begin
                         seconds = (times - begin).dt.total_seconds()
                         found[self.times[0]] = seconds / self._dates[1]
-                    yield {
-                        name: column.to_numpy(dtype=None if name in as_text else np.float64)
-                        for name, column in found.items()
-                    }
+                    kinds = {name: None if name in as_text else np.float64 for name in found}
+                    yield {name: x.to_numpy(dtype=kinds[name]) for name, x in found.items()}
         except InputError:
             raise
         except UnicodeDecodeError as error:
@@ -387,9 +378,8 @@ class TextFile:
         found = list(itertools.islice(wrong, _Options.shown))
         if found:
             number, cells = found[0]
-            expected = (
-                f"{count} columns expected ({', '.join(self.names)[:60]}), {len(cells)} found"
-            )
+            told = f"({', '.join(self.names)[:60]}), {len(cells)} found"
+            expected = f"{count} columns expected {told}"
             more = _more([(n, ", ".join(c)) for n, c in found])
             raise InputError(f"{self.path}: line {number}: {expected}{more}")
 
@@ -541,10 +531,9 @@ def _dialect(path: Path, lines: list[str]) -> tuple[str, str]:
     share, separator, decimal = max(good, key=lambda found: found[0])
     header = _cells(lines[0], ",")
     if separator == "," and len(_cells(sample[0], ",")) == 2 * len(header) > 2 and share == 1:
-        raise InputError(
-            f"{path}: commas between columns and decimal commas cannot be distinguished: write "
-            "semicolons between columns, or decimal points"
-        )
+        told = "commas between columns and decimal commas cannot be distinguished"
+        advice = "write semicolons between columns, or decimal points"
+        raise InputError(f"{path}: {told}: {advice}")
     return separator, decimal
 
 

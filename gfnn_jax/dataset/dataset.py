@@ -72,9 +72,7 @@ class Dataset:
         known = np.isfinite(before + after).all(axis=1)
         if not known.all():
             count, first = int((~known).sum()), int(np.argmin(known))
-            told = (
-                f"{count} pairs have no {coordinates.name} coordinates of the scene, the first is"
-            )
+            told = f"{count} pairs have no {coordinates.name} coordinates of the scene, the first"
             raise FitError(f"{told} number {first}, from 0. Leave them out, or fit without --scene")
         lifted = lift if structure is None or not structure.angles else lift_sites
         y0, y1, centres, covered = lifted(before, after, coordinates)

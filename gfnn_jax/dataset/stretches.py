@@ -295,10 +295,9 @@ def stretches(
     found = [dataclasses.replace(part, even=False) for s in whole for part in s.cut(gap)]
     found = [s for s in found if np.all(np.isfinite(s.q).sum(0) >= FEWEST)]
     if not found:
-        raise FitError(
-            f"{recording.source}: no run has {FEWEST} readings of each position in a row (a step "
-            f"above {gap:g} times the median is a gap)"
-        )
+        step = f"(a step above {gap:g} times the median is a gap)"
+        wanted = f"no run has {FEWEST} readings of each position in a row {step}"
+        raise FitError(f"{recording.source}: {wanted}")
     return found
 
 
@@ -348,10 +347,9 @@ def measure(found: Sequence[Stretch]) -> Scales:
         others = [np.concatenate([s.u, np.tile(s.args, (len(s.t), 1))], axis=1) for s in found]
         told = noise_of_one_law([(s.t, s.y, o) for s, o in zip(found, others, strict=True)])
         sigma = sigma if told is None else told
-    moves = [
-        np.concatenate([np.diff(s.y[have, k]) for s in found for have in [~np.isnan(s.y[:, k])]])
-        for k in range(found[0].y.shape[1])
-    ]
+    columns = range(found[0].y.shape[1])
+    have = [[s.y[~np.isnan(s.y[:, k]), k] for s in found] for k in columns]
+    moves = [np.concatenate([np.diff(values) for values in of]) for of in have]
     resolution = np.array([np.median(np.abs(one)) for one in moves])
     size = np.array([np.sqrt(np.mean(one**2)) for one in moves])
     sigma = np.maximum(sigma, 1e-9 * np.maximum(resolution, size))  # clean data have none

@@ -487,7 +487,5 @@ def _thin(data: Dataset) -> list[str]:
     if dimension > min(data.dim, len(entering) - 1):
         return []
     where = "a curve" if dimension == 1 else f"a surface of dimension {dimension}"
-    return [
-        f"the pairs lie on {where} of the {len(entering)}-dimensional phase space, as those of one "
-        "orbit do. The map is learned there only: other initial states widen it"
-    ]
+    told = f"the pairs lie on {where} of the {len(entering)}-dimensional phase space, as those of"
+    return [f"{told} one orbit do. The map is learned there only: other initial states widen it"]

@@ -62,10 +62,9 @@ def check_number(pairs: Pairs) -> None:
     """Raises FitError where there are fewer pairs than a local Jacobian needs."""
     if len(pairs) < 8 * pairs.dim:
         turned = 8 * len(pairs) < 2 * pairs.dim
-        raise FitError(
-            f"expected at least {8 * pairs.dim} different pairs for d = {pairs.dim}, "
-            f"got {len(pairs)}" + turned * ": a row is a state; are the arrays transposed?"
-        )
+        wanted = f"expected at least {8 * pairs.dim} different pairs for d = {pairs.dim}"
+        advice = ": a row is a state; are the arrays transposed?" * turned
+        raise FitError(f"{wanted}, got {len(pairs)}{advice}")
 
 
 class ChartDeterminant(NamedTuple):
@@ -285,7 +284,5 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
 def _about(name, determinant: ChartDeterminant, what, valid) -> str:
     instead = [n for n in ("midpoint", "type2", "type3") if n in valid and n != name]
     advice = f". Use --chart {instead[0]}" if instead else ". Take a smaller dt"
-    return (
-        f"chart {name} {what}: its determinant, of ∂w/∂z, falls to {determinant.low:.2g} and is "
-        f"negative for {100 * determinant.negative:.0f} % of the states{advice}"
-    )
+    told = f"its determinant, of ∂w/∂z, falls to {determinant.low:.2g} and is negative for"
+    return f"chart {name} {what}: {told} {100 * determinant.negative:.0f} % of the states{advice}"

@@ -145,10 +145,8 @@ def clean(
             )
         )
     if len(gross):
-        messages.append(
-            f"{len(gross)} of {count} pairs (numbers {named(row[gross])}, from 0) are far from a "
-            "polynomial fitted to the others: outliers, they are left out"
-        )
+        told = f"{len(gross)} of {count} pairs (numbers {named(row[gross])}, from 0) are far from a"
+        messages.append(f"{told} polynomial fitted to the others: outliers, they are left out")
     return data, messages
 
 

@@ -274,9 +274,7 @@ def misfit(family, data: Dataset, chart: AnyChart) -> float:
     except (FitError, np.linalg.LinAlgError):  # functions that overflow at these states
         return np.inf
     off = family.gradient(c, w[half:]) - target[half:]
-    left, whole = (
-        np.median(np.linalg.norm(np.reshape(x, (len(x), 2, -1)), axis=2), axis=0)
-        for x in (off, target[half:])
-    )
+    by_two = ((np.reshape(x, (len(x), 2, -1))) for x in (off, target[half:]))
+    left, whole = (np.median(np.linalg.norm(x, axis=2), axis=0) for x in by_two)
     part = float(np.max(left / np.maximum(whole, np.finfo(float).tiny)))
     return part if np.isfinite(part) else np.inf

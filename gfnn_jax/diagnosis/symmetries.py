@@ -133,10 +133,8 @@ def generators(
         text = f"translation of {names[i]}: {names[i + dim]} conserved"
         yield text, _generator(dim, linear={i + dim: 1.0})
     if not one:
-        yield (
-            "translation of all positions: the sum of all momenta conserved",
-            _generator(dim, linear={i + dim: 1.0 for i in range(dim)}),
-        )
+        name = "translation of all positions: the sum of all momenta conserved"
+        yield name, _generator(dim, linear={i + dim: 1.0 for i in range(dim)})
     for i, j in combinations(plain, 2):
         conserved = f"{names[i]} {names[j + dim]} − {names[j]} {names[i + dim]} conserved"
         text = f"rotation in ({names[i]}, {names[j]}): angular momentum {conserved}"

@@ -177,10 +177,8 @@ def residuals_figure(fit: LearnedLaw, recording: Recording) -> Figure:
     channels = list(fit.whiteness)[: _Options.most_rows]
     sheet = _Sheet(recording, len(channels), 3, _Options.page / 3, sharey="row")
     for place, (name, row) in enumerate(zip(channels, sheet.axes, strict=True)):
-        t, x, rate, missed = (
-            _thinned(np.concatenate(column))
-            for column in zip(*(_residual(trace, place) for trace in fit.traces), strict=True)
-        )
+        columns = zip(*(_residual(trace, place) for trace in fit.traces), strict=True)
+        t, x, rate, missed = (_thinned(np.concatenate(column)) for column in columns)
         for ax, against in zip(row, (t, x, rate), strict=True):
             ax.plot(against, missed, ".", ms=2, color=_BLUE, alpha=0.6)
             _noise_lines(ax, fit.noise[name])

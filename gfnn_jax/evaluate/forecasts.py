@@ -97,10 +97,8 @@ def _forecasts(
     )
     starts = [(run, k) for run, t, k in places if t[k] + ahead[-1] <= t[-1]]
     if not starts:
-        raise InputError(
-            f"{recording.source}: no run has {_Options.samples} samples and {ahead[-1]:.3g} s "
-            "behind them that no fit has seen"
-        )
+        told = f"no run has {_Options.samples} samples and {ahead[-1]:.3g} s behind them"
+        raise InputError(f"{recording.source}: {told} that no fit has seen")
     chosen = np.linspace(0, len(starts) - 1, min(_Options.starts, len(starts))).astype(int)
     begins = (starts[i] for i in chosen)
     each = tuple(forecast(recording, run, k, ahead[-1]) for run, k in begins)

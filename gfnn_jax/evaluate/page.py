@@ -324,10 +324,8 @@ def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
     yield Section("Not identified", lines=lines)
     rows = [(r.formula, odds_text(r.odds)) for r in law.rivals] if law is not None else []
     yield Section("Rivals", heads=("alternative", "odds of this law against it"), rows=rows)
-    lines = [
-        f"{found.num_pairs:,} pairs.",
-        *(f"Symmetry of the pairs: {s}." for s in found.symmetries),
-    ]
+    symmetries = (f"Symmetry of the pairs: {s}." for s in found.symmetries)
+    lines = [f"{found.num_pairs:,} pairs.", *symmetries]
     yield Section("The data", lines=[*lines, *found.messages])
 
 

@@ -222,10 +222,8 @@ class _System(NamedTuple):
         values, std = (np.where(np.abs(x) < 1e-9 * self.size, 0.0, x) for x in (values, std))
         kind = "rest position" if stable else "unstable rest position"
         about = "the potential is least there" if stable else "the forces vanish there"
-        found = [
-            Quantity(f"{kind}, {name}", float(x), float(s), unit, about)
-            for name, unit, x, s in zip(self.names, self.units, values, std, strict=True)
-        ]
+        rows = zip(self.names, self.units, values, std, strict=True)
+        found = [Quantity(f"{kind}, {n}", float(x), float(s), u, about) for n, u, x, s in rows]
         if not stable:
             return found
         at = f" about {', '.join(f'{x:.3g}' for x in q)}" if several else ""
@@ -287,10 +285,8 @@ class _System(NamedTuple):
             return np.array([squared, Options.gravity / squared])
 
         (squared, length), (error, of_length) = self.with_errors(compute)
-        named, about = (
-            "length of a simple pendulum of this frequency",
-            f"g/ω₀² with g = {Options.gravity:g} m/s²",
-        )
+        named = "length of a simple pendulum of this frequency"
+        about = f"g/ω₀² with g = {Options.gravity:g} m/s²"
         rate = Quantity("ω₀², of a pendulum g/l", squared, error, "1/s²")
         return [rate, Quantity(named, length, of_length, "m", about)]
 

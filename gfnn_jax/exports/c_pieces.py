@@ -243,9 +243,8 @@ def _generated(name: str, family: str, piece: Generated, width: int, more: int) 
         model = piece.predictor.forward
         within = on_symbols(model.family).inputs(z, args)[0]
         guess["v"] = variables(model, within)
-        begin = (
-            f"double v[{len(guess['v'])}];\n    {name}_guess(z, x, v);\n    {name}_predict(v, x);"
-        )
+        begin = f"double v[{len(guess['v'])}];\n    {name}_guess(z, x, v);"
+        begin += f"\n    {name}_predict(v, x);"
         parts.append(side_by_side(f"{name}_predict", model))
     parts.append(tape.function(f"{name}_guess", guess))
 

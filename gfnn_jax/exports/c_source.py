@@ -64,10 +64,9 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     InputError, in one line, for a map that cannot be written in C.
     """
     if (reason := why_not(map_)) is not None:
-        raise InputError(
-            f"this map cannot be written in C: {reason}. C takes polynomials, Fourier harmonics "
-            "and formulas: use --to stablehlo"
-        )
+        told = f"this map cannot be written in C: {reason}"
+        takes = "C takes polynomials, Fourier harmonics and formulas: use --to stablehlo"
+        raise InputError(f"{told}. {takes}")
     inner = dataclasses.replace(map_, coordinates=CARTESIAN)  # what pieces move
     laws = [isinstance(piece, (Flow, LieFlow, DampedFlow)) for piece in map_.pieces]
     alone = [dataclasses.replace(inner, pieces=(piece,)) for piece in map_.pieces]
@@ -187,10 +186,8 @@ def _comment(map_: SymplecticMap, name: str, about: Mapping[str, Any], sticks: b
     turned = f" {', '.join(angles)}: period 2 pi, any number of turns." if angles else ""
     given = about_args(map_, name)
     outside = "z or args are" if map_.parameters is not None else "z lies"
-    comment = "\n".join(
-        f"   {key}: {value:.3g}" if isinstance(value, float) else f"   {key}: {value}"
-        for key, value in about.items()
-    )
+    numbers = {k: f"{v:.3g}" if isinstance(v, float) else v for k, v in about.items()}
+    comment = "\n".join(f"   {key}: {value}" for key, value in numbers.items())
     text = f"""\
  One step of a learned symplectic map, and its inverse.
 
@@ -278,20 +275,17 @@ def inside_ranges(map_: SymplecticMap) -> list[str]:
         turns = f"floor(({time} - {literal(low[-1])})/{period})"
         lines = [f"const double phase = {time} - {turns}*{period};"]
         given[-1] = "phase"
-    return lines + [
-        f"inside = inside && {value} >= {literal(a)} && {value} <= {literal(b)};"
-        for value, a, b in zip(given, low, high, strict=True)
-    ]
+    within = "inside = inside && {0} >= {1} && {0} <= {2};"
+    ranges = zip(given, low, high, strict=True)
+    return lines + [within.format(v, literal(a), literal(b)) for v, a, b in ranges]
 
 
 def about_args(map_: SymplecticMap, name: str) -> str:
     """Write what the comment at the top says about the args."""
     comment, parameters = "", map_.parameters
     if parameters is not None:
-        ranges = ", ".join(
-            f"{n} from {low:.6g} to {high:.6g}"
-            for n, low, high in zip(parameters.names, parameters.low, parameters.high, strict=True)
-        )
+        rows = zip(parameters.names, parameters.low, parameters.high, strict=True)
+        ranges = ", ".join(f"{n} from {low:.6g} to {high:.6g}" for n, low, high in rows)
         comment = f"\n   args = ({', '.join(parameters.names)}), in the data {ranges}."
         if parameters.period is not None:
             comment += (

@@ -39,10 +39,8 @@ def casadi_function(map_: SymplecticMap, name: str, about: Mapping[str, Any]) ->
     functions["pow"] = lambda x, exponent: x**exponent
     z, u = casadi.SX.sym("z", width), casadi.SX.sym("u", graph.num_given)
     dp, t = casadi.SX.sym("dp", len(graph.values)), casadi.SX.sym("t")
-    now = [
-        sum(u[place] * t**n for n, place in enumerate(places)) + (t if graph.time == i else 0)
-        for i, places in enumerate(graph.series)
-    ]
+    after = [sum(u[place] * t**n for n, place in enumerate(places)) for places in graph.series]
+    now = [x + (t if graph.time == i else 0) for i, x in enumerate(after)]
     values = [dp[k] + value for k, value in enumerate(graph.values.tolist())]
     inputs = {"z": casadi.vertsplit(z), "u": now, "p": values}
     found = casadi.vertcat(*rates_of(graph, inputs, functions))

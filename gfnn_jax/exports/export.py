@@ -107,17 +107,15 @@ def export(
     about = _about(folder)
     of_law = isinstance(map_.pieces[0], (Flow, LieFlow, DampedFlow))
     if to in _PRINTERS and map_.bracket is not None and (to not in ("c", "c-taylor") or not of_law):
-        told = (
-            f"this map has a bracket of its own, {map_.bracket.name}, of which --to {to} makes no"
-        )
+        own = f"this map has a bracket of its own, {map_.bracket.name}"
+        told = f"{own}, of which --to {to} makes no"
         of_laws = ", --to c-taylor or, for the formula of its law, --to latex" * of_law
         raise InputError(f"{told} step: use --to stablehlo{of_laws}")
     if to in _PRINTERS:
         name = out.stem
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or _KEYWORDS_OF_C.fullmatch(name):
-            raise InputError(
-                f"{out}: expected a name of letters, digits and _: functions are named so"
-            )
+            told = "expected a name of letters, digits and _: functions are named so"
+            raise InputError(f"{out}: {told}")
         atomic_write(out, _PRINTERS[to](map_, name, about))
     else:
         known = {"dim": map_.dim, "dt": float(np.asarray(map_.dt))}

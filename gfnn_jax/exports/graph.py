@@ -191,10 +191,8 @@ def _of_lagrangian(tape: Tape, family: Any, p, z, args, creep: float) -> tuple:
     law = law_of(family, p)
     own, dim = law.friction, law.dim
     if np.any(own.loaded):
-        raise InputError(
-            "this law has friction by the size of an input, which has no series where that is 0, "
-            "and is in no format of a law yet: forecast it here (gfnn predict)"
-        )
+        told = "this law has friction by the size of an input, which has no series where that is 0"
+        raise InputError(f"{told}, and is in no format yet: forecast it here (gfnn predict)")
     sharp = own.dry & (own.widths <= creep)
     kinked = np.isin(own.kinds, (QUADRATIC, ONE_SIDED, STRIBECK))
     kinked |= (own.kinds == POWER) & (own.widths % 2 != 1)  # odd powers are smooth

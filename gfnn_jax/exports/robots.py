@@ -108,9 +108,8 @@ def robot_of(map_: SymplecticMap) -> Robot:
     best = min(found, key=lambda chain: chain.off)
     gyroscopic = np.abs(law.momentum(q, none)).max()
     if best.off > Options.most or gyroscopic > 1e-9:
-        raise InputError(
-            f"no planar chain of links: the law differs by {best.off:.0%}: use --to fmu or c"
-        )
+        told = f"the law differs by {best.off:.0%}"
+        raise InputError(f"no planar chain of links: {told}: use --to fmu or c")
     return _of_chain(map_, law, best)
 
 

@@ -69,9 +69,8 @@ class Symbol:
         return self.tape.made("/", other, self)
 
     def __neg__(self):
-        return (
-            self.operands[0] if self.operation == "negative" else self.tape.made("negative", self)
-        )
+        negated = self.operation == "negative"
+        return self.operands[0] if negated else self.tape.made("negative", self)
 
     def __abs__(self):
         return self.tape.made("fabs", self)

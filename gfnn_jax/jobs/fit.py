@@ -188,10 +188,8 @@ def fit_recording(
     named = not of_states or columns.get("positions") or columns.get("columns")
     for path in () if named else data:
         if Path(path).suffix in (".npy", ".npz"):
-            raise InputError(
-                f"{path}: expected columns with names, --states A,B. Of arrays, in Python: "
-                'gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))'
-            )
+            told = "expected columns with names, --states A,B. Of arrays, in Python: "
+            raise InputError(f'{path}: {told}gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))')
     with refusals():
         asked = FitOptions(**options)
     recording = read(list(data), **columns)

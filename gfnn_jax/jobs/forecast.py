@@ -97,10 +97,9 @@ def forecast_recording(model: Path, initial: Path, output: Output, asked: Ahead)
             own = measured.times(_same_run(measured, run))
             times = own[own > last][:num_steps]
             if not len(times):
-                raise InputError(
-                    f"{asked.compare}: holds no sample of run {run} after the end of {initial}, "
-                    f"{last:g} s. To forecast a part of one file, end it by --to"
-                )
+                told = f"holds no sample of run {run} after the end of {initial}, {last:g} s"
+                advice = "To forecast a part of one file, end it by --to"
+                raise InputError(f"{asked.compare}: {told}. {advice}")
         found[run] = forecast(known.map, part, times, ahead)
     compared = None if measured is None else _compared(known, found, measured)
     second = SECONDS[recording.time_unit]

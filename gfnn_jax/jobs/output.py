@@ -210,9 +210,8 @@ def line(candidate: Candidate) -> str:
     The error is estimated from the gradient's residual until steps have validated it.
     """
     first = "" if candidate.validated else "first estimated at "
-    about = (
-        f"{candidate.validation_relative:.2e} of the spread, {candidate.num_parameters} parameters"
-    )
+    error, count = candidate.validation_relative, candidate.num_parameters
+    about = f"{error:.2e} of the spread, {count} parameters"
     return f"{candidate.chart} {candidate.label}: one-step error {first}{about}"
 
 

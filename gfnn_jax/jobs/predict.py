@@ -219,10 +219,8 @@ def _states_of(map_: SymplecticMap, model: Path, initial: Path) -> tuple[np.ndar
         z0 = np.array([recording.array("positions", run)[-1] for run in recording.runs])
         params = np.array([args_of(recording, run, own) for run in recording.runs]) if own else None
     if names and params is None:
-        raise InputError(
-            f"{initial}: expected the parameters {', '.join(names)} of these states: a text file "
-            "with their columns, or an .npz with z0 and an array of each name"
-        )
+        told = f"expected the parameters {', '.join(names)} of these states: a text file with their"
+        raise InputError(f"{initial}: {told} columns, or an .npz with z0 and an array of each name")
     if z0.ndim != 2 or z0.shape[1] != bracket.size or not np.isfinite(z0).all():
         wanted = f"states {', '.join(bracket.labels)} that are finite"
         raise InputError(f"{initial}: expected {wanted}, got an array {z0.shape}")
@@ -332,10 +330,9 @@ class _Prediction:
         while writer.saved < writer.total:
             done = writer.saved - begun
             left = (time.perf_counter() - started) * (writer.total - writer.saved) / max(done, 1)
-            self.output.progress.status(
-                f"step {(writer.saved - 1) * asked.save_every} of {abs(asked.num_steps)}"
-                + (f", about {left:.0f} s left" if done else "")
-            )
+            about = f", about {left:.0f} s left" if done else ""
+            step = f"step {(writer.saved - 1) * asked.save_every} of {abs(asked.num_steps)}"
+            self.output.progress.status(f"{step}{about}")
             count = min(chunk, writer.total - writer.saved)
             lanes, states = self.stepped.advance(lanes, count, **options)
             if drawn is not None and of_samples is not None:

@@ -244,10 +244,8 @@ def _stated_by(by: str, found: Searched, rows: np.ndarray) -> str:
     if by == "test":
         return f"{count} that took no part in the fit or its choices"
     if by == "cross-validation":
-        return (
-            f"{count}, each predicted by a fit without its fifth (cross-validation); some of them "
-            "chose the model's size"
-        )
+        told = f"{count}, each predicted by a fit without its fifth (cross-validation)"
+        return f"{told}; some of them chose the model's size"
     return f"{count} that also chose the model"
 
 
@@ -280,9 +278,7 @@ def of_few(errors: np.ndarray, tolerance: Tolerance) -> str:
         return ""
     unit = " of the spread" if tolerance.relative else ""
     most = f"nine of ten err by less than {np.quantile(errors, OPTIONS.nine_of_ten):.1e}{unit}"
-    bound = (
-        "The 95 % bound of the RMS does not hold for other states: quote the error of nine of ten"
-    )
+    bound = "The 95 % bound of the RMS does not hold for other states: quote that of nine of ten"
     return f"few states make most of the error: {most}. {bound}"
 
 
@@ -400,7 +396,6 @@ def with_test_rows(chosen: Chosen, found: Searched, budget: Budget) -> Chosen:
     each = zip(candidate.map.pieces, fitted, strict=True)
     pieces = tuple(dataclasses.replace(p, **own) if is_s else p for p, is_s in each)
     map_ = dataclasses.replace(candidate.map, pieces=pieces)
-    return chosen._replace(
-        candidate=dataclasses.replace(candidate, map=map_),
-        stated_by=f"{chosen.stated_by}; the map is fitted to them too",
-    )
+    candidate = dataclasses.replace(candidate, map=map_)
+    told = f"{chosen.stated_by}; the map is fitted to them too"
+    return chosen._replace(candidate=candidate, stated_by=told)

@@ -114,9 +114,8 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
     if unmet and noise is None and not reason:  # else it is known why
         messages = [unmet, *messages]
     unmet = request.tolerance.missed_by(candidate, ended)
-    messages = (
-        [*diagnosis, *messages, unmet] if reason == _WHITE else [*messages, unmet, *diagnosis]
-    )
+    white = reason == _WHITE
+    messages = [*diagnosis, *messages, unmet] if white else [*messages, unmet, *diagnosis]
     messages += request.budget.left_out
     return Conclusion(ended, noise, messages, reason == _WHITE)
 
@@ -244,10 +243,8 @@ def _no_noise(sample: _Sample, stalled: bool) -> _LeftOver | None:
         return _LeftOver(None, [message], ended)
     if not stalled:
         return _LeftOver(None, [])
-    some, size = (
-        slice(Options.friction_pairs),
-        float(np.sqrt(np.mean((residual / scale) ** 2))),
-    )
+    size = float(np.sqrt(np.mean((residual / scale) ** 2)))
+    some = slice(Options.friction_pairs)
     smooth = is_smooth(y0, residual)
     found = hidden_friction(image[some], residual[some], sample.angles) if smooth else None
     # Friction shrinks every coordinate by a part of what is left over of it.
@@ -323,9 +320,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
         own = f". The map's own error is then about {part:.1g} of this noise"
     hidden, reason = "", "the residuals are noise"
     if len(np.unique(sequence)) == len(sequence):
-        hidden = (
-            ". Single pairs cannot distinguish noise from what states do not hold (a drive, say)"
-        )
+        hidden = ". Single pairs cannot tell noise from what states do not hold (a drive, say)"
         reason += ", or something that the states do not hold"
     alone = law is not None and not (hidden or law.misfit)
     if law is not None and alone and leaves_white(law.flow, searched.data):

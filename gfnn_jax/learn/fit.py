@@ -134,10 +134,8 @@ def fit(data: Any, scene: Any = None, *, options: FitOptions | None = None, **ch
         warn(about_pairs)
         count = len(request.pairs)
         if not_looked_at := count - len(looked_for_errors(count)):
-            budget.leave_out(
-                f"the search for outliers in {not_looked_at:,} of {count:,} pairs",
-                "those that the final map misses by far are found at the end",
-            )
+            told = f"the search for outliers in {not_looked_at:,} of {count:,} pairs"
+            budget.leave_out(told, "those that the final map misses by far are found at the end")
         data = data.divided(options.seed)
         for asked, same in structures_to_try(request, data):
             request, data = asked, same
@@ -206,10 +204,9 @@ def _refuse_others(changes: Mapping[str, Any]) -> None:
     """Raises TypeError where a keyword says what columns are, or is none of `FitOptions`."""
     roles = {*ReadOptions.__annotations__} - {"angles"}
     for name in roles & {*changes}:
-        raise TypeError(
-            f"fit: unexpected keyword argument '{name}': it belongs to the data. Give it to "
-            f"gfnn.read(path, {name}=…) or gfnn.Recording(table, {name}=…), and fit what they give"
-        )
+        told = f"fit: unexpected keyword argument '{name}': it belongs to the data. Give it to "
+        told += f"gfnn.read(path, {name}=…) or gfnn.Recording(table, {name}=…), and fit what they"
+        raise TypeError(f"{told} give")
     for name in {*changes} - {*OPTIONS}:
         raise TypeError(unexpected("fit", name, [*OPTIONS]))
 
@@ -237,10 +234,8 @@ def as_pairs_or_recording(
     if more is None and isinstance(data, tuple) and len(data) == 2:
         data, more = data
     if more is None:
-        raise FitError(
-            "expected gfnn.Pairs(z0, z1, dt), a gfnn.Recording, a table, a file, or arrays (t, x), "
-            f"got {type(data).__name__}"
-        )
+        wanted = "gfnn.Pairs(z0, z1, dt), a gfnn.Recording, a table, a file, or arrays (t, x)"
+        raise FitError(f"expected {wanted}, got {type(data).__name__}")
     return _of_arrays(data, more), None
 
 

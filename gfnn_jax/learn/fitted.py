@@ -294,10 +294,8 @@ class Fit:
         """The recording that the law was learned from. Raises ValueError where a folder gave the
         fit, which holds no data, and for a fit of pairs."""
         if self.data is None:
-            raise ValueError(
-                "expected a fit that has its recording, and a folder holds none: give it, as in "
-                "fit.forecast(times, after=gfnn.read(FILE))"
-            )
+            told = "expected a fit that has its recording, and a folder holds none"
+            raise ValueError(f"{told}: give it, as in fit.forecast(times, after=gfnn.read(FILE))")
         return self.data if self.learned_to is None else self.data.slice(stop=self.learned_to)
 
     @property

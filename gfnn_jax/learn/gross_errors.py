@@ -138,10 +138,8 @@ def without_gross_errors(request: Request, found: Searched) -> tuple[Searched, l
             "pairs there"
         )
     if len(rim):
-        messages.append(
-            f"{_named(rim, count)} lie at the edge of the data, where S cannot follow them: the "
-            "map is fitted, and its error stated, without them"
-        )
+        told = f"{_named(rim, count)} lie at the edge of the data, where S cannot follow them"
+        messages.append(f"{told}: the map is fitted, and its error stated, without them")
     return found, messages
 
 

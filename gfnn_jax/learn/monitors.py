@@ -106,10 +106,9 @@ def fit_monitors(
         raise InputError("between: expected some stretches that are known, and some None")
     lost = [k for k in range(len(places)) if known[k] is None and known[k - 1] is None]
     if lost:
-        raise InputError(
-            f"place {', '.join(str(k + 1) for k in lost)} has no known stretch on either side, so "
-            "that its momenta are unknown. Give one (between=), or leave the place out"
-        )
+        places = f"place {', '.join(str(k + 1) for k in lost)} has no known stretch on either side"
+        advice = "Give one (between=), or leave the place out"
+        raise InputError(f"{places}, so that its momenta are unknown. {advice}")
     runs = [[_readings(recording, names, run) for names in places] for run in recording.runs]
     states = [_states(q, known) for q in runs]
     steps = np.concatenate([np.diff(recording.times(run)) for run in recording.runs])
@@ -183,10 +182,9 @@ def _matrix(stretch: float | np.ndarray | None, dim: int) -> np.ndarray | None:
         raise InputError(f"between: expected symplectic matrices in q1…qd, p1…pd, {got}")
     values = np.linalg.svd(matrix[:dim, dim:], compute_uv=False)
     if not values[-1] > _Options.singular * max(values[0], 1e-300):
-        raise InputError(
-            "between: the block ∂Q/∂p of a matrix is singular (a phase advance near a multiple of "
-            "π), so that two readings determine no momenta. Give another stretch as the known one"
-        )
+        told = "the block ∂Q/∂p of a matrix is singular (a phase advance near a multiple of π), so"
+        told += " that two readings determine no momenta. Give another stretch as the known one"
+        raise InputError(f"between: {told}")
     return matrix
 
 

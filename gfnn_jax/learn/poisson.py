@@ -162,10 +162,8 @@ def _next(data: Pairs | Recording, pairs: Pairs, verdict: str) -> str:
             return ". If these are positions: gfnn.fit(recording)"
         times = np.concatenate([data.times(run) for run in data.runs])
         first, last = np.quantile(times, [0.25, 0.75])
-        return (
-            ". A body has a law with a bracket while no hand, motor or dry friction turns it. Take "
-            f"that part of the runs, such as --from {first:.6g} --to {last:.6g}"
-        )
+        told = "A body has a law with a bracket while no hand, motor or dry friction turns it"
+        return f". {told}. Take that part of the runs, such as --from {first:.6g} --to {last:.6g}"
     n = pairs.z0.shape[1]
     if n % 2:
         spins = n // 3
@@ -263,10 +261,8 @@ def _without_own_step(bracket: Bracket, pairs: Pairs) -> list[str]:
         return []
     known = Bracket.lie(own.blocks, sized(own, np.asarray(pairs.z0)))
     outside = known.outside(pairs.z0) | known.outside(pairs.z1)
-    return [
-        f"{known.undefined} in {_rows(outside)}, where {known.name} has no step of its own: the "
-        "slower one of any Lie algebra was taken"
-    ]
+    told = f"{known.undefined} in {_rows(outside)}, where {known.name} has no step of its own"
+    return [f"{told}: the slower one of any Lie algebra was taken"]
 
 
 def _given(terms, names: tuple[str, ...]) -> Terms | None:
@@ -275,10 +271,8 @@ def _given(terms, names: tuple[str, ...]) -> Terms | None:
     if not terms:
         return None
     if anything_told(terms):
-        raise InputError(
-            "terms: values, bounds and ties of coefficients are of H of plain pairs, got states "
-            "with a bracket: give the terms without them"
-        )
+        told = "terms: values, bounds and ties of coefficients are of H of plain pairs, got states"
+        raise InputError(f"{told} with a bracket: give the terms without them")
     texts = tuple(dict.fromkeys(to_named_text(parse_named(t, names), names) for t in terms))
     eye = np.eye(len(texts), dtype=int)
     return Terms(0, texts, tuple(map(tuple, eye.tolist())), (), names)
@@ -311,10 +305,9 @@ def _generated(data: Data, bracket: Bracket | None) -> _Learned:
     """The map without a law that S generates in the chart of a bracket. Raises FitError without a
     bracket, and for pairs of several dt, parameters or a drive."""
     if data.beside.names:
-        raise FitError(
-            f"a map without a law is one of one system, got {', '.join(data.beside.names)}. A law "
-            "may depend on them: gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=bracket))"
-        )
+        told = f"a map without a law is one of one system, got {', '.join(data.beside.names)}"
+        law = "gfnn.fit(pairs, model=gfnn.Hamiltonian(bracket=bracket))"
+        raise FitError(f"{told}. A law may depend on them: {law}")
     if bracket is None:
         known = "model=gfnn.GeneratingFunction(bracket=gfnn.Bracket.so3())"
         raise FitError(f"a map without a law needs its bracket, such as {known}")

@@ -105,10 +105,8 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
         if other is not None and (best is None or other.candidate.validation_bound < least):
             best = other
     if best is None:
-        raise FitError(
-            f"{len(triples)} triples of positions gave no S(q, Q) whose step can be solved. Add "
-            "positions, or raise --max-seconds"
-        )
+        told = f"{len(triples)} triples of positions gave no S(q, Q) whose step can be solved"
+        raise FitError(f"{told}. Add positions, or raise --max-seconds")
     return sweep.learned(sweep.without_noise(best), left_out, options.seed)
 
 

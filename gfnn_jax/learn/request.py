@@ -90,10 +90,9 @@ def check_request(
     if pairs.period is not None and options.chart == "type1":
         raise FitError("expected another chart than type1 for a driven map")
     if not own_dt and not 0 < float(pairs.dt) < np.inf:
-        raise FitError(
-            f"expected a time step that is finite and above 0, got {pairs.dt}"
-            + (float(pairs.dt) < 0) * ": where z1 come before z0 in time, exchange them"
-        )
+        reversed_ = (float(pairs.dt) < 0) * ": where z1 come before z0 in time, exchange them"
+        wanted = "expected a time step that is finite and above 0"
+        raise FitError(f"{wanted}, got {pairs.dt}{reversed_}")
     known = () if options.base is None else (options.base,)
     try:
         if anything_told(options.terms):
@@ -110,10 +109,9 @@ def check_request(
     for name, z in (("z0", pairs.z0), ("z1", pairs.z1)):
         finite = np.isfinite(np.asarray(z)).all(axis=1)
         if not finite.all():
-            raise FitError(
-                f"expected finite states, got {int((~finite).sum())} rows of {name} with NaN or "
-                f"infinity, the first is row {int(np.argmin(finite))}"
-            )
+            first = f"the first is row {int(np.argmin(finite))}"
+            got = f"{int((~finite).sum())} rows of {name} with NaN or infinity"
+            raise FitError(f"expected finite states, got {got}, {first}")
     if structure is None:
         check_number(pairs)
     elif len(pairs) < FEWEST:
@@ -130,10 +128,8 @@ def _check_told(structure: str | None, options: FitOptions, pairs: Pairs) -> Non
     refused["args or a drive"] = depends
     for what, given in refused.items():
         if given:
-            raise FitError(
-                "terms: values, bounds and ties of coefficients are of H of plain pairs, got "
-                f"{what}: give the terms without them"
-            )
+            told = "values, bounds and ties of coefficients are of H of plain pairs"
+            raise FitError(f"terms: {told}, got {what}: give the terms without them")
     terms = given_terms(pairs.dim, untold(options.terms))
     Constrained.of(terms, told_terms(pairs.dim, options.terms))
 
@@ -184,10 +180,8 @@ def unlike_the_scene(pairs: Pairs, scene: Scene) -> list[str]:
     ):
         size, usual = (float(np.median(np.linalg.norm(x, axis=1))) for x in (ours, theirs))
         if usual > 0 and not 1 / OPTIONS.other_size < size / usual < OPTIONS.other_size:
-            messages.append(
-                f"the {name} are {size / usual:.2g} times the size of those in the scene "
-                f"{scene.name}, whose features assume its own units: are the data in these?"
-            )
+            told = f"the {name} are {size / usual:.2g} times the size of those in {scene.name}"
+            messages.append(f"{told}, whose features assume its own units: are the data in these?")
     return messages
 
 
@@ -407,10 +401,8 @@ def structures_to_try(request: Request, data: Dataset) -> Iterator[tuple[Request
         best, left = _best(data)
         if left < PROPOSALS.tried:
             structure = structure_of(best, data.dim, data.coordinates)
-            request.watch.on_progress(
-                f"the structure {best} leaves relative residuals of {left:.1g} in forces and "
-                "velocities: it is tried first"
-            )
+            told = f"the structure {best} leaves relative residuals of {left:.1g} in forces and"
+            request.watch.on_progress(f"{told} velocities: it is tried first")
             same = Dataset.of(data.pairs, data.coordinates, structure, data.row)
             same = dataclasses.replace(same, split=data.split)
             yield dataclasses.replace(request, structure=structure), same

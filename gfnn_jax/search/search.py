@@ -391,10 +391,8 @@ def _beats(rival: Candidate, candidate: Candidate) -> bool:
     if (rival.chart, rival.family) == (candidate.chart, candidate.family):
         return False
     margin = 1.0 if rival.family == candidate.family else 10.0
-    return (
-        rival.operations <= 1.1 * candidate.operations
-        and margin * rival.validation_relative < candidate.validation_relative
-    )
+    cheaper = rival.operations <= 1.1 * candidate.operations
+    return cheaper and margin * rival.validation_relative < candidate.validation_relative
 
 
 def _stalled_sweeps(entries: list[Entry]) -> set[tuple[str, str]]:
