@@ -23,17 +23,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from gfnn_jax import processes
+from gfnn_jax import cli_summary, processes
 from gfnn_jax.cli_parser import OF_COLUMNS, column_options, fit_options, names_roles, parser
-from gfnn_jax.cli_summary import (
-    comparison_table,
-    print_forecasts,
-    print_law,
-    print_predicted,
-    print_record,
-    print_summary,
-    print_table,
-)
 from gfnn_jax.compiling import enable_compile_cache
 from gfnn_jax.data.files import are_recordings
 from gfnn_jax.data.roles import ROLES
@@ -173,7 +164,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
         quick, options = arguments.quick, fit_options(arguments)
         ran = run(arguments.scene, output, quick=quick, dt=arguments.dt, **options)
-    print_summary(ran, out)
+    cli_summary.print_summary(ran, out)
     _show(arguments)
     _hold_to(arguments.strict, out / "model")
 
@@ -188,7 +179,7 @@ def _run_file(arguments: argparse.Namespace) -> None:
             from gfnn_jax.jobs.fit import fit
 
             fitted = fit([data], output, dt=arguments.dt, command=arguments.typed, **options)
-        print_summary(fitted, arguments.out)
+        cli_summary.print_summary(fitted, arguments.out)
         return _show(arguments)
     others = tuple(name for name in (*_OF_MAPS, "learn", "quick") if name != "scene")
     _refuse_given(arguments, others, "not for the law of a recording")
@@ -202,7 +193,7 @@ def _run_file(arguments: argparse.Namespace) -> None:
             ran = run_record(data, output, columns=columns, command=arguments.typed, **options)
         finally:
             _show(arguments)
-    print_record(ran, arguments.out)
+    cli_summary.print_record(ran, arguments.out)
 
 
 def _show(arguments: argparse.Namespace) -> None:
@@ -248,7 +239,7 @@ def _look(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print(json.dumps(summary.as_json(), indent=2, ensure_ascii=False))
     else:
-        print_table(summary)
+        cli_summary.print_table(summary)
         print(f"{summary.next}: {summary.command}\nfigure: {figure}")
     wrong = sum(fault.wrong for fault in summary.faults)
     if arguments.strict and wrong:
@@ -292,7 +283,7 @@ def _fit(arguments: argparse.Namespace) -> None:
 
 def _print_fitted(arguments: argparse.Namespace, ran: Any) -> None:
     """Print a map that was learned, and what to type next."""
-    print_summary(ran, arguments.out)
+    cli_summary.print_summary(ran, arguments.out)
     _print_next(arguments, " --num-steps 1000 --out prediction.npz")
     _hold_to(arguments.strict, arguments.out)
 
@@ -320,7 +311,7 @@ def _fit_recording(
     if not is_law:
         return _print_fitted(arguments, ran)
     gains = ran.fit.gains
-    print_law(ran.fit)
+    cli_summary.print_law(ran.fit)
     print(f"written to {arguments.out}")
     if "stop" in columns:  # what no fit has seen is in the file
         compared = f" --to {columns['stop']:g} --compare {arguments.data[0]}"
@@ -397,7 +388,7 @@ def _predict(arguments: argparse.Namespace) -> None:
         lanes = f"{len(predicted.status)} trajectories, {predicted.seconds:.1f} s"
         print(f"process {share.index} of {share.count}: {lanes}")
         return
-    print_predicted(predicted, asked, arguments.out)
+    cli_summary.print_predicted(predicted, asked, arguments.out)
 
 
 def _is_law(model: Path) -> bool:
@@ -417,7 +408,7 @@ def _forecast(arguments: argparse.Namespace) -> None:
     output = Output(arguments.out, arguments.overwrite)
     asked = _taken(Ahead, arguments)
     found = forecast_recording(arguments.model, arguments.initial, output, asked)
-    print_forecasts(found, arguments.out)
+    cli_summary.print_forecasts(found, arguments.out)
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -448,7 +439,7 @@ def _compare(arguments: argparse.Namespace) -> None:
     if compared is None:
         print(f"{out}: already holds the result of this job")
         return
-    print_table(comparison_table(compared))
+    cli_summary.print_table(cli_summary.comparison_table(compared))
     print(f"written to {out}")
 
 

@@ -10,16 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from gfnn_jax.data.blocks import (
-    BLOCK_ROWS,
-    TIME_TOLERANCE,
-    Block,
-    DataWarning,
-    Request,
-    Source,
-    check_dt,
-    column,
-)
+from gfnn_jax.data import blocks
 from gfnn_jax.data.text_files import TextFile
 from gfnn_jax.errors import InputError
 
@@ -32,7 +23,7 @@ def are_states(names: Sequence[str]) -> bool:
     return {name[0] for name in found if _STATE.fullmatch(name)} == {"q", "p"}
 
 
-def open_csv(request: Request, _stream: object) -> Source:
+def open_csv(request: blocks.Request, _stream: object) -> blocks.Source:
     """Open a text file of states. Raises InputError where its columns are not those of states."""
     return _StatesInText(request).source
 
@@ -40,16 +31,16 @@ def open_csv(request: Request, _stream: object) -> Source:
 class _StatesInText:
     """Rows of states in a text file, read from the begin for each iteration of their blocks."""
 
-    def __init__(self, request: Request):
+    def __init__(self, request: blocks.Request):
         self.path, self.file = request.path, TextFile(request.path)
         # Names of columns in lower case -> as the file has them.
         self.names = {name.lower(): name for name in self.file.names}
         dim = sum(bool(re.fullmatch(r"q\d+", name)) for name in self.names)
-        self.states = [column(c, dim) for c in range(2 * dim)]
+        self.states = [blocks.column(c, dim) for c in range(2 * dim)]
         self._check_header()
         self.each_row = request.initial and not {"t", "sequence"} & set(self.names)
         self.with_time = "t" in self.names and request.with_times
-        with contextlib.closing(self._tables(BLOCK_ROWS)) as tables:
+        with contextlib.closing(self._tables(blocks.BLOCK_ROWS)) as tables:
             first = next(tables)
         found = _first_dt(self, first) if "t" in self.names and not request.initial else None
         dt = request.agreed_dt(found)
@@ -60,13 +51,13 @@ class _StatesInText:
             if "t" not in self.names:
                 raise InputError(f"{self.path}: expected a column t, the time of its drive")
             self._check_period(first, first["period"][0])
-            self.period = check_dt(first["period"][0], f"{self.path}: the column period")
+            self.period = blocks.check_dt(first["period"][0], f"{self.path}: the column period")
         further = (*self.states, "t", "sequence", "period")
         self.parameters = [n for n in self.names if n not in (*further, *moving)]
         units = {n.lower(): unit for n, unit in self.file.units.items()}
         names = tuple(re.sub(r"\W+", "_", name) for name in self.parameters)
         more = {"period": self.period, "timed": self.with_time}
-        self.source = Source(dim, dt, self.blocks, units=units, parameters=names, **more)
+        self.source = blocks.Source(dim, dt, self.blocks, units=units, parameters=names, **more)
 
     def _check_header(self) -> None:
         """Raises InputError where columns are missing, or are without a partner."""
@@ -95,20 +86,20 @@ class _StatesInText:
         ignored = [*moving, *(n.lower() for n in self.file.text)]
         if ignored:
             told = f"columns ignored: {', '.join(ignored)} (not constant in a sequence)"
-            warnings.warn(told, DataWarning, stacklevel=6)
+            warnings.warn(told, blocks.DataWarning, stacklevel=6)
         return ignored
 
     def _check_period(self, table: dict[str, np.ndarray], period: float) -> None:
         if np.any(table["period"] != period):
             raise InputError(f"{self.path}: the column period must hold one number in all rows")
 
-    def blocks(self, rows: int) -> Iterator[Block]:
+    def blocks(self, rows: int) -> Iterator[blocks.Block]:
         """The rows in blocks of at most so many. Raises InputError, with the line, where the rows
         of a sequence do not stand together, times do not rise or a parameter changes."""
         earlier: set[float] = set()
         last, count = np.full((1, 2 + len(self.parameters)), np.nan), 0  # the row before; its place
         passed = 0
-        for table in self._tables(min(rows, BLOCK_ROWS)):
+        for table in self._tables(min(rows, blocks.BLOCK_ROWS)):
             length, begin = len(table["q1"]), passed
             nothing = np.zeros(length)
             sequence = (
@@ -137,7 +128,7 @@ class _StatesInText:
             passed += length
             states = np.stack([table[name] for name in self.states], axis=1)
             locate = partial(self._locate, begin)
-            yield Block(states, sequence, place, locate, told[:, 1:])
+            yield blocks.Block(states, sequence, place, locate, told[:, 1:])
 
     def _locate(self, begin: int, row: int, column: int) -> str:
         return f"{self.file.locate(begin + row)}, {self.states[column]}"
@@ -184,7 +175,7 @@ def _even(time: np.ndarray, sequence: np.ndarray, dt: float) -> bool:
     ``time`` and ``sequence`` start one row before."""
     if np.isnan(dt):
         return False
-    slack = TIME_TOLERANCE * dt + 4 * np.finfo(np.float64).eps * np.abs(time[1:])
+    slack = blocks.TIME_TOLERANCE * dt + 4 * np.finfo(np.float64).eps * np.abs(time[1:])
     even = np.abs(np.diff(time) - dt) <= slack
     return bool(even[sequence[1:] == sequence[:-1]].all()) or _only_rounded(time, sequence, dt)
 

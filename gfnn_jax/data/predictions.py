@@ -26,13 +26,7 @@ import numpy as np
 
 from gfnn_jax.errors import InputError
 from gfnn_jax.processes import Share
-from gfnn_jax.storage.outputs import (
-    atomic_file,
-    atomic_write,
-    ensure_new,
-    failures_as_work_errors,
-    sync_folder,
-)
+from gfnn_jax.storage import outputs
 
 
 @dataclasses.dataclass
@@ -147,18 +141,18 @@ class PredictionWriter:
         self._overwrite = overwrite
         if resume and self._journal.exists() and self._read_journal():
             if not is_done(self.out, self._job):  # what stands there is another's
-                ensure_new(self.out, self._overwrite)
+                outputs.ensure_new(self.out, self._overwrite)
             return
         if resume and not overwrite and is_done(self.out, self._job):
             self.finished, self.saved = True, self.total
-            with failures_as_work_errors(self.out):
+            with outputs.failures_as_work_errors(self.out):
                 self._discard()  # what a kill at the very end may have left
             return
-        ensure_new(self.out, overwrite)
+        outputs.ensure_new(self.out, overwrite)
         if self.partial.exists() and not (overwrite or resume):
             told = "an unfinished prediction (--resume goes on with it, --overwrite discards it)"
             raise InputError(f"{self.partial}: {told}")
-        with failures_as_work_errors(self.out):
+        with outputs.failures_as_work_errors(self.out):
             self._discard()
             self.partial.mkdir(parents=True)
         self._write_journal()
@@ -184,13 +178,13 @@ class PredictionWriter:
         name = f"{self.saved:012d}-{stop:012d}.chunk"
         digest = hashlib.sha256(states.data)
         digest.update(rest.getbuffer())
-        with failures_as_work_errors(self.out):
+        with outputs.failures_as_work_errors(self.out):
             with open(self.partial / name, "wb") as stream:
                 stream.write(states.data)
                 stream.write(rest.getbuffer())
                 stream.flush()
                 os.fsync(stream.fileno())
-            sync_folder(self.partial)
+            outputs.sync_folder(self.partial)
             entry = {"file": name, "start": self.saved, "stop": stop, "sha256": digest.hexdigest()}
             with open(self._journal, "ab") as stream:
                 stream.write(json.dumps(entry).encode() + b"\n")
@@ -219,7 +213,7 @@ class PredictionWriter:
         if self.asked.drive is not None:
             t0, period = self.asked.drive
             arrays |= {"t0": t0, "period": np.asarray(period)}
-        with atomic_file(self.out) as stream, zipfile.ZipFile(stream, "w") as archive:
+        with outputs.atomic_file(self.out) as stream, zipfile.ZipFile(stream, "w") as archive:
             shape = (self.lanes, self.total, self._state)
             with member_of(archive, "trajectories", shape, np.float64) as member:
                 self._assemble(member, 0)
@@ -274,7 +268,7 @@ class PredictionWriter:
 
     def _write_journal(self) -> None:
         lines = [{"job": self._job, "overwrite": self._overwrite}, *self._chunks]
-        atomic_write(self._journal, "".join(json.dumps(line) + "\n" for line in lines))
+        outputs.atomic_write(self._journal, "".join(json.dumps(line) + "\n" for line in lines))
 
     def _read_journal(self) -> bool:
         """Take up the chunks that are whole; False if the job's first line was never written."""
@@ -371,9 +365,9 @@ def put_together(parts: Sequence[Path], out: Path, job: dict[str, Any]) -> None:
 
     Memory: 16 MiB, whatever the sizes. Raises WorkError where writing fails; the parts then stay.
     """
-    with failures_as_work_errors(out), contextlib.ExitStack() as stack:
+    with outputs.failures_as_work_errors(out), contextlib.ExitStack() as stack:
         archives = [stack.enter_context(zipfile.ZipFile(path)) for path in parts]
-        stream = stack.enter_context(atomic_file(out))
+        stream = stack.enter_context(outputs.atomic_file(out))
         whole = stack.enter_context(zipfile.ZipFile(stream, "w"))
         for name in (Path(n).stem for n in archives[0].namelist()):
             if name == "job":

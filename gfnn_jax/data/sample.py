@@ -10,16 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from gfnn_jax.data import files
 from gfnn_jax.data.blocks import ARC, BLOCK_ROWS
-from gfnn_jax.data.files import (
-    TrajectoryData,
-    digest_of,
-    iterate_pairs,
-    listed,
-    named,
-    opened,
-    own_files,
-)
 from gfnn_jax.errors import InputError
 from gfnn_jax.processes import Group
 
@@ -33,7 +25,7 @@ def read_sample(
     num_pairs: int = 200_000,
     seed: int = 0,
     group: Group | None = None,
-) -> TrajectoryData:
+) -> files.TrajectoryData:
     """Read a random sample of the pairs of data larger than memory, as `read_trajectories` would.
 
     paths: a file, or several. group: the processes that each read their own pairs of them, as
@@ -47,7 +39,7 @@ def read_sample(
     """
     alone, group = group is None, group or Group()
     found, checksum, count, extremes = None, np.zeros(1, np.uint64), 0, [np.inf, 0.0]
-    for pairs in iterate_pairs(paths, BLOCK_ROWS, dt=dt, share=group.share):
+    for pairs in files.iterate_pairs(paths, BLOCK_ROWS, dt=dt, share=group.share):
         new = _table(pairs, seed)
         args = [column for name, column in new.items() if name.startswith(_ARG)]
         numbers = [*new["pairs"].reshape(len(pairs), -1).T, new["dt"], *args]
@@ -58,14 +50,14 @@ def read_sample(
     of_group = group.folded({n: np.array(v) for n, v in of_process.items()}, _both)
     total = group.broadcast({"count": of_group["count"].sum()} if group.first else None)["count"]
     if not total:
-        raise InputError(f"{named(paths)}: no pair of consecutive states found")
+        raise InputError(f"{files.named(paths)}: no pair of consecutive states found")
     if group.share.count > 1:  # those that the first will want, and a few more
         more = 10 * np.sqrt(num_pairs * ARC)  # ten deviations of the number below a bound
         part = (num_pairs + more) / max(int(total), 1)
         if found is not None and part < 1:
             found = _taken(found, found["key"] < np.uint64(part * 2.0**64))
         found = group.folded(found or {}, _both)
-    with opened(own_files(paths, group.share)[0][0][1], dt) as source:
+    with files.opened(files.own_files(paths, group.share)[0][0][1], dt) as source:
         precision, units, period = source.precision, source.units, source.period
         of_pairs_alone, none = source.of_pairs_alone, np.empty((0, 2, 2 * source.dim))
     if not found:  # this process has no pair, and sends none
@@ -80,15 +72,15 @@ def read_sample(
         begins[1:] = (np.diff(number) != 1) | np.any(pairs[:-1, 1] != pairs[1:, 0], axis=1)
         first = np.maximum.accumulate(np.where(begins, np.arange(len(number)), 0))
         found = {**found, "run": number[first], "place": number - number[first]}
-    alone = alone and len(listed(paths)) == 1
-    digest = digest_of(listed(paths)[0]) if alone else f"{of_group['hash'].sum():016x}"
+    alone = alone and len(files.listed(paths)) == 1
+    digest = files.digest_of(files.listed(paths)[0]) if alone else f"{of_group['hash'].sum():016x}"
     same = of_group["low"].min() == of_group["high"].max()
     states = found["pairs"].reshape(-1, found["pairs"].shape[-1])
     args = {n.removeprefix(_ARG): v for n, v in found.items() if n.startswith(_ARG)}
     each = float(found["dt"][0]) if same and len(states) else found["dt"]
-    pairs = np.full(len(found["pairs"]), 2), each, named(paths), digest, precision, units
+    pairs = np.full(len(found["pairs"]), 2), each, files.named(paths), digest, precision, units
     of_rows = found["run"], found["place"], int(total)
-    return TrajectoryData(states, *pairs, args or None, period, *of_rows)
+    return files.TrajectoryData(states, *pairs, args or None, period, *of_rows)
 
 
 def _table(pairs: Any, seed: int) -> dict[str, np.ndarray]:

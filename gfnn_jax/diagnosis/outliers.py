@@ -30,12 +30,7 @@ from gfnn_jax.dataset.dataset import Dataset
 from gfnn_jax.dataset.runs import Identified, first_occurrences, steps_between
 from gfnn_jax.dataset.structures import Structure
 from gfnn_jax.dataset.varied import given_by
-from gfnn_jax.diagnosis.local_jacobians import (
-    MANY_TERMS,
-    NEIGHBOURS_PER_TERM,
-    check_number,
-    pseudo_inverse,
-)
+from gfnn_jax.diagnosis import local_jacobians
 from gfnn_jax.solve.noise import Biweight, robust
 
 
@@ -113,7 +108,7 @@ def clean(
         messages.append(f"{copies} of {len(pairs)} pairs are copies of others: each counts once")
         pairs, row = pairs.take(first), row[first]
         if structure is None:
-            check_number(pairs)
+            local_jacobians.check_number(pairs)
     data = Dataset.of(pairs, coordinates, structure, row)
     if structure is not None or jumps:  # of many dimensions too few pairs have neighbours
         return data, messages
@@ -177,7 +172,7 @@ def outliers(y0, y1, scale, given=None) -> np.ndarray:
     x, move = np.asarray(y0) / scale, (np.asarray(y1) - np.asarray(y0)) / scale
     x = x if given is None else np.concatenate([x, given], axis=1)
     rows, found = looked_for_errors(len(x)), []
-    few = OPTIONS.neighbourhoods * NEIGHBOURS_PER_TERM * (1 + x.shape[1]) / len(x)
+    few = OPTIONS.neighbourhoods * local_jacobians.NEIGHBOURS_PER_TERM * (1 + x.shape[1]) / len(x)
     for _ in range(OPTIONS.outlier_rounds):
         outlying = _studentised(x[rows], move[rows]) > OPTIONS.outlying * max(1.0, few)
         if not outlying.any():
@@ -191,19 +186,19 @@ def _studentised(x, move):
     """The error of each move (N, 2d) predicted by its neighbours, over its standard deviation."""
     n, width = x.shape
     terms = 1 + width
-    count = NEIGHBOURS_PER_TERM * terms
+    count = local_jacobians.NEIGHBOURS_PER_TERM * terms
     if n <= count:
         return np.zeros(n)
     tree, floor = cKDTree(x), 1e-13 * (1 + np.abs(move).max())
     error, deviation = np.zeros(n), np.zeros(n)
-    rows = _suspect(x, move) if terms > MANY_TERMS else np.arange(n)
+    rows = _suspect(x, move) if terms > local_jacobians.MANY_TERMS else np.arange(n)
     for block in np.array_split(rows, 1 + len(rows) // 10_000):  # in bounded memory
         near = tree.query(x[block], k=count + 1)[1][:, 1:]
         offset = x[near] - x[block][:, None, :]
         design = np.concatenate([np.ones((*offset.shape[:2], 1)), offset], axis=-1)
         moves, kept = move[near], np.ones(near.shape)
         for _ in range(2):  # the second time without the neighbour that fits worst: an outlier?
-            inverse = pseudo_inverse(design * kept[..., None])
+            inverse = local_jacobians.pseudo_inverse(design * kept[..., None])
             solution = inverse @ (moves * kept[..., None])
             rest = np.sum((moves - design @ solution) ** 2, axis=-1) * kept
             deviation[block] = np.sqrt(rest.sum(axis=1) / (kept.sum(axis=1) - terms))

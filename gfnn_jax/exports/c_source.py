@@ -17,16 +17,7 @@ import numpy as np
 
 from gfnn_jax.coordinates import CARTESIAN, LOG, polar
 from gfnn_jax.errors import InputError
-from gfnn_jax.exports import c_parts
-from gfnn_jax.exports.c_pieces import (
-    args_later,
-    christoffel,
-    moves_args,
-    on_symbols,
-    piece_functions,
-    unknowns,
-    why_not_piece,
-)
+from gfnn_jax.exports import c_parts, c_pieces
 from gfnn_jax.exports.graph import LawGraph, graph_of
 from gfnn_jax.exports.symbols import Tape, literal, table
 from gfnn_jax.exports.taylor import c_of_flow
@@ -52,7 +43,7 @@ def why_not(map_: SymplecticMap) -> str | None:
     if not isinstance(map_.domain, Domain):
         return "the map is a sum over equal sites"
     pieces = map_.pieces if map_.bracket is None else ()  # its rates are formulas
-    return next((why for piece in pieces if (why := why_not_piece(piece))), None)
+    return next((why for piece in pieces if (why := c_pieces.why_not_piece(piece))), None)
 
 
 def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
@@ -83,7 +74,9 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
         parts.append(c_parts.POLAR)
     if map_.coordinates.forward is LOG.forward:
         parts.append(c_parts.logarithms(width))
-    most = max((unknowns(p, map_.dim) for p in pieces if isinstance(p, Generated)), default=0)
+    most = max(
+        (c_pieces.unknowns(p, map_.dim) for p in pieces if isinstance(p, Generated)), default=0
+    )
     if most:
         parts.append(c_parts.newton_solver(most, width))
     if most > COFACTORS_UP_TO:
@@ -91,11 +84,11 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     if domain.keep:
         tape = Tape()
         y = tape.inputs("y", width)
-        parts.append(tape.function("christoffel", {"kappa": christoffel(domain, y[0])}))
+        parts.append(tape.function("christoffel", {"kappa": c_pieces.christoffel(domain, y[0])}))
     for i, piece in enumerate(pieces):
         graph, back = graphs[i], map_.reversed().pieces[-1 - i]
         if graph is None:
-            parts += piece_functions(f"piece{i}", piece, back, width, more)
+            parts += c_pieces.piece_functions(f"piece{i}", piece, back, width, more)
         else:
             parts += _flow(f"piece{i}", piece, graph, width, 0 if map_.signals is None else more)
     order = range(len(map_.pieces))
@@ -117,7 +110,7 @@ def _flow(name: str, piece: Any, graph: LawGraph, width: int, inputs: int) -> li
     own = re.findall(r"^static (?:const )?\w+ (\w+)\W", flow, re.M)
     own += re.findall(r"(\w+) = \d", flow.partition("\n")[0])
     flow = re.sub(rf"\b({'|'.join(own)})\b", rf"{name}_\1", flow)
-    later = args_later(f"{name}_later", on_symbols(piece.family), inputs)
+    later = c_pieces.args_later(f"{name}_later", c_pieces.on_symbols(piece.family), inputs)
     ways = (("step", dt), ("back", -dt))
     found = [flow, later] if later else [flow]
     for way, h in ways:
@@ -230,7 +223,7 @@ def args_after(map_: SymplecticMap) -> list[str]:
         later = map_.parameters.after(np.zeros((1, len(names))), 1, dt)[0, -1]
         time = f"y[{width + len(names) - 1}]"
         return [f"{time} = fmod({time} + {literal(later)}, {literal(period)});"]
-    if map_.signals is not None and moves_args(map_.pieces[0], more):
+    if map_.signals is not None and c_pieces.moves_args(map_.pieces[0], more):
         return [f"const double after = {literal(dt)};", f"piece0_later(args, &after, y + {width});"]
     return []
 

@@ -46,12 +46,7 @@ from gfnn_jax.scenes import Scene
 from gfnn_jax.scenes.draws import sample_sequences, sample_test_states
 from gfnn_jax.scenes.trajectories import reference_trajectories
 from gfnn_jax.solve.status import NOT_CONVERGED
-from gfnn_jax.storage.outputs import (
-    atomic_folder,
-    atomic_write,
-    failures_as_work_errors,
-    unfinished,
-)
+from gfnn_jax.storage import outputs
 
 PAPER_GFNN, OURS = "gfnn-paper", "gfnn"
 TITLES = {name: method.title for name, method in METHODS.items()}
@@ -269,7 +264,7 @@ def compare(
     if output.resume and _already_done(output.out, job, chosen):
         return None
     given = {"overwrite": output.overwrite, "resume": output.resume}
-    with unfinished(output.out, job, what="comparison", **given) as kept_in:
+    with outputs.unfinished(output.out, job, what="comparison", **given) as kept_in:
         data = SharedData(scene, seed, quick)
         for method in chosen:
             if (kept_in / f"{method}.json").exists():
@@ -320,7 +315,7 @@ def compare(
             "job": job,
             "methods": reported,
         }
-        with atomic_folder(output.out) as folder:
+        with outputs.atomic_folder(output.out) as folder:
             for file, figure in figures_of_comparison(scene, measured, data.reference).items():
                 figures.save(figure, folder / f"{file}.png")
             (folder / report.REPORT).write_text(report.to_json(result), encoding="utf-8")
@@ -361,9 +356,9 @@ def _already_done(out: Path, job: dict[str, Any], chosen: Sequence[str]) -> bool
 
 def _keep(folder: Path, method: str, part: dict[str, Any], rollouts: Rollouts) -> None:
     """Keep a finished method. The .json is written last: where it exists, the .npz is whole."""
-    with failures_as_work_errors(folder):
+    with outputs.failures_as_work_errors(folder):
         np.savez(folder / f"{method}.npz", **rollouts._asdict())
-    atomic_write(folder / f"{method}.json", report.to_json(part))
+    outputs.atomic_write(folder / f"{method}.json", report.to_json(part))
 
 
 def _kept(folder: Path, method: str) -> tuple[dict[str, Any], Rollouts]:

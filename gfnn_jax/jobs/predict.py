@@ -12,16 +12,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gfnn_jax.data import predictions
 from gfnn_jax.data.blocks import damage
 from gfnn_jax.data.files import are_recordings, read_initial, read_initial_noise
-from gfnn_jax.data.predictions import (
-    PredictionJob,
-    PredictionWriter,
-    is_done,
-    number_of_parts,
-    part_of,
-    put_together,
-)
 from gfnn_jax.data.recording import args_of
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.jobs.output import Output, digest_of, read_in_units, refuse_other_units
@@ -163,13 +156,15 @@ def _in_parts(
 ) -> Predicted:
     """Predict the lanes of this process into a part, or several; the first process joins all."""
     output, whole = job.output, job.request(begin, identity).record
-    if not output.overwrite and output.resume and is_done(output.out, whole):
+    if not output.overwrite and output.resume and predictions.is_done(output.out, whole):
         wait_for_all()
         return _finished(output.out)
     ensure_new(output.out, output.overwrite)
-    many = number_of_parts(output.out, share, resume=output.resume and not output.overwrite)
+    many = predictions.number_of_parts(
+        output.out, share, resume=output.resume and not output.overwrite
+    )
     shares = [Share(i, many) for i in range(many)]
-    lanes = {part_of(output.out, one): one.of(len(begin.z0), block) for one in shares}
+    lanes = {predictions.part_of(output.out, one): one.of(len(begin.z0), block) for one in shares}
     predicted = [Predicted(np.zeros(0, int), np.zeros(0, int), 0.0)]
     for part, own in [*lanes.items()][share.index :: share.count]:
         if own.stop > own.start:
@@ -181,7 +176,7 @@ def _in_parts(
     if share.index == 0:
         output.progress.status(f"writing {output.out}")
         there = [part for part, own in lanes.items() if own.stop > own.start]
-        put_together(there, output.out, whole)
+        predictions.put_together(there, output.out, whole)
         return _finished(output.out)._replace(seconds=seconds)
     status = np.concatenate([part.status for part in predicted])
     return Predicted(status, np.concatenate([part.left_at for part in predicted]), seconds)
@@ -262,7 +257,7 @@ class _Prediction:
     asked: Steps
     output: Output
 
-    def request(self, begin: _Begin, identity: dict[str, Any]) -> PredictionJob:
+    def request(self, begin: _Begin, identity: dict[str, Any]) -> predictions.PredictionJob:
         """Request of these lanes, for their file."""
         parameters, params, own, drive = self.map.parameters, begin.params, None, None
         if parameters is not None and params is not None:
@@ -274,13 +269,15 @@ class _Prediction:
         asked, dt = self.asked, abs(float(self.map.dt))
         bands = self.drawn is not None
         known = asked.num_steps, dt, asked.save_every, bands, own, drive
-        return PredictionJob(identity, begin.z0.shape, *known)
+        return predictions.PredictionJob(identity, begin.z0.shape, *known)
 
     def written(self, out: Path, begin: _Begin, identity: dict[str, Any]) -> Predicted:
         """Predict these lanes into one file."""
         output, asked = self.output, self.asked
         job = self.request(begin, identity)
-        writer = PredictionWriter(out, job, resume=output.resume, overwrite=output.overwrite)
+        writer = predictions.PredictionWriter(
+            out, job, resume=output.resume, overwrite=output.overwrite
+        )
         started = time.perf_counter()
         if writer.finished:
             return _finished(out)
@@ -303,7 +300,7 @@ class _Prediction:
             raise
         return Predicted(status, left_at, time.perf_counter() - started, passed)
 
-    def _go_on(self, begin: _Begin, writer: PredictionWriter) -> Lanes:
+    def _go_on(self, begin: _Begin, writer: predictions.PredictionWriter) -> Lanes:
         """Compute all chunks that are not yet written; return the lanes after the last step."""
         asked, drawn, z0 = self.asked, self.drawn, begin.z0
         options = {"params": begin.params, "stop_outside": asked.outside == "stop"}

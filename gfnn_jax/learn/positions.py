@@ -32,20 +32,7 @@ from gfnn_jax.generating.generated import Generated
 from gfnn_jax.learn.fitted import STATES_MEASURED, Choice, Fit, OfPositions
 from gfnn_jax.learn.options import FitOptions, Watch
 from gfnn_jax.maps.sensors import Sensors
-from gfnn_jax.models.positions.discrete_lagrangian import (
-    Triples,
-    displacement,
-    residuals,
-    solve,
-    triples_of,
-)
-from gfnn_jax.models.positions.latent_positions import (
-    images_of,
-    map_of,
-    starting_noise,
-    states_of,
-    without_noise,
-)
+from gfnn_jax.models.positions import discrete_lagrangian, latent_positions
 from gfnn_jax.phase_space import Pairs, require_x64, sizes
 from gfnn_jax.search.search import MET
 
@@ -88,7 +75,7 @@ def learn_positions(recording: Recording, options: FitOptions, watch: Watch) -> 
     tolerance, structure = Tolerance.of(options), options.structure
     recording, left_out = without_wrong_values(recording)
     budget = options.budget(watch, len(recording.positions) or None)
-    triples = triples_of(recording, sites=structure is not None)
+    triples = discrete_lagrangian.triples_of(recording, sites=structure is not None)
     sites = structure_of(structure, triples.dim, Coordinates("positions", triples.angles))
     if sites is not None and not isinstance(sites, Sites):
         raise FitError(f"expected a ring or a chain of positions, got {structure!r}")
@@ -125,7 +112,7 @@ class _Found(NamedTuple):
 class _Sweep:
     """The triples, which of them train, choose and test, and every size that was tried."""
 
-    triples: Triples
+    triples: discrete_lagrangian.Triples
     sites: Sites | None
     split: Split
     tolerance: Tolerance
@@ -206,7 +193,9 @@ class _Sweep:
         both = np.sort(split.training), np.sort(split.validation)
         training, held_out = map(self.triples.take, both)
         families = self._families(symmetric)
-        found = without_noise(families, training, held_out, self.budget, self.watch.on_progress)
+        found = latent_positions.without_noise(
+            families, training, held_out, self.budget, self.watch.on_progress
+        )
         if found is None:
             return best
         started = time.perf_counter()
@@ -242,12 +231,14 @@ class _Sweep:
         """S of this family by least squares."""
         self.watch.on_progress(f"S of {family.label}, {family.num_parameters} terms")
         started, training = time.perf_counter(), self.triples.take(self.split.training)
-        solved = solve(family, training)
+        solved = discrete_lagrangian.solve(family, training)
         told, count = (solved.rank, solved.condition), len(self.triples)
         about = OfPositions(symmetric, family.num_parameters, *told, count)
-        left = residuals(family, family.unflatten(solved.coefficients), training)
-        deviation = np.sqrt(np.mean((left / displacement(training)) ** 2))
-        noise = starting_noise(family, solved.coefficients, training)
+        left = discrete_lagrangian.residuals(
+            family, family.unflatten(solved.coefficients), training
+        )
+        deviation = np.sqrt(np.mean((left / discrete_lagrangian.displacement(training)) ** 2))
+        noise = latent_positions.starting_noise(family, solved.coefficients, training)
         root = deviation * solved.root
         return self._found(family, about, solved.coefficients, root, noise, started)
 
@@ -264,10 +255,10 @@ class _Sweep:
         triples = self.triples
         training, held = (triples.take(r) for r in (self.split.training, self.split.validation))
         params = family.unflatten(coefficients)
-        states = states_of(family, params, triples)
+        states = latent_positions.states_of(family, params, triples)
         piece = Generated(family, params, TYPE1, triples.dt, sizes(states[0]))
-        left = residuals(family, params, training) / self.spread
-        error = self.error_of(images_of(piece, held), self.split.validation)
+        left = discrete_lagrangian.residuals(family, params, training) / self.spread
+        error = self.error_of(latent_positions.images_of(piece, held), self.split.validation)
         gradient, with_hessian = family.operations
         candidate = Candidate.of(
             error,
@@ -296,7 +287,9 @@ class _Sweep:
         nothing where there are enough. left_out: lines about readings that were."""
         self.watch.on_progress(f"compiling the step of {best.candidate.label}")
         sensors = dataclasses.replace(self.sensors, sigma=best.noise)
-        map_, states = map_of(best.piece, best.root, sensors, self.triples, self.sites)
+        map_, states = latent_positions.map_of(
+            best.piece, best.root, sensors, self.triples, self.sites
+        )
         test = self.split.test if len(self.split.test) else self.split.validation
         steps = stepped(map_, states.z1[test])
         images = np.where(steps.failed[:, None], np.nan, steps.images)[:, : self.triples.dim]
@@ -331,7 +324,7 @@ class _Sweep:
         return Fit(map_, choice)
 
 
-def _split(triples: Triples, seed: int) -> Split:
+def _split(triples: discrete_lagrangian.Triples, seed: int) -> Split:
     """Split by runs, or of few runs by blocks of time, as pairs of states (q, Q − q) are split."""
     coming, going = np.split(triples.moves, 2)
     z0 = np.concatenate([triples.middle, coming], axis=1)
@@ -340,7 +333,7 @@ def _split(triples: Triples, seed: int) -> Split:
     return split_rows(identified(pairs).pairs, seed)
 
 
-def _centres_of_moves(triples: Triples) -> np.ndarray | None:
+def _centres_of_moves(triples: discrete_lagrangian.Triples) -> np.ndarray | None:
     """Centres as `OfDisplacement` has them."""
     if not triples.wrapped:
         return None

@@ -26,12 +26,7 @@ import jax
 import numpy as np
 
 from gfnn_jax.errors import InputError
-from gfnn_jax.storage.outputs import (
-    atomic_file,
-    atomic_folder,
-    failures_as_work_errors,
-    restore_interrupted,
-)
+from gfnn_jax.storage import outputs
 
 # Formats of folders, with where their arrays are: that of 0.3, read only, and that of 0.4.
 _FORMAT, _ARRAYS = 3, {2: "arrays", 3: "arrays.npz"}
@@ -134,7 +129,7 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
     structure = _structure(tree, iter(range(len(leaves))))
     record = {"format": _FORMAT, **record, "leaves": leaves, "structure": structure}
     text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
-    with atomic_folder(folder) as new:
+    with outputs.atomic_folder(folder) as new:
         if stored:
             np.savez(new / _ARRAYS[_FORMAT], allow_pickle=False, **stored)
         (new / _JSON).write_text(text, encoding="utf-8")
@@ -149,8 +144,8 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
 
 def _read(folder: Path) -> tuple[Any, dict[str, Any]]:
     """Read the tree, with NumPy leaves, and the content of ``model.json``; verify both."""
-    with failures_as_work_errors(folder):
-        restore_interrupted(folder)
+    with outputs.failures_as_work_errors(folder):
+        outputs.restore_interrupted(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     if not (folder / _JSON).is_file():
@@ -289,7 +284,7 @@ class KeptFactors:
 
     def save(self, name: str, **arrays) -> None:
         """Save these arrays under this name. Raises WorkError."""
-        with atomic_file(self._path(name)) as stream:
+        with outputs.atomic_file(self._path(name)) as stream:
             np.savez(stream, **arrays)
 
     def _path(self, name: str) -> Path:
