@@ -209,17 +209,14 @@ class _Sequences(NamedTuple):
                     yield block
 
         dtypes = [one.dtype for one in self.arrays]
-        return Source(
-            dim,
-            self.dt,
-            blocks,
-            precision=str(np.result_type(*dtypes) if of_pairs else dtypes[0]),
-            parameters=names,
-            uneven=self.uneven,
-            period=self.period,
-            timed=self.times is not None,
-            of_pairs_alone=of_pairs,
-        )
+        told: dict[str, Any] = {
+            "uneven": self.uneven,
+            "timed": self.times is not None,
+            "of_pairs_alone": of_pairs,
+        }
+        precision = str(np.result_type(*dtypes) if of_pairs else dtypes[0])
+        period = self.period
+        return Source(dim, self.dt, blocks, precision, parameters=names, period=period, **told)
 
 
 def open_npy(request: Request, stream) -> Source:

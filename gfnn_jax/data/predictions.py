@@ -80,15 +80,10 @@ class PredictionJob:
     @property
     def record(self) -> dict[str, Any]:
         """The request as a file can hold it."""
-        job = {
-            **self.identity,
-            "format": OPTIONS.format,
-            "shape": [self.shape[0], len(self.steps), self.shape[1]],
-            **({"bands": True} if self.bands else {}),
-            "num_steps": self.num_steps,
-            "save_every": self.save_every,
-            "dt": float(self.dt),
-        }
+        shape = [self.shape[0], len(self.steps), self.shape[1]]
+        job = {**self.identity, "format": OPTIONS.format, "shape": shape}
+        job |= {"bands": True} if self.bands else {}
+        job |= {"num_steps": self.num_steps, "save_every": self.save_every, "dt": float(self.dt)}
         return json.loads(json.dumps(job))  # as it will be read back
 
 

@@ -249,19 +249,10 @@ class TextFile:
 
         names = [*self.names, _BEYOND]
         words = {n for n in names if n not in wanted or n in self.text or n in as_text}
-        options: dict[str, Any] = {
-            "sep": self._separator,
-            "decimal": self._decimal,
-            "comment": self._comment,
-            "header": None,
-            "names": names,
-            "dtype": {n: str if n in words else np.float64 for n in names},
-            "skiprows": self._first,
-            "chunksize": rows,
-            "na_values": list(_MISSING),
-            "skipinitialspace": True,
-            "index_col": False,
-        }
+        options: dict[str, Any] = {"header": None, "index_col": False, "skipinitialspace": True}
+        options |= {"sep": self._separator, "decimal": self._decimal, "comment": self._comment}
+        options |= {"names": names, "dtype": {n: str if n in words else np.float64 for n in names}}
+        options |= {"skiprows": self._first, "chunksize": rows, "na_values": list(_MISSING)}
         last, begin = self.names[-1], None
         try:
             with self._open() as stream, pd.read_csv(stream, **options) as blocks:

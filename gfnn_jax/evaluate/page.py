@@ -146,16 +146,11 @@ def write_refusal(recording: Recording, error: Exception, folder: Path, about: A
     result["data"] = {**refused["data"], "source": recording.source}
     summary = recording.summary()
     drawn = _svg(figures.recording_figure(recording, summary), "The recording.")
-    sections = [
-        Section("Why", lines=[str(error)]),
-        Section(
-            "The data",
-            lines=[*about.notes, *recording.notes, *map(str, summary.faults)],
-            figures=[drawn],
-        ),
-        Section("To do next", lines=[summary.command]),
-        _made(float("nan"), about.command),
-    ]
+    notes = [*about.notes, *recording.notes, *map(str, summary.faults)]
+    sections = [Section("Why", lines=[str(error)])]
+    sections.append(Section("The data", lines=notes, figures=[drawn]))
+    sections.append(Section("To do next", lines=[summary.command]))
+    sections.append(_made(float("nan"), about.command))
     atomic_write(folder / PAGE, _rendered(_title(recording), verdict, sections))
     atomic_write(folder / REPORT, to_json(result))
 
@@ -177,17 +172,12 @@ def _title(recording: Recording) -> str:
 def _of_law(
     fit: Fit, law: LearnedLaw, forecasts: Forecasts | None, notes: Sequence[str]
 ) -> Iterator[Section]:
-    known = physics(law)
-    yield Section(
-        "Law",
-        lines=[law.units_line, f"Scale of L: {law.gauge}."],
-        formulas=[
-            ("Lagrangian", f"{defines('L')} {law.lagrangian.mathml()}"),
-            ("Rayleigh's dissipation function", f"{defines('R')} {law.friction.mathml()}"),
-            *(("Equation of motion", equation.mathml()) for equation in law.equations),
-        ],
-    )
-    yield _physics(law, known)
+    formulas = [("Lagrangian", f"{defines('L')} {law.lagrangian.mathml()}")]
+    friction = f"{defines('R')} {law.friction.mathml()}"
+    formulas.append(("Rayleigh's dissipation function", friction))
+    formulas += [("Equation of motion", equation.mathml()) for equation in law.equations]
+    yield Section("Law", lines=[law.units_line, f"Scale of L: {law.gauge}."], formulas=formulas)
+    yield _physics(law, physics(law))
     yield _forecasts(fit, _coming(fit, law), law.horizon_lines, forecasts)
     data = fit.data
     if data is not None:  # the longest run after what was learned from, or its last third
@@ -195,17 +185,10 @@ def _of_law(
         begin = figures.begin_of(own, fit.learned_to)
         yield Section("Simulation", script=simulation(law, own, begin))
     if law.traces and fit.data is not None:
-        yield Section(
-            "Residuals",
-            lines=[f"{name}: residuals {one.text}." for name, one in law.whiteness.items()],
-            figures=[
-                _svg(
-                    figures.residuals_figure(law, fit.data),
-                    "Measured minus law along the arcs of "
-                    "the fit: against time, the channel, and its rate of change.",
-                )
-            ],
-        )
+        lines = [f"{name}: residuals {one.text}." for name, one in law.whiteness.items()]
+        told = "Measured minus law along the arcs of the fit: against time, the channel, and its"
+        drawn = _svg(figures.residuals_figure(law, fit.data), f"{told} rate of change.")
+        yield Section("Residuals", lines=lines, figures=[drawn])
     yield Section("Not identified", lines=list(_not_identified(law)))
     heads = ("alternative", "odds of this law against it", "")
     yield Section("Rivals", heads=heads, rows=list(_rivals(law)))
@@ -249,16 +232,13 @@ def _forecasts(
     caption = f"Three forecasts of what no fit has seen, each {begun}."
     units = {name: fit.held_out.unit(name) for name in found.median}
     share = f"{100 * found.within:.0f} % of what was measured lies within two standard deviations"
-    return Section(
-        "Forecasts",
-        lines=[f"{share} (95 % expected).", *lines],
-        heads=("median error", *(f"after {s:.3g} s" for s in found.ahead)),
-        rows=[
-            (name, *(f"{e:.3g} {units[name]}".rstrip() for e in errors))
-            for name, errors in found.median.items()
-        ],
-        figures=[*drawn, _svg(figures.forecasts_figure(found, fit.held_out), caption)],
-    )
+    heads = ("median error", *(f"after {s:.3g} s" for s in found.ahead))
+    rows = []
+    for name, errors in found.median.items():
+        rows.append((name, *(f"{e:.3g} {units[name]}".rstrip() for e in errors)))
+    lines = [f"{share} (95 % expected).", *lines]
+    drawn = [*drawn, _svg(figures.forecasts_figure(found, fit.held_out), caption)]
+    return Section("Forecasts", lines=lines, heads=heads, rows=rows, figures=drawn)
 
 
 def _not_identified(law: LearnedLaw) -> Iterator[str]:
@@ -306,17 +286,11 @@ def _of_choice(fit: Fit, found: Choice) -> Iterator[Section]:
         rows = [(in_letters(t.term), measured(t.coefficient, t.std)) for t in law.terms]
         table = {"heads": ("term", "coefficient"), "rows": rows}
         yield Section("Law", formulas=formulas, lines=[*fit.bracket_lines, *law.notes], **table)
-    yield Section(
-        "The map",
-        lines=[
-            f"{found.line}.",
-            f"Time step {float(np.asarray(fit.map.dt)):g}.",
-            f"The search ended: {found.ended}.",
-            *([found.stated_by] if found.stated_by else []),
-            *([str(found.positions)] if found.positions is not None else []),
-            *map(str, found.partial_laws if not found.met else ()),
-        ],
-    )
+    lines = [f"{found.line}.", f"Time step {float(np.asarray(fit.map.dt)):g}."]
+    lines += [f"The search ended: {found.ended}.", *filter(None, [found.stated_by])]
+    lines += [] if found.positions is None else [str(found.positions)]
+    lines += [] if found.met else map(str, found.partial_laws)
+    yield Section("The map", lines=lines)
     heads, rows = candidate_cells(found)
     yield Section("Candidates", heads=heads, rows=rows)
     null = law.null_terms if law is not None else ()

@@ -141,24 +141,13 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
     # Whether the family depends on time, the last of its args but for the inputs.
     advances = none.size and np.any(at_time(_held(piece.family), none, 1.0) != none)
     time = len(base) - 1 if advances else None
+    names = coordinate_names(dim) if bracket is None else bracket.labels
+    of_terms = piece.family if bracket is None else getattr(piece.family, "family", piece.family)
+    terms = tuple(of_terms.term_names) if plain or bracket is not None else ()
+    law = tape, list(rates), speeds, limits, directions
+    named = names, (*base, *inputs), terms, params if plain else np.zeros(0)
     return LawGraph(
-        tape,
-        list(rates),
-        speeds,
-        limits,
-        directions,
-        coordinate_names(dim) if bracket is None else bracket.labels,
-        (*base, *inputs),
-        tuple(getattr(piece.family, "family", piece.family).term_names)
-        if bracket is not None
-        else tuple(piece.family.term_names)
-        if plain
-        else (),
-        params if plain else np.zeros(0),
-        tuple(series),
-        time,
-        float(map_.dt),
-        np.asarray(map_.scale, float),
+        *law, *named, tuple(series), time, float(map_.dt), np.asarray(map_.scale, float)
     )
 
 

@@ -250,22 +250,12 @@ def _of_chain(map_: SymplecticMap, law: Lagrangian, chain: _Chain) -> Robot:
         told = (f"{n} = {row}" for n, row in zip(names, rows, strict=True))
         notes.append(f"the columns of the data: {', '.join(told)}")
     down = np.array([0.0, 0.0, -1.0])
-    links = [
-        Link(
-            f"joint{j + 1}",
-            j - 1,
-            False,
-            masses[j],
-            centres[j] * down,
-            inertias[j] * np.diag([1.0, 1.0, 1e-3]),
-            Rotation.from_euler("y", -zeros[j]),
-            (lengths[j - 1] if j else 0.0) * down,
-            np.array([0.0, 1.0, 0.0]),
-            chain.rotors[j],
-            lengths[j] or 2 * centres[j] or 1.0,
-        )
-        for j in range(dim)
-    ]
+    links, axis = [], np.array([0.0, 1.0, 0.0])
+    for j in range(dim):
+        body = masses[j], centres[j] * down, inertias[j] * np.diag([1.0, 1.0, 1e-3])
+        origin, length = (lengths[j - 1] if j else 0.0) * down, lengths[j] or 2 * centres[j] or 1.0
+        place = Rotation.from_euler("y", -zeros[j]), origin, axis
+        links.append(Link(f"joint{j + 1}", j - 1, False, *body, *place, chain.rotors[j], length))
     inputs = dict(zip(named, gains.T, strict=True))
     return Robot(links, damping, dry, inputs, gravity * down, notes, float(map_.dt))
 
@@ -346,11 +336,8 @@ def mjcf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
         )
 
     def along(row: np.ndarray, attributes: str = "") -> str:
-        own = "".join(
-            f'<joint joint={quoteattr(link.name)} coef="{_text(c)}"/>'
-            for link, c in zip(links, row, strict=True)
-            if c
-        )
+        parts = [(quoteattr(link.name), c) for link, c in zip(links, row, strict=True) if c]
+        own = "".join(f'<joint joint={name} coef="{_text(c)}"/>' for name, c in parts)
         tendons.append(f'  <fixed name="along{len(tendons) + 1}"{attributes}>{own}</fixed>')
         return f"along{len(tendons)}"
 

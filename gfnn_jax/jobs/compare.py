@@ -129,12 +129,9 @@ def _ours(data: SharedData, progress: Progress) -> tuple[dict[str, Any], Rollout
         fit = search(Pairs(z[:, 0], z[:, 1], scene.dt), scene, asked, progress=progress)
     told = fit.replaced(defect_known=False).report()  # the defect is that of all methods' states
     error = _rms(data, fit.map.step(data.fresh.z0)[0])
-    part = {
-        "model": told["model"],
-        "data": {"num_pairs": fit.num_pairs, "sequence_length": 2},
-        "fit": {**told["fit"], "validation_rms": error, "cap": None, "capped": False},
-        "map": _map_part(fit.map, data) | {"chart_determinant_min": fit.model_determinant_min},
-    }
+    part = {"model": told["model"], "data": {"num_pairs": fit.num_pairs, "sequence_length": 2}}
+    part["fit"] = {**told["fit"], "validation_rms": error, "cap": None, "capped": False}
+    part["map"] = _map_part(fit.map, data) | {"chart_determinant_min": fit.model_determinant_min}
     return part, map_rollouts(fit.map, data.z0, NUM_STEPS)
 
 
@@ -284,37 +281,20 @@ def compare(
             part, rollouts = _kept(kept_in, method)
             rollouts = without_runaways(rollouts, data.reference)
             measured[TITLES[method]] = m = measure(rollouts, scene, data.reference)
-            reported[method] = {
-                "title": TITLES[method],
-                **part,
-                "rollout": m.report,
-                "curve": _curve(m.error),
-                "kl": divergences(scene, m.predicted, data.reference),
-                "elements": None
-                if scene.name != "two-body"
-                else {
-                    name: _curve(metrics.absolute_error(of(m.predicted), of(data.reference)))
-                    for name, of in metrics.ELEMENTS.items()
-                },
-            }
-        result = {
-            "scene": name,
-            "dt": scene.dt,
-            "seed": seed,
-            "dtype": "float64",
-            "device": report.device(),
-            "versions": versions(),
-            "quick": quick,
-            "cap": cap,
-            "data": {
-                "source": "reference data of the scene",
-                "num_pairs": data.num_pairs,
-                "digest": pairs_digest(data.fresh),
-            },
-            "kl_bins": BINS,
-            "job": job,
-            "methods": reported,
-        }
+            kl = divergences(scene, m.predicted, data.reference)
+            told = {"rollout": m.report, "curve": _curve(m.error), "kl": kl, "elements": None}
+            if scene.name == "two-body":
+                ends = m.predicted, data.reference
+                off = {
+                    n: metrics.absolute_error(*map(f, ends)) for n, f in metrics.ELEMENTS.items()
+                }
+                told["elements"] = {n: _curve(error) for n, error in off.items()}
+            reported[method] = {"title": TITLES[method], **part, **told}
+        source = {"source": "reference data of the scene", "num_pairs": data.num_pairs}
+        source["digest"] = pairs_digest(data.fresh)
+        result = {"scene": name, "dt": scene.dt, "seed": seed, "dtype": "float64"}
+        result |= {"device": report.device(), "versions": versions(), "quick": quick, "cap": cap}
+        result |= {"data": source, "kl_bins": BINS, "job": job, "methods": reported}
         with outputs.atomic_folder(output.out) as folder:
             for file, figure in figures_of_comparison(scene, measured, data.reference).items():
                 figures.save(figure, folder / f"{file}.png")
