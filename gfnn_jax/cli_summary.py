@@ -190,16 +190,15 @@ def comparison_table(compared: dict[str, Any]):
         shown.add_column(head, justify="left" if head == "method" else "right")
     for m in compared["methods"].values():
         fit, rolled = m["fit"], m["rollout"]
-        shown.add_row(
-            m["title"],
+        error = (fit["validation_rms"], rolled["error"]["100"], rolled["error"]["1000"])
+        took = f"{fit['seconds']:.1f}" + (" (cap)" if fit["capped"] else "")
+        cells = [
             f"{m['model']['num_parameters']:,}",
-            f"{fit['seconds']:.1f}" + (" (cap)" if fit["capped"] else ""),
+            took,
             f"{rolled['microseconds_per_step']:.2g}",
-            _number(fit["validation_rms"]),
-            _number(rolled["error"]["100"]),
-            _number(rolled["error"]["1000"]),
-            _number(rolled["growth_exponent"], ".2f"),
-            _number(m["map"]["symplecticity_defect"]),
-            *([", ".join(_number(v, ".2g") for v in m["kl"].values())] if chaotic else []),
-        )
+        ]
+        cells += [*map(_number, error), _number(rolled["growth_exponent"], ".2f")]
+        cells += [_number(m["map"]["symplecticity_defect"])]
+        cells += [", ".join(_number(v, ".2g") for v in m["kl"].values())] if chaotic else []
+        shown.add_row(m["title"], *cells)
     return shown

@@ -82,14 +82,8 @@ def polar(*, cyclic: bool) -> Coordinates:
     cyclic: True where the dynamics is invariant under rotation: φ does not enter S, and p_φ is
     conserved to roundoff. The change is not defined at r = 0.
     """
-    return Coordinates(
-        "polar",
-        angles=(1,),
-        cyclic=(1,) if cyclic else (),
-        forward=_to_polar,
-        inverse=_from_polar,
-        names=("r", "φ", "p_r", "p_φ"),
-    )
+    names, cyclic_angles = ("r", "φ", "p_r", "p_φ"), (1,) if cyclic else ()
+    return Coordinates("polar", (1,), cyclic_angles, _to_polar, _from_polar, names)
 
 
 def to_inner(coordinates: Coordinates, z) -> np.ndarray:

@@ -267,14 +267,10 @@ def _of_speeds(source: str, names: Sequence[str], units: Mapping[str, str]) -> U
     turning |= bool(_OF_TURNING.fullmatch(units.get(names[0], "")))
     place = [""] if len(names) == 1 else [str(i + 1) for i in range(len(names))]
     q, v = ("theta", "omega") if turning else ("x", "v")
-    return Undecided(
-        f"{source}: {', '.join(names)}: velocities, and no column shows a position. To learn a "
-        "law, with offsets of the sensors:",
-        {
-            "coordinates": tuple(q + i for i in place),
-            "observe": {n: f"{v}{i} + b{i}" for n, i in zip(names, place, strict=True)},
-        },
-    )
+    observe = {n: f"{v}{i} + b{i}" for n, i in zip(names, place, strict=True)}
+    told = f"{source}: {', '.join(names)}: velocities, and no column shows a position. To learn a"
+    options = {"coordinates": tuple(q + i for i in place), "observe": observe}
+    return Undecided(f"{told} law, with offsets of the sensors:", options)
 
 
 def _of_accelerations(source: str, columns: Mapping[str, np.ndarray]) -> Undecided:

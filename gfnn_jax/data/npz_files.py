@@ -209,14 +209,9 @@ class _Sequences(NamedTuple):
                     yield block
 
         dtypes = [one.dtype for one in self.arrays]
-        told: dict[str, Any] = {
-            "uneven": self.uneven,
-            "timed": self.times is not None,
-            "of_pairs_alone": of_pairs,
-        }
         precision = str(np.result_type(*dtypes) if of_pairs else dtypes[0])
-        period = self.period
-        return Source(dim, self.dt, blocks, precision, parameters=names, period=period, **told)
+        about = names, self.uneven, self.period, self.times is not None, of_pairs
+        return Source(dim, self.dt, blocks, precision, {}, *about)
 
 
 def open_npy(request: Request, stream) -> Source:

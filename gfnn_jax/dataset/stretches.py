@@ -117,15 +117,10 @@ class Stretch:
             found[at] = rows
             return found
 
-        u = [np.interp(every, at, column) for column in self.u.T]
-        return dataclasses.replace(
-            self,
-            t=np.interp(every, at, self.t),
-            y=spread(self.y, np.nan),
-            u=np.stack(u, axis=1) if u else np.zeros((len(every), 0)),
-            q=spread(self.q, np.nan),
-            noise=spread(self.noise, 1.0),
-        )
+        inputs = [np.interp(every, at, column) for column in self.u.T]
+        t, u = np.interp(every, at, self.t), np.reshape(inputs, (-1, len(every))).T
+        y, q, noise = spread(self.y, np.nan), spread(self.q, np.nan), spread(self.noise, 1.0)
+        return dataclasses.replace(self, t=t, y=y, u=u, q=q, noise=noise)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

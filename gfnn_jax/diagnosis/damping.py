@@ -467,13 +467,11 @@ def diagnosed(data: Dataset, chart: str, reversor, seed: int, may_lose: bool = F
         jacobians, plain = undone, plain.without(None, damping.piece)
         data = plain
     elif not look_symplectic(jacobians, error, plain.scale):
-        messages.append(
-            f"{NOT_SYMPLECTIC}: ‖MᵀJM − J‖ is {defect:.2g} ± {error:.1g} (M: local "
-            "Jacobians, coordinates in units of their spread) where a symplectic map has 0. Check "
-            "the order q1…qd, p1…pd, and look for friction or a drive. If p are velocities, learn "
-            "the law of a recording (--positions, --velocities; gfnn.Recording)."
-            + differing(jacobians)
-        )
+        told = f"‖MᵀJM − J‖ is {defect:.2g} ± {error:.1g} (M: local Jacobians, coordinates in units"
+        told += " of their spread) where a symplectic map has 0. Check the order q1…qd, p1…pd, and"
+        told += " look for friction or a drive. If p are velocities, learn the law of a recording"
+        told += f" (--positions, --velocities; gfnn.Recording).{differing(jacobians)}"
+        messages.append(f"{NOT_SYMPLECTIC}: {told}")
     charts = choose_charts(chart, data, reversor, jacobians)
     if charts.half is not None:
         data = data.without(charts.half, charts.half)

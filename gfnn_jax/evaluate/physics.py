@@ -380,18 +380,11 @@ def _mode(
     if abs(real[0]) <= 1e-9 * size:
         return found
     ratio, of_ratio = -real[0] / size, real[1] / size
-    return [
-        *found,
-        Quantity(f"{name}: damping ratio ζ", ratio, of_ratio, "", "by viscous friction"),
-        Quantity(f"{name}: quality factor Q", 1 / (2 * ratio), of_ratio / (2 * ratio**2), ""),
-        Quantity(
-            f"{name}: time of decay to 1/e",
-            -1 / real[0],
-            real[1] / real[0] ** 2,
-            "s",
-            "of the amplitude",
-        ),
-    ]
+    viscous = (f"{name}: damping ratio ζ", ratio, of_ratio, "", "by viscous friction")
+    quality = (f"{name}: quality factor Q", 1 / (2 * ratio), of_ratio / (2 * ratio**2), "")
+    time = -1 / real[0], real[1] / real[0] ** 2
+    decay = (f"{name}: time of decay to 1/e", *time, "s", "of the amplitude")
+    return [*found, Quantity(*viscous), Quantity(*quality), Quantity(*decay)]
 
 
 def _of_swings(swings: Swings, system: _System) -> list[Quantity]:

@@ -126,16 +126,10 @@ def fit(
             fitted = again
             progress.status("the report: the posterior, and the derivative of a step")
             fitted = fitted.settled()
-            result = fitted.report(
-                data={
-                    "source": trajectories.source,
-                    "digest": trajectories.digest,
-                    "precision": trajectories.precision,
-                    "units": trajectories.units,
-                    "dt": _range(trajectories.dt),
-                    "params": {n: _range(v) for n, v in (trajectories.args or {}).items()},
-                }
-            )
+            facts = ("source", "digest", "precision", "units")
+            told = {name: getattr(trajectories, name) for name in facts}
+            params = {n: _range(v) for n, v in (trajectories.args or {}).items()}
+            result = fitted.report(data={**told, "dt": _range(trajectories.dt), "params": params})
         except KeyboardInterrupt as stop:
             if note := publish(kept_in / BEST, output.out):
                 stop.add_note(note)

@@ -140,15 +140,11 @@ class _Model:
     def _roles(self, channels: tuple[str, ...]) -> dict[str, Any]:
         """Keywords of `gfnn_jax.read` for a recording with these columns."""
         positions, speeds = self.sensors.positions, self.sensors.observation_model.speeds
-        return {
-            "positions": tuple(n for n in channels if n in positions),
-            "velocities": tuple(n for n in channels if n in speeds),
-            "sensors": tuple(n for n in channels if n not in (*positions, *speeds)),
-            "inputs": self.sensors.inputs,
-            "coordinates": positions,
-            "angles": self.sensors.angles,
-            **self.columns,
-        }
+        roles = {"positions": tuple(n for n in channels if n in positions)}
+        roles["velocities"] = tuple(n for n in channels if n in speeds)
+        roles["sensors"] = tuple(n for n in channels if n not in (*positions, *speeds))
+        roles |= {"inputs": self.sensors.inputs, "coordinates": positions}
+        return {**roles, "angles": self.sensors.angles, **self.columns}
 
 
 def _same_run(measured: Recording, run: str) -> str:

@@ -177,17 +177,10 @@ def search(
         checkpoints, factors = TrainingCheckpoints(kept_in, job), KeptFactors(kept_in)
         on_better = partial(_keep, kept_in / BEST, scene, job)
     with refusals(), failures_of_arithmetic():
-        return fit(
-            data,
-            scene,
-            options=options,
-            spent=spent,
-            checkpoints=checkpoints,
-            factors=factors,
-            on_progress=progress.status,
-            on_candidate=lambda candidate: progress.line(line(candidate)),
-            on_better=on_better,
-        )
+        hooks: dict[str, Any] = {"checkpoints": checkpoints, "factors": factors}
+        hooks |= {"on_progress": progress.status, "on_better": on_better}
+        hooks["on_candidate"] = lambda candidate: progress.line(line(candidate))
+        return fit(data, scene, options=options, spent=spent, **hooks)
 
 
 def _keep(

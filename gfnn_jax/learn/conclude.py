@@ -69,13 +69,11 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         cut = request.budget.ended or (law.ended if law is not None else "")
         ended = MET if met else cut or _NO_MORE[request.of_network]
     if ended.startswith(MET) and not met:
-        ended = (
-            "the map meets the tolerance on the pairs that chose it, and not on the test pairs, "
-            "which chose nothing: more pairs narrow the bound"
-            if np.isfinite(candidate.validation_relative)
-            else "the implicit step of the map that should meet it fails for some of the states: "
-            "a smaller dt, or a smaller region, helps"
-        )
+        ended = "the map meets the tolerance on the pairs that chose it, and not on the test pairs,"
+        ended += " which chose nothing: more pairs narrow the bound"
+        if not np.isfinite(candidate.validation_relative):
+            ended = "the implicit step of the map that should meet it fails for some of the states:"
+            ended += " a smaller dt, or a smaller region, helps"
     if met and not ended.startswith(MET):  # by the pairs that state the error
         ended = MET
     if law is not None and searched.of_terms is None and searched.linear is None:

@@ -574,21 +574,16 @@ def candidate_cells(found: Choice | Fit) -> tuple[tuple[str, ...], list[tuple[st
     """
     bound = "95 % bound" if found.asked.relative else "95 % bound (absolute)"
     numbers = ("parameters", "error ÷ spread", bound, "outside", "kflop/step", "µs/step", "fit s")
-    rows = [
-        (
-            "→" if c.chosen else "",
-            c.chart,
-            c.label,
-            f"{c.num_parameters:,}",
-            f"{'' if c.validated else '~'}{c.validation_relative:.2e}",
-            f"{'' if c.validated else '~'}{c.validation_bound:.2e}",
+    rows = []
+    for c in found.candidates:
+        about, outside = (
+            "" if c.validated else "~",
             "–" if c.outside is None else f"{c.outside:.1e}",
-            f"{c.operations / 1e3:.1f}",
-            "–" if c.microseconds_per_step is None else f"{c.microseconds_per_step:.2f}",
-            f"{c.fit_seconds:.2f}",
         )
-        for c in found.candidates
-    ]
+        micro = "–" if c.microseconds_per_step is None else f"{c.microseconds_per_step:.2f}"
+        named = "→" if c.chosen else "", c.chart, c.label, f"{c.num_parameters:,}"
+        errors = f"{about}{c.validation_relative:.2e}", f"{about}{c.validation_bound:.2e}", outside
+        rows.append((*named, *errors, f"{c.operations / 1e3:.1f}", micro, f"{c.fit_seconds:.2f}"))
     return ("", "chart", "family", *numbers), rows
 
 

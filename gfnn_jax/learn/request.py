@@ -207,13 +207,15 @@ def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
         return []
     z0, z1 = np.asarray(pairs.z0), np.asarray(pairs.z1)
     range_, move = np.ptp(z0, axis=0), np.abs(z1 - z0).max(axis=0)
-    return [
-        f"coordinate {a} of z, given as an angle, ranges over {range_[a]:.3g} and moves by up to "
-        f"{move[a]:.3g} in a step. Angles are in radians: are these degrees? Convert them, or take "
-        f"{a} out of --angles"
-        for a in coordinates.angles
-        if range_[a] > 2 * TWO_PI and move[a] > np.pi
-    ]
+    messages = []
+    for a in coordinates.angles:
+        told = (
+            f"coordinate {a} of z, given as an angle, ranges over {range_[a]:.3g} and moves by up"
+        )
+        told += f" to {move[a]:.3g} in a step. Angles are in radians: are these degrees? Convert"
+        if range_[a] > 2 * TWO_PI and move[a] > np.pi:
+            messages.append(f"{told} them, or take {a} out of --angles")
+    return messages
 
 
 def wrapped(pairs: Pairs, coordinates: Coordinates) -> list[int]:
