@@ -241,30 +241,20 @@ class Recording:
         sigmas = {name: of for name, of in sigmas.items() if name in with_role}
         check_sigmas(source, sigmas, values)
         about_times = (*(second_times(tables) if dt is None else ()), *restarts(tables, runs))
-        fields = {
-            **roles,
-            "runs": tuple(runs),
-            "angles": angular,
-            "std": typical(std, sigmas, with_role, factors, values),
-            "coordinates": coordinate_names,
-            "observe": dict(observe),
-            "guess": {name: float(value) for name, value in (options.get("guess") or {}).items()},
-            "units": {n: u for n, u in units.items() if n in numbers},
-            "factors": factors,
-            "time_unit": unit,
-            "time_unit_given": told is not None,
-            "offsets": names_of["offset"],
-            "scales": names_of["scale"],
-            "ignored": tuple(n for n in numbers if n not in with_role)
-            + tuple(dict.fromkeys(n for t in tables for n in t.text)),
-            "angles_given": angles is not None or options.get("degrees") is not None,
-            "notes": (*(n for t in tables for n in t.notes), *about_times, *decided),
-            "source": source,
-            "_times": {run: times for run, (times, _) in runs.items()},
-            "_values": values,
-            "_sigmas": sigmas,
-        }
-        vars(self).update(fields)
+        guess, words = options.get("guess") or {}, [n for t in tables for n in t.text]
+        known: dict[str, Any] = {**roles, "runs": tuple(runs), "source": source, "factors": factors}
+        known |= {"angles": angular, "coordinates": coordinate_names, "observe": dict(observe)}
+        known |= {"std": typical(std, sigmas, with_role, factors, values)}
+        known |= {"guess": {name: float(value) for name, value in guess.items()}}
+        known |= {"units": {n: u for n, u in units.items() if n in numbers}}
+        known |= {"time_unit": unit, "time_unit_given": told is not None}
+        known |= {"offsets": names_of["offset"], "scales": names_of["scale"]}
+        unused = [n for n in numbers if n not in with_role]
+        known |= {"ignored": (*unused, *dict.fromkeys(words))}
+        known |= {"angles_given": angles is not None or options.get("degrees") is not None}
+        known |= {"notes": (*(n for t in tables for n in t.notes), *about_times, *decided)}
+        known |= {"_times": {run: times for run, (times, _) in runs.items()}}
+        vars(self).update(known, _values=values, _sigmas=sigmas)
         for run in self.runs:
             for array in (self._times[run], *self._values[run].values()):
                 array.flags.writeable = False

@@ -144,17 +144,13 @@ def from_memory(table: Any) -> Table:
         except (TypeError, ValueError):
             text[name] = values.astype(str)
             continue
-        each = {name: numbers} if numbers.ndim == 1 else _spread(name, numbers)
-        found.update(each)
+        one = numbers.ndim == 1
+        found |= {name: numbers} if one else {f"{name}{i}": x for i, x in enumerate(numbers.T, 1)}
     lengths = {name: len(values) for name, values in found.items()}
     if len(set(lengths.values())) > 1:
         shown = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise InputError(f"expected columns of one length, got {shown}")
     return Table(found, text=text)
-
-
-def _spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    return {f"{name}{i + 1}": column for i, column in enumerate(values.T)}
 
 
 def from_arrays(path: Path, columns: Sequence[str]) -> Table:

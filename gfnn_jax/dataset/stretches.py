@@ -329,7 +329,10 @@ def measure(found: Sequence[Stretch]) -> Scales:
     else:
         half = splines([(s.t, s.q) for s in found])
         sigma = half.sigma
-        smooths = [half.smooth(s.t, s.q, _inside(s.t)[::every]) for s in found]
+        # Without the ends of a run, where a curve's derivatives are those of its noise.
+        edges = [max(1, len(s.t) // 20) for s in found]
+        inside = [s.t[n:-n:every] for s, n in zip(found, edges, strict=True)]
+        smooths = [half.smooth(s.t, s.q, t) for s, t in zip(found, inside, strict=True)]
         apart = np.concatenate([np.diff(s.t) for s in found])
         steps = (float(np.mean(apart[apart <= 10 * np.median(apart)])),)  # of those that are no gap
     speed = np.sqrt(np.mean(np.concatenate([s.v for s in smooths]) ** 2, axis=0))
@@ -376,12 +379,6 @@ def _windows(
     counts = np.array([sum(len(t) for t, _ in one) for one in kinds])
     enough = counts >= min(OPTIONS.enough, counts.max())
     return steps, windows, np.min(np.array(noise)[enough], axis=0)
-
-
-def _inside(t: np.ndarray) -> np.ndarray:
-    """Times but for the ends of a run, where a curve's derivatives are those of its noise."""
-    edge = max(1, len(t) // 20)
-    return t[edge:-edge]
 
 
 def _noise_of_channels(found: Sequence[Stretch]) -> np.ndarray:

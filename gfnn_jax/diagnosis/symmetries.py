@@ -69,18 +69,14 @@ def _conserved(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPai
     last = after[np.concatenate([~goes_on, [True]])]
     moved = np.sqrt(np.mean(((last - first) / data.scale) ** 2))
     for text, generator in generators(data.dim, angles, data.coordinates.names):
-        values = [_generated(generator, z) for z in (before, first, last)]
+        a, b = generator[:, :-1], generator[:, -1]
+        values = [np.sum(z * (0.5 * z @ a + b), axis=1) for z in (before, first, last)]
         spread = np.std(values[0])
         if not spread > 0 or not moved > 0:
             continue
         left = np.sqrt(np.mean((values[2] - values[1]) ** 2)) / spread / moved
         if left <= Options.conserved:
             yield SymmetryOfPairs(text, float(left))
-
-
-def _generated(generator: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """I (N,) at z (N, 2d)."""
-    return np.sum(z * (0.5 * z @ generator[:, :-1] + generator[:, -1]), axis=1)
 
 
 def _reflected(data: Dataset, angles: tuple[int, ...]) -> Iterator[SymmetryOfPairs]:

@@ -37,7 +37,8 @@ def position_error(predicted, reference, angles=()):
     ``angles`` are the indices in z of the coordinates with period 2π, a q or a p: their
     differences are taken to the nearest image, in [−π, π].
     """
-    return _euclidean(split(_difference(predicted, reference, angles))[0])
+    off = split(_difference(predicted, reference, angles))[0]
+    return np.sqrt(np.sum(off**2, axis=-1))
 
 
 def absolute_error(predicted, reference):
@@ -59,10 +60,6 @@ def _difference(predicted, reference, angles=()):
         difference = nearest_image(predicted - reference, angles)
     difference = np.where(np.isfinite(predicted), difference, np.inf)
     return np.where(np.isfinite(reference), difference, np.nan)
-
-
-def _euclidean(difference):
-    return np.sqrt(np.sum(difference**2, axis=-1))
 
 
 def error_statistics(error) -> ErrorStatistics:

@@ -87,22 +87,13 @@ def learn_and_roll(
         about = {**_NO_MAP, "symplecticity_defect": defect}
         images, roll = _steps(learned.step, z), partial(step_rollouts, learned.step)
     training = learned.training
-    part = {
-        "model": dict(zip(_MODEL, model, strict=True)),
-        "data": {"num_pairs": sequences.num_pairs, "sequence_length": length},
-        "fit": {  # its errors are those of the method's own loss
-            "seconds": training.seconds,
-            "compile_seconds": training.compile_seconds,
-            "train_rms": training.train_rms,
-            "loss_rms": training.validation_rms,
-            "cap": budget.cap,
-            "operations": training.operations * training.epochs,
-            "capped": "cap" in training.stopped_because,
-            "stopped_because": training.stopped_because,
-            "validation_rms": _rms(data, images),
-        },
-        "map": about,
-    }
+    facts = ("seconds", "compile_seconds", "train_rms", "stopped_because")
+    took = {name: getattr(training, name) for name in facts}  # of the method's own loss
+    took |= {"loss_rms": training.validation_rms, "cap": budget.cap}
+    took |= {"operations": training.operations * training.epochs}
+    took |= {"capped": "cap" in training.stopped_because, "validation_rms": _rms(data, images)}
+    part = {"model": dict(zip(_MODEL, model, strict=True)), "fit": took, "map": about}
+    part["data"] = {"num_pairs": sequences.num_pairs, "sequence_length": length}
     return part, roll(data.z0, NUM_STEPS)
 
 

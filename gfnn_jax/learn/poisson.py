@@ -96,21 +96,14 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         each = law.noise_of(np.asarray(tested.z1))
         sigma = np.sqrt(np.mean(each**2, axis=0))
         white = bool(np.sqrt(np.mean((off / each) ** 2)) <= NOISE * np.sqrt(2))
-    candidate = Candidate.of(
-        error,
-        label=learned.label,
-        family=learned.family.name,
-        chart=learned.bracket.name,
-        num_parameters=learned.family.num_parameters,
-        operations=float(learned.family.operations[0]),
-        train_rms=learned.relative,
-        validated=True,
-        fit_seconds=seconds,
-        chosen=True,
-        learns="map" if learned.law is None else "hamiltonian",
-        newton_iterations_max=int(steps.iterations.max()),
-        microseconds_per_step=steps.microseconds_per_step,
-    )
+    family, count = learned.family, learned.family.num_parameters
+    named = {"label": learned.label, "family": family.name, "chart": learned.bracket.name}
+    named["learns"] = "map" if learned.law is None else "hamiltonian"
+    costs = {"num_parameters": count, "operations": float(family.operations[0])}
+    costs |= {"fit_seconds": seconds, "microseconds_per_step": steps.microseconds_per_step}
+    most, rms = int(steps.iterations.max()), learned.relative
+    told: dict[str, Any] = {"train_rms": rms, "newton_iterations_max": most, **named, **costs}
+    candidate = Candidate.of(error, validated=True, chosen=True, **told)
     watch.on_candidate(candidate)
     met, messages = tolerance.met_by(candidate), [*left_out, *learned.notes]
     ended = MET if met else _NO_MORE
