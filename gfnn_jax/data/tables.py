@@ -144,8 +144,8 @@ def from_memory(table: Any) -> Table:
         except (TypeError, ValueError):
             text[name] = values.astype(str)
             continue
-        one = numbers.ndim == 1
-        found |= {name: numbers} if one else {f"{name}{i}": x for i, x in enumerate(numbers.T, 1)}
+        names = [f"{name}{i + 1}" for i in range(numbers.shape[-1])] if numbers.ndim > 1 else [name]
+        found.update(zip(names, np.atleast_2d(numbers.T), strict=True))
     lengths = {name: len(values) for name, values in found.items()}
     if len(set(lengths.values())) > 1:
         shown = ", ".join(f"{name} {length}" for name, length in lengths.items())
