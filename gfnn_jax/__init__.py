@@ -48,12 +48,8 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_MODULES = {
-    "figures": "evaluate.figures",
-    "metrics": "evaluate.metrics",
-    "records": "records",
-    "scenes": "scenes",
-}
+_MODULES = {name: name for name in ("records", "scenes")}
+_MODULES |= {name: f"evaluate.{name}" for name in ("figures", "metrics")}
 _NAMES = {  # of what each module gives
     "brackets": "Bracket",
     "compiling": "enable_compile_cache",

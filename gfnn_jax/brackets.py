@@ -354,10 +354,8 @@ class Magnetic(Bracket):
 
     def curl(self, x):
         """F (..., d, d) at positions x (..., d): {m v, m v}."""
-        return sum(
-            as_row(c, x[..., None]) * _monomial(x, p)[..., None, None]
-            for c, p in zip(self.field, self.powers, strict=True)
-        )
+        parts = zip(self.field, self.powers, strict=True)
+        return sum(as_row(c, x[..., None]) * _monomial(x, p)[..., None, None] for c, p in parts)
 
     def curl_slopes(self, x):
         """∂_k F_ij (..., d, d, d), the last index k."""
@@ -370,10 +368,8 @@ class Magnetic(Bracket):
 
     def potential(self, x):
         """A (..., d) with F_ij = ∂_i A_j − ∂_j A_i and x·A = 0: ∫₀¹ s F(s x)ᵀ x ds."""
-        return sum(
-            matmul(x, c) * (_monomial(x, p) / (sum(p) + 2))[..., None]
-            for c, p in zip(self.field, self.powers, strict=True)
-        )
+        parts = zip(self.field, self.powers, strict=True)
+        return sum(matmul(x, c) * (_monomial(x, p) / (sum(p) + 2))[..., None] for c, p in parts)
 
     def matrix(self, z):
         """B (..., 2d, 2d)."""

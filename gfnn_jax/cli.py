@@ -443,16 +443,8 @@ def _compare(arguments: argparse.Namespace) -> None:
     print(f"written to {out}")
 
 
-_COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
-    "scenes": _scenes,
-    "records": _records,
-    "run": _run,
-    "look": _look,
-    "fit": _fit,
-    "predict": _predict,
-    "export": _export,
-    "compare": _compare,
-}
+_ALL = (_scenes, _records, _run, _look, _fit, _predict, _export, _compare)
+_COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {f.__name__[1:]: f for f in _ALL}
 
 
 class Terminated(KeyboardInterrupt):

@@ -247,11 +247,8 @@ def _fit(command: _Command) -> None:
     command.add_fit()
     add_column_options(command.parser)
     _add_despite(command)
-    command.flag(
-        "--keep",
-        "of a recording: write the law into MODEL although it misses most of the motion; the exit "
-        "status is 1 all the same",
-    )
+    about = "of a recording: write the law into MODEL although it misses most of the motion; the"
+    command.flag("--keep", f"{about} exit status is 1 all the same")
     of_each = "each reads its own rows of DATA, or its own files"
     command.flag("--distributed", f"this is one of several processes, by srun, say: {of_each}")
 

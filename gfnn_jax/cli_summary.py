@@ -21,10 +21,8 @@ def law_line(report: dict[str, Any]) -> str:
     chosen = report["model"]["learns"] == "hamiltonian"
     noisy = report["data"]["noise"] is not None and len(law["terms"]) <= _FEW_TERMS
     if chosen and not fit["tolerance_met"] and not noisy:
-        return (
-            f"best partial law: H of {len(law['terms'])} terms, one-step error "
-            f"{fit['validation_relative']:.1e} of the spread (report.json)"
-        )
+        told = f"H of {len(law['terms'])} terms, one-step error {fit['validation_relative']:.1e}"
+        return f"best partial law: {told} of the spread (report.json)"
     return f"{'' if chosen else 'found, and costlier per step than the map: '}H = {law['formula']}"
 
 
@@ -192,11 +190,8 @@ def comparison_table(compared: dict[str, Any]):
         fit, rolled = m["fit"], m["rollout"]
         error = (fit["validation_rms"], rolled["error"]["100"], rolled["error"]["1000"])
         took = f"{fit['seconds']:.1f}" + (" (cap)" if fit["capped"] else "")
-        cells = [
-            f"{m['model']['num_parameters']:,}",
-            took,
-            f"{rolled['microseconds_per_step']:.2g}",
-        ]
+        cells = [f"{m['model']['num_parameters']:,}", took]
+        cells += [f"{rolled['microseconds_per_step']:.2g}"]
         cells += [*map(_number, error), _number(rolled["growth_exponent"], ".2f")]
         cells += [_number(m["map"]["symplecticity_defect"])]
         cells += [", ".join(_number(v, ".2g") for v in m["kl"].values())] if chaotic else []

@@ -191,10 +191,9 @@ class Pairs:
             got = f"{self.z0.shape} and {self.z1.shape}"
             raise FitError(f"expected z0 and z1 of one shape {shape}, got {got}")
         if width % 2 and not any_width:
-            raise FitError(
-                f"{width} columns are no positions and momenta (q, p). Of states with another "
-                'bracket, as angular velocities: gfnn.Pairs(z0, z1, dt, structure="poisson")'
-            )
+            told = f"{width} columns are no positions and momenta (q, p). Of states with another"
+            call = 'gfnn.Pairs(z0, z1, dt, structure="poisson")'
+            raise FitError(f"{told} bracket, as angular velocities: {call}")
         if self.names and len(self.names) != width:
             raise FitError(f"expected {width} names of coordinates, got {len(self.names)}")
 
@@ -202,10 +201,8 @@ class Pairs:
         """Make ``run`` and ``place`` arrays (N,). Raises FitError on other shapes or types."""
         if self.place is not None and self.run is None:
             raise FitError("expected run as well as place: a place is counted along a run")
-        for name, kinds, what in (
-            ("run", "iufUSO", "numbers or text"),
-            ("place", "iu", "integers"),
-        ):
+        kinds_of = {"run": ("iufUSO", "numbers or text"), "place": ("iu", "integers")}
+        for name, (kinds, what) in kinds_of.items():
             given = getattr(self, name)
             if given is None or (isinstance(given, jax.Array) and given.shape == (len(self),)):
                 continue
@@ -234,12 +231,8 @@ class Pairs:
         text = isinstance(self.run, np.ndarray) and self.run.dtype.kind == "U"
         run = (None, tuple(self.run.tolist())) if text else (self.run, None)
         leaves = (self.z0, self.z1, self.args, run[0], self.place, self.std)
-        return (*leaves, *([self.dt] if own else [])), (
-            None if own else self.dt,
-            self.period,
-            run[1],
-            (self.structure, self.names),
-        )
+        leaves = (*leaves, self.dt) if own else leaves
+        return leaves, (None if own else self.dt, self.period, run[1], (self.structure, self.names))
 
     @classmethod
     def tree_unflatten(cls, fixed, leaves) -> Pairs:

@@ -77,10 +77,8 @@ def with_predictor(generated: Generated, data: Dataset, rows) -> Generated:
     args = data.given(rows[solved])[1]
     features = getattr(getattr(generated.family, "inputs", None), "features", None)
     dt = of_lanes(data.given(rows)[0], solved)
-    ends, features = (
-        (data.y0[rows][solved], images[solved]),
-        partial(inputs_of, data, features=features),
-    )
+    features = partial(inputs_of, data, features=features)
+    ends = data.y0[rows][solved], images[solved]
     fitted = fit_predictors(generated.chart, *ends, dt, features, args)
     chosen = affordable(fitted, generated.family)
     return dataclasses.replace(generated, predictor=chosen.predictor)

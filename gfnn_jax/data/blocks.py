@@ -62,10 +62,9 @@ class Block:
 
     def checked(self, path) -> Block:
         """Itself, if every number is finite and not too large; else InputError."""
-        for bad, what in (
-            (~np.isfinite(self.states), "not finite (NaN or infinity)"),
-            (np.abs(self.states) > LARGEST, f"too large (above {LARGEST:.0e})"),
-        ):
+        bad_of = {"not finite (NaN or infinity)": ~np.isfinite(self.states)}
+        bad_of[f"too large (above {LARGEST:.0e})"] = np.abs(self.states) > LARGEST
+        for what, bad in bad_of.items():
             if bad.any():
                 row, column = (int(i) for i in np.argwhere(bad)[0])
                 count = int(bad.sum())
@@ -163,11 +162,10 @@ def check_width(path, name: str, shape: tuple[int, ...]) -> int:
     """d of an array of shape (..., 2d)."""
     width = shape[-1]
     if width == 0 or width % 2:
-        raise InputError(
-            f"{path}: {name} of shape {shape} must have an even last dimension 2d (q first, then "
-            f"p), found {width}. Of states with another bracket, as angular velocities, in Python: "
-            'gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))'
-        )
+        told = f"{name} of shape {shape} must have an even last dimension 2d (q first, then p)"
+        other = "Of states with another bracket, as angular velocities, in Python"
+        call = 'gfnn.fit(gfnn.Pairs(z0, z1, dt, structure="poisson"))'
+        raise InputError(f"{path}: {told}, found {width}. {other}: {call}")
     return width // 2
 
 

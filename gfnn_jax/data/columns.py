@@ -147,10 +147,9 @@ def roles_of(
     if not any(roles[role] for role in ("positions", "velocities", "momenta")):
         if roles["inputs"] and not rest:
             sole = ", ".join(roles["inputs"])
-            raise InputError(
-                f"{source}: by its name {sole} is what drives a motion, and no column shows what "
-                f"moves. If it is what moves, say so: --positions {shlex.quote(sole)}"
-            )
+            told = f"by its name {sole} is what drives a motion, and no column shows what moves"
+            advice = f"If it is what moves, say so: --positions {shlex.quote(sole)}"
+            raise InputError(f"{source}: {told}. {advice}")
         found, told = _by_data(source, runs, rest, units)
         roles |= {role: (*roles[role], *of_role) for role, of_role in found.items()}
         notes += told
@@ -251,10 +250,8 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int)
     if len(names) == 3 and strengths[1] > _Options.one_axis * strengths[0]:
         least = _Options.runs_of_a_body
         wanted = f", from {least} or more runs of different speeds" * (runs < least)
-        return Undecided(
-            f"{source}: {shown} of a body about three axes. To learn its bracket{wanted}:",
-            {"structure": "poisson", "states": tuple(names)},
-        )
+        told = f"{source}: {shown} of a body about three axes. To learn its bracket{wanted}:"
+        return Undecided(told, {"structure": "poisson", "states": tuple(names)})
     main = names[int(np.argmax(known.std(axis=1)))] if known.size else names[0]
     learn = "To learn its law, with an offset b of the sensor:"
     options = {"coordinates": ("theta",), "observe": {main: "omega + b"}}
@@ -302,12 +299,10 @@ def _unclear(
     positions = {"positions": tuple(moving)}
     if explained > _Options.first_order:
         states = {"structure": "poisson", "states": tuple(moving)}
-        return Undecided(
-            f"{source}: the names {', '.join(columns)} do not show what was measured; their rates "
-            f"are functions of {', '.join(moving)} themselves, as of states without velocities, of "
-            f"populations say:{as_typed(states)}. If they are positions:{as_typed(positions)}",
-            states,
-        )
+        told = f"{source}: the names {', '.join(columns)} do not show what was measured; their"
+        told += f" rates are functions of {', '.join(moving)} themselves, as of states without"
+        told += f" velocities, of populations say:{as_typed(states)}"
+        return Undecided(f"{told}. If they are positions:{as_typed(positions)}", states)
     names = f"the names {', '.join(moving)} do not show what was measured"
     may = f"{', '.join(shown)} may be motion or what drives it"
     name = f"Name them:{as_typed(positions)}, or some of them and --inputs"
@@ -434,10 +429,9 @@ def with_sigmas(
             values = np.asarray(given, np.float64)
             length = len(next(iter(tables[0].columns.values()), ()))
             if len(tables) > 1 or values.shape != (length,):
-                raise InputError(
-                    f"std of {name}: expected a number, or one for each of the {length} rows of "
-                    f"one table, got shape {values.shape} for {len(tables)} tables"
-                )
+                wanted = f"a number, or one for each of the {length} rows of one table"
+                got = f"got shape {values.shape} for {len(tables)} tables"
+                raise InputError(f"std of {name}: expected {wanted}, {got}")
             found[name] = name + _STD
             columns = {**tables[0].columns, found[name]: values}
             tables[0] = dataclasses.replace(tables[0], columns=columns)
@@ -453,10 +447,9 @@ def check_sigmas(source: str, sigmas: Mapping[str, str], values: Mapping[str, An
             sigma = columns[of]
             bad = np.isfinite(columns[name]) & ~(np.isfinite(sigma) & (sigma > 0))
             if bad.any():
-                raise InputError(
-                    f"{source}: {of}: expected σ above 0 beside every value of {name}, got "
-                    f"{sigma[bad][0]:g} ({bad.sum()} such rows in run {run})"
-                )
+                got = f"got {sigma[bad][0]:g} ({bad.sum()} such rows in run {run})"
+                wanted = f"expected σ above 0 beside every value of {name}"
+                raise InputError(f"{source}: {of}: {wanted}, {got}")
 
 
 def typical(
@@ -482,10 +475,8 @@ def with_crossings(observe: Mapping[str, Any], events: Mapping[str, str]) -> dic
     "crossing(h)". Raises InputError where h is no text, or a column stands in both."""
     for name, expression in events.items():
         if not (isinstance(expression, str) and expression.strip()):
-            raise InputError(
-                f"events: {name}: expected an expression of coordinates as text, as "
-                f"{{'{name}': 'theta'}}, got {expression!r}"
-            )
+            wanted = f"an expression of coordinates as text, as {{'{name}': 'theta'}}"
+            raise InputError(f"events: {name}: expected {wanted}, got {expression!r}")
         if name in observe:
             raise InputError(f"{name}: expected it in observe or in events, not in both")
     return {**observe, **{name: f"crossing({one})" for name, one in events.items()}}

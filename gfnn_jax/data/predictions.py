@@ -349,10 +349,9 @@ def number_of_parts(out: Path, share: Share, *, resume: bool) -> int:
     if there == {share.count}:
         return share.count
     found = " and of ".join(map(str, sorted(there)))
-    raise InputError(
-        f"{out}: unfinished parts by {found} processes are there, and this job has {share.count}: "
-        + ("delete those of one kind" if resume else "--resume goes on with them, or delete them")
-    )
+    told = f"{out}: unfinished parts by {found} processes are there, and this job has {share.count}"
+    way = "delete those of one kind" if resume else "--resume goes on with them, or delete them"
+    raise InputError(f"{told}: {way}")
 
 
 def put_together(parts: Sequence[Path], out: Path, job: dict[str, Any]) -> None:

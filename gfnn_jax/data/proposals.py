@@ -273,10 +273,8 @@ def _hands(traits: Traits) -> Iterator[Fault]:
     begin, end = _let_go(traits), _caught(traits)
     if begin is not None:
         shown = float(f"{begin / second:.6g}")
-        found = (
-            f"the motion begins at rest and is free from {shown:g} on at the earliest: before it "
-            "something moves the body that no column shows"
-        )
+        found = f"the motion begins at rest and is free from {shown:g} on at the earliest: before"
+        found += " it something moves the body that no column shows"
         yield Fault("let go", found, "To begin there:", {"start": shown})
     if end is not None:
         shown = float(f"{end / second:.6g}")

@@ -114,11 +114,9 @@ class TextFile:
         held = [[c for c in of if c.lower() not in _MISSING] for of in known]
         of_each = zip(self.names, held, strict=True)
         numeric = {n: sum(_is_number(c, self._decimal) for c in of) for n, of in of_each}
-        self.text = tuple(
-            n
-            for n, of in zip(self.names, held, strict=True)
-            if not is_run(n) and 2 * numeric[n] < len(of)
-        )
+        of_each = zip(self.names, held, strict=True)
+        words = (n for n, of in of_each if not is_run(n) and 2 * numeric[n] < len(of))
+        self.text = tuple(words)
         self.times = self._times(dict(zip(self.names, held, strict=True)), time)
         # Words of a file in which the time is told by dates: (how they are read, s in their unit).
         self._dates: tuple[Callable[[Any], Any], float] | None = None

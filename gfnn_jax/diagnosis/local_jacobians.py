@@ -274,11 +274,11 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
         message = _about(name, determinants[name], folded, ())
         return Charts([CHARTS[beyond[0]]], None, determinants, [message])
     lows = ", ".join(f"{n} {j.sign * j.low:.2g}" for n, j in determinants.items())
-    raise FitError(
-        f"no chart covers these data, with or without a base map: each has a determinant near 0 "
-        f"({lows}), and no generating function exists there. Take pairs of a smaller dt or of a "
-        "smaller region, or learn H, which needs no chart: --learn hamiltonian"
+    told = f"each has a determinant near 0 ({lows}), and no generating function exists there. Take"
+    told += (
+        " pairs of a smaller dt or region, or learn H, which needs no chart: --learn hamiltonian"
     )
+    raise FitError(f"no chart covers these data, with or without a base map: {told}")
 
 
 def _about(name, determinant: ChartDeterminant, what, valid) -> str:

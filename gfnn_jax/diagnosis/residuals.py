@@ -252,10 +252,8 @@ def differs_between_sequences(z, residual, sequence) -> bool:
     as_far = ~other & (np.arange(count) > first[:, None])
     known = other.any(axis=1) & as_far.any(axis=1)
     residual, near, places = residual[rows], near[known], np.arange(len(rows))[known]
-    across, along = (
-        np.sum((residual[places] - residual[near[np.arange(len(near)), k[known]]]) ** 2)
-        for k in (first, np.argmax(as_far, axis=1))
-    )
+    ends = (near[np.arange(len(near)), k[known]] for k in (first, np.argmax(as_far, axis=1)))
+    across, along = (np.sum((residual[places] - residual[other]) ** 2) for other in ends)
     return bool(across > 0.5 * np.sum(residual[places] ** 2) and across > Options.across * along)
 
 

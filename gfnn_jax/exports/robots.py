@@ -97,10 +97,8 @@ def robot_of(map_: SymplecticMap) -> Robot:
     if law.powers is not None:
         raise InputError("MJCF and URDF hold no law of systems that differ in parameters: --to fmu")
     if law.terms.leaders or law.terms.driven:
-        raise InputError(
-            "in this law some coordinates move others that do not act back on them, or terms have "
-            "inputs, which no chain of links does: use --to fmu"
-        )
+        told = "in this law some coordinates move others that do not act back on them, or terms"
+        raise InputError(f"{told} have inputs, which no chain of links does: use --to fmu")
     rng = np.random.default_rng(0)
     q, none = rng.uniform(-np.pi, np.pi, (Options.states, dim)), np.zeros((Options.states, dim))
     at_rest = law.derivatives(q, none)

@@ -187,10 +187,8 @@ def equations_of_motion(
     """
     import sympy
 
-    q, v, a = (
-        [sympy.Symbol(name, real=True) for name in names]
-        for names in (coordinates, speeds, [f"{name}_ddot" for name in coordinates])
-    )
+    named = coordinates, speeds, [f"{name}_ddot" for name in coordinates]
+    q, v, a = ([sympy.Symbol(name, real=True) for name in names] for names in named)
     real = {sympy.Symbol(symbol.name): symbol for symbol in (*q, *v)}
     found = []
     for i, own in enumerate(forces):

@@ -132,12 +132,10 @@ def _map_part(map_: SymplecticMap, data: SharedData) -> dict[str, Any]:
     info = map_.step(z)[1]
     solved = np.asarray(info.status) < NOT_CONVERGED
     defects = np.asarray(map_.defect(z, iterations=info.iterations))[solved]
-    return {
-        "symplecticity_defect": float(defects.max()) if len(defects) else None,
-        "unsolved": float(np.mean(~solved)),
-        "chart_determinant_min": float(np.min(np.abs(np.asarray(map_.determinant(z))))),
-        "newton_iterations_max": int(np.max(np.asarray(info.iterations))),
-    }
+    solver: dict[str, Any] = {"newton_iterations_max": int(np.max(np.asarray(info.iterations)))}
+    solver["chart_determinant_min"] = float(np.min(np.abs(np.asarray(map_.determinant(z)))))
+    defect = float(defects.max()) if len(defects) else None
+    return {"symplecticity_defect": defect, "unsolved": float(np.mean(~solved)), **solver}
 
 
 def _rms(data: SharedData, images) -> float:

@@ -97,10 +97,8 @@ def run(
         key_pairs, key_test = _keys(asked.seed)
         pairs = finite_pairs(scene, num_pairs, key_pairs)
         z0 = np.asarray(sample_test_states(scene, num_trajectories, key_test))
-        given: dict[str, Any] = {
-            "params": sample_params(scene, num_trajectories, key_test, test=True),
-            "t0": sample_t0(scene, num_trajectories, key_test),
-        }
+        given: dict[str, Any] = {"t0": sample_t0(scene, num_trajectories, key_test)}
+        given["params"] = sample_params(scene, num_trajectories, key_test, test=True)
         fitted = search(pairs, scene, asked, progress=progress, kept=(kept_in, job)).settled()
         progress.status(f"reference trajectories of {NUM_STEPS} steps")
         reference = np.asarray(reference_trajectories(scene, z0, NUM_STEPS, **given))

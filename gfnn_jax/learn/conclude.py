@@ -132,11 +132,9 @@ def _hidden(chosen: Chosen, searched: Searched) -> list[str]:
     if found is None:
         return []
     change, error = found
-    return [
-        f"phase-space volumes change by {change:.2g} ± {error:.1g} (relative) in a step, as by "
-        "friction. The map keeps volumes: it meets the tolerance of one step, and long rollouts "
-        "miss the decay. With a smaller --tolerance a fit looks for friction"
-    ]
+    told = f"phase-space volumes change by {change:.2g} ± {error:.1g} (relative) in a step, as by"
+    told += " friction. The map keeps volumes: it meets the tolerance of one step, and long"
+    return [f"{told} rollouts miss the decay. With a smaller --tolerance a fit looks for friction"]
 
 
 def _with_clock(ended: str, budget: Budget) -> str:

@@ -71,12 +71,10 @@ class OfPositions:
         left = self.num_parameters - self.rank
         kind = "symmetric, as S of a reversible map is" if self.symmetric else "of no symmetry"
         listed = "" if self.noise is None else ", ".join(f"{s:.3g}" for s in self.noise)
-        return (
-            f"S(q, Q) of {self.num_triples:,} triples of successive positions, {kind}. Positions "
-            "do not determine its scale: momenta, energies and areas have a unit of their own"
-            + (f". {left} undetermined combinations of terms are 0" if left else "")
-            + (f". The noise of the readings is {listed}" if listed else "")
-        )
+        told = f"S(q, Q) of {self.num_triples:,} triples of successive positions, {kind}. Positions"
+        told += " do not determine its scale: momenta, energies and areas have a unit of their own"
+        told += f". {left} undetermined combinations of terms are 0" if left else ""
+        return told + (f". The noise of the readings is {listed}" if listed else "")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -191,10 +189,8 @@ class Choice:
             return 1.0
         size = np.std(self.pairs.z0, axis=0)
         moved = np.mean((self.pairs.z1 - self.pairs.z0) ** 2, axis=0)
-        left, whole = (
-            float(np.sum(square[size > 0] / size[size > 0] ** 2))
-            for square in (self.chosen.deviations**2, moved)
-        )
+        roots = (self.chosen.deviations**2, moved)
+        left, whole = (float(np.sum(x[size > 0] / size[size > 0] ** 2)) for x in roots)
         return 1 - left / whole
 
     def _on_one_level(self, law: LearnedHamiltonian) -> bool:
@@ -576,10 +572,8 @@ def candidate_cells(found: Choice | Fit) -> tuple[tuple[str, ...], list[tuple[st
     numbers = ("parameters", "error ÷ spread", bound, "outside", "kflop/step", "µs/step", "fit s")
     rows = []
     for c in found.candidates:
-        about, outside = (
-            "" if c.validated else "~",
-            "–" if c.outside is None else f"{c.outside:.1e}",
-        )
+        about = "" if c.validated else "~"
+        outside = "–" if c.outside is None else f"{c.outside:.1e}"
         micro = "–" if c.microseconds_per_step is None else f"{c.microseconds_per_step:.2f}"
         named = "→" if c.chosen else "", c.chart, c.label, f"{c.num_parameters:,}"
         errors = f"{about}{c.validation_relative:.2e}", f"{about}{c.validation_bound:.2e}", outside

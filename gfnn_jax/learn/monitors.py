@@ -121,10 +121,9 @@ def fit_monitors(
     unknown = {k: own for k, (own, matrix) in enumerate(stretches) if matrix is None}
     learned = {k: fit(own, learn="map", **options) for k, own in unknown.items()}
     first, one = next(iter(learned.items()))
-    whole = [
-        learned[k].map if matrix is None else _linear(matrix, own, one.map)
-        for k, (own, matrix) in enumerate(stretches)
-    ]
+    whole = []
+    for k, (own, matrix) in enumerate(stretches):
+        whole.append(learned[k].map if matrix is None else _linear(matrix, own, one.map))
     noise, fits = None, map(learned.get, range(len(places)))
     if len(places) == 2 and not one.met:
         better = _of_latent_readings(one.map, runs, known, first)

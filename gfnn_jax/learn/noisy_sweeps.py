@@ -168,10 +168,9 @@ def _corrected(rivals: list[Entry], request: Request) -> Entry:
         raise np.linalg.LinAlgError("expected a chart that is regular at all pairs")
     floor = min(expected.noise for _, expected, _ in estimated)
     risks = [max(expected.error - floor, expected.own) for _, expected, _ in estimated]
-    sweep, expected, most = min(
-        (j for j, risk in zip(estimated, risks, strict=True) if risk <= _NO_WORSE * min(risks)),
-        key=lambda j: j[1].size.operations,
-    )
+    low = _NO_WORSE * min(risks)
+    good = (j for j, risk in zip(estimated, risks, strict=True) if risk <= low)
+    sweep, expected, most = min(good, key=lambda j: j[1].size.operations)
     size = expected.size
     # Once more, by states that a corrected S has found: where an S of too many terms reaches beyond
     # the states, one pass is not enough.

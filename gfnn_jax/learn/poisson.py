@@ -187,11 +187,10 @@ def pairs_of_states(recording: Recording) -> Pairs:
     if len(names) < 2:
         raise InputError(f"expected 2 or more columns of states, got {len(names)}: --positions A,B")
     if recording.inputs:
-        raise InputError(
-            f"a law with a bracket has no inputs, got {', '.join(recording.inputs)}. It may depend "
-            "on parameters, one number of each run, and on the time of a periodic drive: "
-            'gfnn.Pairs(z0, z1, dt, structure="poisson", t0=times, period=T)'
-        )
+        told = f"a law with a bracket has no inputs, got {', '.join(recording.inputs)}"
+        may = "It may depend on parameters, one number of each run, and on the time of a periodic"
+        drive = 'drive: gfnn.Pairs(z0, z1, dt, structure="poisson", t0=times, period=T)'
+        raise InputError(f"{told}. {may} {drive}")
     for number, run in enumerate(recording.runs):
         z, t = np.asarray(recording.array("positions", run)), recording.times(run)
         known = np.asarray(np.isfinite(z).all(axis=1))

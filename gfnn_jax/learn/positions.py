@@ -259,20 +259,13 @@ class _Sweep:
         piece = Generated(family, params, TYPE1, triples.dt, sizes(states[0]))
         left = discrete_lagrangian.residuals(family, params, training) / self.spread
         error = self.error_of(latent_positions.images_of(piece, held), self.split.validation)
-        gradient, with_hessian = family.operations
-        candidate = Candidate.of(
-            error,
-            label=family.label,
-            family=family.name,
-            chart=TYPE1.name,
-            num_parameters=family.num_parameters,
-            operations=float(gradient + with_hessian),
-            train_rms=float(np.sqrt(np.mean(left**2))),
-            validated=True,
-            fit_seconds=time.perf_counter() - started,
-            condition=about.condition,
-            rank=about.rank,
-        )
+        named = {"label": family.label, "family": family.name, "chart": TYPE1.name}
+        count, took = family.num_parameters, time.perf_counter() - started
+        costs = {"num_parameters": count, "fit_seconds": took}
+        costs |= {"operations": float(sum(family.operations))}
+        told: dict[str, Any] = {"condition": about.condition, "rank": about.rank, **named, **costs}
+        rms = float(np.sqrt(np.mean(left**2)))
+        candidate = Candidate.of(error, train_rms=rms, validated=True, **told)
         self.tried.append(candidate)
         self.watch.on_candidate(candidate)
         return _Found(piece, candidate, about, root, noise)

@@ -121,10 +121,8 @@ def check_request(
 def _check_told(structure: str | None, options: FitOptions, pairs: Pairs) -> None:
     """Raises FitError and InputError for what cannot be told of coefficients."""
     depends = bool(pairs.args) or pairs.period is not None
-    refused = {
-        f"structure {structure}": structure is not None,
-        "a network": options.family == "mlp",
-    }
+    network = options.family == "mlp"
+    refused = {f"structure {structure}": structure is not None, "a network": network}
     refused["args or a drive"] = depends
     for what, given in refused.items():
         if given:

@@ -53,10 +53,8 @@ def load_model(folder) -> tuple[dict[str, Any], dict[str, Any]]:
     dtypes = [leaf.dtype for leaf in jax.tree.leaves(tree) if isinstance(leaf, np.ndarray)]
     wide = [dtype for dtype in dtypes if jax.dtypes.canonicalize_dtype(dtype) != dtype]
     if wide:
-        raise InputError(
-            f"{folder}: holds {wide[0]} arrays: switch on JAX's float64 first "
-            '(jax.config.update("jax_enable_x64", True))'
-        )
+        told = f"{folder}: holds {wide[0]} arrays: switch on JAX's float64 first"
+        raise InputError(f'{told} (jax.config.update("jax_enable_x64", True))')
     return tree, record["description"]
 
 
@@ -133,11 +131,8 @@ def _write(folder: Path, tree: Any, record: dict[str, Any]) -> None:
         if stored:
             np.savez(new / _ARRAYS[_FORMAT], allow_pickle=False, **stored)
         (new / _JSON).write_text(text, encoding="utf-8")
-        whole = (
-            (f, hashlib.sha256(f.read_bytes()).hexdigest())
-            for f in sorted(new.rglob("*"))
-            if f.is_file()
-        )
+        files = (f for f in sorted(new.rglob("*")) if f.is_file())
+        whole = ((f, hashlib.sha256(f.read_bytes()).hexdigest()) for f in files)
         sums = [f"{digest}  {file.relative_to(new).as_posix()}\n" for file, digest in whole]
         (new / _SUMS).write_text("".join(sums), encoding="utf-8")
 
