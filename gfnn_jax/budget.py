@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeVar
 from gfnn_jax.errors import OutOfTime
 
 T = TypeVar("T")
+Made = Callable[[], float] | None
 
 MAX_SECONDS = 120.0  # of a fit that is told of no budget
 
@@ -145,7 +146,7 @@ class Budget:
         operations: float,
         *,
         then: tuple[str, float] | None = None,
-        made: Callable[[], float] | None = None,
+        made: Made = None,
     ) -> Iterator[None]:
         """One unit of work of the search. Raises OutOfTime where it does not fit.
 
@@ -177,13 +178,7 @@ class Budget:
 
     @contextlib.contextmanager
     def last(
-        self,
-        name: str,
-        kind: str,
-        operations: float,
-        *,
-        decides: bool = False,
-        made: Callable[[], float] | None = None,
+        self, name: str, kind: str, operations: float, *, decides: bool = False, made: Made = None
     ) -> Iterator[None]:
         """A unit after the search, which the search's end is no reason to leave out. Raises
         OutOfTime where there is no time for it, and then for those after it too.
@@ -203,7 +198,7 @@ class Budget:
         self.operations += decides
 
     def free(
-        self, kind: str, operations: float, made: Callable[[], float] | None = None
+        self, kind: str, operations: float, made: Made = None
     ) -> contextlib.AbstractContextManager[None]:
         """Work that is done in any case, and counts as no operation; its time is measured. made: as
         of ``unit``."""
@@ -250,9 +245,7 @@ class Budget:
         return operations * seconds / done
 
     @contextlib.contextmanager
-    def _timed(
-        self, kind: str, operations: float, made: Callable[[], float] | None
-    ) -> Iterator[None]:
+    def _timed(self, kind: str, operations: float, made: Made) -> Iterator[None]:
         started, before = self._clock(), 0.0 if made is None else made()
         yield
         operations = operations if made is None else made() - before

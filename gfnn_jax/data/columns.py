@@ -68,6 +68,8 @@ class _Options:
 _STD = "_std"  # end of the name of a column that holds the σ of another
 _OF_MOTION = ("positions", "velocities", "momenta", "sensors")  # roles of what shows the motion
 Names = Sequence[str] | str | None
+Roles = dict[str, tuple[str, ...]]
+Units = Mapping[str, str]
 Runs = Mapping[str, tuple[np.ndarray, dict[str, np.ndarray]]]
 
 
@@ -97,12 +99,8 @@ class Undecided(InputError):
 
 
 def roles_of(
-    source: str,
-    names: list[str],
-    given: dict[str, tuple[str, ...]],
-    runs: Runs,
-    units: Mapping[str, str],
-) -> tuple[dict[str, tuple[str, ...]], list[str]]:
+    source: str, names: list[str], given: Roles, runs: Runs, units: Units
+) -> tuple[Roles, list[str]]:
     """(the columns of each role, what had to be decided): those given, else by name, else by what
     the columns hold and their units; where only inputs or parameters are given, those of the other
     columns.
@@ -181,8 +179,8 @@ _OF_DRIVES = re.compile(r"[µumk]?V|[nµum]?A|[mk]?N|N ?·? ?m|Nm", re.IGNORECAS
 
 
 def _by_data(
-    source: str, runs: Runs, names: Sequence[str], units: Mapping[str, str]
-) -> tuple[dict[str, tuple[str, ...]], list[str]]:
+    source: str, runs: Runs, names: Sequence[str], units: Units
+) -> tuple[Roles, list[str]]:
     """(columns by role, notes) of columns whose names tell nothing: pairs, one the other's
     derivative; lengths and angles by their units; voltages, currents and forces beside these as
     inputs; a column that moves alone.
@@ -258,7 +256,7 @@ def _of_rates(source: str, names: Sequence[str], columns: np.ndarray, runs: int)
     return Undecided(f"{source}: {shown}, and no column shows the angle. {learn}", options)
 
 
-def _of_speeds(source: str, names: Sequence[str], units: Mapping[str, str]) -> Undecided:
+def _of_speeds(source: str, names: Sequence[str], units: Units) -> Undecided:
     """Options for velocities whose positions no column shows."""
     turning = is_angle(str(derivative_of(names[0]))) or "omega" in plain(names[0])
     turning |= bool(_OF_TURNING.fullmatch(units.get(names[0], "")))
@@ -332,7 +330,7 @@ def angles_of(
     given: tuple[str, ...],
     degrees: tuple[str, ...],
     by_names: bool,
-    units: Mapping[str, str],
+    units: Units,
 ) -> tuple[tuple[str, ...], dict[str, float]]:
     """(angles in the order of the positions, radians in the units of columns in degrees, turns)."""
     known = (*roles["positions"], *roles["velocities"])
@@ -354,7 +352,7 @@ def angles_of(
     return tuple(n for n in roles["positions"] if n in angles), factors
 
 
-def _unit(units: Mapping[str, str], name: str) -> str:
+def _unit(units: Units, name: str) -> str:
     return units.get(name, "").strip().lower()
 
 
@@ -366,9 +364,7 @@ def check_known(source: str, what: str, wanted: Any, known: Sequence[str]) -> No
         raise InputError(f"{source}: {what}: no column {absent} among {there}")
 
 
-def time_unit_of(
-    source: str, times: Sequence[str], units: Mapping[str, str], given: str | None
-) -> str | None:
+def time_unit_of(source: str, times: Sequence[str], units: Units, given: str | None) -> str | None:
     """The unit of these columns of times: the given one, the header's, or that which their name
     says; None where nothing tells. Raises InputError where two of these differ, or one is not
     known."""
@@ -397,7 +393,7 @@ _UNITS_OF_TIME |= {"millis": "ms", "micros": "us", "day": "d", "days": "d", "hou
 _UNITS_OF_TIME |= {"yr": "year", "years": "year", "a": "year", "μs": "us", "utc": "s"}
 
 
-def _time_unit(name: str, units: Mapping[str, str]) -> str | None:
+def _time_unit(name: str, units: Units) -> str | None:
     """The unit of a column of times, by its header or by its name."""
     words = plain(name).split("_")
     for unit in (_unit(units, name), words[-1], OF_CALENDAR.get(words[0], "")):

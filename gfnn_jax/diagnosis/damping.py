@@ -159,12 +159,12 @@ def learn_damping(
     error: float,
     chart: str,
     reversor,
-    most_operations: float = OPTIONS.most_operations,
+    most: float = OPTIONS.most_operations,
 ) -> LearnedDamping | None:
     """The D_b behind these pairs; None where areas are kept, or no D_b explains what is lost.
 
     data: without a base map. jacobians: (n, 2d, 2d) local ones, known to the error.
-    most_operations: rows × terms² of one solve.
+    most: rows × terms² of one solve.
     """
     factors, dim = area_factors(jacobians, data.scale), data.dim
     b = float(np.median(factors))
@@ -182,7 +182,7 @@ def learn_damping(
         charts = choose_charts(chart, undamped, reversor, start.undone(jacobians))
     except FitError:  # no chart covers the rest
         return None
-    problems = [_Problem(data, each, charts.half, most_operations) for each in charts.charts]
+    problems = [_Problem(data, each, charts.half, most) for each in charts.charts]
 
     def best(spread: np.ndarray) -> tuple[_Fitted, _Problem]:
         first = np.full((1, len(spread)), b)

@@ -19,13 +19,6 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
 from gfnn_jax.coordinates import nearest_image
-from gfnn_jax.evaluate.figures_of_recordings import begin_of as begin_of
-from gfnn_jax.evaluate.figures_of_recordings import coming_figure as coming_figure
-from gfnn_jax.evaluate.figures_of_recordings import forecasts_figure as forecasts_figure
-from gfnn_jax.evaluate.figures_of_recordings import law_figure as law_figure
-from gfnn_jax.evaluate.figures_of_recordings import recording_figure as recording_figure
-from gfnn_jax.evaluate.figures_of_recordings import residuals_figure as residuals_figure
-from gfnn_jax.evaluate.figures_of_recordings import swings_figure as swings_figure
 from gfnn_jax.evaluate.figures_style import COLOURS, HEIGHT, LINES, MARKERS, REFERENCE, WIDTH, style
 from gfnn_jax.evaluate.figures_style import save as save
 from gfnn_jax.evaluate.metrics import error_statistics, kl_divergence

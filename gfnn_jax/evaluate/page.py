@@ -20,6 +20,7 @@ import numpy as np
 from gfnn_jax.data.recording import Recording
 from gfnn_jax.errors import FitError, InputError
 from gfnn_jax.evaluate import figures
+from gfnn_jax.evaluate import figures_of_recordings as of_recordings
 from gfnn_jax.evaluate.figures import Figure
 from gfnn_jax.evaluate.figures_style import as_svg
 from gfnn_jax.evaluate.forecasts import Forecasts, forecasts_of
@@ -91,7 +92,7 @@ def _rendered(title: str, verdict: str, sections: Sequence[Section]) -> str:
 def figure(fit: Fit) -> Figure | None:
     """Figure of a law against its recording, or of the candidates of a map."""
     if isinstance(fit.found, LearnedLaw):
-        return figures.law_figure(fit.found, fit.seen)
+        return of_recordings.law_figure(fit.found, fit.seen)
     return figures.candidates_figure(fit)
 
 
@@ -145,7 +146,7 @@ def write_refusal(recording: Recording, error: Exception, folder: Path, about: A
     result = {**refused, "verdict": verdict, "error": str(error)}
     result["data"] = {**refused["data"], "source": recording.source}
     summary = recording.summary()
-    drawn = _svg(figures.recording_figure(recording, summary), "The recording.")
+    drawn = _svg(of_recordings.recording_figure(recording, summary), "The recording.")
     notes = [*about.notes, *recording.notes, *map(str, summary.faults)]
     sections = [Section("Why", lines=[str(error)])]
     sections.append(Section("The data", lines=notes, figures=[drawn]))
@@ -182,12 +183,12 @@ def _of_law(
     data = fit.data
     if data is not None:  # the longest run after what was learned from, or its last third
         own = data.slice(run=max(data.runs, key=lambda name: np.ptp(data.times(name))))
-        begin = figures.begin_of(own, fit.learned_to)
+        begin = of_recordings.begin_of(own, fit.learned_to)
         yield Section("Simulation", script=simulation(law, own, begin))
     if law.traces and fit.data is not None:
         lines = [f"{name}: residuals {one.text}." for name, one in law.whiteness.items()]
         told = "Measured minus law along the arcs of the fit: against time, the channel, and its"
-        drawn = _svg(figures.residuals_figure(law, fit.data), f"{told} rate of change.")
+        drawn = _svg(of_recordings.residuals_figure(law, fit.data), f"{told} rate of change.")
         yield Section("Residuals", lines=lines, figures=[drawn])
     yield Section("Not identified", lines=list(_not_identified(law)))
     heads = ("alternative", "odds of this law against it", "")
@@ -206,7 +207,7 @@ def _physics(law: LearnedLaw, known: Physics) -> Section:
         unit = "rad" if name in law.map.sensors.angles else law.units.get(name, "")
         label = f"{name} [{unit}]" if unit else name
         caption = "Free swings about rest, by the law: two standard errors are shaded."
-        drawn = [_svg(figures.swings_figure(known.swings, label), caption)]
+        drawn = [_svg(of_recordings.swings_figure(known.swings, label), caption)]
     rows = [(one.name, one.shown, one.unit, one.about) for one in known.quantities]
     heads = ("quantity", "value", "unit", "")
     return Section("Physical quantities", heads=heads, rows=rows, figures=drawn)
@@ -217,7 +218,7 @@ def _coming(fit: Fit, law: LearnedLaw) -> list[tuple[str, str]]:
     if fit.data is None:
         return []
     told = "Forecast from one state at the dashed line on, and what was measured."
-    drawn = figures.coming_figure(law, fit.data, fit.learned_to)
+    drawn = of_recordings.coming_figure(law, fit.data, fit.learned_to)
     return [_svg(drawn, f"{told} Two standard deviations are shaded.")]
 
 
@@ -237,7 +238,7 @@ def _forecasts(
     for name, errors in found.median.items():
         rows.append((name, *(f"{e:.3g} {units[name]}".rstrip() for e in errors)))
     lines = [f"{share} (95 % expected).", *lines]
-    drawn = [*drawn, _svg(figures.forecasts_figure(found, fit.held_out), caption)]
+    drawn = [*drawn, _svg(of_recordings.forecasts_figure(found, fit.held_out), caption)]
     return Section("Forecasts", lines=lines, heads=heads, rows=rows, figures=drawn)
 
 
