@@ -28,9 +28,8 @@ TIME = "t"  # the name, among args, of the time of a drive; it is the last of th
 def require_x64(what: str) -> None:
     """Raise RuntimeError where JAX would silently compute ``what`` in float32."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise RuntimeError(
-            f"{what} needs float64: call jax.config.update('jax_enable_x64', True) first"
-        )
+        told = "call jax.config.update('jax_enable_x64', True) first"
+        raise RuntimeError(f"{what} needs float64: {told}")
 
 
 def split(z):
@@ -88,9 +87,8 @@ def symplecticity_defect(jacobian, scale=None, multiplier: Any = 1.0):
         weighted = form * (scale[:, None] * scale[None, :])
     pulled_back = matmul(xp.swapaxes(jacobian, -1, -2), matmul(form, jacobian))
     kept = weighted.reshape((1,) * (jacobian.ndim - 2) + weighted.shape)
-    defect = (
-        pulled_back - (multiplier[..., None, None] if np.ndim(multiplier) else multiplier) * kept
-    )
+    each = multiplier[..., None, None] if np.ndim(multiplier) else multiplier
+    defect = pulled_back - each * kept
     return xp.max(xp.abs(defect), axis=(-2, -1)) / xp.max(xp.abs(weighted))
 
 
@@ -104,9 +102,8 @@ def defect_of_pairs(before, after, scale, multiplier: Any = 1.0):
     """
     xp, half, dim = namespace(after), len(before) // 2, len(scale) // 2
     form = [xp.sum(t[:half] * apply_j(t[half:]), axis=-1) for t in (after, before)]
-    return xp.max(xp.abs(form[0] - multiplier * form[1]), axis=0) / xp.max(
-        scale[:dim] * scale[dim:]
-    )
+    size = xp.max(scale[:dim] * scale[dim:])
+    return xp.max(xp.abs(form[0] - multiplier * form[1]), axis=0) / size
 
 
 def hamiltonian_vector_field(hamiltonian: Callable) -> Callable:

@@ -152,9 +152,8 @@ def join() -> Share:
             raise InputError(f"expected a whole number as JAX_{name.upper()}, got '{text}'")
         given[name] = None if text is None else int(text)
     try:
-        jax.distributed.initialize(
-            **given, heartbeat_timeout_seconds=_HEARTBEAT, shutdown_timeout_seconds=_PATIENCE
-        )
+        times = {"heartbeat_timeout_seconds": _HEARTBEAT, "shutdown_timeout_seconds": _PATIENCE}
+        jax.distributed.initialize(**given, **times)
         jax.local_devices()  # all processes tell each other what they have: none may leave it out
     except (ValueError, TypeError, RuntimeError) as error:
         told = "--distributed needs a launcher that JAX knows, such as srun or mpirun, or the"

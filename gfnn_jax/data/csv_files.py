@@ -102,9 +102,8 @@ class _StatesInText:
         for table in self._tables(min(rows, blocks.BLOCK_ROWS)):
             length, begin = len(table["q1"]), passed
             nothing = np.zeros(length)
-            sequence = (
-                begin + np.arange(length) if self.each_row else table.get("sequence", nothing)
-            )
+            own = table.get("sequence", nothing)
+            sequence = begin + np.arange(length) if self.each_row else own
             time = table["t"] if self.with_time else nothing
             told = np.stack([sequence, time, *(table[n] for n in self.parameters)], axis=1)
             both = np.concatenate([last, told])

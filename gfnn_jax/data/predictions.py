@@ -42,9 +42,8 @@ class _Options:
 
 OPTIONS = _Options()
 # Axis of the lanes, of the arrays of a file that have one.
-_AXIS_OF_LANES = {"quantiles": 1} | dict.fromkeys(
-    ("trajectories", "std", "status", "left_at", "params", "t0", "horizon"), 0
-)
+_OF_LANES = ("trajectories", "std", "status", "left_at", "params", "t0", "horizon")
+_AXIS_OF_LANES = {"quantiles": 1} | dict.fromkeys(_OF_LANES, 0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -284,10 +283,8 @@ class PredictionWriter:
         for line in lines[1:]:
             carry = self._verified_carry(line)
             if carry is None:
-                told = (
-                    f"{self.partial}: a chunk is damaged or half written: going on from saved state"
-                )
-                warnings.warn(f"{told} {self.saved} instead", stacklevel=3)
+                told = f"{self.partial}: a chunk is damaged or half written: going on from saved"
+                warnings.warn(f"{told} state {self.saved} instead", stacklevel=3)
                 break
             entry = json.loads(line)
             self._chunks.append(entry)

@@ -234,9 +234,8 @@ class Dataset:
             y0 = before.image(found.y0, found.args)
             found = dataclasses.replace(found, y0=y0, before=(*found.before, before))
         if after is not None:
-            found = dataclasses.replace(
-                found, y1=after.inverse().image(found.y1, found.args), after=(after, *found.after)
-            )
+            y1 = after.inverse().image(found.y1, found.args)
+            found = dataclasses.replace(found, y1=y1, after=(after, *found.after))
         return found
 
     def whole_image(self, y: np.ndarray, rows: np.ndarray) -> np.ndarray:

@@ -275,9 +275,7 @@ def choose_charts(request: str, data: Dataset, reversor, jacobians) -> Charts:
         return Charts([CHARTS[beyond[0]]], None, determinants, [message])
     lows = ", ".join(f"{n} {j.sign * j.low:.2g}" for n, j in determinants.items())
     told = f"each has a determinant near 0 ({lows}), and no generating function exists there. Take"
-    told += (
-        " pairs of a smaller dt or region, or learn H, which needs no chart: --learn hamiltonian"
-    )
+    told += " pairs of a smaller dt or region, or learn H without a chart: --learn hamiltonian"
     raise FitError(f"no chart covers these data, with or without a base map: {told}")
 
 

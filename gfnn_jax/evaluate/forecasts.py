@@ -92,9 +92,8 @@ def _forecasts(
 ) -> Forecasts:
     """Forecasts along a recording. forecast: one, of (recording, run, its sample, seconds)."""
     times = {run: recording.times(run) for run in recording.runs}
-    places = (
-        (run, t, k) for run, t in times.items() for k in range(_Options.samples - 1, len(t) - 1)
-    )
+    first = _Options.samples - 1
+    places = ((run, t, k) for run, t in times.items() for k in range(first, len(t) - 1))
     starts = [(run, k) for run, t, k in places if t[k] + ahead[-1] <= t[-1]]
     if not starts:
         told = f"no run has {_Options.samples} samples and {ahead[-1]:.3g} s behind them"

@@ -74,9 +74,8 @@ def c_source(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
         parts.append(c_parts.POLAR)
     if map_.coordinates.forward is LOG.forward:
         parts.append(c_parts.logarithms(width))
-    most = max(
-        (c_pieces.unknowns(p, map_.dim) for p in pieces if isinstance(p, Generated)), default=0
-    )
+    generated = (piece for piece in pieces if isinstance(piece, Generated))
+    most = max((c_pieces.unknowns(piece, map_.dim) for piece in generated), default=0)
     if most:
         parts.append(c_parts.newton_solver(most, width))
     if most > COFACTORS_UP_TO:

@@ -128,9 +128,8 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
     if bracket is not None:
         rates = _of_bracket(bracket, piece, p, z, args)
     elif is_of_law(map_):
-        rates, speeds, limits, directions = _of_lagrangian(
-            tape, family, p, z, args, getattr(sensors, "creep", 0.0) if sharp else -1.0
-        )
+        creep = getattr(sensors, "creep", 0.0) if sharp else -1.0
+        rates, speeds, limits, directions = _of_lagrangian(tape, family, p, z, args, creep)
     else:
         gradient = family.gradient(p, z, args)[0]
         rates = [*gradient[dim:], *(-gradient[:dim])]
@@ -146,9 +145,8 @@ def graph_of(map_: SymplecticMap, sharp: bool = True) -> LawGraph:
     terms = tuple(of_terms.term_names) if plain or bracket is not None else ()
     law = tape, list(rates), speeds, limits, directions
     named = names, (*base, *inputs), terms, params if plain else np.zeros(0)
-    return LawGraph(
-        *law, *named, tuple(series), time, float(map_.dt), np.asarray(map_.scale, float)
-    )
+    dt, scale = float(map_.dt), np.asarray(map_.scale, float)
+    return LawGraph(*law, *named, tuple(series), time, dt, scale)
 
 
 def _of_bracket(bracket: Bracket, piece: Any, p, z, args) -> list[Any]:

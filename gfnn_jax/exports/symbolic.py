@@ -45,9 +45,8 @@ class Formula:
 
     def latex(self) -> str:
         """Formula in LaTeX's notation, its terms in their order, with errors in the last digits."""
-        texts = (
-            rf"\left({as_latex(t)}\right)" if _is_sum(t) else as_latex(t) for t, _, _ in self.terms
-        )
+        wrap = r"\left({}\right)"
+        texts = (wrap.format(as_latex(t)) if _is_sum(t) else as_latex(t) for t, _, _ in self.terms)
         return added(_times(c, s, t) for t, (_, c, s) in zip(texts, self.terms, strict=True)) or "0"
 
     def mathml(self) -> str:

@@ -440,9 +440,8 @@ class _Rows:
             inputs["p"] = tape.inputs("p", len(graph.values))[0] if len(graph.values) else ()
         wanted = [*graph.rates, *graph.speeds, *graph.limits]
         found = graph.tape.evaluated(wanted, inputs, _FUNCTIONS)
-        rates, speeds, limits = np.split(
-            np.array([*found, None], dtype=object)[:-1], [self.width, self.width + self.count]
-        )
+        ends, each = [self.width, self.width + self.count], np.array([*found, None], dtype=object)
+        rates, speeds, limits = np.split(each[:-1], ends)
         self.rates = [rate if _has_row(rate) else tape.made("+", rate, 0.0) for rate in rates]
         self.speeds, self.limits = speeds.tolist(), limits.tolist()
         self.tape, self.size = tape, Options.order + 1

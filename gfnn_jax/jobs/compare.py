@@ -274,9 +274,8 @@ def compare(
             told = {"rollout": m.report, "curve": _curve(m.error), "kl": kl, "elements": None}
             if scene.name == "two-body":
                 ends = m.predicted, data.reference
-                off = {
-                    n: metrics.absolute_error(*map(f, ends)) for n, f in metrics.ELEMENTS.items()
-                }
+                kinds = metrics.ELEMENTS.items()
+                off = {n: metrics.absolute_error(*map(f, ends)) for n, f in kinds}
                 told["elements"] = {n: _curve(error) for n, error in off.items()}
             reported[method] = {"title": TITLES[method], **part, **told}
         source = {"source": "reference data of the scene", "num_pairs": data.num_pairs}

@@ -117,9 +117,8 @@ def fit(
                 last = fitted.budget.last(_TO_ALL, READING, seconds, decides=True)
                 progress.status("fitting the chosen model to all pairs")
                 with failures_of_arithmetic(), row_blocks.on_devices(own):
-                    again = within(
-                        last, partial(refit, fitted, pairs, fitted.validation_pairs, **apart)
-                    )
+                    held = fitted.validation_pairs
+                    again = within(last, partial(refit, fitted, pairs, held, **apart))
             if again is None:
                 group.broadcast({})
                 again = not_refitted(fitted, why) if large else fitted

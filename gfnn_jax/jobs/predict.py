@@ -158,9 +158,8 @@ def _in_parts(
         wait_for_all()
         return _finished(output.out)
     ensure_new(output.out, output.overwrite)
-    many = predictions.number_of_parts(
-        output.out, share, resume=output.resume and not output.overwrite
-    )
+    resume = output.resume and not output.overwrite
+    many = predictions.number_of_parts(output.out, share, resume=resume)
     shares = [Share(i, many) for i in range(many)]
     lanes = {predictions.part_of(output.out, one): one.of(len(begin.z0), block) for one in shares}
     predicted = [Predicted(np.zeros(0, int), np.zeros(0, int), 0.0)]
@@ -273,9 +272,8 @@ class _Prediction:
         """Predict these lanes into one file."""
         output, asked = self.output, self.asked
         job = self.request(begin, identity)
-        writer = predictions.PredictionWriter(
-            out, job, resume=output.resume, overwrite=output.overwrite
-        )
+        ways = {"resume": output.resume, "overwrite": output.overwrite}
+        writer = predictions.PredictionWriter(out, job, **ways)
         started = time.perf_counter()
         if writer.finished:
             return _finished(out)

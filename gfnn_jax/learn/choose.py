@@ -43,7 +43,7 @@ from gfnn_jax.models.hamiltonians.learned_law import LearnedHamiltonian
 from gfnn_jax.models.hamiltonians.learned_law import assembled as flow_assembled
 from gfnn_jax.models.hamiltonians.problem import work_of_refit
 from gfnn_jax.models.hamiltonians.search import preferred
-from gfnn_jax.search.search import Entry
+from gfnn_jax.search.search import Entry, OnProgress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,9 +205,7 @@ def work_of_posterior(num_parameters: int) -> float:
     return OPTIONS.of_root * float(num_parameters) ** 3
 
 
-def stated(
-    chosen: Chosen, found: Searched, budget: Budget, on_progress: Callable[[str], Any]
-) -> Chosen:
+def stated(chosen: Chosen, found: Searched, budget: Budget, on_progress: OnProgress) -> Chosen:
     """The choice with its error on the test rows, or by cross-validation over runs where
     these are of few runs, or over blocks of time where all pairs are."""
     data = found.data
@@ -354,9 +352,8 @@ def _refits(chosen: Chosen, found: Searched) -> _Refits | None:
 
 def _of_law(law: LearnedHamiltonian, data: Dataset) -> _Refits:
     flow = law.flow
-    problem = Problem(
-        data.y0, data.y1, data.each_dt, data.scale, args=data.args, weight=data.weight
-    )
+    each = {"args": data.args, "weight": data.weight}
+    problem = Problem(data.y0, data.y1, data.each_dt, data.scale, **each)
     steps = Steps(flow.stages, flow.over(np.max(data.each_dt)).substeps)
     family, coefficients = flow.family, np.asarray(flow.params)
     if law.constrained is not None:  # what is told of coefficients holds in each fit

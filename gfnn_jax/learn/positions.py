@@ -193,9 +193,8 @@ class _Sweep:
         both = np.sort(split.training), np.sort(split.validation)
         training, held_out = map(self.triples.take, both)
         families = self._families(symmetric)
-        found = latent_positions.without_noise(
-            families, training, held_out, self.budget, self.watch.on_progress
-        )
+        told = self.budget, self.watch.on_progress
+        found = latent_positions.without_noise(families, training, held_out, *told)
         if found is None:
             return best
         started = time.perf_counter()
@@ -234,9 +233,8 @@ class _Sweep:
         solved = discrete_lagrangian.solve(family, training)
         told, count = (solved.rank, solved.condition), len(self.triples)
         about = OfPositions(symmetric, family.num_parameters, *told, count)
-        left = discrete_lagrangian.residuals(
-            family, family.unflatten(solved.coefficients), training
-        )
+        params = family.unflatten(solved.coefficients)
+        left = discrete_lagrangian.residuals(family, params, training)
         deviation = np.sqrt(np.mean((left / discrete_lagrangian.displacement(training)) ** 2))
         noise = latent_positions.starting_noise(family, solved.coefficients, training)
         root = deviation * solved.root
@@ -280,9 +278,8 @@ class _Sweep:
         nothing where there are enough. left_out: lines about readings that were."""
         self.watch.on_progress(f"compiling the step of {best.candidate.label}")
         sensors = dataclasses.replace(self.sensors, sigma=best.noise)
-        map_, states = latent_positions.map_of(
-            best.piece, best.root, sensors, self.triples, self.sites
-        )
+        of_states = sensors, self.triples, self.sites
+        map_, states = latent_positions.map_of(best.piece, best.root, *of_states)
         test = self.split.test if len(self.split.test) else self.split.validation
         steps = stepped(map_, states.z1[test])
         images = np.where(steps.failed[:, None], np.nan, steps.images)[:, : self.triples.dim]

@@ -274,9 +274,8 @@ class RowsOfRefit:
     def close(self, pairs: Pairs) -> np.ndarray:
         """Mark the pairs (N,) that the old map serves, and does not miss by far."""
         served = self._served(pairs)
-        served[served] = self._close(
-            np.asarray(pairs.z1)[served], self._images(self.map, pairs.take(np.flatnonzero(served)))
-        )
+        images = self._images(self.map, pairs.take(np.flatnonzero(served)))
+        served[served] = self._close(np.asarray(pairs.z1)[served], images)
         return served
 
     def _served(self, pairs: Pairs) -> np.ndarray:

@@ -173,9 +173,8 @@ def unlike_the_scene(pairs: Pairs, scene: Scene) -> list[str]:
     else:
         states = np.asarray(sample_states(scene, OPTIONS.compared, jax.random.key(0)))
     messages = []
-    for name, ours, theirs in zip(
-        ("positions", "momenta"), split(np.asarray(pairs.z0)), split(states), strict=True
-    ):
+    halves = split(np.asarray(pairs.z0)), split(states)
+    for name, ours, theirs in zip(("positions", "momenta"), *halves, strict=True):
         size, usual = (float(np.median(np.linalg.norm(x, axis=1))) for x in (ours, theirs))
         if usual > 0 and not 1 / OPTIONS.other_size < size / usual < OPTIONS.other_size:
             told = f"the {name} are {size / usual:.2g} times the size of those in {scene.name}"
@@ -207,10 +206,8 @@ def not_radians(pairs: Pairs, coordinates: Coordinates) -> list[str]:
     range_, move = np.ptp(z0, axis=0), np.abs(z1 - z0).max(axis=0)
     messages = []
     for a in coordinates.angles:
-        told = (
-            f"coordinate {a} of z, given as an angle, ranges over {range_[a]:.3g} and moves by up"
-        )
-        told += f" to {move[a]:.3g} in a step. Angles are in radians: are these degrees? Convert"
+        told = f"coordinate {a} of z, given as an angle, ranges over {range_[a]:.3g} and moves by"
+        told += f" up to {move[a]:.3g} in a step. Angles are in radians: are these degrees? Convert"
         if range_[a] > 2 * TWO_PI and move[a] > np.pi:
             messages.append(f"{told} them, or take {a} out of --angles")
     return messages

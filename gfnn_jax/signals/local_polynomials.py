@@ -73,9 +73,8 @@ def _windows(times: Sequence[np.ndarray], size: int) -> tuple[np.ndarray, np.nda
     """Rows (W, size), centres (W,) and runs (W,) of windows without a gap."""
     lengths = np.array([len(t) for t in times])
     begins = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    starts = np.concatenate(
-        [b + np.arange(max(n - size + 1, 0)) for b, n in zip(begins, lengths, strict=True)]
-    ).astype(int)
+    each = zip(begins, lengths, strict=True)
+    starts = np.concatenate([b + np.arange(max(n - size + 1, 0)) for b, n in each]).astype(int)
     most = max(_MOST_NUMBERS // size, 1)
     if len(starts) > most:
         starts = starts[np.linspace(0, len(starts) - 1, most).astype(int)]

@@ -47,9 +47,8 @@ def ensure_new(path, overwrite: bool = False, *, folder: bool = False) -> Path:
             if not overwrite:
                 raise InputError(f"{path}: exists already (--overwrite replaces it)")
             if folder and not any((path / mark).is_file() for mark in FOLDER_MARKS):
-                raise InputError(
-                    f"{path}: is a folder without {' or '.join(FOLDER_MARKS)}; not overwritten"
-                )
+                marks = " or ".join(FOLDER_MARKS)
+                raise InputError(f"{path}: is a folder without {marks}; not overwritten")
             inside = [*path.iterdir(), *path.glob("model/*")] if folder else []
             others = [file for file in inside if not any(map(file.match, _OURS))]
             if others:
