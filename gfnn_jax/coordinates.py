@@ -249,8 +249,7 @@ def _bridges(points, part):
     """Shortest edge from each part of the points (``part`` numbers them) to another part.
 
     Any two parts differ in some bit of their numbers. For each bit, the points of one value are
-    searched among those of the other. Memory stays that of the points.
-    """
+    searched among those of the other. Memory stays that of the points."""
     from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 
     distance, to = np.full(len(points), np.inf), np.zeros(len(points), dtype=int)

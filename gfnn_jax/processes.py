@@ -118,8 +118,7 @@ def _store() -> Any:
 
     JAX has no public name for it. It takes arrays of any size, compiles nothing, and waits for as
     long as the first process searches; Gloo, XLA's collectives on a CPU, gives up after 30 s. 2 MB
-    take 0.02 to 0.3 s, several times as long as by a collective.
-    """
+    take 0.02 to 0.3 s, several times as long as by a collective."""
     from jax._src import distributed
 
     return distributed.global_state.client
@@ -145,15 +144,15 @@ def join() -> Share:
     """
     import jax  # loaded when first used: refusing bad usage needs none
 
-    given = {}
+    given: dict[str, Any] = {}
     for name in ("num_processes", "process_id"):
         text = os.environ.get(f"JAX_{name.upper()}")
         if text is not None and not text.isdecimal():
             raise InputError(f"expected a whole number as JAX_{name.upper()}, got '{text}'")
         given[name] = None if text is None else int(text)
     try:
-        times = {"heartbeat_timeout_seconds": _HEARTBEAT, "shutdown_timeout_seconds": _PATIENCE}
-        jax.distributed.initialize(**given, **times)
+        given |= {"heartbeat_timeout_seconds": _HEARTBEAT, "shutdown_timeout_seconds": _PATIENCE}
+        jax.distributed.initialize(**given)
         jax.local_devices()  # all processes tell each other what they have: none may leave it out
     except (ValueError, TypeError, RuntimeError) as error:
         told = "--distributed needs a launcher that JAX knows, such as srun or mpirun, or the"

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import gfnn_jax as gfnn
-from gfnn_jax.data.files import DataWarning, are_recordings, read_trajectories
+from gfnn_jax.data.blocks import DataWarning
+from gfnn_jax.data.files import are_recordings, read_trajectories
 from gfnn_jax.errors import InputError
 
 NUMBERS = st.floats(-1e12, 1e12).map(lambda x: x + 0.5)  # no column of whole numbers alone

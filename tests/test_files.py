@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gfnn_jax.data import files
-from gfnn_jax.data.blocks import BLOCK_ROWS
-from gfnn_jax.data.files import DataWarning, summary
+from gfnn_jax.data.blocks import BLOCK_ROWS, DataWarning
+from gfnn_jax.data.files import summary
 from gfnn_jax.errors import InputError
 
 RNG = np.random.default_rng(0)
@@ -195,7 +195,7 @@ def test_streaming_memory_is_bounded(tmp_path, suffix):
     if suffix == ".csv":
         np.savetxt(path, z, delimiter=",", header="q1,q2,p1,p2", comments="")
         # A block of lines as text and as numbers; the whole file so would take 23 MB.
-        limit = files.BLOCK_ROWS * 600
+        limit = BLOCK_ROWS * 600
     else:
         limit = z.nbytes // 4
         np.save(path, z) if suffix == ".npy" else np.savez_compressed(path, trajectories=z)

@@ -43,8 +43,7 @@ class _Options:
     lags: samples over which changes are taken. quarter: of the columns' variance that a change may
     have. samples: changes for each function, at least. parts: into which the runs are cut, each
     judged by the fit to the others. invariant: part of a function's variance within runs,
-    that noise leaves of one that is constant in each.
-    """
+    that noise leaves of one that is constant in each."""
 
     like: float = 0.85  # likeness of a column to the derivative of another, that tells
     most_columns: int = 12  # whose names do not tell, that are compared
@@ -185,8 +184,7 @@ def _by_data(
     derivative; lengths and angles by their units; voltages, currents and forces beside these as
     inputs; a column that moves alone.
 
-    Raises Undecided where a column is left over that may be a position or an input.
-    """
+    Raises Undecided where a column is left over that may be a position or an input."""
     times = [t for t, _ in runs.values()]
     some = names[: _Options.most_columns]
     columns = {n: np.concatenate([values[n] for _, values in runs.values()]) for n in some}

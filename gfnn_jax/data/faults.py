@@ -53,8 +53,7 @@ class _Options:
     For different systems: most runs, fewest windows of a run; a run moves by another law where the
     common fit misses its accelerations by ``worse`` times its own residual, and by ``missed`` of
     their spread. drives: part of what is missed without a column that is missed with it as an
-    input, at most, where it is one.
-    """
+    input, at most, where it is one."""
 
     wide: float = 0.75 * np.pi
     swing: float = 2 * TURN
@@ -454,8 +453,7 @@ def _of_other_systems(traits: Traits) -> list[str]:
     Accelerations by local polynomials are fitted with functions that small mechanical systems have:
     once for all runs together, and for each run by itself, where one half of its windows is fitted
     and the other judged. Runs of one system lose nothing by being fitted together. Where the
-    functions do not describe the runs one by one, nothing can be told.
-    """
+    functions do not describe the runs one by one, nothing can be told."""
     recording, dim = traits.recording, traits.recording.dim
     varied = any(np.ptp(traits.range(name)) > 0 for name in recording.parameters)
     if len(recording.runs) < 2 or not recording.positions or dim > 3 or varied:

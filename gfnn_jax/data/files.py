@@ -33,19 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from gfnn_jax.data.blocks import (
-    ARC,
-    BLOCK_ROWS,
-    TIME,
-    Block,
-    DataWarning,
-    Request,
-    Source,
-    check_dt,
-    column,
-    damage,
-    joined,
-)
+from gfnn_jax.data import blocks
 from gfnn_jax.data.csv_files import are_states, open_csv
 from gfnn_jax.data.npz_files import open_npy, open_npz
 from gfnn_jax.data.text_files import TextFile
@@ -118,7 +106,7 @@ def read_trajectories(
     duplicated columns and about states that never move.
     """
     with opened(path, dt) as source:
-        whole = joined(source.blocks(2**62), source.dim)
+        whole = blocks.joined(source.blocks(2**62), source.dim)
     states, sequence, going = whole.states, whole.sequence, whole.going
     dt, args = source.of_pairs(whole.own, going)
     begins = np.flatnonzero(np.diff(sequence, prepend=np.nan) != 0)
@@ -128,7 +116,7 @@ def read_trajectories(
         found = f"{pairs} pair{'s' * (pairs != 1)} of consecutive states found"
         raise InputError(f"{path}: {found}, at least {needed} are needed for d = {source.dim}")
     for odd in _odd_columns(states, going):
-        warnings.warn(f"{path}: {odd}", DataWarning, stacklevel=2)
+        warnings.warn(f"{path}: {odd}", blocks.DataWarning, stacklevel=2)
     known = (labels(sequence[going]), whole.place[going])
     identities = (None, None) if source.of_pairs_alone else known
     about = str(path), digest_of(path), source.precision, source.units, args, source.period
@@ -182,10 +170,10 @@ def iterate_pairs(
             wanted = f"expected .npz or .npy, whose rows {share.count} processes can share"
             raise InputError(f"{path}: {wanted}, or as many files as processes")
         with opened(path, dt) as source:
-            last: list[Block] = []  # the row before the next block
+            last: list[blocks.Block] = []  # the row before the next block
             last_arc = (0, np.empty(2 * source.dim))
             for new in source.blocks(chunk, *([of_rows] if of_rows.count > 1 else [])):
-                block = joined([*last, new], source.dim)
+                block = blocks.joined([*last, new], source.dim)
                 last, rows = [block.rows(np.array([-1]))], block.going
                 if len(rows):
                     z0, z1 = block.states[rows], block.states[rows + 1]
@@ -202,7 +190,7 @@ def _arcs_of_pairs(pair: np.ndarray, z0, z1, last_arc: int, last_image) -> np.nd
     the state of the one before's image, cut where `ARC` divides their numbers. last_arc,
     last_image: of the pair before these."""
     before = np.concatenate([last_image[None], z1[:-1]])
-    begins = (pair % ARC == 0) | np.any(before != z0, axis=1)
+    begins = (pair % blocks.ARC == 0) | np.any(before != z0, axis=1)
     return np.maximum.accumulate(np.where(begins, pair, last_arc))
 
 
@@ -216,17 +204,17 @@ def read_initial(
     holds one state a row; of any other trajectory file each sequence gives its last state. t among
     the parameters is the time of a drive: t0 of the file, or the time of the last state.
     """
-    driven = TIME in parameters
+    driven = blocks.TIME in parameters
     with opened(path, None, initial=True, driven=driven) as source:
         if source.dim != dim:
             wanted = f"expected states of {2 * dim} columns (d = {dim})"
             raise InputError(f"{path}: {wanted}, found {2 * source.dim} columns (d = {source.dim})")
         columns = {name: 1 + i for i, name in enumerate(source.parameters)}
         if driven and "t0" in columns:
-            columns[TIME] = columns["t0"]
+            columns[blocks.TIME] = columns["t0"]
         elif driven and source.timed:
-            columns[TIME] = 0
-        if driven and TIME not in columns:
+            columns[blocks.TIME] = 0
+        if driven and blocks.TIME not in columns:
             needed = "expected t0, the time of the drive that the model was learned with"
             raise InputError(f"{path}: {needed}, beside the states; found none")
         missing = [name for name in parameters if name not in columns]
@@ -236,9 +224,9 @@ def read_initial(
                 "which the model was learned with, beside the states; found "
                 f"{', '.join(source.parameters) or 'none'}"
             )
-        found: list[Block] = []
-        held: Block | None = None  # the last row so far: the end of its sequence, or not
-        for block in source.blocks(BLOCK_ROWS):
+        found: list[blocks.Block] = []
+        held: blocks.Block | None = None  # the last row so far: the end of its sequence, or not
+        for block in source.blocks(blocks.BLOCK_ROWS):
             if held is not None and held.sequence[0] != block.sequence[0]:
                 found.append(held.checked(path))
             ends = np.flatnonzero(block.sequence[1:] != block.sequence[:-1])
@@ -247,7 +235,7 @@ def read_initial(
         if held is None:
             raise InputError(f"{path}: holds no states")
         found.append(held.checked(path))
-    ends = joined(found, dim)
+    ends = blocks.joined(found, dim)
     if not parameters:
         return ends.states, None
     assert ends.own is not None
@@ -274,14 +262,16 @@ def read_initial_noise(path, shape: tuple[int, int]) -> np.ndarray | None:
 @contextlib.contextmanager
 def opened(
     path, dt: float | None, *, initial: bool = False, driven: bool = False
-) -> Iterator[Source]:
+) -> Iterator[blocks.Source]:
     """Open a trajectory file, its header checked. ``initial``: only its last states are wanted, and
     their times where ``driven``."""
     path = Path(path)
     opener = _OPENERS.get(path.suffix.lower())
     if opener is None:
         raise InputError(f"{path}: expected a .npz, .npy or .csv file")
-    request = Request(path, None if dt is None else check_dt(dt, "the given dt"), initial, driven)
+    request = blocks.Request(
+        path, None if dt is None else blocks.check_dt(dt, "the given dt"), initial, driven
+    )
     try:
         if not path.is_file():
             raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
@@ -319,12 +309,12 @@ def _is_recording(path: Path, with_roles: bool) -> bool:
         return False  # the reader of trajectories says what is the matter
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        with damage(path, "the archive"), zipfile.ZipFile(path) as archive:
+        with blocks.damage(path, "the archive"), zipfile.ZipFile(path) as archive:
             return not {"z0.npy", "trajectories.npy"} & set(archive.namelist())
     if with_roles or suffix == ".mat":
         return True
     if suffix == ".npy":
-        with damage(path, "the array"):
+        with blocks.damage(path, "the array"):
             return np.load(path, mmap_mode="r", allow_pickle=False).dtype.names is not None
     try:
         return not are_states(TextFile(path).names)
@@ -340,11 +330,12 @@ def _odd_columns(states: np.ndarray, going: np.ndarray) -> Iterator[str]:
         return
     constant = [c for c in range(2 * dim) if np.all(states[:, c] == states[0, c])]
     if constant:
-        names = ", ".join(column(c, dim) for c in constant)
+        names = ", ".join(blocks.column(c, dim) for c in constant)
         yield f"constant column(s) {names}. A conserved momentum is constant; else check them"
     for a, b in itertools.combinations(range(2 * dim), 2):
         if a not in constant and np.array_equal(states[:, a], states[:, b]):
-            yield f"columns {column(a, dim)} and {column(b, dim)} are equal in every row"
+            both = " and ".join(blocks.column(c, dim) for c in (a, b))
+            yield f"columns {both} are equal in every row"
 
 
 def digest_of(path) -> str:
@@ -378,7 +369,7 @@ def summary(data: TrajectoryData) -> list[str]:
     lines = ["; ".join([*parts, f"copies: {copies}"])]
     move = np.sqrt(np.mean((pairs.z1 - pairs.z0) ** 2, axis=0))
     low, high = data.states.min(axis=0), data.states.max(axis=0)
-    names = [column(c, data.dim) for c in range(2 * data.dim)]
+    names = [blocks.column(c, data.dim) for c in range(2 * data.dim)]
     columns = list(zip(names, low, high, data.states.std(axis=0), move, strict=True))
     if len(columns) > _MOST_COLUMNS:
         some = _MOST_COLUMNS // 4

@@ -139,8 +139,7 @@ class _Sequences(NamedTuple):
 
     arrays: one array of the states, or z0 and z1 of pairs. each_row: whether each row of the array
     is a sequence. lengths: (M,) of those used. times: (M, L), or None. uneven: whether their steps
-    differ from dt.
-    """
+    differ from dt."""
 
     path: Path
     arrays: tuple[_StoredArray, ...]

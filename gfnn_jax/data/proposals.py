@@ -30,8 +30,7 @@ class _Options:
     at most. still: samples at rest before or behind a motion, and times the noise that they
     scatter. moved: times the noise of a motion. most_ways: of a hand, to and fro. early: part of a
     record within which it lets go. large: part of the largest swing. swings: at least, of a motion
-    that is caught. uneven: relative scatter of steps that rounding makes.
-    """
+    that is caught. uneven: relative scatter of steps that rounding makes."""
 
     most: int = 2000
     round: float = 3.0

@@ -171,8 +171,7 @@ class Recording:
         table: a DataFrame, a dict of arrays (T,), or a list of these, one run each (or several,
         told apart by a column run, trial or sequence). A column t or time holds the times, which
         rise in a run; without a column of runs a new run begins where they fall. options:
-        `ReadOptions`. Raises InputError where names, times or values do not fit.
-        """
+        `ReadOptions`. Raises InputError where names, times or values do not fit."""
         for name in set(options) - set(ReadOptions.__annotations__):
             raise TypeError(unexpected("Recording", name, [*ReadOptions.__annotations__]))
         by_name: dict[str, Any] = dict(options)

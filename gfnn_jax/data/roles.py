@@ -27,14 +27,12 @@ _ANGLES = (
     *("theta", "phi", "psi", "alpha", "beta", "gamma"),
     *("angle", "winkel", "yaw", "pitch", "roll"),
 )
+_INPUTS = ("u", "tau", "torque", "force", "thrust", "input", "voltage", "current", "motor", "drive")
 _WORDS = {
     "positions": (*_ANGLES, "q", "x", "y", "z", "r", "position", "pos", "displacement"),
     "velocities": ("v", "omega", "velocity", "vel", "speed", "qdot", "qd", "gyro", "dq"),
     "momenta": ("p", "momentum"),
-    "inputs": (
-        *("u", "tau", "torque", "force", "thrust", "input"),
-        *("voltage", "current", "motor", "drive", "command"),
-    ),
+    "inputs": (*_INPUTS, "command"),
 }
 _ROLE_OF = {word: role for role, words in _WORDS.items() for word in words}
 # A word, perhaps an index (a number or the letter of an axis) after it.

@@ -67,8 +67,7 @@ class TextFile:
 
         columns: names of those wanted, or of all, in order, where the file has no header. time:
         name of the column of times. Raises InputError where the file holds no rows of numbers, or
-        they can be read in two ways.
-        """
+        they can be read in two ways."""
         self.path = path
         text = text_of(path)
         self._open, self.notes = text.open, text.notes
@@ -129,8 +128,7 @@ class TextFile:
         """The place of the first row of numbers among lines; None where there is none.
 
         Instruments write numbers into their preambles too: a row that does not fit the last ones is
-        of the preamble where a line without numbers, the names, stands between.
-        """
+        of the preamble where a line without numbers, the names, stands between."""
         tail = cells[-_Options.last_lines :]
         widths = [len(one) for one in tail]
         width = max(set(widths), key=lambda w: (widths.count(w), w))
@@ -206,8 +204,7 @@ class TextFile:
         """(names, units by name) where brackets or a stroke before them give these, without what
         programs write around them: "Latest: Time", "Angle (rad) Run #1".
 
-        Columns of several runs side by side keep their run behind the name, and are in ``runs``.
-        """
+        Columns of several runs side by side keep their run behind the name, and are in ``runs``."""
         parts = [part for part in map(_OF_RUN.fullmatch, cells) if part is not None]
         labels = [part["before"] or part["behind"] or "" for part in parts]
         split = [split_unit(part["name"]) for part in parts]
@@ -284,8 +281,7 @@ class TextFile:
         """The reader of dates and times of day, and the unit in s of the times that it gives.
 
         5/7/2021 is July or May, whichever makes the steps more even. Raises InputError where they
-        are of no kind that is known.
-        """
+        are of no kind that is known."""
         import pandas as pd
         from pandas.tseries.api import guess_datetime_format as guess
 

@@ -68,8 +68,7 @@ def text_of(path: Path) -> Text:
 def _opener(path: Path, suffix: str) -> tuple[Callable[[], BinaryIO], tuple[str, ...]]:
     """The function that opens the bytes, and notes.
 
-    Raises InputError where an archive has not one table.
-    """
+    Raises InputError where an archive has not one table."""
     if suffix == ".gz":
         return (lambda: gzip.open(path, "rb")), ()  # type: ignore[return-value]
     if suffix != ".zip":

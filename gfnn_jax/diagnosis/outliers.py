@@ -262,8 +262,7 @@ class _Model:
     """Polynomials of one degree, y0 -> y1 and back.
 
     sizes: (N,) the larger residual of either, in units of its median; 0 where neither state is a
-    regressor. left: the larger median, in units of the moves'. unit: (2d,) robust deviations.
-    """
+    regressor. left: the larger median, in units of the moves'. unit: (2d,) robust deviations."""
 
     def __init__(self, data: Dataset, known: np.ndarray, degree: int):
         self._angles, self._degree = data.coordinates.angles, degree

@@ -225,8 +225,7 @@ class _Given:
 def _generated(name: str, family: str, piece: Generated, width: int, more: int) -> list[str]:
     """Write the step of a generated piece, or of its inverse.
 
-    family: name of the piece whose functions in C compute the derivatives of S.
-    """
+    family: name of the piece whose functions in C compute the derivatives of S."""
     chart, n = piece.chart, unknowns(piece, width // 2)
     dt, scale = float(np.asarray(piece.dt)), np.asarray(piece.scale)
     equation = ImplicitStep(chart)

@@ -132,31 +132,24 @@ def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str], ahead: Sequenc
     changed = map_.coordinates.forward is not CARTESIAN.forward
     centres = np.ravel(np.asarray(map_.angle_centre))
     turns = f", turns[{len(angles)}]" if angles else ""
-    lines = [
-        f"double y[{width + more}]{turns};",
-        "to_inner(z, y);" if changed else f"memcpy(y, z, {width}*sizeof *y);",
-        *([f"memcpy(y + {width}, args, {more}*sizeof *y);"] if more else []),
-        *ahead,
-        *(
-            f"y[{a}] = reduced(y[{a}], {literal(centre)}, &turns[{k}]);"
-            for k, (a, centre) in enumerate(zip(angles, centres, strict=True))
-        ),
-        f"int inside = all_finite({width}, y);",
-    ]
+    lines = [f"double y[{width + more}]{turns};"]
+    lines.append("to_inner(z, y);" if changed else f"memcpy(y, z, {width}*sizeof *y);")
+    lines += [f"memcpy(y + {width}, args, {more}*sizeof *y);"] if more else []
+    lines += ahead
+    for k, (a, centre) in enumerate(zip(angles, centres, strict=True)):
+        lines.append(f"y[{a}] = reduced(y[{a}], {literal(centre)}, &turns[{k}]);")
+    lines.append(f"int inside = all_finite({width}, y);")
     assert isinstance(domain, Domain)
     if domain.keep:
         limit = literal(float(np.asarray(domain.limit)))
         lines += ["double kappa[1];", "christoffel(y, kappa);"]
         lines.append(f"inside = inside && kappa[0] <= {limit};")
     lines += inside_ranges(map_)
+    lines += ["int status = OK;", *(f"status = worse(status, {piece}(y));" for piece in pieces)]
+    lines += ["if (status == OK && !inside)", "    status = LEFT_DOMAIN;"]
+    lines += [f"if (!all_finite({width}, y))", "    status = NON_FINITE;"]
+    lines += [f"y[{a}] = unreduced(y[{a}], turns[{k}]);" for k, a in enumerate(angles)]
     lines += [
-        "int status = OK;",
-        *(f"status = worse(status, {piece}(y));" for piece in pieces),
-        "if (status == OK && !inside)",
-        "    status = LEFT_DOMAIN;",
-        f"if (!all_finite({width}, y))",
-        "    status = NON_FINITE;",
-        *(f"y[{a}] = unreduced(y[{a}], turns[{k}]);" for k, a in enumerate(angles)),
         "to_user(y, Z);" if changed else f"memcpy(Z, y, {width}*sizeof *y);",
         "return status;",
     ]

@@ -350,20 +350,17 @@ def mjcf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     # arm of benchmarks/machines.py is 5 mrad off after 0.5 s by that, and 1 mrad by this. Of its
     # implicit steps, of first order, the free pendulum there is 9 mrad off, by these 0.03.
     stiff = f'solreffriction="{_text(2 * step)} 1" solimpfriction="0.999 0.999 0.001"'
-    parts = [
-        f"<mujoco model={quoteattr(name)}>",
-        _comment(robot, about),
-        '<compiler angle="radian" inertiafromgeom="false" boundmass="0" boundinertia="0"/>',
-        f"<default><joint {stiff}/><tendon {stiff}/></default>",
-        f'<option timestep="{_text(step)}" gravity="{_text(robot.gravity)}" integrator="RK4"/>',
-        "<worldbody>",
-        *(body(i) for i, link in enumerate(links) if link.parent == BASE),
-        "</worldbody>",
-        *(["<tendon>", *tendons, "</tendon>"] if tendons else []),
-        *(["<actuator>", *motors, "</actuator>"] if motors else []),
-        "</mujoco>\n",
-    ]
-    return "\n".join(parts)
+    parts = [f"<mujoco model={quoteattr(name)}>", _comment(robot, about)]
+    parts.append(
+        '<compiler angle="radian" inertiafromgeom="false" boundmass="0" boundinertia="0"/>'
+    )
+    parts.append(f"<default><joint {stiff}/><tendon {stiff}/></default>")
+    gravity = f'gravity="{_text(robot.gravity)}"'
+    parts.append(f'<option timestep="{_text(step)}" {gravity} integrator="RK4"/>')
+    bodies = [body(i) for i, link in enumerate(links) if link.parent == BASE]
+    for kind, own in (("worldbody", bodies), ("tendon", tendons), ("actuator", motors)):
+        parts += [f"<{kind}>", *own, f"</{kind}>"] if own else []
+    return "\n".join([*parts, "</mujoco>\n"])
 
 
 def urdf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:

@@ -427,8 +427,7 @@ def _has_row(rate: Any) -> bool:
 class _Rows:
     """The rows of a table T, a series each: z, the forces that hold bodies, then all operations.
 
-    unrolled: whether coefficients are variables of their own instead of entries of T.
-    """
+    unrolled: whether coefficients are variables of their own instead of entries of T."""
 
     def __init__(self, graph: LawGraph, values: Any, unrolled: bool | None):
         self.graph, tape = graph, Tape()
@@ -600,12 +599,9 @@ def c_of_flow(graph: LawGraph, coefficients: bool = False, unrolled: bool | None
         numbers["REST"] = Options.rest
         tables["int speeds[FRICTIONS]"] = map(rows.begin, rows.speeds)
         tables["double directions[FRICTIONS*DIM]"] = map(literal, np.ravel(graph.directions))
-    parts = [
-        "enum { " + ", ".join(f"{name} = {value}" for name, value in sizes.items()) + " };",
-        *(f"static const double {name} = {literal(value)};" for name, value in numbers.items()),
-        *(f"static const {name} = {{{', '.join(values)}}};" for name, values in tables.items()),
-        "",
-    ]
+    parts = ["enum { " + ", ".join(f"{name} = {value}" for name, value in sizes.items()) + " };"]
+    parts += [f"static const double {name} = {literal(value)};" for name, value in numbers.items()]
+    parts += [f"static const {name} = {{{', '.join(of)}}};" for name, of in tables.items()] + [""]
     if rows.unrolled:
         return "\n".join([*parts, MOVED, _given(rows), _written_out(rows), SMOOTH])
     signed = ", const double *sigma" if rows.count else ""

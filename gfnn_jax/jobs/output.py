@@ -188,8 +188,7 @@ def _keep(
 ) -> None:
     """Save the best map so far, unless a better one is there.
 
-    A resumed fit goes through its small sizes again, which are worse than what it had kept.
-    """
+    A resumed fit goes through its small sizes again, which are worse than what it had kept."""
     with contextlib.suppress(InputError, KeyError):  # none can be read
         if float(saved.record(folder)["validation_relative"]) <= candidate.validation_relative:
             return

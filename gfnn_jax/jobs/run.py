@@ -132,8 +132,7 @@ def _keys(seed):
 def _band(map_: SymplecticMap, z0, predicted, given: dict[str, Any]) -> np.ndarray | None:
     """Two standard deviations (B, L) of the position of the first trajectories.
 
-    None where the map has no posterior.
-    """
+    None where the map has no posterior."""
     if map_.posterior is None:
         return None
     few = slice(WHOLE.band_trajectories)

@@ -121,8 +121,7 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     Where the steps of a map that was to meet the tolerance do not, larger ones of its sweep are
     looked at before others. Errors are infinite where a step fails: where some fail of every map,
     smaller ones of the best sweep follow, and of maps that all have such steps the one is taken of
-    which the fewest do.
-    """
+    which the fewest do."""
     budget, on_progress, bound = request.budget, request.watch.on_progress, request.tolerance.bound
     compile_seconds, tried = 0.0, []
     first, larger = ranking[0], iter(())
@@ -251,8 +250,7 @@ def _of_steps(chosen: Chosen, found: Searched) -> float:
     """Upper bound of the error of a flow's own steps, in the tolerance's measure; 0 of other maps.
 
     It is known without images, so all states tell it: the few that pass a centre closely have most
-    of it, and hardly one may be among those that state the error.
-    """
+    of it, and hardly one may be among those that state the error."""
     law, data = chosen.law, found.data
     if law is None or not law.terms:
         return 0.0

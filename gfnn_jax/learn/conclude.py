@@ -272,8 +272,7 @@ def _what_is_left(chosen: Chosen, searched: Searched, stalled: bool) -> _LeftOve
     """Noise, where larger models no longer helped, friction, or a parameter that differs between
     sequences.
 
-    The residuals are those of the chosen map, or of the best generated one where H was chosen.
-    """
+    The residuals are those of the chosen map, or of the best generated one where H was chosen."""
     candidate, data, law = chosen.candidate, searched.data, chosen.law
     entry = chosen.entry or next(iter(searched.found.ranking), None)
     if law is not None and law.turns:

@@ -164,32 +164,18 @@ def fit(data: Any, scene: Any = None, *, options: FitOptions | None = None, **ch
     if damping is not None:  # a fact, not a warning
         messages.append(damping.line(data.dt))
     num_states = min(STATES_MEASURED, block_of(2 * data.dim))
-    choice = Choice.of(
-        budget,
-        chosen.data.pairs.take(chosen.data.validation[:num_states]),
-        candidates=_all_candidates(chosen, found),
-        asked=request.tolerance,
-        num_pairs=len(data),
-        validation_pairs=data.pairs.take(data.validation),
-        determinants=found.charts.determinants,
-        data_defect=diagnosis.data_defect,
-        base_map=bool(chosen.data.before or chosen.data.after),
-        hamiltonian=found.law,
-        noise=conclusion.noise,
-        messages=tuple(messages),
-        ended=conclusion.ended,
-        compile_seconds=chosen.compile_seconds,
-        model_determinant_min=_smallest_determinant(chosen),
-        pairs=data.pairs,
-        scene=scene,
-        damping=damping,
-        symmetries=symmetries,
-        partial_laws=() if found.met_by_law else tuple(request.partial_laws),
-        stated_by=chosen.stated_by,
-        test_pairs=data.pairs.take(data.test) if len(data.test) else None,
-        white=conclusion.white,
-        seed=options.seed,
-    )
+    known: dict[str, Any] = {"pairs": data.pairs, "num_pairs": len(data), "scene": scene}
+    known |= {"validation_pairs": data.pairs.take(data.validation), "seed": options.seed}
+    known |= {"test_pairs": data.pairs.take(data.test) if len(data.test) else None}
+    known |= {"determinants": found.charts.determinants, "data_defect": diagnosis.data_defect}
+    known |= {"base_map": bool(chosen.data.before or chosen.data.after), "damping": damping}
+    known |= {"noise": conclusion.noise, "ended": conclusion.ended, "white": conclusion.white}
+    known |= {"messages": tuple(messages), "symmetries": symmetries, "hamiltonian": found.law}
+    known |= {"partial_laws": () if found.met_by_law else tuple(request.partial_laws)}
+    known |= {"compile_seconds": chosen.compile_seconds, "stated_by": chosen.stated_by}
+    known |= {"model_determinant_min": _smallest_determinant(chosen), "asked": request.tolerance}
+    tested = chosen.data.pairs.take(chosen.data.validation[:num_states])
+    choice = Choice.of(budget, tested, candidates=_all_candidates(chosen, found), **known)
     return Fit(chosen.candidate.map, choice)
 
 

@@ -232,8 +232,7 @@ def _standing_alone(
 ) -> np.ndarray:
     """Rows of ``far`` whose residual is far beyond ``around``, that of their neighbours.
 
-    ordinary: times the median of all, that those neighbours' residuals stay below.
-    """
+    ordinary: times the median of all, that those neighbours' residuals stay below."""
     middle = np.median(size)
     alone = far[(size[far] > OPTIONS.beyond * around) & (around < ordinary * middle)]
     between = np.sum((size > OPTIONS.tail * middle) & (size <= OPTIONS.beyond * middle))

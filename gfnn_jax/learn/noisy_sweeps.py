@@ -90,8 +90,7 @@ def _as_far(found: Searched) -> list[Entry]:
     """The best entry of every sweep that has come as far as the best one and can be corrected.
 
     All by their residuals: a search validates few by steps, whose errors are no measure of those
-    that were estimated where noise is nothing like the spread, as of a radial momentum.
-    """
+    that were estimated where noise is nothing like the spread, as of a radial momentum."""
     best: dict[int, tuple[float, Entry]] = {}
     limit = _estimated(found.found.ranking[0]) / GAINED
     for entry in found.found.entries:

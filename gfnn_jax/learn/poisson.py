@@ -116,26 +116,15 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
         messages.append(tolerance.missed_by(candidate, ended))
         warnings.warn(messages[-1], FitWarning, stacklevel=4)
     tested = tested.take(slice(min(STATES_MEASURED, block_of(n))))
-    choice = Choice.of(
-        budget,
-        tested,
-        candidates=(candidate,),
-        asked=tolerance,
-        num_pairs=len(pairs) - len(test),
-        hamiltonian=learned.law and _learned(learned.law, map_, candidate, messages),
-        noise=sigma,
-        messages=tuple(messages),
-        ended=ended,
-        compile_seconds=steps.compile_seconds,
-        pairs=pairs,
-        stated_by=f"{len(test):,} pairs that were not fitted to",
-        validation_pairs=pairs.take(split.validation),
-        test_pairs=pairs.take(split.test) if len(split.test) else None,
-        white=white,
-        seed=options.seed,
-        several=learned.law.several if learned.law else "",
-    )
-    return Fit(map_, choice)
+    law = learned.law and _learned(learned.law, map_, candidate, messages)
+    known: dict[str, Any] = {"candidates": (candidate,), "hamiltonian": law, "asked": tolerance}
+    known |= {"several": learned.law.several if learned.law else "", "noise": sigma}
+    known |= {"messages": tuple(messages), "ended": ended, "white": white, "seed": options.seed}
+    known |= {"pairs": pairs, "validation_pairs": pairs.take(split.validation)}
+    known |= {"test_pairs": pairs.take(split.test) if len(split.test) else None}
+    known |= {"stated_by": f"{len(test):,} pairs that were not fitted to"}
+    known |= {"num_pairs": len(pairs) - len(test), "compile_seconds": steps.compile_seconds}
+    return Fit(map_, Choice.of(budget, tested, **known))
 
 
 def _next(data: Pairs | Recording, pairs: Pairs, verdict: str) -> str:

@@ -295,23 +295,14 @@ class _Sweep:
         part = "took no part in the fit or its choices" if test is self.split.test else "also chose"
         tested = states.take(test[: min(STATES_MEASURED, block_of(2 * map_.dim))])
         determinant = np.asarray(map_.determinant(tested.z0))
-        choice = Choice.of(
-            self.budget,
-            tested,
-            candidates=tuple(sorted([*others, chosen], key=lambda c: c.operations)),
-            asked=self.tolerance,
-            num_pairs=best.about.num_triples,
-            messages=tuple(messages),
-            ended=ended,
-            compile_seconds=steps.compile_seconds,
-            model_determinant_min=float(determinant[np.argmin(np.abs(determinant))]),
-            pairs=states,
-            positions=best.about,
-            stated_by=f"{len(test):,} triples that {part}",
-            validation_pairs=states.take(self.split.validation),
-            seed=seed,
-        )
-        return Fit(map_, choice)
+        known: dict[str, Any] = {"positions": best.about, "num_pairs": best.about.num_triples}
+        known["candidates"] = tuple(sorted([*others, chosen], key=lambda c: c.operations))
+        known |= {"messages": tuple(messages), "ended": ended, "seed": seed}
+        known |= {"pairs": states, "validation_pairs": states.take(self.split.validation)}
+        known |= {"stated_by": f"{len(test):,} triples that {part}", "asked": self.tolerance}
+        known["model_determinant_min"] = float(determinant[np.argmin(np.abs(determinant))])
+        known["compile_seconds"] = steps.compile_seconds
+        return Fit(map_, Choice.of(self.budget, tested, **known))
 
 
 def _split(triples: discrete_lagrangian.Triples, seed: int) -> Split:

@@ -231,8 +231,7 @@ def _of_quadratic(data: Dataset, y0, y1) -> Affine:
 
     With rows x = w − w̄ and t of the target gradient, in units in which all residuals count alike,
     the normal equations are of Lyapunov's kind, G A + A G = xᵀt + tᵀx with G = xᵀx: they take (2d)³
-    operations, where a basis of the quadratic terms takes (2d)⁶.
-    """
+    operations, where a basis of the quadratic terms takes (2d)⁶."""
     dt, width = data.dt, y0.shape[1]
     w, target = MIDPOINT.evaluation_point(y0, y1), MIDPOINT.target_gradient(y0, y1, dt)
     weight = residual_weight(MIDPOINT, data.scale, dt)

@@ -30,8 +30,7 @@ def _drawn(key, *, draw, num):
 def _enough(num: int) -> int:
     """Number of rows that are drawn where ``num`` are wanted, so that few programs are compiled.
 
-    JAX draws each entry from its index alone: the first rows of more are the same bits.
-    """
+    JAX draws each entry from its index alone: the first rows of more are the same bits."""
     return max(1024, 1 << (num - 1).bit_length())
 
 

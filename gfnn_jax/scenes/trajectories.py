@@ -50,8 +50,7 @@ def _solve(field, span, z, until=None, *, tolerance=OPTIONS.tolerance, predicts=
     or where it ``predicts`` by Dopri5, which is then differentiated forwards.
 
     With ``until`` the solver stops at the end of the first step after which ``until(z)`` holds. It
-    never interpolates. The result is NaN where the solver fails.
-    """
+    never interpolates. The result is NaN where the solver fails."""
     import diffrax  # takes half a second: loaded when first used
 
     start, end = span
@@ -123,8 +122,7 @@ class _Dynamics:
         """The next crossing of the section, to roundoff, from z (2d,).
 
         The orbit is followed to below the section and then to beyond it. It is brought back onto it
-        with the section's own coordinate as the independent variable (Hénon, Physica D 5, 1982).
-        """
+        with the section's own coordinate as the independent variable (Hénon, Physica D 5, 1982)."""
         assert self.section is not None
         field, i = hamiltonian_vector_field(self.section.hamiltonian), self.section.index
 
@@ -172,8 +170,7 @@ def _blocks(num):
     """Yield ``rows``, the numbers of the states that are solved together, all of one length.
 
     The last state fills up the last block. A state has the same bits beside any others, for the
-    solver controls the steps of each lane alone.
-    """
+    solver controls the steps of each lane alone."""
     lanes = OPTIONS.lanes_on_cpu if jax.default_backend() == "cpu" else OPTIONS.lanes_on_accelerator
     for first in range(0, num, lanes):
         yield np.minimum(np.arange(first, first + lanes), num - 1)

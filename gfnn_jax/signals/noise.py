@@ -32,8 +32,7 @@ class _Options:
     trimmed: part of the windows, those with the largest residuals, that may hold outliers. fewest:
     windows. rare: part of the samples that outliers are at most. unresolved: part of a column's
     spread, above which what polynomials leave is the motion itself. lags, most_rows: of an
-    autoregression. white: autocorrelation beyond that of white noise which is no accident.
-    """
+    autoregression. white: autocorrelation beyond that of white noise which is no accident."""
 
     degree: int = 5
     growth: float = 1.5

@@ -100,8 +100,7 @@ def _lines(t: np.ndarray, y: np.ndarray) -> tuple[list[tuple[float, float]], flo
 
     A matrix pencil of the Hankel matrix of even values (Hua and Sarkar 1990) has a line, which
     grows or dies down, for each; or several side by side, where its frequency changes with its
-    size. Those are clear whose sizes are some standard errors.
-    """
+    size. Those are clear whose sizes are some standard errors."""
     peaks = dominant_frequencies([t], y, 4)
     if not peaks:
         return [], 0.0

@@ -124,8 +124,7 @@ def _periodograms(series: np.ndarray, size: int, length: int) -> np.ndarray:
     """Mean of the periodograms of parts of this size that overlap by half, each without its line,
     under a Hann window, filled up with zeros to ``length``: Welch's spectrum for a step of 1.
 
-    Of scipy, `signal.welch` gives the same, and takes half a second to load.
-    """
+    Of scipy, `signal.welch` gives the same, and takes half a second to load."""
     parts = sliding_window_view(series, size)[:: size - size // 2].T
     line = np.vander(np.linspace(-1, 1, size), 2)
     parts = parts - line @ np.linalg.lstsq(line, parts, rcond=None)[0]

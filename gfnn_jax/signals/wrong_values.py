@@ -50,8 +50,7 @@ class _Options:
     least; resolutions: that the motion goes in a step (slower, equal values are a sensor's digits).
 
     At jumps: smooth: degree of the polynomial of each side; beyond: part of the jump by which the
-    sample is beyond both sides, for the overshoot of a real one is less.
-    """
+    sample is beyond both sides, for the overshoot of a real one is less."""
 
     block: int = 16
     ordinary: float = 0.8
@@ -173,8 +172,7 @@ def _outliers(
     """(begin, end, how far off at most) of stretches of samples of a run (n,).
 
     t, x: without missing values. resolution: the smallest step between values, 0 if it is unknown.
-    rough: of the column (`_roughness`).
-    """
+    rough: of the column (`_roughness`)."""
     miss = _misses(t, x)
     if len(x) < 2 * _Options.side + 1 or not miss.max() > _Options.rough * rough:
         return []
@@ -267,8 +265,7 @@ def _stuck(t: np.ndarray, x: np.ndarray, resolution: float, rough: float) -> lis
     """(begin, end) of the samples of a run (n,) that repeat the one before ``begin``.
 
     t, x: without missing values. resolution: the smallest step between values, 0 if it is unknown.
-    rough: of the column (`_roughness`), which the motion goes in a step at least.
-    """
+    rough: of the column (`_roughness`), which the motion goes in a step at least."""
     if len(x) < _Options.fewest:
         return []
     times = np.diff(t)

@@ -194,8 +194,7 @@ def _orbax():
 def _verify_files(folder: Path) -> None:
     """Verify that every file listed in SHA256SUMS is there and unchanged. Raises Damaged.
 
-    Files that are not listed are ignored.
-    """
+    Files that are not listed are ignored."""
     try:
         listed = (folder / _SUMS).read_text(encoding="utf-8").splitlines()
         sums = {name: digest for digest, name in (line.split("  ", 1) for line in listed)}

@@ -225,8 +225,7 @@ def unfinished(
 def _claimed(out: Path, what: str) -> Iterator[None]:
     """Hold ``OUT.lock`` by this process, where the system has file locks.
 
-    A killed process releases it. Raises InputError where another process holds it.
-    """
+    A killed process releases it. Raises InputError where another process holds it."""
     try:
         import fcntl
     except ImportError:
