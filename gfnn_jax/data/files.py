@@ -269,9 +269,8 @@ def opened(
     opener = _OPENERS.get(path.suffix.lower())
     if opener is None:
         raise InputError(f"{path}: expected a .npz, .npy or .csv file")
-    request = blocks.Request(
-        path, None if dt is None else blocks.check_dt(dt, "the given dt"), initial, driven
-    )
+    dt = None if dt is None else blocks.check_dt(dt, "the given dt")
+    request = blocks.Request(path, dt, initial, driven)
     try:
         if not path.is_file():
             raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")

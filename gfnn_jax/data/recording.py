@@ -231,10 +231,8 @@ class Recording:
         angular, radians = angles_of(source, known, *given_angles, units)
         factors = {name: radians.get(name, 1.0) for name in numbers}
         factors |= {of: factors[name] for name, of in sigmas.items()}
-        values = {
-            run: {name: column * factors[name] for name, column in of_run.items()}
-            for run, (_, of_run) in runs.items()
-        }
+        by_run = ((run, of_run.items()) for run, (_, of_run) in runs.items())
+        values = {run: {n: column * factors[n] for n, column in items} for run, items in by_run}
         for what in ("std", "offset", "scale"):
             check_known(source, what, std if what == "std" else names_of[what], with_role)
         sigmas = {name: of for name, of in sigmas.items() if name in with_role}

@@ -149,11 +149,8 @@ def _whole(map_: SymplecticMap, name: str, pieces: Sequence[str], ahead: Sequenc
     lines += ["if (status == OK && !inside)", "    status = LEFT_DOMAIN;"]
     lines += [f"if (!all_finite({width}, y))", "    status = NON_FINITE;"]
     lines += [f"y[{a}] = unreduced(y[{a}], turns[{k}]);" for k, a in enumerate(angles)]
-    lines += [
-        "to_user(y, Z);" if changed else f"memcpy(Z, y, {width}*sizeof *y);",
-        "return status;",
-    ]
-    body = "\n".join(f"    {line}" for line in lines)
+    lines.append("to_user(y, Z);" if changed else f"memcpy(Z, y, {width}*sizeof *y);")
+    body = "\n".join(f"    {line}" for line in [*lines, "return status;"])
     return f"{_signature(map_, name)}\n{{\n{body}\n}}\n"
 
 

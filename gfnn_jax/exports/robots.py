@@ -351,9 +351,8 @@ def mjcf(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> str:
     # implicit steps, of first order, the free pendulum there is 9 mrad off, by these 0.03.
     stiff = f'solreffriction="{_text(2 * step)} 1" solimpfriction="0.999 0.999 0.001"'
     parts = [f"<mujoco model={quoteattr(name)}>", _comment(robot, about)]
-    parts.append(
-        '<compiler angle="radian" inertiafromgeom="false" boundmass="0" boundinertia="0"/>'
-    )
+    compiler = 'angle="radian" inertiafromgeom="false" boundmass="0" boundinertia="0"'
+    parts.append(f"<compiler {compiler}/>")
     parts.append(f"<default><joint {stiff}/><tendon {stiff}/></default>")
     gravity = f'gravity="{_text(robot.gravity)}"'
     parts.append(f'<option timestep="{_text(step)}" {gravity} integrator="RK4"/>')

@@ -84,10 +84,8 @@ def _errors(scene: Scene, measured: dict[str, Measured], reference) -> dict[str,
         drawn["energy"] = figures.energy_error({n: (steps, e) for n, e in energies.items()}).figure
     if scene.name == "two-body":
         both = metrics.ELEMENTS.values()
-        elements = {
-            n: (steps, *(metrics.absolute_error(f(m.predicted), f(reference)) for f in both))
-            for n, m in measured.items()
-        }
+        ends = [(n, [(f(m.predicted), f(reference)) for f in both]) for n, m in measured.items()]
+        elements = {n: (steps, *(metrics.absolute_error(*pair) for pair in of)) for n, of in ends}
         drawn["elements"] = figures.element_errors(elements)[0].figure
     return drawn
 

@@ -213,11 +213,9 @@ def linear_map(data: Dataset, tolerance: Tolerance) -> Candidate | None:
     if half is not None:
         shift = half.matrix @ half.shift + half.shift
         tried.append(Affine(half.matrix @ half.matrix, half.centre, shift))
-    tried = [
-        (measured_error(data, tolerance, to_user(coordinates, piece.image(data.y0[held]))), piece)
-        for piece in tried
-    ]
-    error, piece = min(tried, key=lambda found: found[0].relative)
+    images = [to_user(coordinates, piece.image(data.y0[held])) for piece in tried]
+    errors = [measured_error(data, tolerance, image) for image in images]
+    error, piece = min(zip(errors, tried, strict=True), key=lambda found: found[0].relative)
     width = len(data.scale)
     named = {"label": "linear", "family": "linear", "chart": "affine"}
     costs = {"num_parameters": width * (width + 3) // 2, "operations": 2.0 * width**2}

@@ -184,9 +184,8 @@ def _orbax():
         return ocp.PyTreeCheckpointer()
     # Else it would wait for all processes of a job, which know nothing of this folder.
     own = jax.process_index()
-    alone = ocp.options.MultiprocessingOptions(
-        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
-    )
+    names = {"active_processes": {own}, "barrier_sync_key_prefix": f"process{own}"}
+    alone = ocp.options.MultiprocessingOptions(primary_host=own, **names)
     handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
     return ocp.Checkpointer(handler, multiprocessing_options=alone)
 
