@@ -18,6 +18,7 @@ import numpy as np
 
 from gfnn_jax.signals.local_polynomials import LocalFits, local_fits
 from gfnn_jax.signals.noise import Noise
+from gfnn_jax.signals.steps import Runs
 
 
 class _Options:
@@ -92,7 +93,7 @@ def window(noises: Sequence[Noise]) -> int:
 
 
 def derivatives(
-    times: Sequence[np.ndarray], columns: np.ndarray, size: int, sigmas: Sequence[float | None]
+    times: Runs, columns: np.ndarray, size: int, sigmas: Sequence[float | None]
 ) -> Derivatives | None:
     """Local polynomials of columns (C, T) in windows of ``size`` samples; None where none fits.
 
@@ -112,7 +113,7 @@ def _errors(scores: np.ndarray, normal: np.ndarray, blocks: int = 20) -> np.ndar
     return np.sqrt(np.diag(inverse @ (sums.T @ sums) @ inverse))
 
 
-def difference(times: Sequence[np.ndarray], x: np.ndarray, v: np.ndarray) -> str | None:
+def difference(times: Runs, x: np.ndarray, v: np.ndarray) -> str | None:
     """Forward, backward or central, where v (T,) is that difference of x (T,) but for the digits of
     the file; None otherwise, also where the difference of fourth order is closer: then v was
     measured, or computed, and the motion is smooth."""

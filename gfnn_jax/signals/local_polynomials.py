@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyvander
 from scipy.special import comb
+
+from gfnn_jax.signals.steps import Runs
 
 _WIDEST = 1.5  # of the median duration of windows of so many samples; wider ones hold a gap
 _MOST_NUMBERS = 60_000  # in the windows of one fit, for time and memory
@@ -43,9 +44,7 @@ class LocalFits:
         return np.sum(self.residuals**2, axis=-1) / free
 
 
-def local_fits(
-    times: Sequence[np.ndarray], columns: np.ndarray, size: int, degree: int
-) -> LocalFits | None:
+def local_fits(times: Runs, columns: np.ndarray, size: int, degree: int) -> LocalFits | None:
     """Fits of ``degree`` in windows of ``size`` samples, spread evenly over the runs.
 
     times: (n_r,) of each run. columns: (C, T). Windows that hold a gap are left out. None where no
@@ -69,7 +68,7 @@ def local_fits(
     return LocalFits(rows, centres, run, *found, q)
 
 
-def _windows(times: Sequence[np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _windows(times: Runs, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows (W, size), centres (W,) and runs (W,) of windows without a gap."""
     lengths = np.array([len(t) for t in times])
     begins = np.concatenate([[0], np.cumsum(lengths)[:-1]])
@@ -163,7 +162,7 @@ def choose_half(stretches: list[tuple[np.ndarray, np.ndarray]]) -> tuple[int, np
     return halves[good[-1]], np.where(told, by_differences, sigma)
 
 
-def _by_differences(each: Sequence[np.ndarray], rounding: np.ndarray) -> np.ndarray:
+def _by_differences(each: Runs, rounding: np.ndarray) -> np.ndarray:
     """σ (d,) of white noise by the differences of y (n, d) at even times that are least for their
     order; infinite of few. Of a smooth motion they vanish with their order, faster than what a
     cubic leaves."""

@@ -14,12 +14,11 @@ those before it and from the inputs. Both estimates are upper bounds; the smalle
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 
 from gfnn_jax.signals.local_polynomials import LocalFits, local_fits
-from gfnn_jax.signals.steps import even_runs
+from gfnn_jax.signals.steps import Runs, even_runs
 from gfnn_jax.signals.wrong_values import wrong_values
 
 _SIZES = (9, 11, 13, 15, 19, 23, 29, 37, 45, 57, 71, 89, 111, 139, 173, 217, 271, 339)
@@ -63,9 +62,7 @@ class Noise:
         return self.correlation is None or abs(self.correlation) < _Options.white
 
 
-def noise(
-    times: Sequence[np.ndarray], columns: np.ndarray, inputs: np.ndarray | None = None
-) -> list[Noise]:
+def noise(times: Runs, columns: np.ndarray, inputs: np.ndarray | None = None) -> list[Noise]:
     """The noise of each column (C, T). inputs: (k, T), what drives the motion."""
     shortest = max((len(t) for t in times), default=0) // 2
     sizes = [size for size in _SIZES if size <= shortest]
@@ -91,7 +88,7 @@ def noise(
     return found
 
 
-def _without_outliers(times: Sequence[np.ndarray], column: np.ndarray) -> np.ndarray:
+def _without_outliers(times: Runs, column: np.ndarray) -> np.ndarray:
     """A column (T,), NaN at its outliers, unless they are so many that they are noise with long
     tails, as of a sensor's single counts."""
     runs = np.split(column, np.cumsum([len(t) for t in times])[:-1])
@@ -144,7 +141,7 @@ def _correlation(fit: LocalFits, column: int) -> float:
     return float(shared - neighbours / (size - q.shape[2]))
 
 
-def _unpredicted(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> float | None:
+def _unpredicted(times: Runs, columns: Runs) -> float | None:
     """RMS of what the samples before, and the inputs, do not tell linearly of the first column;
     None where the samples are not even or are few."""
     ends, lags = np.cumsum([len(t) for t in times]), _Options.lags

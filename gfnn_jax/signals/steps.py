@@ -9,6 +9,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial import legendre
 
+Runs = Sequence[np.ndarray]  # an array of each run
+
 
 class _Options:
     """gap: times the 95th percentile of the steps, above which a step is a gap. even: part of a
@@ -28,7 +30,7 @@ class _Options:
     kept: float = 2.0
 
 
-def median_step(times: Sequence[np.ndarray]) -> float:
+def median_step(times: Runs) -> float:
     """The median time between samples, in s; NaN where no run has two."""
     steps = np.concatenate([np.diff(t) for t in times])
     return float(np.median(steps)) if len(steps) else np.nan
@@ -39,14 +41,14 @@ def longest_step(steps: np.ndarray) -> float:
     return float(_Options.gap * np.quantile(steps, 0.95)) if len(steps) else np.inf
 
 
-def gaps(times: Sequence[np.ndarray]) -> list[tuple[int, float, float]]:
+def gaps(times: Runs) -> list[tuple[int, float, float]]:
     """(number of the run, begin, end in s) of each gap."""
     longest = longest_step(np.concatenate([np.diff(t) for t in times]))
     found = [(r, t, k) for r, t in enumerate(times) for k in np.flatnonzero(np.diff(t) > longest)]
     return [(run, float(t[k]), float(t[k + 1])) for run, t, k in found]
 
 
-def even_runs(times: Sequence[np.ndarray]) -> list[int]:
+def even_runs(times: Runs) -> list[int]:
     """Numbers of the runs whose steps are all the median step, but for a twentieth."""
     step = median_step(times)
     most = _Options.even * step
@@ -76,7 +78,7 @@ def drift(times: np.ndarray) -> float:
     return float(6 * bend / slope)
 
 
-def spectrum(times: Sequence[np.ndarray], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def spectrum(times: Runs, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(frequencies (F,) in Hz, power density (F,) in units²/Hz) by Welch's method with Hann
     windows; the mean over runs, weighted by their length.
 
@@ -134,9 +136,7 @@ def _periodograms(series: np.ndarray, size: int, length: int) -> np.ndarray:
     return power / np.sum(window**2)
 
 
-def dominant_frequencies(
-    times: Sequence[np.ndarray], values: np.ndarray, most: int = 3
-) -> list[float]:
+def dominant_frequencies(times: Runs, values: np.ndarray, most: int = 3) -> list[float]:
     """Frequencies in Hz of the highest peaks, the highest first, those above a hundredth of it."""
     frequencies, power = spectrum(times, values)
     if len(frequencies) < 4 or not np.any(power > 0):

@@ -21,11 +21,12 @@ sample between them that is far beyond either (`wrong_at_jumps`).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
+
+from gfnn_jax.signals.steps import Runs
 
 TURN = 2 * np.pi
 
@@ -88,9 +89,7 @@ class WrongValues:
     off: float | None
 
 
-def wrong_values(
-    times: Sequence[np.ndarray], runs: Sequence[np.ndarray], resolution: float | None
-) -> tuple[WrongValues, ...]:
+def wrong_values(times: Runs, runs: Runs, resolution: float | None) -> tuple[WrongValues, ...]:
     """The wrong values of a column (n_r,) of each run, NaN where missing, in the order of time."""
     begins = np.cumsum([0, *map(len, times)])
     known = [np.flatnonzero(np.isfinite(x)) for x in runs]
@@ -108,9 +107,7 @@ def wrong_values(
     return tuple(sorted(found, key=lambda stretch: stretch.rows[0]))
 
 
-def wrong_at_jumps(
-    times: Sequence[np.ndarray], runs: Sequence[np.ndarray], resolution: float | None
-) -> tuple[WrongValues, ...]:
+def wrong_at_jumps(times: Runs, runs: Runs, resolution: float | None) -> tuple[WrongValues, ...]:
     """The samples of an input (n_r,) of each run that are beyond both sides of a jump."""
     begins, found, side = np.cumsum([0, *map(len, times)]), [], _Options.side
     for run, (t, x, begin) in enumerate(zip(times, runs, begins, strict=False)):
@@ -157,7 +154,7 @@ def _misses(t: np.ndarray, x: np.ndarray) -> np.ndarray:
     return found
 
 
-def _roughness(runs: Sequence[np.ndarray]) -> float:
+def _roughness(runs: Runs) -> float:
     """The largest miss that is ordinary in a column, of the `_misses` (n_r,) of its runs: 3.4
     standard deviations of white noise. Infinite where no run has a block of samples."""
     size = _Options.block
