@@ -215,8 +215,7 @@ class Constant(Bracket):
 
     @cached_property
     def casimirs(self) -> tuple[Casimir, ...]:
-        kernel = null_space(self.form)
-        return tuple(Casimir(None, row, False, self.labels) for row in kernel)
+        return tuple(Casimir(None, row, False, self.labels) for row in null_space(self.form))
 
     def _entry(self, i: int, j: int) -> str:
         return added([(self.form[i, j], "")])
@@ -553,8 +552,7 @@ def _monomial(x, powers: tuple[int, ...]):
 
 def _monomial_slope(x, powers: tuple[int, ...], k: int):
     """∂/∂x_k of a monomial (...)."""
-    less = tuple(a - (n == k) for n, a in enumerate(powers))
-    return powers[k] * _monomial(x, less)
+    return powers[k] * _monomial(x, tuple(a - (n == k) for n, a in enumerate(powers)))
 
 
 def _product(names: Sequence[str], powers: tuple[int, ...]) -> str:

@@ -155,8 +155,7 @@ def circle_centre(angle) -> tuple[float, bool]:
     widest = int(np.argmax(gaps))
     if gaps[widest] < TWO_PI / 8:
         return 0.0, True
-    after_gap = wrapped[(widest + 1) % len(wrapped)]
-    centre = after_gap + 0.5 * (TWO_PI - gaps[widest])
+    centre = wrapped[(widest + 1) % len(wrapped)] + 0.5 * (TWO_PI - gaps[widest])
     return float(np.mod(centre + np.pi, TWO_PI) - np.pi), False
 
 

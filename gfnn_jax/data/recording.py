@@ -348,8 +348,7 @@ class Recording:
         """The columns of a role (n, k) in a run, as `values`. Raises InputError at no such role."""
         if role not in ROLES:
             raise InputError(f"expected a role among {', '.join(ROLES)}, got {role!r}")
-        names = getattr(self, role)
-        columns = [self.values(name, run) for name in names]
+        columns = [self.values(name, run) for name in getattr(self, role)]
         return np.stack(columns, axis=1) if columns else np.empty((len(self.times(run)), 0))
 
     def driven_by(self, names: Sequence[str]) -> Recording:
@@ -451,8 +450,7 @@ def read(
         if not path.is_file():
             raise InputError(f"{path}: {'is not a file' if path.exists() else 'no such file'}")
         if path.suffix.lower() in ARRAYS:
-            table = _timed(from_arrays(path, chosen), time)
-            tables.append(rows_of(table, rows))
+            tables.append(rows_of(_timed(from_arrays(path, chosen), time), rows))
         else:
             shown = with_crossings(options.get("observe") or {}, options.get("events") or {})
             words = crossings_in(shown)

@@ -388,5 +388,4 @@ def _remarks(column: Column) -> str:
 
 def _fault(fault: Fault) -> Text:
     head, style = (f"wrong ({fault.kind}): ", "bold red") if fault.wrong else ("note: ", "yellow")
-    text = Text(head, style=style)
-    return text.append(said(str(fault)), style="not bold default")
+    return Text(head, style=style).append(said(str(fault)), style="not bold default")

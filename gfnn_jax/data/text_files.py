@@ -449,8 +449,7 @@ def _stacked(text: TextFile, columns: Sequence[str]) -> Table:
     kept = [str(n) for n in found if not columns or n in (*columns, time, "run")]
     named, units = {n: found[n].to_numpy() for n in kept}, text.units.items()
     units = {text.runs[name][0]: unit for name, unit in units}
-    beside = f"the runs {', '.join(runs)} stand side by side"
-    notes = (*text.notes, *_put_aside(aside), beside)
+    notes = (*text.notes, *_put_aside(aside), f"the runs {', '.join(runs)} stand side by side")
     return Table(named, units, str(text.path), {}, notes, time=time)
 
 

@@ -202,8 +202,7 @@ class Accelerations:
     def held_out(self, angles: Sequence[bool]) -> np.ndarray:
         """RMS (d,) that fits to every other block of windows leave in the blocks between, where
         some positions are angles."""
-        table = functions(self.q, self.v, angles, self.u)
-        return held_out(scaled(table), self.a.T)
+        return held_out(scaled(functions(self.q, self.v, angles, self.u)), self.a.T)
 
 
 def accelerations(traits: Traits, inputs: Sequence[str]) -> Accelerations | None:

@@ -130,8 +130,7 @@ def looked_at(pairs: Pairs, rows: np.ndarray, most: int) -> tuple[np.ndarray, np
 def sampled(pairs: Pairs, most: int, seed: int) -> np.ndarray:
     """About ``most`` rows in rising order, drawn by the seed: whole runs, the longer ones in
     stretches of a twentieth of all that are drawn. ``pairs``: in the order of their runs."""
-    goes_on = steps_between(pairs) > 0
-    first = np.concatenate([[True], ~goes_on])
+    first = np.concatenate([[True], ~(steps_between(pairs) > 0)])
     run = np.cumsum(first) - 1
     along = np.arange(len(pairs)) - np.flatnonzero(first)[run]
     longest = max(1, most // _Options.stretches)

@@ -140,6 +140,5 @@ def _blocks(goes_on: np.ndarray, longest: int, part: int) -> np.ndarray:
     starts = np.concatenate([[True], ~goes_on])
     run = np.cumsum(starts) - 1
     place = np.arange(len(starts)) - np.flatnonzero(starts)[run]
-    length = np.bincount(run)[run]
-    cut = (length > longest) & (place % part == 0)
+    cut = (np.bincount(run)[run] > longest) & (place % part == 0)
     return np.cumsum(starts | cut) - 1

@@ -83,8 +83,7 @@ def state_noise(map_: SymplecticMap, pairs: Pairs, taken: float) -> np.ndarray:
     residual = nearest_image(z1 - _images(map_, pairs, z0), map_.angles_of_z)
     jacobian = np.empty((len(z0), width, width))
     for j, apart in enumerate(Options.apart * size):
-        offset = apart * (np.arange(width) == j)
-        jacobian[:, :, j] = _change(map_, pairs, offset) / apart
+        jacobian[:, :, j] = _change(map_, pairs, apart * (np.arange(width) == j)) / apart
     known = np.isfinite(residual).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
     shared = np.flatnonzero(next_of(pairs, np.flatnonzero(known)))
     return of_pairs(residual[known], jacobian[known], shared) / np.sqrt(1.0 - taken)

@@ -56,8 +56,7 @@ def beside_flow(map_: SymplecticMap, pairs: Pairs, degree: int = 6) -> BesideFlo
         return np.concatenate([p[..., None], slopes], axis=2)
 
     of_state = columns(q, p)
-    flat = of_state.reshape(momenta.size, -1)
-    found = np.linalg.lstsq(flat, momenta.ravel(), rcond=None)[0]
+    found = np.linalg.lstsq(of_state.reshape(momenta.size, -1), momenta.ravel(), rcond=None)[0]
     unit, spread = np.sqrt(np.mean(momenta**2)), sizes(q)
     step = np.asarray(map_.step(np.concatenate([q, of_state @ found], axis=1))[0])
     moved = nearest_image(step[:, :dim] - image, angles)

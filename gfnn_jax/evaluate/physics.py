@@ -296,8 +296,7 @@ class _System(NamedTuple):
             return []
 
         def compute(other: _System) -> np.ndarray:
-            dry = other.law.friction.kinds == DRY
-            held = np.sum(np.asarray(other.law.losses)[dry])
+            held = np.sum(np.asarray(other.law.losses)[other.law.friction.kinds == DRY])
             return np.array([held / abs(other._curvature(other._near(q)).item())])
 
         (width,), (error,) = self.with_errors(compute)
@@ -309,8 +308,7 @@ class _System(NamedTuple):
     def swings(self, q: np.ndarray) -> Swings | None:
         """Frequency and Q of swings about rest, up to those of the data."""
         largest = float(self.size[0])
-        fractions = np.linspace(Options.small, 1.0, Options.amplitudes)
-        amplitude = largest * fractions
+        amplitude = largest * np.linspace(Options.small, 1.0, Options.amplitudes)
 
         def compute(other: _System) -> np.ndarray:
             start = float(other._near(q)[0])
@@ -352,8 +350,7 @@ class _System(NamedTuple):
         speed = np.sqrt(2 * free / law.masses(q)[:, 0, 0])
         path = 0.5 * np.pi * weights * half * np.cos(angle)
         period = 2 * np.sum(path / speed)
-        v = speed[:, None]
-        lost, _ = law.power(q, v)
+        lost, _ = law.power(q, speed[:, None])
         per_period = 2 * np.sum(path * lost.sum(axis=-1) / speed)
         stored = energy - self._potential(rest)
         return 1 / period, 2 * np.pi * stored / per_period if per_period > 0 else np.inf

@@ -108,8 +108,7 @@ def in_powers(model: PolynomialModel) -> dict[tuple[int, ...], np.ndarray]:
     indices = [half.indices.tolist() for half in halves]
     angles = [angle for half in halves for angle in half.is_angle]
     found: dict[tuple[int, ...], np.ndarray] = {}
-    used = np.argwhere(np.any(model.matrices != 0, axis=0)).tolist()
-    for a, b in used:
+    for a, b in np.argwhere(np.any(model.matrices != 0, axis=0)).tolist():
         functions = [*indices[0][a], *indices[1][b]]
         each = [_powers(k, degree, angle) for k, angle in zip(functions, angles, strict=True)]
         for factors in product(*each):

@@ -54,8 +54,7 @@ def casadi_function(map_: SymplecticMap, name: str, about: Mapping[str, Any]) ->
     off = casadi.vec((stages - slopes) / casadi.repmat(scale, 1, rule.nodes.size))
     given = casadi.vertcat(z, u, dp, t, h)
     equation = {"x": casadi.vec(stages), "p": given, "g": off}
-    rules = {"abstol": _FLOOR, "max_iter": 40}
-    solver = casadi.rootfinder("stages", "newton", equation, rules)
+    solver = casadi.rootfinder("stages", "newton", equation, {"abstol": _FLOOR, "max_iter": 40})
     again = casadi.Function("again", [casadi.vec(stages), given], [casadi.vec(slopes)])
     shapes = {"z": width, "u": u.numel(), "dp": dp.numel(), "h": 1}
     Z, U, D, H = (casadi.MX.sym(name, size) for name, size in shapes.items())

@@ -49,8 +49,7 @@ def fmu(map_: SymplecticMap, name: str, about: Mapping[str, Any]) -> bytes:
     without a law, or with one that is no formula, WorkError without a C compiler.
     """
     graph = graph_of(map_)
-    starts = _starts(graph, map_)
-    text = _source(graph, graph_of(map_, sharp=False), starts)
+    text = _source(graph, graph_of(map_, sharp=False), _starts(graph, map_))
     token = hashlib.sha256(text.encode()).hexdigest()[:32]
     text = text.replace("TOKEN", f'"{token}"', 1)
     packed = io.BytesIO()

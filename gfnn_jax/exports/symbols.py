@@ -197,8 +197,7 @@ class Tape:
                 found[symbol.number] = inputs[name][int(place[:-1])]
                 continue
             values = [found[o.number] if isinstance(o, Symbol) else o for o in own]
-            made = _ARITHMETIC.get(operation) or functions[operation]
-            found[symbol.number] = made(*values)
+            found[symbol.number] = (_ARITHMETIC.get(operation) or functions[operation])(*values)
         return [found[r.number] if isinstance(r, Symbol) else r for r in results]
 
     def _uses(self, results) -> dict[int, int]:

@@ -57,8 +57,7 @@ def map_rollouts(
 def step_rollouts(step: Callable, z0, num_steps: int = NUM_STEPS) -> Rollouts:
     """Roll out a plain ``step(z)`` -> Z of one state (2d,) from z0 (B, 2d)."""
     z0 = np.asarray(z0)
-    program = _rolled_out.lower(step, z0, num_steps).compile()
-    states, seconds = _timed(program, z0)
+    states, seconds = _timed(_rolled_out.lower(step, z0, num_steps).compile(), z0)
     states = np.asarray(states)
     finite = np.isfinite(states).all(axis=(1, 2))
     return Rollouts(states, np.where(finite, OK, NON_FINITE), seconds)
@@ -126,8 +125,7 @@ def measure(rollouts: Rollouts, scene: Scene, reference: np.ndarray, params=None
     conserved = scene.hamiltonian if scene.period is None else None
     hamiltonian = scene.invariants.get("energy", conserved)
     if hamiltonian is not None:
-        values = _along(hamiltonian, predicted, params)
-        energy = metrics.energy_error(np.asarray(values))
+        energy = metrics.energy_error(np.asarray(_along(hamiltonian, predicted, params)))
         drift = metrics.energy_drift(steps, energy)
     # Roundoff grows by other laws than the error of a model: no exponent where it is all there is.
     roundoff = _ROUNDINGS * np.finfo(float).eps * float(np.max(sizes(reference[:, 0])))

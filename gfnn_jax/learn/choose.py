@@ -127,8 +127,7 @@ def _of_ranking(ranking: list[Entry], request: Request) -> Chosen:
     first, larger = ranking[0], iter(())
     if first.candidate.validation_bound <= bound:
         sweep, sizes = first.sweep, first.sweep.sizes
-        more = sizes[sizes.index(first.size) + 1 :]
-        larger = _validated(sweep, more, budget, on_progress)
+        larger = _validated(sweep, sizes[sizes.index(first.size) + 1 :], budget, on_progress)
     smaller = _smaller(tried, budget, on_progress)
     for entry in itertools.chain([first], larger, ranking[1:], smaller):
         step = f"{entry.candidate.chart} {entry.candidate.label}"
@@ -350,8 +349,8 @@ def _refits(chosen: Chosen, found: Searched) -> _Refits | None:
 
 def _of_law(law: LearnedHamiltonian, data: Dataset) -> _Refits:
     flow = law.flow
-    each = {"args": data.args, "weight": data.weight}
-    problem = Problem(data.y0, data.y1, data.each_dt, data.scale, **each)
+    y0, y1 = data.y0, data.y1
+    problem = Problem(y0, y1, data.each_dt, data.scale, args=data.args, weight=data.weight)
     steps = Steps(flow.stages, flow.over(np.max(data.each_dt)).substeps)
     family, coefficients = flow.family, np.asarray(flow.params)
     if law.constrained is not None:  # what is told of coefficients holds in each fit
@@ -382,8 +381,7 @@ def with_test_rows(chosen: Chosen, found: Searched, budget: Budget) -> Chosen:
     again = within(last, lambda: sweep.with_test_rows(size))
     if again is None:  # told with what else was left out
         return chosen
-    before = sweep.solve(size)[0]
-    if not again.validation_rms <= before.validation_rms:
+    if not again.validation_rms <= sweep.solve(size)[0].validation_rms:
         return chosen
     params = jax.tree.map(np.asarray, size.family.unflatten(again.coefficients))
     fitted = [isinstance(piece, Generated) for piece in candidate.map.pieces]

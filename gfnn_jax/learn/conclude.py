@@ -88,8 +88,7 @@ def conclude(chosen: Chosen, searched: Searched, request: Request) -> Conclusion
         messages += request.budget.left_out
         return Conclusion(ended, searched.data.noise_of_channels, messages)
     diagnosis: list[str] = []
-    jumps = wrapped(request.pairs, request.coordinates)
-    if jumps:
+    if wrapped(request.pairs, request.coordinates):
         messages = []  # of a law that misses them
         ended = reason = "no map follows the jumps of an angle that is wrapped and was not named"
     elif candidate.validation_relative > Options.roundoff and searched.linear is None:

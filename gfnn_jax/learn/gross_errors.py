@@ -204,8 +204,7 @@ def _at_the_rim(found: Searched, rows: np.ndarray) -> bool:
     others[rows] = False
     left = sweep.residuals(chosen)
     size = _sizes(left)
-    place = sweep.sizes.index(chosen)
-    for smaller in reversed(sweep.sizes[:place]):
+    for smaller in reversed(sweep.sizes[: sweep.sizes.index(chosen)]):
         coarse = sweep.residuals(smaller)
         if np.median(_sizes(coarse)[others]) > OPTIONS.coarser * np.median(size[others]):
             differ = _sizes(coarse - left)

@@ -60,8 +60,7 @@ class Monitors:
 
     def turn(self, place: int = 0) -> SymplecticMap:
         """The map of a turn that begins at a place, by its number: all maps in a row."""
-        row = [*self.maps[place:], *self.maps[:place]]
-        return reduce(SymplecticMap.then, row)
+        return reduce(SymplecticMap.then, [*self.maps[place:], *self.maps[:place]])
 
     def states(self, recording: Recording, place: int = 0) -> dict[str, np.ndarray]:
         """z = (q, p) (turns, 2d) at a place, by the names of the runs, from both monitors of a

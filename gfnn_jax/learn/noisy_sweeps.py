@@ -271,8 +271,7 @@ class NoisySweep(LinearSweep):
         train, count = self.factors(size.group).train, size.family.num_parameters
         solved, larger = self.solve(size)[0], self._larger(size)
         most = size.family if larger is None else larger.family
-        sample = self._part(SAMPLE_ROWS * most.num_parameters)
-        blocks = list(sample.rows(most))
+        blocks = list(self._part(SAMPLE_ROWS * most.num_parameters).rows(most))
         rows, numbers = np.concatenate([rows for rows, _ in blocks]), sum(n for _, n in blocks)
         of_sample = Triangle.of(rows)
 

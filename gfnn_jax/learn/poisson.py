@@ -87,8 +87,7 @@ def learn_poisson(data: Pairs | Recording, options: FitOptions, watch: Watch) ->
     tested = pairs.take(test)
     own_dt = tested.dt if np.ndim(dt) else None
     steps = stepped(map_, np.asarray(tested.z0), own_dt, tested.args)
-    images = np.where(steps.failed[:, None], np.nan, steps.images)
-    off = images - np.asarray(tested.z1)
+    off = np.where(steps.failed[:, None], np.nan, steps.images) - np.asarray(tested.z1)
     error = one_step_error(off, every.spread[:n], tolerance, split.stretch[test])
     # both states of a pair have the noise that its sequence tells
     sigma, white = None, False
@@ -255,8 +254,7 @@ def _given(terms, names: tuple[str, ...]) -> Terms | None:
         told = "terms: values, bounds and ties of coefficients are of H of plain pairs, got states"
         raise InputError(f"{told} with a bracket: give the terms without them")
     texts = tuple(dict.fromkeys(to_named_text(parse_named(t, names), names) for t in terms))
-    eye = np.eye(len(texts), dtype=int)
-    return Terms(0, texts, tuple(map(tuple, eye.tolist())), (), names)
+    return Terms(0, texts, tuple(map(tuple, np.eye(len(texts), dtype=int).tolist())), (), names)
 
 
 class _Learned(NamedTuple):

@@ -139,8 +139,7 @@ def refit(
         worker.task["held"] = _states_of(apart)
         worker.task |= worker.resolving(held)
         bare = dataclasses.replace(map_, posterior=None)
-        task = {_OF_TASK + n: v for n, v in worker.task.items()}
-        group.broadcast(packed(bare, scene) | task)
+        group.broadcast(packed(bare, scene) | {_OF_TASK + n: v for n, v in worker.task.items()})
         found = worker.solved(chunks, held, group)
         apart, above = f"not dt = {float(map_.dt):g} apart", f"above {Options.outlying:g}"
         served, close = found.count + found.outliers, "as of close passages"
@@ -209,8 +208,7 @@ def _with_coefficients(
 ) -> LearnedHamiltonian:
     """The law with the coefficients of this fit."""
     names = [term.term for term in law.terms]
-    errors = fit.standard_errors.tolist()
-    terms = tuple(map(Term, names, fit.coefficients.tolist(), errors))
+    terms = tuple(map(Term, names, fit.coefficients.tolist(), fit.standard_errors.tolist()))
     flow = dataclasses.replace(law.flow, params=fit.coefficients)
     text = getattr(flow.family, "prefix", "") + formula(terms)
     return dataclasses.replace(law, flow=flow, terms=terms, shown=text, candidate=candidate)

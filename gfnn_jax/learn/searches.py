@@ -220,8 +220,7 @@ def linear_map(data: Dataset, tolerance: Tolerance) -> Candidate | None:
     named = {"label": "linear", "family": "linear", "chart": "affine"}
     costs = {"num_parameters": width * (width + 3) // 2, "operations": 2.0 * width**2}
     candidate = Candidate.of(error, train_rms=error.relative, fit_seconds=0.0, **named, **costs)
-    map_ = composed(piece, data)
-    return dataclasses.replace(with_error(candidate, error), map=map_)
+    return dataclasses.replace(with_error(candidate, error), map=composed(piece, data))
 
 
 def _of_quadratic(data: Dataset, y0, y1) -> Affine:

@@ -46,8 +46,7 @@ def _perturbations(key, *, length, shape):
 def _orbit(law: AroundOrbit, reference: Reference):
     """States (num_steps + 1, 2d) of the law's orbit."""
     start = np.array([law.start])
-    states = reference.trajectories(start, 1, law.num_steps)
-    return np.concatenate([start, states[:, 0]])
+    return np.concatenate([start, reference.trajectories(start, 1, law.num_steps)[:, 0]])
 
 
 def _reduce_angles(coordinates, z):

@@ -121,8 +121,7 @@ def smooth(
     n = len(t)
     at = np.arange(n) if at is None else at
     width = min(2 * half + 1, n)
-    first = np.clip(at - width // 2, 0, n - width)
-    index = first[:, None] + np.arange(width)
+    index = np.clip(at - width // 2, 0, n - width)[:, None] + np.arange(width)
     span = 0.5 * (t[index[:, -1]] - t[index[:, 0]])
     x = (t[index] - t[at, None]) / span[:, None]
     powers = x[:, :, None] ** np.arange(4.0)

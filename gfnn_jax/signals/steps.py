@@ -114,10 +114,8 @@ def _welch(runs: list, step: float, length: int) -> tuple[np.ndarray, np.ndarray
         known = np.isfinite(x)
         if known.sum() < 8:
             continue
-        even = np.arange(t[0], t[-1] + 0.5 * step, step)
-        series = np.interp(even, t[known], x[known])
-        size = min(length, len(series))
-        power = _periodograms(series, size, length) * step
+        series = np.interp(np.arange(t[0], t[-1] + 0.5 * step, step), t[known], x[known])
+        power = _periodograms(series, min(length, len(series)), length) * step
         total, weight = total + power * len(series), weight + len(series)
     return frequencies, np.asarray(total) / max(weight, 1) * np.ones_like(frequencies)
 
