@@ -110,8 +110,8 @@ class _StatesInText:
             begins = both[1:, 0] != both[:-1, 0]
             for row in np.flatnonzero(begins):
                 if sequence[row] in earlier or not np.isfinite(sequence[row]):
-                    rows = f"the rows of sequence {sequence[row]:g} must stand together"
-                    raise InputError(f"{self.path}: {self.file.locate(begin + int(row))}: {rows}")
+                    must = f"the rows of sequence {sequence[row]:g} must stand together"
+                    raise InputError(f"{self.path}: {self.file.locate(begin + int(row))}: {must}")
                 if "sequence" in table:
                     earlier.add(float(sequence[row]))
             if self.with_time:

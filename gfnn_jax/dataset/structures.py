@@ -7,7 +7,6 @@ A structure tells which libraries of terms are tried, and by what the domain of 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import re
 from collections.abc import Iterator, Sequence
 from math import comb
@@ -71,8 +70,8 @@ class Sites:
         sites' q2, p2, …"""
         ends = _ENDS[self.kind]
         if self.angles:
-            for (degree, products), end in itertools.product(Options.fourier, ends):
-                yield periodic_site_terms(dim, end, degree, products=products)
+            for degree, products in Options.fourier:
+                yield from (periodic_site_terms(dim, e, degree, products=products) for e in ends)
             return
         if given:
             yield from (site_terms(dim, end, 0, 0, given, self.fields) for end in ends)

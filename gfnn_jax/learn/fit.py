@@ -164,18 +164,18 @@ def fit(data: Any, scene: Any = None, *, options: FitOptions | None = None, **ch
     if damping is not None:  # a fact, not a warning
         messages.append(damping.line(data.dt))
     num_states = min(STATES_MEASURED, block_of(2 * data.dim))
-    known: dict[str, Any] = {"pairs": data.pairs, "num_pairs": len(data), "scene": scene}
-    known |= {"validation_pairs": data.pairs.take(data.validation), "seed": options.seed}
-    known |= {"test_pairs": data.pairs.take(data.test) if len(data.test) else None}
-    known |= {"determinants": found.charts.determinants, "data_defect": diagnosis.data_defect}
-    known |= {"base_map": bool(chosen.data.before or chosen.data.after), "damping": damping}
-    known |= {"noise": conclusion.noise, "ended": conclusion.ended, "white": conclusion.white}
-    known |= {"messages": tuple(messages), "symmetries": symmetries, "hamiltonian": found.law}
-    known |= {"partial_laws": () if found.met_by_law else tuple(request.partial_laws)}
-    known |= {"compile_seconds": chosen.compile_seconds, "stated_by": chosen.stated_by}
-    known |= {"model_determinant_min": _smallest_determinant(chosen), "asked": request.tolerance}
+    facts: dict[str, Any] = {"pairs": data.pairs, "num_pairs": len(data), "scene": scene}
+    facts |= {"validation_pairs": data.pairs.take(data.validation), "seed": options.seed}
+    facts |= {"test_pairs": data.pairs.take(data.test) if len(data.test) else None}
+    facts |= {"determinants": found.charts.determinants, "data_defect": diagnosis.data_defect}
+    facts |= {"base_map": bool(chosen.data.before or chosen.data.after), "damping": damping}
+    facts |= {"noise": conclusion.noise, "ended": conclusion.ended, "white": conclusion.white}
+    facts |= {"messages": tuple(messages), "symmetries": symmetries, "hamiltonian": found.law}
+    facts |= {"partial_laws": () if found.met_by_law else tuple(request.partial_laws)}
+    facts |= {"compile_seconds": chosen.compile_seconds, "stated_by": chosen.stated_by}
+    facts |= {"model_determinant_min": _smallest_determinant(chosen), "asked": request.tolerance}
     tested = chosen.data.pairs.take(chosen.data.validation[:num_states])
-    choice = Choice.of(budget, tested, candidates=_all_candidates(chosen, found), **known)
+    choice = Choice.of(budget, tested, candidates=_all_candidates(chosen, found), **facts)
     return Fit(chosen.candidate.map, choice)
 
 
