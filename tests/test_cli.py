@@ -181,12 +181,10 @@ def csv_file(path, sequences, header):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("suffix", "num_pairs", "tolerance", "num_steps"),
-    [
-        pytest.param("npz", 400, 3e-2, 100, marks=pytest.mark.slow),
-        pytest.param("csv", 6_000, 1e-5, 1_000, marks=pytest.mark.slow),
-    ],
+    [("npz", 400, 3e-2, 100), ("csv", 6_000, 1e-5, 1_000)],
 )
 def test_pairs_from_plain_numpy(suffix, num_pairs, tolerance, num_steps, tmp_path, capsys):
     """Kepler orbits that know nothing of the package: fit, then predict, as good as promised."""

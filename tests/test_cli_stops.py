@@ -243,13 +243,8 @@ def killed_training(arguments, seconds):
     return process.returncode != 0
 
 
-@pytest.mark.parametrize(
-    ("kills", "tolerance"),
-    [
-        pytest.param(1, 1e-3, marks=pytest.mark.slow),
-        pytest.param(20, 1e-14, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("kills", "tolerance"), [(1, 1e-3), (20, 1e-14)])
 def test_killed_trainings_resume(kills, tolerance, tmp_path):
     """SIGKILLs at random moments of a training: the same map in the end, to the last bit."""
     data = pairs_file(tmp_path / "d.npz", oscillator(100, [0, 1.0]), dt=1.0)

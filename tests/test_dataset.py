@@ -153,12 +153,6 @@ def test_single_pairs_are_split_at_random():
     assert not np.array_equal(split.test, split_rows(pairs, seed=4).test)
 
 
-def test_few_pairs_have_no_test_rows():
-    states = np.random.default_rng(0).normal(size=(2, 59, 2))
-    split = split_rows(identified(gfnn.Pairs(*states, 0.4)).pairs, seed=0)
-    assert [len(rows) for rows in split[:3]] == [54, 5, 0]
-
-
 @pytest.mark.parametrize("lengths", [(20,) * 30, (7, 1, 40, 3, 12) * 10])
 def test_whole_runs_are_held_out(lengths):
     pairs = identified(in_rows(walks(*lengths))).pairs

@@ -162,7 +162,7 @@ def hardening(z):
     [
         (swinging, {"p1²": 0.5, "cos(q1)": -1.0}, 1e-3, 150),
         # A polynomial of five terms leaves misfit there that is a third of the noise.
-        pytest.param(swinging, {"p1²": 0.5, "cos(q1)": -1.0}, 1e-6, 1_000, marks=pytest.mark.slow),
+        (swinging, {"p1²": 0.5, "cos(q1)": -1.0}, 1e-6, 1_000),
         (hardening, {"q1²": 0.5, "p1²": 0.5, "q1⁴": 0.25}, 1e-3, 150),
     ],
 )

@@ -83,7 +83,7 @@ def short_runs_of_a_spring(rng, count=120):
     return [(t, x + sigma * rng.normal(size=x.shape)) for t, x in runs], sigma
 
 
-@pytest.mark.parametrize("draw", range(4))
+@pytest.mark.parametrize("draw", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 3))])
 @pytest.mark.parametrize("make", [short_runs_of_two_carts, short_runs_of_a_spring])
 def test_the_law_of_short_runs_tells_their_noise(make, draw):
     runs, sigma = make(np.random.default_rng(draw))
