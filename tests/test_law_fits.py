@@ -25,7 +25,7 @@ from gfnn_jax.maps.estimates import Orbits, Window, estimates_of, law_of, propag
 from gfnn_jax.maps.laws import states_of
 from gfnn_jax.models.lagrangians.exchange import with_exchanges
 from gfnn_jax.models.lagrangians.given_terms import given_terms
-from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_again
+from gfnn_jax.models.lagrangians.input_rules import InputModel, choose_again, with_delay
 from gfnn_jax.models.lagrangians.libraries import central, textbook
 from gfnn_jax.models.lagrangians.recordings import samples_of
 from gfnn_jax.models.lagrangians.rivals import (
@@ -840,6 +840,28 @@ def test_a_known_mass_scales_the_law(recwarn):
     assert not [w for w in recwarn if "requested" in str(w.message)]
     assert fit.lagrangian.terms[0].coefficient == pytest.approx(1.5)
     assert fit.lagrangian.terms[1].coefficient == pytest.approx(6.0, rel=0.01)
+
+
+@pytest.mark.parametrize("costs", [[9.0, 12.0, 8.9], [9.0, 9.1, 8.9]])
+def test_a_delay_is_taken_where_held_out_arcs_gain_more_than_chance(costs, monkeypatch):
+    """ẍ = −4 x + u(t − 0.02): costs of three arcs with the delay, and 10 without."""
+    t = 0.05 * np.arange(200)
+    u, x = np.sin(3 * t), np.sin(3 * (t - 0.02)) / (4 - 9) + 0.1 * np.cos(2 * t)
+    x = x + 1e-3 * np.random.default_rng(0).normal(size=200)
+    recording = gfnn.Recording({"t": t, "x": x, "u": u}, positions=["x"], inputs=["u"])
+    problem = dataclasses.replace(samples_of(recording).problem, rules=("band",), inputs=None)
+    terms = (((2,), (0,), (0,), 0.0), ((0,), (2,), (0,), 0.0))
+    structure = Structure(1, terms, (), (), 1)
+    known = {("term", terms[1]): -2.0, ("gain", 0, 0): 1.0}
+    fit = problem.fit(structure, known, problem.arcs(1.0), problem.scales.sigma)
+
+    def held_out(model, sigma):
+        return np.array(costs) if model.delay else np.full(3, 10.0)
+
+    monkeypatch.setattr(InputModel, "held_out", held_out)
+    found = with_delay(fit)
+    expected = 0.02 if max(costs) < 10 else 0.0
+    assert found.delay == pytest.approx(expected, abs=4 * found.error * bool(expected))
 
 
 @pytest.mark.slow

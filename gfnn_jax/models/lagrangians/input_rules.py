@@ -7,7 +7,8 @@ A fit's residuals are linear in a small delay τ as they are in the coefficients
 
 with G' the gains of further inputs ∂u(t − τ)/∂τ, and terms that have inputs alike. So one
 evaluation of the arcs gives the delay that fits best, with its standard error, and how far the
-coefficients imitate it. It is taken where it is significant and held-out arcs gain by it. The rule
+coefficients imitate it. It is taken where it is significant and held-out arcs gain by it more than
+the standard error of what they gain: by less the one or the other hangs on roundoff. The rule
 between samples is that of which held-out arcs cost least, each with its own delay: chosen with the
 first law, whose misfit may hide the choice, and again with the last. Inputs that are held act as
 those in between do half a sample later, but for little: of rules whose costs differ by no more than
@@ -148,7 +149,8 @@ def with_delay(fit: LawFit) -> InputModel:
     if here.fit is fit:
         return here
     apart = Comparison.of(here.held_out(fit.sigma), begun.held_out(fit.sigma))
-    return here if apart.is_lower() else begun._replace(error=here.error)
+    gains = apart.is_lower() and apart.apart < -apart.error
+    return here if gains else begun._replace(error=here.error)
 
 
 def _correction(here: InputModel) -> tuple[float, float]:
