@@ -23,6 +23,7 @@ from command_line import (
     predict,
 )
 
+from gfnn_jax.data.predictions import PredictionWriter
 from gfnn_jax.jobs import output
 from gfnn_jax.jobs import predict as predict_job
 from gfnn_jax.maps import saved as models
@@ -129,7 +130,7 @@ def test_a_killed_fit_that_kept_nothing_is_in_nobodys_way(fitted, tmp_path, monk
 @contextlib.contextmanager
 def stopped_after(num_chunks, stop):
     """The prediction is stopped after so many chunks."""
-    append = predict_job.PredictionWriter.append
+    append = PredictionWriter.append
     count = 0
 
     def counting(writer, states, carry):
@@ -141,7 +142,7 @@ def stopped_after(num_chunks, stop):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(predict_job, "_CHUNK_LANE_STEPS", 30)
-        patch.setattr(predict_job.PredictionWriter, "append", counting)
+        patch.setattr(PredictionWriter, "append", counting)
         yield
 
 

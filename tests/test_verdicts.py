@@ -59,7 +59,7 @@ def test_friction_that_is_not_seen_leaves_the_stiffness_open():
     assert fit.verdict.startswith("one of several")
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 3))])
 def test_what_creeps_back_is_not_identified_as_drag(seed):
     """An overdamped spring: of its slow part x = e^−λt drag alone, ẍ = −λ ẋ, leaves as little as
     any spring with the friction that suits it."""

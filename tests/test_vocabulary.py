@@ -244,6 +244,7 @@ def test_a_foucault_pendulum_has_its_field_and_its_hamiltonian():
     assert float(fit.hamiltonian.sympy().subs(at)) == pytest.approx(float(H.subs(at)), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_one_energy_does_not_tell_a_mass_from_a_potential_of_many_terms():
     def acceleration(q, v):  # M = 1 + (ax² − 1)², as of a bead on a wire; V = −b (ax³/3 − x + cx²)
         a, b, c = 1.2, 9.81, 0.7
