@@ -93,7 +93,7 @@ class InRestingFrame(AroundAnother):
     family: Any
     dilations: Dilations
 
-    at_time = CaldirolaKanai.at_time
+    at_time = CaldirolaKanai.at_time  # pyright: ignore[reportAssignmentType]
 
     @property
     def num_parameters(self) -> int:
