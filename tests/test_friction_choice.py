@@ -53,6 +53,14 @@ def test_speeds_have_differences_in_one_unit(names, factors, joint):
     assert joints == ({joint} if joint else set())
 
 
+def test_a_coefficient_of_one_third_alone_leaves_the_choice_to_the_others():
+    made = table(0)
+    made.rows[:20, ..., 1] = 0.0
+    found = chosen(Table(CANDIDATES, made.rows, 1.0))
+    assert found.rows == (CANDIDATES[0],)
+    assert np.isfinite(list(found.odds.values())).all()
+
+
 def test_friction_that_is_not_there_is_not_taken_by_the_errors_of_other_coefficients():
     """By odds on held-out arcs alone seven of these twenty had another friction as well. That some
     have none is the limit which the module names."""
