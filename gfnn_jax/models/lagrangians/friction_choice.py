@@ -372,7 +372,7 @@ class Table:
         f, found = self.width, self.rows[..., self.width :].copy()
         for triangle, held in zip(self.triangles[:-1], self.folds, strict=True):
             size = np.linalg.norm(triangle[:, :f], axis=0)
-            size = np.where(size > 0, size, 1.0)  # of a coefficient that the other thirds do not show
+            size = np.where(size > 0, size, 1.0)  # where the other thirds do not show one
             others = np.linalg.pinv(triangle[:f, :f] / size, rcond=OPTIONS.rank) @ triangle[:f, f:]
             found[held] -= self.rows[held][..., :f] / size @ others
         return found
